@@ -1,0 +1,1 @@
+"""SIOMS: workcell devices as UNIX-like device nodes."""
