@@ -1,0 +1,137 @@
+"""Enumerations of the protocol. The numbers are wire facts: never renumber, only append."""
+
+from enum import IntEnum, IntFlag
+
+PROTOCOL_VERSION = 1
+
+
+class NodeClass(IntEnum):
+    """Class of a device node (dissertation, table F.1)."""
+
+    BINARY = 1
+    ANALOG = 2
+    AXIS = 3
+
+
+class ControlMode(IntFlag):
+    """The ``control_mode`` field of an axis write record (dissertation, table F.4).
+
+    Exactly one of the first six says what is commanded, with one extension: POSITION together with
+    VELOCITY (and ACCELERATION) commands a position that is passed with that velocity (and
+    acceleration) instead of reached at rest. The other flags say which further fields hold.
+    """
+
+    JERK = 0x0001
+    ACCELERATION = 0x0002
+    VELOCITY = 0x0004
+    POSITION = 0x0008
+    FORCE = 0x0010
+    FORCE_VELOCITY = 0x0020
+    SPECIFIED_TIME = 0x0040
+    WAIT_FOR_EXTERNAL_SYNCH = 0x0080
+    SPECIFIED_GAINS = 0x0100
+    SPECIFIED_FORCE_OFFSET = 0x0200
+    SPECIFIED_MAX_VEL_ACC = 0x0400
+    SPECIFIED_MAX_FORCE = 0x0800
+    SPECIFIED_WAIT_MARKER = 0x1000
+    SPECIFIED_SIGNAL_MARKER = 0x2000
+    RELATIVE = 0x4000
+    """Beyond the table: ``position`` counts from where the preceding command ends."""
+
+
+QUANTITIES = 0x003F
+"""Mask of the flags that say what is commanded."""
+
+
+class AxisStatus(IntFlag):
+    """The ``status`` word of an axis reading."""
+
+    MOVING = 0x0001
+    FORCE_MODE = 0x0002
+    LIMIT_MINUS = 0x0004
+    LIMIT_PLUS = 0x0008
+    HOMED = 0x0010
+    FOLLOWING_ERROR = 0x0020
+    FAULT = 0x0040
+    EMERGENCY_STOP = 0x0080
+    WAITING_MARKER = 0x0100
+    WAITING_SYNCH = 0x0200
+    SATURATED = 0x0400
+    HOMING = 0x0800
+    STOPPING = 0x1000
+    SWITCH_MINUS = 0x2000
+    SWITCH_PLUS = 0x4000
+    STALLED = 0x8000
+
+
+class AnalogStatus(IntFlag):
+    """The ``flags`` word of an analog reading; 0 is a good value."""
+
+    SATURATED = 0x1
+    INVALID = 0x2
+    OVERRUN = 0x4
+    """Samples were lost before this one."""
+
+
+class Request(IntEnum):
+    """ioctl requests (dissertation, table F.5, and beyond it from STOP on)."""
+
+    GET_IO_STRUCT_INFO = 1
+    CALIBRATE_DEVICE = 2
+    ZERO_DEVICE = 3
+    WAIT_UNTIL_IDLE = 4
+    SEND_EXTERNAL_SYNCH = 5
+    EMERGENCY_STOP = 6
+    SIGNAL_MARKER = 7
+    WAIT_MARKER = 8
+    RESERVE_MARKER = 9
+    FREE_MARKER = 10
+    WAIT_UNTIL_EVENT = 11
+    SET_GAINS = 12
+    GET_GAINS = 13
+    STOP = 20
+    RESET = 21
+    HOME = 22
+    SET_LIMITS = 23
+    GET_LIMITS = 24
+    FLUSH = 25
+    CANCEL_WAITS = 26
+    GET_STATISTICS = 27
+
+
+class Access(IntFlag):
+    """Mode of an open: what the handle may do."""
+
+    READ = 1
+    WRITE = 2
+
+
+class Right(IntFlag):
+    """What the configuration grants a user on a node."""
+
+    READ = 1
+    WRITE = 2
+    STOP = 4
+    ADMINISTER = 8
+    ALL = 15
+
+
+class PageState(IntEnum):
+    """State words of a page. A reader accepts only GOOD from both the driver and the daemon."""
+
+    STARTING = 0
+    GOOD = 1
+    LINK_LOST = 2
+    FAULT = 3
+    STALE = 4
+    CLOSED = 5
+
+
+class WriteFlag(IntFlag):
+    """Flags of a WRITE message."""
+
+    APPEND = 0
+    REPLACE = 1
+    """Empty the buffer first and re-plan from the present state, without a jump."""
+    LATEST = 2
+    """Do not wait for an acknowledgement line by line: reply only when the write is refused."""

@@ -1,0 +1,97 @@
+"""The emergency-stop latch and the stop-request page.
+
+Two pages of shared memory, both checked by every driver in every tick, so that a stop works while
+the daemon is busy or gone:
+
+* the latch page is written by the daemon and the drivers: ``stopped_ns`` is 0, or the time when the
+  workcell was stopped; the daemon also stamps ``daemon_alive_ns`` in it, from its real loop.
+* the request page is writable by every client with the right to stop. Any change of its word is a
+  request; a client can thus cause a stop but never clear one.
+
+This is a software stop (category 1 or 2 of IEC 60204-1 at best), not a safety-rated function.
+"""
+
+LATCH_SIZE = 4096
+REQUEST_SIZE = 4096
+_STOPPED, _RESETS, _ALIVE = 0, 1, 2
+_TEXT, _TEXT_SIZE = 64, 256
+
+
+class Latch:
+    """View of the latch page.
+
+    Args:
+        buffer: the latch page, LATCH_SIZE bytes; writable in the daemon and the drivers.
+
+    Concurrency: stores are single words; daemon and drivers may latch at the same time.
+    """
+
+    def __init__(self, buffer: memoryview) -> None:
+        self._bytes = buffer
+        self._words = buffer[:64].cast("Q")
+
+    @property
+    def stopped_ns(self) -> int:
+        """Time of the stop [ns, CLOCK_MONOTONIC], 0 when not stopped."""
+        return self._words[_STOPPED]
+
+    @property
+    def resets(self) -> int:
+        """How often the latch has been cleared; a stop between two looks shows as a change."""
+        return self._words[_RESETS]
+
+    @property
+    def daemon_alive_ns(self) -> int:
+        """Last stamp of the daemon's loop [ns, CLOCK_MONOTONIC]."""
+        return self._words[_ALIVE]
+
+    @property
+    def source(self) -> str:
+        """Who stopped and why."""
+        return bytes(self._bytes[_TEXT : _TEXT + _TEXT_SIZE]).split(b"\0")[0].decode("utf-8", "replace")
+
+    def stop(self, now_ns: int, source: str) -> bool:
+        """Latch the stop; return whether it was not latched before."""
+        if self._words[_STOPPED]:
+            return False
+        self._bytes[_TEXT : _TEXT + _TEXT_SIZE] = source.encode()[: _TEXT_SIZE - 1].ljust(_TEXT_SIZE, b"\0")
+        self._words[_STOPPED] = now_ns
+        return True
+
+    def reset(self) -> None:
+        """Clear the latch (the daemon's, on behalf of somebody entitled)."""
+        self._words[_RESETS] += 1
+        self._words[_STOPPED] = 0
+
+    def daemon_alive(self, now_ns: int) -> None:
+        """Stamp the daemon's loop as alive."""
+        self._words[_ALIVE] = now_ns
+
+    def release(self) -> None:
+        """Drop the views, so that the mapping can be closed."""
+        self._words.release()
+        self._bytes.release()
+
+
+class StopRequest:
+    """View of the stop-request page.
+
+    Args:
+        buffer: the request page, REQUEST_SIZE bytes; writable in clients that may stop.
+    """
+
+    def __init__(self, buffer: memoryview) -> None:
+        self._words = buffer[:8].cast("Q")
+
+    @property
+    def word(self) -> int:
+        """The present word; a change is a request."""
+        return self._words[0]
+
+    def request(self, now_ns: int) -> None:
+        """Request a stop of the workcell."""
+        self._words[0] = now_ns if now_ns != self._words[0] else now_ns + 1
+
+    def release(self) -> None:
+        """Drop the view, so that the mapping can be closed."""
+        self._words.release()

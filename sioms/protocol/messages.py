@@ -1,0 +1,131 @@
+"""Messages on the SOCK_SEQPACKET sockets: one msgpack array a packet.
+
+Request  [verb, id, arguments...]        id > 0, unique among the sender's unanswered requests
+Reply    [0, id, errno, value or text]   errno 0: value; else text, one sentence without full stop
+Notice   [verb, 0, arguments...]         draws no reply
+
+Packets are bounded by MAX_PACKET; a larger write carries its records in a sealed memory file whose
+descriptor goes along. Whoever receives something else ends that connection, and nothing else.
+"""
+
+from enum import IntEnum
+
+import msgpack
+
+MAX_PACKET = 65536
+MAX_INLINE = 49152
+"""Bytes of records up to which a write carries them in the packet."""
+MAX_WRITE = 1 << 24
+"""Bytes of records in one write at most."""
+MAX_TEXT = 1024
+
+
+class ClientVerb(IntEnum):
+    """From a client to the daemon."""
+
+    HELLO = 1
+    OPEN = 2
+    CLOSE = 3
+    LIST = 4
+    INFO = 5
+    STATUS = 6
+    RESERVE_MARKER = 10
+    FREE_MARKER = 11
+    SIGNAL_MARKER = 12
+    WAIT_MARKER = 13
+    EMERGENCY_STOP = 20
+    RESET = 21
+    RELOAD = 22
+    CANCEL = 30
+
+
+class HandleVerb(IntEnum):
+    """From a client to a driver, on the socket of a handle."""
+
+    WRITE = 1
+    IOCTL = 2
+    SUBSCRIBE = 3
+    KEEPALIVE = 4
+    CANCEL = 5
+
+
+class DriverVerb(IntEnum):
+    """Between the daemon and a driver, on its control socket (D: sent by the daemon)."""
+
+    ATTACH = 1
+    """D: [handle, block, channels, bits, mode, rights, lease_ns, who]; descriptors: socket, eventfd, pidfd."""
+    DETACH = 2
+    """D: [handle]: end it, as if its socket had closed."""
+    STOP_CHANGED = 3
+    """D: [what]: the latch has changed, look at once."""
+    SHUTDOWN = 4
+    """D: stop, make outputs safe, exit."""
+    INPUT = 5
+    """D: [name, block, channels, bits]; descriptor: the page of a node that the driver reads."""
+    NODE_STOP = 6
+    """D: [block, channels, source]: emergency stop of some channels. NODE_RESET likewise."""
+    NODE_RESET = 7
+    READY = 20
+    """[blocks]; descriptors: one page a block, writable until the daemon seals it."""
+    DETACHED = 21
+    """[handle]: its axes are being halted, the channels are free."""
+    MARKER_SIGNALLED = 22
+    """[number]."""
+    STOPPED = 23
+    """[source]: the driver has latched the emergency stop of the workcell."""
+    LINK = 24
+    """[state, reason]: PageState of the device behind the driver."""
+    LOG = 25
+    """[level, text]."""
+
+
+class NurseryVerb(IntEnum):
+    """Between the daemon and the nursery, the process that forks the drivers."""
+
+    DESCRIBE = 1
+    """[device, driver, table, folder] -> [errors, description]."""
+    SPAWN = 2
+    """[device, generation, rt]; descriptors: control socket, latch, request page, markers -> pid; descriptor: pidfd."""
+
+
+class MalformedMessage(Exception):
+    """A packet that is no message: too long, no msgpack, not the promised shape."""
+
+
+def encode(*parts: object) -> bytes:
+    """Pack a message."""
+    packed: bytes = msgpack.packb(parts, use_bin_type=True)
+    return packed
+
+
+def decode(packet: bytes) -> list[object]:
+    """Unpack a message and check its head.
+
+    Returns:
+        The list [verb, id, ...], both integers within range.
+
+    Raises:
+        MalformedMessage: anything else.
+    """
+    try:
+        message = msgpack.unpackb(
+            packet, raw=False, use_list=True, strict_map_key=True, max_buffer_size=MAX_PACKET
+        )
+    except Exception as error:  # msgpack raises a wide family for bad input, all of them meaning just this
+        raise MalformedMessage(f"decode packet of {len(packet)} bytes: {type(error).__name__}: {error}") from None
+    if not isinstance(message, list) or len(message) < 2:
+        raise MalformedMessage("decode packet: not an array of verb, id and arguments")
+    verb, number = message[0], message[1]
+    if type(verb) is not int or type(number) is not int or not (0 <= verb < 256 and 0 <= number < 1 << 53):
+        raise MalformedMessage(f"decode packet: verb {verb!r}, id {number!r}; want integers from 0")
+    return message
+
+
+def reply(number: int, value: object = None) -> bytes:
+    """Pack a successful reply."""
+    return encode(0, number, 0, value)
+
+
+def refusal(number: int, errno_: int, text: str) -> bytes:
+    """Pack a refusal with its errno and its sentence."""
+    return encode(0, number, errno_, text[:MAX_TEXT])

@@ -1,0 +1,265 @@
+"""The shared-memory page of one block: a header and a ring of snapshots.
+
+One driver process writes, any number of processes read, and reading takes no system call: the
+reader copies the newest snapshot out of the ring and checks its number before and after.
+
+Layout (little endian; offsets in bytes)::
+
+    0    magic "SIOMSpg1"          40  offset of the first slot
+    8    version u32, class u32    48  lease_ns: alive_ns older than this = driver hung
+    16   channels u32, fields u32  56  generation of the driver process
+    24   slots (a power of two)    64  driver state u32, daemon state u32 (PageState)
+    32   bytes of a slot           72  head: number of the newest snapshot, 0 = none yet
+                                   80  alive_ns: stamped every tick by the driver
+    96   reason: UTF-8 text, NUL padded, why the state is not good (160 bytes)
+    256  slots
+
+    slot: number u64, stamp_ns u64, tick u64, reserved u64, then one array of 8-byte values a field
+
+A snapshot is written with its number zeroed, and published by its number and then by the head, so
+a writer killed half-way leaves the preceding snapshot the newest. The ring lets a reader that was
+asleep find every edge of the recent past.
+
+Concurrency: one writer thread; readers anywhere. The stores of number, payload and head must not be
+reordered: x86 keeps stores in order; elsewhere an uncontended lock is passed as a fence.
+"""
+
+import os
+from struct import Struct, pack_into, unpack_from
+
+from .flags import NodeClass, PageState
+from .records import READ_FIELDS
+
+MAGIC = b"SIOMSpg1"
+VERSION = 1
+HEADER_SIZE = 256
+SLOT_HEADER = 32
+REASON_OFFSET = 96
+REASON_SIZE = 160
+_GOOD = PageState.GOOD | PageState.GOOD << 32
+_HEAD, _ALIVE, _LEASE, _STATES = 72 // 8, 80 // 8, 48 // 8, 64 // 8
+_HEADER = Struct("<8sIIIIQQQQQII")
+_SLOT = Struct("<QQQQ")
+
+if os.uname().machine in ("x86_64", "i686", "AMD64"):
+
+    def _fence() -> None:
+        """Keep store order: nothing to do, this processor does."""
+
+else:
+    from _thread import allocate_lock
+
+    _lock = allocate_lock()
+
+    def _fence() -> None:
+        """Keep store order: an acquire and a release."""
+        with _lock:
+            pass
+
+
+class PageError(Exception):
+    """The page is not one of ours, or of another version."""
+
+
+class NotReadable(Exception):
+    """The page must not be read now: the driver is starting, gone, hung or in fault.
+
+    Args:
+        state: why, as a PageState; STALE also when the lease has run out.
+        reason: sentence written by the driver or the daemon, may be empty.
+    """
+
+    def __init__(self, state: PageState, reason: str) -> None:
+        super().__init__(reason)
+        self.state = state
+        self.reason = reason
+
+
+def slot_size(node_class: NodeClass, channels: int) -> int:
+    """Return the bytes of one snapshot."""
+    return SLOT_HEADER + 8 * len(READ_FIELDS[node_class]) * channels
+
+
+def page_size(node_class: NodeClass, channels: int, slots: int) -> int:
+    """Return the bytes of a page with a ring of the given number of slots (a power of two)."""
+    return HEADER_SIZE + slots * slot_size(node_class, channels)
+
+
+def _write_reason(buffer: memoryview, text: str) -> None:
+    encoded = text.encode()[: REASON_SIZE - 1]
+    buffer[REASON_OFFSET : REASON_OFFSET + REASON_SIZE] = encoded.ljust(REASON_SIZE, b"\0")
+
+
+class PageWriter:
+    """The driver's side of a page, in a writable buffer of page_size bytes.
+
+    Args:
+        buffer: zeroed memory, mapped writable.
+        node_class: class of the block.
+        channels: number of channels.
+        slots: length of the ring, a power of two of at least 4.
+        lease_ns: how old ``alive_ns`` may get before readers call the driver hung.
+        generation: distinguishes successive driver processes of one device.
+    """
+
+    def __init__(
+        self,
+        buffer: memoryview,
+        node_class: NodeClass,
+        channels: int,
+        slots: int,
+        lease_ns: int,
+        generation: int,
+    ) -> None:
+        if slots < 4 or slots & (slots - 1):
+            raise PageError(f"lay out page: {slots} slots; must be a power of two of at least 4")
+        fields = len(READ_FIELDS[node_class])
+        size = slot_size(node_class, channels)
+        _HEADER.pack_into(
+            buffer, 0, MAGIC, VERSION, node_class, channels, fields, slots, size, HEADER_SIZE, lease_ns,
+            generation, PageState.STARTING, PageState.GOOD,
+        )  # fmt: skip
+        self._bytes = buffer.cast("B")
+        self._words = self._bytes.cast("Q")
+        self._mask = slots - 1
+        self._size = size
+        self._number = 0
+
+    @property
+    def number(self) -> int:
+        """Number of the newest snapshot, 0 before the first."""
+        return self._number
+
+    def alive(self, now_ns: int) -> None:
+        """Stamp the driver as alive [ns, CLOCK_MONOTONIC]."""
+        self._words[_ALIVE] = now_ns
+
+    def publish(self, payload: memoryview, stamp_ns: int, tick: int) -> None:
+        """Publish one snapshot of all channels.
+
+        Args:
+            payload: the field arrays one after the other, ``memoryview`` of bytes.
+            stamp_ns: time the values hold for [ns, CLOCK_MONOTONIC].
+            tick: number of the driver's tick.
+        """
+        number = self._number + 1
+        offset = HEADER_SIZE + (number & self._mask) * self._size
+        word = offset >> 3
+        words = self._words
+        words[word] = 0
+        _fence()
+        words[word + 1] = stamp_ns
+        words[word + 2] = tick
+        self._bytes[offset + SLOT_HEADER : offset + self._size] = payload
+        _fence()
+        words[word] = number
+        words[_HEAD] = number
+        self._number = number
+
+    def set_state(self, state: PageState, reason: str = "") -> None:
+        """Set the driver's state word, and the reason for a state that is not good."""
+        _write_reason(self._bytes, reason)
+        _fence()
+        pack_into("<I", self._bytes, 64, state)
+
+    def release(self) -> None:
+        """Drop the views, so that the mapping can be closed."""
+        self._words.release()
+        self._bytes.release()
+
+
+def set_daemon_state(buffer: memoryview, state: PageState, reason: str) -> None:
+    """Set the daemon's state word in a mapped page (the daemon's only store in it)."""
+    _write_reason(buffer, reason)
+    _fence()
+    pack_into("<I", buffer, 68, state)
+
+
+class PageReader:
+    """A reader of a page in a read-only mapping.
+
+    Args:
+        buffer: the mapping (``mmap`` object; slices of it copy).
+
+    Raises:
+        PageError: no page of this version.
+    """
+
+    __slots__ = ("_buffer", "_mask", "_size", "_words", "channels", "generation", "node_class", "slots")
+
+    def __init__(self, buffer) -> None:  # type: ignore[no-untyped-def]  # mmap or bytes-like whose slices copy
+        magic, version, cls, channels, _, slots, size, _, _, generation, _, _ = _HEADER.unpack_from(buffer, 0)
+        if magic != MAGIC or version != VERSION:
+            raise PageError(f"map page: magic {magic!r}, version {version}; want {MAGIC!r}, {VERSION}")
+        self._buffer = buffer
+        self._words = memoryview(buffer).cast("Q")
+        self._mask = slots - 1
+        self._size = size
+        self.channels: int = channels
+        self.node_class = NodeClass(cls)
+        self.slots: int = slots
+        self.generation: int = generation
+
+    @property
+    def head(self) -> int:
+        """Number of the newest snapshot; 0 before the first."""
+        return self._words[_HEAD]
+
+    def check(self, now_ns: int) -> None:
+        """Raise NotReadable unless driver and daemon call the page good and the lease holds."""
+        words = self._words
+        if words[_STATES] != _GOOD or now_ns - words[_ALIVE] > words[_LEASE]:
+            self._refuse(now_ns)
+
+    def latest(self, now_ns: int) -> bytes:
+        """Copy the newest snapshot, slot header included.
+
+        Args:
+            now_ns: the time [ns, CLOCK_MONOTONIC], for the lease.
+
+        Raises:
+            NotReadable: the driver is starting, hung, gone or in fault: never old data as new.
+        """
+        words = self._words
+        if words[_STATES] != _GOOD or now_ns - words[_ALIVE] > words[_LEASE]:
+            self._refuse(now_ns)
+        while True:
+            number = words[_HEAD]
+            offset = HEADER_SIZE + (number & self._mask) * self._size
+            raw: bytes = self._buffer[offset : offset + self._size]
+            # The writer may have lapped us between reading the head and copying.
+            if words[offset >> 3] == number and raw[:8] == number.to_bytes(8, "little"):
+                return raw
+            if number == 0:
+                raise NotReadable(PageState.STARTING, "nothing published yet")
+
+    def numbered(self, number: int) -> bytes | None:
+        """Copy a snapshot of the ring by its number; None when it is overwritten or not there yet."""
+        offset = HEADER_SIZE + (number & self._mask) * self._size
+        raw: bytes = self._buffer[offset : offset + self._size]
+        if number > 0 and self._words[offset >> 3] == number and raw[:8] == number.to_bytes(8, "little"):
+            return raw
+        return None
+
+    def release(self) -> None:
+        """Drop the view, so that the mapping can be closed."""
+        self._words.release()
+
+    def _refuse(self, now_ns: int) -> None:
+        words = self._words
+        driver, daemon = unpack_from("<II", self._buffer, 64)
+        text = self._buffer[REASON_OFFSET : REASON_OFFSET + REASON_SIZE].split(b"\0")[0].decode("utf-8", "replace")
+        if daemon != PageState.GOOD:
+            raise NotReadable(PageState(daemon), text)
+        if driver != PageState.GOOD:
+            raise NotReadable(PageState(driver), text)
+        age = (now_ns - words[_ALIVE]) / 1e9
+        raise NotReadable(
+            PageState.STALE, f"its driver has not ticked for {age:.3f} s (lease {words[_LEASE] / 1e9:.3f} s)"
+        )
+
+
+def slot_header(raw: bytes) -> tuple[int, int, int]:
+    """Return (number, stamp_ns, tick) of a copied snapshot."""
+    number, stamp_ns, tick, _ = _SLOT.unpack_from(raw, 0)
+    return number, stamp_ns, tick

@@ -1,0 +1,149 @@
+"""Blocks: the arrays of channels that a device shows, and the memory their readings live in.
+
+A block is published whole, so all its channels carry one tick and one time stamp. Nodes are views
+of blocks. The driver fills ``data``; the kit publishes.
+
+Concurrency: owned by the one thread of the driver process.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.protocol.flags import NodeClass
+from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.protocol.records import READ_FIELDS
+
+if TYPE_CHECKING:
+    from sioms.motion import AxisBank, DriveBank
+
+
+@dataclass(frozen=True, slots=True)
+class BlockSpec:
+    """What a block is, told before any process runs.
+
+    Args:
+        name: '' for the node that bears the device's own name, else the suffix: ``tactile0.strain``.
+        node_class: class of its channels.
+        channels: the channels in order; their names make the nodes of single channels.
+        writable: whether clients may write (axis blocks always are).
+        history: snapshots kept in the page, a power of two of at least 4.
+        capacity: commands an axis buffers.
+        safe: for a writable binary or analog block the value each channel takes when its writer
+            goes away or the workcell stops; None keeps the last value.
+    """
+
+    name: str
+    node_class: NodeClass
+    channels: tuple[ChannelInfo, ...]
+    writable: bool = False
+    history: int = 64
+    capacity: int = 0
+    safe: tuple[float | None, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """What a device is: the answer to ``describe``.
+
+    Args:
+        blocks: its blocks.
+        tick_hz: rate of its tick, poll or frames [Hz].
+        inputs: names of nodes of other devices that the driver reads (simulated coupling, load
+            information); the kit opens them and reopens them when their device comes back.
+        lease_s: a reader calls the driver hung when it has not ticked for this long [s].
+    """
+
+    blocks: tuple[BlockSpec, ...]
+    tick_hz: float
+    inputs: tuple[str, ...] = ()
+    lease_s: float = 0.1
+
+
+class Block:
+    """A block and the memory of its present readings.
+
+    Attributes:
+        spec: what it is.
+        n: number of channels.
+        fields: shape (fields, n) float64, one row a field in the order of READ_FIELDS; integer
+            fields are the same memory seen through ``words``.
+        words: shape (fields, n) int64, the same memory.
+        stamp_ns: time the readings hold for [ns, CLOCK_MONOTONIC]; set by the driver when it knows
+            better than "now", e.g. for samples that travelled.
+    """
+
+    def __init__(self, spec: BlockSpec, fields: NDArray[np.float64] | None = None) -> None:
+        self.spec = spec
+        self.n = len(spec.channels)
+        shape = (len(READ_FIELDS[spec.node_class]), self.n)
+        self.fields = np.zeros(shape) if fields is None else fields
+        if self.fields.shape != shape or not self.fields.flags.c_contiguous:
+            raise ValueError(f"make block {spec.name!r}: fields of shape {self.fields.shape}; want {shape}, contiguous")
+        self.words: NDArray[np.int64] = self.fields.view(np.int64)
+        self.stamp_ns = 0
+
+    def payload(self) -> memoryview:
+        """Return the readings as bytes in page order, without copying."""
+        return memoryview(self.fields).cast("B")
+
+
+class AnalogBlock(Block):
+    """Analog channels: ``data`` (n,) in declared units and ``flags`` (n,) of AnalogStatus."""
+
+    def __init__(self, spec: BlockSpec) -> None:
+        super().__init__(spec)
+        self.data: NDArray[np.float64] = self.fields[0]
+        self.flags: NDArray[np.int64] = self.words[1]
+
+
+class BinaryBlock(Block):
+    """Binary ports: ``data`` (n,) int64, one port of up to 62 bits a channel."""
+
+    def __init__(self, spec: BlockSpec) -> None:
+        super().__init__(spec)
+        self.data: NDArray[np.int64] = self.words[0]
+        self._changed_ns = self.words[1]
+        self._edges = self.words[2]
+
+    def set(self, port: int, value: int, stamp_ns: int) -> bool:
+        """Set a port; count and stamp the edge if it is one.
+
+        Args:
+            port: index of the port.
+            value: its new bits.
+            stamp_ns: time of the edge, as exact as the device gives it [ns, CLOCK_MONOTONIC].
+
+        Returns:
+            Whether the value changed.
+        """
+        if int(self.data[port]) == value:
+            return False
+        self.data[port] = value
+        self._changed_ns[port] = stamp_ns
+        self._edges[port] += 1
+        return True
+
+
+@dataclass(slots=True)
+class AxisBlock:
+    """Axes: the bank that commands them; its ``fields`` are what is published."""
+
+    spec: BlockSpec
+    bank: AxisBank | DriveBank
+    stamp_ns: int = 0
+    n: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.n = len(self.spec.channels)
+
+    def payload(self) -> memoryview:
+        """Return the readings as bytes in page order, without copying."""
+        return memoryview(self.bank.fields).cast("B")
+
+
+AnyBlock = AxisBlock | AnalogBlock | BinaryBlock

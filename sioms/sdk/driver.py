@@ -1,0 +1,267 @@
+"""What a driver author writes: one of three small classes. The kit does everything else.
+
+* :class:`TickDriver`: the host closes the loop, or the device is simulated: ``tick`` at ``tick_hz``.
+* :class:`LineDriver`: request and reply on a serial or TCP line, one or more :class:`LineUnit` on it
+  (a bus); hooks are generators of exchanges (see ``exchange``).
+* :class:`StreamDriver`: a device that pushes: ``feed`` takes the bytes as they come.
+
+All three have ``Settings`` (the device's table in the configuration; unknown keys are errors) and
+``describe``, which is pure: it runs before there is a process and tells the blocks. The kit owns the
+process, the tick, clients, command buffers, markers, synch, emergency stop, dead-man, publication,
+reconnection with back-off and link counters. A driver has no threads, no sleeps and no retries.
+
+A driver is found by its entry point in the group ``sioms.drivers``, or by the path of its file in
+the configuration (``driver = "./mydriver.py"``, the class named ``DRIVER`` in it).
+
+Concurrency: every hook is called from the one thread of the driver process.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+import msgspec
+
+from sioms.protocol.flags import Request
+
+from .blocks import AnyBlock, BlockSpec, Description
+from .exchange import Steps
+from .settings import LineSettings
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from sioms.motion import DriveAction, MarkerPort
+
+
+class InputNode(Protocol):
+    """A node of another device that this driver reads (``Description.inputs``)."""
+
+    def read(self, now_ns: int) -> NDArray[np.float64] | None:
+        """Return the readings, shape (fields, channels) in READ_FIELDS order; None while it is not there.
+
+        Integer fields (status, binary data) are int64 in the same memory: ``.view(np.int64)``.
+        """
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time stamp of what ``read`` returned last [ns]."""
+
+
+class Kit(Protocol):
+    """What the kit offers a driver."""
+
+    @property
+    def markers(self) -> MarkerPort:
+        """Marker access for the banks."""
+
+    @property
+    def inputs(self) -> Mapping[str, InputNode]:
+        """The nodes named in ``Description.inputs``."""
+
+    def log(self, level: str, text: str) -> None:
+        """Write a line to the daemon's log; level is debug, info, warning or error."""
+
+    def emergency_stop(self, source: str) -> None:
+        """Stop the whole workcell: for an input that is an emergency-stop source."""
+
+    def publish(self, block: AnyBlock, stamp_ns: int) -> None:
+        """Publish a block now; only stream drivers need it, for several frames in one feed."""
+
+
+class Refusal(Exception):
+    """A driver refuses a client's request: becomes the client's OSError.
+
+    Args:
+        errno_: POSIX errno, e.g. EINVAL.
+        text: sentence without full stop: what is wrong and what would be right.
+    """
+
+    def __init__(self, errno_: int, text: str) -> None:
+        super().__init__(text)
+        self.errno = errno_
+
+
+class Driver(ABC):
+    """What all drivers share.
+
+    Args:
+        name: device name in the configuration.
+        settings: its validated table.
+        kit: services.
+    """
+
+    Settings: ClassVar[type[msgspec.Struct]]
+
+    def __init__(self, name: str, settings: Any, kit: Kit) -> None:
+        self.name = name
+        self.settings = settings
+        self.kit = kit
+
+    @classmethod
+    @abstractmethod
+    def describe(cls, name: str, settings: Any) -> Description:
+        """Tell the blocks, rate and inputs; pure; raises ValueError with a sentence for bad settings."""
+
+    @property
+    @abstractmethod
+    def blocks(self) -> Sequence[AnyBlock]:
+        """The blocks in the order of the description, made in __init__."""
+
+    def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
+        """Answer a request that the kit does not answer itself (ZERO_DEVICE, SET_GAINS, GET_GAINS ...).
+
+        The kit answers all axis requests through the bank. Return a msgpack-able value.
+
+        Raises:
+            Refusal: not supported or not now.
+        """
+        import errno
+
+        raise Refusal(errno.ENOTTY, f"{request.name} is not a request this device knows")
+
+
+class TickDriver(Driver):
+    """A driver whose ``tick`` runs at the described rate; the kit publishes all blocks after it."""
+
+    def open(self) -> None:  # noqa: B027  # a hook that may stay empty
+        """Get ready; raises LinkError to be retried later."""
+
+    @abstractmethod
+    def tick(self, now_ns: int) -> None:
+        """Do one period: read inputs, tick the banks, drive the outputs, fill the blocks.
+
+        Args:
+            now_ns: the scheduled time of this tick [ns, CLOCK_MONOTONIC], not the time it began.
+        """
+
+    def write_outputs(self, block: BlockSpec, channels: Sequence[int], values: Sequence[float]) -> None:
+        """Set output channels of a writable binary or analog block; takes effect in the next tick.
+
+        Values are validated against the channel's width or range. Called for clients, and for the
+        safe values when a writer goes away or the workcell stops.
+        """
+        raise NotImplementedError(f"{type(self).__name__} describes a writable block but takes no outputs")
+
+    def slack(self, now_ns: int, until_ns: int) -> None:  # noqa: B027  # a hook that may stay empty
+        """Use the time left before the next tick, e.g. ``bank.plan_ahead``."""
+
+    def close(self) -> None:  # noqa: B027  # a hook that may stay empty
+        """Leave the device safe; axes have already been stopped."""
+
+
+class LineUnit(ABC):
+    """One device on a line. Its hooks are generators of exchanges.
+
+    Attributes:
+        name: for messages, e.g. ``mod0 unit 3``.
+        misses: failed exchanges in a row after which the unit counts as lost; it is then reopened
+            every few seconds, and the others on the line do not wait for it.
+    """
+
+    name: str
+    misses: int = 3
+
+    @property
+    @abstractmethod
+    def blocks(self) -> Sequence[AnyBlock]:
+        """The blocks this unit fills."""
+
+    @abstractmethod
+    def open(self) -> Steps:
+        """Identify the device, set its dead-man, stop what moves; runs again after every loss.
+
+        Raises:
+            LinkError: no answer; retried with back-off.
+            DeviceError: wrong identity and the like; the unit goes into fault, with the sentence.
+        """
+
+    @abstractmethod
+    def poll(self) -> Steps:
+        """Read the state once and fill the blocks (for axes: call ``bank.poll`` with what was read)."""
+
+    def act(self, action: DriveAction) -> Steps:
+        """Carry out what a DriveBank asks: start a command, stop an axis, home, reset a fault."""
+        raise NotImplementedError(f"{type(self).__name__} describes axes but carries out no actions")
+
+    def write_outputs(self, block: BlockSpec, channels: Sequence[int], values: Sequence[float]) -> Steps:
+        """Write output channels of a writable binary or analog block."""
+        raise NotImplementedError(f"{type(self).__name__} describes a writable block but takes no outputs")
+
+    def stop(self) -> Steps:
+        """Stop all motion of this unit as fast as it can; needs no prior state, repeatable."""
+        yield from ()
+
+    def close(self) -> Steps:
+        """Leave the device safe; ``stop`` has run already."""
+        yield from ()
+
+
+class LineDriver(Driver):
+    """A driver of one or several units on one line; one exchange is in flight at a time.
+
+    Attributes:
+        line: the line's settings.
+        gap_s: silence on the line before each request [s].
+        recovery_s: silence after a time-out before the input is discarded and the next request is
+            sent: the longest turn-around of a device, so that a late reply is never taken for the next.
+    """
+
+    line: LineSettings
+    gap_s: float = 0.0
+    recovery_s: float = 0.05
+
+    @property
+    @abstractmethod
+    def units(self) -> Sequence[LineUnit]:
+        """The units on the line."""
+
+    @property
+    def blocks(self) -> Sequence[AnyBlock]:
+        """All blocks of all units, in order."""
+        return [block for unit in self.units for block in unit.blocks]
+
+
+class StreamDriver(Driver):
+    """A driver of a device that pushes samples.
+
+    Attributes:
+        line: the line's settings.
+        heartbeat_s: period of ``heartbeat`` [s], 0 = never.
+        silence_s: without a good frame for this long the link is lost [s].
+    """
+
+    line: LineSettings
+    heartbeat_s: float = 0.0
+    silence_s: float = 0.5
+
+    @abstractmethod
+    def open(self) -> Steps:
+        """Identify the device and start the stream; runs again after every loss."""
+
+    @abstractmethod
+    def feed(self, data: bytes, now_ns: int) -> int:
+        """Take received bytes; fill and publish the blocks (``kit.publish``) for every good frame.
+
+        Args:
+            data: bytes as they came, cut anywhere (a whole datagram on UDP).
+            now_ns: time of their arrival [ns, CLOCK_MONOTONIC].
+
+        Returns:
+            The number of good frames in them; the kit supervises the stream by it.
+        """
+
+    def heartbeat(self) -> Steps:
+        """Keep the stream alive."""
+        yield from ()
+
+    def counters(self) -> Mapping[str, int]:
+        """Return the link counters that the codec keeps: bad checksums, lost blocks ..."""
+        return {}
+
+    def close(self) -> Steps:
+        """Stop the stream."""
+        yield from ()

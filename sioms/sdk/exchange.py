@@ -1,0 +1,81 @@
+"""What a driver says to its line: exchanges, as values. Pure; the kit does the I/O.
+
+A driver's hooks are generators: they yield an :class:`Exchange` (or a :class:`Send`, or a
+:class:`Pause`) and are resumed with the decoded reply. The kit owns time-outs, silence, draining,
+repetition, reconnection and the serving of clients in between, so a driver has no sleeps, no
+retries and no threads, and its tests need no line: they resume the generator themselves.
+
+    def poll(self):
+        status = yield self.bus.read_holding(0x1003, 1)
+        self.moving[0] = bool(status[0] & 4)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import Any
+
+
+class LinkError(Exception):
+    """The line failed: no reply, a cut or garbled reply, a reply to another request.
+
+    The kit repeats a repeatable exchange, counts the failure, and declares the link lost after
+    ``misses`` failures in a row. Not for what a device answers properly: that is DeviceError.
+    """
+
+
+class DeviceError(Exception):
+    """The device answered, and refused (Modbus exception, error status). Never repeated.
+
+    Args:
+        errno_: POSIX errno that a client sees, e.g. EINVAL for an illegal value, EIO otherwise.
+        text: sentence without full stop that names the request and the refusal.
+    """
+
+    def __init__(self, errno_: int, text: str) -> None:
+        super().__init__(text)
+        self.errno = errno_
+
+
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """One request and its reply.
+
+    Args:
+        data: bytes to send.
+        want: given the bytes received so far, the total length of the reply, or None while that
+            cannot be told yet; raises LinkError as soon as the bytes cannot be the reply.
+        decode: turns the complete reply into the value the generator is resumed with; raises
+            LinkError (damaged) or DeviceError (refused).
+        timeout_s: longest time from the last byte sent to the last byte received [s].
+        repeatable: True only for requests without side effects.
+        what: the request in words, for messages: ``read 2 registers at 0x1014 of unit 1``.
+    """
+
+    data: bytes
+    want: Callable[[bytes], int | None]
+    decode: Callable[[bytes], Any]
+    timeout_s: float
+    repeatable: bool
+    what: str
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """Bytes that draw no reply (ODrive set-points, stream control, heartbeats)."""
+
+    data: bytes
+    what: str
+
+
+@dataclass(frozen=True, slots=True)
+class Pause:
+    """Let the line rest, and the kit serve others, for a time [s] that the device needs."""
+
+    duration_s: float
+
+
+Step = Exchange | Send | Pause
+Steps = Generator[Step, Any, None]
+"""What a hook returns: a generator of steps."""
