@@ -53,7 +53,8 @@ class DriverVerb(IntEnum):
     """Between the daemon and a driver, on its control socket (D: sent by the daemon)."""
 
     ATTACH = 1
-    """D: [handle, block, channels, bits, mode, rights, lease_ns, who]; descriptors: socket, eventfd, pidfd."""
+    """D: [handle, block, channels, bit, access, exclusive, rights, lease_ns, who, node]; descriptors: socket,
+    eventfd, pidfd if any."""
     DETACH = 2
     """D: [handle]: end it, as if its socket had closed."""
     STOP_CHANGED = 3
@@ -61,7 +62,7 @@ class DriverVerb(IntEnum):
     SHUTDOWN = 4
     """D: stop, make outputs safe, exit."""
     INPUT = 5
-    """D: [name, block, channels, bits]; descriptor: the page of a node that the driver reads."""
+    """D: [name, channels, bit]; descriptor: the page of a node that the driver reads."""
     NODE_STOP = 6
     """D: [block, channels, source]: emergency stop of some channels. NODE_RESET likewise."""
     NODE_RESET = 7
@@ -85,7 +86,8 @@ class NurseryVerb(IntEnum):
     DESCRIBE = 1
     """[device, driver, table, folder] -> [errors, description]."""
     SPAWN = 2
-    """[device, generation, rt]; descriptors: control socket, latch, request page, markers -> pid; descriptor: pidfd."""
+    """[device, driver, table, generation, options] -> pid; descriptors: control socket, latch, request page,
+    markers -> pidfd."""
 
 
 class MalformedMessage(Exception):
@@ -112,7 +114,9 @@ def decode(packet: bytes) -> list[object]:
             packet, raw=False, use_list=True, strict_map_key=True, max_buffer_size=MAX_PACKET
         )
     except Exception as error:  # msgpack raises a wide family for bad input, all of them meaning just this
-        raise MalformedMessage(f"decode packet of {len(packet)} bytes: {type(error).__name__}: {error}") from None
+        raise MalformedMessage(
+            f"decode packet of {len(packet)} bytes: {type(error).__name__}: {error}"
+        ) from None
     if not isinstance(message, list) or len(message) < 2:
         raise MalformedMessage("decode packet: not an array of verb, id and arguments")
     verb, number = message[0], message[1]

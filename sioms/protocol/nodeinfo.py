@@ -45,7 +45,16 @@ class ChannelInfo:
 
     def pack(self) -> list[object]:
         """Return the wire form."""
-        return [self.name, self.unit, self.minimum, self.maximum, self.width, self.modes, self.limits, self.description]
+        return [
+            self.name,
+            self.unit,
+            self.minimum,
+            self.maximum,
+            self.width,
+            self.modes,
+            self.limits,
+            self.description,
+        ]
 
 
 class NodeInfo:

@@ -205,6 +205,11 @@ class PageReader:
         """Number of the newest snapshot; 0 before the first."""
         return self._words[_HEAD]
 
+    @property
+    def alive_ns(self) -> int:
+        """Last stamp of the driver [ns, CLOCK_MONOTONIC]."""
+        return self._words[_ALIVE]
+
     def check(self, now_ns: int) -> None:
         """Raise NotReadable unless driver and daemon call the page good and the lease holds."""
         words = self._words
@@ -248,7 +253,11 @@ class PageReader:
     def _refuse(self, now_ns: int) -> None:
         words = self._words
         driver, daemon = unpack_from("<II", self._buffer, 64)
-        text = self._buffer[REASON_OFFSET : REASON_OFFSET + REASON_SIZE].split(b"\0")[0].decode("utf-8", "replace")
+        text = (
+            self._buffer[REASON_OFFSET : REASON_OFFSET + REASON_SIZE]
+            .split(b"\0")[0]
+            .decode("utf-8", "replace")
+        )
         if daemon != PageState.GOOD:
             raise NotReadable(PageState(daemon), text)
         if driver != PageState.GOOD:

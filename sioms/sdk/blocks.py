@@ -83,7 +83,9 @@ class Block:
         shape = (len(READ_FIELDS[spec.node_class]), self.n)
         self.fields = np.zeros(shape) if fields is None else fields
         if self.fields.shape != shape or not self.fields.flags.c_contiguous:
-            raise ValueError(f"make block {spec.name!r}: fields of shape {self.fields.shape}; want {shape}, contiguous")
+            raise ValueError(
+                f"make block {spec.name!r}: fields of shape {self.fields.shape}; want {shape}, contiguous"
+            )
         self.words: NDArray[np.int64] = self.fields.view(np.int64)
         self.stamp_ns = 0
 

@@ -127,7 +127,7 @@ class Driver(ABC):
 class TickDriver(Driver):
     """A driver whose ``tick`` runs at the described rate; the kit publishes all blocks after it."""
 
-    def open(self) -> None:  # noqa: B027  # a hook that may stay empty
+    def open(self) -> None:  # a hook that may stay empty
         """Get ready; raises LinkError to be retried later."""
 
     @abstractmethod
@@ -146,10 +146,10 @@ class TickDriver(Driver):
         """
         raise NotImplementedError(f"{type(self).__name__} describes a writable block but takes no outputs")
 
-    def slack(self, now_ns: int, until_ns: int) -> None:  # noqa: B027  # a hook that may stay empty
+    def slack(self, now_ns: int, until_ns: int) -> None:  # a hook that may stay empty
         """Use the time left before the next tick, e.g. ``bank.plan_ahead``."""
 
-    def close(self) -> None:  # noqa: B027  # a hook that may stay empty
+    def close(self) -> None:  # a hook that may stay empty
         """Leave the device safe; axes have already been stopped."""
 
 

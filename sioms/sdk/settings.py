@@ -30,7 +30,9 @@ class LineSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         named = [key for key in ("serial", "tcp", "udp") if getattr(self, key) is not None]
         if len(named) != 1:
-            raise ValueError(f"line names {', '.join(named) or 'nothing'}; want exactly one of serial, tcp, udp")
+            raise ValueError(
+                f"line names {', '.join(named) or 'nothing'}; want exactly one of serial, tcp, udp"
+            )
         if not 300 <= self.baud <= 12_000_000:
             raise ValueError(f"baud = {self.baud}; want 300 to 12000000")
         for key in ("tcp", "udp"):

@@ -1,0 +1,206 @@
+"""The daemon's configuration: TOML text in, validated structs or a list of errors out. Pure.
+
+The daemon validates what it reads itself; the rest of a device's table belongs to the driver and is
+validated by the driver's ``Settings`` in the nursery, so that every device reports its own errors.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
+from typing import Any, Literal, TypeVar
+
+import msgspec
+
+Table = TypeVar("Table", bound=msgspec.Struct)
+RightName = Literal["read", "write", "stop", "administer"]
+
+
+class WorkcellTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[workcell]``: the daemon itself."""
+
+    name: str = "workcell"
+    socket: str = ""
+    socket_mode: str = "0660"
+    socket_group: str = ""
+    start_stopped: bool = False
+    daemon_lease_s: float = 0.5
+    max_sessions: int = 256
+    max_handles: int = 256
+    max_markers: int = 128
+    max_waits: int = 64
+
+
+class GrantTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[[grant]]``: rights of users and groups on nodes; patterns as in the shell."""
+
+    rights: list[RightName]
+    users: list[str] = []
+    groups: list[str] = []
+    nodes: list[str] = ["*"]
+
+
+class DeviceTable(msgspec.Struct, frozen=True):
+    """``[device.NAME]``: the keys the daemon reads; all others go to the driver."""
+
+    driver: str
+    description: str = ""
+    on_loss: Literal["none", "stop"] = "none"
+    realtime_priority: int = 50
+    hang_s: float = 1.0
+    user: str = ""
+
+
+class NodeTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[node.NAME]``: another name, or a group of channels of one device."""
+
+    of: str
+    channels: list[str] = []
+    description: str = ""
+
+
+class StopSourceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[[emergency_stop]]``: a binary input that stops the workcell while it reads ``active``."""
+
+    node: str
+    active: Literal[0, 1] = 0
+
+
+class Device(msgspec.Struct, frozen=True):
+    """A configured device: the daemon's part and the driver's."""
+
+    name: str
+    common: DeviceTable
+    settings: dict[str, Any]
+
+
+class Config(msgspec.Struct, frozen=True):
+    """A configuration without errors of its own (names are checked with the descriptions)."""
+
+    workcell: WorkcellTable
+    devices: dict[str, Device]
+    nodes: dict[str, NodeTable]
+    grants: list[GrantTable]
+    stop_sources: list[StopSourceTable]
+    folder: str
+
+
+_SECTIONS = ("workcell", "device", "node", "grant", "emergency_stop")
+_COMMON = tuple(field.name for field in msgspec.structs.fields(DeviceTable))
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return '; did you mean "x"?' or the list of what there is, as the end of an error."""
+    known = list(known)
+    close = get_close_matches(word, known, 1, 0.6)
+    if close:
+        return f'; did you mean "{close[0]}"?'
+    return f"; there are: {', '.join(sorted(known))}" if known else ""
+
+
+def explain(where: str, error: msgspec.ValidationError, known: Iterable[str]) -> str:
+    """Turn msgspec's error into a sentence that names the table, and the key that was meant."""
+    text = str(error)
+    path = ""
+    if " - at `$" in text:
+        text, _, path = text.partition(" - at `$")
+        path = path.rstrip("`").removeprefix(".")
+    hint = ""
+    if "unknown field" in text:
+        key = text.split("`")[1]
+        return f"{where}: unknown key {key}{did_you_mean(key, known)}"
+    if "missing required field" in text:
+        return f"{where}: key {text.split('`')[1]} is missing"
+    return f"{where}{'.' + path if path else ''}: {text[0].lower() + text[1:]}{hint}"
+
+
+def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
+    """Read a configuration.
+
+    Args:
+        text: the TOML text.
+        folder: where relative paths in it start.
+
+    Returns:
+        The configuration and the errors, one sentence each; None when there is nothing to go on with.
+    """
+    try:
+        root = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        return None, [f"read configuration: {str(error)[0].lower() + str(error)[1:]}"]
+    errors = [
+        f"unknown section [{key}]{did_you_mean(key, _SECTIONS)}" for key in root if key not in _SECTIONS
+    ]
+    workcell = _convert(root.get("workcell", {}), WorkcellTable, "[workcell]", errors) or WorkcellTable()
+    devices: dict[str, Device] = {}
+    for name, table in _tables(root, "device", errors):
+        device = _device(name, table, errors)
+        if device is not None:
+            devices[name] = device
+    nodes = {}
+    for name, table in _tables(root, "node", errors):
+        node = _convert(table, NodeTable, f"[node.{name}]", errors)
+        if node is not None:
+            nodes[name] = node
+        if name in devices:
+            errors.append(f"[node.{name}]: a device has this name already; choose another")
+    grants = [
+        grant
+        for i, table in enumerate(root.get("grant", []), 1)
+        if (grant := _convert(table, GrantTable, f"[[grant]] number {i}", errors)) is not None
+    ]
+    sources = [
+        source
+        for i, table in enumerate(root.get("emergency_stop", []), 1)
+        if (source := _convert(table, StopSourceTable, f"[[emergency_stop]] number {i}", errors)) is not None
+    ]
+    if not devices and not errors:
+        errors.append("read configuration: no [device.NAME] in it; want at least one")
+    return Config(workcell, devices, nodes, grants, sources, folder), errors
+
+
+def _tables(root: Mapping[str, Any], section: str, errors: list[str]) -> list[tuple[str, dict[str, Any]]]:
+    found = root.get(section, {})
+    if not isinstance(found, dict):
+        errors.append(f"[{section}]: want tables [{section}.NAME]")
+        return []
+    good = []
+    for name, table in found.items():
+        if not isinstance(table, dict):
+            errors.append(f"[{section}] {name}: want a table [{section}.{name}]")
+        elif not _is_name(name) and section == "device":
+            errors.append(
+                f"[device.{name}]: a device name is letters, digits, - and _, beginning with a letter"
+            )
+        elif section == "node" and not all(_is_name(part) for part in name.split(".")):
+            errors.append(f"[node.{name}]: a node name is words of letters, digits, - and _, joined by dots")
+        else:
+            good.append((name, table))
+    return good
+
+
+def _is_name(name: str) -> bool:
+    return (
+        bool(name)
+        and name[0].isascii()
+        and name[0].isalpha()
+        and all(c.isascii() and (c.isalnum() or c in "-_") for c in name)
+        and name != "readonly"
+    )
+
+
+def _device(name: str, table: dict[str, Any], errors: list[str]) -> Device | None:
+    where = f"[device.{name}]"
+    common = _convert({k: v for k, v in table.items() if k in _COMMON}, DeviceTable, where, errors)
+    if common is None:
+        return None
+    return Device(name, common, {k: v for k, v in table.items() if k not in _COMMON})
+
+
+def _convert(table: object, kind: type[Table], where: str, errors: list[str]) -> Table | None:
+    try:
+        return msgspec.convert(table, kind)
+    except msgspec.ValidationError as error:
+        errors.append(explain(where, error, [field.name for field in msgspec.structs.fields(kind)]))
+        return None

@@ -1,0 +1,290 @@
+"""Driver processes: start, supervise, restart, end. One ``DriverProcess`` a configured device."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import mmap
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable, Sequence
+from enum import Enum
+from typing import Any, Protocol
+
+from sioms.protocol.flags import PageState
+from sioms.protocol.messages import MAX_PACKET, DriverVerb, MalformedMessage, decode, encode
+from sioms.protocol.page import PageReader, set_daemon_state
+
+from .config import Device
+from .loop import Loop, Timer
+from .names import DeviceInfo
+from .nursery import Nursery
+from .restarts import Restarts
+
+_SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | 0x0010 | fcntl.F_SEAL_SEAL  # 0x10: F_SEAL_FUTURE_WRITE
+_SHUTDOWN_S = 3.0
+
+
+class State(Enum):
+    """Life of a device."""
+
+    DOWN = "down"
+    STARTING = "starting"
+    UP = "up"
+    RESTARTING = "restarting"
+    FAULT = "fault"
+    ENDING = "ending"
+
+
+class Owner(Protocol):
+    """What the server does when something happens to a device."""
+
+    def device_up(self, device: DriverProcess) -> None:
+        """The driver is ready."""
+
+    def device_gone(self, device: DriverProcess, reason: str) -> None:
+        """The driver process is no more; its handles are void."""
+
+    def device_hung(self, device: DriverProcess, reason: str) -> None:
+        """The driver has missed its lease."""
+
+    def device_message(self, device: DriverProcess, verb: DriverVerb, arguments: list[Any]) -> None:
+        """The driver tells something."""
+
+
+class DriverProcess:
+    """A device's driver process, through all its restarts.
+
+    Args:
+        loop: the daemon's loop.
+        nursery: returns the nursery of the day.
+        device: its configuration.
+        info: its description.
+        shared: descriptors of latch, request page and marker table, passed to each process.
+        owner: who is told.
+        log: the daemon's log.
+    """
+
+    def __init__(
+        self, loop: Loop, nursery: Callable[[], Nursery], device: Device, info: DeviceInfo,
+        shared: Sequence[int], owner: Owner, log: Callable[..., None], options: dict[str, Any],
+    ) -> None:  # fmt: skip
+        self.device = device
+        self.info = info
+        self.state = State.DOWN
+        self.reason = ""
+        self.link: tuple[PageState, str] = (PageState.STARTING, "")
+        self.generation = 0
+        self.pid = 0
+        self.started_ns = 0
+        self.restarts = Restarts()
+        self.page_fds: list[int] = []
+        self.hung = False
+        self._options = options
+        self._maps: list[mmap.mmap] = []
+        self._readers: list[PageReader] = []
+        self._loop = loop
+        self._nursery = nursery
+        self._ended: Callable[[], None] | None = None
+        self._shared = shared
+        self._owner = owner
+        self._log = log
+        self._sock: socket.socket | None = None
+        self._pidfd = -1
+        self._timer: Timer | None = None
+
+    @property
+    def name(self) -> str:
+        """Device name."""
+        return self.device.name
+
+    @property
+    def settled(self) -> bool:
+        """Whether the first start has succeeded or failed for good."""
+        return self.state not in (State.DOWN, State.STARTING)
+
+    def start(self) -> None:
+        """Fork the driver process."""
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours.setblocking(False)
+        self._sock = ours
+        self.generation += 1
+        self.state = State.STARTING
+        self.started_ns = time.monotonic_ns()
+        self.hung = False
+        options = dict(
+            self._options,
+            realtime_priority=self.device.common.realtime_priority,
+            user=self.device.common.user,
+        )
+        self._nursery().spawn(
+            self.name, self.device.common.driver, self.device.settings, self.generation, options,
+            [theirs.fileno(), *self._shared], self._spawned,
+        )  # fmt: skip
+        theirs.close()
+        self._loop.watch(ours.fileno(), self._receive)
+
+    def _spawned(self, pid: Any, errno_: int, text: str, fds: list[int]) -> None:
+        if errno_:
+            self._end(f"its process could not be started: {text}")
+        elif self._sock is None:  # ended while the nursery was forking
+            for fd in fds:
+                os.close(fd)
+            os.kill(pid, signal.SIGKILL)
+        else:
+            self.pid, self._pidfd = pid, fds[0]
+            self._loop.watch(self._pidfd, self._exited)
+
+    def send(self, verb: DriverVerb, *arguments: object, fds: Sequence[int] = ()) -> None:
+        """Send a notice to the driver.
+
+        Raises:
+            OSError: EIO, the driver is gone or does not take messages any more.
+        """
+        if self._sock is None:
+            raise OSError(errno.EIO, f"device {self.name} is {self.state.value}: {self.reason}")
+        try:
+            socket.send_fds(self._sock, [encode(verb, 0, *arguments)], list(fds))
+        except OSError as error:
+            raise OSError(
+                errno.EIO, f"driver of {self.name} does not take messages: {error.strerror}"
+            ) from None
+
+    def tell(self, verb: DriverVerb, *arguments: object) -> None:
+        """Send a notice; a driver that cannot take it will be found dead or hung anyway."""
+        try:
+            self.send(verb, *arguments)
+        except OSError as error:
+            self._log("warning", "notice lost", device=self.name, verb=verb.name, why=error.strerror)
+
+    def check(self, now_ns: int) -> None:
+        """Look at the lease: mark a hung driver stale, end one that stays hung."""
+        if self.state is not State.UP:
+            if self.state is State.STARTING and now_ns - self.started_ns > 30_000_000_000:
+                self.kill("it was not ready within 30 s")
+            return
+        reader = self._readers[0]
+        age_ns = now_ns - reader.alive_ns
+        if age_ns > self.info.lease_s * 1e9 and not self.hung:
+            self.hung = True
+            self._owner.device_hung(self, f"its driver has not ticked for {age_ns / 1e9:.3f} s")
+        elif age_ns < self.info.lease_s * 1e9:
+            self.hung = False
+        if age_ns > (self.info.lease_s + self.device.common.hang_s) * 1e9:
+            self.kill(f"its driver hung for {age_ns / 1e9:.2f} s and was killed")
+
+    def kill(self, reason: str) -> None:
+        """End the process at once (SIGKILL) and let the restart policy go on."""
+        self.reason = reason
+        self._kill_process()
+        self._end(reason)
+
+    def shutdown(self, done: Callable[[], None] | None = None) -> None:
+        """Let the driver stop, make its outputs safe and exit; kill it when it takes too long."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._ended = done
+        if self._sock is None:
+            self.state = State.DOWN
+            if done is not None:
+                done()
+            return
+        self.state = State.ENDING
+        self.tell(DriverVerb.SHUTDOWN)
+        self._timer = self._loop.after(_SHUTDOWN_S, lambda: self.kill("it did not end when asked to"))
+
+    def _receive(self) -> None:
+        if self._sock is None:
+            return
+        try:
+            packet, fds, _, _ = socket.recv_fds(self._sock, MAX_PACKET, 250)
+        except BlockingIOError:
+            return
+        except OSError:
+            packet, fds = b"", []
+        if not packet:
+            self._exited()
+            return
+        try:
+            message: list[Any] = decode(packet)
+            verb = DriverVerb(message[0])
+        except (MalformedMessage, ValueError) as error:
+            self.kill(f"its driver sent a malformed message: {error}")
+            return
+        if verb is DriverVerb.READY:
+            self._ready(fds)
+            return
+        for fd in fds:
+            os.close(fd)
+        if verb is DriverVerb.LINK:
+            self.link = (PageState(message[2]), message[3])
+        self._owner.device_message(self, verb, message[2:])
+
+    def _ready(self, fds: list[int]) -> None:
+        self._maps = [mmap.mmap(fd, 4096) for fd in fds]
+        for fd in fds:
+            fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _SEALS)
+        self._readers = [PageReader(m) for m in self._maps]
+        self.page_fds = fds
+        self.state = State.UP
+        self.reason = ""
+        self._log("info", "device up", device=self.name, pid=self.pid, generation=self.generation)
+        self._owner.device_up(self)
+
+    def _kill_process(self) -> None:
+        if self._pidfd >= 0:
+            try:
+                signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
+            except ProcessLookupError:
+                return
+
+    def _exited(self) -> None:
+        if self._sock is None:
+            return
+        self._kill_process()  # a driver that closed its control socket has no business living on
+        self._end(self.reason or "its driver process ended")
+
+    def _end(self, reason: str) -> None:
+        """Clear everything of the present process, tell the owner, and plan the restart."""
+        if self._sock is None:
+            return
+        for mapping in self._maps:
+            set_daemon_state(memoryview(mapping), PageState.STALE, reason)
+        for reader in self._readers:
+            reader.release()
+        self._maps, self._readers = [], []
+        for fd in self.page_fds:
+            os.close(fd)
+        self.page_fds = []
+        self._loop.unwatch(self._sock.fileno())
+        self._sock.close()
+        self._sock = None
+        if self._pidfd >= 0:
+            self._loop.unwatch(self._pidfd)
+            os.close(self._pidfd)
+            self._pidfd = -1
+        if self._timer is not None:
+            self._timer.cancel()
+        was, self.pid = self.state, 0
+        self.reason = reason
+        self.link = (PageState.STALE, reason)
+        if was is State.ENDING:
+            self.state = State.DOWN
+            self._owner.device_gone(self, reason)
+            if self._ended is not None:
+                self._ended()
+            return
+        again_ns = self.restarts.died(time.monotonic_ns())
+        self.state = State.FAULT if again_ns is None else State.RESTARTING
+        self._log("error", "device lost", device=self.name, reason=reason, then=self.state.value)
+        self._owner.device_gone(self, reason)
+        if again_ns is not None:
+            self._timer = self._loop.at(again_ns, self.start)
+
+    def reset(self) -> None:
+        """Start a device in fault again, with a clean record."""
+        if self.state is State.FAULT:
+            self.restarts.forget()
+            self.start()

@@ -1,0 +1,128 @@
+"""Loading a configuration: parse it, let a fresh nursery describe every device, check all names.
+
+Everything is checked before anything is touched, and all errors of all devices come together.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from .config import Config, parse
+from .loop import Loop
+from .names import DeviceInfo, NameTable
+from .nursery import Nursery
+
+TIMEOUT_S = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A configuration that can be taken up.
+
+    Attributes:
+        stop_sources: for each device with emergency-stop inputs [block, channel, bit, active] lists.
+    """
+
+    config: Config
+    names: NameTable
+    nursery: Nursery
+    stop_sources: dict[str, list[list[int]]]
+
+
+class Loader:
+    """Loads once and tells the result.
+
+    Args:
+        loop: the daemon's loop.
+        path: of the configuration.
+        done: called with the plan (None when there are errors) and the errors.
+        nursery_died: passed on to the nursery.
+    """
+
+    def __init__(
+        self, loop: Loop, path: str, done: Callable[[Plan | None, list[str]], None],
+        nursery_died: Callable[[Nursery], None],
+    ) -> None:  # fmt: skip
+        self._loop = loop
+        self._path = path
+        self._done = done
+        self._died = nursery_died
+        self._infos: dict[str, DeviceInfo] = {}
+        self._errors: list[str] = []
+
+    def start(self) -> None:
+        """Begin; the rest happens in the loop."""
+        try:
+            with open(self._path, encoding="utf-8") as file:
+                text = file.read()
+        except (OSError, UnicodeDecodeError) as error:
+            why = error.strerror if isinstance(error, OSError) else str(error)
+            self._done(None, [f"read configuration {self._path}: {str(why).lower()}"])
+            return
+        config, self._errors = parse(text, os.path.dirname(os.path.abspath(self._path)))
+        if config is None or not config.devices:
+            self._done(None, self._errors)
+            return
+        self._config = config
+        self._waiting = set(config.devices)
+        self._nursery = Nursery(self._loop, self._died)
+        self._timer = self._loop.after(TIMEOUT_S, self._late)
+        for name, device in config.devices.items():
+            self._nursery.describe(
+                name, device.common.driver, device.settings, config.folder,
+                lambda value, errno_, text, _fds, n=name: self._described(n, value, errno_, text),
+            )  # fmt: skip
+
+    def _described(self, name: str, value: Any, errno_: int, text: str) -> None:
+        if name not in self._waiting:
+            return
+        self._waiting.discard(name)
+        if errno_:
+            self._errors.append(f"[device.{name}]: {text}")
+        else:
+            errors, packed = value
+            self._errors += [f"[device.{name}]{error}" for error in errors]
+            if packed is not None:
+                driver = self._config.devices[name].common.driver
+                self._infos[name] = DeviceInfo.unpack(name, driver, packed)
+        if not self._waiting:
+            self._finish()
+
+    def _late(self) -> None:
+        self._errors += [
+            f"[device.{n}]: its driver was not described within {TIMEOUT_S:g} s" for n in self._waiting
+        ]
+        self._finish()
+
+    def _finish(self) -> None:
+        self._timer.cancel()
+        self._waiting = set()
+        # Names of devices that failed would only be missed again as targets of aliases.
+        names = NameTable(
+            {n: self._infos[n] for n in self._config.devices if n in self._infos}, self._config.nodes
+        )
+        sources = self._stop_sources(names)
+        if not self._errors:
+            self._errors += names.errors
+        if self._errors:
+            self._nursery.close()
+            self._done(None, self._errors)
+            return
+        self._done(Plan(self._config, names, self._nursery, sources), [])
+
+    def _stop_sources(self, names: NameTable) -> dict[str, list[list[int]]]:
+        found: dict[str, list[list[int]]] = {}
+        for source in self._config.stop_sources:
+            node = names.nodes.get(source.node)
+            if node is None or names.block(node).node_class.name != "BINARY" or len(node.channels) != 1:
+                names.errors.append(
+                    f"[[emergency_stop]]: node = {source.node}; want the name of one binary input"
+                )
+                continue
+            found.setdefault(node.device, []).append(
+                [node.block, node.channels[0], max(node.bit, 0), int(source.active)]
+            )
+        return found

@@ -1,0 +1,83 @@
+"""A selector with timers: the daemon's one loop.
+
+asyncio would double the daemon's start time and memory for what is one select call.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import selectors
+import time
+from collections.abc import Callable
+from typing import Any
+
+Callback = Callable[[], Any]
+
+
+class Timer:
+    """A pending call; ``cancel`` makes it void."""
+
+    __slots__ = ("callback",)
+
+    def __init__(self, callback: Callback) -> None:
+        self.callback: Callback | None = callback
+
+    def cancel(self) -> None:
+        """Make the call void."""
+        self.callback = None
+
+
+class Loop:
+    """Runs callbacks when descriptors become readable and when times are reached.
+
+    Concurrency: one thread.
+    """
+
+    def __init__(self) -> None:
+        self._selector = selectors.DefaultSelector()
+        self._timers: list[tuple[int, int, Timer]] = []
+        self._order = itertools.count()
+        self.running = True
+
+    def watch(self, fd: int, callback: Callback) -> None:
+        """Call back whenever the descriptor is readable or hung up."""
+        self._selector.register(fd, selectors.EVENT_READ, callback)
+
+    def unwatch(self, fd: int) -> None:
+        """Stop watching a descriptor; call before closing it."""
+        self._selector.unregister(fd)
+
+    def at(self, when_ns: int, callback: Callback) -> Timer:
+        """Call back once at a time [ns, CLOCK_MONOTONIC]."""
+        timer = Timer(callback)
+        heapq.heappush(self._timers, (when_ns, next(self._order), timer))
+        return timer
+
+    def after(self, delay_s: float, callback: Callback) -> Timer:
+        """Call back once after a delay [s]."""
+        return self.at(time.monotonic_ns() + int(delay_s * 1e9), callback)
+
+    def run(self) -> None:
+        """Run until ``running`` is cleared."""
+        while self.running:
+            self.step()
+
+    def step(self) -> None:
+        """Wait for the next event or timer and serve it."""
+        while self._timers and self._timers[0][2].callback is None:
+            heapq.heappop(self._timers)
+        timeout = max(0.0, (self._timers[0][0] - time.monotonic_ns()) / 1e9) if self._timers else None
+        for key, _ in self._selector.select(timeout):
+            # An earlier callback of this round may have closed this descriptor.
+            if self._selector.get_map().get(key.fd) is key:
+                key.data()
+        now = time.monotonic_ns()
+        while self._timers and self._timers[0][0] <= now:
+            callback = heapq.heappop(self._timers)[2].callback
+            if callback is not None:
+                callback()
+
+    def close(self) -> None:
+        """Release the selector."""
+        self._selector.close()

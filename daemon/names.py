@@ -1,0 +1,183 @@
+"""The name table: which node names exist, and which channels of which device each one shows. Pure.
+
+Names are views; ownership is kept on channels. So a bit and its byte, an axis and its group, and two
+names of one thing exclude each other without any rule of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+from sioms.protocol.flags import PROTOCOL_VERSION, NodeClass
+from sioms.protocol.nodeinfo import ChannelInfo
+
+from .config import NodeTable, did_you_mean
+
+READONLY = ".readonly"
+
+
+@dataclass(frozen=True, slots=True)
+class BlockInfo:
+    """A block as the nursery described it."""
+
+    name: str
+    node_class: NodeClass
+    channels: tuple[ChannelInfo, ...]
+    writable: bool
+    history: int
+    capacity: int
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceInfo:
+    """A device as the nursery described it."""
+
+    name: str
+    driver: str
+    blocks: tuple[BlockInfo, ...]
+    tick_hz: float
+    inputs: tuple[str, ...]
+    lease_s: float
+
+    @classmethod
+    def unpack(cls, name: str, driver: str, packed: list) -> DeviceInfo:  # type: ignore[type-arg]
+        """Make it from the nursery's reply."""
+        blocks, tick_hz, inputs, lease_s = packed
+        return cls(
+            name,
+            driver,
+            tuple(
+                BlockInfo(n, NodeClass(c), tuple(ChannelInfo(*ch) for ch in chs), w, history, capacity)
+                for n, c, chs, w, history, capacity in blocks
+            ),
+            tick_hz,
+            tuple(inputs),
+            lease_s,
+        )
+
+
+Claim = tuple[str, int, int, int]
+"""(device, block, channel, bit): a piece of an output; bit -1 is the whole channel."""
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """One name and what it shows."""
+
+    name: str
+    device: str
+    block: int
+    channels: tuple[int, ...]
+    bit: int
+    read_only: bool
+
+    def claims(self) -> list[Claim]:
+        """Return what an open of this node owns: nothing for a read-only one."""
+        return (
+            []
+            if self.read_only
+            else [(self.device, self.block, channel, self.bit) for channel in self.channels]
+        )
+
+
+class NameTable:
+    """All names of a workcell.
+
+    Attributes:
+        nodes: by name, in the order of the configuration.
+        devices: descriptions by device name.
+        errors: sentences about aliases and inputs that name nothing.
+    """
+
+    def __init__(self, devices: Mapping[str, DeviceInfo], aliases: Mapping[str, NodeTable]) -> None:
+        self.devices = dict(devices)
+        self.nodes: dict[str, Node] = {}
+        self.errors: list[str] = []
+        for device in devices.values():
+            for index, block in enumerate(device.blocks):
+                base = device.name if not block.name else f"{device.name}.{block.name}"
+                everything = tuple(range(len(block.channels)))
+                self._add(
+                    Node(base, device.name, index, everything, -1, not block.writable),
+                    f"[device.{device.name}]",
+                )
+        for name, alias in aliases.items():
+            self._alias(name, alias)
+        for device in devices.values():
+            for wanted in device.inputs:
+                if wanted not in self.nodes:
+                    self.errors.append(
+                        f"[device.{device.name}]: reads node {wanted}, which there is not{did_you_mean(wanted, self.nodes)}"
+                    )
+
+    def block(self, node: Node) -> BlockInfo:
+        """Return the block a node shows."""
+        return self.devices[node.device].blocks[node.block]
+
+    def pack(self, node: Node) -> list[object]:
+        """Return a node's information in wire form (see NodeInfo)."""
+        device, block = self.devices[node.device], self.block(node)
+        channels = [block.channels[i].pack() for i in node.channels]
+        if node.bit >= 0:
+            channels = [[f"bit{node.bit}", "", 0, 1, 1, 0, {}, ""]]
+        return [
+            node.name, int(block.node_class), node.read_only, channels, node.bit, device.tick_hz,
+            block.capacity, node.device, device.driver, PROTOCOL_VERSION,
+        ]  # fmt: skip
+
+    def _add(self, node: Node, where: str) -> None:
+        for each in self._companions(node):
+            if each.name in self.nodes:
+                self.errors.append(
+                    f"{where}: node name {each.name} is taken already by device {self.nodes[each.name].device}"
+                )
+            else:
+                self.nodes[each.name] = each
+
+    def _companions(self, node: Node) -> Iterator[Node]:
+        """Yield the node, its parts, and the read-only companion of each that can be written."""
+        for each in self._parts(node):
+            yield each
+            if not each.read_only:
+                yield replace(each, name=each.name + READONLY, read_only=True)
+
+    def _parts(self, node: Node) -> Iterator[Node]:
+        yield node
+        block = self.block(node)
+        if len(node.channels) > 1:
+            for channel in node.channels:
+                part = replace(node, name=f"{node.name}.{block.channels[channel].name}", channels=(channel,))
+                yield part
+                yield from self._bits(part, block)
+        else:
+            yield from self._bits(node, block)
+
+    def _bits(self, node: Node, block: BlockInfo) -> Iterator[Node]:
+        width = block.channels[node.channels[0]].width
+        if node.bit < 0 and width > 1:
+            for bit in range(width):
+                yield replace(node, name=f"{node.name}.bit{bit}", bit=bit)
+
+    def _alias(self, name: str, alias: NodeTable) -> None:
+        where = f"[node.{name}]"
+        target = self.nodes.get(alias.of)
+        if target is None:
+            self.errors.append(
+                f"{where}: of = {alias.of}, which there is not{did_you_mean(alias.of, self.nodes)}"
+            )
+            return
+        channels = target.channels
+        if alias.channels:
+            names = {self.block(target).channels[i].name: i for i in target.channels}
+            wrong = [c for c in alias.channels if c not in names]
+            if wrong:
+                self.errors.append(
+                    f"{where}: {alias.of} has no channel {wrong[0]}{did_you_mean(wrong[0], names)}"
+                )
+                return
+            if len(set(alias.channels)) < len(alias.channels):
+                self.errors.append(f"{where}: a channel is named twice in {alias.channels}")
+                return
+            channels = tuple(names[c] for c in alias.channels)
+        self._add(replace(target, name=name, channels=channels), where)

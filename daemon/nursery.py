@@ -1,0 +1,105 @@
+"""The daemon's side of the nursery, the process that knows the drivers.
+
+The daemon imports no driver. The nursery imports them once, validates their settings, and forks one
+process a device, so a driver process starts in milliseconds and shares the pages of its libraries.
+A reload starts a fresh nursery, which sees changed driver files.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from sioms.protocol.messages import MAX_PACKET, MalformedMessage, NurseryVerb, decode, encode
+
+from .loop import Loop
+
+Answer = Callable[[Any, int, str, list[int]], None]
+"""Called with (value, errno, text, descriptors)."""
+
+
+class Nursery:
+    """A nursery process and the requests it has not answered.
+
+    Args:
+        loop: the daemon's loop.
+        died: called when the process has gone.
+    """
+
+    def __init__(self, loop: Loop, died: Callable[[Nursery], None]) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._loop = loop
+        self._died = died
+        self._sock = ours
+        self._answers: dict[int, Answer] = {}
+        self._number = 0
+        theirs.set_inheritable(True)
+        environment = dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", PYTHONFAULTHANDLER="1")
+        arguments = [sys.executable, "-m", "sioms.sdk.nursery", str(theirs.fileno())]
+        self.pid = os.posix_spawn(sys.executable, arguments, environment)
+        theirs.close()
+        loop.watch(ours.fileno(), self._receive)
+
+    def describe(
+        self, device: str, driver: str, settings: dict[str, Any], folder: str, answer: Answer
+    ) -> None:
+        """Validate a device's settings and describe its blocks."""
+        self._request(answer, [], NurseryVerb.DESCRIBE, device, driver, settings, folder)
+
+    def spawn(
+        self, device: str, driver: str, settings: dict[str, Any], generation: int, options: dict[str, Any],
+        fds: Sequence[int], answer: Answer,
+    ) -> None:  # fmt: skip
+        """Fork a driver process; answers with its pid and a descriptor of it."""
+        self._request(answer, fds, NurseryVerb.SPAWN, device, driver, settings, generation, options)
+
+    def close(self) -> None:
+        """End the nursery; the drivers it forked live on."""
+        if self._sock.fileno() >= 0:
+            self._loop.unwatch(self._sock.fileno())
+            self._sock.close()
+
+    def _request(self, answer: Answer, fds: Sequence[int], verb: NurseryVerb, *arguments: object) -> None:
+        self._number += 1
+        packet = encode(verb, self._number, *arguments)
+        if len(packet) > MAX_PACKET:
+            answer(None, 7, f"settings of {len(packet)} bytes; want at most {MAX_PACKET}", [])
+            return
+        self._answers[self._number] = answer
+        try:
+            socket.send_fds(self._sock, [packet], list(fds))
+        except OSError as error:
+            del self._answers[self._number]
+            answer(None, error.errno or 5, f"the nursery does not answer: {error}", [])
+
+    def _receive(self) -> None:
+        try:
+            packet, fds, _, _ = socket.recv_fds(self._sock, 1 << 20, 8)
+        except OSError:
+            packet, fds = b"", []
+        if not packet:
+            self._end()
+            return
+        try:
+            message: list[Any] = decode(packet)
+        except MalformedMessage:
+            self._end()
+            return
+        answer = self._answers.pop(message[1], None)
+        if answer is None:
+            for fd in fds:
+                os.close(fd)
+        elif message[2]:
+            answer(None, message[2], message[3], fds)
+        else:
+            answer(message[3], 0, "", fds)
+
+    def _end(self) -> None:
+        self.close()
+        pending, self._answers = self._answers, {}
+        for answer in pending.values():
+            answer(None, 5, "the nursery died", [])
+        self._died(self)

@@ -1,0 +1,272 @@
+"""The daemon: takes up configurations, owns the driver processes, and tells clients of both.
+
+Control plane only: it opens, closes, names, supervises and stops. Readings and commands pass it by.
+
+Concurrency: everything runs in the one loop; nothing blocks in it.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Callable
+from typing import Any
+
+from sioms.protocol.flags import PageState
+from sioms.protocol.messages import DriverVerb
+
+from .clients import Clients
+from .config import Config
+from .devices import DriverProcess, State
+from .loading import Loader, Plan
+from .log import Log
+from .loop import Loop
+from .names import NameTable
+from .notify import ServiceManager
+from .nursery import Nursery
+from .rights import Rights
+from .shared import Shared
+
+ALIVE_S = 0.02
+
+
+class Server:
+    """The workcell's daemon.
+
+    Args:
+        loop: the loop it lives in.
+        listener: the listening SOCK_SEQPACKET socket.
+        config_path: where the configuration is read from, again at every reload.
+        log: its log.
+    """
+
+    def __init__(self, loop: Loop, listener: socket.socket, config_path: str, log: Log) -> None:
+        self.loop = loop
+        self.log = log
+        self.shared = Shared()
+        self.names = NameTable({}, {})
+        self.devices: dict[str, DriverProcess] = {}
+        self.config: Config | None = None
+        self.clients = Clients(self, listener)
+        self.exit_status = 0
+        self._path = config_path
+        self._nursery: Nursery | None = None
+        self._stop_sources: dict[str, list[list[int]]] = {}
+        self._leaving: dict[str, DriverProcess] = {}
+        self._loader: Loader | None = None
+        self._manager = ServiceManager()
+        self._told_ready = False
+        self._ending = False
+        self._request_seen = self.shared.request.word
+        self._alive()
+        if self._manager.watchdog_ns:
+            self._feed_watchdog()
+
+    def load(self, done: Callable[[list[str]], None]) -> None:
+        """Read the configuration and take it up: what has not changed is not touched.
+
+        Args:
+            done: called with the errors; with any, everything stays as it was.
+        """
+        if self._loader is not None:
+            done(["reload: another one is under way; try again when it is done"])
+            return
+        if self._told_ready:
+            self._manager.tell(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
+
+        def loaded(plan: Plan | None, errors: list[str]) -> None:
+            self._loader = None
+            if plan is not None:
+                self._take_up(plan)
+            for error in errors:
+                self.log("error", "configuration", text=error)
+            if self._told_ready:
+                self._manager.tell("READY=1")
+            done(errors)
+
+        self._loader = Loader(self.loop, self._path, loaded, self._nursery_died)
+        self._loader.start()
+
+    def shutdown(self) -> None:
+        """End all drivers, then the loop."""
+        if self._ending:
+            return
+        self._ending = True
+        self.log("info", "shutdown")
+        self._manager.tell("STOPPING=1")
+        for device in list(self.devices.values()):
+            self._retire(device)
+        self._maybe_end()
+
+    def stop_workcell(self, source: str) -> None:
+        """Latch the emergency stop and wake every driver."""
+        if self.shared.latch.stop(time.monotonic_ns(), source):
+            self.log("warning", "emergency stop", source=source)
+        for device in self.devices.values():
+            device.tell(DriverVerb.STOP_CHANGED)
+
+    def reset_workcell(self, who: str) -> None:
+        """Clear the latch and give devices in fault another try; nothing moves by itself."""
+        self._request_seen = self.shared.request.word
+        self.shared.latch.reset()
+        self.log("info", "reset", by=who)
+        for device in self.devices.values():
+            device.tell(DriverVerb.STOP_CHANGED)
+            device.reset()
+
+    # --- what devices tell -----------------------------------------------------------------------
+
+    def device_up(self, device: DriverProcess) -> None:
+        """Give the new process the pages it reads, and its page to those that read it."""
+        for other in self.devices.values():
+            for name in other.info.inputs:
+                if other is device or self.names.nodes[name].device == device.name:
+                    self._send_input(other, name)
+        self.clients.retry_opens()
+        self._maybe_ready()
+
+    def device_gone(self, device: DriverProcess, reason: str) -> None:
+        """Void the handles of a process that is no more, and stop what is tied to it."""
+        self.clients.device_gone(device, reason)
+        if device.state is not State.DOWN and device.device.common.on_loss == "stop":
+            self.stop_workcell(f"device {device.name} lost: {reason}")
+        self._maybe_ready()
+
+    def device_hung(self, device: DriverProcess, reason: str) -> None:
+        """Report a missed lease, and stop what is tied to the device."""
+        self.log("warning", "device late", device=device.name, reason=reason)
+        if device.device.common.on_loss == "stop":
+            self.stop_workcell(f"device {device.name}: {reason}")
+
+    def device_message(self, device: DriverProcess, verb: DriverVerb, arguments: list[Any]) -> None:
+        """Take a notice of a driver."""
+        match verb:
+            case DriverVerb.DETACHED:
+                self.clients.detached(device, arguments[0])
+            case DriverVerb.MARKER_SIGNALLED:
+                self.clients.marker_signalled()
+            case DriverVerb.STOPPED:
+                self.log("warning", "emergency stop", source=arguments[0], device=device.name)
+                for other in self.devices.values():
+                    other.tell(DriverVerb.STOP_CHANGED)
+            case DriverVerb.LINK:
+                state = PageState(arguments[0])
+                good = state in (PageState.GOOD, PageState.STARTING)
+                self.log(
+                    "info" if good else "error",
+                    "link",
+                    device=device.name,
+                    state=state.name.lower(),
+                    reason=arguments[1],
+                )
+                if not good and device.device.common.on_loss == "stop":
+                    self.stop_workcell(f"device {device.name}: {arguments[1]}")
+            case DriverVerb.LOG:
+                self.log(str(arguments[0]), "driver", device=device.name, text=arguments[1])
+            case _:
+                device.kill(f"its driver sent {verb.name}, which is not for a driver to send")
+
+    # --- inside ----------------------------------------------------------------------------------
+
+    def _take_up(self, plan: Plan) -> None:
+        first = self.config is None
+        old, self._nursery = self._nursery, plan.nursery
+        changed_sources = {n for n in {*plan.stop_sources, *self._stop_sources}
+                           if plan.stop_sources.get(n) != self._stop_sources.get(n)}  # fmt: skip
+        self.config, self.names, self._stop_sources = plan.config, plan.names, plan.stop_sources
+        self.clients.rights = Rights(plan.config.grants, os.getuid())
+        if first and plan.config.workcell.start_stopped:
+            self.shared.latch.stop(time.monotonic_ns(), "started stopped, as configured")
+        for name, device in list(self.devices.items()):
+            wanted = plan.config.devices.get(name)
+            if wanted != device.device or name in changed_sources:
+                self.log("info", "device ends", device=name, why="removed" if wanted is None else "changed")
+                self._retire(device)
+        for name in plan.config.devices:
+            self._start(name)
+        if old is not None:
+            old.close()
+        self._maybe_ready()
+
+    def _start(self, name: str) -> None:
+        """Start a configured device that is not there yet; one that is leaving starts when it has left."""
+        if self.config is None or self._ending or name in self.devices or name in self._leaving:
+            return
+        options = {
+            "stop_sources": self._stop_sources.get(name, []),
+            "daemon_lease_s": self.config.workcell.daemon_lease_s,
+            "folder": self.config.folder,
+        }
+        device = DriverProcess(
+            self.loop, self._current_nursery, self.config.devices[name], self.names.devices[name],
+            self.shared.fds, self, self.log, options,
+        )  # fmt: skip
+        self.devices[name] = device
+        device.start()
+
+    def _retire(self, device: DriverProcess) -> None:
+        del self.devices[device.name]
+        self._leaving[device.name] = device
+        device.shutdown(lambda: self._left(device))
+
+    def _left(self, device: DriverProcess) -> None:
+        del self._leaving[device.name]
+        if self.config is not None and device.name in self.config.devices:
+            self._start(device.name)
+        self._maybe_end()
+
+    def _current_nursery(self) -> Nursery:
+        if self._nursery is None:
+            self._nursery = Nursery(self.loop, self._nursery_died)
+        return self._nursery
+
+    def _nursery_died(self, nursery: Nursery) -> None:
+        if nursery is self._nursery and not self._ending:
+            self.log("error", "nursery died")
+            self._nursery = None
+
+    def _send_input(self, reader: DriverProcess, name: str) -> None:
+        node = self.names.nodes[name]
+        source = self.devices.get(node.device)
+        if source is None or reader.state is not State.UP or source.state is not State.UP:
+            return
+        try:
+            reader.send(DriverVerb.INPUT, name, node.channels, node.bit, fds=[source.page_fds[node.block]])
+        except OSError as error:
+            self.log("warning", "input lost", device=reader.name, node=name, why=error.strerror)
+
+    def _maybe_ready(self) -> None:
+        if self._told_ready or self.config is None or not all(d.settled for d in self.devices.values()):
+            return
+        self._told_ready = True
+        self._manager.tell("READY=1")
+        up = sum(d.state is State.UP for d in self.devices.values())
+        self.log(
+            "info",
+            "ready",
+            socket=self.clients.address,
+            devices=f"{up}/{len(self.devices)}",
+            nodes=len(self.names.nodes),
+        )
+
+    def _maybe_end(self) -> None:
+        if self._ending and not self._leaving:
+            if self._nursery is not None:
+                self._nursery.close()
+            self.loop.running = False
+
+    def _alive(self) -> None:
+        now = time.monotonic_ns()
+        self.shared.latch.daemon_alive(now)
+        if self.shared.request.word != self._request_seen:
+            # A client that could not reach us has asked the drivers directly; they have acted already.
+            self._request_seen = self.shared.request.word
+            self.stop_workcell("a client, through the stop-request page")
+        for device in list(self.devices.values()):
+            device.check(now)
+        self.loop.after(ALIVE_S, self._alive)
+
+    def _feed_watchdog(self) -> None:
+        self._manager.tell("WATCHDOG=1")
+        self.loop.at(time.monotonic_ns() + self._manager.watchdog_ns, self._feed_watchdog)

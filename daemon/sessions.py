@@ -1,0 +1,111 @@
+"""Sessions and handles: what the daemon knows of its clients."""
+
+from __future__ import annotations
+
+import grp
+import os
+import pwd
+import socket
+import struct
+from dataclasses import dataclass, field
+
+from sioms.protocol.flags import Access
+
+from .loop import Timer
+from .names import Claim, Node
+from .rights import Peer
+
+_SO_PEERPIDFD = 77  # Linux 6.5; not in the socket module of Python 3.11
+
+
+@dataclass(slots=True)
+class Handle:
+    """An open node.
+
+    Attributes:
+        number: unique in the daemon's life.
+        session: who opened it.
+        node: what was opened.
+        access: how.
+        since_ns: when.
+        generation: of the driver process it is attached to.
+        closing: message number of the close that waits for the driver, if any.
+    """
+
+    number: int
+    session: Session
+    node: Node
+    access: Access
+    since_ns: int
+    generation: int
+    closing: int = 0
+
+    @property
+    def claims(self) -> list[Claim]:
+        """What it owns."""
+        return self.node.claims()
+
+
+@dataclass(slots=True, eq=False)
+class Wait:
+    """A request that is not answered yet."""
+
+    number: int
+    session: Session
+    timer: Timer | None
+    what: str
+
+
+@dataclass(slots=True, eq=False)
+class Session:
+    """One client's connection.
+
+    Attributes:
+        sock: its socket, non-blocking.
+        peer: its credentials.
+        pidfd: descriptor of its process, -1 when the kernel gives none.
+        name: what it calls itself.
+        handles: by number.
+        waits: unanswered requests by message number.
+        markers: numbers reserved, persisting ones not counted.
+    """
+
+    sock: socket.socket
+    peer: Peer
+    pidfd: int
+    name: str = ""
+    handles: dict[int, Handle] = field(default_factory=dict)
+    waits: dict[int, Wait] = field(default_factory=dict)
+    markers: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.peer}" + (f" {self.name}" if self.name else "")
+
+
+def peer_of(sock: socket.socket) -> Peer:
+    """Return the credentials of the other end, vouched for by the kernel."""
+    pid, uid, gid = struct.unpack("3i", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+    try:
+        user = pwd.getpwuid(uid).pw_name
+        gids = os.getgrouplist(user, gid)
+    except KeyError:
+        user, gids = str(uid), [gid]
+    groups = set()
+    for each in gids:
+        try:
+            groups.add(grp.getgrgid(each).gr_name)
+        except KeyError:
+            groups.add(str(each))
+    return Peer(pid, uid, user, frozenset(groups))
+
+
+def pidfd_of(sock: socket.socket, pid: int) -> int:
+    """Return a descriptor of the peer's process; -1 when there is none to be had."""
+    try:
+        return struct.unpack("i", sock.getsockopt(socket.SOL_SOCKET, _SO_PEERPIDFD, 4))[0]
+    except OSError:
+        pass
+    try:
+        return os.pidfd_open(pid)
+    except OSError:
+        return -1
