@@ -1,1 +1,40 @@
+"""Motion: command buffers, profiles, limits and control laws of axes. Pure: no I/O and no clock.
 
+AxisBank closes the loop on the host; DriveBank feeds drives that close their own. Positions are in
+the unit of the axis (m or rad), forces in N or N*m, instants in integer ns of CLOCK_MONOTONIC.
+"""
+
+from .bank import AxisBank
+from .commands import Command
+from .drives import Action, DriveBank, StartCommand, StopAxis
+from .types import (
+    SWITCH_HOME,
+    SWITCH_MINUS,
+    SWITCH_PLUS,
+    AxisKind,
+    AxisSettings,
+    CommandError,
+    Event,
+    EventKind,
+    Homing,
+    MarkerPort,
+)
+
+__all__ = [
+    "SWITCH_HOME",
+    "SWITCH_MINUS",
+    "SWITCH_PLUS",
+    "Action",
+    "AxisBank",
+    "AxisKind",
+    "AxisSettings",
+    "Command",
+    "CommandError",
+    "DriveBank",
+    "Event",
+    "EventKind",
+    "Homing",
+    "MarkerPort",
+    "StartCommand",
+    "StopAxis",
+]

@@ -1,0 +1,62 @@
+"""Command buffers of the axes of a bank: chunks of the written arrays, in order, one queue per axis."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .commands import Command
+
+
+class CommandBuffers:
+    """One first-in first-out buffer per axis. ``count`` (n,) is how many records each holds.
+
+    A written array is kept as it came, split by axis into views; a record becomes a Python object
+    only when it is the next to run.
+    """
+
+    def __init__(self, n: int, capacity: int) -> None:
+        self.capacity = capacity
+        self.count = np.zeros(n, dtype=np.int64)
+        self._chunks: list[deque[NDArray[Any]]] = [deque() for _ in range(n)]
+        self._position = [0] * n
+
+    def append(self, commands: NDArray[Any]) -> NDArray[np.int64]:
+        """Append validated commands (COMMAND_DTYPE, order kept per axis); return the axes touched."""
+        axis = commands["axis"]
+        if len(commands) > 1 and (axis[1:] < axis[:-1]).any():
+            order = np.argsort(axis, kind="stable")
+            commands, axis = commands[order], axis[order]
+        first = np.flatnonzero(np.concatenate(([True], axis[1:] != axis[:-1])))
+        touched = axis[first].astype(np.int64)
+        bounds = [*first.tolist(), len(commands)]
+        for i, a in enumerate(touched.tolist()):
+            self._chunks[a].append(commands[bounds[i] : bounds[i + 1]])
+        self.count[touched] += np.diff(bounds)
+        return touched
+
+    def pop(self, axis: int) -> Command | None:
+        """Take the oldest command of an axis, None when it has none."""
+        chunks = self._chunks[axis]
+        if not chunks:
+            return None
+        i = self._position[axis]
+        chunk = chunks[0]
+        command = Command._make(chunk[i].item())
+        if i + 1 < len(chunk):
+            self._position[axis] = i + 1
+        else:
+            chunks.popleft()
+            self._position[axis] = 0
+        self.count[axis] -= 1
+        return command
+
+    def clear(self, axes: NDArray[np.int64]) -> None:
+        """Drop all commands of these axes."""
+        for a in axes[self.count[axes] > 0].tolist():
+            self._chunks[a].clear()
+            self._position[a] = 0
+        self.count[axes] = 0

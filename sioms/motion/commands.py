@@ -1,0 +1,265 @@
+"""Validation of written axis records, vectorised over the array; nothing is taken when one is bad.
+
+A record is checked field by field against the flags of its ``control_mode``; fields whose flag is
+not set are ignored. The rules are one table (RULES), so that a message can always say what would
+have been accepted.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.protocol.flags import QUANTITIES, ControlMode, NodeClass
+from sioms.protocol.records import numpy_dtype
+
+from .types import AxisKind, AxisSettings, CommandError, MarkerPort
+
+WIRE_DTYPE = np.dtype(numpy_dtype(NodeClass.AXIS))
+COMMAND_DTYPE = np.dtype([*numpy_dtype(NodeClass.AXIS), ("signal_generation", "<i8"), ("wait_generation", "<i8")])
+"""A record as buffered: ``axis`` is the bank axis, marker tokens are resolved to number and generation."""
+
+M = ControlMode
+KNOWN = sum(ControlMode)
+COMBINATIONS = (
+    M.JERK,
+    M.ACCELERATION,
+    M.VELOCITY,
+    M.POSITION,
+    M.POSITION | M.VELOCITY,
+    M.POSITION | M.VELOCITY | M.ACCELERATION,
+    M.FORCE,
+    M.FORCE_VELOCITY,
+)
+FORCE_FLAGS = M.FORCE | M.FORCE_VELOCITY | M.SPECIFIED_FORCE_OFFSET | M.SPECIFIED_MAX_FORCE
+_IS_COMBINATION = np.zeros(QUANTITIES + 1, dtype=bool)
+_IS_COMBINATION[[int(c) for c in COMBINATIONS]] = True
+
+
+class Command(NamedTuple):
+    """One buffered record as Python numbers, in the order of COMMAND_DTYPE."""
+
+    axis: int
+    control_mode: int
+    signal_marker_number: int
+    wait_marker_number: int
+    position: float
+    velocity: float
+    acceleration: float
+    jerk: float
+    max_velocity: float
+    max_acceleration: float
+    time: float
+    k: float
+    kz: float
+    kp: float
+    kb: float
+    force_offset: float
+    force: float
+    force_velocity: float
+    max_force: float
+    signal_generation: int
+    wait_generation: int
+
+
+class Limits:
+    """Limits of every axis as arrays (n,), absent ones infinite.
+
+    ``velocity``, ``acceleration`` and ``force`` are the configured maxima.
+    """
+
+    def __init__(self, settings: Sequence[AxisSettings]) -> None:
+        inf = np.inf
+
+        def column(name: str, absent: float) -> NDArray[np.float64]:
+            values = [getattr(s, name) for s in settings]
+            return np.array([absent if v is None else v for v in values], dtype=np.float64)
+
+        self.minimum = column("position_min", -inf)
+        self.maximum = column("position_max", inf)
+        self.velocity = column("velocity_max", inf)
+        self.acceleration = column("acceleration_max", inf)
+        self.jerk = column("jerk_max", inf)
+        self.force = column("force_max", inf)
+
+
+class Rule(NamedTuple):
+    """A field that holds when a flag is set, with its bound and unit."""
+
+    flag: ControlMode
+    field: str
+    bound: str
+    """Name of the array in Limits: |value| at most that; "" when only finiteness is asked."""
+    positive: bool
+    unit: str
+
+
+RULES = (
+    Rule(M.VELOCITY, "velocity", "velocity", False, "{u}/s"),
+    Rule(M.ACCELERATION, "acceleration", "acceleration", False, "{u}/s^2"),
+    Rule(M.JERK, "jerk", "jerk", False, "{u}/s^3"),
+    Rule(M.FORCE, "force", "force", False, "{f}"),
+    Rule(M.FORCE_VELOCITY, "force_velocity", "", False, "{f}/s"),
+    Rule(M.SPECIFIED_TIME, "time", "", False, "s"),
+    Rule(M.SPECIFIED_GAINS, "k", "", False, ""),
+    Rule(M.SPECIFIED_GAINS, "kz", "", False, ""),
+    Rule(M.SPECIFIED_GAINS, "kp", "", False, ""),
+    Rule(M.SPECIFIED_GAINS, "kb", "", False, ""),
+    Rule(M.SPECIFIED_FORCE_OFFSET, "force_offset", "force", False, "{f}"),
+    Rule(M.SPECIFIED_MAX_VEL_ACC, "max_velocity", "velocity", True, "{u}/s"),
+    Rule(M.SPECIFIED_MAX_VEL_ACC, "max_acceleration", "acceleration", True, "{u}/s^2"),
+    Rule(M.SPECIFIED_MAX_FORCE, "max_force", "force", True, "{f}"),
+)
+
+
+class Validator:
+    """Checks arrays of records against the axes of one bank. Pure: keeps no record."""
+
+    def __init__(self, settings: Sequence[AxisSettings], limits: Limits, markers: MarkerPort) -> None:
+        self._settings = settings
+        self._limits = limits
+        self._markers = markers
+        self._modes = np.array([int(s.modes) for s in settings], dtype=np.uint32)
+        stepper = np.array([s.kind is AxisKind.STEPPER for s in settings])
+        self._modes[stepper] &= np.uint32(KNOWN & ~FORCE_FLAGS)
+
+    def check(self, records: NDArray[Any], axes: NDArray[np.int64]) -> NDArray[Any]:
+        """Return the records as COMMAND_DTYPE, with bank axes and captured markers.
+
+        Args:
+            records: structured array of WIRE_DTYPE.
+            axes: bank axis of each node-local index.
+
+        Raises:
+            CommandError: EINVAL for what no axis like this could do, ERANGE for a value outside
+                its limits, and what the marker port raises.
+        """
+        local = records["axis"]
+        bad = (local < 0) | (local >= len(axes))
+        if bad.any():
+            i = int(bad.argmax())
+            raise CommandError(
+                errno.EINVAL, f"write, record {i}: axis {local[i]} does not exist; 0 to {len(axes) - 1}"
+            )
+        commands = np.zeros(len(records), dtype=COMMAND_DTYPE)
+        for name in WIRE_DTYPE.names or ():
+            commands[name] = records[name]
+        commands["axis"] = axes[local]
+        self._check_modes(commands)
+        self._check_values(commands)
+        self._check_position(commands)
+        self._capture(commands)
+        return commands
+
+    def refuse(self, errno_: int, commands: NDArray[Any], i: int, what: str) -> CommandError:
+        """Build the error for record i."""
+        axis = int(commands["axis"][i])
+        return CommandError(errno_, f"write axis {axis} ({self._settings[axis].name}), record {i}: {what}")
+
+    def _check_modes(self, commands: NDArray[Any]) -> None:
+        mode = commands["control_mode"]
+        bad = ~_IS_COMBINATION[mode & QUANTITIES] | ((mode & ~np.uint32(KNOWN)) != 0)
+        bad |= ((mode & int(M.RELATIVE)) != 0) & ((mode & int(M.POSITION)) == 0)
+        if bad.any():
+            i = int(bad.argmax())
+            names = ", ".join(str(c.name) for c in COMBINATIONS)
+            raise self.refuse(
+                errno.EINVAL, commands, i, f"control_mode {int(mode[i]):#06x} is no command; one of {names}, "
+                "RELATIVE only with POSITION"
+            )
+        missing = mode & ~self._modes[commands["axis"]]
+        if missing.any():
+            i = int((missing != 0).argmax())
+            offered = ControlMode(int(self._modes[commands["axis"][i]]))
+            raise self.refuse(
+                errno.EINVAL, commands, i,
+                f"this axis cannot do {ControlMode(int(missing[i])).name}; it has {offered.name}"
+            )
+
+    def _check_values(self, commands: NDArray[Any]) -> None:
+        mode, axis = commands["control_mode"], commands["axis"]
+        present = int(np.bitwise_or.reduce(mode)) if len(mode) else 0
+        for rule in RULES:
+            if not present & rule.flag:
+                continue
+            held = (mode & int(rule.flag)) != 0
+            value = commands[rule.field]
+            bad = held & ~np.isfinite(value)
+            if bad.any():
+                i = int(bad.argmax())
+                raise self.refuse(errno.EINVAL, commands, i, f"{rule.field} is {value[i]}; a finite number")
+            if rule.bound:
+                bound = getattr(self._limits, rule.bound)[axis]
+                bad = held & ((np.abs(value) > bound) | (rule.positive & (value <= 0)))
+                if bad.any():
+                    raise self._out_of_range(commands, int(bad.argmax()), rule, bound)
+        if present & M.SPECIFIED_TIME:
+            self._check_time(commands)
+        if present & M.SPECIFIED_GAINS:
+            bad = ((mode & int(M.SPECIFIED_GAINS)) != 0) & (np.abs(commands["kp"]) >= 1)
+            if bad.any():
+                i = int(bad.argmax())
+                raise self.refuse(
+                    errno.ERANGE, commands, i, f"kp {commands['kp'][i]} makes the law unstable; between -1 and 1"
+                )
+
+    def _out_of_range(
+        self, commands: NDArray[Any], i: int, rule: Rule, bound: NDArray[np.float64]
+    ) -> CommandError:
+        settings = self._settings[int(commands["axis"][i])]
+        unit = rule.unit.format(u=settings.unit, f=settings.force_unit)
+        low = "above 0" if rule.positive else f"{-bound[i]:g}"
+        return self.refuse(
+            errno.ERANGE, commands, i,
+            f"{rule.field} {commands[rule.field][i]:g} {unit} is outside the limits; {low} to {bound[i]:g} {unit}"
+        )
+
+    def _check_time(self, commands: NDArray[Any]) -> None:
+        mode, time = commands["control_mode"], commands["time"]
+        timed = (mode & int(M.SPECIFIED_TIME)) != 0
+        bad = timed & ((time == 0) | (time > 1e6))
+        passing = int(M.POSITION | M.VELOCITY)
+        bad |= timed & (time < 0) & ((mode & passing) == passing)
+        if bad.any():
+            i = int(bad.argmax())
+            raise self.refuse(
+                errno.EINVAL, commands, i, f"time {time[i]:g} s; more than 0 and at most 1e6 s, or negative for "
+                "'until the next command' (not with a position that is passed)"
+            )
+
+    def _check_position(self, commands: NDArray[Any]) -> None:
+        mode, axis, value = commands["control_mode"], commands["axis"], commands["position"]
+        held = (mode & int(M.POSITION)) != 0
+        if not held.any():
+            return
+        bad = held & ~np.isfinite(value)
+        if bad.any():
+            i = int(bad.argmax())
+            raise self.refuse(errno.EINVAL, commands, i, f"position is {value[i]}; a finite number")
+        low, high = self._limits.minimum[axis], self._limits.maximum[axis]
+        bad = held & ((mode & int(M.RELATIVE)) == 0) & ((value < low) | (value > high))
+        if bad.any():
+            i = int(bad.argmax())
+            unit = self._settings[int(axis[i])].unit
+            raise self.refuse(
+                errno.ERANGE, commands, i,
+                f"position {value[i]:g} {unit} is outside the soft limits; {low[i]:g} to {high[i]:g} {unit}"
+            )
+
+    def _capture(self, commands: NDArray[Any]) -> None:
+        mode = commands["control_mode"]
+        for flag, field, generation in (
+            (M.SPECIFIED_SIGNAL_MARKER, "signal_marker_number", "signal_generation"),
+            (M.SPECIFIED_WAIT_MARKER, "wait_marker_number", "wait_generation"),
+        ):
+            held = (mode & int(flag)) != 0
+            tokens = commands[field]
+            for token in np.unique(tokens[held]).tolist():
+                captured = self._markers.capture(token, signal=flag is M.SPECIFIED_SIGNAL_MARKER)
+                rows = held & (tokens == token)
+                commands[field][rows], commands[generation][rows] = captured
+            commands[field][~held] = 0

@@ -1,0 +1,120 @@
+"""Control laws, vectorised over the axes of a bank: servo and stepper in one pass.
+
+Servo (dissertation, section F.2.4): ``u[n] = k (e[n] + kz e[n-1]) - kp tau[n-1] + kb v[n] + tau_o``,
+``tau[n] = clip(u[n], -tau_m, tau_m)``; e desired minus actual position, v the filtered actual
+velocity. In force mode ``u = force + kb v + tau_o``. Damping is ``kb < 0``.
+
+Stepper: the same form slews the output position: e is desired minus output position, the law gives
+the output velocity w (``kp`` acts on w[n-1], ``kb`` on the desired velocity), which is clipped to
+the limits of velocity and acceleration before it moves the output. k = 1/tick with the rest zero
+is dead beat: the output is on the set-point in every tick as long as the limits allow it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .types import AxisKind, AxisSettings
+
+Vector = NDArray[np.float64]
+
+
+class ControlLaw:
+    """State and gains of the laws of n axes. Gains and limits are arrays (n,), free to change between ticks.
+
+    Args:
+        settings: one per axis.
+        tick_s: nominal period [s].
+        gains: arrays k, kz, kp, kb (n,) to use, rows of the published fields.
+    """
+
+    def __init__(self, settings: Sequence[AxisSettings], tick_s: float, gains: Sequence[Vector]) -> None:
+        n = len(settings)
+        self.stepper = np.array([s.kind is AxisKind.STEPPER for s in settings], dtype=bool)
+        self.k, self.kz, self.kp, self.kb = gains
+        default = [1.0 / tick_s if s.kind is AxisKind.STEPPER else 0.0 for s in settings]
+        self.k[:] = [d if s.k is None else s.k for s, d in zip(settings, default, strict=True)]
+        self.kz[:] = [s.kz for s in settings]
+        self.kp[:] = [s.kp for s in settings]
+        self.kb[:] = [s.kb for s in settings]
+        self.offset = np.array([s.force_offset for s in settings])
+        self.force_limit = np.array([s.force_max for s in settings], dtype=np.float64)
+        self.velocity_limit = np.array([s.velocity_max for s in settings], dtype=np.float64)
+        self.acceleration_limit = np.array([s.acceleration_max for s in settings], dtype=np.float64)
+        self.error = np.zeros(n)
+        self.output = np.zeros(n)
+        """tau[n-1] of servos, w[n-1] of steppers."""
+        self.slewed = np.zeros(n)
+        """Output position of steppers."""
+        self.saturated = np.zeros(n, dtype=bool)
+        self.all_servo = not self.stepper.any()
+        self._old = np.zeros(n)
+        self._u = np.zeros(n)
+        self._term = np.zeros(n)
+        self._low = np.zeros(n)
+
+    def step(
+        self,
+        desired: Vector,
+        desired_velocity: Vector,
+        actual: Vector,
+        velocity: Vector,
+        dt: float,
+        force_rows: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Advance error and output of all axes by one tick.
+
+        Args:
+            desired: desired position; of axes in force mode the desired force (n,).
+            desired_velocity: (n,), used by steppers only.
+            actual: measured position (n,).
+            velocity: filtered measured velocity (n,).
+            dt: time since the last tick [s].
+            force_rows: mask of the axes in force mode, None when there are none.
+        """
+        if not self.all_servo:
+            w_last, e_last = self.output[self.stepper], self.error[self.stepper]
+        self._servo(desired, actual, velocity)
+        if force_rows is not None:
+            np.add(desired, self.kb * velocity, out=self._u, where=force_rows)
+            np.add(self._u, self.offset, out=self._u, where=force_rows)
+            self.error[force_rows] = 0.0
+        self._clip()
+        if not self.all_servo:
+            self._slew(desired, desired_velocity, w_last, e_last, dt)
+
+    def _servo(self, desired: Vector, actual: Vector, velocity: Vector) -> None:
+        e, old, u, term = self.error, self._old, self._u, self._term
+        old[:] = e
+        np.subtract(desired, actual, out=e)
+        np.multiply(self.kz, old, out=u)
+        u += e
+        u *= self.k
+        np.multiply(self.kp, self.output, out=term)
+        u -= term
+        np.multiply(self.kb, velocity, out=term)
+        u += term
+        u += self.offset
+
+    def _clip(self) -> None:
+        np.negative(self.force_limit, out=self._low)
+        np.maximum(self._u, self._low, out=self.output)
+        np.minimum(self.output, self.force_limit, out=self.output)
+        np.not_equal(self.output, self._u, out=self.saturated)
+
+    def _slew(
+        self, desired: Vector, desired_velocity: Vector, w_last: Vector, e_last: Vector, dt: float
+    ) -> None:
+        s = self.stepper
+        e = desired[s] - self.slewed[s]
+        free = self.k[s] * (e + self.kz[s] * e_last) - self.kp[s] * w_last + self.kb[s] * desired_velocity[s]
+        # Rounding must not count as saturation: a profile at full acceleration is within the limits.
+        v, a = self.velocity_limit[s] * (1 + 1e-6), self.acceleration_limit[s] * dt * (1 + 1e-6)
+        w = np.clip(np.clip(free, w_last - a, w_last + a), -v, v)
+        self.slewed[s] += w * dt
+        self.output[s] = w
+        self.error[s] = e
+        self.saturated[s] = np.abs(w - free) > 1e-3 * v

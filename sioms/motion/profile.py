@@ -1,0 +1,284 @@
+"""Plans: what one command makes an axis do, as polynomial segments in continuous time.
+
+A segment is (duration [s], c0 .. c5), position = sum c_i t^i from its own start. Position commands
+are time-optimal (Ruckig); velocity, acceleration and jerk commands are velocity profiles of Ruckig
+with the command's own bounds, because each of them is "go towards that velocity, at most so fast";
+a timed pass through (position, velocity, acceleration) is the quintic through both ends.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import ruckig
+
+from sioms.protocol.flags import ControlMode
+
+from .commands import Command
+
+M = ControlMode
+MAX_SEGMENTS = 13
+"""Two brake phases, seven of the profile, two of arrival, the hold, one to spare."""
+SHORTEST_S = 1e-11
+TIME_TOLERANCE_S = 1e-9
+
+Segment = tuple[float, float, float, float, float, float, float]
+State = tuple[float, float, float]
+"""Position, velocity, acceleration."""
+
+
+class InfeasibleError(Exception):
+    """The command cannot be carried out within the limits from the state in which it begins."""
+
+
+class Bounds(NamedTuple):
+    """Limits that hold for a plan; jerk may be infinite, positions too."""
+
+    velocity: float
+    acceleration: float
+    jerk: float
+    minimum: float
+    maximum: float
+
+
+class Plan(NamedTuple):
+    """Segments of one command.
+
+    duration is infinite for a command that lasts until the next; final is the state at the end of
+    the last segment (for an infinite one the state it settles in, which is steady only when
+    resting). guard asks for the stopping-distance check in every tick.
+    """
+
+    segments: list[Segment]
+    duration: float
+    final: State
+    guard: bool
+
+
+class Planner:
+    """Makes plans. Holds Ruckig's objects, so one planner per thread."""
+
+    def __init__(self) -> None:
+        self._otg = ruckig.Ruckig(1)
+        self._input = ruckig.InputParameter(1)
+        self._trajectory = ruckig.Trajectory(1)
+
+    def plan(self, command: Command, state: State, bounds: Bounds) -> Plan:
+        """Return the plan of a position, velocity, acceleration or jerk command from a state.
+
+        Raises:
+            InfeasibleError: the sentence says what is not possible and what would be.
+        """
+        mode = command.control_mode
+        if mode & M.POSITION:
+            return self._position(command, state, bounds)
+        duration = command.time if mode & M.SPECIFIED_TIME and command.time > 0 else math.inf
+        velocity, limited = _velocity_goal(command, state, bounds)
+        return self._velocity(velocity, duration, state, limited)
+
+    def _position(self, command: Command, state: State, bounds: Bounds) -> Plan:
+        mode = command.control_mode
+        target = command.position + (state[0] if mode & M.RELATIVE else 0.0)
+        if not bounds.minimum <= target <= bounds.maximum:
+            raise InfeasibleError(
+                f"position {target:g} is outside the soft limits; {bounds.minimum:g} to {bounds.maximum:g}"
+            )
+        final = (
+            target,
+            command.velocity if mode & M.VELOCITY else 0.0,
+            command.acceleration if mode & M.ACCELERATION else 0.0,
+        )
+        timed = bool(mode & M.SPECIFIED_TIME) and command.time > 0
+        if timed and mode & M.VELOCITY:
+            return timed_pass(state, final, bool(mode & M.ACCELERATION), command.time, bounds)
+        plan = self._optimal(state, final, bounds, command.time if timed else None)
+        if mode & M.SPECIFIED_TIME and command.time < 0:
+            hold = (math.inf, target, 0.0, 0.0, 0.0, 0.0, 0.0)
+            plan = Plan([*plan.segments, hold], math.inf, final, plan.guard)
+        return plan
+
+    def _optimal(self, state: State, final: State, bounds: Bounds, exact_s: float | None) -> Plan:
+        given = self._input
+        given.control_interface = ruckig.ControlInterface.Position
+        given.target_position = [final[0]]
+        given.target_velocity = [final[1]]
+        given.target_acceleration = [final[2]]
+        given.minimum_duration = exact_s
+        segments = self._calculate(state, bounds) or [(0.0, *final, 0.0, 0.0, 0.0)]
+        duration = self._trajectory.duration
+        if exact_s is not None:
+            if duration > exact_s + TIME_TOLERANCE_S:
+                shortest = self._trajectory.independent_min_durations[0]
+                raise InfeasibleError(
+                    f"time {exact_s:g} s is too short for {state[0]:g} to {final[0]:g}; at least {shortest:g} s"
+                )
+            if duration < exact_s:
+                segments.append((exact_s - duration, final[0], final[1], 0.5 * final[2], 0.0, 0.0, 0.0))
+            duration = exact_s
+        low, high = _extent(segments)
+        guard = low < bounds.minimum - 1e-9 or high > bounds.maximum + 1e-9
+        return Plan(segments, duration, final, guard)
+
+    def _velocity(self, goal: float, duration: float, state: State, bounds: Bounds) -> Plan:
+        given = self._input
+        given.control_interface = ruckig.ControlInterface.Velocity
+        given.target_velocity = [goal]
+        given.target_acceleration = [0.0]
+        given.minimum_duration = None
+        segments = self._calculate(state, bounds)
+        reached = sum(s[0] for s in segments)
+        position = _end(segments[-1])[0] if segments else state[0]
+        segments.append((math.inf, position, goal, 0.0, 0.0, 0.0, 0.0))
+        if math.isinf(duration):
+            return Plan(segments, duration, (position, goal, 0.0), True)
+        segments = _truncated(segments, duration)
+        final = _end(segments[-1])
+        return Plan(segments, duration, (final[0], goal, 0.0) if duration >= reached else final, True)
+
+    def _calculate(self, state: State, bounds: Bounds) -> list[Segment]:
+        given = self._input
+        given.current_position = [state[0]]
+        given.current_velocity = [state[1]]
+        given.current_acceleration = [state[2]]
+        given.max_velocity = [bounds.velocity]
+        given.max_acceleration = [bounds.acceleration]
+        given.max_jerk = [bounds.jerk]
+        try:
+            result = self._otg.calculate(given, self._trajectory)
+        except ruckig.RuckigError as e:
+            raise InfeasibleError(str(e).replace("\n", " ").replace("[ruckig] ", "").strip()) from e
+        if result not in (ruckig.Result.Working, ruckig.Result.Finished):
+            raise InfeasibleError(f"no profile from velocity {state[1]:g} within the limits ({result.name})")
+        return _segments(self._trajectory.profiles[0][0])
+
+
+def timed_pass(state: State, final: State, given_acceleration: bool, time: float, bounds: Bounds) -> Plan:
+    """Return the quintic from state to final in exactly ``time`` [s].
+
+    Without a commanded acceleration the end takes that of the cubic through both positions and
+    velocities (0 when it ends at rest): it depends on commanded values alone, so pieces of a
+    sampled curve join with continuous acceleration and errors do not travel along.
+
+    Raises:
+        InfeasibleError: the piece leaves the limits of position, velocity or acceleration.
+    """
+    p0, v0, a0 = state
+    p1, v1, a1 = final
+    if not given_acceleration and v1 != 0.0:
+        a1 = (2 * v0 + 4 * v1) / time - 6 * (p1 - p0) / time**2
+    d = p1 - p0
+    c3 = (10 * d / time - 6 * v0 - 4 * v1) / time**2 - (3 * a0 - a1) / (2 * time)
+    c4 = (-15 * d / time + 8 * v0 + 7 * v1) / time**3 + (3 * a0 - 2 * a1) / (2 * time**2)
+    c5 = (6 * d / time - 3 * (v0 + v1)) / time**4 - (a0 - a1) / (2 * time**3)
+    segment = (time, p0, v0, 0.5 * a0, c3, c4, c5)
+    _check_quintic(segment, bounds)
+    return Plan([segment], time, (p1, v1, a1), False)
+
+
+def _check_quintic(segment: Segment, bounds: Bounds) -> None:
+    t, p0, v0, c2, c3, c4, c5 = segment
+    # Bernstein coefficients enclose a polynomial: most pieces are cleared by these few numbers.
+    speed, acceleration, low, high = _quintic_peaks(segment)
+    slack = 1 + 1e-6
+    if acceleration > bounds.acceleration * slack:
+        raise InfeasibleError(
+            f"the piece of {t:g} s needs an acceleration of {acceleration:g}; at most {bounds.acceleration:g}"
+        )
+    if speed > bounds.velocity * slack:
+        raise InfeasibleError(
+            f"the piece of {t:g} s needs a velocity of {speed:g}; at most {bounds.velocity:g}"
+        )
+    if low < bounds.minimum - 1e-9 or high > bounds.maximum + 1e-9:
+        raise InfeasibleError(
+            f"the piece of {t:g} s leads from {low:g} to {high:g}; limits {bounds.minimum:g} to {bounds.maximum:g}"
+        )
+
+
+def _quintic_peaks(segment: Segment) -> tuple[float, float, float, float]:
+    """Return peak speed, peak acceleration, lowest and highest position of a segment, on 33 points."""
+    t, c0, c1, c2, c3, c4, c5 = segment
+    speed = acceleration = 0.0
+    low, high = math.inf, -math.inf
+    for i in range(33):
+        x = t * i / 32
+        p = c0 + x * (c1 + x * (c2 + x * (c3 + x * (c4 + x * c5))))
+        v = c1 + x * (2 * c2 + x * (3 * c3 + x * (4 * c4 + x * 5 * c5)))
+        a = 2 * c2 + x * (6 * c3 + x * (12 * c4 + x * 20 * c5))
+        speed = max(speed, abs(v))
+        acceleration = max(acceleration, abs(a))
+        low, high = min(low, p), max(high, p)
+    return speed, acceleration, low, high
+
+
+def _velocity_goal(command: Command, state: State, bounds: Bounds) -> tuple[float, Bounds]:
+    """Return the velocity that a v/a/j command drives at, and the bounds on the way there."""
+    mode = command.control_mode
+    if mode & M.VELOCITY:
+        return max(-bounds.velocity, min(bounds.velocity, command.velocity)), bounds
+    if mode & M.ACCELERATION and command.acceleration != 0:
+        goal = math.copysign(bounds.velocity, command.acceleration)
+        size = min(abs(command.acceleration), bounds.acceleration)
+        return goal, bounds._replace(acceleration=size)
+    if mode & M.JERK and command.jerk != 0:
+        goal = math.copysign(bounds.velocity, command.jerk)
+        return goal, bounds._replace(jerk=min(abs(command.jerk), bounds.jerk))
+    if mode & M.JERK and state[2] != 0:
+        goal = math.copysign(bounds.velocity, state[2])
+        return goal, bounds._replace(acceleration=abs(state[2]))
+    ramp = 0.0 if math.isinf(bounds.jerk) else state[2] * abs(state[2]) / (2 * bounds.jerk)
+    return max(-bounds.velocity, min(bounds.velocity, state[1] + ramp)), bounds
+
+
+def _segments(profile: ruckig.Profile) -> list[Segment]:
+    segments: list[Segment] = []
+    for part in (profile.brake, profile, profile.accel):
+        durations = part.t
+        if not any(durations):
+            continue
+        p, v, a, j = part.p, part.v, part.a, part.j
+        for i, t in enumerate(durations):
+            if t > SHORTEST_S:
+                cubic = j[i] / 6 if math.isfinite(j[i]) else 0.0
+                segments.append((t, p[i], v[i], 0.5 * a[i], cubic, 0.0, 0.0))
+    return segments
+
+
+def _end(segment: Segment) -> State:
+    t, c0, c1, c2, c3, c4, c5 = segment
+    return (
+        c0 + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * c5)))),
+        c1 + t * (2 * c2 + t * (3 * c3 + t * (4 * c4 + t * 5 * c5))),
+        2 * c2 + t * (6 * c3 + t * (12 * c4 + t * 20 * c5)),
+    )
+
+
+def _truncated(segments: list[Segment], duration: float) -> list[Segment]:
+    kept: list[Segment] = []
+    left = duration
+    for segment in segments:
+        if segment[0] >= left:
+            kept.append((left, *segment[1:]))
+            break
+        kept.append(segment)
+        left -= segment[0]
+    return kept
+
+
+def _extent(segments: list[Segment]) -> tuple[float, float]:
+    """Return lowest and highest position of cubic segments (ends and turning points)."""
+    low, high = math.inf, -math.inf
+    for t, c0, c1, c2, c3, _, _ in segments:
+        for x in (0.0, t, *_turning_points(c1, c2, c3, t)):
+            p = c0 + x * (c1 + x * (c2 + x * c3))
+            low, high = min(low, p), max(high, p)
+    return low, high
+
+
+def _turning_points(c1: float, c2: float, c3: float, t: float) -> list[float]:
+    if c3 == 0:
+        roots = [-c1 / (2 * c2)] if c2 else []
+    else:
+        root = c2 * c2 - 3 * c3 * c1
+        roots = [(-c2 + s * math.sqrt(root)) / (3 * c3) for s in (1, -1)] if root > 0 else []
+    return [x for x in roots if 0 < x < t]

@@ -1,0 +1,282 @@
+"""Commands waiting to run: validation, buffers, gates (markers, synch), latches and events of a bank.
+
+Shared by the host-closed loop (AxisBank) and the drives that close their own (DriveBank), so that
+buffer, marker and latch semantics are the same for both. What runs, and when, is theirs.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.protocol.flags import AxisStatus, ControlMode
+
+from .buffers import CommandBuffers
+from .commands import WIRE_DTYPE, Command, Limits, Validator
+from .types import AxisSettings, CommandError, Event, EventKind, MarkerPort
+
+AxesLike = Sequence[int] | NDArray[np.int64]
+
+
+class CommandQueue:
+    """The waiting commands of n axes. The *head* of an axis is the command that runs next.
+
+    Arrays (n,): ``gated_synch`` and ``gated_marker`` say what the head waits for, ``latched`` holds
+    the persistent AxisStatus bits (HOMED, FAULT, EMERGENCY_STOP, FOLLOWING_ERROR, STALLED, HOMING).
+    """
+
+    def __init__(self, settings: Sequence[AxisSettings], markers: MarkerPort, capacity: int) -> None:
+        self.n = len(settings)
+        self.settings = tuple(settings)
+        self.limits = Limits(settings)
+        self.capacity = capacity
+        self.heads: list[Command | None] = [None] * self.n
+        self.has_head = np.zeros(self.n, dtype=bool)
+        self.gated_synch = np.zeros(self.n, dtype=bool)
+        self.gated_marker = np.zeros(self.n, dtype=bool)
+        self.latched = np.zeros(self.n, dtype=np.int64)
+        self.home_required = np.array([s.homing is not None and s.homing.required for s in settings], dtype=bool)
+        self._buffers = CommandBuffers(self.n, capacity)
+        self._markers = markers
+        self._validator = Validator(settings, self.limits, markers)
+        self._waiting: dict[tuple[int, int], set[int]] = {}
+        self._fault_text: dict[int, str] = {}
+        self._events: list[tuple[EventKind, Any, int, int, str]] = []
+
+    # -- writing ------------------------------------------------------------------------------
+
+    def admit(self, records: NDArray[Any], axes: AxesLike, *, replace: bool) -> NDArray[Any]:
+        """Check a written array and the state of its axes; return it as commands, nothing taken yet."""
+        if records.dtype != WIRE_DTYPE:
+            raise CommandError(errno.EINVAL, "write: the records are no axis write records; table F.3")
+        commands = self._validator.check(records, np.asarray(axes, dtype=np.int64))
+        touched = np.bincount(commands["axis"], minlength=self.n)
+        self._check_latches(np.flatnonzero(touched))
+        full = touched > (self.capacity if replace else self.room_of_all())
+        if full.any():
+            axis = int(full.argmax())
+            room = self.capacity if replace else int(self.room_of_all()[axis])
+            raise CommandError(
+                errno.EAGAIN if touched[axis] <= self.capacity else errno.EINVAL,
+                f"write axis {axis} ({self.settings[axis].name}): {touched[axis]} commands do not fit; "
+                f"room for {room} of {self.capacity}",
+            )
+        return commands
+
+    def _check_latches(self, axes: NDArray[np.int64]) -> None:
+        latched = self.latched[axes]
+        homed = (latched & int(AxisStatus.HOMED)) != 0
+        barred = (latched & int(AxisStatus.EMERGENCY_STOP | AxisStatus.FAULT | AxisStatus.HOMING)) != 0
+        barred |= self.home_required[axes] & ~homed
+        if not barred.any():
+            return
+        axis = int(axes[barred.argmax()])
+        bits, what = int(self.latched[axis]), f"write axis {axis} ({self.settings[axis].name}): "
+        if bits & AxisStatus.EMERGENCY_STOP:
+            raise CommandError(errno.EPERM, what + "stopped by emergency stop; RESET first")
+        if bits & AxisStatus.FAULT:
+            raise CommandError(errno.EIO, what + f"in fault ({self.fault_text(axis)}); RESET first")
+        if bits & AxisStatus.HOMING:
+            raise CommandError(errno.EBUSY, what + "homing; wait until it is idle")
+        raise CommandError(errno.EPERM, what + "home required; HOME first")
+
+    def append(self, commands: NDArray[Any]) -> NDArray[np.int64]:
+        """Take admitted commands; return the axes touched, each of which now has a head."""
+        if not len(commands):
+            return np.zeros(0, dtype=np.int64)
+        touched = self._buffers.append(commands)
+        self.load_heads(touched)
+        return touched
+
+    def room_of_all(self) -> NDArray[np.int64]:
+        """Return how many commands each axis has room for."""
+        room: NDArray[np.int64] = self.capacity - self._buffers.count - self.has_head
+        return room
+
+    def count(self, out: NDArray[np.int64]) -> None:
+        """Write the number of commands that wait, per axis, into out (n,)."""
+        np.add(self._buffers.count, self.has_head, out=out, casting="unsafe")
+
+    # -- heads and gates ----------------------------------------------------------------------
+
+    def load_heads(self, axes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Make the oldest command of each of these axes its head; return the axes that gained one."""
+        lacking = axes[~self.has_head[axes] & (self._buffers.count[axes] > 0)]
+        for axis in lacking.tolist():
+            command = self._buffers.pop(axis)
+            if command is None:
+                continue
+            self.heads[axis] = command
+            self.has_head[axis] = True
+            if command.control_mode & ControlMode.WAIT_FOR_EXTERNAL_SYNCH:
+                self.gated_synch[axis] = True
+            if command.control_mode & ControlMode.SPECIFIED_WAIT_MARKER:
+                self._wait_for(axis, command)
+        return lacking
+
+    def _wait_for(self, axis: int, command: Command) -> None:
+        key = (command.wait_marker_number, command.wait_generation)
+        if self._markers.state(*key) is True:
+            return
+        self.gated_marker[axis] = True
+        self._waiting.setdefault(key, set()).add(axis)
+
+    @property
+    def waits_for_markers(self) -> bool:
+        """Tell whether any head waits for a marker."""
+        return bool(self._waiting)
+
+    def poll_markers(self) -> tuple[list[int], list[tuple[int, int]]]:
+        """Look at the markers that heads wait for, once each.
+
+        Returns:
+            the axes released, and (axis, marker number) of those whose marker was freed.
+        """
+        released: list[int] = []
+        broken: list[tuple[int, int]] = []
+        for (number, generation), axes in list(self._waiting.items()):
+            state = self._markers.state(number, generation)
+            if state is False:
+                continue
+            del self._waiting[number, generation]
+            self.gated_marker[list(axes)] = False
+            if state is None:
+                broken.extend((axis, number) for axis in sorted(axes))
+            else:
+                released.extend(sorted(axes))
+        return released, broken
+
+    def signal(self, number: int, generation: int, now_ns: int) -> None:
+        """Signal the marker of a command that ended."""
+        self._markers.signal(number, generation, now_ns)
+
+    def clear(self, axes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Drop all waiting commands of these axes; return the axes that had any."""
+        had = axes[self.has_head[axes] | (self._buffers.count[axes] > 0)]
+        self._buffers.clear(axes)
+        for axis in axes[self.gated_marker[axes]].tolist():
+            for key in [k for k, waiting in self._waiting.items() if axis in waiting]:
+                self._waiting[key].discard(axis)
+                if not self._waiting[key]:
+                    del self._waiting[key]
+        for axis in axes[self.has_head[axes]].tolist():
+            self.heads[axis] = None
+        self.has_head[axes] = False
+        self.gated_synch[axes] = False
+        self.gated_marker[axes] = False
+        return had
+
+    # -- limits and coordinates ---------------------------------------------------------------
+
+    def check_calibration(
+        self, axes: NDArray[np.int64], positions: NDArray[np.float64], idle: NDArray[np.bool_]
+    ) -> None:
+        """Raise when one of these axes may not be given this coordinate now."""
+        for axis, value, free in zip(axes.tolist(), positions.tolist(), idle.tolist(), strict=True):
+            what = f"calibrate axis {axis} ({self.settings[axis].name}): "
+            if not np.isfinite(value):
+                raise CommandError(errno.EINVAL, what + f"position is {value}; a finite number")
+            if not free:
+                raise CommandError(errno.EBUSY, what + "it moves or has commands; wait until it is idle")
+            low, high = self.limits.minimum[axis], self.limits.maximum[axis]
+            if not low <= value <= high:
+                raise CommandError(
+                    errno.ERANGE, what + f"position {value:g} is outside the soft limits; {low:g} to {high:g}"
+                )
+
+    def set_limits(
+        self, axes: AxesLike, limits: dict[str, float | None], position: NDArray[np.float64]
+    ) -> None:
+        """Set limits of axes; a value of None returns to the configured one.
+
+        Args:
+            axes: bank axes.
+            limits: any of position_min, position_max, velocity_max, acceleration_max, jerk_max,
+                force_max; never wider than configured.
+            position: present positions (n,), which must stay inside.
+
+        Raises:
+            CommandError: EINVAL for an unknown name or number, ERANGE when wider than configured or
+                when the axis stands outside; then nothing is changed.
+        """
+        changes: list[tuple[NDArray[np.float64], int, float]] = []
+        for axis in np.asarray(axes).tolist():
+            for name, value in limits.items():
+                changes.append((self._limit_array(name), axis, self._checked_limit(axis, name, value, position)))
+        for array, axis, value in changes:
+            array[axis] = value
+
+    def _limit_array(self, name: str) -> NDArray[np.float64]:
+        arrays = {
+            "position_min": self.limits.minimum,
+            "position_max": self.limits.maximum,
+            "velocity_max": self.limits.velocity,
+            "acceleration_max": self.limits.acceleration,
+            "jerk_max": self.limits.jerk,
+            "force_max": self.limits.force,
+        }
+        if name not in arrays:
+            raise CommandError(errno.EINVAL, f"set limits: no limit {name!r}; one of {', '.join(arrays)}")
+        return arrays[name]
+
+    def _checked_limit(self, axis: int, name: str, value: float | None, position: NDArray[np.float64]) -> float:
+        what = f"set limits of axis {axis} ({self.settings[axis].name}): "
+        configured = getattr(self.settings[axis], name)
+        lower = name == "position_min"
+        widest = (-np.inf if lower else np.inf) if configured is None else float(configured)
+        wanted = widest if value is None else float(value)
+        if np.isnan(wanted) or (not name.startswith("position") and wanted <= 0):
+            raise CommandError(errno.EINVAL, what + f"{name} {wanted:g}; a positive number")
+        if wanted < widest if lower else wanted > widest:
+            raise CommandError(errno.ERANGE, what + f"{name} {wanted:g} is wider than configured; {widest:g}")
+        if (lower and position[axis] < wanted) or (name == "position_max" and position[axis] > wanted):
+            raise CommandError(
+                errno.ERANGE, what + f"{name} {wanted:g}, but the axis stands at {position[axis]:g}; move it inside"
+            )
+        return wanted
+
+    def get_limits(self, axis: int) -> dict[str, float | None]:
+        """Return the limits of an axis in force, None where there is none."""
+        names = ("position_min", "position_max", "velocity_max", "acceleration_max", "jerk_max", "force_max")
+        values = {name: float(self._limit_array(name)[axis]) for name in names}
+        return {name: value if np.isfinite(value) else None for name, value in values.items()}
+
+    # -- latches and events -------------------------------------------------------------------
+
+    def latch_fault(self, axes: NDArray[np.int64], text: str, now_ns: int, errno_: int = errno.EIO) -> None:
+        """Set the fault latch of these axes with its reason; the first reason stays."""
+        fresh = axes[(self.latched[axes] & int(AxisStatus.FAULT)) == 0]
+        if not fresh.size:
+            return
+        self.latched[fresh] |= int(AxisStatus.FAULT)
+        for axis in fresh.tolist():
+            self._fault_text[axis] = text
+        self.emit(EventKind.FAULT, fresh, now_ns, errno_, text)
+
+    def fault_text(self, axis: int) -> str:
+        """Return why an axis is in fault, empty when it is not."""
+        return self._fault_text.get(axis, "")
+
+    def unlatch(self, axes: NDArray[np.int64]) -> None:
+        """Clear emergency stop and fault of these axes."""
+        bits = AxisStatus.EMERGENCY_STOP | AxisStatus.FAULT | AxisStatus.FOLLOWING_ERROR | AxisStatus.STALLED
+        self.latched[axes] &= ~int(bits)
+        for axis in axes.tolist():
+            self._fault_text.pop(axis, None)
+
+    def emit(
+        self, kind: EventKind, axes: NDArray[np.int64], stamp_ns: int, errno_: int = 0, text: str = ""
+    ) -> None:
+        """Note an event; it becomes an Event when it is taken."""
+        if axes.size:
+            self._events.append((kind, axes, stamp_ns, errno_, text))
+
+    def take_events(self) -> list[Event]:
+        """Return the events since the last call, oldest first."""
+        events = [Event(k, tuple(a.tolist()), t, e, text) for k, a, t, e, text in self._events]
+        self._events.clear()
+        return events

@@ -1,0 +1,188 @@
+"""Plans of all axes as arrays, evaluated at one instant by one vectorised Horner scheme.
+
+Every axis has two rows: the plan that runs and the one made ahead. Starting a plan made ahead
+flips the row and copies nothing. Instants are integer nanoseconds plus a fraction in [0, 1) that
+is carried from command to command, so that a trajectory of many pieces does not drift.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .profile import MAX_SEGMENTS, Plan
+
+NEVER_NS = 2**62
+UNCUT_NS = 2**63 - 1
+Axes = NDArray[np.int64]
+
+
+class PlanStore:
+    """Two plans per axis and the segment of the running one that holds now.
+
+    Arrays (n,): ``start_ns``, ``start_fraction`` begin of the running plan; ``segment_ns`` and
+    ``end_ns`` begin and end of its present segment; ``cut_ns`` where the plan is made to end. ``final`` (2n, 3), ``duration`` (2n,) belong
+    to rows; ``row`` (n,) is the running row of an axis, ``row ^ 1`` the other.
+    """
+
+    def __init__(self, n: int) -> None:
+        self.row = 2 * np.arange(n, dtype=np.int64)
+        self.start_ns = np.zeros(n, dtype=np.int64)
+        self.start_fraction = np.zeros(n)
+        self.segment_ns = np.zeros(n, dtype=np.int64)
+        self.end_ns = np.full(n, NEVER_NS, dtype=np.int64)
+        self.cut_ns = np.full(n, UNCUT_NS, dtype=np.int64)
+        self.next_ns = NEVER_NS
+        self.duration = np.full(2 * n, np.inf)
+        self.final = np.zeros((2 * n, 3))
+        self._segment = np.zeros(n, dtype=np.int64)
+        self._count = np.ones(2 * n, dtype=np.int64)
+        self._ends = np.full((2 * n, MAX_SEGMENTS), np.inf)
+        self._coefficients = np.zeros((2 * n, MAX_SEGMENTS, 6))
+        self._present = np.zeros((6, n))
+        self._order = 3
+        self._dt = np.zeros(n)
+        self._integer = np.zeros(n, dtype=np.int64)
+
+    def put(self, row: int, plan: Plan) -> None:
+        """Write a plan into a row."""
+        count = len(plan.segments)
+        table = np.array(plan.segments)
+        self._coefficients[row, :count] = table[:, 1:]
+        np.cumsum(table[:, 0], out=self._ends[row, :count])
+        self._ends[row, count - 1] = plan.duration
+        self._count[row] = count
+        self.duration[row] = plan.duration
+        self.final[row] = plan.final
+
+    def put_hold(self, rows: Axes, position: NDArray[np.float64]) -> None:
+        """Write 'rest at position until something comes' into rows."""
+        self._coefficients[rows, 0] = 0.0
+        self._coefficients[rows, 0, 0] = position
+        self._ends[rows, 0] = np.inf
+        self._count[rows] = 1
+        self.duration[rows] = np.inf
+        self.final[rows] = 0.0
+        self.final[rows, 0] = position
+
+    def put_brake(
+        self,
+        rows: Axes,
+        position: NDArray[np.float64],
+        velocity: NDArray[np.float64],
+        deceleration: NDArray[np.float64],
+    ) -> None:
+        """Write 'stop from (position, velocity) at constant deceleration > 0' into rows."""
+        duration = np.abs(velocity) / deceleration
+        self._coefficients[rows, 0] = 0.0
+        self._coefficients[rows, 0, 0] = position
+        self._coefficients[rows, 0, 1] = velocity
+        self._coefficients[rows, 0, 2] = -0.5 * np.copysign(deceleration, velocity)
+        self._ends[rows, 0] = duration
+        self._count[rows] = 1
+        self.duration[rows] = duration
+        self.final[rows] = 0.0
+        self.final[rows, 0] = position + 0.5 * velocity * duration
+
+    def begin(self, axes: Axes, start_ns: NDArray[np.int64], fraction: NDArray[np.float64]) -> None:
+        """Let the plans in the running rows of these axes begin at start + fraction [ns]."""
+        self.start_ns[axes] = start_ns
+        self.start_fraction[axes] = fraction
+        self._segment[axes] = 0
+        self.segment_ns[axes] = start_ns
+        self.cut_ns[axes] = UNCUT_NS
+        self._load(axes)
+
+    def flip(self, axes: Axes) -> None:
+        """Make the other row the running one; begin() follows."""
+        self.row[axes] ^= 1
+
+    def shift(self, axes: Axes, by: float) -> None:
+        """Add to the position of all plans of these axes, running and made ahead."""
+        for rows in (self.row[axes], self.row[axes] ^ 1):
+            self._coefficients[rows, :, 0] += by
+            self.final[rows, 0] += by
+        self._present[0, axes] += by
+
+    def advance(self, axes: Axes) -> Axes:
+        """Go to the next segment of axes whose segment ended; return those whose plan ended."""
+        cut = self.end_ns[axes] >= self.cut_ns[axes]
+        if cut.any():
+            self._end_here(axes[cut])
+        more = ~cut & (self._segment[axes] + 1 < self._count[self.row[axes]])
+        going = axes[more]
+        if going.size:
+            self.segment_ns[going] = self.end_ns[going]
+            self._segment[going] += 1
+            self._load(going)
+        return axes[~more]
+
+    def _end_here(self, axes: Axes) -> None:
+        rows, cut_ns = self.row[axes], self.cut_ns[axes]
+        self.final[rows] = self.state(axes, cut_ns)
+        self.start_ns[axes] = cut_ns
+        self.start_fraction[axes] = 0.0
+        self.duration[rows] = 0.0
+
+    def _load(self, axes: Axes) -> None:
+        rows, segment = self.row[axes], self._segment[axes]
+        present = self._coefficients[rows, segment]
+        self._present[:, axes] = present.T
+        if self._order == 3 and present[:, 4:].any():
+            self._order = 5
+        end = np.minimum(self._ends[rows, segment] * 1e9 + self.start_fraction[axes], float(NEVER_NS))
+        # The fraction decides nothing here: it is below a nanosecond, and carried by finish().
+        end_ns = np.minimum(self.start_ns[axes] + np.ceil(end).astype(np.int64), NEVER_NS)
+        self.end_ns[axes] = np.minimum(end_ns, self.cut_ns[axes])
+        self.next_ns = min(self.next_ns, int(self.end_ns[axes].min()))
+
+    def due(self, now_ns: int) -> Axes:
+        """Return the axes whose segment has ended, and note when the next one ends."""
+        axes = np.flatnonzero(self.end_ns <= now_ns)
+        if not axes.size:
+            self.next_ns = int(self.end_ns.min())
+        return axes
+
+    def ended_at(self, axes: Axes) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the exact instants, ns and fraction, at which the running plans end."""
+        total = self.start_fraction[axes] + self.duration[self.row[axes]] * 1e9
+        whole = np.floor(total)
+        return self.start_ns[axes] + whole.astype(np.int64), total - whole
+
+    def cut(self, axes: Axes, end_ns: int) -> None:
+        """Let running plans end exactly at end_ns (not in the past of their segments), whatever they do then."""
+        self.cut_ns[axes] = end_ns
+        self.end_ns[axes] = np.minimum(self.end_ns[axes], end_ns)
+        self.next_ns = min(self.next_ns, end_ns)
+
+    def state(self, axes: Axes, now_ns: int | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return position, velocity, acceleration (m, 3) of the present segments at now."""
+        t = (now_ns - self.segment_ns[axes]) * 1e-9
+        c0, c1, c2, c3, c4, c5 = self._present[:, axes]
+        position = c0 + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * c5))))
+        velocity = c1 + t * (2 * c2 + t * (3 * c3 + t * (4 * c4 + t * 5 * c5)))
+        acceleration = 2 * c2 + t * (6 * c3 + t * (12 * c4 + t * 20 * c5))
+        return np.stack((position, velocity, acceleration), axis=1)
+
+    def evaluate(self, now_ns: int, position: NDArray[np.float64], velocity: NDArray[np.float64]) -> None:
+        """Write the set-points of all axes at now into position and velocity (n,).
+
+        Horner with the derivative carried along; quintic terms only while some axis has them.
+        """
+        t, c = self._dt, self._present
+        np.subtract(now_ns, self.segment_ns, out=self._integer)
+        np.multiply(self._integer, 1e-9, out=t)
+        order = self._order
+        np.multiply(c[order], t, out=position)
+        position += c[order - 1]
+        velocity[:] = c[order]
+        for i in range(order - 2, -1, -1):
+            velocity *= t
+            velocity += position
+            position *= t
+            position += c[i]
+
+    def settle_order(self) -> None:
+        """Drop the quintic terms again when no axis has any (called between ticks)."""
+        if self._order == 5 and not self._present[4:].any():
+            self._order = 3

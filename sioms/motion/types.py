@@ -1,0 +1,158 @@
+"""What the motion core says to its host: settings of an axis, errors, events, and the marker seam."""
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+from sioms.protocol.flags import ControlMode
+
+SWITCH_MINUS, SWITCH_PLUS, SWITCH_HOME = 1, 2, 4
+"""Bits of an axis in the ``switches`` argument of AxisBank.tick()."""
+EVERY_MODE = ControlMode(0x7FFF)
+
+
+class CommandError(Exception):
+    """A command is refused; nothing of the written array was taken.
+
+    Args:
+        errno_: POSIX errno that a client sees (EINVAL, ERANGE, EAGAIN, EPERM, EBUSY, EIO).
+        text: sentence that names axis, field, value and unit, and what would be accepted.
+    """
+
+    def __init__(self, errno_: int, text: str) -> None:
+        super().__init__(text)
+        self.errno = errno_
+
+
+class MarkerPort(Protocol):
+    """The marker table as the motion core needs it; the kit binds it to shared memory."""
+
+    def capture(self, token_or_number: int, *, signal: bool) -> tuple[int, int]:
+        """Return (number, generation) of a marker named in a record.
+
+        Args:
+            token_or_number: token, or for waiting also the bare number.
+            signal: True when the record wants to signal it, which needs the key.
+
+        Raises:
+            CommandError: EINVAL when the marker is not reserved, EPERM when the key is wrong.
+        """
+
+    def state(self, number: int, generation: int) -> bool | None:
+        """Tell whether this generation was signalled; None when it was freed."""
+
+    def signal(self, number: int, generation: int, now_ns: int) -> None:
+        """Signal this generation once."""
+
+
+class AxisKind(Enum):
+    """What the host drives. SERVO takes a force or torque, STEPPER takes a position."""
+
+    SERVO = "servo"
+    STEPPER = "stepper"
+
+
+class EventKind(Enum):
+    """What happened to axes in a tick or a verb."""
+
+    STARTED = "started"
+    ENDED = "ended"
+    IDLE = "idle"
+    DROPPED = "dropped"
+    """The buffer was emptied without being asked for by its writer; errno and text say why."""
+    FAULT = "fault"
+    HOMED = "homed"
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One thing that happened at once to one or many axes.
+
+    Args:
+        kind: what happened.
+        axes: bank axes it happened to.
+        stamp_ns: instant [ns]; for STARTED, ENDED and IDLE the tick that saw it.
+        errno: for DROPPED and FAULT the errno that waiters receive, else 0.
+        text: for DROPPED and FAULT the reason.
+    """
+
+    kind: EventKind
+    axes: tuple[int, ...]
+    stamp_ns: int
+    errno: int = 0
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Homing:
+    """How an axis finds its reference.
+
+    Fast search towards the home switch, slow release from it; the instant of release is the
+    reference. An end switch in the way turns the search round once.
+
+    Args:
+        velocity: search velocity [unit/s], > 0.
+        slow_velocity: velocity of the slow pass that sets the accuracy [unit/s], > 0.
+        direction: -1 or +1, where the home switch is searched first.
+        offset: position of the switch's edge in the axis' coordinates [unit].
+        switch: "home", "minus" or "plus": which switch is the reference.
+        travel: search gives up after this distance [unit].
+        required: writes are refused (EPERM) until the axis is homed.
+    """
+
+    velocity: float
+    slow_velocity: float
+    direction: int = -1
+    offset: float = 0.0
+    switch: str = "home"
+    travel: float = float("inf")
+    required: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class AxisSettings:
+    """One axis as configured. Lengths in ``unit`` (m or rad), forces in N or N*m.
+
+    The gains are those of the servo law, dissertation section F.2.4:
+    ``u[n] = k (e[n] + kz e[n-1]) - kp tau[n-1] + kb v[n] + tau_o``. Note the sign: damping is
+    ``kb < 0``. A stepper's gains default to dead-beat slewing, k = 1/tick, the rest 0.
+
+    Args:
+        name: name for messages.
+        kind: servo or stepper.
+        unit: "m" or "rad".
+        position_min: lower soft limit, None when there is none.
+        position_max: upper soft limit, None when there is none.
+        velocity_max: > 0 [unit/s].
+        acceleration_max: > 0 [unit/s^2].
+        jerk_max: > 0 [unit/s^3], None when unlimited.
+        force_max: > 0 [N or N*m]; servo only.
+        velocity_filter_s: time constant of the velocity filter [s].
+        following_error_max: [unit], None when not watched.
+        homing: None when the axis cannot be homed.
+        modes: control-mode flags that a drive offers (drives that close their own loop).
+    """
+
+    name: str
+    kind: AxisKind = AxisKind.SERVO
+    unit: str = "m"
+    position_min: float | None = None
+    position_max: float | None = None
+    velocity_max: float = 1.0
+    acceleration_max: float = 10.0
+    jerk_max: float | None = None
+    force_max: float = 1.0
+    k: float | None = None
+    kz: float = 0.0
+    kp: float = 0.0
+    kb: float = 0.0
+    force_offset: float = 0.0
+    velocity_filter_s: float = 0.0
+    following_error_max: float | None = None
+    homing: Homing | None = None
+    modes: ControlMode = EVERY_MODE
+
+    @property
+    def force_unit(self) -> str:
+        """Unit of force that belongs to ``unit``."""
+        return "N*m" if self.unit == "rad" else "N"
