@@ -1,0 +1,270 @@
+"""Register maps: a Modbus device family described in one TOML file, without code.
+
+A map tells how a device is identified, which registers are read in every poll, what their numbers
+mean in SI units, what the bits of the status say, which writes make up a command and whether it may
+be repeated, how it is stopped, what dead-man it has, and its alarm codes. ``docs/register-maps.md``
+explains every key by example; the structs below are the schema.
+
+:func:`load_map` reports all errors of a file at once, each with the place, what is wrong and what would be right.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from . import regmap_check
+from .registers import Rounding, TypeName, WordOrder, width
+
+Table = Literal["holding", "input", "coil", "discrete"]
+
+
+class Schema(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Base of the schema: unknown keys are errors."""
+
+
+class Signal(Schema, frozen=True):
+    """A value, or an array of values, in registers or bits.
+
+    Args:
+        address: of the first register or bit.
+        type: of one value; coils and discrete inputs have none.
+        table: where it is.
+        count: number of values, one after the other.
+        words: length of a text [registers].
+        unit, scale, offset: SI = (raw + offset) * scale * unit.
+        word_order: of 32-bit values, when it differs from the map's.
+        verified: False for what was not tried on a device or found in the vendor's documents.
+        note: free text.
+    """
+
+    address: int
+    type: TypeName = "u16"
+    table: Table = "holding"
+    count: int = 1
+    words: int = 0
+    unit: str = ""
+    scale: float = 1.0
+    offset: float = 0.0
+    word_order: WordOrder | None = None
+    verified: bool = True
+    note: str = ""
+
+    @property
+    def is_bits(self) -> bool:
+        """Whether it lies among coils or discrete inputs."""
+        return self.table in ("coil", "discrete")
+
+    @property
+    def span(self) -> int:
+        """Number of registers, or bits, that it covers."""
+        return self.count if self.is_bits else self.count * width(self.type, self.words)
+
+
+class Identify(Schema, frozen=True):
+    """One test of identity: the signal must lie in a range, or contain a text."""
+
+    signal: str
+    minimum: float | None = None
+    maximum: float | None = None
+    contains: str | None = None
+    equals_setting: str | None = None
+    """Name of a setting of the device that it must equal, e.g. ``pulses_per_turn``."""
+
+
+class Bit(Schema, frozen=True):
+    """A bit of a signal of the status."""
+
+    signal: str
+    bit: int
+    inverted: bool = False
+
+
+class Item(Schema, frozen=True):
+    """One value of a write: a constant, or a quantity of the command converted to the unit.
+
+    Args:
+        type: of the registers.
+        value: the constant.
+        source: name of the quantity: position, velocity, acceleration, deceleration, speed (|velocity|) ...
+        unit, scale: as for a signal.
+        minimum, maximum: raw numbers that the device accepts.
+        round: "down" never passes the asked value in size, "up" never stays below it.
+    """
+
+    type: TypeName = "u16"
+    value: int | None = None
+    source: str | None = None
+    unit: str = ""
+    scale: float = 1.0
+    minimum: int | None = None
+    maximum: int | None = None
+    round: Rounding = "nearest"
+
+
+class Write(Schema, frozen=True):
+    """One message to the device: items into consecutive registers, or one coil."""
+
+    address: int
+    items: tuple[Item, ...]
+    table: Literal["holding", "coil"] = "holding"
+    function: Literal["single", "multiple"] = "multiple"
+    pause_s: float = 0.0
+    """Time that the device needs after it [s]."""
+
+
+class Command(Schema, frozen=True):
+    """Writes that belong together.
+
+    Args:
+        writes: in order.
+        repeat: whether the whole may be sent again after a failed exchange; never for relative moves,
+            jog starts, "position := x" and EEPROM writes.
+        verified: as for a signal.
+    """
+
+    writes: tuple[Write, ...]
+    repeat: bool = False
+    verified: bool = True
+    note: str = ""
+
+
+class DeadMan(Schema, frozen=True):
+    """What the device itself does when its host falls silent.
+
+    Args:
+        by: "refresh": a command must be sent again within ``timeout_s``; "link": any message counts;
+            "none": the device goes on.
+        timeout_s: of the device [s].
+        covers: control modes that end by it.
+        refresh: commands that must be sent again (by = "refresh").
+    """
+
+    by: Literal["refresh", "link", "none"] = "none"
+    timeout_s: float = 0.0
+    covers: tuple[str, ...] = ()
+    refresh: tuple[str, ...] = ()
+    note: str = ""
+
+
+class Alarms(Schema, frozen=True):
+    """Alarm codes as text; keys are numbers, decimal or 0x…"""
+
+    signal: str
+    codes: dict[str, str] = {}
+    lasting: tuple[int, ...] = ()
+    """Codes that only a power cycle clears."""
+    bitmask: bool = False
+    """The signal is a set of flags, not a number."""
+
+
+class Axis(Schema, frozen=True):
+    """What makes the device an axis.
+
+    Args:
+        modes: control modes that exist: POSITION, VELOCITY, FORCE; each has a command of its name in lower case.
+        position, velocity: signals of the readings; without velocity the position is differentiated.
+        status: names of :data:`STATUS_NAMES` to bits.
+    """
+
+    modes: tuple[str, ...]
+    position: str
+    velocity: str | None = None
+    status: dict[str, Bit] = {}
+
+
+class Port(Schema, frozen=True):
+    """A block of binary or analog channels.
+
+    Args:
+        signal: its values; the number of channels is the model's, or the setting's.
+        node_class: binary (bits make one port) or analog.
+        name: of the node, when it differs from the port's.
+        writable: whether clients may write it.
+        minimum, maximum: accepted analog values [SI].
+    """
+
+    signal: str
+    node_class: Literal["binary", "analog"]
+    name: str = ""
+    writable: bool = False
+    minimum: float | None = None
+    maximum: float | None = None
+
+
+class RegisterMap(Schema, frozen=True, kw_only=True):
+    """A device family."""
+
+    family: str
+    title: str
+    source: str
+    word_order: WordOrder = "big"
+    turnaround_s: float = 0.1
+    gap_s: float = 0.0
+    """Silence that the device needs between frames, beyond the line's own [s]."""
+    merge_gap: int = 0
+    """Unused registers that a read may cross to join two signals; 0 where they may be illegal."""
+    identify: tuple[Identify, ...] = ()
+    poll: dict[str, tuple[str, ...]] = {}
+    """Group name to signals: "always" in each poll, "seldom" about once a second, "open" once."""
+    signals: dict[str, Signal]
+    commands: dict[str, Command] = {}
+    axis: Axis | None = None
+    ports: dict[str, Port] = {}
+    models: dict[str, dict[str, int]] = {}
+    """Model name to the number of channels of each port."""
+    dead_man: DeadMan = DeadMan()
+    alarms: Alarms | None = None
+
+
+class RegisterMapError(ValueError):
+    """A map is wrong.
+
+    Attributes:
+        problems: one sentence each, with the place in the file.
+    """
+
+    def __init__(self, where: str, problems: list[str]) -> None:
+        super().__init__("\n".join(f"read register map {where}: {problem}" for problem in problems))
+        self.problems = problems
+
+
+def parse_map(document: Mapping[str, Any], where: str) -> RegisterMap:
+    """Return the checked map.
+
+    Raises:
+        RegisterMapError: with all problems of the document.
+    """
+    problems = regmap_check.schema_problems(document, RegisterMap)
+    if not problems:
+        result = msgspec.convert(document, RegisterMap)
+        problems = regmap_check.meaning_problems(result)
+        if not problems:
+            return result
+    raise RegisterMapError(where, problems)
+
+
+def load_map(path: Path, overrides: Mapping[str, Any] | None = None) -> RegisterMap:
+    """Return the map in a TOML file, with the keys of ``overrides`` put over it.
+
+    Raises:
+        RegisterMapError: unreadable or wrong.
+    """
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise RegisterMapError(str(path), [str(error)]) from None
+    return parse_map(_merged(document, overrides or {}), str(path))
+
+
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    result = dict(below)
+    for key, value in above.items():
+        old = result.get(key)
+        both = isinstance(old, Mapping) and isinstance(value, Mapping)
+        result[key] = _merged(old, value) if both else value  # type: ignore[arg-type]
+    return result

@@ -1,0 +1,119 @@
+"""Register maps: the shipped ones hold, and each mistake is named with its place and its cure."""
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import sioms.drivers
+from sioms.sdk.regmap import RegisterMapError, load_map, parse_map
+
+MAPS = Path(sioms.drivers.__file__).parent / "maps"
+
+
+@pytest.mark.parametrize("path", sorted(MAPS.glob("*.toml")), ids=lambda path: path.stem)
+def test_shipped_maps_hold(path: Path) -> None:
+    assert load_map(path).family == path.stem
+
+
+def leadshine() -> dict[str, Any]:
+    return tomllib.loads((MAPS / "leadshine.toml").read_text())
+
+
+def put(document: dict[str, Any], place: str, value: Any) -> None:
+    *path, last = place.split("/")
+    node: Any = document
+    for key in path:
+        node = node[int(key)] if isinstance(node, list) else node.setdefault(key, {})
+    if isinstance(node, list):
+        node[int(last)] = value
+    else:
+        node[last] = value
+
+
+ITEM = "commands/position/writes/0/items/2"
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "sentence"),
+    [
+        ("signals/position/adress", 1, "signals.position.adress: unknown key; did you mean address"),
+        ("signals/position/address", "x", "signals.position.address = 'x': expected `int`, got `str`"),
+        ("signals/position/type", "int32", "signals.position.type = 'int32': invalid enum value"),
+        ("signals/position/unit", "puls", "signals.position.unit: unknown unit 'puls'; did you mean pulse"),
+        (
+            "signals/position/address",
+            0x1002,
+            "inside signals.position (0x1002 to 0x1003 of the holding table)",
+        ),
+        ("signals/position/address", 0xFFFF, "address 0xffff with 2 places leaves 0 to 0xffff"),
+        ("signals/position/scale", 0, "signals.position: scale is 0; another number is right"),
+        ("signals/name", {"address": 0x100, "type": "text"}, "signals.name: a text needs words"),
+        ("signals/big", {"address": 0x8000, "count": 126}, "126 places; one message reads at most 125"),
+        ("poll/allways", ["status"], "poll.allways: unknown group; did you mean always"),
+        ("poll/seldom", ["allarm"], "poll.seldom: unknown signal allarm; did you mean alarm"),
+        ("poll/always", ["status", "velocity"], "poll.always: position is missing, the axis reads it"),
+        ("identify/0", {"signal": "status"}, "identify[0]: tests nothing"),
+        ("axis/modes", ["POSITON"], "axis.modes: unknown mode POSITON; did you mean POSITION"),
+        ("axis/modes", ["FORCE"], "axis.modes: FORCE needs commands.force"),
+        ("axis/status/moving", {"signal": "status", "bit": 16}, "bit 16 of status; 0 to 15 is right"),
+        ("axis/status", {}, "neither moving nor done"),
+        ("commands/stop/repeat", False, "commands.stop: repeat is false; a stop must be repeatable"),
+        (
+            "commands/relative/repeat",
+            True,
+            "commands.relative: repeat is true, but relative has an effect each time",
+        ),
+        ("commands/stopp", {"writes": []}, "commands.stopp: unknown command; did you mean stop"),
+        (
+            "commands/home/writes/0/items/0/value",
+            70000,
+            "70000 does not fit a register of type u16; 0 to 65535",
+        ),
+        ("commands/home/writes/0/items/0/source", "speed", "has both value and source; exactly one is right"),
+        ("commands/home/writes/0/items/0", {}, "has neither value nor source"),
+        (
+            "commands/home/writes/0/items",
+            [{"type": "u32", "value": 1}],
+            "function single writes one register, not 2",
+        ),
+        (f"{ITEM}/source", "sped", "unknown quantity sped; did you mean speed"),
+        (f"{ITEM}/unit", "pulse", "speed cannot be in 'pulse'; one of rpm, pulse/s is right"),
+        (f"{ITEM}/maximum", 70000, "maximum 70000 does not fit type u16"),
+        ("dead_man/refresh", ["jog"], "dead_man.refresh: unknown command jog"),
+        ("dead_man/timeout_s", 0.0, "dead_man.timeout_s: is 0.0 s; more than 0 is right"),
+        ("alarms/codes/high", "x", "alarms.codes: 'high' is no number"),
+        ("alarms/signal", "alarms", "alarms: unknown signal alarms; did you mean alarm"),
+        ("ports/do", {"signal": "enable", "node_class": "binary"}, "coil or discrete is right"),
+        ("modells", {}, "modells: unknown key; did you mean models"),
+    ],
+)
+def test_each_mistake_has_its_sentence(place: str, value: Any, sentence: str) -> None:
+    document = leadshine()
+    put(document, place, value)
+    with pytest.raises(RegisterMapError) as caught:
+        parse_map(document, "x.toml")
+    assert sentence in str(caught.value)
+    assert str(caught.value).startswith("read register map x.toml: ")
+
+
+def test_all_mistakes_come_at_once() -> None:
+    document = leadshine()
+    del document["title"]
+    document["signals"]["status"]["adress"] = document["signals"]["alarm"]["unitt"] = 1
+    document["axis"]["status"]["moving"]["bit"] = "two"
+    with pytest.raises(RegisterMapError) as caught:
+        parse_map(document, "x.toml")
+    assert len(caught.value.problems) == 4
+
+
+def test_overrides_and_unreadable_files(tmp_path: Path) -> None:
+    changed = load_map(MAPS / "leadshine.toml", {"signals": {"alarm": {"address": 0x2204}}})
+    assert changed.signals["alarm"].address == 0x2204
+    assert changed.signals["status"].address == 0x1003
+    with pytest.raises(RegisterMapError, match="No such file"):
+        load_map(tmp_path / "none.toml")
+    (tmp_path / "bad.toml").write_text("family = ")
+    with pytest.raises(RegisterMapError, match="Invalid value"):
+        load_map(tmp_path / "bad.toml")
