@@ -30,7 +30,9 @@ def one(effects=None, substeps=4, tick_s=TICK_S, **parameters):
 def test_moving_motor_agrees_with_quadrature():
     bank = one(mass=2.0, viscous=3.0, coulomb=1.0)
     run(bank, 8.0, 500)
-    solution = solve_ivp(lambda t, y: [y[1], (8 - 3 * y[1] - 1) / 2], (0, 0.5), [0, 0], rtol=1e-11, atol=1e-13)
+    solution = solve_ivp(
+        lambda t, y: [y[1], (8 - 3 * y[1] - 1) / 2], (0, 0.5), [0, 0], rtol=1e-11, atol=1e-13
+    )
     assert bank.position[0] == pytest.approx(solution.y[0, -1], rel=1e-9)
     assert bank.velocity[0] == pytest.approx(solution.y[1, -1], rel=1e-9)
 
@@ -71,7 +73,10 @@ def test_friction_however_stiff_never_drives():
 
 
 def test_terminal_velocity_differs_by_direction():
-    effects = {"viscous": {"coefficient": 1.0, "coefficient_minus": 3.0}, "coulomb": {"level": 0.5, "level_minus": 1}}
+    effects = {
+        "viscous": {"coefficient": 1.0, "coefficient_minus": 3.0},
+        "coulomb": {"level": 0.5, "level_minus": 1},
+    }
     plus = one(effects, mass=0.1, viscous=1.0)
     minus = one(effects, mass=0.1, viscous=1.0)
     run(plus, 6.0, 3000)

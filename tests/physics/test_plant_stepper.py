@@ -107,7 +107,12 @@ def test_switches_follow_the_rotor():
 
 @pytest.mark.parametrize(
     "change, word",
-    [({"mass": 0.0}, "mass"), ({"coulomb": 60.0}, "hold_force"), ({"mass": 1e-7}, "substeps"), ({"step": -1.0}, "step")],
+    [
+        ({"mass": 0.0}, "mass"),
+        ({"coulomb": 60.0}, "hold_force"),
+        ({"mass": 1e-7}, "substeps"),
+        ({"step": -1.0}, "step"),
+    ],
 )
 def test_refuses_what_no_stepper_can_be(change, word):
     with pytest.raises(ValueError, match=word):
