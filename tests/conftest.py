@@ -1,0 +1,188 @@
+"""Generic helpers of all tests: processes with a ready line, free names, markers, hypothesis settings."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import IO
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+# A loaded machine is no fault of the code under test: examples are counted, not timed.
+settings.register_profile("sioms", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("sioms")
+
+MARKERS = {
+    "slow": "takes more than five seconds",
+    "root": "needs the rights of root; skipped without",
+}
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    for name, meaning in MARKERS.items():
+        config.addinivalue_line("markers", f"{name}: {meaning}")
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    if item.get_closest_marker("root") and os.geteuid() != 0:
+        pytest.skip("needs the rights of root")
+
+
+class Running:
+    """A process of our own session whose output is collected line by line while it runs.
+
+    Any thread may call; the output is read by a thread of its own, so that the process never blocks on a full pipe.
+
+    Attributes:
+        process: the process; its stdin is a pipe.
+        lines: all lines of stdout and stderr so far, without their ends.
+    """
+
+    def __init__(
+        self, command: Sequence[str | os.PathLike[str]], env: Mapping[str, str], cwd: Path | None
+    ) -> None:
+        self.command = [os.fspath(part) for part in command]
+        self.process = subprocess.Popen(
+            self.command,
+            env={**os.environ, "PYTHONUNBUFFERED": "1", **env},
+            cwd=cwd,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+        self.lines: list[str] = []
+        self._news = threading.Condition()
+        self._ended = False
+        assert self.process.stdout is not None
+        self._reader = threading.Thread(target=self._collect, args=(self.process.stdout,), daemon=True)
+        self._reader.start()
+
+    def _collect(self, stream: IO[str]) -> None:
+        for line in stream:
+            with self._news:
+                self.lines.append(line.rstrip("\n"))
+                self._news.notify_all()
+        with self._news:
+            self._ended = True
+            self._news.notify_all()
+
+    def wait_line(self, pattern: str, timeout_s: float = 20.0) -> re.Match[str]:
+        """Return the first match of a regular expression in any line, old or new.
+
+        Raises:
+            AssertionError: the output ended or the time ran out; the message holds all that was said.
+        """
+        deadline = time.monotonic() + timeout_s
+        seen = 0
+        with self._news:
+            while True:
+                for line in self.lines[seen:]:
+                    if match := re.search(pattern, line):
+                        return match
+                seen = len(self.lines)
+                left = deadline - time.monotonic()
+                if self._ended or left <= 0:
+                    why = "its output ended" if self._ended else f"{timeout_s:g} s went by"
+                    raise AssertionError(self._told(f"no line matched {pattern!r} before {why}"))
+                self._news.wait(left)
+
+    def wait_exit(self, timeout_s: float = 20.0) -> int:
+        """Return the exit status (minus the signal's number after a kill), with all output collected."""
+        try:
+            status = self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(self._told(f"still running after {timeout_s:g} s")) from None
+        self._reader.join(1.0)  # a grandchild may hold the pipe open; what came until now is enough
+        return status
+
+    def signal(self, number: signal.Signals) -> None:
+        self.process.send_signal(number)
+
+    def end(self) -> None:
+        """Kill the process and everything that it started in its session."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+        self._reader.join(1.0)
+        if self.process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self.process.stdin.close()
+        if self.process.stdout is not None and not self._reader.is_alive():
+            self.process.stdout.close()
+
+    def _told(self, what: str) -> str:
+        said = "\n".join(self.lines[-60:]) or "(nothing)"
+        return f"{' '.join(self.command)}: {what}; status {self.process.poll()}; it said:\n{said}"
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., Running]]:
+    """Start processes, ``start(command, env={}, cwd=None) -> Running``; those left over are killed after the test."""
+    running: list[Running] = []
+
+    def start_one(
+        command: Sequence[str | os.PathLike[str]],
+        env: Mapping[str, str] | None = None,
+        cwd: Path | None = None,
+    ) -> Running:
+        running.append(Running(command, env or {}, cwd))
+        return running[-1]
+
+    yield start_one
+    for one in reversed(running):
+        one.end()
+
+
+@pytest.fixture
+def short_folder() -> Iterator[Path]:
+    """A fresh folder with a path short enough for the 107 bytes of a Unix socket's address."""
+    folder = Path(tempfile.mkdtemp(prefix="sioms-", dir="/tmp"))
+    yield folder
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture
+def free_name(short_folder: Path) -> Callable[[str], Path]:
+    """Make names that nobody uses: ``free_name("daemon.sock")``; each call gives another one."""
+    numbers = itertools.count()
+    return lambda name: short_folder / f"{next(numbers)}-{name}"
+
+
+@pytest.fixture
+def free_port() -> Callable[[], int]:
+    """Give TCP ports of 127.0.0.1 that were free a moment ago; let a server of our own bind port 0 instead."""
+
+    def pick() -> int:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            return int(probe.getsockname()[1])
+
+    return pick
+
+
+@pytest.fixture
+def wait_until() -> Callable[..., None]:
+    """Poll what gives no line and no event: ``wait_until(predicate, timeout_s=10.0, what="...")``."""
+
+    def wait(predicate: Callable[[], object], timeout_s: float = 10.0, what: str = "the condition") -> None:
+        deadline = time.monotonic() + timeout_s
+        while not predicate():
+            if time.monotonic() > deadline:
+                raise AssertionError(f"{what} did not come true within {timeout_s:g} s")
+            time.sleep(0.002)
+
+    return wait
