@@ -24,9 +24,10 @@ from sioms.protocol.messages import (
     refusal,
     reply,
 )
+from sioms.wording import did_you_mean
 
 from .claims import Claims
-from .config import WorkcellTable, did_you_mean
+from .config import WorkcellTable
 from .devices import DriverProcess, State
 from .marker_owners import MarkerError, MarkerOwners, Reservation
 from .names import READONLY, Node

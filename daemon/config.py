@@ -7,11 +7,12 @@ validated by the driver's ``Settings`` in the nursery, so that every device repo
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Mapping
-from difflib import get_close_matches
+from collections.abc import Mapping
 from typing import Any, Literal, TypeVar
 
 import msgspec
+
+from sioms.wording import did_you_mean, explain, field_names
 
 Table = TypeVar("Table", bound=msgspec.Struct)
 RightName = Literal["read", "write", "stop", "administer"]
@@ -88,31 +89,6 @@ class Config(msgspec.Struct, frozen=True):
 
 _SECTIONS = ("workcell", "device", "node", "grant", "emergency_stop")
 _COMMON = tuple(field.name for field in msgspec.structs.fields(DeviceTable))
-
-
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return '; did you mean "x"?' or the list of what there is, as the end of an error."""
-    known = list(known)
-    close = get_close_matches(word, known, 1, 0.6)
-    if close:
-        return f'; did you mean "{close[0]}"?'
-    return f"; there are: {', '.join(sorted(known))}" if known else ""
-
-
-def explain(where: str, error: msgspec.ValidationError, known: Iterable[str]) -> str:
-    """Turn msgspec's error into a sentence that names the table, and the key that was meant."""
-    text = str(error)
-    path = ""
-    if " - at `$" in text:
-        text, _, path = text.partition(" - at `$")
-        path = path.rstrip("`").removeprefix(".")
-    hint = ""
-    if "unknown field" in text:
-        key = text.split("`")[1]
-        return f"{where}: unknown key {key}{did_you_mean(key, known)}"
-    if "missing required field" in text:
-        return f"{where}: key {text.split('`')[1]} is missing"
-    return f"{where}{'.' + path if path else ''}: {text[0].lower() + text[1:]}{hint}"
 
 
 def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
@@ -202,5 +178,5 @@ def _convert(table: object, kind: type[Table], where: str, errors: list[str]) ->
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
-        errors.append(explain(where, error, [field.name for field in msgspec.structs.fields(kind)]))
+        errors.append(explain(where, error, field_names(kind)))
         return None

@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 
 from sioms.protocol.flags import PROTOCOL_VERSION, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.wording import did_you_mean
 
-from .config import NodeTable, did_you_mean
+from .config import NodeTable
 
 READONLY = ".readonly"
 

@@ -91,16 +91,38 @@ class Block:
 
     def payload(self) -> memoryview:
         """Return the readings as bytes in page order, without copying."""
-        return memoryview(self.fields).cast("B")
+        return self.fields.data.cast("B")
 
 
 class AnalogBlock(Block):
-    """Analog channels: ``data`` (n,) in declared units and ``flags`` (n,) of AnalogStatus."""
+    """Analog channels: ``data`` (n,) in declared units and ``flags`` (n,) of AnalogStatus.
+
+    What is published is ``gains @ (data - offset)``: zero and gain matrix are the same for all analog
+    devices, so no driver does them.
+
+    Attributes:
+        offset: shape (n,), subtracted; set by ZERO_DEVICE.
+        gains: shape (n, n), or None for the unit matrix; set by SET_GAINS.
+    """
 
     def __init__(self, spec: BlockSpec) -> None:
         super().__init__(spec)
         self.data: NDArray[np.float64] = self.fields[0]
         self.flags: NDArray[np.int64] = self.words[1]
+        self.offset: NDArray[np.float64] = np.zeros(self.n)
+        self.gains: NDArray[np.float64] | None = None
+        self._shown = np.zeros_like(self.fields)
+        self._shown_flags = self._shown.view(np.int64)[1]
+        self._bytes = self._shown.data.cast("B")
+
+    def payload(self) -> memoryview:
+        """Return the readings, corrected, as bytes in page order."""
+        shown = self._shown[0]
+        np.subtract(self.data, self.offset, out=shown)
+        if self.gains is not None:
+            shown[:] = self.gains @ shown
+        self._shown_flags[:] = self.flags
+        return self._bytes
 
 
 class BinaryBlock(Block):
@@ -145,7 +167,7 @@ class AxisBlock:
 
     def payload(self) -> memoryview:
         """Return the readings as bytes in page order, without copying."""
-        return memoryview(self.bank.fields).cast("B")
+        return self.bank.fields.data.cast("B")
 
 
 AnyBlock = AxisBlock | AnalogBlock | BinaryBlock

@@ -18,6 +18,7 @@ Concurrency: every hook is called from the one thread of the driver process.
 
 from __future__ import annotations
 
+import errno
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
@@ -27,14 +28,14 @@ import msgspec
 from sioms.protocol.flags import Request
 
 from .blocks import AnyBlock, BlockSpec, Description
-from .exchange import Steps
+from .exchange import DeviceError, Steps
 from .settings import LineSettings
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from sioms.motion import DriveAction, MarkerPort
+    from sioms.motion import Action, MarkerPort
 
 
 class InputNode(Protocol):
@@ -119,8 +120,6 @@ class Driver(ABC):
         Raises:
             Refusal: not supported or not now.
         """
-        import errno
-
         raise Refusal(errno.ENOTTY, f"{request.name} is not a request this device knows")
 
 
@@ -181,11 +180,28 @@ class LineUnit(ABC):
 
     @abstractmethod
     def poll(self) -> Steps:
-        """Read the state once and fill the blocks (for axes: call ``bank.poll`` with what was read)."""
+        """Read the state once and fill the blocks.
 
-    def act(self, action: DriveAction) -> Steps:
-        """Carry out what a DriveBank asks: start a command, stop an axis, home, reset a fault."""
+        For axes, end with ``return self.bank.poll(...)``: the kit then carries out the actions that
+        the bank wants, stops first. Runs at the described rate, and at once after a command.
+        """
+
+    def act(self, action: Action) -> Steps:
+        """Carry out what a DriveBank wants: start a command, or stop an axis."""
         raise NotImplementedError(f"{type(self).__name__} describes axes but carries out no actions")
+
+    def home(self, axes: Sequence[int]) -> Steps:
+        """Start the drive's own homing of axes; report the end with ``bank.set_homed``.
+
+        Raises:
+            DeviceError: the drive has none (EOPNOTSUPP).
+        """
+        raise DeviceError(errno.EOPNOTSUPP, "this drive cannot home by itself; use CALIBRATE_DEVICE")
+        yield from ()
+
+    def reset(self, axes: Sequence[int]) -> Steps:
+        """Clear alarms of axes in the drive; the bank's latches have been cleared already."""
+        yield from ()
 
     def write_outputs(self, block: BlockSpec, channels: Sequence[int], values: Sequence[float]) -> Steps:
         """Write output channels of a writable binary or analog block."""

@@ -1,0 +1,120 @@
+"""Connections: a serial port, a TCP stream or a UDP association as one non-blocking descriptor."""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import socket
+import termios
+
+import serial
+
+from .settings import LineSettings
+
+
+class Connection:
+    """A line that is open, or being opened.
+
+    Args:
+        settings: which line.
+
+    Raises:
+        OSError: it cannot be opened; the text says what to look at.
+    """
+
+    def __init__(self, settings: LineSettings) -> None:
+        self.settings = settings
+        self._serial: serial.Serial | None = None
+        self._sock: socket.socket | None = None
+        if settings.serial is not None:
+            self._open_serial(settings)
+        else:
+            self._open_socket(settings)
+
+    @property
+    def fd(self) -> int:
+        """The descriptor, for epoll."""
+        owner = self._serial if self._serial is not None else self._sock
+        return owner.fileno() if owner is not None else -1
+
+    def is_connected(self) -> bool:
+        """Tell whether a TCP connection has come about; raises OSError when it was refused."""
+        if self._sock is None or self.settings.tcp is None:
+            return True
+        if not select.select([], [self._sock], [], 0)[1]:
+            return False
+        error = self._sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        if error:
+            raise OSError(error, f"connect to {self.settings}: {os.strerror(error).lower()}")
+        return True
+
+    def write(self, data: bytes) -> None:
+        """Send bytes at once, or fail: requests are far smaller than any buffer."""
+        sent = os.write(self.fd, data)
+        if sent != len(data):
+            raise OSError(errno.EIO, f"send on {self.settings}: took {sent} of {len(data)} bytes")
+
+    def read(self) -> bytes:
+        """Return what has come, b'' when nothing has.
+
+        Raises:
+            OSError: the line is gone: unplugged, or closed by the device.
+        """
+        try:
+            data = os.read(self.fd, 65536)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise OSError(
+                error.errno, f"{self.settings} is gone: {os.strerror(error.errno or 5).lower()}"
+            ) from None
+        if not data:
+            raise OSError(errno.EIO, f"{self.settings} is gone: it was closed from the other side")
+        return data
+
+    def close(self) -> None:
+        """Release the line."""
+        if self._serial is not None:
+            self._serial.close()
+        if self._sock is not None:
+            self._sock.close()
+
+    def _open_serial(self, settings: LineSettings) -> None:
+        try:
+            self._serial = serial.Serial(
+                settings.serial, settings.baud, parity=settings.parity, stopbits=settings.stop_bits,
+                timeout=0, exclusive=True,
+            )  # fmt: skip
+        except serial.SerialException as error:
+            number = error.errno or errno.EIO
+            hint = {
+                errno.ENOENT: "no such port; is the device plugged in",
+                errno.EACCES: "no permission; is the user in the group dialout",
+                errno.EBUSY: "in use by another process",
+                errno.EWOULDBLOCK: "in use by another process",
+            }.get(number, str(error).lower())
+            raise OSError(number, f"open {settings.serial}: {hint}") from None
+        except (ValueError, termios.error) as error:
+            raise OSError(errno.EINVAL, f"open {settings.serial} at {settings.baud} baud: {error}") from None
+        os.set_blocking(self._serial.fileno(), False)
+
+    def _open_socket(self, settings: LineSettings) -> None:
+        kind = socket.SOCK_STREAM if settings.tcp else socket.SOCK_DGRAM
+        host, _, port = (settings.tcp or settings.udp or "").rpartition(":")
+        sock = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, kind)
+        try:
+            sock.setblocking(False)
+            if settings.tcp:
+                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if settings.local:
+                local_host, _, local_port = settings.local.rpartition(":")
+                sock.bind((local_host, int(local_port)))
+            result = sock.connect_ex((host.strip("[]"), int(port)))
+        except OSError as error:
+            sock.close()
+            raise OSError(error.errno, f"connect to {settings}: {error.strerror}") from None
+        if result not in (0, errno.EINPROGRESS):
+            sock.close()
+            raise OSError(result, f"connect to {settings}: {os.strerror(result).lower()}")
+        self._sock = sock

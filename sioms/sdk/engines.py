@@ -1,0 +1,538 @@
+"""Engines: what a tick of the driver process does for each of the three kinds of driver."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from sioms.motion import Action, AxisBank, StopAxis
+from sioms.protocol.flags import PageState
+
+from .blocks import AnyBlock, AxisBlock
+from .connection import Connection
+from .driver import LineDriver, LineUnit, Refusal, StreamDriver, TickDriver
+from .exchange import DeviceError, LinkError, Steps
+from .handles import Handle
+from .line import Counters, Line, Priority
+from .requests import LATER
+
+if TYPE_CHECKING:
+    from .runtime import Runtime
+
+HOUSEKEEPING_HZ = 200.0
+FIRST_PAUSE_NS = 250_000_000
+LONGEST_PAUSE_NS = 4_000_000_000
+
+
+class Engine(Protocol):
+    """What the runtime needs of an engine."""
+
+    tick_hz: float
+
+    def tick(self, now_ns: int) -> None:
+        """Do the work of one tick and publish."""
+
+    def write_outputs(
+        self,
+        handle: Handle | None,
+        number: int,
+        block: AnyBlock,
+        channels: Sequence[int],
+        values: Sequence[float],
+    ) -> Any:
+        """Set outputs for a client (handle) or for safety (None)."""
+
+    def commands_written(self, block: AnyBlock) -> None:
+        """A bank's buffers have changed between two ticks."""
+
+    def home(self, block: AnyBlock, axes: Sequence[int]) -> None:
+        """Home axes."""
+
+    def reset(self, block: AnyBlock, axes: Sequence[int]) -> None:
+        """Clear the device's alarms of axes."""
+
+    def stop(self, blocks: Sequence[AnyBlock]) -> None:
+        """Stop the motion of blocks as fast as the device can (the banks have been told already)."""
+
+    def is_quiet(self) -> bool:
+        """Whether everything that was asked of the device has been done."""
+
+    def close(self) -> None:
+        """Leave the device safe."""
+
+
+class TickEngine:
+    """Runs a TickDriver."""
+
+    def __init__(self, runtime: Runtime, driver: TickDriver, tick_hz: float) -> None:
+        self.tick_hz = tick_hz
+        self._runtime = runtime
+        self._driver = driver
+        self._is_open = False
+        self._retry_ns = 0
+        self._pause_ns = FIRST_PAUSE_NS
+
+    def tick(self, now_ns: int) -> None:
+        """Tick the driver and publish all blocks."""
+        if not self._is_open and not self._open(now_ns):
+            return
+        self._driver.tick(now_ns)
+
+    def _open(self, now_ns: int) -> bool:
+        if now_ns < self._retry_ns:
+            return False
+        try:
+            self._driver.open()
+        except (LinkError, OSError) as error:
+            self._runtime.set_link(self._driver.blocks, PageState.LINK_LOST, str(error))
+            self._retry_ns = now_ns + self._pause_ns
+            self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
+            return False
+        self._is_open = True
+        self._runtime.set_link(self._driver.blocks, PageState.GOOD, "")
+        return True
+
+    @property
+    def publishes(self) -> bool:
+        """Whether there are readings to publish."""
+        return self._is_open
+
+    def write_outputs(
+        self,
+        handle: Handle | None,
+        number: int,
+        block: AnyBlock,
+        channels: Sequence[int],
+        values: Sequence[float],
+    ) -> Any:
+        """Hand the values to the driver; they take effect in the next tick."""
+        try:
+            self._driver.write_outputs(block.spec, channels, values)
+        except Refusal as error:
+            raise OSError(error.errno, str(error)) from None
+        for channel, value in zip(channels, values, strict=True):
+            self._runtime.outputs[(id(block), channel)] = value
+        return self._runtime.tick
+
+    def slack(self, now_ns: int, until_ns: int) -> None:
+        """Let the driver use the time that is left."""
+        self._driver.slack(now_ns, until_ns)
+
+    def commands_written(self, block: AnyBlock) -> None:
+        """Nothing: the next tick sees it."""
+
+    def home(self, block: AnyBlock, axes: Sequence[int]) -> None:
+        """Home by the bank's own search."""
+        if isinstance(block, AxisBlock) and isinstance(block.bank, AxisBank):
+            block.bank.home(axes, self._runtime.now_ns())
+
+    def reset(self, block: AnyBlock, axes: Sequence[int]) -> None:
+        """Nothing: the bank has been reset."""
+
+    def stop(self, blocks: Sequence[AnyBlock]) -> None:
+        """Nothing: the banks command the device in the next tick."""
+
+    def is_quiet(self) -> bool:
+        """A tick is all there is."""
+        return True
+
+    def close(self) -> None:
+        """Leave the device safe."""
+        if self._is_open:
+            self._driver.close()
+
+
+class _Connected:
+    """What line and stream drivers share: a connection that is opened again after every loss."""
+
+    tick_hz = HOUSEKEEPING_HZ
+
+    def __init__(
+        self, runtime: Runtime, driver: LineDriver | StreamDriver, gap_s: float, recovery_s: float
+    ) -> None:
+        self.counters = Counters()
+        self.line: Line | None = None
+        self._runtime = runtime
+        self._base = driver
+        self._gap_s = gap_s
+        self._recovery_s = recovery_s
+        self._connecting: Connection | None = None
+        self._retry_ns = 0
+        self._pause_ns = FIRST_PAUSE_NS
+        runtime.line_due = self._line_due
+
+    def connect(self, now_ns: int) -> bool:
+        """Get the line up, a little at every tick; return whether it is."""
+        if self.line is not None:
+            return True
+        try:
+            if self._connecting is None:
+                if now_ns < self._retry_ns:
+                    return False
+                self._connecting = Connection(self._base.line)
+                self._limit_ns = now_ns + int(self._base.line.connect_timeout_s * 1e9)
+            if not self._connecting.is_connected():
+                if now_ns > self._limit_ns:
+                    raise OSError(
+                        errno.ETIMEDOUT,
+                        f"connect to {self._base.line}: no answer within {self._base.line.connect_timeout_s:g} s",
+                    )
+                return False
+        except OSError as error:
+            if self._connecting is not None:
+                self._connecting.close()
+                self._connecting = None
+            self._runtime.set_link(self._base.blocks, PageState.LINK_LOST, error.strerror or str(error))
+            self._retry_ns = now_ns + self._pause_ns
+            self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
+            return False
+        connection, self._connecting = self._connecting, None
+        self.line = Line(connection, self._gap_s, self._recovery_s, self.counters, self.unsolicited())
+        self._runtime.watch(connection.fd, self._readable)
+        self._pause_ns = FIRST_PAUSE_NS
+        self.connected(now_ns)
+        return True
+
+    def unsolicited(self) -> Any:
+        """Return what takes bytes that no exchange waits for."""
+        return None
+
+    def connected(self, now_ns: int) -> None:
+        """Begin: the line is up."""
+        raise NotImplementedError
+
+    def line_lost(self, reason: str, now_ns: int) -> None:
+        """Close the line and try again later."""
+        line, self.line = self.line, None
+        if line is None:
+            return
+        self.counters.reconnects += 1
+        self._runtime.unwatch(line.connection.fd)
+        line.connection.close()
+        self._retry_ns = now_ns + self._pause_ns
+        self._runtime.lose(self._base.blocks, reason)
+        line.abandon(reason)
+
+    def guarded(self, action: Any, now_ns: int) -> None:
+        """Do something on the line; when it is gone, say so and start again."""
+        try:
+            action()
+        except OSError as error:
+            self.line_lost(error.strerror or str(error), now_ns)
+        self._arm()
+
+    def _readable(self) -> None:
+        now_ns = self._runtime.now_ns()
+        if self.line is not None:
+            line = self.line
+            self.guarded(lambda: line.receive(now_ns), now_ns)
+
+    def _line_due(self) -> None:
+        now_ns = self._runtime.now_ns()
+        if self.line is not None:
+            line = self.line
+            self.guarded(lambda: line.advance_time(now_ns), now_ns)
+
+    def _arm(self) -> None:
+        self._runtime.set_line_timer(self.line.deadline_ns if self.line is not None else None)
+
+    def close_line(self) -> None:
+        """Release the line for good."""
+        if self.line is not None:
+            self._runtime.unwatch(self.line.connection.fd)
+            self.line.connection.close()
+            self.line = None
+
+
+class _UnitState:
+    """A unit on the line, and how it is doing."""
+
+    def __init__(self, unit: LineUnit) -> None:
+        self.unit = unit
+        self.is_up = False
+        self.busy = False
+        self.misses = 0
+        self.due_ns = 0
+        self.pause_ns = FIRST_PAUSE_NS
+        self.fresh = False
+
+
+class LineEngine(_Connected):
+    """Runs a LineDriver: opens and polls its units in turn, and carries out actions and outputs."""
+
+    def __init__(self, runtime: Runtime, driver: LineDriver, poll_hz: float) -> None:
+        super().__init__(runtime, driver, driver.gap_s, driver.recovery_s)
+        self._driver = driver
+        self._period_ns = int(1e9 / poll_hz)
+        self._units = [_UnitState(unit) for unit in driver.units]
+        self._by_block = {id(block): state for state in self._units for block in state.unit.blocks}
+        self.publishes = False
+
+    def connected(self, now_ns: int) -> None:
+        """Open all units."""
+        for state in self._units:
+            state.is_up = state.busy = False
+            state.due_ns = now_ns
+            state.pause_ns = FIRST_PAUSE_NS
+
+    def tick(self, now_ns: int) -> None:
+        """Start the polls and opens that are due."""
+        if not self.connect(now_ns):
+            return
+        for state in self._units:
+            if not state.busy and now_ns >= state.due_ns:
+                self._start(state, now_ns)
+
+    def _start(self, state: _UnitState, now_ns: int) -> None:
+        line = self.line
+        if line is None:
+            return
+        state.busy = True
+        if state.is_up:
+            state.due_ns = max(state.due_ns + self._period_ns, now_ns)
+            steps, done = state.unit.poll(), self._polled
+        else:
+            steps, done = state.unit.open(), self._opened
+        self.guarded(
+            lambda: line.submit(steps, Priority.POLL, lambda v, e: done(state, v, e), now_ns), now_ns
+        )
+
+    def _opened(self, state: _UnitState, _: None, error: Exception | None) -> None:
+        state.busy = False
+        now_ns = self._runtime.now_ns()
+        if error is None:
+            state.is_up, state.misses, state.due_ns = True, 0, now_ns
+            state.pause_ns = FIRST_PAUSE_NS
+            state.fresh = True
+            return
+        kind = PageState.FAULT if isinstance(error, DeviceError) else PageState.LINK_LOST
+        self._runtime.set_link(state.unit.blocks, kind, f"{state.unit.name}: {error}")
+        state.due_ns = now_ns + state.pause_ns
+        state.pause_ns = min(2 * state.pause_ns, LONGEST_PAUSE_NS)
+
+    def _polled(self, state: _UnitState, actions: Sequence[Action] | None, error: Exception | None) -> None:
+        state.busy = False
+        now_ns = self._runtime.now_ns()
+        if error is not None:
+            state.misses += 1
+            if state.misses >= state.unit.misses:
+                self._lose_unit(state, f"{state.unit.name}: {error}", now_ns)
+            return
+        state.misses = 0
+        if state.fresh:
+            state.fresh = False
+            self._runtime.set_link(state.unit.blocks, PageState.GOOD, "")
+        for block in state.unit.blocks:
+            self._runtime.publish(block, block.stamp_ns or now_ns)
+        self._carry_out(state, actions or (), now_ns)
+        self._runtime.after_publication(now_ns)
+        if state.due_ns <= now_ns and self.line is not None and not state.busy and self._runtime.running:
+            self._start(state, now_ns)  # the line is slower than the rate asked for: poll back to back
+
+    def _lose_unit(self, state: _UnitState, reason: str, now_ns: int) -> None:
+        state.is_up = False
+        state.due_ns = now_ns + state.pause_ns
+        self._runtime.lose(state.unit.blocks, reason)
+
+    def _carry_out(self, state: _UnitState, actions: Sequence[Action], now_ns: int) -> None:
+        for action in actions:
+            priority = Priority.STOP if isinstance(action, StopAxis) else Priority.ACT
+            self._submit(state, state.unit.act(action), priority, [action.axis])
+
+    def _submit(self, state: _UnitState, steps: Steps, priority: Priority, axes: Sequence[int]) -> None:
+        """Run a hook that moves or stops axes; when it fails, those axes are in fault."""
+        line, now_ns = self.line, self._runtime.now_ns()
+        if line is None:
+            return
+
+        def done(_: Any, error: Exception | None) -> None:
+            later_ns = self._runtime.now_ns()
+            if error is not None:
+                for block in state.unit.blocks:
+                    if isinstance(block, AxisBlock):
+                        block.bank.fault(np.array(axes), f"{state.unit.name}: {error}", later_ns)
+            state.due_ns = min(state.due_ns, later_ns)  # look at once what it did
+
+        self.guarded(lambda: line.submit(steps, priority, done, now_ns), now_ns)
+
+    def home(self, block: AnyBlock, axes: Sequence[int]) -> None:
+        """Start the drive's homing."""
+        state = self._by_block[id(block)]
+        self._submit(state, state.unit.home(axes), Priority.ACT, axes)
+
+    def reset(self, block: AnyBlock, axes: Sequence[int]) -> None:
+        """Clear the drive's alarms."""
+        state = self._by_block[id(block)]
+        self._submit(state, state.unit.reset(axes), Priority.ACT, axes)
+
+    def write_outputs(
+        self,
+        handle: Handle | None,
+        number: int,
+        block: AnyBlock,
+        channels: Sequence[int],
+        values: Sequence[float],
+    ) -> Any:
+        """Send the values; the client's answer comes when the device has confirmed them."""
+        state, line, now_ns = self._by_block[id(block)], self.line, self._runtime.now_ns()
+        if line is None or not state.is_up:
+            raise OSError(errno.EIO, f"write {block.spec.name}: {state.unit.name} does not answer")
+        steps = state.unit.write_outputs(block.spec, channels, values)
+
+        def done(_: Any, error: Exception | None) -> None:
+            if error is None:
+                for channel, value in zip(channels, values, strict=True):
+                    self._runtime.outputs[(id(block), channel)] = value
+            if handle is None:
+                if error is not None:
+                    self._runtime.log("error", f"{state.unit.name}: safe outputs could not be set: {error}")
+            elif error is None:
+                handle.answer(number, self._runtime.tick)
+            else:
+                errno_ = error.errno if isinstance(error, DeviceError) else errno.EIO
+                handle.refuse(number, errno_, f"write {handle.node}: {state.unit.name}: {error}")
+
+        priority = Priority.STOP if handle is None else Priority.OUTPUT
+        self.guarded(lambda: line.submit(steps, priority, done, now_ns), now_ns)
+        return LATER
+
+    def commands_written(self, block: AnyBlock) -> None:
+        """Poll at once: the bank has something to send."""
+        state, now_ns = self._by_block[id(block)], self._runtime.now_ns()
+        if state.is_up and not state.busy:
+            state.due_ns = now_ns
+            self._start(state, now_ns)
+
+    def stop(self, blocks: Sequence[AnyBlock]) -> None:
+        """Send every unit's fastest stop, ahead of everything else."""
+        wanted = {id(self._by_block[id(block)]) for block in blocks if isinstance(block, AxisBlock)}
+        for state in self._units:
+            if id(state) in wanted:
+                self._submit(state, state.unit.stop(), Priority.STOP, [])
+
+    def is_quiet(self) -> bool:
+        """Whether the line has nothing left to do."""
+        return self.line is None or self.line.is_free
+
+    def close(self) -> None:
+        """Let every unit leave its device safe; the runtime runs the loop until it is quiet."""
+        line, now_ns = self.line, self._runtime.now_ns()
+        if line is None:
+            return
+        for state in self._units:
+            if state.is_up:
+                self.guarded(
+                    lambda state=state: line.submit(  # type: ignore[misc]
+                        state.unit.close(), Priority.ACT, lambda v, e: None, now_ns
+                    ),
+                    now_ns,
+                )
+
+
+class StreamEngine(_Connected):
+    """Runs a StreamDriver: opens the stream, feeds the driver, watches that good frames come."""
+
+    publishes = False
+
+    def __init__(self, runtime: Runtime, driver: StreamDriver) -> None:
+        super().__init__(runtime, driver, 0.0, 0.1)
+        self._driver = driver
+        self._is_up = False
+        self._busy = False
+        self._due_ns = 0
+        self._good_ns = 0
+        self._heartbeat_ns = 0
+
+    def unsolicited(self) -> Any:
+        """Samples are what nobody asked for, one by one."""
+        return self._feed
+
+    def connected(self, now_ns: int) -> None:
+        """Open the stream."""
+        self._is_up = self._busy = False
+        self._due_ns = now_ns
+
+    def tick(self, now_ns: int) -> None:
+        """Open, keep alive, and watch the stream."""
+        if not self.connect(now_ns) or self.line is None or self._busy:
+            return
+        line = self.line
+        if not self._is_up:
+            if now_ns >= self._due_ns:
+                self._busy = True
+                self.guarded(
+                    lambda: line.submit(self._driver.open(), Priority.POLL, self._opened, now_ns), now_ns
+                )
+        elif now_ns - self._good_ns > self._driver.silence_s * 1e9:
+            self._is_up = False
+            self._due_ns = now_ns
+            self._runtime.lose(
+                self._driver.blocks, f"no good frame for {(now_ns - self._good_ns) / 1e9:.3f} s"
+            )
+        elif self._driver.heartbeat_s and now_ns >= self._heartbeat_ns:
+            self._heartbeat_ns = now_ns + int(self._driver.heartbeat_s * 1e9)
+            self.guarded(
+                lambda: line.submit(self._driver.heartbeat(), Priority.POLL, lambda v, e: None, now_ns),
+                now_ns,
+            )
+
+    def _opened(self, _: Any, error: Exception | None) -> None:
+        self._busy = False
+        now_ns = self._runtime.now_ns()
+        if error is None:
+            self._is_up, self._good_ns = True, now_ns
+            self._heartbeat_ns = now_ns + int(self._driver.heartbeat_s * 1e9)
+            return
+        kind = PageState.FAULT if isinstance(error, DeviceError) else PageState.LINK_LOST
+        self._runtime.set_link(self._driver.blocks, kind, str(error))
+        self._due_ns = now_ns + self._pause_ns
+        self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
+
+    def _feed(self, data: bytes, now_ns: int) -> None:
+        if not self._is_up:
+            return
+        if self._driver.feed(data, now_ns):
+            if self._good_ns == 0 or not self._runtime.is_good(self._driver.blocks):
+                self._runtime.set_link(self._driver.blocks, PageState.GOOD, "")
+                self._pause_ns = FIRST_PAUSE_NS
+            self._good_ns = now_ns
+            self._runtime.after_publication(now_ns)
+
+    def write_outputs(
+        self,
+        handle: Handle | None,
+        number: int,
+        block: AnyBlock,
+        channels: Sequence[int],
+        values: Sequence[float],
+    ) -> Any:
+        """Refuse: a stream has no outputs."""
+        raise OSError(errno.EBADF, f"write {block.spec.name}: this device only sends")
+
+    def commands_written(self, block: AnyBlock) -> None:
+        """Nothing: a stream has no axes."""
+
+    def home(self, block: AnyBlock, axes: Sequence[int]) -> None:
+        """Nothing: a stream has no axes."""
+
+    def reset(self, block: AnyBlock, axes: Sequence[int]) -> None:
+        """Nothing: a stream has no axes."""
+
+    def stop(self, blocks: Sequence[AnyBlock]) -> None:
+        """Nothing moves."""
+
+    def is_quiet(self) -> bool:
+        """Whether the line has nothing left to do."""
+        return self.line is None or self.line.is_free
+
+    def close(self) -> None:
+        """Stop the stream."""
+        line, now_ns = self.line, self._runtime.now_ns()
+        if line is not None and self._is_up:
+            self._is_up = False
+            self.guarded(
+                lambda: line.submit(self._driver.close(), Priority.ACT, lambda v, e: None, now_ns), now_ns
+            )

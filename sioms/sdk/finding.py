@@ -1,0 +1,148 @@
+"""Finding drivers: by entry point in the group ``sioms.drivers``, or by the path of a file."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import entry_points
+from typing import Any
+
+import msgspec
+
+from sioms.protocol.flags import NodeClass
+from sioms.wording import did_you_mean, explain, field_names
+
+from .driver import Driver, LineDriver, StreamDriver, TickDriver
+
+GROUP = "sioms.drivers"
+
+
+class DriverNotFound(Exception):
+    """There is no such driver, or it cannot be imported; the text says which and why."""
+
+
+@cache
+def _registered() -> Mapping[str, Any]:
+    return {point.name: point for point in entry_points(group=GROUP)}
+
+
+def driver_names() -> list[str]:
+    """Return the names of all registered drivers."""
+    return sorted(_registered())
+
+
+@cache
+def find_driver(name: str, folder: str) -> type[Driver]:
+    """Return a driver's class.
+
+    Args:
+        name: entry-point name, or the path of a Python file (with a slash or ending in .py) whose
+            module has the class under the name ``DRIVER``.
+        folder: where a relative path starts.
+
+    Raises:
+        DriverNotFound: with a sentence.
+    """
+    if "/" in name or name.endswith(".py"):
+        return _from_file(os.path.join(folder, name))
+    point = _registered().get(name)
+    if point is None:
+        raise DriverNotFound(f"driver = {name}: no such driver{did_you_mean(name, driver_names())}")
+    try:
+        return _checked(point.load(), name)
+    except DriverNotFound:
+        raise
+    except Exception as error:  # whatever a foreign module does at import is reported, not suffered
+        raise DriverNotFound(f"driver = {name}: import failed: {type(error).__name__}: {error}") from error
+
+
+def _from_file(path: str) -> type[Driver]:
+    stem = os.path.splitext(os.path.basename(path))[0].replace("-", "_")
+    spec = importlib.util.spec_from_file_location(f"sioms_driver_{stem}", path)
+    if spec is None or spec.loader is None or not os.path.isfile(path):
+        raise DriverNotFound(f"driver = {path}: no such file; want a Python file that defines DRIVER")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise DriverNotFound(f"driver = {path}: import failed: {type(error).__name__}: {error}") from error
+    if not hasattr(module, "DRIVER"):
+        raise DriverNotFound(f"driver = {path}: it defines no DRIVER; set DRIVER to the driver's class")
+    return _checked(module.DRIVER, path)
+
+
+def _checked(found: object, name: str) -> type[Driver]:
+    kinds = (TickDriver, LineDriver, StreamDriver)
+    if not (isinstance(found, type) and issubclass(found, kinds)):
+        raise DriverNotFound(
+            f"driver = {name}: {found!r} is no class of TickDriver, LineDriver or StreamDriver"
+        )
+    return found
+
+
+def read_settings(driver: type[Driver], table: Mapping[str, Any], folder: str) -> tuple[Any, list[str]]:
+    """Validate a device's table.
+
+    Args:
+        driver: the driver's class.
+        table: the keys of the device that the daemon does not read itself.
+        folder: of the configuration, for settings that name files: a key ``..._file`` that is a
+            relative path is taken from there.
+
+    Returns:
+        The settings (None with errors) and the errors, each beginning with ``.key`` or ``: ``.
+    """
+    kind = driver.Settings
+    table = {
+        key: os.path.join(folder, value)
+        if key.endswith("_file") and isinstance(value, str) and value
+        else value
+        for key, value in table.items()
+    }
+    known = field_names(kind)
+    errors = []
+    # One error at a time is what the validator gives; unknown keys are collected beside it.
+    top = {field.encode_name for field in msgspec.structs.fields(kind)}
+    for key in [k for k in table if k not in top]:
+        errors.append(f": unknown key {key}{did_you_mean(key, top)}")
+        del table[key]
+    try:
+        return msgspec.convert(table, kind), errors
+    except msgspec.ValidationError as error:
+        errors.append(explain("", error, known))
+        return None, errors
+
+
+def describe(driver: type[Driver], name: str, settings: Any) -> tuple[list[object] | None, list[str]]:
+    """Let a driver describe a device; return the wire form (see DeviceInfo.unpack) and the errors."""
+    try:
+        description = driver.describe(name, settings)
+    except ValueError as error:
+        return None, [f": {error}"]
+    errors = _block_errors(description.blocks)
+    if not 0.1 <= description.tick_hz <= 20_000:
+        errors.append(f": rate {description.tick_hz:g} Hz; want 0.1 to 20000")
+    blocks = [
+        [
+            b.name, int(b.node_class), [c.pack() for c in b.channels],
+            b.writable or b.node_class is NodeClass.AXIS, b.history, b.capacity,
+        ]
+        for b in description.blocks
+    ]  # fmt: skip
+    return [blocks, description.tick_hz, list(description.inputs), description.lease_s], errors
+
+
+def _block_errors(blocks: Any) -> list[str]:
+    errors = []
+    names = [block.name for block in blocks]
+    for block in blocks:
+        channels = [channel.name for channel in block.channels]
+        if not channels:
+            errors.append(f": block {block.name!r} has no channel; want at least one")
+        for name in {c for c in channels if channels.count(c) > 1}:
+            errors.append(f": two channels are named {name}; names must differ")
+        if names.count(block.name) > 1:
+            errors.append(f": two blocks are named {block.name!r}; names must differ")
+    return errors

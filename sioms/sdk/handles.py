@@ -1,0 +1,185 @@
+"""Handles: the connections of clients to this driver process, and what they are waiting for.
+
+A handle is a socket, an eventfd and, for its owner's death, a pidfd. All three belong to the kernel,
+so a client that dies in any way is noticed here directly, without the daemon.
+
+Concurrency: owned by the driver process's one thread.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.protocol.flags import Access, Right
+from sioms.protocol.messages import encode, refusal, reply
+
+from .blocks import AnyBlock
+
+MAX_WAITS = 64
+
+
+@dataclass(slots=True, eq=False)
+class Handle:
+    """One open node of one client.
+
+    Attributes:
+        number: the daemon's number of it.
+        node: name it was opened by.
+        who: whose it is, for messages.
+        sock: socket to the client, non-blocking.
+        event: eventfd that wakes the client.
+        pidfd: the client's process, -1 when unknown.
+        block: what it shows; ``channels`` of it, and one bit of them if ``bit`` >= 0.
+        access: what it may do by its mode; ``exclusive`` says that it owns its channels.
+        rights: what its user may do.
+        lease_ns: longest silence allowed to the client, 0 = any.
+        every: eventfd is written on every n-th publication; 0 = not; -1 = when a binary edge came.
+        waits: unanswered requests by message number; each has a way to be ended.
+    """
+
+    number: int
+    node: str
+    who: str
+    sock: socket.socket
+    event: int
+    pidfd: int
+    block: AnyBlock
+    channels: NDArray[np.intp]
+    bit: int
+    access: Access
+    exclusive: bool
+    rights: Right
+    lease_ns: int
+    heard_ns: int
+    every: int = 0
+    countdown: int = 0
+    waits: dict[int, Wait] = field(default_factory=dict)
+    full: Callable[[], tuple[Any] | None] | None = None
+
+    @property
+    def writes(self) -> bool:
+        """Whether it may write."""
+        return self.exclusive and bool(self.access & Access.WRITE)
+
+    def answer(self, number: int, value: object = None) -> None:
+        """Reply to a request; a client that does not read is found dead later, by its socket or its lease."""
+        self._send(reply(number, value))
+
+    def refuse(self, number: int, errno_: int, text: str) -> None:
+        """Refuse a request."""
+        self._send(refusal(number, errno_, text))
+
+    def tell_end(self, errno_: int, text: str) -> None:
+        """Tell the client why its handle ends, before the socket closes."""
+        self._send(encode(0, 0, errno_, text))
+
+    def wake(self) -> None:
+        """Make the client's eventfd readable."""
+        try:
+            os.eventfd_write(self.event, 1)
+        except BlockingIOError:
+            return  # it has been readable for 2**64 - 2 publications; it will notice
+
+    def close(self) -> None:
+        """Release the descriptors."""
+        self.sock.close()
+        os.close(self.event)
+        if self.pidfd >= 0:
+            os.close(self.pidfd)
+
+    def _send(self, packet: bytes) -> None:
+        try:
+            self.sock.send(packet)
+        except OSError:
+            return
+
+
+@dataclass(slots=True, eq=False)
+class Wait:
+    """A request that is answered later.
+
+    Attributes:
+        handle, number: what to answer.
+        what: the request in words.
+        deadline_ns: when it times out, None = never.
+        ready: asked every tick; answers with (value,) when done, None while not; raises OSError to refuse.
+        channels: axes it depends on: dropped buffers end it.
+        cancelled: undoes what the wait has begun.
+    """
+
+    handle: Handle
+    number: int
+    what: str
+    deadline_ns: int | None
+    ready: Callable[[], tuple[Any] | None]
+    channels: frozenset[int] = frozenset()
+    cancelled: Callable[[], None] | None = None
+
+
+class Waits:
+    """All waits of a driver process."""
+
+    def __init__(self) -> None:
+        self._waits: list[Wait] = []
+
+    def add(self, wait: Wait) -> None:
+        """Keep a wait until it is ready, late, cancelled or its handle is gone.
+
+        Raises:
+            OSError: EAGAIN, the handle has too many.
+        """
+        if len(wait.handle.waits) >= MAX_WAITS:
+            raise OSError(errno.EAGAIN, f"{wait.what}: {MAX_WAITS} requests of this handle wait already")
+        wait.handle.waits[wait.number] = wait
+        self._waits.append(wait)
+
+    def check(self, now_ns: int) -> None:
+        """Answer what is ready or late; cheap when nothing waits."""
+        if not self._waits:
+            return
+        for wait in list(self._waits):
+            try:
+                done = wait.ready()
+            except OSError as error:
+                self.end(wait, error.errno or errno.EIO, error.strerror or str(error))
+                continue
+            if done is not None:
+                self._remove(wait)
+                wait.handle.answer(wait.number, done[0])
+            elif wait.deadline_ns is not None and now_ns >= wait.deadline_ns:
+                self.end(wait, errno.ETIMEDOUT, f"{wait.what}: not within its time-out")
+
+    def end(self, wait: Wait, errno_: int, text: str) -> None:
+        """End a wait with a refusal."""
+        if self._remove(wait):
+            if wait.cancelled is not None:
+                wait.cancelled()
+            wait.handle.refuse(wait.number, errno_, text)
+
+    def end_where(self, condition: Callable[[Wait], bool], errno_: int, text: str) -> int:
+        """End all waits that a condition holds for; return how many."""
+        ended = [wait for wait in self._waits if condition(wait)]
+        for wait in ended:
+            self.end(wait, errno_, f"{wait.what}: {text}")
+        return len(ended)
+
+    def forget(self, handle: Handle) -> None:
+        """Drop the waits of a handle that is gone."""
+        for wait in list(handle.waits.values()):
+            self._remove(wait)
+            if wait.cancelled is not None:
+                wait.cancelled()
+
+    def _remove(self, wait: Wait) -> bool:
+        if wait.handle.waits.pop(wait.number, None) is None:
+            return False
+        self._waits.remove(wait)
+        return True

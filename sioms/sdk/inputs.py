@@ -1,0 +1,63 @@
+"""Nodes of other devices that a driver reads."""
+
+from __future__ import annotations
+
+import mmap
+import os
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.protocol.page import SLOT_HEADER, NotReadable, PageReader, slot_header
+from sioms.protocol.records import READ_FIELDS
+
+
+class Input:
+    """A node of another device; empty until the daemon hands its page over, and again after every restart.
+
+    Concurrency: one thread.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.stamp_ns = 0
+        self._reader: PageReader | None = None
+        self._map: mmap.mmap | None = None
+
+    def attach(self, fd: int, channels: Sequence[int], bit: int) -> None:
+        """Take the page of the present driver process; closes the descriptor."""
+        self.detach()
+        size = os.fstat(fd).st_size
+        self._map = mmap.mmap(fd, size, prot=mmap.PROT_READ)
+        os.close(fd)
+        self._reader = PageReader(self._map)
+        self._fields = len(READ_FIELDS[self._reader.node_class])
+        self._channels = np.array(channels, dtype=np.intp)
+        self._all = list(channels) == list(range(self._reader.channels))
+        self._bit = bit
+
+    def detach(self) -> None:
+        """Let the page go."""
+        if self._reader is not None and self._map is not None:
+            self._reader.release()
+            self._map.close()
+        self._reader, self._map = None, None
+
+    def read(self, now_ns: int) -> NDArray[np.float64] | None:
+        """Return the readings, shape (fields, channels); None while the device is not there."""
+        if self._reader is None:
+            return None
+        try:
+            raw = self._reader.latest(now_ns)
+        except NotReadable:
+            return None
+        self.stamp_ns = slot_header(raw)[1]
+        values = np.frombuffer(raw, np.float64, offset=SLOT_HEADER).reshape(self._fields, -1)
+        if not self._all:
+            values = values[:, self._channels]
+        if self._bit >= 0:
+            values = values.copy()
+            words = values.view(np.int64)
+            words[0] = words[0] >> self._bit & 1
+        return values

@@ -1,0 +1,294 @@
+"""The line: runs drivers' steps on a connection, one exchange at a time.
+
+Keeps what every half-duplex line needs: the silence before a request, the exact length of a reply,
+time-outs, silence and draining after a bad reply (so that a late reply is never taken for the next),
+repetition of what may be repeated, and counters.
+
+Concurrency: owned by the driver process's one thread; driven by ``receive`` and ``advance_time``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum, auto
+from heapq import heappop, heappush
+from itertools import count
+from typing import Any
+
+from .connection import Connection
+from .exchange import DeviceError, Exchange, LinkError, Pause, Send, Step, Steps
+
+ATTEMPTS = 2
+"""Times a repeatable request is sent before its exchange counts as failed."""
+
+
+class Priority(IntEnum):
+    """Order of jobs that are ready at the same time."""
+
+    STOP = 0
+    ACT = 1
+    OUTPUT = 2
+    POLL = 3
+
+
+Done = Callable[[Any, Exception | None], None]
+"""Called with a job's return value, or with the LinkError or DeviceError that ended it."""
+
+
+@dataclass(slots=True, eq=False)
+class Job:
+    """One run of a hook."""
+
+    steps: Steps
+    priority: Priority
+    done: Done
+
+
+@dataclass(slots=True)
+class Counters:
+    """What the line has been through."""
+
+    requests: int = 0
+    replies: int = 0
+    repeats: int = 0
+    timeouts: int = 0
+    garbled: int = 0
+    refused: int = 0
+    noise_bytes: int = 0
+    reconnects: int = 0
+    sent_bytes: int = 0
+    received_bytes: int = 0
+
+
+class _State(Enum):
+    IDLE = auto()
+    RESTING = auto()
+    """Waiting until ``_until_ns``: silence before a request, or a Pause."""
+    EXPECTING = auto()
+    RECOVERING = auto()
+
+
+@dataclass(slots=True)
+class _Running:
+    job: Job
+    step: Step | None = None
+    attempts: int = 0
+    reply: bytearray = field(default_factory=bytearray)
+
+
+class Line:
+    """Runs jobs on a connection.
+
+    Args:
+        connection: the open connection.
+        gap_s: silence before each request [s].
+        recovery_s: silence after a bad or missing reply [s].
+        unsolicited: takes bytes that no exchange waits for; None counts them as noise.
+        counters: kept over reconnections.
+    """
+
+    def __init__(
+        self, connection: Connection, gap_s: float, recovery_s: float, counters: Counters,
+        unsolicited: Callable[[bytes, int], None] | None = None,
+    ) -> None:  # fmt: skip
+        self.connection = connection
+        self.counters = counters
+        settings = connection.settings
+        self._character_ns = int(settings.bits_per_character / settings.baud * 1e9) if settings.serial else 0
+        self._gap_ns = int(gap_s * 1e9)
+        self._recovery_ns = int(recovery_s * 1e9)
+        self._unsolicited = unsolicited
+        self._queue: list[tuple[int, int, Job]] = []
+        self._order = count()
+        self._running: _Running | None = None
+        self._suspended: list[tuple[_Running, Any]] = []
+        self._state = _State.IDLE
+        self._until_ns = 0
+        self._quiet_since_ns = 0
+
+    @property
+    def deadline_ns(self) -> int | None:
+        """When ``advance_time`` has something to do, None when only bytes or jobs matter."""
+        return None if self._state is _State.IDLE else self._until_ns
+
+    @property
+    def is_free(self) -> bool:
+        """Whether nothing runs and nothing waits."""
+        return self._running is None and not self._queue
+
+    def submit(self, steps: Steps, priority: Priority, done: Done, now_ns: int) -> None:
+        """Run a hook as soon as the line is free for it; a stop goes in after the present exchange."""
+        heappush(self._queue, (priority, next(self._order), Job(steps, priority, done)))
+        if self._running is None:
+            self._next_job(now_ns)
+
+    def abandon(self, reason: str) -> None:
+        """End all jobs with a LinkError; the connection is gone."""
+        running = [self._running] if self._running else []
+        jobs = (
+            [r.job for r in running]
+            + [r.job for r, _ in self._suspended]
+            + [job for _, _, job in self._queue]
+        )
+        self._running, self._suspended, self._queue, self._state = None, [], [], _State.IDLE
+        for job in jobs:
+            job.steps.close()
+            job.done(None, LinkError(reason))
+
+    def receive(self, now_ns: int) -> None:
+        """Take what has come; raises OSError when the connection is gone."""
+        data = self.connection.read()
+        if not data:
+            return
+        self.counters.received_bytes += len(data)
+        self._quiet_since_ns = now_ns
+        if self._state is not _State.EXPECTING or self._running is None:
+            if self._unsolicited is not None and self._state is not _State.RECOVERING:
+                self._unsolicited(data, now_ns)
+            else:
+                self.counters.noise_bytes += len(data)
+            return
+        running = self._running
+        exchange = running.step
+        if not isinstance(exchange, Exchange):
+            return
+        running.reply += data
+        try:
+            length = exchange.want(bytes(running.reply))
+            if length is None or len(running.reply) < length:
+                return
+            value = exchange.decode(bytes(running.reply[:length]))
+        except LinkError as error:
+            self.counters.garbled += 1
+            self._recover(str(error), now_ns)
+        except DeviceError as error:
+            self.counters.replies += 1
+            self.counters.refused += 1
+            self._resume(error, now_ns)
+        else:
+            self.counters.replies += 1
+            rest = bytes(running.reply[length:])
+            if rest and self._unsolicited is None:
+                self.counters.noise_bytes += len(rest)
+            self._resume(value, now_ns)
+            if rest and self._unsolicited is not None:
+                self._unsolicited(rest, now_ns)
+
+    def advance_time(self, now_ns: int) -> None:
+        """Do what is due: the end of a silence, a time-out."""
+        if self._state is _State.IDLE or now_ns < self._until_ns:
+            return
+        running = self._running
+        if running is None:
+            self._state = _State.IDLE
+            return
+        match self._state:
+            case _State.RESTING:
+                if isinstance(running.step, Pause):
+                    self._resume(None, now_ns)
+                else:
+                    self._transmit(now_ns)
+            case _State.EXPECTING:
+                self.counters.timeouts += 1
+                step = running.step
+                what = step.what if isinstance(step, Exchange) else "exchange"
+                got = f"{len(running.reply)} bytes of a reply" if running.reply else "no reply"
+                self._recover(f"{what}: {got} within its time-out", now_ns)
+            case _State.RECOVERING:
+                if now_ns - self._quiet_since_ns < self._recovery_ns:
+                    self._until_ns = self._quiet_since_ns + self._recovery_ns
+                    return
+                self._after_recovery(now_ns)
+
+    # --- inside ----------------------------------------------------------------------------------
+
+    def _next_job(self, now_ns: int) -> None:
+        if self._queue and (not self._suspended or self._queue[0][0] == Priority.STOP):
+            job = heappop(self._queue)[2]
+            self._running = _Running(job)
+            self._resume(None, now_ns)
+        elif self._suspended:
+            self._running, value = self._suspended.pop()
+            self._resume(value, now_ns)
+
+    def _resume(self, value: Any, now_ns: int) -> None:
+        """Give a step's result to the hook and begin its next step."""
+        running = self._running
+        if running is None:
+            return
+        self._state = _State.IDLE
+        if self._queue and self._queue[0][0] == Priority.STOP and running.job.priority != Priority.STOP:
+            self._suspended.append((running, value))
+            self._running = None
+            self._next_job(now_ns)
+            return
+        try:
+            if isinstance(value, Exception):
+                step = running.job.steps.throw(value)
+            else:
+                step = running.job.steps.send(value)
+        except StopIteration as end:
+            self._finish(running.job, end.value, None, now_ns)
+        except (LinkError, DeviceError) as error:
+            self._finish(running.job, None, error, now_ns)
+        else:
+            running.step, running.attempts = step, 0
+            self._begin(step, now_ns)
+
+    def _finish(self, job: Job, value: Any, error: Exception | None, now_ns: int) -> None:
+        self._running = None
+        job.done(value, error)
+        if self._running is None:
+            self._next_job(now_ns)
+
+    def _begin(self, step: Step, now_ns: int) -> None:
+        if isinstance(step, Pause):
+            self._rest_until(now_ns + int(step.duration_s * 1e9))
+        elif now_ns < self._quiet_since_ns + self._gap_ns:
+            self._rest_until(self._quiet_since_ns + self._gap_ns)
+        else:
+            self._transmit(now_ns)
+
+    def _rest_until(self, until_ns: int) -> None:
+        self._state, self._until_ns = _State.RESTING, until_ns
+
+    def _transmit(self, now_ns: int) -> None:
+        running = self._running
+        if running is None or not isinstance(running.step, Exchange | Send):
+            return
+        step = running.step
+        if self._unsolicited is None:
+            self.counters.noise_bytes += len(self.connection.read())
+        self.connection.write(step.data)
+        self.counters.requests += 1
+        self.counters.sent_bytes += len(step.data)
+        on_line_ns = len(step.data) * self._character_ns
+        self._quiet_since_ns = now_ns + on_line_ns
+        if isinstance(step, Send):
+            if on_line_ns:
+                running.step = Pause(0.0)  # resume when the last bit has left
+                self._rest_until(now_ns + on_line_ns)
+            else:
+                self._resume(None, now_ns)
+            return
+        running.attempts += 1
+        running.reply.clear()
+        self._state = _State.EXPECTING
+        self._until_ns = now_ns + on_line_ns + int(step.timeout_s * 1e9)
+
+    def _recover(self, reason: str, now_ns: int) -> None:
+        self._state = _State.RECOVERING
+        self._reason = reason
+        self._until_ns = max(now_ns, self._quiet_since_ns) + self._recovery_ns
+
+    def _after_recovery(self, now_ns: int) -> None:
+        running = self._running
+        if running is None:
+            return
+        step = running.step
+        if isinstance(step, Exchange) and step.repeatable and running.attempts < ATTEMPTS:
+            self.counters.repeats += 1
+            self._transmit(now_ns)
+        else:
+            self._resume(LinkError(self._reason), now_ns)

@@ -1,0 +1,93 @@
+"""The nursery: imports drivers once, validates their settings, and forks a process for each device.
+
+Started by the daemon as ``python -m sioms.sdk.nursery FD``. Forking shares the memory of the
+libraries among all drivers, and makes a restart a matter of milliseconds. The nursery has one thread
+and no state but imported modules; drivers live on when it dies, and it ends when the daemon does.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import socket
+import sys
+import traceback
+from typing import Any
+
+from sioms.protocol.messages import NurseryVerb, decode, refusal, reply
+
+from .finding import DriverNotFound, describe, find_driver, read_settings
+
+
+def main(fd: int) -> None:
+    """Serve the daemon until it closes the socket."""
+    sock = socket.socket(fileno=fd)
+    os.set_inheritable(fd, False)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the daemon decides what Ctrl-C means
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel reaps; the daemon watches by pidfd
+    while True:
+        packet, fds, _, _ = socket.recv_fds(sock, 1 << 20, 8)
+        if not packet:
+            return
+        message: list[Any] = decode(packet)
+        number = message[1]
+        try:
+            match NurseryVerb(message[0]):
+                case NurseryVerb.DESCRIBE:
+                    sock.send(reply(number, _describe(*message[2:])))
+                case NurseryVerb.SPAWN:
+                    _spawn(sock, number, fds, *message[2:])
+        except Exception as error:  # a driver's describe may raise anything; the daemon must hear of it
+            traceback.print_exc()
+            sock.send(refusal(number, 5, f"{type(error).__name__}: {error}"))
+        finally:
+            for each in fds:
+                os.close(each)
+
+
+def _describe(device: str, driver: str, table: dict[str, Any], folder: str) -> list[Any]:
+    try:
+        found = find_driver(driver, folder)
+    except DriverNotFound as error:
+        return [[f": {error}"], None]
+    settings, errors = read_settings(found, table, folder)
+    if settings is None:
+        return [errors, None]
+    packed, more = describe(found, device, settings)
+    return [errors + more, packed]
+
+
+def _spawn(
+    sock: socket.socket, number: int, fds: list[int], device: str, driver: str, table: dict[str, Any],
+    generation: int, options: dict[str, Any],
+) -> None:  # fmt: skip
+    from .runtime import run  # numpy and the motion core: not needed to check a configuration
+
+    found = find_driver(driver, options["folder"])
+    settings, errors = read_settings(found, table, options["folder"])
+    if errors:
+        raise ValueError("; ".join(errors))
+    gc.collect()
+    gc.freeze()
+    pid = os.fork()
+    if pid == 0:
+        status = 1
+        try:
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            sock.close()
+            status = run(found, device, settings, generation, options, fds)
+        except BaseException:  # the process ends here whatever happened, and must not run the nursery's code
+            traceback.print_exc()
+        finally:
+            sys.stderr.flush()
+            os._exit(status)
+    pidfd = os.pidfd_open(pid)
+    try:
+        socket.send_fds(sock, [reply(number, pid)], [pidfd])
+    finally:
+        os.close(pidfd)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))

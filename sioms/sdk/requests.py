@@ -1,0 +1,356 @@
+"""What clients may ask of a driver on a handle: writes and ioctl requests.
+
+Every request either takes effect as a whole or is refused with an errno and one sentence that names
+the node, the channel, the field, the value and what would be accepted.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.motion import CommandError
+from sioms.protocol.flags import NodeClass, Request, Right, WriteFlag
+from sioms.protocol.records import WRITE_STRUCT, numpy_dtype
+
+from .blocks import AnalogBlock, AxisBlock, BinaryBlock
+from .driver import Refusal
+from .handles import Handle, Wait
+
+if TYPE_CHECKING:
+    from .runtime import Runtime
+
+_DTYPE = {cls: np.dtype(numpy_dtype(cls)) for cls in NodeClass}
+LATER = object()
+"""Returned instead of a value when the answer comes later."""
+
+
+def _refuse(errno_: int, text: str) -> OSError:
+    return OSError(errno_, text)
+
+
+# --- write ---------------------------------------------------------------------------------------
+
+
+def write(
+    runtime: Runtime, handle: Handle, number: int, flags: int, timeout_s: float | None, data: bytes
+) -> Any:
+    """Carry out a write of whole records.
+
+    Args:
+        runtime: the driver process.
+        handle: who writes.
+        number: message number, for an answer that comes later.
+        flags: WriteFlag.
+        timeout_s: how long to wait for room in the command buffers [s]; 0: not at all; None: for ever.
+        data: the records, one after the other.
+
+    Returns:
+        The tick number, or LATER.
+
+    Raises:
+        OSError: refused; nothing was taken.
+    """
+    what = f"write {handle.node}"
+    if not handle.writes:
+        raise _refuse(errno.EBADF, f"{what}: the handle is not open for writing")
+    node_class = handle.block.spec.node_class
+    size = WRITE_STRUCT[node_class].size
+    if not data or len(data) % size:
+        raise _refuse(errno.EINVAL, f"{what}: {len(data)} bytes; want whole records of {size} bytes")
+    records = np.frombuffer(data, _DTYPE[node_class])
+    if isinstance(handle.block, AxisBlock):
+        return _write_axes(runtime, handle, number, flags, timeout_s, records, what)
+    channels, values = _output_values(runtime, handle, records, what)
+    if runtime.stopped:
+        raise _refuse(errno.EPERM, f"{what}: stopped by emergency stop ({runtime.latch.source}); reset first")
+    return runtime.engine.write_outputs(handle, number, handle.block, channels, values)
+
+
+def _write_axes(
+    runtime: Runtime, handle: Handle, number: int, flags: int, timeout_s: float | None,
+    records: NDArray[Any], what: str,
+) -> Any:  # fmt: skip
+    bank = handle.block.bank  # type: ignore[union-attr]
+    replace = bool(flags & WriteFlag.REPLACE)
+
+    def attempt() -> None:
+        try:
+            bank.append(records, handle.channels, runtime.now_ns(), replace=replace)
+        except CommandError as error:
+            raise _refuse(error.errno, f"{what}: {error}") from None
+        runtime.engine.commands_written(handle.block)
+
+    if timeout_s is not None and timeout_s <= 0 and not handle.full:
+        attempt()
+        return runtime.tick
+
+    def ready() -> tuple[Any] | None:
+        # Writes of one handle keep their order: a later one waits behind the first that found no room.
+        if handle.full not in (None, ready):
+            return None
+        try:
+            attempt()
+        except OSError as error:
+            if error.errno != errno.EAGAIN:
+                handle.full = None
+                raise
+            handle.full = ready  # type: ignore[assignment]
+            return None
+        handle.full = None
+        return (runtime.tick,)
+
+    def cancelled() -> None:
+        if handle.full is ready:
+            handle.full = None
+
+    if handle.full is None:
+        done = ready()
+        if done is not None:
+            return done[0]
+    runtime.waits.add(Wait(handle, number, what, runtime.deadline(timeout_s), ready, frozenset(), cancelled))
+    return LATER
+
+
+def _output_values(
+    runtime: Runtime, handle: Handle, records: NDArray[Any], what: str
+) -> tuple[list[int], list[float]]:
+    """Check the records of an output and turn them into one value for each channel."""
+    block = handle.block
+    ports: dict[int, float] = {}
+    for record in records:
+        index = int(record["channel"])
+        if not 0 <= index < len(handle.channels):
+            raise _refuse(errno.EINVAL, f"{what}: channel {index}; want 0 to {len(handle.channels) - 1}")
+        channel = int(handle.channels[index])
+        info = block.spec.channels[channel]
+        if isinstance(block, BinaryBlock):
+            value, width = int(record["data"]), info.width
+            mask = int(record["mask"]) or (1 << width) - 1
+            if handle.bit >= 0:
+                if value not in (0, 1):
+                    raise _refuse(errno.EINVAL, f"{what}: data {value}; want 0 or 1")
+                value, mask = value << handle.bit, 1 << handle.bit
+            elif not 0 <= value < 1 << width:
+                raise _refuse(
+                    errno.EINVAL, f"{what}: channel {info.name}: data {value}; want 0 to {(1 << width) - 1}"
+                )
+            before = ports.get(channel, runtime.outputs.get((id(block), channel), int(block.data[channel])))
+            ports[channel] = (int(before) & ~mask) | (value & mask)
+        else:
+            number = float(record["data"])
+            low = -math.inf if info.minimum is None else info.minimum
+            high = math.inf if info.maximum is None else info.maximum
+            if not math.isfinite(number):
+                raise _refuse(
+                    errno.EINVAL, f"{what}: channel {info.name}: data {number}; want a finite number"
+                )
+            if not low <= number <= high:
+                raise _refuse(
+                    errno.ERANGE,
+                    f"{what}: channel {info.name}: data {number:g} {info.unit}; want {low:g} to {high:g} {info.unit}",
+                )
+            ports[channel] = number
+    return list(ports), list(ports.values())
+
+
+# --- ioctl ---------------------------------------------------------------------------------------
+
+_NEEDS_OWNER = {
+    Request.CALIBRATE_DEVICE, Request.HOME, Request.SET_LIMITS, Request.FLUSH,
+}  # fmt: skip
+_NEEDS_RIGHT = {
+    Request.EMERGENCY_STOP: Right.STOP,
+    Request.STOP: Right.STOP | Right.WRITE,
+    Request.SEND_EXTERNAL_SYNCH: Right.WRITE,
+    Request.RESET: Right.WRITE | Right.ADMINISTER,
+    Request.CANCEL_WAITS: Right.WRITE | Right.ADMINISTER,
+    Request.ZERO_DEVICE: Right.WRITE,
+    Request.SET_GAINS: Right.WRITE,
+}
+
+
+def ioctl(
+    runtime: Runtime, handle: Handle, number: int, request_number: int, argument: Any, timeout_s: float | None
+) -> Any:
+    """Carry out a request; see ``Request``.
+
+    Returns:
+        A msgpack-able value, or LATER.
+
+    Raises:
+        OSError: refused.
+    """
+    try:
+        request = Request(request_number)
+    except ValueError:
+        raise _refuse(errno.ENOTTY, f"ioctl {request_number} on {handle.node}: no such request") from None
+    what = f"{request.name} on {handle.node}"
+    owns = handle.exclusive or not _writable(handle)
+    if request in _NEEDS_OWNER and not (owns and handle.exclusive):
+        raise _refuse(errno.EBADF, f"{what}: needs the output node itself, not its read-only companion")
+    if request in (Request.ZERO_DEVICE, Request.SET_GAINS) and not owns:
+        raise _refuse(errno.EBADF, f"{what}: needs the output node itself, not its read-only companion")
+    right = _NEEDS_RIGHT.get(request, Right.READ)
+    if not handle.rights & right:
+        raise _refuse(errno.EPERM, f"{what}: the user has no right to do that; ask for a [[grant]]")
+    match request:
+        case Request.EMERGENCY_STOP:
+            return runtime.stop_node(handle.block, handle.channels, f"{handle.who} on {handle.node}")
+        case Request.RESET:
+            return runtime.reset_node(handle.block, handle.channels, what)
+        case Request.CANCEL_WAITS:
+            ours = {int(c) for c in handle.channels}
+            return runtime.waits.end_where(
+                lambda w: (
+                    w.handle.block is handle.block
+                    and w.number != number
+                    and not ours.isdisjoint(int(c) for c in w.handle.channels)
+                ),
+                errno.ECANCELED,
+                f"cancelled by {handle.who}",
+            )
+        case Request.GET_STATISTICS:
+            return runtime.statistics_report()
+        case Request.WAIT_UNTIL_EVENT:
+            raise _refuse(errno.ENOTTY, f"{what}: is answered by the client library, out of the page")
+        case Request.ZERO_DEVICE if isinstance(handle.block, AnalogBlock):
+            return _zero_analog(runtime, handle, number, argument, timeout_s, what)
+        case Request.SET_GAINS | Request.GET_GAINS if isinstance(handle.block, AnalogBlock):
+            return _gains(handle, request, argument, what)
+    if isinstance(handle.block, AxisBlock):
+        try:
+            return _axis_request(runtime, handle, number, request, argument, timeout_s, what)
+        except CommandError as error:
+            raise _refuse(error.errno, f"{what}: {error}") from None
+    try:
+        return runtime.driver.ioctl(handle.block.spec, request, [int(c) for c in handle.channels], argument)
+    except Refusal as error:
+        raise _refuse(error.errno, f"{what}: {error}") from None
+
+
+def _writable(handle: Handle) -> bool:
+    return handle.block.spec.writable or isinstance(handle.block, AxisBlock)
+
+
+def _axis_request(
+    runtime: Runtime, handle: Handle, number: int, request: Request, argument: Any,
+    timeout_s: float | None, what: str,
+) -> Any:  # fmt: skip
+    bank, axes, now_ns = handle.block.bank, handle.channels, runtime.now_ns()  # type: ignore[union-attr]
+    match request:
+        case Request.WAIT_UNTIL_IDLE:
+            if bank.is_idle(axes):
+                return None
+            channels = frozenset(int(a) for a in axes)
+            runtime.waits.add(
+                Wait(
+                    handle, number, what, runtime.deadline(timeout_s),
+                    lambda: (None,) if bank.is_idle(axes) else None, channels,
+                )
+            )  # fmt: skip
+            return LATER
+        case Request.SEND_EXTERNAL_SYNCH:
+            start_ns = int(argument) if argument else now_ns
+            if start_ns < now_ns - runtime.period_ns:
+                raise _refuse(
+                    errno.ETIME,
+                    f"{what}: its start time passed {(now_ns - start_ns) / 1e6:.2f} ms ago; give it more lead",
+                )
+            if start_ns > now_ns + 60_000_000_000:
+                raise _refuse(
+                    errno.EINVAL, f"{what}: starts in {(start_ns - now_ns) / 1e9:.0f} s; want at most 60 s"
+                )
+            bank.synch(axes, start_ns, now_ns)
+            runtime.engine.commands_written(handle.block)
+            return start_ns
+        case Request.CALIBRATE_DEVICE:
+            bank.calibrate(axes, np.array(_numbers(argument, len(axes), what, "position")))
+        case Request.ZERO_DEVICE:
+            bank.zero(axes)
+        case Request.STOP:
+            bank.stop(axes, now_ns)
+            runtime.end_axis_waits(handle.block, axes, errno.ECANCELED, f"stopped by {handle.who}")
+        case Request.FLUSH:
+            bank.flush(axes)
+        case Request.HOME:
+            runtime.engine.home(handle.block, [int(a) for a in axes])
+        case Request.SET_LIMITS:
+            if not isinstance(argument, dict) or not all(isinstance(k, str) for k in argument):
+                raise _refuse(errno.EINVAL, f"{what}: want limits by name, e.g. {{position_max: 0.2}}")
+            try:
+                bank.set_limits(axes, **argument)
+            except TypeError as error:
+                raise _refuse(errno.EINVAL, f"{what}: {error}") from None
+        case Request.GET_LIMITS:
+            return [bank.get_limits(int(axis)) for axis in axes]
+        case _:
+            raise _refuse(errno.ENOTTY, f"{what}: not a request an axis knows")
+    runtime.engine.commands_written(handle.block)
+    return None
+
+
+def _zero_analog(
+    runtime: Runtime, handle: Handle, number: int, argument: Any, timeout_s: float | None, what: str
+) -> Any:
+    """Take the mean of the next readings as offset."""
+    block = handle.block
+    samples = 1 if argument is None else argument
+    if type(samples) is not int or not 1 <= samples <= 1_000_000:
+        raise _refuse(errno.EINVAL, f"{what}: {samples!r} samples; want 1 to 1000000")
+    total = np.zeros(len(handle.channels))
+    seen = 0
+    last = runtime.published(block)
+
+    def ready() -> tuple[Any] | None:
+        nonlocal seen, last
+        now = runtime.published(block)
+        if now == last:
+            return None
+        last = now
+        total[:] += block.data[handle.channels]  # type: ignore[union-attr]
+        seen += 1
+        if seen < samples:
+            return None
+        mean = total / samples
+        if not np.isfinite(mean).all():
+            raise _refuse(errno.EIO, f"{what}: the readings are not finite; the offset stays as it was")
+        block.offset[handle.channels] = mean  # type: ignore[union-attr]
+        return (mean.tolist(),)
+
+    runtime.waits.add(Wait(handle, number, what, runtime.deadline(timeout_s), ready))
+    return LATER
+
+
+def _gains(handle: Handle, request: Request, argument: Any, what: str) -> list[float] | None:
+    block = handle.block
+    n = len(handle.channels)
+    if n != block.n:
+        raise _refuse(
+            errno.EINVAL, f"{what}: the gain matrix belongs to the whole array of {block.n} channels"
+        )
+    if request is Request.GET_GAINS:
+        gains = np.eye(n) if block.gains is None else block.gains  # type: ignore[union-attr]
+        values: list[float] = gains.ravel().tolist()
+        return values
+    numbers = argument if isinstance(argument, list) else [argument]
+    if len(numbers) == n:  # the diagonal alone
+        block.gains = np.diag(_numbers(numbers, n, what, "gain"))  # type: ignore[union-attr]
+    else:
+        block.gains = np.array(_numbers(numbers, n * n, what, "gain")).reshape(n, n)  # type: ignore[union-attr]
+    return None
+
+
+def _numbers(argument: Any, count: int, what: str, name: str) -> Sequence[float]:
+    values = argument if isinstance(argument, list) else [argument]
+    if len(values) != count:
+        raise _refuse(errno.EINVAL, f"{what}: {len(values)} values of {name}; want {count}")
+    for value in values:
+        if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+            raise _refuse(errno.EINVAL, f"{what}: {name} {value!r}; want a finite number")
+    return [float(value) for value in values]

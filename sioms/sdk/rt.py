@@ -1,0 +1,89 @@
+"""Real-time services of Linux that Python 3.11 does not wrap: timerfd, mlockall, timer slack.
+
+Everything that needs a privilege is tried and, when refused, done without: SIOMS then runs with the
+latencies of an ordinary process.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import gc
+import os
+import time
+
+_libc = ctypes.CDLL(None, use_errno=True)
+_TFD_CLOEXEC, _TFD_NONBLOCK, _TFD_TIMER_ABSTIME = 0o2000000, 0o4000, 1
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_PR_SET_NAME, _PR_SET_TIMERSLACK = 15, 29
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("sec", ctypes.c_long), ("nsec", ctypes.c_long))
+
+
+class _Itimerspec(ctypes.Structure):
+    _fields_ = (("interval", _Timespec), ("value", _Timespec))
+
+
+class TimerFd:
+    """A timer as a descriptor (timerfd_create(2)), on CLOCK_MONOTONIC.
+
+    Concurrency: one thread.
+    """
+
+    def __init__(self) -> None:
+        self.fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, _TFD_CLOEXEC | _TFD_NONBLOCK)
+        if self.fd < 0:
+            raise OSError(ctypes.get_errno(), "create timer: timerfd_create failed")
+        self._spec = _Itimerspec()
+        self._pointer = ctypes.byref(self._spec)
+
+    def set(self, first_ns: int, period_ns: int = 0) -> None:
+        """Expire at a time [ns, CLOCK_MONOTONIC; 0 disarms], and then every period [ns]."""
+        spec = self._spec
+        spec.value.sec, spec.value.nsec = divmod(first_ns, 1_000_000_000)
+        spec.interval.sec, spec.interval.nsec = divmod(period_ns, 1_000_000_000)
+        if _libc.timerfd_settime(self.fd, _TFD_TIMER_ABSTIME, self._pointer, None):
+            raise OSError(ctypes.get_errno(), "set timer: timerfd_settime failed")
+
+    def expirations(self) -> int:
+        """Return how often it has expired since the last call."""
+        try:
+            return int.from_bytes(os.read(self.fd, 8), "little")
+        except BlockingIOError:
+            return 0
+
+    def close(self) -> None:
+        """Release the descriptor."""
+        os.close(self.fd)
+
+
+def name_process(name: str) -> None:
+    """Set the name that ps and top show (15 bytes)."""
+    _libc.prctl(_PR_SET_NAME, name.encode()[:15], 0, 0, 0)
+
+
+def become_realtime(priority: int) -> list[str]:
+    """Ask for real-time scheduling and resident memory, and switch the cyclic collector off.
+
+    Args:
+        priority: SCHED_FIFO priority 1 to 99; 0 leaves the scheduling as it is.
+
+    Returns:
+        What was refused, in words, for the log.
+    """
+    refused = []
+    _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+    if priority:
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        except (PermissionError, OSError) as error:
+            refused.append(f"SCHED_FIFO priority {priority} ({errno.errorcode.get(error.errno or 0, '?')})")
+    # ONFAULT: the pages shared with the nursery stay shared until they are written.
+    if _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
+        refused.append(f"mlockall ({errno.errorcode.get(ctypes.get_errno(), '?')})")
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    return refused
