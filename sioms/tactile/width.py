@@ -21,6 +21,7 @@ from sioms.tactile.indenter import FLAT
 Floats = NDArray[np.float64]
 
 POINTS = 17
+_FINE = 101
 WIDEST = 0.5  # half width [rad]: a flat under some 700 N/m on the fingers described here
 
 
@@ -39,12 +40,21 @@ class WidthTable:
     half_widths: Floats
     ratio: Floats
     _spline: CubicSpline = field(init=False, repr=False)
+    _fine: list[tuple[float, float]] = field(init=False, repr=False)
+    _step: float = field(init=False, repr=False)
+    _unit: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         # mirrored about a = 0, because the ratio is even
         a, h = np.asarray(self.half_widths), np.asarray(self.ratio)
         spline = CubicSpline(np.concatenate([-a[:0:-1], a]), np.concatenate([h[:0:-1], h]))
+        fine, step = np.linspace(0.0, a[-1], _FINE, retstep=True)
         object.__setattr__(self, "_spline", spline)
+        object.__setattr__(
+            self, "_fine", list(zip(spline(fine).tolist(), (step * spline(fine, 1)).tolist(), strict=True))
+        )
+        object.__setattr__(self, "_step", float(step))
+        object.__setattr__(self, "_unit", float(hertz_product(self.cylinder, 1.0)))
 
     @property
     def largest(self) -> float:
@@ -63,6 +73,19 @@ class WidthTable:
         # d(a^2 h)/d(a^2) = h + a h'/2
         slope: Floats = hertz_product(self.cylinder, 1.0) * (self._spline(a) + 0.5 * a * self._spline(a, 1))
         return slope
+
+    def radius(self, load: float, square: float) -> tuple[float, float]:
+        """Return R [m] and dR/db [m/rad^2] at a load [N/m] and b = a^2; scalar and fast, for every frame."""
+        a = square**0.5
+        place = min(int(a / self._step), len(self._fine) - 2)
+        h0, d0 = self._fine[place]
+        h1, d1 = self._fine[place + 1]
+        s = a / self._step - place
+        r = 1.0 - s
+        h = (1.0 + 2.0 * s) * r * r * h0 + s * r * r * d0 + s * s * (3.0 - 2.0 * s) * h1 - s * s * r * d1
+        slope = 6.0 * s * r * (h1 - h0) + r * (1.0 - 3.0 * s) * d0 + s * (3.0 * s - 2.0) * d1
+        unit = self._unit / load
+        return unit * square * h, unit * (h + 0.5 * a * slope / self._step)
 
     def half_width(self, product: float) -> float:
         """Return a [rad] at the product P R [N].

@@ -1,0 +1,280 @@
+"""Estimate place, load and radius of the touch in every frame of strains.
+
+    estimator = Estimator(finger)
+    shape = estimator.frame(strains)                        # (ns,) strains, tension positive
+    shape = estimator.frame(strains, load=Load(203.0, 4.0))  # with a force sensor: N/m and its standard
+    deviation
+
+The model is the finger's E map with round contacts of the finger's width table (dissertation 3.5).  Errors
+are propagated from the elements' noise and, in proportion to the touch, from the misfit that calibration
+left; the covariance is that of weighted least squares.  An estimate always carries a quality; `Quality.GOOD`
+means no flag is set.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from enum import Flag, auto
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sioms.tactile.finger import Finger
+from sioms.tactile.kernel import MOST_STEPS, Products, Solve, Status, compiled, plain
+
+Floats = NDArray[np.float64]
+
+
+class Quality(Flag):
+    """Say what is wrong with an estimate."""
+
+    GOOD = 0
+    NO_CONTACT = auto()  # the strains do not rise above the noise: nothing is estimated
+    BAD_ELEMENTS = auto()  # some elements are dead, saturated or not finite and were left out
+    TOO_FEW_ELEMENTS = auto()  # fewer than four usable elements near the touch: nothing is estimated
+    POOR_FIT = (
+        auto()
+    )  # one round contact does not explain the strains: two contacts, a strange shape, a drifted finger
+    OUT_OF_ARC = auto()  # beyond the outermost elements
+    OVERLOAD = auto()  # wider or heavier than the model covers
+    SHARP = auto()  # the width is at its lower bound: an edge, or a load too small to tell
+    FLAT_OR_HOLLOW = auto()  # R is not below rb: no convex indenter does that
+    NOT_CONVERGED = auto()
+    WRONG_SIGN = auto()  # the strains are those of a pull
+
+
+_HUGE = 1e30  # variance of an element that must not count
+_NOTHING = Quality.NO_CONTACT | Quality.TOO_FEW_ELEMENTS | Quality.WRONG_SIGN
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """A measured load P [N/m] and its standard deviation [N/m]; zero deviation means exact."""
+
+    value: float
+    deviation: float
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeEstimate:
+    """Hold what one frame says about the touch; immutable.  All numbers are nan when nothing was estimated.
+
+    Args:
+        angle_rad: place t_c.
+        load_n_per_m: P, compression positive.
+        equivalent_radius_m: R, 1/R = 1/rb + 1/rc.
+        equivalent_curvature_per_m: 1/R, which behaves for flats (1/rb) and is infinite for an edge.
+        radius_m: rc, infinite for a flat or hollow indenter.
+        width_rad: theta_w = 2a.
+        residual: root mean square of strain less model, over the usable elements.
+        misfit: chi square per degree of freedom, about 1 when the model fits.
+        covariance: of (angle [rad], load [N/m], R [m]), rows in this order.
+        quality: flags.
+        steps: steps of the search.
+    """
+
+    angle_rad: float
+    load_n_per_m: float
+    equivalent_radius_m: float
+    equivalent_curvature_per_m: float
+    radius_m: float
+    width_rad: float
+    residual: float
+    misfit: float
+    covariance: tuple[tuple[float, float, float], ...]
+    quality: Quality
+    steps: int
+
+    @property
+    def deviations(self) -> tuple[float, float, float]:
+        """Return the standard deviations of angle [rad], load [N/m] and R [m]."""
+        c = self.covariance
+        return math.sqrt(c[0][0]), math.sqrt(c[1][1]), math.sqrt(c[2][2])
+
+    @property
+    def usable(self) -> bool:
+        """Return whether anything was estimated."""
+        return not self.quality & _NOTHING
+
+
+_BLANK = ((math.nan,) * 3,) * 3
+
+
+def _nothing(quality: Quality) -> ShapeEstimate:
+    n = math.nan
+    return ShapeEstimate(n, n, n, n, n, n, n, n, _BLANK, quality, 0)
+
+
+class Estimator:
+    """Fit frames of one finger.  Not to be shared between threads while a frame is being fitted.
+
+    Args:
+        finger: the calibrated finger.
+        compiled: True demands numba, False plain numpy, None takes numba if it is installed.
+        poor_fit: misfit above which POOR_FIT is set.
+        contact_sigma: how far above the noise the strains must be to count as a touch, in standard deviations
+            of their chi square.
+    """
+
+    def __init__(
+        self, finger: Finger, compiled: bool | None = False, poor_fit: float = 4.0, contact_sigma: float = 6.0
+    ) -> None:
+        self.finger = finger
+        self._table = finger.strain_table()
+        self._widths = finger.width_table()
+        self._solve = self._choose(compiled)
+        self._poor_fit, self._contact_sigma = poor_fit, contact_sigma
+        noise = np.asarray(finger.strain_noise, dtype=np.float64) ** 2
+        self._used = np.isfinite(noise)
+        self._noise = np.where(self._used, noise, _HUGE)
+        self._share = np.asarray(finger.misfit, dtype=np.float64) ** 2
+        angles = np.asarray(finger.angles_rad, dtype=np.float64)
+        pitch = float(np.ptp(angles)) / max(angles.size - 1, 1)
+        self._arc = float(angles.min()) - 0.5 * pitch, float(angles.max()) + 0.5 * pitch
+        self._radius = finger.cylinder.outer_m
+        table = self._table
+        self._widest = float(table.half_widths[-1]) ** 2
+        bank, places = self._templates()
+        self._fixed = (
+            table.nodes, table.first, table.step, float(table.half_widths[1]), bank, bank**2 + 1e-300, places,
+        )  # fmt: skip
+
+    @staticmethod
+    def _choose(wanted: bool | None) -> Solve:
+        if wanted is False:
+            return plain()
+        if wanted is True:
+            return compiled()
+        try:
+            return compiled()
+        except ImportError:
+            return plain()
+
+    def _templates(self) -> tuple[Floats, Floats]:
+        """Return strain patterns of narrow to wide touches every two degrees, to start the search from the best."""
+        table = self._table
+        rows = np.searchsorted(table.half_widths, [0.05, 0.15, 0.3, 0.45]).clip(0, table.half_widths.size - 1)
+        columns = np.arange(0, table.nodes.shape[1], 2)
+        bank = table.nodes[rows[:, None], columns, 0].reshape(rows.size * columns.size, -1)
+        angle = table.first + table.step * columns
+        square = table.half_widths[rows] ** 2
+        return np.ascontiguousarray(bank), np.stack(
+            [np.tile(angle, rows.size), np.repeat(square, columns.size)], axis=1
+        )
+
+    def frame(
+        self, strains: ArrayLike, load: Load | None = None, usable: NDArray[np.bool_] | None = None
+    ) -> ShapeEstimate:
+        """Estimate the touch of one frame.
+
+        Args:
+            strains: shape (ns,), tension positive (a press is negative); values that are not finite are left
+                out.
+            load: what a force sensor says, if any.
+            usable: which elements to use, shape (ns,); None takes all that are finite and not dead in the
+                finger's file.
+
+        Raises:
+            ValueError: wrong number of strains, or a load that is not finite and pressing.
+        """
+        y = np.asarray(strains, dtype=np.float64)
+        if y.shape != self._noise.shape:
+            raise ValueError(
+                f"estimate shape: frame has {y.size} strains in shape {y.shape}; the finger has {self._noise.size} elements"
+            )
+        if load is not None and not (0.0 < load.value < math.inf and 0.0 <= load.deviation < math.inf):
+            raise ValueError(
+                f"estimate shape: load is {load.value} +- {load.deviation} N/m; need a finite pressing load"
+            )
+        return self._estimate(y, load, usable)
+
+    def _estimate(self, y: Floats, load: Load | None, usable: NDArray[np.bool_] | None) -> ShapeEstimate:
+        noise, quality, count = self._noise, Quality.GOOD, y.size
+        good = self._used & np.isfinite(y)
+        if usable is not None:
+            good &= usable
+        if not good.all():
+            quality, count = Quality.BAD_ELEMENTS, int(np.count_nonzero(good))
+            y, noise = np.where(good, y, 0.0), np.where(good, noise, _HUGE)
+        if count < 4:
+            return _nothing(quality | Quality.TOO_FEW_ELEMENTS)
+        value, weight = 0.0, 0.0
+        if load is not None:
+            value, weight = load.value, 1.0 / max(load.deviation, 1e-6 * load.value) ** 2
+        least = count + self._contact_sigma * math.sqrt(2.0 * count)
+        status, t, b, at, steps, total = self._solve(
+            *self._fixed, noise, self._share, least, y, value, weight
+        )
+        if status == Status.NO_CONTACT:
+            return _nothing(quality | Quality.NO_CONTACT)
+        if status == Status.WRONG_SIGN:
+            return _nothing(quality | Quality.WRONG_SIGN)
+        return self._describe(t, b, at, steps, value, weight, count, total, quality)
+
+    def _describe(
+        self, t: float, b: float, at: Products, steps: int, load: float, load_weight: float, count: int, total: float,
+        quality: Quality,
+    ) -> ShapeEstimate:  # fmt: skip
+        ff, ft, fb, fy, tt, tb, _, bb, _, yy = at
+        ff, fy = ff + load_weight, fy + load_weight * load
+        p = fy / ff
+        if p <= 0.0:
+            return _nothing(quality | Quality.WRONG_SIGN)
+        chi = max(yy + load_weight * load * load - fy * fy / ff, 0.0)
+        misfit = chi / max(count + (load_weight > 0.0) - 3, 1)
+        radius, slope = self._widths.radius(p, b)
+        covariance = _covariance(p, (p * p * tt, p * ft, p * p * tb, ff, p * fb, p * p * bb), radius, slope)
+        quality |= self._judge(t, b, p, radius, misfit, steps)
+        bend = 1.0 / radius if radius > 0.0 else math.inf
+        own = bend - 1.0 / self._radius
+        return ShapeEstimate(
+            t, p, radius, bend, 1.0 / own if own > 0.0 else math.inf, 2.0 * math.sqrt(b),
+            math.sqrt(chi / total), misfit, covariance, quality, steps,
+        )  # fmt: skip
+
+    def _judge(self, t: float, b: float, load: float, radius: float, misfit: float, steps: int) -> Quality:
+        quality = Quality.GOOD
+        if misfit > self._poor_fit:
+            quality |= Quality.POOR_FIT
+        if not self._arc[0] <= t <= self._arc[1]:
+            quality |= Quality.OUT_OF_ARC
+        if b >= self._widest or load > self.finger.most_load_n_per_m:
+            quality |= Quality.OVERLOAD
+        if b <= 0.0:
+            quality |= Quality.SHARP
+        if radius >= self._radius:
+            quality |= Quality.FLAT_OR_HOLLOW
+        if steps >= MOST_STEPS:
+            quality |= Quality.NOT_CONVERGED
+        return quality
+
+    def batch(
+        self,
+        frames: Iterable[ArrayLike],
+        load: Load | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> Iterator[ShapeEstimate]:
+        """Estimate many frames in turn; `progress` is told how many are done."""
+        for done, strains in enumerate(frames, 1):
+            yield self.frame(strains, load)
+            if progress is not None:
+                progress(done)
+
+
+def _covariance(
+    load: float, information: tuple[float, float, float, float, float, float], radius: float, slope: float
+) -> tuple[tuple[float, float, float], ...]:
+    """Invert the information on (t, P, b), upper triangle by rows, and turn b into R: dR = slope db - R/P dP."""
+    a, b, c, d, e, f = information
+    m00, m01, m02 = d * f - e * e, c * e - b * f, b * e - c * d
+    det = a * m00 + b * m01 + c * m02
+    if not det > 0.0:
+        return _BLANK
+    m11, m12, m22 = a * f - c * c, b * c - a * e, a * d - b * b
+    by_load = -radius / load
+    tr = (m01 * by_load + m02 * slope) / det
+    pr = (m11 * by_load + m12 * slope) / det
+    rr = (m11 * by_load**2 + 2.0 * m12 * by_load * slope + m22 * slope**2) / det
+    return (m00 / det, m01 / det, tr), (m01 / det, m11 / det, pr), (tr, pr, rr)

@@ -1,0 +1,261 @@
+"""Fit place, width and load of one contact to one frame of strains: variable projection with Levenberg-Marquardt steps.
+
+The load P enters linearly and is eliminated at every step; what remains is a search in (t, b), b = a^2, on
+the tables of `sioms.tactile.model`.  Everything the search needs at a point is ten scalar products of f,
+df/dt, df/db and the strains y, so the search itself is plain scalar arithmetic, written once; only the scalar
+products exist twice, in numpy and as loops for numba (optional).  Source: Golub and Pereyra (1973) in
+Kaufman's form; dissertation 3.5.
+
+Weights are inverse variances, hence the cost is a chi square and the covariance needs no scale.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from enum import IntEnum
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Products = tuple[float, float, float, float, float, float, float, float, float, float]
+# fits (nodes, first, step, width_step, weights, y, load, load_weight, t, b) -> (t, b, ten products,
+# iterations)
+Fit = Callable[..., tuple[float, float, Products, int]]
+# solves one frame, see `_solver` -> (status, t, b, ten products, iterations, sum of weights)
+Solve = Callable[..., tuple[int, float, float, Products, int, float]]
+
+MOST_STEPS = 40
+_TOLERANCE = 1e-7  # stop when a step gains less than this much chi square: 3e-4 standard deviations
+
+
+def _products_numpy(
+    nodes: Floats,
+    first: float,
+    step: float,
+    width_step: float,
+    weights: Floats,
+    y: Floats,
+    t: float,
+    b: float,
+) -> Products:
+    """Return ff, ft, fb, fy, tt, tb, ty, bb, by, yy with f = f(t, b), t = df/dt, b = df/db, weighted."""
+    rows, columns, _, elements = nodes.shape
+    column = min(max(int((t - first) / step), 0), columns - 2)
+    s = (t - first) / step - column
+    row = min(int(b**0.5 / width_step), rows - 2)
+    low = (row * width_step) ** 2
+    span = ((row + 1) * width_step) ** 2 - low
+    u = (b - low) / span
+    s2, u2 = s * (1.0 - s), u * (1.0 - u)
+    s0, s1, p0, p1 = (1.0 + 2.0 * s) * (1.0 - s) ** 2, s**2 * (3.0 - 2.0 * s), s2 * (1.0 - s), -s2 * s
+    ds, dp0, dp1 = 6.0 * s2 / step, (1.0 - s) * (1.0 - 3.0 * s) / step, s * (3.0 * s - 2.0) / step
+    u0, u1, v0, v1 = (
+        (1.0 + 2.0 * u) * (1.0 - u) ** 2,
+        u**2 * (3.0 - 2.0 * u),
+        span * u2 * (1.0 - u),
+        -span * u2 * u,
+    )
+    du, dv0, dv1 = 6.0 * u2 / span, (1.0 - u) * (1.0 - 3.0 * u), u * (3.0 * u - 2.0)
+    along = np.array([[s0, p0, s1, p1], [-ds, dp0, ds, dp1], [s0, p0, s1, p1]])
+    across = np.array([[u0, v0, u1, v1], [u0, v0, u1, v1], [-du, dv0, du, dv1]])
+    # nodes (row, column, [f, ft, fb, ftb], element) against across (row, value or d/db) x along (column,
+    # value or d/dt)
+    mixed = across.reshape(3, 2, 1, 2, 1) * along.reshape(3, 1, 2, 1, 2)
+    block = nodes[row : row + 2, column : column + 2].reshape(16, elements)
+    values = np.empty((4, elements))
+    np.matmul(mixed.reshape(3, 16), block, out=values[:3])
+    values[3] = y
+    gram = (values * weights) @ values.T
+    (ff, ft, fb, fy), (_, tt, tb, ty), (_, _, bb, by), (_, _, _, yy) = gram.tolist()
+    return ff, ft, fb, fy, tt, tb, ty, bb, by, yy
+
+
+def _products_loops(
+    nodes: Floats,
+    first: float,
+    step: float,
+    width_step: float,
+    weights: Floats,
+    y: Floats,
+    t: float,
+    b: float,
+) -> Products:
+    """Return the same as `_products_numpy`, for the compiler."""
+    rows, columns, _, elements = nodes.shape
+    column = min(max(int((t - first) / step), 0), columns - 2)
+    s = (t - first) / step - column
+    row = min(int(b**0.5 / width_step), rows - 2)
+    low = (row * width_step) ** 2
+    span = ((row + 1) * width_step) ** 2 - low
+    u = (b - low) / span
+    along = (
+        (1.0 + 2.0 * s) * (1.0 - s) ** 2,
+        s * (1.0 - s) ** 2,
+        s**2 * (3.0 - 2.0 * s),
+        -(s**2) * (1.0 - s),
+    )
+    d_along = (-6.0 * s * (1.0 - s), (1.0 - s) * (1.0 - 3.0 * s), 6.0 * s * (1.0 - s), s * (3.0 * s - 2.0))
+    across = (
+        (1.0 + 2.0 * u) * (1.0 - u) ** 2,
+        u * (1.0 - u) ** 2,
+        u**2 * (3.0 - 2.0 * u),
+        -(u**2) * (1.0 - u),
+    )
+    d_across = (-6.0 * u * (1.0 - u), (1.0 - u) * (1.0 - 3.0 * u), 6.0 * u * (1.0 - u), u * (3.0 * u - 2.0))
+    value, turn, widen = np.zeros(elements), np.zeros(elements), np.zeros(elements)
+    for i in range(2):
+        for j in range(2):
+            for q in range(4):
+                x, z = 2 * j + q % 2, 2 * i + q // 2
+                scale = span if q >= 2 else 1.0
+                w0 = along[x] * across[z] * scale
+                w1 = d_along[x] * across[z] * scale / step
+                w2 = along[x] * d_across[z] * scale / span
+                cell = nodes[row + i, column + j, q]
+                for e in range(elements):
+                    value[e] += w0 * cell[e]
+                    turn[e] += w1 * cell[e]
+                    widen[e] += w2 * cell[e]
+    ff = ft = fb = fy = tt = tb = ty = bb = by = yy = 0.0
+    for e in range(elements):
+        w = weights[e]
+        ff += w * value[e] * value[e]
+        ft += w * value[e] * turn[e]
+        fb += w * value[e] * widen[e]
+        fy += w * value[e] * y[e]
+        tt += w * turn[e] * turn[e]
+        tb += w * turn[e] * widen[e]
+        ty += w * turn[e] * y[e]
+        bb += w * widen[e] * widen[e]
+        by += w * widen[e] * y[e]
+        yy += w * y[e] * y[e]
+    return ff, ft, fb, fy, tt, tb, ty, bb, by, yy
+
+
+def _build(products: Callable[..., Products]) -> Fit:
+    """Return the search over the given scalar products; its body is also what numba compiles."""
+
+    def fit(
+        nodes: Floats,
+        first: float,
+        step: float,
+        width_step: float,
+        weights: Floats,
+        y: Floats,
+        load: float,
+        load_weight: float,
+        t: float,
+        b: float,
+    ) -> tuple[float, float, Products, int]:
+        top_t = first + step * (nodes.shape[1] - 1)
+        top_b = (width_step * (nodes.shape[0] - 1)) ** 2
+        at = products(nodes, first, step, width_step, weights, y, t, b)
+        ff, fy = at[0] + load_weight, at[3] + load_weight * load
+        cost = -(max(fy, 0.0) ** 2) / ff
+        damping = 1e-3
+        steps = 0
+        while steps < MOST_STEPS:
+            steps += 1
+            p = fy / ff
+            # a load of the wrong sign gives no direction: fall back on a small positive one
+            p = max(p, 1e-3)
+            gain_t, gain_b = p * (at[6] - p * at[1]), p * (at[8] - p * at[2])
+            tt, bb = p * p * (at[4] - at[1] ** 2 / ff), p * p * (at[7] - at[2] ** 2 / ff)
+            tb = p * p * (at[5] - at[1] * at[2] / ff)
+            held = (b <= 0.0 and gain_b < 0.0) or (b >= top_b and gain_b > 0.0)
+            lt, lb = tt * (1.0 + damping) + 1e-30, bb * (1.0 + damping) + 1e-30
+            if held:
+                move_t, move_b = gain_t / lt, 0.0
+            else:
+                det = lt * lb - tb * tb
+                move_t, move_b = (lb * gain_t - tb * gain_b) / det, (lt * gain_b - tb * gain_t) / det
+            # one pitch at most: the model turns over within about that distance
+            move_t = min(max(move_t, -0.1), 0.1)
+            new_t = min(max(t + move_t, first), top_t)
+            new_b = min(max(b + move_b, 0.0), top_b)
+            promised = (new_t - t) * gain_t + (new_b - b) * gain_b
+            try_at = products(nodes, first, step, width_step, weights, y, new_t, new_b)
+            try_ff, try_fy = try_at[0] + load_weight, try_at[3] + load_weight * load
+            try_cost = -(max(try_fy, 0.0) ** 2) / try_ff
+            if try_cost <= cost + 1e-12 * abs(cost):
+                t, b, at, ff, fy, cost = new_t, new_b, try_at, try_ff, try_fy, try_cost
+                damping = max(0.1 * damping, 1e-9)
+                if promised < _TOLERANCE:
+                    break
+            else:
+                if promised < _TOLERANCE:
+                    break
+                damping = max(10.0 * damping, 1e-3)
+        return t, b, at, steps
+
+    return fit
+
+
+class Status(IntEnum):
+    """Say how far `solve` came."""
+
+    FITTED = 0
+    NO_CONTACT = 1
+    WRONG_SIGN = 2
+
+
+def _solver(fit: Fit) -> Solve:
+    """Return one frame's whole work: weights, touch or not, best pattern, search; numba compiles its body too."""
+
+    def solve(
+        nodes: Floats,
+        first: float,
+        step: float,
+        width_step: float,
+        bank: Floats,
+        bank_square: Floats,
+        places: Floats,
+        noise: Floats,
+        share: Floats,
+        least: float,
+        y: Floats,
+        load: float,
+        load_weight: float,
+    ) -> tuple[int, float, float, Products, int, float]:
+        blank = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        square = y * y
+        if (square / noise).sum() < least:
+            return 1, 0.0, 0.0, blank, 0, 0.0
+        weights = 1.0 / (noise + share * square.max())
+        score = bank @ (weights * y)
+        best = np.argmax(score * np.abs(score) / (bank_square @ weights))
+        if score[best] <= 0.0:
+            return 2, 0.0, 0.0, blank, 0, 0.0
+        t, b, at, steps = fit(
+            nodes, first, step, width_step, weights, y, load, load_weight, places[best, 0], places[best, 1]
+        )
+        return 0, t, b, at, steps, weights.sum()
+
+    return solve
+
+
+@lru_cache(maxsize=1)
+def plain() -> Solve:
+    """Return the solver in plain numpy."""
+    return _solver(_build(_products_numpy))
+
+
+@lru_cache(maxsize=1)
+def compiled() -> Solve:
+    """Return the solver compiled by numba; takes seconds the first time on a machine, then is read from the cache.
+
+    Raises:
+        ImportError: numba is not installed (the extra `fast`).
+    """
+    if importlib.util.find_spec("numba") is None:
+        raise ImportError(
+            "compile tactile fit: numba is not installed; pip install sioms[fast], or fit in plain numpy"
+        )
+    numba: Any = importlib.import_module("numba")
+    jit = numba.njit(cache=True, error_model="numpy")
+    solver: Solve = jit(_solver(jit(_build(jit(_products_loops)))))
+    return solver
