@@ -1,0 +1,262 @@
+"""Simulated axes: a motion bank that closes its loop over simulated motors and steppers.
+
+Besides the axes it shows a block ``plant`` with what the simulated world feels of them: the true
+position of each load and the force with which it presses on its wall. Simulated sensors read it.
+
+    [device.mod0]
+    driver = "sim-axes"
+    [[device.mod0.axis]]
+    name = "xaxis"
+    velocity_max = 0.5
+    acceleration_max = 5.0
+    force_max = 40.0
+    motor = { mass = 2.0, viscous = 4.0, coulomb = 3.0, stiction = 4.0, encoder_step = 1e-6 }
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.motion import SWITCH_HOME, SWITCH_MINUS, SWITCH_PLUS, AxisBank, AxisKind, AxisSettings
+from sioms.plant.effects import Effect, build_effects, parse_effects
+from sioms.plant.motor import MotorBank
+from sioms.plant.parameters import Motor
+from sioms.plant.stepper import Stepper, StepperBank
+from sioms.protocol.flags import ControlMode, NodeClass
+from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.sdk.blocks import AnalogBlock, AnyBlock, AxisBlock, BlockSpec, Description
+from sioms.sdk.driver import Kit, TickDriver
+from sioms.sdk.tables import from_table, table_type
+
+# More than this many ticks late, the simulated world stands still instead of catching up.
+_CATCH_UP = 50
+# A profile takes some 20 us to plan; few at a time, so that a plan never delays a tick.
+_PLANS, _SLACK_NS = 8, 300_000
+
+Array = NDArray[np.float64]
+
+ALL_MODES = ControlMode(0x7FFF)
+FORCE_MODES = (
+    ControlMode.FORCE
+    | ControlMode.FORCE_VELOCITY
+    | ControlMode.SPECIFIED_FORCE_OFFSET
+    | ControlMode.SPECIFIED_MAX_FORCE
+)
+
+AxisTable: Any = table_type(
+    AxisSettings,
+    without=("kind", "modes"),
+    extra={
+        "bandwidth_hz": (float, 30.0),
+        "motor": (table_type(Motor) | None, None),
+        "stepper": (table_type(Stepper) | None, None),
+    },
+)
+"""Keys of an axis: those of AxisSettings, and ``motor`` or ``stepper``.
+
+``bandwidth_hz`` sets the gains of a servo that gives none.
+"""
+
+
+class SimAxesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Keys of the device.
+
+    Attributes:
+        axis: the axes.
+        tick_hz: rate of the control loop.
+        capacity: commands that each axis buffers.
+        effects: effects beyond the motors' parameters, a table per axis name or "*".
+        effects_file: the same from a TOML file, to be hidden from who looks at the configuration.
+        history: snapshots kept for readers.
+    """
+
+    axis: list[AxisTable]
+    tick_hz: float = 1000.0
+    capacity: int = 16384
+    effects: dict[str, dict[str, Any]] = {}
+    effects_file: str = ""
+    history: int = 64
+
+
+class SimAxes(TickDriver):
+    """Servo and stepper axes over simulated mechanics.
+
+    Concurrency: the one thread of the driver process.
+    """
+
+    Settings = SimAxesSettings
+
+    @classmethod
+    def describe(cls, name: str, settings: SimAxesSettings) -> Description:
+        """Tell the axes and the plant; reads the effects file, so that its mistakes show before the start."""
+        if not settings.axis:
+            raise ValueError("axis: none given; want a table [[...axis]] for each axis")
+        _build(settings)
+        return Description(
+            (
+                BlockSpec(
+                    "", NodeClass.AXIS, tuple(_axis_channel(axis) for axis in settings.axis),
+                    history=settings.history, capacity=settings.capacity,
+                ),
+                BlockSpec("plant", NodeClass.ANALOG, tuple(_plant_channels(settings.axis)), history=settings.history),
+            ),
+            settings.tick_hz,
+        )  # fmt: skip
+
+    def __init__(self, name: str, settings: SimAxesSettings, kit: Kit) -> None:
+        super().__init__(name, settings, kit)
+        axes, plant = self.describe(name, settings).blocks
+        self._servos, self._steppers, configured = _build(settings)
+        self._tick_ns = round(1e9 / settings.tick_hz)
+        self.bank = AxisBank(
+            configured, tick_s=1 / settings.tick_hz, markers=kit.markers, capacity=settings.capacity
+        )
+        self._axes, self._plant = AxisBlock(axes, self.bank), AnalogBlock(plant)
+        n = len(configured)
+        stepper = np.array([axis.kind is AxisKind.STEPPER for axis in configured])
+        self._servo_rows, self._stepper_rows = np.flatnonzero(~stepper), np.flatnonzero(stepper)
+        self._reading = np.zeros(n)
+        self._switches = np.zeros(n, dtype=np.int64)
+        self._command: Array | None = None
+        self._last_ns = 0
+
+    @property
+    def blocks(self) -> Sequence[AnyBlock]:
+        """The axes and the plant."""
+        return (self._axes, self._plant)
+
+    def tick(self, now_ns: int) -> None:
+        """Let the world go on under the last command up to now, measure, and command anew."""
+        if self._command is not None:
+            ticks = round((now_ns - self._last_ns) / self._tick_ns)
+            for _ in range(min(ticks, _CATCH_UP)):
+                self._advance(self._command)
+        self._last_ns = now_ns
+        self._measure()
+        self._command = self.bank.tick(now_ns, self._reading, self._switches)
+        self._show()
+
+    def slack(self, now_ns: int, until_ns: int) -> None:
+        """Plan profiles ahead while there is time."""
+        if until_ns - now_ns > _SLACK_NS:
+            self.bank.plan_ahead(_PLANS)
+
+    def _advance(self, command: Array) -> None:
+        if self._servos is not None:
+            self._servos.advance(command[self._servo_rows])
+        if self._steppers is not None:
+            self._steppers.advance(command[self._stepper_rows])
+
+    def _measure(self) -> None:
+        if self._servos is not None:
+            self._reading[self._servo_rows] = self._servos.encoder.position
+            self._switches[self._servo_rows] = _switch_bits(self._servos)
+        if self._steppers is not None:
+            self._reading[self._stepper_rows] = self._steppers.reading
+            self._switches[self._stepper_rows] = _switch_bits(self._steppers)
+
+    def _show(self) -> None:
+        data = self._plant.data.reshape(-1, 2)
+        if self._servos is not None:
+            data[self._servo_rows, 0] = self._servos.load_position
+            data[self._servo_rows, 1] = self._servos.contact_force
+        if self._steppers is not None:
+            data[self._stepper_rows, 0] = self._steppers.position
+
+
+def _switch_bits(bank: MotorBank | StepperBank) -> NDArray[np.int64]:
+    bits: NDArray[np.int64] = bank.at_limit_minus * SWITCH_MINUS
+    bits += bank.at_limit_plus * SWITCH_PLUS
+    bits += bank.at_home * SWITCH_HOME
+    return bits
+
+
+def _build(settings: SimAxesSettings) -> tuple[MotorBank | None, StepperBank | None, list[AxisSettings]]:
+    """Make the plants and the settings of the bank.
+
+    Raises:
+        ValueError: an axis, a motor or an effect that cannot be.
+    """
+    tick_s = 1 / settings.tick_hz
+    servos = [axis for axis in settings.axis if axis.motor is not None]
+    steppers = [axis for axis in settings.axis if axis.stepper is not None]
+    for axis in settings.axis:
+        if (axis.motor is None) == (axis.stepper is None):
+            raise ValueError(f"axis {axis.name}: has neither or both of motor and stepper; want one of them")
+    effects = _effects(settings, [axis.name for axis in servos])
+    motors = MotorBank([from_table(Motor, a.motor) for a in servos], tick_s, effects) if servos else None
+    rotors = StepperBank([from_table(Stepper, a.stepper) for a in steppers], tick_s) if steppers else None
+    return motors, rotors, [_axis_settings(axis, tick_s) for axis in settings.axis]
+
+
+def _effects(settings: SimAxesSettings, servos: Sequence[str]) -> tuple[Effect, ...]:
+    """Return the effects of the table and of the file."""
+    effects = build_effects(settings.effects, servos, "effects")
+    if not settings.effects_file:
+        return effects
+    try:
+        with open(settings.effects_file, encoding="utf-8") as file:
+            text = file.read()
+    except OSError as error:
+        reason = error.strerror or errno.errorcode.get(error.errno or 0, "?")
+        raise ValueError(f"effects_file {settings.effects_file}: {reason}; want a TOML file") from error
+    return effects + parse_effects(text, servos, settings.effects_file)
+
+
+def _axis_settings(axis: Any, tick_s: float) -> AxisSettings:
+    """Return the bank's settings; a servo without gains gets those of its bandwidth."""
+    if axis.stepper is not None:
+        return from_table(AxisSettings, axis, {"kind": AxisKind.STEPPER, "modes": ALL_MODES & ~FORCE_MODES})
+    settings = from_table(AxisSettings, axis, {"kind": AxisKind.SERVO, "modes": ALL_MODES})
+    if settings.k is not None:
+        return settings
+    k, kz = _gains(axis, tick_s)
+    return replace(settings, k=k, kz=kz)
+
+
+def _gains(axis: Any, tick_s: float) -> tuple[float, float]:
+    """Return k and kz of a critically damped lead: k (1 + kz) = m w^2, -k kz T = 2 m w."""
+    rate = 2 * np.pi * axis.bandwidth_hz
+    if not 0 < rate * tick_s <= 0.4:
+        raise ValueError(
+            f"axis {axis.name}: bandwidth_hz {axis.bandwidth_hz:g} at a tick of {1 / tick_s:g} Hz; "
+            f"want above 0 and at most {0.4 / (2 * np.pi * tick_s):.3g}"
+        )
+    lead = 2 * axis.motor.mass * rate / tick_s
+    k = axis.motor.mass * rate * rate + lead
+    return k, -lead / k
+
+
+def _axis_channel(axis: Any) -> ChannelInfo:
+    limits = {"velocity": axis.velocity_max, "acceleration": axis.acceleration_max}
+    if axis.jerk_max is not None:
+        limits["jerk"] = axis.jerk_max
+    modes = ALL_MODES & ~FORCE_MODES
+    if axis.stepper is None:
+        limits["force"] = axis.force_max
+        modes = ALL_MODES
+    return ChannelInfo(axis.name, axis.unit, axis.position_min, axis.position_max, 0, int(modes), limits)
+
+
+def _plant_channels(axes: Sequence[Any]) -> list[ChannelInfo]:
+    force_unit = {"m": "N", "rad": "N*m"}
+    return [
+        channel
+        for axis in axes
+        for channel in (
+            ChannelInfo(f"{axis.name}_position", axis.unit, description="true position of the load"),
+            ChannelInfo(
+                f"{axis.name}_contact", force_unit.get(axis.unit, "N"), description="force on the wall"
+            ),
+        )
+    ]
+
+
+DRIVER = SimAxes

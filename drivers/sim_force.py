@@ -1,0 +1,130 @@
+"""A simulated six-component force/torque sensor that feels the contacts of simulated axes.
+
+[device.force0]
+driver = "sim-force"
+noise = [0.05, 0.05, 0.08, 0.002, 0.002, 0.002]
+[[device.force0.contact]]
+node = "mod0.plant.zaxis_contact"
+direction = [0, 0, -1]
+point_m = [0.0, 0.02, 0.1]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from sioms.plant.force_sensor import COMPONENTS, Contact, ForceSensor
+from sioms.protocol.flags import AnalogStatus, NodeClass
+from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
+from sioms.sdk.driver import Kit, TickDriver
+
+Vector = tuple[float, float, float]
+Six = Annotated[list[float], Meta(min_length=6, max_length=6)]
+
+
+class ContactTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A contact that the sensor feels.
+
+    Attributes:
+        node: analog node of one channel with the contact force [N].
+        direction: of the force on the sensor.
+        point_m: of its application, from the sensor's origin.
+    """
+
+    node: str
+    direction: Vector
+    point_m: Vector = (0.0, 0.0, 0.0)
+
+
+class SimForceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Keys of the device; six values are fx, fy, fz [N], tx, ty, tz [N m].
+
+    Attributes:
+        contact: the contacts it feels.
+        noise: standard deviations.
+        resolution: steps of the readings, all positive, or none.
+        bias: readings without load.
+        limit: the readings saturate here.
+        cross_talk: 6 rows of 6, applied to the true components.
+        seed: of the noise.
+        tick_hz: rate.
+        history: snapshots kept for readers.
+    """
+
+    contact: list[ContactTable] = []
+    noise: Six = [0.05, 0.05, 0.08, 0.002, 0.002, 0.002]
+    resolution: Six = [0.01, 0.01, 0.02, 0.0005, 0.0005, 0.0005]
+    bias: Six = [0.0] * 6
+    limit: Six = [200.0, 200.0, 400.0, 10.0, 10.0, 10.0]
+    cross_talk: Annotated[list[Six], Meta(min_length=6, max_length=6)] | None = None
+    seed: int = 0
+    tick_hz: float = 1000.0
+    history: int = 64
+
+
+class SimForce(TickDriver):
+    """A simulated force/torque sensor.
+
+    Concurrency: the one thread of the driver process.
+    """
+
+    Settings = SimForceSettings
+
+    @classmethod
+    def describe(cls, name: str, settings: SimForceSettings) -> Description:
+        """Tell the six channels and the contact nodes."""
+        _sensor(settings)
+        units = ("N",) * 3 + ("N*m",) * 3
+        channels = tuple(
+            ChannelInfo(component, unit, -limit, limit)
+            for component, unit, limit in zip(COMPONENTS, units, settings.limit, strict=True)
+        )
+        inputs = tuple(dict.fromkeys(contact.node for contact in settings.contact))
+        return Description(
+            (BlockSpec("", NodeClass.ANALOG, channels, history=settings.history),), settings.tick_hz, inputs
+        )
+
+    def __init__(self, name: str, settings: SimForceSettings, kit: Kit) -> None:
+        super().__init__(name, settings, kit)
+        self._block = AnalogBlock(self.describe(name, settings).blocks[0])
+        self._sensor = _sensor(settings)
+        self._forces = np.zeros(len(settings.contact))
+        self._limit = np.array(settings.limit)
+
+    @property
+    def blocks(self) -> Sequence[AnyBlock]:
+        """The six components."""
+        return (self._block,)
+
+    def tick(self, now_ns: int) -> None:
+        """Read the contacts; one whose device is not there presses nothing and makes the reading invalid."""
+        missing = False
+        for index, contact in enumerate(self.settings.contact):
+            reading = self.kit.inputs[contact.node].read(now_ns)
+            missing |= reading is None
+            self._forces[index] = 0.0 if reading is None else reading[0, 0]
+        data = self._sensor.read(self._forces, self._block.data)
+        self._block.flags[:] = (np.abs(data) >= self._limit) * int(AnalogStatus.SATURATED)
+        if missing:
+            self._block.flags |= int(AnalogStatus.INVALID)
+
+
+def _sensor(settings: SimForceSettings) -> ForceSensor:
+    return ForceSensor(
+        [Contact(contact.direction, contact.point_m) for contact in settings.contact],
+        settings.noise,
+        settings.resolution,
+        settings.bias,
+        settings.limit,
+        None if settings.cross_talk is None else np.array(settings.cross_talk),
+        settings.seed,
+    )
+
+
+DRIVER = SimForce

@@ -1,0 +1,137 @@
+"""A simulated tactile finger: the strain pattern under an object that a simulated axis presses on it.
+
+The driver knows the contact force and, where told, the contact angle from nodes of other devices.
+
+    [device.tactile0]
+    driver = "sim-tactile"
+    force_node = "mod0.plant.zaxis_contact"
+    angle_node = "mod0.plant.xaxis_position"
+    angle_per_position = 78.7
+    angle_rad = 1.29
+    indenter_radius_m = 0.006
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+
+from sioms.plant.finger import FingerShape, TactileArray
+from sioms.protocol.flags import AnalogStatus, NodeClass
+from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
+from sioms.sdk.driver import Kit, TickDriver
+from sioms.sdk.tables import from_table, table_type
+
+FingerTable: Any = table_type(FingerShape)
+
+
+class SimTactileSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Keys of the device.
+
+    Attributes:
+        force_node: analog node of one channel with the force on the finger [N]; no contact when absent.
+        angle_node: node of one channel that moves the contact along the finger; fixed when absent.
+        angle_rad: contact angle, at position 0 of the angle node.
+        angle_per_position: [rad/m or rad/rad].
+        indenter_radius_m: radius of the object, infinite for a flat.
+        finger: geometry and material.
+        gain, offset: of the elements [1, %]; one number for each.
+        noise, resolution: of all [%].
+        seed: of the noise.
+        tick_hz: rate.
+        history: snapshots kept for readers.
+    """
+
+    force_node: str = ""
+    angle_node: str = ""
+    angle_rad: float = 1.29
+    angle_per_position: float = 0.0
+    indenter_radius_m: float = 6e-3
+    finger: FingerTable = FingerTable()
+    gain: list[float] = []
+    offset: list[float] = []
+    noise: float = 0.02
+    resolution: float = 0.01
+    seed: int = 0
+    tick_hz: float = 200.0
+    history: int = 64
+
+
+class SimTactile(TickDriver):
+    """A simulated tactile array.
+
+    Concurrency: the one thread of the driver process.
+    """
+
+    Settings = SimTactileSettings
+
+    @classmethod
+    def describe(cls, name: str, settings: SimTactileSettings) -> Description:
+        """Tell the elements and the nodes that are felt."""
+        elements = _array(settings).offset.size
+        channels = tuple(
+            ChannelInfo(f"e{index}", "%", description="radial compression") for index in range(elements)
+        )
+        inputs = tuple(dict.fromkeys(node for node in (settings.force_node, settings.angle_node) if node))
+        return Description(
+            (BlockSpec("", NodeClass.ANALOG, channels, history=settings.history),), settings.tick_hz, inputs
+        )
+
+    def __init__(self, name: str, settings: SimTactileSettings, kit: Kit) -> None:
+        super().__init__(name, settings, kit)
+        self._block = AnalogBlock(self.describe(name, settings).blocks[0])
+        self._array = _array(settings)
+
+    @property
+    def blocks(self) -> Sequence[AnyBlock]:
+        """The elements."""
+        return (self._block,)
+
+    def tick(self, now_ns: int) -> None:
+        """Read force and angle; while a device is not there the reading is invalid."""
+        settings = self.settings
+        force, angle = self._value(settings.force_node, now_ns), self._value(settings.angle_node, now_ns)
+        contact_rad = settings.angle_rad + settings.angle_per_position * (angle or 0.0)
+        self._array.read(force or 0.0, contact_rad, settings.indenter_radius_m, self._block.data)
+        missing = force is None or angle is None
+        self._block.flags[:] = int(AnalogStatus.INVALID) if missing else 0
+
+    def _value(self, node: str, now_ns: int) -> float | None:
+        """Return a node's value, 0 for no node, None while its device is not there."""
+        if not node:
+            return 0.0
+        reading = self.kit.inputs[node].read(now_ns)
+        return None if reading is None else float(reading[0, 0])
+
+
+def _array(settings: SimTactileSettings) -> TactileArray:
+    """Make the array.
+
+    Raises:
+        ValueError: numbers of another length than the elements, or a radius that is no radius.
+    """
+    shape = from_table(FingerShape, settings.finger)
+    elements = len(shape.angles_rad)
+    for key, values in (("gain", settings.gain), ("offset", settings.offset)):
+        if len(values) not in (0, elements):
+            raise ValueError(f"{key}: {len(values)} numbers; want {elements}, one for each element")
+    if not (settings.indenter_radius_m > 0 and elements > 0 and math.isfinite(settings.angle_rad)):
+        raise ValueError(
+            f"indenter_radius_m {settings.indenter_radius_m:g}, {elements} angles_rad, angle_rad "
+            f"{settings.angle_rad:g}; want a positive radius, one angle or more, a finite angle"
+        )
+    return TactileArray(
+        shape,
+        settings.gain or 1.0,
+        settings.offset or 0.0,
+        settings.noise,
+        settings.resolution,
+        settings.seed,
+    )
+
+
+DRIVER = SimTactile
