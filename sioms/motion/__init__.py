@@ -6,7 +6,7 @@ the unit of the axis (m or rad), forces in N or N*m, instants in integer ns of C
 
 from .bank import AxisBank
 from .commands import Command
-from .drives import Action, DriveBank, StartCommand, StopAxis
+from .drives import ActionKind, DriveAction, DriveBank
 from .types import (
     SWITCH_HOME,
     SWITCH_MINUS,
@@ -24,17 +24,16 @@ __all__ = [
     "SWITCH_HOME",
     "SWITCH_MINUS",
     "SWITCH_PLUS",
-    "Action",
+    "ActionKind",
     "AxisBank",
     "AxisKind",
     "AxisSettings",
     "Command",
     "CommandError",
+    "DriveAction",
     "DriveBank",
     "Event",
     "EventKind",
     "Homing",
     "MarkerPort",
-    "StartCommand",
-    "StopAxis",
 ]

@@ -1,8 +1,8 @@
 """DriveBank: buffers, markers, synch and latches for drives that close their own loop.
 
 The drive makes its own profile; the bank decides when a command goes out and when it has ended.
-poll() takes what the drive reports and answers with actions for the driver to carry out. Pure, and
-one thread, as AxisBank.
+poll() takes what the drive reports, take_actions() hands out what shall be sent, action_done() and
+action_failed() tell how that went. Pure, and one thread, as AxisBank.
 """
 
 from __future__ import annotations
@@ -10,41 +10,59 @@ from __future__ import annotations
 import errno
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.protocol.flags import AxisStatus, ControlMode
+from sioms.protocol.flags import AxisStatus
 from sioms.protocol.records import AXIS_READ_FIELDS
 
+from . import modes
 from .commands import Command
-from .queue import AxesLike, CommandQueue
+from .queue import AxesLike, CommandQueue, LimitValue
 from .types import AxisSettings, CommandError, Event, EventKind, MarkerPort
 
-M = ControlMode
+NEVER_NS = 2**62
 Axes = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True)
-class StartCommand:
-    """Start this command on this axis now; position is absolute and in the axis' raw coordinates."""
+class ActionKind(Enum):
+    """What a drive shall do."""
 
+    START = "start"
+    STOP = "stop"
+    """Stop at maximum deceleration and hold."""
+    QUICK_STOP = "quick stop"
+    """The fastest stop that the drive has (emergency stop, fault)."""
+    HOME = "home"
+    RESET = "reset"
+    """Clear the drive's own fault."""
+
+
+@dataclass(frozen=True, slots=True)
+class DriveAction:
+    """One thing that the driver shall send to one drive.
+
+    Args:
+        kind: what to do.
+        axis: bank axis.
+        command: for START the command; its position is absolute and in the drive's raw coordinates.
+        velocity_max: velocity limit in force [unit/s].
+        acceleration_max: acceleration limit in force [unit/s^2].
+    """
+
+    kind: ActionKind
     axis: int
-    command: Command
+    command: Command | None
     velocity_max: float
     acceleration_max: float
 
-
-@dataclass(frozen=True, slots=True)
-class StopAxis:
-    """Stop this axis: fastest (emergency stop, fault) or controlled at maximum deceleration."""
-
-    axis: int
-    fastest: bool
-
-
-Action = StartCommand | StopAxis
+    @property
+    def is_stop(self) -> bool:
+        """Tell whether it stops the axis and must overtake everything else."""
+        return self.kind in (ActionKind.STOP, ActionKind.QUICK_STOP)
 
 
 class DriveBank:
@@ -85,15 +103,20 @@ class DriveBank:
         self._stopping = np.zeros(n, dtype=bool)
         self._moved = np.zeros(n, dtype=bool)
         self._started_ns = np.zeros(n, dtype=np.int64)
-        self._end_ns = np.full(n, 2**62, dtype=np.int64)
+        self._end_ns = np.full(n, NEVER_NS, dtype=np.int64)
         self._end_fraction = np.zeros(n)
         self._release_ns = np.zeros(n, dtype=np.int64)
         self._offset = np.zeros(n)
         self._target = np.zeros(n)
         self._settle_ns = int(settle_s * 1e9)
-        self._stops: dict[int, bool] = {}
+        self._acknowledged = np.zeros(n, dtype=bool)
+        self._homing = np.zeros(n, dtype=bool)
+        self._resetting = np.zeros(n, dtype=bool)
+        self._stops: dict[int, ActionKind] = {}
+        self._actions: list[DriveAction] = []
         self._seen = False
         self._last_ns = 0
+        self._moving = np.zeros(n, dtype=bool)
 
     # -- verbs: as AxisBank --------------------------------------------------------------------
 
@@ -110,6 +133,7 @@ class DriveBank:
             for axis in touched.tolist():
                 self._running[axis] = None
         self._queue.append(commands)
+        self.advance(now_ns)
 
     def room(self, axes: AxesLike) -> int:
         """Return how many further commands fit into the fullest buffer of these axes."""
@@ -120,9 +144,9 @@ class DriveBank:
         self._queue.clear(np.asarray(axes, dtype=np.int64))
 
     def synch(self, axes: AxesLike, start_ns: int, now_ns: int) -> tuple[int, ...]:
-        """Release the commands that wait for the external synch; they go out in the poll at start_ns."""
+        """Release the commands that wait for the external synch; they go out at start_ns (see due_ns)."""
         chosen = np.asarray(axes, dtype=np.int64)
-        chosen = chosen[self._queue.gated_synch[chosen] & (~self._active[chosen] | self._open_ended(chosen))]
+        chosen = chosen[self._queue.gated_synch[chosen] & (~self._active[chosen] | self._is_open_ended(chosen))]
         self._queue.gated_synch[chosen] = False
         self._release_ns[chosen] = start_ns
         return tuple(chosen.tolist())
@@ -141,8 +165,12 @@ class DriveBank:
         self._halt(fresh, fastest=True)
 
     def reset(self, axes: AxesLike) -> None:
-        """Clear emergency stop and fault. Nothing resumes."""
-        self._queue.unlatch(np.asarray(axes, dtype=np.int64))
+        """Clear emergency stop and fault, the drive's own too. Nothing resumes."""
+        chosen = np.asarray(axes, dtype=np.int64)
+        faulty = chosen[(self._queue.latched[chosen] & int(AxisStatus.FAULT)) != 0]
+        self._queue.unlatch(chosen)
+        self._resetting[faulty] = True
+        self._actions.extend(self._action(ActionKind.RESET, axis) for axis in faulty.tolist())
 
     def fault(self, axes: AxesLike, text: str, now_ns: int | None = None) -> None:
         """Put axes in fault: buffers dropped, the drive stopped the fastest way; latched until reset()."""
@@ -169,13 +197,29 @@ class DriveBank:
         """Make the present place of each axis position 0; see calibrate()."""
         self.calibrate(axes, np.zeros(len(axes)))
 
-    def set_limits(self, axes: AxesLike, **limits: float | None) -> None:
+    def set_limits(self, axes: AxesLike, **limits: LimitValue) -> None:
         """Narrow the limits of axes; see CommandQueue.set_limits()."""
-        self._queue.set_limits(axes, limits, self._position)
+        chosen = np.asarray(axes, dtype=np.int64)
+        if not self.is_idle(chosen):
+            raise CommandError(errno.EBUSY, "set limits: an axis moves or has commands; wait until it is idle")
+        self._queue.set_limits(chosen, limits, self._position)
+        self._velocity_limit[chosen] = self._limits.velocity[chosen]
+        self._acceleration_limit[chosen] = self._limits.acceleration[chosen]
 
-    def get_limits(self, axis: int) -> dict[str, float | None]:
-        """Return the limits of an axis in force, None where there is none."""
-        return self._queue.get_limits(axis)
+    def get_limits(self, axes: AxesLike) -> dict[str, list[float | None]]:
+        """Return the limits in force by name, one entry per axis, None where there is none."""
+        return self._queue.get_limits(axes)
+
+    def home(self, axes: AxesLike, now_ns: int) -> None:
+        """Let the drives run their own homing; the end is a HOMED event."""
+        chosen = np.asarray(axes, dtype=np.int64)
+        self._queue.check_homing(chosen, self._idle(chosen))
+        self._queue.latched[chosen] |= int(AxisStatus.HOMING)
+        self._queue.latched[chosen] &= ~int(AxisStatus.HOMED)
+        for axis in chosen.tolist():
+            self._actions.append(self._action(ActionKind.HOME, axis))
+            self._engage(axis, now_ns)
+        self._homing[chosen] = True
 
     def is_idle(self, axes: AxesLike) -> bool:
         """Tell whether these axes stand still and have no commands."""
@@ -194,7 +238,7 @@ class DriveBank:
         if homed:
             self._queue.emit(EventKind.HOMED, fresh, self._last_ns)
 
-    # -- the poll ------------------------------------------------------------------------------
+    # -- driver side ---------------------------------------------------------------------------
 
     def poll(
         self,
@@ -205,29 +249,77 @@ class DriveBank:
         done: NDArray[np.bool_],
         fault: Sequence[str] | None = None,
         force: NDArray[np.float64] | None = None,
-    ) -> list[Action]:
-        """Take the drives' reports and return what shall be sent to them, stops first.
+    ) -> None:
+        """Take the drives' reports, end what has ended and begin what follows.
 
         Args:
             now_ns: instant of the report [ns].
             position: raw positions (n,).
             velocity: measured velocities (n,).
             moving: drive says it moves (n,).
-            done: drive says its last command is finished (n,); believed only once the command was
-                seen moving, or settle_s after it went out.
+            done: drive says its last command is finished (n,); believed only after the command was
+                confirmed, and then seen moving or settle_s old.
             fault: fault text of each axis, empty when it has none; None when none has.
             force: measured forces or torques (n,), None when the drive tells none.
         """
         self._last_ns = now_ns
         self._seen = True
+        self._moving = moving.copy()
         self._take(now_ns, position, velocity, fault, force)
+        self._end_reached(now_ns, moving, done)
+        self.advance(now_ns)
+
+    def advance(self, now_ns: int) -> None:
+        """Do what time and markers allow without a new report: end timed commands, begin what waits."""
+        self._last_ns = max(self._last_ns, now_ns)
         self._poll_markers(now_ns)
-        self._end_commands(now_ns, moving, done)
-        actions: list[Action] = [StopAxis(axis, fastest) for axis, fastest in self._stops.items()]
+        timed = self._active & ~self._stopping & ~self._homing & (self._end_ns <= now_ns)
+        for axis in np.flatnonzero(timed).tolist():
+            self._end(axis, now_ns)
+        self._start_commands(now_ns)
+        self._publish()
+
+    @property
+    def due_ns(self) -> int:
+        """Instant at which advance() has something to do without a report, 2**62 when none."""
+        waiting = self._release_ns[self._queue.has_head & (self._release_ns > self._last_ns)]
+        ends = self._end_ns[self._active & ~self._stopping]
+        return int(min(waiting.min(initial=NEVER_NS), ends.min(initial=NEVER_NS)))
+
+    def take_actions(self) -> list[DriveAction]:
+        """Return what shall be sent, stops first; each is handed out once."""
+        actions = [self._action(kind, axis) for axis, kind in self._stops.items()]
+        actions += self._actions
         self._stops.clear()
-        actions.extend(self._start_commands(now_ns))
-        self._publish(moving)
+        self._actions = []
         return actions
+
+    def action_done(self, action: DriveAction, now_ns: int) -> None:
+        """Note that a drive confirmed an action: from now on its reports speak of it."""
+        if action.kind is ActionKind.RESET:
+            self._resetting[action.axis] = False
+            return
+        self._acknowledged[action.axis] = True
+        self._started_ns[action.axis] = now_ns
+
+    def action_failed(self, action: DriveAction, text: str, now_ns: int) -> None:
+        """Note that an action could not be sent or was refused: the axis is stopped and in fault."""
+        self._resetting[action.axis] = False
+        self.fault([action.axis], f"{action.kind.value} failed: {text}", now_ns)
+        if action.kind is ActionKind.QUICK_STOP:
+            self._stops.pop(action.axis, None)
+            self._acknowledged[action.axis] = True
+
+    def _action(self, kind: ActionKind, axis: int, command: Command | None = None) -> DriveAction:
+        return DriveAction(
+            kind, axis, command, float(self._velocity_limit[axis]), float(self._acceleration_limit[axis])
+        )
+
+    def _engage(self, axis: int, now_ns: int) -> None:
+        """The axis is about to be told something; reports count only once that is confirmed."""
+        self._active[axis] = True
+        self._moved[axis] = self._acknowledged[axis] = False
+        self._started_ns[axis] = now_ns
 
     def _take(
         self,
@@ -245,7 +337,7 @@ class DriveBank:
         if not good.all():
             self._fault_fresh(np.flatnonzero(~good), "the reported position is not a finite number", now_ns)
         for axis, text in enumerate(fault or ()):
-            if text:
+            if text and not self._resetting[axis]:
                 self._fault_fresh(np.array([axis]), text, now_ns)
 
     def _fault_fresh(self, axes: Axes, text: str, now_ns: int) -> None:
@@ -260,30 +352,37 @@ class DriveBank:
             self._queue.emit(EventKind.DROPPED, np.array([axis]), now_ns, errno.EPIPE, text)
             self._halt(np.array([axis]), fastest=False)
 
-    def _open_ended(self, axes: Axes) -> NDArray[np.bool_]:
+    def _end_reached(self, now_ns: int, moving: NDArray[np.bool_], done: NDArray[np.bool_]) -> None:
+        heard = self._active & self._acknowledged
+        self._moved |= moving & heard
+        settled = now_ns - self._started_ns >= self._settle_ns
+        stands = heard & ~moving
+        reached = stands & done & (self._moved | settled)
+        for axis in np.flatnonzero(stands).tolist():
+            command = self._running[axis]
+            if self._stopping[axis]:
+                self._end(axis, now_ns)
+            elif self._homing[axis] and reached[axis]:
+                self._homed(axis, now_ns)
+            elif reached[axis] and command is not None and _ends_by_itself(command):
+                self._end(axis, now_ns)
+
+    def _homed(self, axis: int, now_ns: int) -> None:
+        self._homing[axis] = False
+        self._queue.latched[axis] &= ~int(AxisStatus.HOMING)
+        self.set_homed([axis])
+        self._end(axis, now_ns)
+
+    def _is_open_ended(self, axes: Axes) -> NDArray[np.bool_]:
         """Tell which running commands last until the next one arrives."""
         return np.array([c is not None and _is_open_ended(c) for c in (self._running[a] for a in axes)], dtype=bool)
-
-    def _end_commands(self, now_ns: int, moving: NDArray[np.bool_], done: NDArray[np.bool_]) -> None:
-        settled = now_ns - self._started_ns >= self._settle_ns
-        self._moved |= moving & self._active
-        reached = self._active & ~moving & done & (self._moved | settled)
-        ended = np.zeros(self.n, dtype=bool)
-        for axis in np.flatnonzero(self._active).tolist():
-            command = self._running[axis]
-            if self._stopping[axis] or (command is not None and _ends_by_itself(command)):
-                ended[axis] = reached[axis] or (self._stopping[axis] and settled[axis] and not moving[axis])
-            else:
-                ended[axis] = now_ns >= self._end_ns[axis]
-        for axis in np.flatnonzero(ended).tolist():
-            self._end(axis, now_ns)
 
     def _end(self, axis: int, now_ns: int) -> None:
         command, one = self._running[axis], np.array([axis])
         self._running[axis] = None
         if command is not None:
             self._queue.emit(EventKind.ENDED, one, now_ns)
-            if command.control_mode & M.SPECIFIED_SIGNAL_MARKER:
+            if command.control_mode & modes.SIGNAL_MARKER:
                 self._queue.signal(command.signal_marker_number, command.signal_generation, now_ns)
         was_stop = bool(self._stopping[axis])
         self._active[axis] = self._stopping[axis] = False
@@ -294,73 +393,71 @@ class DriveBank:
             else:
                 self._halt(one, fastest=False)
 
-    def _start_commands(self, now_ns: int) -> list[Action]:
+    def _start_commands(self, now_ns: int) -> None:
         queue = self._queue
-        queue.load_heads(np.arange(self.n))
-        free = queue.has_head & ~queue.gated_synch & ~queue.gated_marker & ~self._stopping
+        queue.load_heads(np.flatnonzero(~queue.has_head))
+        free = queue.has_head & ~queue.gated_synch & ~queue.gated_marker & ~self._stopping & ~self._homing
         free &= self._release_ns <= now_ns
-        actions: list[Action] = []
         for axis in np.flatnonzero(free).tolist():
-            if self._active[axis] and self._running[axis] is not None:
-                if not self._open_ended(np.array([axis]))[0]:
+            running = self._running[axis]
+            if self._active[axis] and running is not None:
+                if not _is_open_ended(running):
                     continue
                 self._end(axis, now_ns)
-            start = self._start(axis, now_ns)
-            if start is not None:
-                actions.append(start)
-        return actions
+            self._start(axis, now_ns)
 
-    def _start(self, axis: int, now_ns: int) -> StartCommand | None:
+    def _start(self, axis: int, now_ns: int) -> None:
         command, one = self._queue.heads[axis], np.array([axis])
         if command is None:
-            return None
+            return
         mode = command.control_mode
-        if mode & M.POSITION:
-            target = command.position + (self._target[axis] if mode & M.RELATIVE else 0.0)
+        if mode & modes.POSITION:
+            target = command.position + (self._target[axis] if mode & modes.RELATIVE else 0.0)
             low, high = self._limits.minimum[axis], self._limits.maximum[axis]
             if not low <= target <= high:
                 text = f"position {target:g} is outside the soft limits; {low:g} to {high:g}"
                 self.fault(one, text, now_ns)
-                return None
+                return
             self._target[axis] = target
             command = command._replace(position=float(target - self._offset[axis]))
-        if mode & M.SPECIFIED_MAX_VEL_ACC:
+        if mode & modes.MAX_VEL_ACC:
             self._velocity_limit[axis], self._acceleration_limit[axis] = command.max_velocity, command.max_acceleration
-        timed = bool(mode & M.SPECIFIED_TIME) and command.time > 0
+        timed = bool(mode & modes.TIME) and command.time > 0
         due_ns, fraction = (int(self._end_ns[axis]), float(self._end_fraction[axis]))
         if not 0 <= now_ns - due_ns < self._settle_ns:
             due_ns, fraction = now_ns, 0.0
         total = fraction + command.time * 1e9
-        self._end_ns[axis] = due_ns + int(total) if timed else 2**62
+        self._end_ns[axis] = due_ns + int(total) if timed else NEVER_NS
         self._end_fraction[axis] = total % 1.0 if timed else 0.0
         self._queue.has_head[axis] = False
         self._running[axis] = command
-        self._active[axis] = True
-        self._moved[axis] = False
-        self._started_ns[axis] = now_ns
+        self._engage(axis, now_ns)
         self._queue.emit(EventKind.STARTED, one, now_ns)
-        return StartCommand(
-            axis, command, float(self._velocity_limit[axis]), float(self._acceleration_limit[axis])
-        )
+        self._actions.append(self._action(ActionKind.START, axis, command))
 
     def _halt(self, axes: Axes, *, fastest: bool) -> None:
         self._queue.clear(axes)
+        self._actions = [a for a in self._actions if a.axis not in axes or a.kind is ActionKind.RESET]
+        self._queue.latched[axes] &= ~int(AxisStatus.HOMING)
+        self._homing[axes] = False
         for axis in axes.tolist():
             self._running[axis] = None
-            self._stops[axis] = self._stops.get(axis, False) or fastest
-        self._active[axes] = True
+            if fastest or self._stops.get(axis) is not ActionKind.QUICK_STOP:
+                self._stops[axis] = ActionKind.QUICK_STOP if fastest else ActionKind.STOP
+            self._engage(axis, self._last_ns)
         self._stopping[axes] = True
-        self._started_ns[axes] = self._last_ns
 
-    def _publish(self, moving: NDArray[np.bool_]) -> None:
+    def _publish(self) -> None:
         running = np.array([c is not None for c in self._running])
-        position_mode = np.array([c is not None and bool(c.control_mode & M.POSITION) for c in self._running])
+        position_mode = np.array([c is not None and bool(c.control_mode & modes.POSITION) for c in self._running])
         self._target[~self._active] = self._position[~self._active]
         np.copyto(self._desired, np.where(position_mode, self._target, self._position))
+        np.copyto(self._desired_velocity, self._velocity)
         np.subtract(self._desired, self._position, out=self._following)
-        self._in_motion[:] = self._active | moving
+        busy = self._active | self._moving
+        self._in_motion[:] = busy
         status = self._queue.latched.copy()
-        status |= np.where(self._active | moving, int(AxisStatus.MOVING), 0)
+        status |= np.where(busy, int(AxisStatus.MOVING), 0)
         status |= np.where(self._stopping, int(AxisStatus.STOPPING), 0)
         status |= np.where(self._queue.gated_marker & ~running, int(AxisStatus.WAITING_MARKER), 0)
         status |= np.where(self._queue.gated_synch & ~running, int(AxisStatus.WAITING_SYNCH), 0)
@@ -368,6 +465,7 @@ class DriveBank:
         self._queue.count(self._buffered)
 
     def _idle(self, axes: Axes) -> NDArray[np.bool_]:
+        """Tell which axes stand with nothing to do."""
         idle: NDArray[np.bool_] = ~self._active[axes] & ~self._queue.has_head[axes]
         return idle
 
@@ -375,12 +473,12 @@ class DriveBank:
 def _ends_by_itself(command: Command) -> bool:
     """Tell whether the drive's own 'done' ends this command."""
     mode = command.control_mode
-    return bool(mode & M.POSITION) and not (mode & M.SPECIFIED_TIME)
+    return bool(mode & modes.POSITION) and not (mode & modes.TIME)
 
 
 def _is_open_ended(command: Command) -> bool:
     """Tell whether this command lasts until the next one arrives."""
     mode = command.control_mode
-    if mode & M.SPECIFIED_TIME:
+    if mode & modes.TIME:
         return command.time < 0
-    return not mode & M.POSITION
+    return not mode & modes.POSITION

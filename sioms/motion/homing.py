@@ -8,7 +8,6 @@ until the axis stands again.
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import AxisStatus
 
 from .queue import CommandQueue
-from .types import SWITCH_HOME, SWITCH_MINUS, SWITCH_PLUS, AxisSettings, CommandError, EventKind, Homing
+from .types import SWITCH_HOME, SWITCH_MINUS, SWITCH_PLUS, AxisSettings, EventKind, Homing
 
 BITS = {"minus": SWITCH_MINUS, "plus": SWITCH_PLUS, "home": SWITCH_HOME}
 
@@ -40,7 +39,7 @@ class Mover(Protocol):
     def drive(self, axis: int, velocity: float, now_ns: int) -> None:
         """Go over to this velocity from the present state."""
 
-    def halt(self, axis: int, now_ns: int) -> None:
+    def brake(self, axis: int, now_ns: int) -> None:
         """Stop at maximum deceleration."""
 
     def stands(self, axis: int) -> bool:
@@ -83,17 +82,7 @@ class HomingRuns:
         Raises:
             CommandError: EINVAL when an axis has no homing, EBUSY when it moves, EPERM or EIO when latched.
         """
-        for axis, free in zip(axes.tolist(), idle.tolist(), strict=True):
-            what = f"home axis {axis} ({self._settings[axis].name}): "
-            latched = int(self._queue.latched[axis])
-            if self._settings[axis].homing is None:
-                raise CommandError(errno.EINVAL, what + "no homing is configured for it")
-            if latched & AxisStatus.EMERGENCY_STOP:
-                raise CommandError(errno.EPERM, what + "stopped by emergency stop; RESET first")
-            if latched & AxisStatus.FAULT:
-                raise CommandError(errno.EIO, what + f"in fault ({self._queue.fault_text(axis)}); RESET first")
-            if not free:
-                raise CommandError(errno.EBUSY, what + "it moves or has commands; wait until it is idle")
+        self._queue.check_homing(axes, idle)
         for axis in axes.tolist():
             homing = self._settings[axis].homing
             if homing is None:
@@ -136,7 +125,7 @@ class HomingRuns:
             case Phase.RELEASE:
                 if not closed:
                     mover.shift(axis, homing.offset - mover.measured(axis))
-                    mover.halt(axis, now_ns)
+                    mover.brake(axis, now_ns)
                     run.phase = Phase.FINISH
             case Phase.FINISH:
                 if mover.stands(axis):
@@ -149,7 +138,7 @@ class HomingRuns:
         mover, homing = self._mover, run.homing
         if closed:
             run.phase = Phase.SETTLE
-            mover.halt(axis, now_ns)
+            mover.brake(axis, now_ns)
             return ""
         direction = -homing.direction if run.turned else homing.direction
         if switches & (SWITCH_MINUS if direction < 0 else SWITCH_PLUS):

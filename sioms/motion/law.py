@@ -31,10 +31,13 @@ class ControlLaw:
         gains: arrays k, kz, kp, kb (n,) to use, rows of the published fields.
     """
 
-    def __init__(self, settings: Sequence[AxisSettings], tick_s: float, gains: Sequence[Vector]) -> None:
+    def __init__(self, settings: Sequence[AxisSettings], tick_s: float, gains: Sequence[Vector] | Vector) -> None:
         n = len(settings)
         self.stepper = np.array([s.kind is AxisKind.STEPPER for s in settings], dtype=bool)
-        self.k, self.kz, self.kp, self.kb = gains
+        self.k: Vector = gains[0]
+        self.kz: Vector = gains[1]
+        self.kp: Vector = gains[2]
+        self.kb: Vector = gains[3]
         default = [1.0 / tick_s if s.kind is AxisKind.STEPPER else 0.0 for s in settings]
         self.k[:] = [d if s.k is None else s.k for s, d in zip(settings, default, strict=True)]
         self.kz[:] = [s.kz for s in settings]

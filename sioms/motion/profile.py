@@ -9,18 +9,20 @@ a timed pass through (position, velocity, acceleration) is the quintic through b
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import ruckig
 
-from sioms.protocol.flags import ControlMode
-
+from . import modes
 from .commands import Command
 
-M = ControlMode
 MAX_SEGMENTS = 13
 """Two brake phases, seven of the profile, two of arrival, the hold, one to spare."""
 SHORTEST_S = 1e-11
+POSITION_INTERFACE = ruckig.ControlInterface.Position
+VELOCITY_INTERFACE = ruckig.ControlInterface.Velocity
+DONE = (ruckig.Result.Working, ruckig.Result.Finished)
 TIME_TOLERANCE_S = 1e-9
 
 Segment = tuple[float, float, float, float, float, float, float]
@@ -71,36 +73,58 @@ class Planner:
             InfeasibleError: the sentence says what is not possible and what would be.
         """
         mode = command.control_mode
-        if mode & M.POSITION:
+        if mode & modes.POSITION:
             return self._position(command, state, bounds)
-        duration = command.time if mode & M.SPECIFIED_TIME and command.time > 0 else math.inf
+        duration = command.time if mode & modes.TIME and command.time > 0 else math.inf
         velocity, limited = _velocity_goal(command, state, bounds)
         return self._velocity(velocity, duration, state, limited)
 
     def _position(self, command: Command, state: State, bounds: Bounds) -> Plan:
         mode = command.control_mode
-        target = command.position + (state[0] if mode & M.RELATIVE else 0.0)
+        target = command.position + (state[0] if mode & modes.RELATIVE else 0.0)
         if not bounds.minimum <= target <= bounds.maximum:
             raise InfeasibleError(
                 f"position {target:g} is outside the soft limits; {bounds.minimum:g} to {bounds.maximum:g}"
             )
         final = (
             target,
-            command.velocity if mode & M.VELOCITY else 0.0,
-            command.acceleration if mode & M.ACCELERATION else 0.0,
+            command.velocity if mode & modes.VELOCITY else 0.0,
+            command.acceleration if mode & modes.ACCELERATION else 0.0,
         )
-        timed = bool(mode & M.SPECIFIED_TIME) and command.time > 0
-        if timed and mode & M.VELOCITY:
-            return timed_pass(state, final, bool(mode & M.ACCELERATION), command.time, bounds)
+        timed = bool(mode & modes.TIME) and command.time > 0
+        if timed and mode & modes.VELOCITY:
+            return self.timed_pass(state, final, bool(mode & modes.ACCELERATION), command.time, bounds)
         plan = self._optimal(state, final, bounds, command.time if timed else None)
-        if mode & M.SPECIFIED_TIME and command.time < 0:
+        if mode & modes.TIME and command.time < 0:
             hold = (math.inf, target, 0.0, 0.0, 0.0, 0.0, 0.0)
             plan = Plan([*plan.segments, hold], math.inf, final, plan.guard)
         return plan
 
+    def timed_pass(
+        self, state: State, final: State, given_acceleration: bool, time: float, bounds: Bounds
+    ) -> Plan:
+        """Return the motion from state to final in exactly ``time`` [s]: the quintic when it keeps the limits.
+
+        Otherwise Ruckig's profile stretched to that time, which needs less velocity and acceleration.
+
+        Raises:
+            InfeasibleError: neither keeps the limits.
+        """
+        if not given_acceleration:
+            end = pass_acceleration(state[0], state[1], final[0], final[1], time)
+            final = (final[0], final[1], max(-bounds.acceleration, min(bounds.acceleration, end)))
+        coefficients = quintic(state, final, time)
+        reason = fault_of_pass(coefficients, time, bounds)
+        if not reason:
+            return Plan([(time, *coefficients)], time, final, False)
+        try:
+            return self._optimal(state, final, bounds, time)
+        except InfeasibleError as e:
+            raise InfeasibleError(f"the piece of {time:g} s to {final[0]:g} {reason} ({e})") from e
+
     def _optimal(self, state: State, final: State, bounds: Bounds, exact_s: float | None) -> Plan:
         given = self._input
-        given.control_interface = ruckig.ControlInterface.Position
+        given.control_interface = POSITION_INTERFACE
         given.target_position = [final[0]]
         given.target_velocity = [final[1]]
         given.target_acceleration = [final[2]]
@@ -116,13 +140,13 @@ class Planner:
             if duration < exact_s:
                 segments.append((exact_s - duration, final[0], final[1], 0.5 * final[2], 0.0, 0.0, 0.0))
             duration = exact_s
-        low, high = _extent(segments)
-        guard = low < bounds.minimum - 1e-9 or high > bounds.maximum + 1e-9
+        extent = self._trajectory.position_extrema[0]
+        guard = extent.min < bounds.minimum - 1e-9 or extent.max > bounds.maximum + 1e-9
         return Plan(segments, duration, final, guard)
 
     def _velocity(self, goal: float, duration: float, state: State, bounds: Bounds) -> Plan:
         given = self._input
-        given.control_interface = ruckig.ControlInterface.Velocity
+        given.control_interface = VELOCITY_INTERFACE
         given.target_velocity = [goal]
         given.target_acceleration = [0.0]
         given.minimum_duration = None
@@ -148,82 +172,88 @@ class Planner:
             result = self._otg.calculate(given, self._trajectory)
         except ruckig.RuckigError as e:
             raise InfeasibleError(str(e).replace("\n", " ").replace("[ruckig] ", "").strip()) from e
-        if result not in (ruckig.Result.Working, ruckig.Result.Finished):
+        if result not in DONE:
             raise InfeasibleError(f"no profile from velocity {state[1]:g} within the limits ({result.name})")
         return _segments(self._trajectory.profiles[0][0])
 
 
-def timed_pass(state: State, final: State, given_acceleration: bool, time: float, bounds: Bounds) -> Plan:
-    """Return the quintic from state to final in exactly ``time`` [s].
+def pass_acceleration(p0: Any, v0: Any, p1: Any, v1: Any, time: Any) -> Any:
+    """Return the acceleration with which a timed pass ends when none is commanded (floats or arrays).
 
-    Without a commanded acceleration the end takes that of the cubic through both positions and
-    velocities (0 when it ends at rest): it depends on commanded values alone, so pieces of a
-    sampled curve join with continuous acceleration and errors do not travel along.
-
-    Raises:
-        InfeasibleError: the piece leaves the limits of position, velocity or acceleration.
+    It is that of the cubic through both positions and velocities (0 when it ends at rest): it
+    depends on commanded values alone, so pieces of a sampled curve join with continuous
+    acceleration and errors do not travel along.
     """
+    return (v1 != 0.0) * ((2 * v0 + 4 * v1) / time - 6 * (p1 - p0) / time**2)
+
+
+def quintic(state: tuple[Any, Any, Any], final: tuple[Any, Any, Any], time: Any) -> tuple[Any, ...]:
+    """Return the coefficients c0 .. c5 of the quintic between two states in a time [s] (floats or arrays)."""
     p0, v0, a0 = state
     p1, v1, a1 = final
-    if not given_acceleration and v1 != 0.0:
-        a1 = (2 * v0 + 4 * v1) / time - 6 * (p1 - p0) / time**2
     d = p1 - p0
     c3 = (10 * d / time - 6 * v0 - 4 * v1) / time**2 - (3 * a0 - a1) / (2 * time)
     c4 = (-15 * d / time + 8 * v0 + 7 * v1) / time**3 + (3 * a0 - 2 * a1) / (2 * time**2)
     c5 = (6 * d / time - 3 * (v0 + v1)) / time**4 - (a0 - a1) / (2 * time**3)
-    segment = (time, p0, v0, 0.5 * a0, c3, c4, c5)
-    _check_quintic(segment, bounds)
-    return Plan([segment], time, (p1, v1, a1), False)
+    return p0, v0, 0.5 * a0, c3, c4, c5
 
 
-def _check_quintic(segment: Segment, bounds: Bounds) -> None:
-    t, p0, v0, c2, c3, c4, c5 = segment
-    # Bernstein coefficients enclose a polynomial: most pieces are cleared by these few numbers.
-    speed, acceleration, low, high = _quintic_peaks(segment)
-    slack = 1 + 1e-6
-    if acceleration > bounds.acceleration * slack:
-        raise InfeasibleError(
-            f"the piece of {t:g} s needs an acceleration of {acceleration:g}; at most {bounds.acceleration:g}"
-        )
-    if speed > bounds.velocity * slack:
-        raise InfeasibleError(
-            f"the piece of {t:g} s needs a velocity of {speed:g}; at most {bounds.velocity:g}"
-        )
-    if low < bounds.minimum - 1e-9 or high > bounds.maximum + 1e-9:
-        raise InfeasibleError(
-            f"the piece of {t:g} s leads from {low:g} to {high:g}; limits {bounds.minimum:g} to {bounds.maximum:g}"
-        )
+def enclosures(c: tuple[Any, ...], t: Any) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
+    """Return the Bernstein coefficients of position, velocity and acceleration over [0, t].
+
+    A polynomial lies between its smallest and its largest Bernstein coefficient, and begins and
+    ends at the first and the last. Works on floats and on arrays.
+    """
+    p0, c1, c2, c3, c4, c5 = c[0], c[1] * t, c[2] * t**2, c[3] * t**3, c[4] * t**4, c[5] * t**5
+    position = (
+        p0, p0 + c1 / 5, p0 + 2 * c1 / 5 + c2 / 10, p0 + 3 * c1 / 5 + 3 * c2 / 10 + c3 / 10,
+        p0 + 4 * c1 / 5 + 3 * c2 / 5 + 2 * c3 / 5 + c4 / 5, p0 + c1 + c2 + c3 + c4 + c5,
+    )
+    velocity = tuple(5 * (position[i + 1] - position[i]) / t for i in range(5))
+    acceleration = tuple(4 * (velocity[i + 1] - velocity[i]) / t for i in range(4))
+    return position, velocity, acceleration
 
 
-def _quintic_peaks(segment: Segment) -> tuple[float, float, float, float]:
-    """Return peak speed, peak acceleration, lowest and highest position of a segment, on 33 points."""
-    t, c0, c1, c2, c3, c4, c5 = segment
-    speed = acceleration = 0.0
-    low, high = math.inf, -math.inf
-    for i in range(33):
-        x = t * i / 32
-        p = c0 + x * (c1 + x * (c2 + x * (c3 + x * (c4 + x * c5))))
-        v = c1 + x * (2 * c2 + x * (3 * c3 + x * (4 * c4 + x * 5 * c5)))
-        a = 2 * c2 + x * (6 * c3 + x * (12 * c4 + x * 20 * c5))
-        speed = max(speed, abs(v))
-        acceleration = max(acceleration, abs(a))
-        low, high = min(low, p), max(high, p)
-    return speed, acceleration, low, high
+def leaves(bernstein: tuple[float, ...], low: float, high: float, depth: int = 24) -> bool:
+    """Tell whether a polynomial in Bernstein form leaves [low, high]; halves it until that is certain."""
+    if max(bernstein) <= high and min(bernstein) >= low:
+        return False
+    if not low <= bernstein[0] <= high or not low <= bernstein[-1] <= high or depth == 0:
+        return True
+    left, right, row = [bernstein[0]], [bernstein[-1]], list(bernstein)
+    while len(row) > 1:
+        row = [0.5 * (a + b) for a, b in pairwise(row)]
+        left.append(row[0])
+        right.append(row[-1])
+    return leaves(tuple(left), low, high, depth - 1) or leaves(tuple(reversed(right)), low, high, depth - 1)
+
+
+def fault_of_pass(coefficients: tuple[float, ...], time: float, bounds: Bounds) -> str:
+    """Return which limit a quintic piece breaks, empty when none."""
+    position, velocity, acceleration = enclosures(coefficients, time)
+    v, a = bounds.velocity * (1 + 1e-6), bounds.acceleration * (1 + 1e-6)
+    if leaves(acceleration, -a, a):
+        return f"needs more acceleration than {bounds.acceleration:g}"
+    if leaves(velocity, -v, v):
+        return f"needs more velocity than {bounds.velocity:g}"
+    if leaves(position, bounds.minimum - 1e-9, bounds.maximum + 1e-9):
+        return f"leaves the soft limits {bounds.minimum:g} to {bounds.maximum:g}"
+    return ""
 
 
 def _velocity_goal(command: Command, state: State, bounds: Bounds) -> tuple[float, Bounds]:
     """Return the velocity that a v/a/j command drives at, and the bounds on the way there."""
     mode = command.control_mode
-    if mode & M.VELOCITY:
+    if mode & modes.VELOCITY:
         return max(-bounds.velocity, min(bounds.velocity, command.velocity)), bounds
-    if mode & M.ACCELERATION and command.acceleration != 0:
+    if mode & modes.ACCELERATION and command.acceleration != 0:
         goal = math.copysign(bounds.velocity, command.acceleration)
         size = min(abs(command.acceleration), bounds.acceleration)
         return goal, bounds._replace(acceleration=size)
-    if mode & M.JERK and command.jerk != 0:
+    if mode & modes.JERK and command.jerk != 0:
         goal = math.copysign(bounds.velocity, command.jerk)
         return goal, bounds._replace(jerk=min(abs(command.jerk), bounds.jerk))
-    if mode & M.JERK and state[2] != 0:
+    if mode & modes.JERK and state[2] != 0:
         goal = math.copysign(bounds.velocity, state[2])
         return goal, bounds._replace(acceleration=abs(state[2]))
     ramp = 0.0 if math.isinf(bounds.jerk) else state[2] * abs(state[2]) / (2 * bounds.jerk)
@@ -263,22 +293,3 @@ def _truncated(segments: list[Segment], duration: float) -> list[Segment]:
         kept.append(segment)
         left -= segment[0]
     return kept
-
-
-def _extent(segments: list[Segment]) -> tuple[float, float]:
-    """Return lowest and highest position of cubic segments (ends and turning points)."""
-    low, high = math.inf, -math.inf
-    for t, c0, c1, c2, c3, _, _ in segments:
-        for x in (0.0, t, *_turning_points(c1, c2, c3, t)):
-            p = c0 + x * (c1 + x * (c2 + x * c3))
-            low, high = min(low, p), max(high, p)
-    return low, high
-
-
-def _turning_points(c1: float, c2: float, c3: float, t: float) -> list[float]:
-    if c3 == 0:
-        roots = [-c1 / (2 * c2)] if c2 else []
-    else:
-        root = c2 * c2 - 3 * c3 * c1
-        roots = [(-c2 + s * math.sqrt(root)) / (3 * c3) for s in (1, -1)] if root > 0 else []
-    return [x for x in roots if 0 < x < t]

@@ -13,13 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.protocol.flags import AxisStatus, ControlMode
+from sioms.protocol.flags import AxisStatus
 
+from . import modes
 from .buffers import CommandBuffers
 from .commands import WIRE_DTYPE, Command, Limits, Validator
 from .types import AxisSettings, CommandError, Event, EventKind, MarkerPort
 
 AxesLike = Sequence[int] | NDArray[np.int64]
+LimitValue = float | None | Sequence[float | None]
+LIMIT_NAMES = ("position_min", "position_max", "velocity_max", "acceleration_max", "jerk_max", "force_max")
 
 
 class CommandQueue:
@@ -107,16 +110,23 @@ class CommandQueue:
         """Make the oldest command of each of these axes its head; return the axes that gained one."""
         lacking = axes[~self.has_head[axes] & (self._buffers.count[axes] > 0)]
         for axis in lacking.tolist():
-            command = self._buffers.pop(axis)
-            if command is None:
-                continue
-            self.heads[axis] = command
-            self.has_head[axis] = True
-            if command.control_mode & ControlMode.WAIT_FOR_EXTERNAL_SYNCH:
-                self.gated_synch[axis] = True
-            if command.control_mode & ControlMode.SPECIFIED_WAIT_MARKER:
-                self._wait_for(axis, command)
+            self.load_head(axis)
         return lacking
+
+    def load_head(self, axis: int) -> bool:
+        """Make the oldest command of an axis its head; tell whether it has a head now."""
+        if self.has_head[axis]:
+            return True
+        command = self._buffers.pop(axis)
+        if command is None:
+            return False
+        self.heads[axis] = command
+        self.has_head[axis] = True
+        if command.control_mode & modes.SYNCH:
+            self.gated_synch[axis] = True
+        if command.control_mode & modes.WAIT_MARKER:
+            self._wait_for(axis, command)
+        return True
 
     def _wait_for(self, axis: int, command: Command) -> None:
         key = (command.wait_marker_number, command.wait_generation)
@@ -188,15 +198,28 @@ class CommandQueue:
                     errno.ERANGE, what + f"position {value:g} is outside the soft limits; {low:g} to {high:g}"
                 )
 
+    def check_homing(self, axes: NDArray[np.int64], idle: NDArray[np.bool_]) -> None:
+        """Raise when one of these axes may not home now."""
+        for axis, free in zip(axes.tolist(), idle.tolist(), strict=True):
+            what = f"home axis {axis} ({self.settings[axis].name}): "
+            latched = int(self.latched[axis])
+            if self.settings[axis].homing is None:
+                raise CommandError(errno.EINVAL, what + "no homing is configured for it")
+            if latched & AxisStatus.EMERGENCY_STOP:
+                raise CommandError(errno.EPERM, what + "stopped by emergency stop; RESET first")
+            if latched & AxisStatus.FAULT:
+                raise CommandError(errno.EIO, what + f"in fault ({self.fault_text(axis)}); RESET first")
+            if not free:
+                raise CommandError(errno.EBUSY, what + "it moves or has commands; wait until it is idle")
+
     def set_limits(
-        self, axes: AxesLike, limits: dict[str, float | None], position: NDArray[np.float64]
+        self, axes: NDArray[np.int64], limits: dict[str, LimitValue], position: NDArray[np.float64]
     ) -> None:
         """Set limits of axes; a value of None returns to the configured one.
 
         Args:
             axes: bank axes.
-            limits: any of position_min, position_max, velocity_max, acceleration_max, jerk_max,
-                force_max; never wider than configured.
+            limits: by LIMIT_NAMES, one number for all axes or one per axis; never wider than configured.
             position: present positions (n,), which must stay inside.
 
         Raises:
@@ -204,9 +227,13 @@ class CommandQueue:
                 when the axis stands outside; then nothing is changed.
         """
         changes: list[tuple[NDArray[np.float64], int, float]] = []
-        for axis in np.asarray(axes).tolist():
-            for name, value in limits.items():
-                changes.append((self._limit_array(name), axis, self._checked_limit(axis, name, value, position)))
+        for name, given in limits.items():
+            array = self._limit_array(name)
+            values = list(given) if isinstance(given, Sequence) else [given] * len(axes)
+            if len(values) != len(axes):
+                raise CommandError(errno.EINVAL, f"set limits: {len(values)} values of {name}; {len(axes)} or one")
+            for axis, value in zip(axes.tolist(), values, strict=True):
+                changes.append((array, axis, self._checked_limit(axis, name, value, position)))
         for array, axis, value in changes:
             array[axis] = value
 
@@ -239,11 +266,13 @@ class CommandQueue:
             )
         return wanted
 
-    def get_limits(self, axis: int) -> dict[str, float | None]:
-        """Return the limits of an axis in force, None where there is none."""
-        names = ("position_min", "position_max", "velocity_max", "acceleration_max", "jerk_max", "force_max")
-        values = {name: float(self._limit_array(name)[axis]) for name in names}
-        return {name: value if np.isfinite(value) else None for name, value in values.items()}
+    def get_limits(self, axes: AxesLike) -> dict[str, list[float | None]]:
+        """Return the limits in force by name, one entry per axis, None where there is none."""
+        found: dict[str, list[float | None]] = {}
+        for name in LIMIT_NAMES:
+            values = self._limit_array(name)[np.asarray(axes)].tolist()
+            found[name] = [value if np.isfinite(value) else None for value in values]
+        return found
 
     # -- latches and events -------------------------------------------------------------------
 

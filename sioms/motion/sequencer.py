@@ -1,0 +1,402 @@
+"""Sequencer: which plan every axis runs, and what follows when one ends.
+
+An axis always runs exactly one plan: a hold at rest, a command, or a brake. The plan of the next
+command is made ahead, in the slack between ticks, when the state it begins in is known; then its
+start is a few array operations for all axes that start together, a thousand as well as one.
+Concurrency: that of the bank.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.protocol.flags import AxisStatus
+
+from . import modes
+from .commands import Command
+from .law import ControlLaw
+from .profile import Bounds, InfeasibleError, Plan, Planner, State
+from .queue import CommandQueue
+from .store import UNCUT_NS, PlanStore
+from .types import AxisSettings, EventKind
+
+Axes = NDArray[np.int64]
+Floats = NDArray[np.float64]
+REST = 1e-9
+"""Speed below which a set-point is at rest [unit/s]."""
+
+# What the running plan of an axis is. Plain integers: they live in arrays.
+HOLD: Final = 0
+POSITION: Final = 1
+RATE: Final = 2
+"""Velocity, acceleration or jerk command."""
+FORCE: Final = 3
+BRAKE: Final = 4
+STOP: Final = 5
+"""A brake that was asked for or forced by a limit."""
+
+_KIND_STATUS = np.array(
+    [
+        0,
+        AxisStatus.MOVING,
+        AxisStatus.MOVING,
+        AxisStatus.MOVING | AxisStatus.FORCE_MODE,
+        AxisStatus.MOVING,
+        AxisStatus.MOVING | AxisStatus.STOPPING,
+    ],
+    dtype=np.int64,
+)
+_HOMING = int(AxisStatus.HOMING)
+
+
+class Sequencer:
+    """Plans of n axes in time. Arrays (n,): ``kind`` of the running plan, ``guard`` where soft limits are
+    watched in every tick, ``limit_bits`` LIMIT_* of the last limit stop, ``status`` and ``in_motion``
+    as they change with events.
+
+    Args:
+        settings: one per axis.
+        queue: the waiting commands.
+        law: where gains, offset and force limit of a command are put in force.
+        position, velocity: measured, (n,), kept up to date by the bank; axes in force mode begin
+            what follows from there.
+        in_motion: (n,) int64, written here.
+    """
+
+    def __init__(
+        self,
+        settings: Sequence[AxisSettings],
+        queue: CommandQueue,
+        law: ControlLaw,
+        position: Floats,
+        velocity: Floats,
+        in_motion: NDArray[np.int64],
+    ) -> None:
+        n = len(settings)
+        self.store = PlanStore(n)
+        self.kind = np.zeros(n, dtype=np.int64)
+        self.guard = np.zeros(n, dtype=bool)
+        self.limit_bits = np.zeros(n, dtype=np.int64)
+        self.status = np.zeros(n, dtype=np.int64)
+        self.velocity_limit = queue.limits.velocity.copy()
+        self.acceleration_limit = queue.limits.acceleration.copy()
+        self.any_force = False
+        self.any_guard = False
+        self._queue = queue
+        self._limits = queue.limits
+        self._law = law
+        self._position = position
+        self._velocity = velocity
+        self._in_motion = in_motion
+        self._planner = Planner()
+        self._row_kind = np.zeros(2 * n, dtype=np.int64)
+        self._row_guard = np.zeros(2 * n, dtype=bool)
+        self._row_command: list[Command | None] = [None] * (2 * n)
+        self._row_signals = np.zeros(2 * n, dtype=bool)
+        self._row_sets = np.zeros(2 * n, dtype=bool)
+        self._ready = np.zeros(n, dtype=bool)
+        self._todo: dict[int, None] = {}
+
+    # -- what the bank asks for ---------------------------------------------------------------
+
+    def appended(self, axes: Axes, now_ns: int) -> None:
+        """New commands wait on these axes: begin at now what no gate and no running command holds."""
+        self._todo.update(dict.fromkeys(axes[~self._ready[axes]].tolist()))
+        self.release(axes, now_ns)
+        self.advance(now_ns)
+        self.refresh(axes)
+
+    def replaced(self, axes: Axes, now_ns: int) -> None:
+        """New commands shall take over at now from whatever runs, without its signal."""
+        self._todo.update(dict.fromkeys(axes.tolist()))
+        self._row_signals[self.store.row[axes]] = False
+        self.store.cut(axes, now_ns)
+        self.advance(now_ns)
+        self.refresh(axes)
+
+    def release(self, axes: Axes, start_ns: int) -> None:
+        """End the open-ended plans of these axes at start_ns where the head has no gate (any more)."""
+        queue, store = self._queue, self.store
+        free = queue.has_head[axes] & ~queue.gated_synch[axes] & ~queue.gated_marker[axes]
+        free &= self.is_open_ended(axes) & (store.cut_ns[axes] == UNCUT_NS)
+        chosen = axes[free]
+        if chosen.size:
+            store.cut(chosen, start_ns)
+
+    def is_open_ended(self, axes: Axes) -> NDArray[np.bool_]:
+        """Tell which running plans last until the next command."""
+        ended: NDArray[np.bool_] = np.isinf(self.store.duration[self.store.row[axes]])
+        return ended
+
+    def is_idle(self, axes: Axes) -> NDArray[np.bool_]:
+        """Tell which axes hold still, have no command and are not homing."""
+        idle: NDArray[np.bool_] = (self.kind[axes] == HOLD) & ~self._queue.has_head[axes]
+        idle &= (self._queue.latched[axes] & _HOMING) == 0
+        return idle
+
+    def drop(self, axes: Axes) -> None:
+        """Forget all waiting commands of these axes, and the plans made for them."""
+        self._queue.clear(axes)
+        self._ready[axes] = False
+        if self._todo:
+            for axis in axes.tolist():
+                self._todo.pop(axis, None)
+
+    def halt(self, axes: Axes, now_ns: int) -> None:
+        """Drop the commands and brake at maximum deceleration from the present state."""
+        waited = axes[(self.kind[axes] == HOLD) & self._queue.has_head[axes]]
+        self.drop(axes)
+        moving = axes[(self.kind[axes] != HOLD) & (self.kind[axes] != STOP)]
+        if moving.size:
+            self.brake(moving, self.state(moving, now_ns), now_ns)
+            self.advance(now_ns)
+        if waited.size:
+            self._queue.emit(EventKind.IDLE, waited[self.is_idle(waited)], now_ns)
+        self.refresh(axes)
+
+    def brake(self, axes: Axes, state: Floats, start_ns: int) -> None:
+        """Stop from state (m, 2 or 3) at maximum deceleration, beginning at start_ns."""
+        store = self.store
+        store.put_brake(store.row[axes], state[:, 0], state[:, 1], self._limits.acceleration[axes])
+        self._run_now(axes, STOP, start_ns)
+
+    def hold(self, axes: Axes, position: Floats, start_ns: int) -> None:
+        """Rest at position."""
+        self.store.put_hold(self.store.row[axes], position)
+        self._run_now(axes, HOLD, start_ns)
+
+    def drive(self, axis: int, velocity: float, now_ns: int) -> None:
+        """Go over to a velocity from the present state, outside the buffer and the soft limits (homing)."""
+        one = np.array([axis])
+        command = Command._make([0.0] * len(Command._fields))
+        command = command._replace(control_mode=modes.VELOCITY, velocity=velocity)
+        p, v, a = self.state(one, now_ns)[0].tolist()
+        bounds = self._bounds(axis, command)._replace(minimum=-math.inf, maximum=math.inf)
+        self.store.put(int(self.store.row[axis]), self._planner.plan(command, (p, v, a), bounds))
+        self._run_now(one, RATE, now_ns)
+
+    def _run_now(self, axes: Axes, kind: int, start_ns: int) -> None:
+        self._set_kind(axes, kind)
+        self.store.begin(axes, np.full(axes.size, start_ns), np.zeros(axes.size))
+        self._settle_masks()
+        self.refresh(axes)
+
+    def state(self, axes: Axes, now_ns: int) -> Floats:
+        """Return the set-point state (m, 3) at now; of axes in force mode the measured one."""
+        return self._actual_of_force(axes, self.store.state(axes, now_ns))
+
+    def _actual_of_force(self, axes: Axes, state: Floats) -> Floats:
+        if self.any_force:
+            force = self.kind[axes] == FORCE
+            state[force, 0] = self._position[axes[force]]
+            state[force, 1] = self._velocity[axes[force]]
+            state[force, 2] = 0.0
+        return state
+
+    # -- transitions --------------------------------------------------------------------------
+
+    def advance(self, now_ns: int) -> None:
+        """Carry out everything that was due until now, at its own exact instant."""
+        store = self.store
+        if now_ns < store.next_ns:
+            return
+        while (axes := store.due(now_ns)).size:
+            ended = store.advance(axes)
+            if ended.size:
+                self._finish(ended, now_ns)
+
+    def _finish(self, axes: Axes, now_ns: int) -> None:
+        """End the running plans of these axes and begin what follows."""
+        store, queue = self.store, self._queue
+        rows = store.row[axes]
+        start_ns, fraction = store.ended_at(axes)
+        state = self._actual_of_force(axes, store.final[rows])
+        kind = self._row_kind[rows]
+        queue.emit(EventKind.ENDED, axes[(kind >= POSITION) & (kind <= FORCE)], now_ns)
+        for row in rows[self._row_signals[rows]].tolist():
+            self._signal(row, now_ns)
+        queue.load_heads(axes)
+        free = queue.has_head[axes] & ~queue.gated_synch[axes] & ~queue.gated_marker[axes]
+        for i in np.flatnonzero(free & ~self._ready[axes]).tolist():
+            p, v, a = state[i].tolist()
+            self._plan_head(int(axes[i]), (p, v, a), now_ns)
+        go = free & self._ready[axes]
+        if go.all():
+            self._start(axes, start_ns, fraction, now_ns)
+        else:
+            if go.any():
+                self._start(axes[go], start_ns[go], fraction[go], now_ns)
+            rest = ~go
+            self._rest(axes[rest], state[rest], start_ns[rest], fraction[rest], now_ns)
+
+    def _signal(self, row: int, now_ns: int) -> None:
+        command = self._row_command[row]
+        self._row_signals[row] = False
+        if command is not None:
+            self._queue.signal(command.signal_marker_number, command.signal_generation, now_ns)
+
+    def _start(self, axes: Axes, start_ns: NDArray[np.int64], fraction: Floats, now_ns: int) -> None:
+        store = self.store
+        store.flip(axes)
+        rows = store.row[axes]
+        store.begin(axes, start_ns, fraction)
+        self._ready[axes] = False
+        self._queue.has_head[axes] = False
+        self.kind[axes] = self._row_kind[rows]
+        self.guard[axes] = self._row_guard[rows]
+        self.limit_bits[axes] = 0
+        self._todo.update(dict.fromkeys(axes.tolist()))
+        for row in rows[self._row_sets[rows]].tolist():
+            self._put_in_force(row // 2, self._row_command[row])
+        self._queue.emit(EventKind.STARTED, axes, now_ns)
+        self._settle_masks()
+        self.refresh(axes)
+
+    def _put_in_force(self, axis: int, command: Command | None) -> None:
+        """Put the gains, offset and limits that a command specifies in force; they stay."""
+        if command is None:
+            return
+        law, mode = self._law, command.control_mode
+        if mode & modes.GAINS:
+            law.k[axis], law.kz[axis], law.kp[axis], law.kb[axis] = command.k, command.kz, command.kp, command.kb
+        if mode & modes.FORCE_OFFSET:
+            law.offset[axis] = command.force_offset
+        if mode & modes.MAX_FORCE:
+            law.force_limit[axis] = command.max_force
+        if mode & modes.MAX_VEL_ACC:
+            self.velocity_limit[axis], self.acceleration_limit[axis] = command.max_velocity, command.max_acceleration
+
+    def _rest(
+        self, axes: Axes, state: Floats, start_ns: NDArray[np.int64], fraction: Floats, now_ns: int
+    ) -> None:
+        """Nothing follows: hold the axes at rest, brake the others."""
+        store = self.store
+        still = np.abs(state[:, 1]) <= REST
+        chosen = axes[still]
+        if chosen.size:
+            came = chosen[self.kind[chosen] != HOLD]
+            store.put_hold(store.row[chosen], state[still, 0])
+            self._set_kind(chosen, HOLD)
+            store.begin(chosen, start_ns[still], fraction[still])
+            self._queue.emit(EventKind.IDLE, came[self.is_idle(came)], now_ns)
+        chosen = axes[~still]
+        if chosen.size:
+            deceleration = self._limits.acceleration[chosen]
+            store.put_brake(store.row[chosen], state[~still, 0], state[~still, 1], deceleration)
+            self._set_kind(chosen, BRAKE)
+            store.begin(chosen, start_ns[~still], fraction[~still])
+        self._settle_masks()
+        self.refresh(axes)
+
+    def _set_kind(self, axes: Axes, kind: int) -> None:
+        rows = self.store.row[axes]
+        self.kind[axes] = self._row_kind[rows] = kind
+        self.guard[axes] = False
+        self._row_signals[rows] = False
+
+    def _settle_masks(self) -> None:
+        self.any_force = bool((self.kind == FORCE).any())
+        self.any_guard = bool(self.guard.any())
+
+    def refresh(self, axes: Axes) -> None:
+        """Rebuild the status bits that change with events only."""
+        kind, queue = self.kind[axes], self._queue
+        status = _KIND_STATUS[kind]
+        status |= queue.latched[axes]
+        status |= self.limit_bits[axes]
+        marker, synch = queue.gated_marker[axes], queue.gated_synch[axes]
+        if marker.any() or synch.any():
+            waiting = self.is_open_ended(axes)
+            status |= (waiting & marker) * np.int64(AxisStatus.WAITING_MARKER)
+            status |= (waiting & synch) * np.int64(AxisStatus.WAITING_SYNCH)
+        self.status[axes] = status
+        self._in_motion[axes] = kind != HOLD
+
+    # -- planning -----------------------------------------------------------------------------
+
+    def plan_ahead(self, count: int, now_ns: int) -> int:
+        """Plan up to ``count`` heads whose starting state is known; return how many axes were looked at."""
+        done = 0
+        queue, todo, store = self._queue, self._todo, self.store
+        store.settle_order()
+        while todo and done < count:
+            axis = next(iter(todo))
+            del todo[axis]
+            done += 1
+            if not queue.load_head(axis) or self._ready[axis]:
+                continue
+            kind, row = self.kind[axis], store.row[axis]
+            if kind == HOLD or (kind != FORCE and store.duration[row] < math.inf):
+                p, v, a = store.final[row].tolist()
+                self._plan_head(axis, (p, v, a), now_ns)
+        return done
+
+    def _plan_head(self, axis: int, state: State, now_ns: int) -> None:
+        """Plan the head of an axis from a state into its other row; a failure is a latched fault."""
+        command = self._queue.heads[axis]
+        if command is None:
+            return
+        mode = command.control_mode
+        row = int(self.store.row[axis]) ^ 1
+        try:
+            if mode & modes.ANY_FORCE:
+                plan, kind = self._plan_force(axis, command), FORCE
+            else:
+                plan = self._planner.plan(command, state, self._bounds(axis, command))
+                kind = POSITION if mode & modes.POSITION else RATE
+        except InfeasibleError as e:
+            self._refuse(axis, str(e), now_ns)
+            return
+        self.store.put(row, plan)
+        self._row_kind[row] = kind
+        self._row_guard[row] = plan.guard
+        self._row_command[row] = command
+        self._row_signals[row] = bool(mode & modes.SIGNAL_MARKER)
+        self._row_sets[row] = bool(mode & modes.SETTINGS)
+        self._ready[axis] = True
+
+    def _bounds(self, axis: int, command: Command) -> Bounds:
+        limits = self._limits
+        if command.control_mode & modes.MAX_VEL_ACC:
+            velocity, acceleration = command.max_velocity, command.max_acceleration
+        else:
+            velocity, acceleration = float(self.velocity_limit[axis]), float(self.acceleration_limit[axis])
+        return Bounds(
+            velocity, acceleration, float(limits.jerk[axis]), float(limits.minimum[axis]), float(limits.maximum[axis])
+        )
+
+    def _plan_force(self, axis: int, command: Command) -> Plan:
+        """Return force over time as a plan: a constant, or a ramp up to the force limit and on."""
+        mode, time = command.control_mode, command.time
+        duration = time if mode & modes.TIME and time > 0 else math.inf
+        if mode & modes.FORCE:
+            level = command.force
+            return Plan([(duration, level, 0.0, 0.0, 0.0, 0.0, 0.0)], duration, (level, 0.0, 0.0), True)
+        limit = command.max_force if mode & modes.MAX_FORCE else float(self._law.force_limit[axis])
+        if self.kind[axis] == FORCE:
+            present = float(self.store.final[self.store.row[axis], 0])
+        else:
+            present = float(self._law.output[axis])
+        present = max(-limit, min(limit, present))
+        rate = command.force_velocity
+        goal = math.copysign(limit, rate)
+        ramp = (goal - present) / rate if rate else math.inf
+        if ramp >= duration:
+            end = present + rate * duration if rate else present
+            return Plan([(duration, present, rate, 0.0, 0.0, 0.0, 0.0)], duration, (end, 0.0, 0.0), True)
+        segments = [(ramp, present, rate, 0.0, 0.0, 0.0, 0.0), (duration - ramp, goal, 0.0, 0.0, 0.0, 0.0, 0.0)]
+        return Plan(segments, duration, (goal, 0.0, 0.0), True)
+
+    def _refuse(self, axis: int, text: str, now_ns: int) -> None:
+        """A command turned out infeasible: drop the buffer and latch a fault; the axis brakes and holds."""
+        one = np.array([axis])
+        self.drop(one)
+        self._queue.emit(EventKind.DROPPED, one, now_ns, errno.ERANGE, text)
+        self._queue.latch_fault(one, text, now_ns, errno.ERANGE)
+        self.refresh(one)
