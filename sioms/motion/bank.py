@@ -107,7 +107,7 @@ class AxisBank:
             raise CommandError(errno.EIO, "write: no position has been measured yet; wait for the first tick")
         sequencer = self._sequencer
         sequencer.advance(now_ns)
-        commands = self._queue.admit(records, axes, replace=replace)
+        commands = self._queue.admit(records, axes, sequencer.rest_positions(), replace=replace)
         if not len(commands):
             return
         if replace:
@@ -241,8 +241,6 @@ class AxisBank:
             raise CommandError(errno.EBUSY, "set limits: an axis moves or has commands; wait until it is idle")
         self._queue.set_limits(chosen, limits, self._position)
         held = self._queue.limits
-        self._sequencer.velocity_limit[chosen] = held.velocity[chosen]
-        self._sequencer.acceleration_limit[chosen] = held.acceleration[chosen]
         self._law.velocity_limit[chosen] = held.velocity[chosen]
         self._law.acceleration_limit[chosen] = held.acceleration[chosen]
         self._law.force_limit[chosen] = held.force[chosen]

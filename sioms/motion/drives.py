@@ -96,8 +96,7 @@ class DriveBank:
         self._in_motion, self._status_word, self._buffered = integers[10], integers[11], integers[12]
         self._queue = CommandQueue(settings, markers, capacity)
         self._limits = self._queue.limits
-        self._velocity_limit = self._limits.velocity.copy()
-        self._acceleration_limit = self._limits.acceleration.copy()
+        self._velocity_limit, self._acceleration_limit = self._queue.in_force
         self._running: list[Command | None] = [None] * n
         self._active = np.zeros(n, dtype=bool)
         self._stopping = np.zeros(n, dtype=bool)
@@ -122,7 +121,7 @@ class DriveBank:
 
     def append(self, records: NDArray[Any], axes: AxesLike, now_ns: int, *, replace: bool = False) -> None:
         """Append written records, all or none; see AxisBank.append()."""
-        commands = self._queue.admit(records, axes, replace=replace)
+        commands = self._queue.admit(records, axes, np.full(self.n, np.nan), replace=replace)
         if not self._seen:
             raise CommandError(errno.EIO, "write: the drive has not reported its position yet; wait for it")
         if replace:
@@ -203,8 +202,6 @@ class DriveBank:
         if not self.is_idle(chosen):
             raise CommandError(errno.EBUSY, "set limits: an axis moves or has commands; wait until it is idle")
         self._queue.set_limits(chosen, limits, self._position)
-        self._velocity_limit[chosen] = self._limits.velocity[chosen]
-        self._acceleration_limit[chosen] = self._limits.acceleration[chosen]
 
     def get_limits(self, axes: AxesLike) -> dict[str, list[float | None]]:
         """Return the limits in force by name, one entry per axis, None where there is none."""

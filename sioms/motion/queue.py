@@ -18,6 +18,7 @@ from sioms.protocol.flags import AxisStatus
 from . import modes
 from .buffers import CommandBuffers
 from .commands import WIRE_DTYPE, Command, Limits, Validator
+from .feasibility import Feasibility, Tail
 from .types import AxisSettings, CommandError, Event, EventKind, MarkerPort
 
 AxesLike = Sequence[int] | NDArray[np.int64]
@@ -46,17 +47,33 @@ class CommandQueue:
         self._buffers = CommandBuffers(self.n, capacity)
         self._markers = markers
         self._validator = Validator(settings, self.limits, markers)
+        self.in_force = (self.limits.velocity.copy(), self.limits.acceleration.copy())
+        """Velocity and acceleration limits that commands have specified, (n,) each."""
+        self.tail = Tail(np.full((self.n, 3), np.nan), self.in_force[0].copy(), self.in_force[1].copy())
+        self._next_tail: tuple[NDArray[np.int64], Tail] | None = None
+        self._feasibility = Feasibility(self.limits, self._validator)
         self._waiting: dict[tuple[int, int], set[int]] = {}
         self._fault_text: dict[int, str] = {}
         self._events: list[tuple[EventKind, Any, int, int, str]] = []
 
     # -- writing ------------------------------------------------------------------------------
 
-    def admit(self, records: NDArray[Any], axes: AxesLike, *, replace: bool) -> NDArray[Any]:
-        """Check a written array and the state of its axes; return it as commands, nothing taken yet."""
+    def admit(
+        self, records: NDArray[Any], axes: AxesLike, at_rest: NDArray[np.float64], *, replace: bool
+    ) -> NDArray[Any]:
+        """Check a written array and the state of its axes; return it as commands, nothing taken yet.
+
+        Args:
+            records: as written.
+            axes: bank axis of each node-local index.
+            at_rest: position (n,) of axes that are idle, NaN of the others.
+            replace: the buffers of these axes will be emptied first.
+        """
         if records.dtype != WIRE_DTYPE:
             raise CommandError(errno.EINVAL, "write: the records are no axis write records; table F.3")
         commands = self._validator.check(records, np.asarray(axes, dtype=np.int64))
+        if not len(commands):
+            return commands
         touched = np.bincount(commands["axis"], minlength=self.n)
         self._check_latches(np.flatnonzero(touched))
         full = touched > (self.capacity if replace else self.room_of_all())
@@ -68,7 +85,22 @@ class CommandQueue:
                 f"write axis {axis} ({self.settings[axis].name}): {touched[axis]} commands do not fit; "
                 f"room for {room} of {self.capacity}",
             )
+        self._check_feasible(commands, at_rest, replace)
         return commands
+
+    def _check_feasible(self, commands: NDArray[Any], at_rest: NDArray[np.float64], replace: bool) -> None:
+        known = self.tail.state
+        resting = np.isfinite(at_rest)
+        known[resting, 0] = at_rest[resting]
+        known[resting, 1:] = 0.0
+        tail = self.tail._replace(state=np.where(resting[:, None], known, np.nan)) if replace else self.tail
+        self._next_tail = self._feasibility.check(commands, tail)
+
+    def forget_tail(self, axes: NDArray[np.int64]) -> None:
+        """The buffers of these axes were emptied: what follows begins in a state not known here."""
+        self.tail.state[axes] = np.nan
+        self.tail.velocity[axes] = self.in_force[0][axes]
+        self.tail.acceleration[axes] = self.in_force[1][axes]
 
     def _check_latches(self, axes: NDArray[np.int64]) -> None:
         latched = self.latched[axes]
@@ -92,6 +124,11 @@ class CommandQueue:
         if not len(commands):
             return np.zeros(0, dtype=np.int64)
         touched = self._buffers.append(commands)
+        if self._next_tail is not None:
+            axes, end = self._next_tail
+            for held, new in zip(self.tail, end, strict=True):
+                held[axes] = new
+            self._next_tail = None
         self.load_heads(touched)
         return touched
 
@@ -166,6 +203,7 @@ class CommandQueue:
 
     def clear(self, axes: NDArray[np.int64]) -> NDArray[np.int64]:
         """Drop all waiting commands of these axes; return the axes that had any."""
+        self.forget_tail(axes)
         had = axes[self.has_head[axes] | (self._buffers.count[axes] > 0)]
         self._buffers.clear(axes)
         for axis in axes[self.gated_marker[axes]].tolist():
@@ -236,6 +274,9 @@ class CommandQueue:
                 changes.append((array, axis, self._checked_limit(axis, name, value, position)))
         for array, axis, value in changes:
             array[axis] = value
+        self.in_force[0][axes] = self.limits.velocity[axes]
+        self.in_force[1][axes] = self.limits.acceleration[axes]
+        self.forget_tail(axes)
 
     def _limit_array(self, name: str) -> NDArray[np.float64]:
         arrays = {

@@ -84,8 +84,7 @@ class Sequencer:
         self.guard = np.zeros(n, dtype=bool)
         self.limit_bits = np.zeros(n, dtype=np.int64)
         self.status = np.zeros(n, dtype=np.int64)
-        self.velocity_limit = queue.limits.velocity.copy()
-        self.acceleration_limit = queue.limits.acceleration.copy()
+        self._velocity_limit, self._acceleration_limit = queue.in_force
         self.any_force = False
         self.any_guard = False
         self._queue = queue
@@ -139,6 +138,12 @@ class Sequencer:
         idle: NDArray[np.bool_] = (self.kind[axes] == HOLD) & ~self._queue.has_head[axes]
         idle &= (self._queue.latched[axes] & _HOMING) == 0
         return idle
+
+    def rest_positions(self) -> Floats:
+        """Return where idle axes rest, NaN for the others (n,)."""
+        idle = (self.kind == HOLD) & ~self._queue.has_head
+        rest: Floats = np.where(idle, self.store.final[self.store.row, 0], np.nan)
+        return rest
 
     def drop(self, axes: Axes) -> None:
         """Forget all waiting commands of these axes, and the plans made for them."""
@@ -270,7 +275,7 @@ class Sequencer:
         if mode & modes.MAX_FORCE:
             law.force_limit[axis] = command.max_force
         if mode & modes.MAX_VEL_ACC:
-            self.velocity_limit[axis], self.acceleration_limit[axis] = command.max_velocity, command.max_acceleration
+            self._velocity_limit[axis], self._acceleration_limit[axis] = command.max_velocity, command.max_acceleration
 
     def _rest(
         self, axes: Axes, state: Floats, start_ns: NDArray[np.int64], fraction: Floats, now_ns: int
@@ -366,7 +371,7 @@ class Sequencer:
         if command.control_mode & modes.MAX_VEL_ACC:
             velocity, acceleration = command.max_velocity, command.max_acceleration
         else:
-            velocity, acceleration = float(self.velocity_limit[axis]), float(self.acceleration_limit[axis])
+            velocity, acceleration = float(self._velocity_limit[axis]), float(self._acceleration_limit[axis])
         return Bounds(
             velocity, acceleration, float(limits.jerk[axis]), float(limits.minimum[axis]), float(limits.maximum[axis])
         )
