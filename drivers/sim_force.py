@@ -12,11 +12,9 @@ point_m = [0.0, 0.02, 0.1]
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
 
 import msgspec
 import numpy as np
-from msgspec import Meta
 
 from sioms.plant.force_sensor import COMPONENTS, Contact, ForceSensor
 from sioms.protocol.flags import AnalogStatus, NodeClass
@@ -25,7 +23,7 @@ from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
 from sioms.sdk.driver import Kit, TickDriver
 
 Vector = tuple[float, float, float]
-Six = Annotated[list[float], Meta(min_length=6, max_length=6)]
+Six = tuple[float, float, float, float, float, float]
 
 
 class ContactTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -58,11 +56,11 @@ class SimForceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     contact: list[ContactTable] = []
-    noise: Six = [0.05, 0.05, 0.08, 0.002, 0.002, 0.002]
-    resolution: Six = [0.01, 0.01, 0.02, 0.0005, 0.0005, 0.0005]
-    bias: Six = [0.0] * 6
-    limit: Six = [200.0, 200.0, 400.0, 10.0, 10.0, 10.0]
-    cross_talk: Annotated[list[Six], Meta(min_length=6, max_length=6)] | None = None
+    noise: Six = (0.05, 0.05, 0.08, 0.002, 0.002, 0.002)
+    resolution: Six = (0.01, 0.01, 0.02, 0.0005, 0.0005, 0.0005)
+    bias: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    limit: Six = (200.0, 200.0, 400.0, 10.0, 10.0, 10.0)
+    cross_talk: tuple[Six, Six, Six, Six, Six, Six] | None = None
     seed: int = 0
     tick_hz: float = 1000.0
     history: int = 64

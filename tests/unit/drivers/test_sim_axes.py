@@ -1,0 +1,145 @@
+"""Simulated axes: they move as commanded over their physics, home, stall, press and take hidden effects."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from sioms.drivers.sim_axes import SimAxes
+from sioms.protocol.flags import AxisStatus, ControlMode
+
+SERVO = {
+    "name": "x", "velocity_max": 0.5, "acceleration_max": 5.0, "force_max": 60.0,
+    "position_min": -0.2, "position_max": 0.5,
+    "motor": {"mass": 2.0, "viscous": 4.0, "coulomb": 3.0, "stiction": 4.0, "encoder_step": 1e-6},
+}  # fmt: skip
+STEPPER = {
+    "name": "belt", "velocity_max": 0.3, "acceleration_max": 2.0,
+    "stepper": {"mass": 0.4, "step": 2e-4, "hold_force": 60.0, "coulomb": 3.0, "home": 0.0},
+}  # fmt: skip
+
+
+def status(driver, axis=0):
+    return AxisStatus(int(driver.bank.fields.view(np.int64)[11, axis]))
+
+
+def test_servo_moves_to_its_goal_and_rests_within_friction(bench):
+    mod = bench.make(SimAxes, "mod0", {"axis": [SERVO]})
+    bench.run(0.01)
+    bench.write(mod, control_mode=ControlMode.POSITION, position=0.2)
+    bench.run(2.0, until=lambda: mod.bank.is_idle([0]))
+    bench.run(0.3)
+    stiffness = 2.0 * (2 * np.pi * 30) ** 2
+    assert mod.bank.fields[0, 0] == pytest.approx(0.2, abs=3.0 / stiffness + 2e-6)
+    true = mod.blocks[1].data[0]
+    assert 0 <= true - mod.bank.fields[0, 0] < 1e-6 + 1e-9
+
+
+def test_tracking_error_without_friction_is_that_of_the_acceleration(bench):
+    axis = SERVO | {"motor": {"mass": 2.0}}
+    mod = bench.make(SimAxes, "mod0", {"axis": [axis]})
+    bench.run(0.01)
+    bench.write(mod, control_mode=ControlMode.POSITION, position=0.2)
+    worst = 0.0
+    for _ in range(600):
+        bench.run(0.001)
+        worst = max(worst, abs(mod.bank.fields[9, 0]))
+    # a/w^2 in steady acceleration; the step in acceleration of an unlimited jerk stays below twice that.
+    assert 0.5 * 5.0 / (2 * np.pi * 30) ** 2 < worst < 2 * 5.0 / (2 * np.pi * 30) ** 2
+
+
+def test_servo_and_stepper_in_one_device(bench):
+    mod = bench.make(SimAxes, "mod0", {"axis": [STEPPER, SERVO]})
+    bench.run(0.01)
+    bench.write(mod, axis=0, control_mode=ControlMode.POSITION, position=0.05)
+    bench.write(mod, axis=1, control_mode=ControlMode.POSITION, position=-0.1)
+    bench.run(2.0, until=lambda: mod.bank.is_idle([0, 1]))
+    bench.run(0.3)
+    plant = mod.blocks[1].data
+    assert plant[0] == pytest.approx(0.05, abs=2e-5)
+    assert plant[2] == pytest.approx(-0.1, abs=2e-4)
+
+
+def test_stepper_that_loses_steps_does_not_notice_but_the_world_does(bench):
+    weak = STEPPER | {"acceleration_max": 300.0, "velocity_max": 1.5}
+    mod = bench.make(SimAxes, "belt0", {"axis": [weak]})
+    bench.run(0.01)
+    bench.write(mod, control_mode=ControlMode.POSITION, position=0.3)
+    bench.run(2.0, until=lambda: mod.bank.is_idle([0]))
+    bench.run(0.3)
+    assert mod.bank.fields[0, 0] == pytest.approx(0.3, abs=2e-5)
+    assert mod.blocks[1].data[0] < 0.29
+
+
+def test_homing_finds_the_switch_edge(bench):
+    homing = {"velocity": 0.1, "slow_velocity": 0.01, "direction": -1, "offset": 0.0}
+    axis = SERVO | {
+        "homing": homing,
+        "position_min": -0.3,
+        "motor": SERVO["motor"] | {"home": -0.05, "start": 0.02},
+    }
+    mod = bench.make(SimAxes, "mod0", {"axis": [axis]})
+    bench.run(0.01)
+    mod.bank.home([0], bench.now_ns)
+    bench.run(5.0, until=lambda: bool(status(mod) & AxisStatus.HOMED))
+    bench.run(0.5)
+    # The new coordinate counts from the edge of the switch.
+    assert mod.bank.fields[0, 0] - (mod.blocks[1].data[0] + 0.05) == pytest.approx(0.0, abs=5e-5)
+
+
+def test_force_mode_presses_on_the_wall(bench):
+    wall = {"position": 0.01, "stiffness": 2e4, "damping": 100.0}
+    axis = SERVO | {"motor": {"mass": 2.0, "viscous": 60.0, "wall": wall}}
+    mod = bench.make(SimAxes, "mod0", {"axis": [axis]})
+    bench.run(0.01)
+    bench.write(mod, control_mode=ControlMode.FORCE, force=12.0)
+    bench.run(2.0)
+    assert mod.blocks[1].data[1] == pytest.approx(12.0, rel=1e-3)
+    assert mod.blocks[1].data[0] == pytest.approx(0.01 + 12.0 / 2e4, rel=1e-3)
+
+
+def test_late_ticks_cost_the_world_no_time(bench):
+    """The plant falls freely for the whole time, also when ticks were skipped."""
+    axis = SERVO | {"motor": {"mass": 1.0, "load_force": 1.0}, "k": 0.0}
+    mod = bench.make(SimAxes, "mod0", {"axis": [axis]})
+    bench.run(0.005)
+    bench.now_ns += 20_000_000
+    bench.run(0.005)
+    seconds = 0.005 + 0.020 + 0.005 - 0.001
+    assert mod.blocks[1].data[0] == pytest.approx(1.0 * seconds**2 / 2, rel=1e-9)
+
+
+def test_hidden_effects_file(bench, tmp_path):
+    file = tmp_path / "hidden.toml"
+    file.write_text('[x]\ncoulomb = { level = 9.0 }\n["*"]\noffset = { force = 5.0 }\n')
+    hidden = bench.make(SimAxes, "mod0", {"axis": [SERVO | {"k": 0.0}], "effects_file": str(file)})
+    plain = bench.make(
+        SimAxes, "mod1", {"axis": [SERVO | {"k": 0.0}], "effects": {"x": {"offset": {"force": 5.0}}}}
+    )
+    bench.run(0.2)
+    # 5 N do not overcome 4 + 9 N of stiction, but 4 N alone.
+    assert hidden.blocks[1].data[0] == 0.0
+    assert plain.blocks[1].data[0] > 0.005
+
+
+@pytest.mark.parametrize(
+    "table, words",
+    [
+        ({"axis": []}, "axis: none given"),
+        ({"axis": [{k: v for k, v in SERVO.items() if k != "motor"}]}, "neither or both"),
+        ({"axis": [SERVO | {"motor": {"mass": -1.0}}]}, "mass -1"),
+        ({"axis": [SERVO | {"bandwidth_hz": 500.0}]}, "bandwidth_hz 500"),
+        ({"axis": [SERVO], "effects": {"y": {}}}, "no such axis"),
+        ({"axis": [SERVO], "effects_file": "/nowhere.toml"}, "No such file"),
+    ],
+)
+def test_bad_settings_are_told_by_describe(table, words):
+    with pytest.raises(ValueError, match=words):
+        SimAxes.describe("mod0", msgspec.convert(table, SimAxes.Settings))
+
+
+@pytest.mark.parametrize(
+    "change", [{"masss": 1.0}, {"motor": {"mass": 1.0, "coulumb": 1.0}}, {"homing": {"velo": 1}}]
+)
+def test_unknown_keys_are_errors_at_every_depth(change):
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert({"axis": [SERVO | change]}, SimAxes.Settings)
