@@ -1,0 +1,76 @@
+"""Identifiability: could another effect, or another set, have made these data?
+
+For every named effect the look-alikes take its place and everything is refitted. ``missed`` is the share of
+the effect's contribution that the look-alike cannot reproduce; below ``AMBIGUOUS`` (or within one standard
+error on held-out blocks) these data do not tell the two apart, however small the formal intervals are:
+what separates them then is a transient or two, where unmodelled effects live.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sioms.reconcile.blocks import better
+from sioms.reconcile.effects import library
+from sioms.reconcile.fit import Fit
+from sioms.reconcile.screen import screen
+from sioms.reconcile.search import Found, Searcher, physical, size, without
+
+AMBIGUOUS = 0.05
+FEEBLE = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Rival:
+    """A look-alike put in the place of a named effect.
+
+    Attributes:
+        missed: share of the contribution of ``effect`` that it cannot reproduce.
+        errors: by how many standard errors it is worse on held-out blocks.
+    """
+
+    effect: str
+    rival: str
+    missed: float
+    errors: float
+    fit: Fit
+
+    @property
+    def open(self) -> bool:
+        """True where the data do not rule the rival out."""
+        return self.missed < AMBIGUOUS or (self.errors < 1.0 and self.missed < 4.0 * AMBIGUOUS)
+
+
+def rivals(searcher: Searcher, found: Found) -> list[Rival]:
+    """Refit with each look-alike in the place of each named effect, those not decided by a channel."""
+    out = []
+    lib = library()
+    for name in [n for n in found.fit.model.effects if n not in searcher.frozen and n in lib]:
+        names = [n for n in _alike(name) if n in searcher.names and n not in found.fit.model.effects]
+        if not names:
+            continue
+        bare = searcher.fit(found.fit.model.without_effect(name), 5)
+        contribution = bare.cost - found.fit.cost
+        if contribution <= 0.0:
+            continue
+        for start in screen(searcher.problem, bare, names):
+            if start.gain * bare.cost < 0.3 * contribution:
+                continue
+            model = without(bare.model, lib[start.effect].replaces)
+            fit = searcher.fit(model.with_effect(start.effect, start.values))
+            if not physical(fit, start.effect):
+                continue
+            _, errors = better(found.losses, searcher.loss(fit))
+            out.append(Rival(name, start.effect, (fit.cost - found.fit.cost) / contribution, errors, fit))
+    best: dict[tuple[str, str], Rival] = {}
+    for r in out:
+        if (r.effect, r.rival) not in best or r.missed < best[r.effect, r.rival].missed:
+            best[r.effect, r.rival] = r
+    return sorted(best.values(), key=lambda r: r.missed)
+
+
+def _alike(name: str) -> list[str]:
+    """Look-alikes in either direction, without those that merely contain the effect or are contained in it."""
+    lib = library()
+    both = [n for n in lib if n in lib[name].lookalikes or name in lib[n].lookalikes]
+    return [n for n in both if n not in lib[name].replaces and size(n) <= size(name) + 1]

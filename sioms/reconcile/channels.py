@@ -1,0 +1,220 @@
+"""Channels first: what the sensor and the drive say by themselves, before any mechanics is fitted.
+
+The count lattice and the index marks judge the sensor, measured against commanded force the drive. What is
+found here is measured directly, so the later fits keep it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from sioms.reconcile.effect import Array
+from sioms.reconcile.model import AxisModel
+from sioms.reconcile.records import Record, Session
+
+LATTICE_SHARE = 0.998
+#: A scale or a drive effect must be this many standard errors away from nothing ...
+SIGNIFICANT = 5.0
+#: ... and explain at least this share of what the drive residual holds.
+DRIVE_GAIN = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """An effect that a channel shows by itself.
+
+    Attributes:
+        values: parameters; errors: their standard errors.
+        evidence: one sentence with figures.
+    """
+
+    effect: str
+    values: Mapping[str, float]
+    errors: Mapping[str, float]
+    evidence: str
+
+
+def lattice(session: Session, model: AxisModel) -> Finding | None:
+    """Find the largest number of which (nearly) all count differences are multiples."""
+    steps = np.concatenate([np.diff(np.rint(r.position / model.resolution).astype(np.int64)) for r in
+                            session.records])
+    moved = np.abs(steps[steps != 0])
+    if len(moved) < 20:
+        return None
+    sizes, times = np.unique(moved, return_counts=True)
+    best = 1
+    for factor in range(2, int(min(sizes.max(), 4096)) + 1):
+        if times[sizes % factor == 0].sum() >= LATTICE_SHARE * times.sum():
+            best = factor
+    if best == 1:
+        return None
+    share = times[sizes % best == 0].sum() / times.sum()
+    return Finding("encoder_quantisation", {"factor": float(best)}, {"factor": 0.0},
+                   f"{100 * share:.1f} % of {len(moved)} position changes are multiples of {best} counts")
+
+
+def index_scale(session: Session, model: AxisModel) -> Finding | None:
+    """Fit measured against true position of the index marks; None where they agree or are too few."""
+    fit = index_fit(session, model)
+    if fit is None:
+        return None
+    gain, error, marks = fit
+    if abs(gain - 1.0) < SIGNIFICANT * error or abs(gain - 1.0) < 3e-4:
+        return None
+    return Finding("encoder_scale", {"gain": gain}, {"gain": error},
+                   f"{marks} index marks lie {gain:.5f} +- {error:.5f} of their pitch apart")
+
+
+def index_fit(session: Session, model: AxisModel) -> tuple[float, float, int] | None:
+    """Estimate measured over true displacement from index marks.
+
+    Returns:
+        (gain, standard error, number of marks), or None with fewer than two distinct marks.
+    """
+    where, width, record = [], [], []
+    for i, r in enumerate(session.records):
+        if r.index is None:
+            continue
+        at = np.flatnonzero(r.index[:-1])
+        where.append(0.5 * (r.position[at] + r.position[at + 1]))
+        width.append(np.abs(r.position[at + 1] - r.position[at]) + 2.0 * model.resolution)
+        record.append(np.full(len(at), i))
+    if not where or sum(map(len, where)) < 4:
+        return None
+    y, s = np.concatenate(where), np.concatenate(width) / np.sqrt(12.0)
+    best: tuple[float, float, float] | None = None
+    for trial in np.concatenate([[1.0], np.linspace(0.8, 1.25, 451)]):
+        n = np.rint(y / (model.pitch * trial))
+        if len(np.unique(n)) < 2:
+            continue
+        g, e, chi = _line(n * model.pitch, y, s)
+        if best is None or chi < best[2] * (1.0 - 1e-6):
+            best = (g, e, chi)
+    if best is None:
+        return None
+    gain, error, chi = best
+    return gain, error * max(1.0, np.sqrt(chi)), len(y)
+
+
+def _line(x: Array, y: Array, s: Array) -> tuple[float, float, float]:
+    """Weighted straight line: slope, its standard error, reduced chi square."""
+    w = 1.0 / s**2
+    xm, ym = np.average(x, weights=w), np.average(y, weights=w)
+    sxx = float(np.sum(w * (x - xm) ** 2))
+    slope = float(np.sum(w * (x - xm) * (y - ym))) / sxx
+    rest = y - ym - slope * (x - xm)
+    return slope, 1.0 / np.sqrt(sxx), float(np.sum(w * rest**2) / max(len(x) - 2, 1))
+
+
+def drive_output(force: Array, delay: float, lag: float, limit: float, dt: float) -> Array:
+    """Mean force over each sample of a drive with delay, first-order lag and limit (at nominal constant)."""
+    k = int(np.floor(delay / dt))
+    part = delay / dt - k
+    held = np.concatenate([np.zeros(k + 1), force])
+    u = (1.0 - part) * held[1 : len(force) + 1] + part * held[: len(force)]
+    if lag > 0.0:
+        decay, out, state = np.exp(-dt / lag), np.empty_like(u), 0.0
+        share = (1.0 - decay) * lag / dt
+        for i, goal in enumerate(u):
+            out[i] = goal + (state - goal) * share
+            state = goal + (state - goal) * decay
+        u = out
+    limited: Array = np.clip(u, -limit, limit)
+    return limited
+
+
+def drive(session: Session, model: AxisModel) -> list[Finding]:
+    """Compare measured with commanded force: delay, lag, saturation, the fewest that explain it."""
+    records = [r for r in session.records if r.force_measured is not None]
+    if not records:
+        return []
+    dt = model.sample_time_s
+    noise = _white(records)
+    limit, at_limit = _plateau(records, noise)
+
+    def misfit(delay: float, lag: float) -> float:
+        total = 0.0
+        for r in records:
+            assert_measured = r.force_measured if r.force_measured is not None else r.force
+            e = assert_measured - drive_output(r.force, max(delay, 0.0), max(lag, 0.0), limit, dt)
+            total += float(np.sum(e[20:] ** 2))
+        return total
+
+    n = sum(len(r) - 20 for r in records)
+    found = []
+    if at_limit:
+        found.append(Finding("saturation", {"limit": limit}, {"limit": noise / np.sqrt(at_limit)},
+                             f"measured force stays at {limit:.4g} {model.force_unit} in {at_limit} samples "
+                             "while the command goes on"))
+    none = misfit(0.0, 0.0)
+    delay = _delay(misfit, dt)
+    lag = minimize(lambda p: misfit(0.0, p[0] * dt), [1.0], method="Nelder-Mead", options={"maxfev": 25}).x[0] * dt
+    scores = {"delay": misfit(delay, 0.0), "lag": misfit(0.0, max(lag, 0.0))}
+    name = min(scores, key=lambda s: scores[s])
+    value = delay if name == "delay" else lag
+    slope = np.sqrt(n * np.mean(np.concatenate([np.gradient(r.force, dt) for r in records]) ** 2))
+    error = float(np.sqrt(scores[name] / n) / slope)
+    if value > max(SIGNIFICANT * error, 1e-3 * dt) and scores[name] < (1.0 - DRIVE_GAIN) * none:
+        symbol = "delay" if name == "delay" else "tau"
+        other = "lag" if name == "delay" else "delay"
+        found.append(Finding(name, {symbol: float(value)}, {symbol: error},
+                             f"measured force is late by {1e3 * value:.3f} ms; misfit {np.sqrt(scores[name] / n):.3g}, "
+                             f"with {other} {np.sqrt(scores[other] / n):.3g}, with neither {np.sqrt(none / n):.3g} "
+                             f"{model.force_unit}"))
+    return found
+
+
+def _delay(misfit: object, dt: float) -> float:
+    """Search whole samples first, then within one."""
+    call = misfit  # a callable (delay, lag) -> sum of squares
+    grid = np.arange(0.0, 20.5, 0.5) * dt
+    start = grid[int(np.argmin([call(d, 0.0) for d in grid]))]  # type: ignore[operator]
+    best = minimize(lambda p: call(p[0] * dt, 0.0), [start / dt], method="Nelder-Mead",  # type: ignore[operator]
+                    options={"maxfev": 40, "xatol": 1e-4, "initial_simplex": [[start / dt], [start / dt + 0.3]]})
+    return float(max(best.x[0], 0.0) * dt)
+
+
+def _white(records: list[Record]) -> float:
+    """White noise of the measured force."""
+    second = [1.4826 * np.median(np.abs(np.diff(r.force_measured, 2))) / np.sqrt(6.0) for r in records
+              if r.force_measured is not None]
+    return float(max(np.median(second), 1e-12))
+
+
+def _plateau(records: list[Record], noise: float) -> tuple[float, int]:
+    """Find a level at which the measured force stays although the command passes it clearly.
+
+    Returns:
+        (level, number of samples there); (inf, 0) where there is none.
+    """
+    measured = np.concatenate([r.force_measured for r in records if r.force_measured is not None])
+    commanded = np.concatenate([r.force for r in records])
+    top = float(np.quantile(np.abs(measured), 0.9995))
+    near = np.abs(np.abs(measured) - top) < 5.0 * noise + 0.004 * top
+    beyond = near & (np.abs(commanded) > 1.03 * top + 6.0 * noise)
+    if beyond.sum() < 8 or np.abs(commanded).max() < 1.05 * top:
+        return np.inf, 0
+    # a real plateau: hardly any measured sample above, and the command beyond it most of the time it is near
+    level = float(np.median(np.abs(measured[beyond])))
+    if np.mean(np.abs(measured) > level + 6.0 * noise) > 1e-3 or _late(records, level, noise):
+        return np.inf, 0
+    return level, int(beyond.sum())
+
+
+def _late(records: list[Record], level: float, noise: float) -> bool:
+    """Say whether large commands are reached later (a delay), not cut off."""
+    reached = passed = 0
+    for r in records:
+        if r.force_measured is None:
+            continue
+        above = np.abs(r.force) > 1.05 * level + 6.0 * noise
+        edges = np.flatnonzero(above[1:] & ~above[:-1]) + 1
+        for e in edges:
+            passed += 1
+            stop = e + 30
+            reached += bool(np.any(np.abs(r.force_measured[e:stop]) > 1.02 * level + 6.0 * noise))
+    return passed > 0 and reached > 0.2 * passed

@@ -1,0 +1,47 @@
+"""The library of axis effects, and how users add their own.
+
+A user's package lists an ``Effect`` (or a tuple of them) under the entry-point group
+``sioms.effects``; it then takes part in the workflow, in model files and in simulated axes.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.metadata import entry_points
+
+from sioms.reconcile.effect import Effect
+from sioms.reconcile.effects import drive, friction, position, sensor, terms, transmission
+
+GROUP = "sioms.effects"
+BUILT_IN: tuple[Effect, ...] = (
+    *sensor.EFFECTS,
+    *drive.EFFECTS,
+    *friction.EFFECTS,
+    *position.EFFECTS,
+    *transmission.EFFECTS,
+)
+
+
+@cache
+def library() -> dict[str, Effect]:
+    """Return every known effect by name: the built-in ones and those of installed packages.
+
+    Raises:
+        ValueError: an entry point is no effect, or takes a name that is in use.
+    """
+    found = {e.name: e for e in BUILT_IN}
+    for point in entry_points(group=GROUP):
+        given = point.load()
+        for effect in given if isinstance(given, tuple) else (given,):
+            if not isinstance(effect, Effect):
+                raise ValueError(f"load effect {point.name}: got {type(effect).__name__}; needs an Effect")
+            if effect.name in found:
+                raise ValueError(f"load effect {point.name}: the name {effect.name} is in use; choose another")
+            found[effect.name] = effect
+    return found
+
+
+@cache
+def known() -> dict[str, Effect]:
+    """Return the library and, beside it, the nameless terms that a refusal may offer."""
+    return {**library(), **{t.name: t for t in terms.TERMS}}

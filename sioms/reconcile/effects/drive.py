@@ -1,0 +1,82 @@
+"""The actuator channel: what lies between the commanded and the acting force."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sioms.reconcile.effect import TURN, Array, Channel, Effect, Parameter, Ref, Slot
+from sioms.reconcile.jit import state_function
+
+
+@state_function
+def ripple_gain(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """1 + depth sin(n theta + phase)."""
+    return 1.0 + p[0] * np.sin(p[2] * p[TURN] * x + p[1])
+
+
+TORQUE_RIPPLE = Effect(
+    name="torque_ripple",
+    title="torque ripple",
+    channel=Channel.ACTUATOR,
+    slot=Slot.GAIN,
+    function=ripple_gain,
+    equation="F = u (1 + depth sin(n theta + phase))",
+    parameters=(
+        Parameter("depth", "1", Ref.ONE, 0.0, 0.6, 0.05, "relative ripple of the force constant"),
+        Parameter("phase", "rad", Ref.ANGLE, -np.pi, np.pi, 0.0, "phase at position zero", phase=True),
+        Parameter("n", "1/pitch", Ref.ONE, 1.0, 60.0, 1.0, "periods in a pitch", fixed=True),
+    ),
+    signature="periodic force residual in position, proportional to the motor force",
+    lookalikes=("cogging", "eccentricity"),
+    separate="one full turn with two loads",
+)
+DELAY = Effect(
+    name="delay",
+    title="transport delay",
+    channel=Channel.ACTUATOR,
+    slot=Slot.DELAY,
+    equation="F(t) = u(t - delay)",
+    parameters=(Parameter("delay", "s", Ref.TIME, 0.0, 0.02, 1.5e-3, "delay of the command"),),
+    signature="force residual with the rate of the command; measured current late by a constant time",
+    lookalikes=("lag", "elastic"),
+    separate="force steps, or a multi-sine up to the bandwidth",
+)
+LAG = Effect(
+    name="lag",
+    title="drive lag",
+    channel=Channel.ACTUATOR,
+    slot=Slot.LAG,
+    equation="tau dF/dt = u - F",
+    parameters=(Parameter("tau", "s", Ref.TIME, 0.0, 0.02, 1.5e-3, "time constant of the drive"),),
+    signature="as a delay, with the fast part attenuated",
+    lookalikes=("delay", "elastic"),
+    separate="force steps",
+)
+SATURATION = Effect(
+    name="saturation",
+    title="force saturation",
+    channel=Channel.ACTUATOR,
+    slot=Slot.LIMIT,
+    equation="F = clip(u, -limit, limit)",
+    parameters=(Parameter("limit", "{F}", Ref.FORCE, 0.02, 10.0, 0.5, "largest force"),),
+    signature="force residual only where the command is large",
+    lookalikes=("thermal_gain", "load_friction"),
+    separate="force steps of growing height",
+)
+THERMAL_GAIN = Effect(
+    name="thermal_gain",
+    title="thermal loss of the force constant",
+    channel=Channel.ACTUATOR,
+    slot=Slot.THERMAL,
+    equation="F = u (1 - loss T), tau dT/dt = (u / rated)^2 - T",
+    parameters=(
+        Parameter("loss", "1", Ref.ONE, 0.0, 5.0, 0.1, "relative loss at steady rated heating"),
+        Parameter("tau", "s", Ref.TIME, 0.5, 1e4, 10.0, "thermal time constant"),
+    ),
+    signature="force residual proportional to the motor force, growing with the heat put in",
+    lookalikes=("payload", "load_friction", "saturation"),
+    separate="the same record cold and warm, in both orders",
+    session=("temperature at the start",),
+)
+
+EFFECTS = (TORQUE_RIPPLE, DELAY, LAG, SATURATION, THERMAL_GAIN)

@@ -1,0 +1,174 @@
+"""Friction: forces that oppose motion and vanish or hold at rest.
+
+Sources: B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit, "A survey of models, analysis tools and
+compensation methods for the control of machines with friction", Automatica 30 (1994) 1083-1138,
+for viscous, Coulomb, Stribeck; P. R. Dahl, "A solid friction model", 1968, for presliding.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sioms.reconcile.effect import TURN, Array, Channel, Effect, Parameter, Ref, Slot
+from sioms.reconcile.jit import state_function
+
+
+@state_function
+def viscous_force(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """-b v."""
+    return -p[0] * v
+
+
+@state_function
+def direction_force(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """-d |v|: adds d to the viscous coefficient forward, subtracts it backward."""
+    return -p[0] * np.abs(v)
+
+
+@state_function
+def quadratic_force(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """-c v |v|."""
+    return -p[0] * v * np.abs(v)
+
+
+@state_function
+def coulomb_level(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """Fc."""
+    return p[0] + 0.0 * v
+
+
+@state_function
+def position_level(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """Fc + Fm sin(n theta + phase)."""
+    return p[0] + p[1] * np.sin(p[3] * p[TURN] * x + p[2])
+
+
+@state_function
+def stribeck_level(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """Fc + (Fs - Fc) exp(-(v / vs)^2)."""
+    return p[0] + (p[1] - p[0]) * np.exp(-((v / p[2]) ** 2))
+
+
+@state_function
+def load_level(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """mu |u|."""
+    return p[0] * np.abs(u)
+
+
+VISCOUS = Effect(
+    name="viscous",
+    title="viscous friction",
+    channel=Channel.MECHANICS,
+    slot=Slot.FORCE,
+    function=viscous_force,
+    equation="F = -b_extra v",
+    parameters=(Parameter("b_extra", "{F} s/{x}", Ref.DAMPING, 0.0, 5.0, 0.05, "added viscous coefficient"),),
+    signature="force residual proportional to speed, odd in direction",
+    lookalikes=("coulomb", "quadratic_drag", "viscous_direction"),
+    separate="cruise at several speeds both ways",
+)
+VISCOUS_DIRECTION = Effect(
+    name="viscous_direction",
+    title="direction-dependent viscous friction",
+    channel=Channel.MECHANICS,
+    slot=Slot.FORCE,
+    function=direction_force,
+    equation="F = -b_dir |v|: the coefficient is b + b_dir forward, b - b_dir backward",
+    parameters=(Parameter("b_dir", "{F} s/{x}", Ref.DAMPING, -2.0, 2.0, 0.02, "half the difference of the "
+                          "forward and backward coefficients"),),
+    signature="force residual proportional to speed, even in direction",
+    lookalikes=("offset",),
+    separate="cruise at several speeds both ways, and rest",
+)
+QUADRATIC_DRAG = Effect(
+    name="quadratic_drag",
+    title="quadratic drag",
+    channel=Channel.MECHANICS,
+    slot=Slot.FORCE,
+    function=quadratic_force,
+    equation="F = -c v |v|",
+    parameters=(Parameter("c", "{F} s^2/{x}^2", Ref.DRAG, 0.0, 5.0, 0.05, "drag coefficient"),),
+    signature="force residual with the square of speed, odd in direction",
+    lookalikes=("viscous",),
+    separate="cruise at several speeds up to the largest, both ways",
+)
+COULOMB = Effect(
+    name="coulomb",
+    title="Coulomb friction",
+    channel=Channel.MECHANICS,
+    slot=Slot.FRICTION,
+    function=coulomb_level,
+    equation="F = -Fc sign(v); at rest it holds any force up to Fc",
+    parameters=(Parameter("Fc", "{F}", Ref.FORCE, 0.0, 1.5, 0.05, "friction level"),),
+    signature="force residual steps with the direction of motion and does not depend on speed",
+    lookalikes=("stribeck", "viscous", "offset", "presliding"),
+    separate="slow reversals and cruise at several speeds both ways",
+    replaces=("stribeck", "presliding", "coulomb_position"),
+)
+COULOMB_POSITION = Effect(
+    name="coulomb_position",
+    title="Coulomb friction that varies over the turn",
+    channel=Channel.MECHANICS,
+    slot=Slot.FRICTION,
+    function=position_level,
+    equation="F = -(Fc + Fm sin(n theta + phase)) sign(v)",
+    parameters=(
+        Parameter("Fc", "{F}", Ref.FORCE, 0.0, 1.5, 0.05, "mean friction level"),
+        Parameter("Fm", "{F}", Ref.FORCE, 0.0, 1.5, 0.02, "amplitude of its variation"),
+        Parameter("phase", "rad", Ref.ANGLE, -np.pi, np.pi, 0.0, "phase at position zero", phase=True),
+        Parameter("n", "1/pitch", Ref.ONE, 1.0, 60.0, 1.0, "periods in a pitch", fixed=True),
+    ),
+    signature="periodic force residual whose sign follows the direction of motion",
+    lookalikes=("coulomb", "cogging", "torque_ripple"),
+    separate="one full turn at constant speed, both ways",
+    replaces=("coulomb", "stribeck", "presliding"),
+)
+STRIBECK = Effect(
+    name="stribeck",
+    title="Stribeck friction (low-speed drop)",
+    channel=Channel.MECHANICS,
+    slot=Slot.FRICTION,
+    function=stribeck_level,
+    equation="F = -(Fc + (Fs - Fc) exp(-(v/vs)^2)) sign(v); at rest it holds up to Fs",
+    parameters=(
+        Parameter("Fc", "{F}", Ref.FORCE, 0.0, 1.5, 0.05, "level at speed"),
+        Parameter("Fs", "{F}", Ref.FORCE, 0.0, 3.0, 0.08, "breakaway level"),
+        Parameter("vs", "{x}/s", Ref.SPEED, 2e-4, 0.5, 0.02, "speed over which the level drops"),
+    ),
+    signature="as Coulomb friction, larger below the Stribeck speed",
+    lookalikes=("coulomb", "presliding", "backlash"),
+    separate="reversals at several low speeds",
+    replaces=("coulomb", "presliding", "coulomb_position"),
+)
+PRESLIDING = Effect(
+    name="presliding",
+    title="Coulomb friction with presliding (Dahl)",
+    channel=Channel.MECHANICS,
+    slot=Slot.HYSTERESIS,
+    equation="dF/dx = (Fc sign(v) - F) / xs, force -F",
+    parameters=(
+        Parameter("Fc", "{F}", Ref.FORCE, 0.0, 1.5, 0.05, "level after sliding"),
+        Parameter("xs", "{x}", Ref.PITCH, 1e-5, 5e-3, 1e-3, "presliding displacement"),
+    ),
+    signature="friction force builds up over a displacement after every reversal",
+    lookalikes=("coulomb", "stribeck", "backlash"),
+    separate="small reversals of several amplitudes",
+    session=("state at the start",),
+    replaces=("coulomb", "stribeck", "coulomb_position"),
+)
+LOAD_FRICTION = Effect(
+    name="load_friction",
+    title="load-dependent friction",
+    channel=Channel.MECHANICS,
+    slot=Slot.FRICTION,
+    function=load_level,
+    equation="F = -mu |u| sign(v)",
+    parameters=(Parameter("mu", "1", Ref.ONE, 0.0, 0.6, 0.05, "share of the transmitted force lost"),),
+    signature="force residual opposes motion and grows with the motor force",
+    lookalikes=("coulomb", "thermal_gain", "payload"),
+    separate="the same speeds at several accelerations or loads",
+)
+
+EFFECTS = (
+    VISCOUS, VISCOUS_DIRECTION, QUADRATIC_DRAG, COULOMB, COULOMB_POSITION, STRIBECK, PRESLIDING, LOAD_FRICTION,
+)

@@ -1,0 +1,118 @@
+"""Nameless terms: what a refusal may offer when no effect of the library explains the data.
+
+A term describes the residual in symbols; it claims no cause and is kept out of the list of named effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from sioms.reconcile.effect import TURN, Array, Channel, Effect, Parameter, Ref, Slot
+from sioms.reconcile.jit import state_function
+
+TERM_PREFIX = "term_"
+
+
+@state_function
+def square(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """-k x^2."""
+    return -p[0] * x * x
+
+
+@state_function
+def cube(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """-k x^3."""
+    return -p[0] * x * x * x
+
+
+@state_function
+def even_drag(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """-c v^2."""
+    return -p[0] * v * v
+
+
+@state_function
+def cubic_drag(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """-c v^3."""
+    return -p[0] * v * v * v
+
+
+@state_function
+def falling_drag(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """-c v / (1 + (v/v0)^2)."""
+    return -p[0] * v / (1.0 + (v / p[1]) ** 2)
+
+
+@state_function
+def levelling_drag(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """-f tanh(v/v0)."""
+    return -p[0] * np.tanh(v / p[1])
+
+
+@state_function
+def place_drag(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """-c x v."""
+    return -p[0] * x * v
+
+
+@state_function
+def turn_drag(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """-c v sin(n theta + phase)."""
+    return -p[0] * v * np.sin(p[2] * p[TURN] * x + p[1])
+
+
+@state_function
+def wave(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """amp sin(kappa theta + phase), kappa any number."""
+    return p[0] * np.sin(p[2] * p[TURN] * x + p[1])
+
+
+@state_function
+def load_square(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """-g u |u|, with g per unit of force."""
+    return -p[0] * u * np.abs(u)
+
+
+PHASE = Parameter("phase", "rad", Ref.ANGLE, -np.pi, np.pi, 0.0, "phase at position zero", phase=True)
+ORDER = Parameter("n", "1/pitch", Ref.ONE, 1.0, 12.0, 1.0, "periods in a pitch", fixed=True)
+SPEED = Parameter("v0", "{x}/s", Ref.SPEED, 2e-3, 1.0, 0.1, "speed of the bend")
+
+
+def _size(symbol: str, unit: str, ref: Ref, text: str = "size") -> Parameter:
+    return Parameter(symbol, unit, ref, -50.0, 50.0, 0.05, text)
+
+
+def _term(name: str, equation: str, function: Callable[..., float] | None, *parameters: Parameter,
+          slot: Slot = Slot.FORCE, replaces: tuple[str, ...] = (),
+          lookalikes: tuple[str, ...] = ()) -> Effect:
+    return Effect(name=TERM_PREFIX + name, title=equation, channel=Channel.MECHANICS, slot=slot, function=function,
+                  equation=equation, parameters=parameters, signature="", lookalikes=lookalikes, separate="",
+                  replaces=replaces)
+
+
+TERMS = (
+    _term("x2", "F = -k x^2", square, _size("k", "{F}/{x}^2", Ref.STIFFNESS)),
+    _term("x3", "F = -k x^3", cube, _size("k", "{F}/{x}^3", Ref.STIFFNESS), lookalikes=("spring",)),
+    _term("v2", "F = -c v^2", even_drag, _size("c", "{F} s^2/{x}^2", Ref.DRAG)),
+    _term("v3", "F = -c v^3", cubic_drag, _size("c", "{F} s^3/{x}^3", Ref.DRAG), lookalikes=("viscous", "quadratic_drag")),
+    _term("falling_drag", "F = -c v / (1 + (v/v0)^2)", falling_drag,
+          _size("c", "{F} s/{x}", Ref.DAMPING), SPEED, lookalikes=("viscous",)),
+    _term("levelling_drag", "F = -f tanh(v/v0)", levelling_drag, _size("f", "{F}", Ref.FORCE), SPEED,
+          lookalikes=("coulomb", "viscous")),
+    _term("xv", "F = -c x v", place_drag, _size("c", "{F} s/{x}^2", Ref.DAMPING)),
+    _term("turn_drag", "F = -c v sin(n theta + phase)", turn_drag, _size("c", "{F} s/{x}", Ref.DAMPING), PHASE,
+          ORDER),
+    _term("wave", "F = amp sin(kappa theta + phase)", wave, _size("amp", "{F}", Ref.FORCE), PHASE,
+          Parameter("kappa", "1/pitch", Ref.ONE, 0.02, 3.0, 0.5, "periods in a pitch, any number"),
+          lookalikes=("offset",)),
+    _term("load_square", "F = -g u |u|", load_square, _size("g", "1/({F})", Ref.ONE)),
+    _term("hysteresis", "dF/dx = (f sign(v) - F)/length, force -F", None,
+          Parameter("f", "{F}", Ref.FORCE, 0.0, 1.5, 0.05, "level long after a reversal"),
+          Parameter("xs", "{x}", Ref.PITCH, 5e-3, 1.0, 0.05, "displacement over which it builds up"),
+          slot=Slot.HYSTERESIS, replaces=("presliding", "coulomb", "stribeck", "coulomb_position"), lookalikes=("coulomb",)),
+    _term("turn_inertia", "J = J0 + dJ sin(n theta + phase)", None,
+          Parameter("dJ", "{F} s^2/{x}", Ref.INERTIA, 0.0, 0.9, 0.1, "amplitude of the inertia"), PHASE, ORDER,
+          slot=Slot.MODULATION),
+)

@@ -1,0 +1,191 @@
+"""Fit the switched-on effects of a model to records, nested in the tracking simulation.
+
+The residual is the innovation over its expected standard deviation: what the model cannot predict over the
+observer's short memory. It follows the measurement, so that stick, slip and contact happen where they did
+happen, and it is smooth in the parameters where a free closed loop is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sioms.reconcile.effect import Array, Parameter
+from sioms.reconcile.effects import known
+from sioms.reconcile.model import AxisModel
+from sioms.reconcile.noise import Noise
+from sioms.reconcile.records import Session
+from sioms.reconcile.simulate import Run, pack, track
+
+BASE = "base"
+SKIP_S = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Free:
+    """One free number: a parameter of an effect, or a base parameter of the axis."""
+
+    effect: str
+    symbol: str
+    scale: float
+    lower: float
+    upper: float
+    phase: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Records to fit and the observer to fit them with."""
+
+    session: Session
+    noise: Noise
+    skip: int = 50
+
+    def runs(self, model: AxisModel) -> list[Run]:
+        """Track every record; the heat state carries over."""
+        packed = pack(model)
+        temperature, out = 0.0, []
+        for r in self.session.records:
+            run = track(model, r.position, r.force, self.noise.gain, temperature, packed)
+            temperature = run.end_temperature if self.session.continuous else 0.0
+            out.append(run)
+        return out
+
+    def residual(self, model: AxisModel) -> Array:
+        """Innovations over their expected standard deviation, all records in a row, without the starts."""
+        parts = [r.innovation[self.skip :] for r in self.runs(model)]
+        e: Array = np.concatenate(parts) / self.noise.innovation
+        return np.clip(np.nan_to_num(e, nan=1e6, posinf=1e6, neginf=-1e6), -1e6, 1e6)
+
+    def join(self, parts: Sequence[Array]) -> Array:
+        """Lay per-record arrays out as ``residual`` does."""
+        return np.concatenate([p[self.skip :] for p in parts])
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A fitted model.
+
+    Attributes:
+        residual: at the optimum, shape (n,), in units of the floor.
+        jacobian: d residual / d (parameter / scale), shape (n, k).
+    """
+
+    model: AxisModel
+    free: tuple[Free, ...]
+    residual: Array
+    jacobian: Array
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares."""
+        return float(self.residual @ self.residual)
+
+    @property
+    def ratio(self) -> float:
+        """Root mean square of the residual, in units of the expected innovation."""
+        return float(np.sqrt(np.mean(self.residual**2)))
+
+
+def free_parameters(model: AxisModel, frozen: Sequence[str] = ()) -> tuple[Free, ...]:
+    """List what may move: every differentiable parameter of the effects not frozen, and the uncertain base."""
+    lib, out = known(), []
+    for name, given in model.effects.items():
+        if name in frozen:
+            continue
+        for p in lib[name].parameters:
+            if not p.fixed:
+                out.append(_free(model, name, p, given[p.symbol]))
+    for symbol in model.refine:
+        value = getattr(model, symbol)
+        out.append(Free(BASE, symbol, max(abs(value), 1e-12), 0.0, np.inf))
+    return tuple(out)
+
+
+def _free(model: AxisModel, name: str, p: Parameter, value: float) -> Free:
+    scale = model.scale(p)
+    lower, upper = (-np.inf, np.inf) if p.phase else (p.lower * scale, p.upper * scale)
+    size = 1.0 if p.phase else max(abs(value), 0.1 * abs(p.start) * scale, 1e-12)
+    return Free(name, p.symbol, size, lower, upper, p.phase)
+
+
+def get(model: AxisModel, free: Sequence[Free]) -> Array:
+    """Read the free numbers."""
+    return np.array([getattr(model, f.symbol) if f.effect == BASE else model.effects[f.effect][f.symbol]
+                     for f in free], dtype=np.float64)
+
+
+def put(model: AxisModel, free: Sequence[Free], values: Array) -> AxisModel:
+    """Return the model with the free numbers set; phases are wrapped to (-pi, pi]."""
+    effects = {k: dict(v) for k, v in model.effects.items()}
+    base: dict[str, float] = {}
+    for f, value in zip(free, values, strict=True):
+        v = float(value)
+        if f.phase:
+            v = float(np.angle(np.exp(1j * v)))
+        if f.effect == BASE:
+            base[f.symbol] = v
+        else:
+            effects[f.effect][f.symbol] = v
+    return replace(model, effects=effects, **base)  # type: ignore[arg-type]
+
+
+def jacobian(problem: Problem, model: AxisModel, free: Sequence[Free], at: Array, base: Array,
+             step: float = 2e-3) -> Array:
+    """Forward differences in the scaled parameters, stepping away from a bound."""
+    j = np.empty((len(base), len(free)))
+    for i, f in enumerate(free):
+        h = step * f.scale
+        if at[i] + h > f.upper:
+            h = -h
+        moved = at.copy()
+        moved[i] += h
+        j[:, i] = (problem.residual(put(model, free, moved)) - base) * (f.scale / h)
+    return j
+
+
+def refit(problem: Problem, model: AxisModel, frozen: Sequence[str] = (), iterations: int = 8,
+          tolerance: float = 1e-3) -> Fit:
+    """Fit all free parameters by bounded Levenberg-Marquardt.
+
+    Args:
+        frozen: effects that keep their values (those that a channel of their own has measured).
+        iterations: largest number of accepted steps.
+        tolerance: stop when a step gains less than this share of the cost.
+
+    Returns:
+        The fit at the best point found.
+    """
+    free = free_parameters(model, frozen)
+    at = get(model, free)
+    r = problem.residual(model)
+    if not free:
+        return Fit(model, free, r, np.empty((len(r), 0)))
+    scale = np.array([f.scale for f in free])
+    lower, upper = np.array([f.lower for f in free]), np.array([f.upper for f in free])
+    damping, cost = 1e-3, float(r @ r)
+    j = jacobian(problem, model, free, at, r)
+    for _ in range(iterations):
+        h, g = j.T @ j, j.T @ r
+        gained = False
+        for _ in range(5):
+            step = np.linalg.lstsq(h + damping * np.diag(np.diag(h) + 1e-12 * np.trace(h) + 1e-30), -g,
+                                   rcond=1e-12)[0]
+            trial = np.clip(at + np.clip(step, -3.0, 3.0) * scale, lower, upper)
+            rt = problem.residual(put(model, free, trial))
+            ct = float(rt @ rt)
+            if ct < cost:
+                gained = True
+                break
+            damping = max(damping, 1e-4) * 8.0
+        if not gained:
+            break
+        done = cost - ct < tolerance * cost
+        at, r, cost = trial, rt, ct
+        damping = max(damping * 0.2, 1e-7)
+        j = jacobian(problem, model, free, at, r)
+        if done:
+            break
+    return Fit(put(model, free, at), free, r, j)

@@ -1,0 +1,111 @@
+"""Refusal: is there something left that no named effect explains, and what does it look like?
+
+A generic smoother over the state, judged on blocks it has not seen, says how much of the residual *could* be
+explained by anything that depends on position, speed, direction, force, acceleration, place in the turn or
+displacement since reversal. It names nothing; it only keeps the named model honest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sioms.reconcile.blocks import block_ids
+from sioms.reconcile.effect import Array
+from sioms.reconcile.fit import Fit, Problem
+from sioms.reconcile.model import AxisModel
+from sioms.reconcile.noise import response
+from sioms.reconcile.screen import Motion, dead_band, direction, instrument_motion
+
+KNOTS = 14
+HARMONICS = 4
+RIDGES = (1e-4, 1e-2, 1.0)
+BURST_S = 0.1
+
+
+def hats(x: Array, knots: Array) -> Array:
+    """Piecewise linear basis on rising knots, shape (n, len(knots))."""
+    out = np.zeros((len(x), len(knots)))
+    place = np.clip(np.searchsorted(knots, x) - 1, 0, len(knots) - 2)
+    width = knots[place + 1] - knots[place]
+    part = np.clip((x - knots[place]) / np.where(width > 0, width, 1.0), 0.0, 1.0)
+    rows = np.arange(len(x))
+    out[rows, place] = 1.0 - part
+    out[rows, place + 1] += part
+    return out
+
+
+def _knots(parts: list[Array], count: int = KNOTS) -> Array:
+    """Knots at quantiles, so that every hat has data."""
+    q = np.unique(np.quantile(np.concatenate(parts), np.linspace(0.0, 1.0, count)))
+    return q if len(q) > 1 else np.array([q[0], q[0] + 1.0])
+
+
+def since_reversal(x: Array, sign: Array) -> Array:
+    """Displacement since the last change of direction, shape (n,)."""
+    turn = np.flatnonzero(np.diff(np.sign(np.where(np.abs(sign) > 0.5, sign, 0.0))) != 0) + 1
+    start = np.zeros(len(x), dtype=np.int64)
+    start[turn] = turn
+    out: Array = np.abs(x - x[np.maximum.accumulate(start)])
+    return out
+
+
+def basis(motions: list[Motion], model: AxisModel, dead: float) -> list[Array]:
+    """Generic force columns of the state for every record, shape (n, k) each."""
+    kx, kv = _knots([m.x for m in motions]), _knots([m.v for m in motions], 2 * KNOTS)
+    ku, ka = _knots([m.u for m in motions], 8), _knots([m.a for m in motions], 8)
+    turn = 2.0 * np.pi / model.pitch
+    whole = max(float(np.ptp(m.x)) for m in motions) > 0.5 * model.pitch
+    length = max(float(np.ptp(m.x)) for m in motions)
+    out = []
+    for m in motions:
+        s = direction(m.v, dead)
+        xi = since_reversal(m.x, s)
+        columns = [hats(m.x, kx), hats(m.x, kx) * s[:, None], hats(m.v, kv), hats(m.u, ku), hats(m.a, ka),
+                   s[:, None] * np.exp(-xi[:, None] / (length * np.array([3e-3, 1e-2, 3e-2, 1e-1]))),
+                   (m.x * m.v)[:, None], s[:, None]]
+        if whole:
+            wave = np.concatenate([f(h * turn * m.x)[:, None] for h in range(1, HARMONICS + 1)
+                                   for f in (np.sin, np.cos)], axis=1)
+            columns += [wave, wave * m.a[:, None], wave * (m.v**2)[:, None], wave * m.u[:, None], wave * m.v[:, None]]
+        out.append(np.concatenate(columns, axis=1))
+    return out
+
+
+def smoother_share(problem: Problem, fit: Fit, folds: int = 5) -> float:
+    """Share of the residual's energy that the generic smoother explains on blocks it has not seen."""
+    motions = instrument_motion(problem, fit.model)
+    columns = basis(motions, fit.model, dead_band(problem, fit.model))
+    parts = [response(fit.model, problem.noise, c)[problem.skip :] for c in columns]
+    f = np.concatenate(parts) / problem.noise.innovation
+    size = np.sqrt(np.mean(f**2, axis=0))
+    f = f[:, size > 1e-12] / size[size > 1e-12]
+    ids = block_ids(problem, fit.model.sample_time_s)
+    fold = ids % folds
+    r = fit.residual
+    best = 0.0
+    grams = [(f[fold == i].T @ f[fold == i], f[fold == i].T @ r[fold == i]) for i in range(folds)]
+    for ridge in RIDGES:
+        left = 0.0
+        for i in range(folds):
+            h = sum((g[0] for k, g in enumerate(grams) if k != i), np.zeros_like(grams[0][0]))
+            y = sum((g[1] for k, g in enumerate(grams) if k != i), np.zeros_like(grams[0][1]))
+            c = np.linalg.solve(h + ridge * len(r) * 1e-2 * np.eye(len(h)), y)
+            left += float(np.sum((r[fold == i] - f[fold == i] @ c) ** 2))
+        best = max(best, 1.0 - left / float(r @ r))
+    return best
+
+
+def bursts(problem: Problem, fit: Fit) -> tuple[float, Array]:
+    """Measure how far the residual comes in bursts.
+
+    Returns:
+        (share of the energy above the quiet level that the loudest tenth of the blocks holds,
+        True for the samples of loud blocks).
+    """
+    ids = block_ids(problem, fit.model.sample_time_s, BURST_S)
+    energy = np.bincount(ids, weights=fit.residual**2) / np.bincount(ids)
+    quiet = float(np.median(energy))
+    above = np.clip(energy - quiet, 0.0, None)
+    top = np.sort(above)[-max(len(above) // 10, 1) :]
+    share = float(top.sum() / max(above.sum(), 1e-300))
+    return share, np.asarray(energy > 6.0 * quiet)[ids]

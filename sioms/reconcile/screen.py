@@ -1,0 +1,304 @@
+"""Screen the library: how much of the innovation each effect could explain, and where its fit should start.
+
+Effects that are forces of the state are evaluated on the smoothed measured motion and passed through the same
+linear filter that turns an unmodelled force into an innovation (so nothing is differentiated); the others are
+tried in the tracking simulation on a small grid. The Jacobian of the effects already in the model takes part,
+so that a gain is one beyond re-adjustment. Source of the filtered regression: M. Gautier, A. Janot,
+P.-O. Vandanjon, "A new closed-loop output error method", IEEE T-CST 21 (2013) 428-444.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import butter, sosfiltfilt
+
+from sioms.reconcile.effect import Array, Effect, Parameter, Ref, Slot
+from sioms.reconcile.effects import known
+from sioms.reconcile.fit import Fit, Problem
+from sioms.reconcile.model import AxisModel
+from sioms.reconcile.noise import response
+from sioms.reconcile.simulate import simulate
+
+#: Trial values, as multiples of a parameter's scale, of effects that are not forces of the state.
+GRID_DELAY = (0.5e-3, 2e-3, 5e-3)
+GRID_RESONANCE = (7.0, 11.0, 16.0, 24.0, 36.0, 55.0)
+GRID_GAP = tuple(float(g) for g in np.geomspace(3e-4, 6e-2, 20))
+GRID_LIMIT = (0.95, 0.85, 0.7, 0.5, 0.3)
+GRID_TAU = (3.0, 10.0, 40.0)
+SPEED_STEPS = 7
+STATE_SLOTS = (Slot.FORCE, Slot.FRICTION, Slot.GAIN, Slot.MODULATION)
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Smoothed motion of one record; arrays of shape (n,)."""
+
+    x: Array
+    v: Array
+    a: Array
+    u: Array
+    temperature: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """A screened candidate: its gain (share of the cost) and the values to start its fit from."""
+
+    effect: str
+    gain: float
+    values: dict[str, float]
+
+
+def smoothed_motion(problem: Problem, model: AxisModel, cutoff_hz: float = 0.0) -> list[Motion]:
+    """Return zero-phase filtered position, speed and acceleration of every record.
+
+    Args:
+        cutoff_hz: 0 takes three times the observer's bandwidth, within 10 and 150 Hz.
+    """
+    dt = model.sample_time_s
+    if cutoff_hz <= 0.0:
+        cutoff_hz = float(np.clip(3.0 * np.sqrt(problem.noise.gain[1] / dt) / (2.0 * np.pi), 10.0, 150.0))
+    sos = butter(3, min(2.0 * cutoff_hz * dt, 0.8), output="sos")
+    out = []
+    for record, run in zip(problem.session.records, problem.runs(model), strict=True):
+        x = sosfiltfilt(sos, record.position, padtype="odd", padlen=min(300, len(record) - 1))
+        v = np.gradient(x, dt)
+        a = np.gradient(v, dt)
+        out.append(Motion(x, v, a, run.applied, run.temperature))
+    return out
+
+
+def direction(v: Array, dead: float) -> Array:
+    """Sign of speed with a linear passage of half-width ``dead`` [{x}/s]."""
+    s: Array = np.clip(v / max(dead, 1e-300), -1.0, 1.0)
+    return s
+
+
+def state_columns(effect: Effect, model: AxisModel, motion: Motion, shape: dict[str, float], dead: float) -> Array:
+    """Forces per unit of each amplitude of a state effect (two columns where it has a phase), shape (n, k)."""
+    columns = []
+    for amplitude, phase in amplitudes(effect):
+        for turn in (0.0, np.pi / 2) if phase is not None else (0.0,):
+            values = {p.symbol: shape.get(p.symbol, 0.0) for p in effect.parameters}
+            values[amplitude.symbol] = 1.0
+            if phase is not None:
+                values[phase.symbol] = turn
+            row = effect.row(effect.values(values), model.pitch)
+            if effect.slot is Slot.MODULATION:
+                columns.append(_modulation(model, motion, shape, turn))
+                continue
+            f = effect.evaluate(motion.x, motion.v, motion.u, motion.temperature, row)
+            if effect.slot is Slot.FRICTION:
+                f = -f * direction(motion.v, dead)
+            elif effect.slot is Slot.GAIN:
+                f = motion.u * (f - 1.0)
+            columns.append(f)
+    return np.stack(columns, axis=1)
+
+
+def _modulation(model: AxisModel, motion: Motion, shape: dict[str, float], phase: float) -> Array:
+    """Force of a unit inertia that varies over the turn: -(s a + s' v^2 / 2)."""
+    w = shape["n"] * 2.0 * np.pi / model.pitch
+    f: Array = -(np.sin(w * motion.x + phase) * motion.a + 0.5 * motion.v**2 * w * np.cos(w * motion.x + phase))
+    return f
+
+
+def amplitudes(effect: Effect) -> list[tuple[Parameter, Parameter | None]]:
+    """Pair every parameter in which the effect is linear with the phase that follows it, if any."""
+    out: list[tuple[Parameter, Parameter | None]] = []
+    for i, p in enumerate(effect.parameters):
+        linear = "{F}" in p.unit or (effect.slot is Slot.GAIN and i == 0) or (i == 0 and p.unit == "1")
+        if linear:
+            following = effect.parameters[i + 1] if i + 1 < len(effect.parameters) else None
+            out.append((p, following if following is not None and following.phase else None))
+    return out
+
+
+def shapes(effect: Effect, model: AxisModel, largest_order: int) -> Iterator[dict[str, float]]:
+    """Yield trial values of the parameters in which a state effect is not linear."""
+    linear = {p.symbol for p, _ in amplitudes(effect)}
+    order = next((p for p in effect.parameters if p.fixed), None)
+    shape = next((p for p in effect.parameters if p.symbol not in linear and not p.fixed and not p.phase), None)
+    if order is not None:
+        first = 1 if not model.rotary else max(int(order.lower), 2 if effect.slot is Slot.FORCE else 1)
+        for n in range(first, largest_order + 1):
+            yield {order.symbol: float(n)}
+    elif shape is not None:
+        if shape.ref is not Ref.SPEED:
+            for s in np.geomspace(shape.lower, shape.upper, 2 * SPEED_STEPS):
+                yield {shape.symbol: float(s * model.scale(shape))}
+            return
+        span = np.geomspace(max(shape.lower, 1e-3), min(shape.upper, 0.3), SPEED_STEPS)
+        for s in span:
+            yield {shape.symbol: float(s * model.scale(shape))}
+    else:
+        yield {}
+
+
+def screen(problem: Problem, fit: Fit, names: list[str], levels: Mapping[str, float] | None = None) -> list[Start]:
+    """Rank effects by what they could explain beyond the fitted model.
+
+    Args:
+        names: effects to try; those that replace one in the model are tried without it being removed.
+        levels: amplitudes already in the model, per symbol, to which what is found adds.
+
+    Returns:
+        The candidates, best first.
+    """
+    motions = smoothed_motion(problem, fit.model)
+    lib = known()
+    q = _orthonormal(fit.jacobian)
+    rest = fit.residual - q @ (q.T @ fit.residual)
+    dead = dead_band(problem, fit.model)
+    span = max(float(np.ptp(m.x)) for m in motions)
+    largest = int(np.clip(60.0, 1, 60)) if span > 0.5 * fit.model.pitch else 1
+    out = []
+    for name in names:
+        effect = lib[name]
+        if effect.slot in STATE_SLOTS:
+            out.append(_screen_state(problem, fit, effect, motions, q, rest, dead, largest, levels or {}))
+        else:
+            out.extend(_screen_trials(problem, fit, effect, q, rest))
+    return sorted((s for s in out if s is not None), key=lambda s: -s.gain)
+
+
+def instrument_motion(problem: Problem, model: AxisModel) -> list[Motion]:
+    """Return the motion of the simulated closed loop, which carries none of the noise of the measurement.
+
+    Falls back to the smoothed measurement where there is no controller or command to simulate.
+    """
+    commands = [r.command for r in problem.session.records]
+    if model.controller is None or any(c is None for c in commands):
+        return smoothed_motion(problem, model)
+    out, temperature = [], 0.0
+    for c in commands:
+        run = simulate(model, c if c is not None else np.empty(0), temperature)
+        temperature = run.end_temperature if problem.session.continuous else 0.0
+        out.append(Motion(run.x, run.v, np.gradient(run.v, model.sample_time_s), run.applied, run.temperature))
+    return out
+
+
+def dead_band(problem: Problem, model: AxisModel) -> float:
+    """Speed below which the sign of the smoothed speed is not known: three times its noise."""
+    return 3.0 * problem.noise.sensor * np.sqrt(problem.noise.gain[1] / model.sample_time_s)
+
+
+def _orthonormal(j: Array) -> Array:
+    if j.shape[1] == 0:
+        return j
+    norms = np.linalg.norm(j, axis=0)
+    kept = j[:, norms > 0] / norms[norms > 0]
+    if kept.shape[1] == 0:
+        return kept
+    u, s, _ = np.linalg.svd(kept, full_matrices=False)
+    basis: Array = u[:, s > 1e-6 * s[0]]
+    return basis
+
+
+def _filtered(problem: Problem, model: AxisModel, columns: list[Array]) -> Array:
+    """Pass force columns of every record into the domain of the residual, shape (n, k)."""
+    parts = [response(model, problem.noise, c)[problem.skip :] for c in columns]
+    e: Array = np.concatenate(parts) / problem.noise.innovation
+    return e
+
+
+def _screen_state(problem: Problem, fit: Fit, effect: Effect, motions: list[Motion], q: Array, rest: Array,
+                  dead: float, largest: int, levels: Mapping[str, float]) -> Start | None:
+    best: Start | None = None
+    for shape in shapes(effect, fit.model, largest):
+        f = _filtered(problem, fit.model,
+                      [state_columns(effect, fit.model, m, shape, dead) for m in motions])
+        f = f - q @ (q.T @ f)
+        size = np.linalg.norm(f, axis=0)
+        keep = size > 1e-9
+        if not np.any(keep):
+            continue
+        coefficient = np.zeros(f.shape[1])
+        coefficient[keep] = np.linalg.lstsq(f[:, keep] / size[keep], rest, rcond=1e-8)[0] / size[keep]
+        gain = 1.0 - float(np.sum((rest - f @ coefficient) ** 2)) / float(rest @ rest)
+        if best is None or gain > best.gain:
+            best = Start(effect.name, gain, _values(effect, fit.model, shape, coefficient, levels))
+    return best
+
+
+def _values(effect: Effect, model: AxisModel, shape: dict[str, float], c: Array,
+            levels: Mapping[str, float]) -> dict[str, float]:
+    """Turn regression coefficients into parameters within their bounds."""
+    values, i = dict(shape), 0
+    for amplitude, phase in amplitudes(effect):
+        if phase is None:
+            values[amplitude.symbol] = float(c[i]) + levels.get(amplitude.symbol, 0.0)
+            i += 1
+        else:
+            values[amplitude.symbol] = float(np.hypot(c[i], c[i + 1]))
+            values[phase.symbol] = float(np.arctan2(c[i + 1], c[i]))
+            i += 2
+    for p in effect.parameters:
+        s = model.scale(p)
+        if not p.phase:
+            low = max(p.lower * s, 1e-3 * p.start * s) if p.lower >= 0.0 else p.lower * s
+            values[p.symbol] = float(np.clip(values[p.symbol], low, p.upper * s))
+    return values
+
+
+def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator[dict[str, float]]:
+    """Yield trial values of an effect that is no force of the state."""
+    start = {p.symbol: p.start * model.scale(p) for p in effect.parameters}
+    first = effect.parameters[0].symbol
+    peak = max(float(np.max(np.abs(r.force))) for r in problem.session.records)
+    match effect.slot:
+        case Slot.DELAY | Slot.LAG:
+            grid: tuple[dict[str, float], ...] = tuple({first: g} for g in GRID_DELAY)
+        case Slot.ELASTIC:
+            grid = tuple({first: g, "load_fraction": f} for g in GRID_RESONANCE for f in (0.3, 0.6))
+        case Slot.BACKLASH:
+            grid = tuple({first: g * model.pitch, "load_fraction": f} for g in GRID_GAP for f in (0.4, 0.6))
+        case Slot.LIMIT:
+            grid = tuple({first: g * peak} for g in GRID_LIMIT)
+        case Slot.THERMAL:
+            grid = tuple({"tau": g, "loss": 0.1} for g in GRID_TAU)
+        case Slot.HYSTERESIS:
+            low, high = (effect.parameters[1].lower, effect.parameters[1].upper)
+            grid = tuple({"xs": float(g) * model.pitch} for g in np.geomspace(10.0 * low, 0.8 * high, 4))
+        case Slot.SCALE:
+            grid = ({first: 1.01},)
+        case Slot.ECCENTRICITY:
+            grid = tuple({"phase": g} for g in (0.0, np.pi / 2))
+        case _:
+            grid = ({},)
+    for g in grid:
+        yield {**start, **g}
+
+
+def _screen_trials(problem: Problem, fit: Fit, effect: Effect, q: Array, rest: Array) -> list[Start]:
+    """Try an effect on a grid in the simulation; the change it makes may be stretched, not turned round."""
+    best: list[Start] = []
+    model = fit.model
+    for name in effect.replaces:
+        model = model.without_effect(name) if name in model.effects else model
+    for values in trial_values(effect, model, problem):
+        d = problem.residual(model.with_effect(effect.name, values)) - fit.residual
+        d = d - q @ (q.T @ d)
+        size = float(d @ d)
+        if size <= 0.0:
+            continue
+        stretch = float(np.clip(-(d @ rest) / size, 0.0 if effect.slot is not Slot.SCALE else -9.0, 9.0))
+        gain = 1.0 - float(np.sum((rest + stretch * d) ** 2)) / float(rest @ rest)
+        best.append(Start(effect.name, gain, _stretched(effect, model, values, stretch)))
+    best.sort(key=lambda s: -s.gain)
+    return best[: 2 if effect.slot in (Slot.ELASTIC, Slot.BACKLASH) else 1]
+
+
+def _stretched(effect: Effect, model: AxisModel, values: dict[str, float], stretch: float) -> dict[str, float]:
+    """Scale the amplitude where the effect is linear in it."""
+    p = effect.parameters[0]
+    neutral = {Slot.SCALE: 1.0}.get(effect.slot, 0.0)
+    if effect.slot in (Slot.ELASTIC, Slot.BACKLASH, Slot.LIMIT):
+        return values
+    s = model.scale(p)
+    amplitude = neutral + (values[p.symbol] - neutral) * stretch
+    low = max(p.lower * s, 1e-3 * p.start * s) if p.lower >= 0.0 else p.lower * s
+    return {**values, p.symbol: float(np.clip(amplitude, low, p.upper * s))}

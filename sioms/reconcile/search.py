@@ -1,0 +1,241 @@
+"""Search for the effects that are missing: screen, refit the best few nested, let earlier ones leave again.
+
+A step adds the effect that saves most on held-out blocks, but the simplest one within a standard error of
+it. After each step every effect must still earn its place, and a simpler look-alike that does as well takes
+the place of a richer one. The search stops when nothing saves ``GAIN`` of what remains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.reconcile.blocks import better, block_ids, heldout
+from sioms.reconcile.effect import Array, Slot
+from sioms.reconcile.effects import known
+from sioms.reconcile.fit import Fit, Problem, refit
+from sioms.reconcile.model import AxisModel
+from sioms.reconcile.screen import Start, screen
+
+GAIN = 0.05  # least share of what remains that an effect must save on held-out blocks
+SURE = 2.0  # least number of standard errors of that saving
+FLOOR = 1.15  # stop at this multiple of the expected innovation
+TRIES = 4  # candidates refitted per step
+STEPS = 6
+PERIODIC_SURE = 3.0  # for effects whose order is searched over tens of values
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step of the ladder: what was done, what it saved, what remained, in units of the expected innovation."""
+
+    action: str
+    effect: str
+    ratio: float
+    saved: float
+    rivals: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Result of a search."""
+
+    fit: Fit
+    losses: Array
+    ladder: tuple[Step, ...]
+
+
+@dataclass(slots=True)
+class Searcher:
+    """Search over one problem. Not thread-safe.
+
+    Attributes:
+        frozen: effects measured by a channel of their own; they stay, with their values.
+        excluded: effects that must not be tried (ruled out by a channel, or not applicable).
+        progress: told what is being done.
+    """
+
+    problem: Problem
+    frozen: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    keep: NDArray[np.bool_] | None = None
+    progress: Callable[[str], None] = lambda text: None
+    ids: NDArray[np.int64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Number the blocks."""
+        self.ids = np.empty(0, dtype=np.int64)
+
+    def fit(self, model: AxisModel, iterations: int = 8) -> Fit:
+        """Refit with the channel effects frozen."""
+        effect = next((known()[n] for n in model.effects if known()[n].slot is Slot.BACKLASH), None)
+        if effect is not None and iterations > 4:
+            return polish(self.problem, model, self.frozen)
+        return refit(self.problem, model, self.frozen, iterations)
+
+    def loss(self, fit: Fit) -> Array:
+        """Held-out loss per block."""
+        if len(self.ids) != len(fit.residual):
+            self.ids = block_ids(self.problem, fit.model.sample_time_s)
+        losses = heldout(fit, self.ids)
+        return losses if self.keep is None else losses[self.keep]
+
+    def run(self, start: AxisModel) -> Found:
+        """Search from a model."""
+        fit = self.fit(start)
+        losses = self.loss(fit)
+        ladder = [Step("start", "", fit.ratio, 0.0)]
+        for _ in range(STEPS):
+            if fit.ratio <= FLOOR:
+                break
+            step = self._add(fit, losses)
+            if step is None:
+                break
+            ladder.append(step[2])
+            fit, losses = step[0], step[1]
+            self.progress(f"{ladder[-1].action} {ladder[-1].effect}: residual {fit.ratio:.2f} of the expected")
+            fit, losses = self._simplify(fit, losses, ladder)
+            fit, losses = self._eliminate(fit, losses, ladder)
+        return Found(fit, losses, tuple(ladder))
+
+    def _candidates(self, fit: Fit) -> list[Start]:
+        names = [n for n in self.names if n not in fit.model.effects and n not in self.frozen
+                 and not any(f in known()[n].replaces for f in self.frozen)]
+        starts = [s for s in screen(self.problem, fit, [n for n in names if not replaced(fit.model, n)])
+                  if s.gain > 0.5 * GAIN]
+        starts += self._upgrades(fit, [n for n in names if replaced(fit.model, n)])
+        starts.sort(key=lambda s: -s.gain)
+        chosen = starts[:TRIES]
+        if chosen:
+            alike = known()[chosen[0].effect].lookalikes
+            chosen += [s for s in starts[TRIES:] if s.effect in alike and s.gain > 0.3 * chosen[0].gain]
+        return chosen
+
+    def _upgrades(self, fit: Fit, names: list[str]) -> list[Start]:
+        """Screen richer forms of an effect in the model, on top of the level it has."""
+        out = []
+        for name in names:
+            old = next(n for n in known()[name].replaces if n in fit.model.effects)
+            level = next(iter(fit.model.effects[old].values()))
+            levels = {p.symbol: level for p in known()[name].parameters if p.symbol in ("Fc", "Fs", "f")}
+            out += screen(self.problem, fit, [name], levels)
+        return out
+
+    def _add(self, fit: Fit, losses: Array) -> tuple[Fit, Array, Step] | None:
+        """Refit the best candidates and take the simplest of those that save most."""
+        tried: dict[str, tuple[Fit, Array, float, float]] = {}
+        for s in self._candidates(fit):
+            model = without(fit.model, known()[s.effect].replaces)
+            new = self.fit(model.with_effect(s.effect, s.values), 8 if not tried else 5)
+            loss = self.loss(new)
+            gain, sure = better(loss, losses)
+            if s.effect not in tried or gain > tried[s.effect][2]:
+                tried[s.effect] = (new, loss, gain, sure)
+        good = {n: t for n, t in tried.items() if t[2] >= GAIN and t[3] >= self._sure(n) and physical(t[0], n)}
+        if not good:
+            return None
+        name = simplest(good)
+        new, loss, gain, _ = good[name]
+        rivals = {n: t[2] for n, t in tried.items() if n != name}
+        return new, loss, Step("add", name, new.ratio, gain, rivals)
+
+    def _sure(self, name: str) -> float:
+        return PERIODIC_SURE if any(p.fixed for p in known()[name].parameters) else SURE
+
+    def _eliminate(self, fit: Fit, losses: Array, ladder: list[Step]) -> tuple[Fit, Array]:
+        """Let effects leave that no longer save their share."""
+        for name in [n for n in fit.model.effects if n not in self.frozen]:
+            if len([n for n in fit.model.effects if n not in self.frozen]) < 2:
+                break
+            without = self.fit(fit.model.without_effect(name), 6)
+            loss = self.loss(without)
+            gain, sure = better(losses, loss)
+            if gain < GAIN or sure < 1.0:
+                fit, losses = without, loss
+                ladder.append(Step("leave", name, fit.ratio, -gain))
+        return fit, losses
+
+    def _simplify(self, fit: Fit, losses: Array, ladder: list[Step]) -> tuple[Fit, Array]:
+        """Put a simpler look-alike in the place of a richer effect where it does as well."""
+        lib = known()
+        for name in [n for n in fit.model.effects if n not in self.frozen]:
+            for other in lib[name].lookalikes:
+                if other not in self.names or other in fit.model.effects or size(other) >= size(name):
+                    continue
+                plain = {p.symbol: p.start * fit.model.scale(p) for p in lib[other].parameters}
+                shared = {k: v for k, v in fit.model.effects[name].items() if k in plain}
+                new = self.fit(fit.model.without_effect(name).with_effect(other, {**plain, **shared}), 6)
+                loss = self.loss(new)
+                lost, sure = better(losses, loss)
+                if lost < GAIN or sure < 1.0:
+                    fit, losses = new, loss
+                    ladder.append(Step("simplify", f"{name} to {other}", fit.ratio, -lost))
+                    break
+        return fit, losses
+
+
+def without(model: AxisModel, names: Sequence[str]) -> AxisModel:
+    """Switch some effects off."""
+    for name in names:
+        model = model.without_effect(name) if name in model.effects else model
+    return model
+
+
+def replaced(model: AxisModel, name: str) -> bool:
+    """Say whether an effect would take the place of one in the model."""
+    return any(n in model.effects for n in known()[name].replaces)
+
+
+def size(name: str) -> int:
+    """Number of parameters of an effect."""
+    return len(known()[name].parameters)
+
+
+def simplest(good: dict[str, tuple[Fit, Array, float, float]]) -> str:
+    """Of the candidates within one standard error and ``GAIN`` of the best, the one with the fewest parameters."""
+    best = max(good, key=lambda n: good[n][2])
+    near = []
+    for n, (_, loss, _, _) in good.items():
+        lost, sure = better(good[best][1], loss)
+        if lost < GAIN or sure < 1.0:
+            near.append(n)
+    return min(near, key=lambda n: (size(n), -good[n][2]))
+
+
+def physical(fit: Fit, name: str) -> bool:
+    """Say whether the amplitude of an effect has left its lower bound."""
+    effect = known()[name]
+    p, scale = effect.primary, fit.model.scale(effect.primary)
+    value = fit.model.effects[name][p.symbol]
+    if effect.slot in (Slot.LIMIT, Slot.ELASTIC):
+        return value < 0.98 * p.upper * scale
+    if p.lower < 0.0 or effect.slot is Slot.SCALE:
+        return True
+    return value > max(p.lower, 1e-4 * p.start) * scale * 1.01
+
+
+def polish(problem: Problem, model: AxisModel, frozen: Sequence[str]) -> Fit:
+    """Fit a backlash: its cost is rough, so search the gap by golden steps before the smooth fit of the rest."""
+    name = next(n for n in model.effects if known()[n].slot is Slot.BACKLASH)
+    best, cost = model, np.inf
+    for spread in (0.25, 0.08, 0.025, 0.008):
+        trials = [best]
+        for symbol, width in (("gap", spread), ("load_fraction", spread), ("zeta", 2.0 * spread),
+                              ("f_contact", spread)):
+            here = best.effects[name]
+            for sign in (1.0, -1.0, 0.4, -0.4):
+                trials.append(best.with_effect(name, {**here, symbol: here[symbol] * (1.0 + width * sign)}))
+            for trial in trials:
+                c = float(np.sum(problem.residual(trial) ** 2)) if _inside(trial, name) else np.inf
+                if c < cost:
+                    best, cost = trial, c
+            trials = []
+    return refit(problem, best, frozen, 4)
+
+
+def _inside(model: AxisModel, name: str) -> bool:
+    return all(p.lower * model.scale(p) <= model.effects[name][p.symbol] <= p.upper * model.scale(p)
+               for p in known()[name].parameters)

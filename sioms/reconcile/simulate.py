@@ -1,0 +1,188 @@
+"""Run an axis model over records: closed loop or tracking.
+
+The model's effects are packed into the rows that the kernel reads; nothing here depends on which effects
+exist, only on their slots.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sioms.reconcile import kernel as k
+from sioms.reconcile.effect import ROW, Array, Slot
+from sioms.reconcile.effects import known
+from sioms.reconcile.jit import state_function
+from sioms.reconcile.model import AxisModel, controller_row
+
+SLOTS = 8
+
+@state_function
+def _nothing(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+    """Fill an empty place."""
+    return 0.0 * x
+
+
+@dataclass(frozen=True, slots=True)
+class Packed:
+    """A model as the kernel reads it."""
+
+    plant: Array
+    functions: dict[Slot, tuple[Any, ...]]
+    rows: dict[Slot, Array]
+    counts: dict[Slot, int]
+    substeps: int
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Result of one record; every array has shape (n,).
+
+    Attributes:
+        position: what the sensor would say (when closed, on the count lattice).
+        force: command of the controller (when tracking, the recorded one).
+        applied: mean force of the drive over each sample, at nominal force constant.
+        innovation: measured - predicted position (tracking only).
+        x, v: state; temperature: heat state; end_temperature: after the last sample.
+    """
+
+    position: Array
+    force: Array
+    applied: Array
+    innovation: Array
+    x: Array
+    v: Array
+    temperature: Array
+
+    @property
+    def end_temperature(self) -> float:
+        """Heat state at the last sample."""
+        return float(self.temperature[-1])
+
+
+def pack(model: AxisModel, substeps: int = 0) -> Packed:
+    """Pack a model for the kernel.
+
+    Args:
+        substeps: steps in a sample; 0 chooses 2, or 4 with a transmission, 6 in contact.
+
+    Raises:
+        ValueError: more effects in one slot than the kernel holds.
+    """
+    lib = known()
+    plant = np.zeros(k.PLANT_SIZE)
+    plant[k.INERTIA], plant[k.VISCOUS] = model.inertia, model.viscous
+    plant[k.DT], plant[k.QUANTUM], plant[k.GAIN_Y] = model.sample_time_s, model.resolution, 1.0
+    plant[k.TURN_X], plant[k.LIMIT] = 2.0 * np.pi / model.pitch, np.inf
+    plant[k.RATED], plant[k.TAU_T], plant[k.HYST_X] = model.rated_force, 1.0, 1.0
+    functions: dict[Slot, list[Any]] = {Slot.FORCE: [], Slot.FRICTION: [], Slot.GAIN: []}
+    rows = {s: np.zeros((SLOTS, ROW)) for s in functions}
+    transmission: tuple[Slot, Array] | None = None
+    for name, given in model.effects.items():
+        effect = lib[name]
+        p = effect.values(given)
+        if effect.slot in functions:
+            place = len(functions[effect.slot])
+            if place >= SLOTS:
+                raise ValueError(f"simulate {model.name}: more than {SLOTS} effects of kind {effect.slot.value}")
+            rows[effect.slot][place] = effect.row(p, model.pitch)
+            functions[effect.slot].append(effect.function)
+        elif effect.slot in (Slot.ELASTIC, Slot.BACKLASH):
+            transmission = (effect.slot, p)
+        else:
+            _place(plant, effect.slot, p)
+    if transmission is not None:
+        _couple(plant, *transmission)
+    steps = substeps or _steps(transmission)
+    filled = {s: (*f, *[_nothing] * (SLOTS - len(f))) for s, f in functions.items()}
+    return Packed(plant, filled, rows, {s: len(f) for s, f in functions.items()}, steps)
+
+
+def _steps(transmission: tuple[Slot, Array] | None) -> int:
+    if transmission is None:
+        return 2
+    return 4 if transmission[0] is Slot.ELASTIC else 6
+
+
+def _place(plant: Array, slot: Slot, p: Array) -> None:
+    """Write the parameters of a slot that has its own place in the plant row."""
+    match slot:
+        case Slot.INERTIA:
+            plant[k.INERTIA] += p[0]
+        case Slot.DELAY:
+            plant[k.DELAY] += p[0]
+        case Slot.LAG:
+            plant[k.LAG] = p[0]
+        case Slot.LIMIT:
+            plant[k.LIMIT] = p[0]
+        case Slot.THERMAL:
+            plant[k.LOSS], plant[k.TAU_T] = p
+        case Slot.HYSTERESIS:
+            plant[k.HYST_F], plant[k.HYST_X] = p
+        case Slot.SCALE:
+            plant[k.GAIN_Y] = p[0]
+        case Slot.ECCENTRICITY:
+            plant[k.ECC_AMP], plant[k.ECC_PHASE] = p
+        case Slot.MODULATION:
+            plant[k.MOD_A], plant[k.MOD_PHASE], plant[k.MOD_N] = p
+        case Slot.LATTICE:
+            plant[k.QUANTUM] *= p[0]
+        case _:
+            raise ValueError(f"pack slot {slot.value}: it has no place in the plant row")
+
+
+def _couple(plant: Array, slot: Slot, p: Array) -> None:
+    """Write stiffness and damping of the transmission."""
+    r = p[1]
+    reduced = plant[k.INERTIA] * r * (1.0 - r)
+    hz, zeta, gap = (p[0], p[2], 0.0) if slot is Slot.ELASTIC else (p[2], p[3], p[0])
+    stiff = (2.0 * np.pi * hz) ** 2 * reduced
+    plant[k.LOAD], plant[k.STIFF], plant[k.GAP] = r, stiff, gap
+    plant[k.DAMP] = 2.0 * zeta * np.sqrt(stiff * reduced)
+
+
+def _march(p: Packed, closed: bool, command: Array, measured: Array, force: Array, ctl: Array,
+           gain: tuple[float, float], start: Array) -> Run:
+    out = np.zeros((len(command), k.OUT_SIZE))
+    f, lv, g = Slot.FORCE, Slot.FRICTION, Slot.GAIN
+    k.march(closed, command, measured, force, ctl, p.plant, p.functions[f], p.counts[f], p.rows[f],
+            p.functions[lv], p.counts[lv], p.rows[lv], p.functions[g], p.counts[g], p.rows[g],
+            gain[0], gain[1], start, p.substeps, out)
+    return Run(out[:, k.OUT_Y], out[:, k.OUT_FORCE], out[:, k.OUT_APPLIED], out[:, k.OUT_INNOVATION],
+               out[:, k.OUT_X], out[:, k.OUT_V], out[:, k.OUT_T])
+
+
+def simulate(model: AxisModel, command: Array, temperature: float = 0.0, substeps: int = 0) -> Run:
+    """Simulate the closed loop from rest at ``model.start_position``.
+
+    Args:
+        command: position command, shape (n,), [{x}].
+        temperature: heat state at the start, dimensionless.
+
+    Returns:
+        The run; ``position`` lies on the count lattice.
+    """
+    command = np.ascontiguousarray(command, dtype=np.float64)
+    start = np.array([model.start_position, 0.0, temperature])
+    return _march(pack(model, substeps), True, command, command, command, controller_row(model), (0.0, 0.0), start)
+
+
+def track(model: AxisModel, position: Array, force: Array, gain: tuple[float, float],
+          temperature: float = 0.0, packed: Packed | None = None) -> Run:
+    """Drive the plant with a recorded force while an observer holds it on the recorded position.
+
+    Args:
+        position: measured, shape (n,), [{x}].
+        force: command force, shape (n,), held over each sample, [{F}].
+        gain: correction of position [1] and speed [1/s] by the innovation.
+
+    Returns:
+        The run; ``innovation`` is what the model could not predict.
+    """
+    y = np.ascontiguousarray(position, dtype=np.float64)
+    u = np.ascontiguousarray(force, dtype=np.float64)
+    p = packed or pack(model)
+    start = np.array([y[0] / p.plant[k.GAIN_Y], 0.0, temperature])
+    return _march(p, False, y, y, u, np.zeros(k.CTL_SIZE), gain, start)
