@@ -79,8 +79,8 @@ class MotorBank:
             effect.apply(command)
         np.minimum(command, self._force_max, out=command)
         np.maximum(command, self._force_min, out=command)
+        np.copyto(self.drive_force, command)
         if not self._nonlinear and self._is_free():
-            np.copyto(self.drive_force, command)
             np.add(command, self._load_constant, out=self._force)
             self._whole_tick.step(self._force)
             self._hold_at_stops()
@@ -159,8 +159,8 @@ class MotorBank:
         motion, force, h = self._motion, self._force, self._substep_s
         coupling = self._transmission
         self._predict()
-        np.copyto(self.drive_force, self._command)
         if self._supply.limits:
+            np.copyto(self.drive_force, self._command)
             self._supply.clip(motion.velocity, self.drive_force)
         # Without a transmission the load's forces go straight to the motor.
         load = force if coupling is None else self._load_force

@@ -110,19 +110,29 @@ class StepperBank:
         self.at_limit_minus, self.at_limit_plus, self.at_home = np.zeros((3, n), dtype=np.bool_)
         self.stalled, self._flag = np.zeros((2, n), dtype=np.bool_)
         self._in_step = np.ones(n)
+        self._rested = False
         self.lost_steps = np.zeros(n)
         self._goal, self._move, self._field, self._force, self._work, self._strength = np.zeros((6, n))
         self._sense()
 
     def advance(self, position: Array) -> None:
         """Turn the fields to a commanded position [m or rad], shape (n,), evenly over one tick."""
-        goal, move, work = self._goal, self._move, self._work
+        goal, move = self._goal, self._move
         np.divide(position, self._micro, out=goal)
         np.round(goal, out=goal)
         np.multiply(goal, self._micro, out=goal)
         np.subtract(goal, self.reading, out=move)
-        # Force left at this speed of the field: 1/sqrt(1 + (v/corner)^2).
-        np.multiply(move, self._per_corner, out=work)
+        # Rotors that rest on a resting field stay there: their force stays below stiction.
+        if np.count_nonzero(move) or np.count_nonzero(self.velocity) or not self._rested:
+            self._turn()
+        self._rested = not np.count_nonzero(move)
+        np.copyto(self.reading, goal)
+        self._sense()
+
+    def _turn(self) -> None:
+        """Turn the fields by the move, with the force left at its speed: 1/sqrt(1 + (v/corner)^2)."""
+        work = self._work
+        np.multiply(self._move, self._per_corner, out=work)
         np.divide(work, self._tick_s, out=work)
         np.multiply(work, work, out=work)
         np.add(work, 1.0, out=work)
@@ -130,8 +140,6 @@ class StepperBank:
         np.divide(self._hold, work, out=self._strength)
         for index in range(self.substeps):
             self._substep((index + 0.5) / self.substeps)
-        np.copyto(self.reading, goal)
-        self._sense()
 
     def _substep(self, share: float) -> None:
         """Step the rotors under the field at the middle of the substep."""
