@@ -39,7 +39,7 @@ class GrantTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rights: list[RightName]
     users: list[str] = []
     groups: list[str] = []
-    nodes: list[str] = ["*"]
+    nodes: list[str] = msgspec.field(default_factory=lambda: ["*"])
 
 
 class DeviceTable(msgspec.Struct, frozen=True):

@@ -111,7 +111,7 @@ def decode(packet: bytes) -> list[object]:
     """
     try:
         message = msgpack.unpackb(
-            packet, raw=False, use_list=True, strict_map_key=True, max_buffer_size=MAX_PACKET
+            packet, raw=False, use_list=True, strict_map_key=True
         )
     except Exception as error:  # msgpack raises a wide family for bad input, all of them meaning just this
         raise MalformedMessage(

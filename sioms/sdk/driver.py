@@ -28,14 +28,14 @@ import msgspec
 from sioms.protocol.flags import Request
 
 from .blocks import AnyBlock, BlockSpec, Description
-from .exchange import DeviceError, Steps
+from .exchange import Steps
 from .settings import LineSettings
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from sioms.motion import Action, MarkerPort
+    from sioms.motion import DriveAction, MarkerPort
 
 
 class InputNode(Protocol):
@@ -182,26 +182,17 @@ class LineUnit(ABC):
     def poll(self) -> Steps:
         """Read the state once and fill the blocks.
 
-        For axes, end with ``return self.bank.poll(...)``: the kit then carries out the actions that
+        For axes call ``bank.poll(...)`` with what was read: the kit then carries out the actions that
         the bank wants, stops first. Runs at the described rate, and at once after a command.
         """
 
-    def act(self, action: Action) -> Steps:
-        """Carry out what a DriveBank wants: start a command, or stop an axis."""
-        raise NotImplementedError(f"{type(self).__name__} describes axes but carries out no actions")
-
-    def home(self, axes: Sequence[int]) -> Steps:
-        """Start the drive's own homing of axes; report the end with ``bank.set_homed``.
+    def act(self, action: DriveAction) -> Steps:
+        """Carry out what a DriveBank wants: start a command, stop, home, or reset a fault.
 
         Raises:
-            DeviceError: the drive has none (EOPNOTSUPP).
+            DeviceError: the drive refuses; the axis goes into fault.
         """
-        raise DeviceError(errno.EOPNOTSUPP, "this drive cannot home by itself; use CALIBRATE_DEVICE")
-        yield from ()
-
-    def reset(self, axes: Sequence[int]) -> Steps:
-        """Clear alarms of axes in the drive; the bank's latches have been cleared already."""
-        yield from ()
+        raise NotImplementedError(f"{type(self).__name__} describes axes but carries out no actions")
 
     def write_outputs(self, block: BlockSpec, channels: Sequence[int], values: Sequence[float]) -> Steps:
         """Write output channels of a writable binary or analog block."""

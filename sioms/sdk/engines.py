@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
-import numpy as np
-
-from sioms.motion import Action, AxisBank, StopAxis
+from sioms.motion import DriveAction, DriveBank
 from sioms.protocol.flags import PageState
 
 from .blocks import AnyBlock, AxisBlock
 from .connection import Connection
 from .driver import LineDriver, LineUnit, Refusal, StreamDriver, TickDriver
-from .exchange import DeviceError, LinkError, Steps
+from .exchange import DeviceError, LinkError
 from .handles import Handle
 from .line import Counters, Line, Priority
 from .requests import LATER
@@ -47,12 +46,6 @@ class Engine(Protocol):
 
     def commands_written(self, block: AnyBlock) -> None:
         """A bank's buffers have changed between two ticks."""
-
-    def home(self, block: AnyBlock, axes: Sequence[int]) -> None:
-        """Home axes."""
-
-    def reset(self, block: AnyBlock, axes: Sequence[int]) -> None:
-        """Clear the device's alarms of axes."""
 
     def stop(self, blocks: Sequence[AnyBlock]) -> None:
         """Stop the motion of blocks as fast as the device can (the banks have been told already)."""
@@ -123,14 +116,6 @@ class TickEngine:
 
     def commands_written(self, block: AnyBlock) -> None:
         """Nothing: the next tick sees it."""
-
-    def home(self, block: AnyBlock, axes: Sequence[int]) -> None:
-        """Home by the bank's own search."""
-        if isinstance(block, AxisBlock) and isinstance(block.bank, AxisBank):
-            block.bank.home(axes, self._runtime.now_ns())
-
-    def reset(self, block: AnyBlock, axes: Sequence[int]) -> None:
-        """Nothing: the bank has been reset."""
 
     def stop(self, blocks: Sequence[AnyBlock]) -> None:
         """Nothing: the banks command the device in the next tick."""
@@ -283,6 +268,9 @@ class LineEngine(_Connected):
         if not self.connect(now_ns):
             return
         for state in self._units:
+            if state.is_up:
+                for block in state.unit.blocks:
+                    self.commands_written(block)  # time and markers may have released commands
             if not state.busy and now_ns >= state.due_ns:
                 self._start(state, now_ns)
 
@@ -300,7 +288,7 @@ class LineEngine(_Connected):
             lambda: line.submit(steps, Priority.POLL, lambda v, e: done(state, v, e), now_ns), now_ns
         )
 
-    def _opened(self, state: _UnitState, _: None, error: Exception | None) -> None:
+    def _opened(self, state: _UnitState, _: Any, error: Exception | None) -> None:
         state.busy = False
         now_ns = self._runtime.now_ns()
         if error is None:
@@ -313,7 +301,7 @@ class LineEngine(_Connected):
         state.due_ns = now_ns + state.pause_ns
         state.pause_ns = min(2 * state.pause_ns, LONGEST_PAUSE_NS)
 
-    def _polled(self, state: _UnitState, actions: Sequence[Action] | None, error: Exception | None) -> None:
+    def _polled(self, state: _UnitState, _: Any, error: Exception | None) -> None:
         state.busy = False
         now_ns = self._runtime.now_ns()
         if error is not None:
@@ -327,7 +315,8 @@ class LineEngine(_Connected):
             self._runtime.set_link(state.unit.blocks, PageState.GOOD, "")
         for block in state.unit.blocks:
             self._runtime.publish(block, block.stamp_ns or now_ns)
-        self._carry_out(state, actions or (), now_ns)
+            if isinstance(block, AxisBlock):
+                self._take_actions(state, block, now_ns)
         self._runtime.after_publication(now_ns)
         if state.due_ns <= now_ns and self.line is not None and not state.busy and self._runtime.running:
             self._start(state, now_ns)  # the line is slower than the rate asked for: poll back to back
@@ -337,36 +326,35 @@ class LineEngine(_Connected):
         state.due_ns = now_ns + state.pause_ns
         self._runtime.lose(state.unit.blocks, reason)
 
-    def _carry_out(self, state: _UnitState, actions: Sequence[Action], now_ns: int) -> None:
-        for action in actions:
-            priority = Priority.STOP if isinstance(action, StopAxis) else Priority.ACT
-            self._submit(state, state.unit.act(action), priority, [action.axis])
-
-    def _submit(self, state: _UnitState, steps: Steps, priority: Priority, axes: Sequence[int]) -> None:
-        """Run a hook that moves or stops axes; when it fails, those axes are in fault."""
-        line, now_ns = self.line, self._runtime.now_ns()
-        if line is None:
+    def _take_actions(self, state: _UnitState, block: AxisBlock, now_ns: int) -> None:
+        """Send what the bank wants sent, stops ahead of everything."""
+        bank, line = block.bank, self.line
+        if not isinstance(bank, DriveBank):
             return
+        for action in bank.take_actions():
+            if line is None:
+                bank.action_failed(action, "the line is down", now_ns)
+                continue
+            priority = Priority.STOP if action.is_stop else Priority.ACT
+            done = partial(self._acted, state, block, bank, action)
+            self.guarded(partial(line.submit, state.unit.act(action), priority, done, now_ns), now_ns)
 
-        def done(_: Any, error: Exception | None) -> None:
-            later_ns = self._runtime.now_ns()
-            if error is not None:
-                for block in state.unit.blocks:
-                    if isinstance(block, AxisBlock):
-                        block.bank.fault(np.array(axes), f"{state.unit.name}: {error}", later_ns)
-            state.due_ns = min(state.due_ns, later_ns)  # look at once what it did
-
-        self.guarded(lambda: line.submit(steps, priority, done, now_ns), now_ns)
-
-    def home(self, block: AnyBlock, axes: Sequence[int]) -> None:
-        """Start the drive's homing."""
-        state = self._by_block[id(block)]
-        self._submit(state, state.unit.home(axes), Priority.ACT, axes)
-
-    def reset(self, block: AnyBlock, axes: Sequence[int]) -> None:
-        """Clear the drive's alarms."""
-        state = self._by_block[id(block)]
-        self._submit(state, state.unit.reset(axes), Priority.ACT, axes)
+    def _acted(
+        self,
+        state: _UnitState,
+        block: AxisBlock,
+        bank: DriveBank,
+        action: DriveAction,
+        _: Any,
+        error: Exception | None,
+    ) -> None:
+        now_ns = self._runtime.now_ns()
+        if error is None:
+            bank.action_done(action, now_ns)
+        else:
+            bank.action_failed(action, f"{state.unit.name}: {error}", now_ns)
+            self._take_actions(state, block, now_ns)
+        state.due_ns = min(state.due_ns, now_ns)  # look at once what it did
 
     def write_outputs(
         self,
@@ -400,18 +388,16 @@ class LineEngine(_Connected):
         return LATER
 
     def commands_written(self, block: AnyBlock) -> None:
-        """Poll at once: the bank has something to send."""
+        """Send at once what the bank has to send."""
         state, now_ns = self._by_block[id(block)], self._runtime.now_ns()
-        if state.is_up and not state.busy:
-            state.due_ns = now_ns
-            self._start(state, now_ns)
+        if isinstance(block, AxisBlock) and isinstance(block.bank, DriveBank) and state.is_up:
+            block.bank.advance(now_ns)
+            self._take_actions(state, block, now_ns)
 
     def stop(self, blocks: Sequence[AnyBlock]) -> None:
-        """Send every unit's fastest stop, ahead of everything else."""
-        wanted = {id(self._by_block[id(block)]) for block in blocks if isinstance(block, AxisBlock)}
-        for state in self._units:
-            if id(state) in wanted:
-                self._submit(state, state.unit.stop(), Priority.STOP, [])
+        """Send what the banks have been told: their stops overtake everything else on the line."""
+        for block in blocks:
+            self.commands_written(block)
 
     def is_quiet(self) -> bool:
         """Whether the line has nothing left to do."""
@@ -513,12 +499,6 @@ class StreamEngine(_Connected):
         raise OSError(errno.EBADF, f"write {block.spec.name}: this device only sends")
 
     def commands_written(self, block: AnyBlock) -> None:
-        """Nothing: a stream has no axes."""
-
-    def home(self, block: AnyBlock, axes: Sequence[int]) -> None:
-        """Nothing: a stream has no axes."""
-
-    def reset(self, block: AnyBlock, axes: Sequence[int]) -> None:
         """Nothing: a stream has no axes."""
 
     def stop(self, blocks: Sequence[AnyBlock]) -> None:

@@ -100,7 +100,7 @@ def _write_axes(
             if error.errno != errno.EAGAIN:
                 handle.full = None
                 raise
-            handle.full = ready  # type: ignore[assignment]
+            handle.full = ready
             return None
         handle.full = None
         return (runtime.tick,)
@@ -279,7 +279,7 @@ def _axis_request(
         case Request.FLUSH:
             bank.flush(axes)
         case Request.HOME:
-            runtime.engine.home(handle.block, [int(a) for a in axes])
+            bank.home(axes, now_ns)
         case Request.SET_LIMITS:
             if not isinstance(argument, dict) or not all(isinstance(k, str) for k in argument):
                 raise _refuse(errno.EINVAL, f"{what}: want limits by name, e.g. {{position_max: 0.2}}")
@@ -288,7 +288,7 @@ def _axis_request(
             except TypeError as error:
                 raise _refuse(errno.EINVAL, f"{what}: {error}") from None
         case Request.GET_LIMITS:
-            return [bank.get_limits(int(axis)) for axis in axes]
+            return bank.get_limits(axes)
         case _:
             raise _refuse(errno.ENOTTY, f"{what}: not a request an axis knows")
     runtime.engine.commands_written(handle.block)

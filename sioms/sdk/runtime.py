@@ -246,7 +246,7 @@ class Runtime:
 
     def _reset_axes(self, block: AxisBlock, channels: Any) -> None:
         block.bank.reset(np.array(channels, dtype=np.intp))
-        self.engine.reset(block, [int(c) for c in channels])
+        self.engine.commands_written(block)
 
     def statistics_report(self) -> dict[str, object]:
         """Return what GET_STATISTICS tells: tick times, link counters, handles."""

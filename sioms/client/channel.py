@@ -1,0 +1,288 @@
+"""A request channel: a SOCK_SEQPACKET socket on which requests are answered by number.
+
+Concurrency: any number of threads may call at once. One of those that wait reads for all; when its
+own answer has come it passes the reading on.
+
+``_socket`` instead of ``socket``: importing the latter costs a shell tool half of its start time.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from _socket import (
+    AF_UNIX,
+    CMSG_SPACE,
+    SCM_RIGHTS,
+    SHUT_RDWR,
+    SO_RCVTIMEO,
+    SOCK_SEQPACKET,
+    SOL_SOCKET,
+    socket,
+)
+from _thread import allocate_lock
+from array import array
+from struct import pack
+from time import monotonic
+
+from sioms.protocol.messages import MAX_PACKET, MalformedMessage, decode, encode
+
+_CMSG_CLOEXEC = 0x40000000
+_ANCILLARY = CMSG_SPACE(8 * 4)
+_FOREVER = pack("ll", 0, 0)
+GRACE_S = 2.0
+"""How much longer than its own time-out an answer may take before the other side counts as hung."""
+
+
+class Call:
+    """A request to be sent: verb, arguments, descriptors, and how long its answer may take.
+
+    Attributes:
+        what: the request in words, for messages.
+        limit_s: the time-out that the other side has been given [s], None = it may take for ever.
+    """
+
+    __slots__ = ("arguments", "fds", "limit_s", "verb", "what")
+
+    def __init__(
+        self, what: str, verb: int, *arguments: object, fds: tuple[int, ...] = (), limit_s: float | None = 0.0
+    ) -> None:
+        self.what = what
+        self.verb = verb
+        self.arguments = arguments
+        self.fds = fds
+        self.limit_s = limit_s
+
+
+class Answer:
+    """A successful reply: its value, and the descriptors that came along."""
+
+    __slots__ = ("fds", "value")
+
+    def __init__(self, value: object, fds: list[int]) -> None:
+        self.value = value
+        self.fds = fds
+
+
+def connect(path: str) -> socket:
+    """Connect to the daemon.
+
+    Raises:
+        OSError: nobody listens there, with a sentence that says how to start a daemon.
+    """
+    sock = socket(AF_UNIX, SOCK_SEQPACKET)
+    try:
+        sock.connect(path)
+    except OSError as error:
+        sock.close()
+        hint = {
+            errno.ENOENT: "no daemon listens there; start one with `siomsd --config FILE`, or name its socket in SIOMS_SOCKET",
+            errno.ECONNREFUSED: "the daemon that made this socket is gone; start one with `siomsd --config FILE`",
+            errno.EACCES: "no permission; ask to be put into the group of the socket",
+        }.get(error.errno or 0, os.strerror(error.errno or errno.EIO).lower())
+        raise OSError(error.errno, f"connect to {path}: {hint}") from None
+    return sock
+
+
+class Channel:
+    """Requests and answers on a connected socket.
+
+    Args:
+        sock: the socket, owned by the channel from now on.
+        name: whose it is, for messages: the daemon, or a node.
+    """
+
+    def __init__(self, sock: socket, name: str) -> None:
+        self.name = name
+        self._sock = sock
+        self._number = 0
+        self._mutex = allocate_lock()
+        self._reading = False
+        self._answers: dict[int, tuple[list, list[int]]] = {}  # type: ignore[type-arg]
+        self._waiting: dict[int, object] = {}
+        self._timeout = 0.0
+        self._ended: tuple[int, str] | None = None
+
+    @property
+    def closed(self) -> bool:
+        """Whether the channel has been closed on this side."""
+        return self._sock.fileno() < 0
+
+    def fileno(self) -> int:
+        """Return the socket's descriptor."""
+        return self._sock.fileno()
+
+    def call(self, call: Call) -> Answer:
+        """Send a request and wait for its answer.
+
+        Raises:
+            OSError: the refusal, with its errno and sentence; EIO when the other side is gone,
+                ETIMEDOUT when it does not answer within the time-out and a grace.
+        """
+        return self.wait(self.send(call), call)
+
+    def send(self, call: Call) -> int:
+        """Send a request; return its number."""
+        with self._mutex:
+            if self._ended is not None:
+                raise OSError(*self._ended)
+            self._number += 1
+            number = self._number
+            packet = encode(call.verb, number, *call.arguments)
+            if len(packet) > MAX_PACKET:
+                raise OSError(
+                    errno.EMSGSIZE, f"{call.what}: {len(packet)} bytes in one message; at most {MAX_PACKET}"
+                )
+            try:
+                if call.fds:
+                    self._sock.sendmsg([packet], [(SOL_SOCKET, SCM_RIGHTS, array("i", call.fds))])
+                else:
+                    self._sock.send(packet)
+            except OSError as error:
+                raise self._gone(error, call.what) from None
+        return number
+
+    def notice(self, packet: bytes) -> None:
+        """Send a packet that draws no answer."""
+        try:
+            self._sock.send(packet)
+        except OSError as error:
+            raise self._gone(error, "send") from None
+
+    def wait(self, number: int, call: Call) -> Answer:
+        """Wait for the answer to a sent request."""
+        deadline = None if call.limit_s is None else monotonic() + call.limit_s + GRACE_S
+        while True:
+            with self._mutex:
+                found = self._answers.pop(number, None)
+                if found is None:
+                    if self._ended is not None:
+                        raise OSError(*self._ended)
+                    lead = not self._reading
+                    if lead:
+                        self._reading = True
+                    else:
+                        turn = allocate_lock()
+                        turn.acquire()
+                        self._waiting[number] = turn
+            if found is not None:
+                return self._result(found)
+            if not lead:
+                left = -1 if deadline is None else max(0.0, deadline - monotonic())
+                turn.acquire(True, left)
+                with self._mutex:
+                    self._waiting.pop(number, None)
+                    late = number not in self._answers and deadline is not None and monotonic() >= deadline
+                if late:
+                    raise self._late(call)
+                continue
+            try:
+                found = self._read(number, deadline)
+            finally:
+                with self._mutex:
+                    self._reading = False
+                    if self._waiting:  # pass the reading on
+                        self._waiting.pop(next(iter(self._waiting))).release()  # type: ignore[attr-defined]
+            if found is None:
+                raise self._late(call)
+            return self._result(found)
+
+    def take(self) -> tuple[list, list[int]] | None:  # type: ignore[type-arg]
+        """Read one packet without waiting, for event loops; None when there is none.
+
+        Raises:
+            OSError: the other side is gone, or has ended this channel with a reason.
+        """
+        try:
+            return self._packet(0x40)  # MSG_DONTWAIT
+        except BlockingIOError:
+            return None
+
+    def close(self) -> None:
+        """Close the socket; waiting threads get EBADF."""
+        with self._mutex:
+            if self._ended is None:
+                self._ended = (errno.EBADF, f"{self.name} is closed")
+            if self._sock.fileno() >= 0:
+                try:
+                    self._sock.shutdown(SHUT_RDWR)
+                except OSError:
+                    pass  # the other side was gone already
+                if not self._reading:
+                    self._sock.close()
+
+    def _read(self, number: int, deadline: float | None) -> tuple[list, list[int]] | None:  # type: ignore[type-arg]
+        """Read packets until the one with this number has come; None when it is late."""
+        while True:
+            if deadline is None:
+                timeout = 0.0
+            else:
+                timeout = deadline - monotonic()
+                if timeout <= 0:
+                    return None
+            self._set_timeout(timeout)
+            try:
+                message, fds = self._packet(0)
+            except BlockingIOError:
+                continue
+            if message[1] == number:
+                return message, fds
+            with self._mutex:
+                self._answers[message[1]] = (message, fds)
+                turn = self._waiting.pop(message[1], None)
+            if turn is not None:
+                turn.release()  # type: ignore[attr-defined]
+
+    def _packet(self, flags: int) -> tuple[list, list[int]]:  # type: ignore[type-arg]
+        try:
+            packet, ancillary, _, _ = self._sock.recvmsg(MAX_PACKET, _ANCILLARY, flags | _CMSG_CLOEXEC)
+        except BlockingIOError:
+            raise
+        except OSError as error:
+            raise self._gone(error, "receive") from None
+        fds: list[int] = []
+        for level, kind, data in ancillary:
+            if level == SOL_SOCKET and kind == SCM_RIGHTS:
+                received = array("i")
+                received.frombytes(data[: len(data) - len(data) % 4])
+                fds += received
+        if not packet:
+            raise self._gone(None, "receive")
+        try:
+            message = decode(packet)
+        except MalformedMessage as error:
+            raise self._gone(OSError(errno.EPROTO, str(error)), "receive") from None
+        if message[1] == 0:
+            # The last word before the other side closes: errno and why.
+            self._ended = (int(message[2]), str(message[3]))  # type: ignore[call-overload]
+            raise OSError(*self._ended)
+        return message, fds
+
+    def _set_timeout(self, timeout: float) -> None:
+        # In steps, because setting it is a system call: an answer is seldom late.
+        coarse = 0.0 if not timeout else max(0.05, timeout if timeout < 1.0 else float(int(timeout) + 1))
+        if coarse != self._timeout:
+            self._timeout = coarse
+            seconds = int(coarse)
+            self._sock.setsockopt(SOL_SOCKET, SO_RCVTIMEO, pack("ll", seconds, int((coarse - seconds) * 1e6)))
+
+    def _result(self, found: tuple[list, list[int]]) -> Answer:  # type: ignore[type-arg]
+        message, fds = found
+        if message[2]:
+            for fd in fds:
+                os.close(fd)
+            raise OSError(message[2], message[3])
+        return Answer(message[3], fds)
+
+    def _gone(self, error: OSError | None, what: str) -> OSError:
+        if self._ended is None:
+            if error is not None and error.errno == errno.EPROTO:
+                self._ended = (errno.EPROTO, f"{what} on {self.name}: {error.strerror}")
+            elif self._sock.fileno() < 0:
+                self._ended = (errno.EBADF, f"{self.name} is closed")
+            else:
+                self._ended = (errno.EIO, f"{self.name}: the process behind it has gone; open it again")
+        return OSError(*self._ended)
+
+    def _late(self, call: Call) -> OSError:
+        return OSError(errno.ETIMEDOUT, f"{call.what}: {self.name} does not answer; is its process hung?")

@@ -1,0 +1,91 @@
+"""Commands for axes: write records made of the words that are given."""
+
+from __future__ import annotations
+
+from sioms.protocol.flags import ControlMode
+from sioms.protocol.records import AXIS_WRITE, AXIS_WRITE_FIELDS
+
+_DEFAULT = {name: 0 if code in "iIq" else 0.0 for name, code in AXIS_WRITE_FIELDS}
+_QUANTITY = {
+    "position": ControlMode.POSITION,
+    "velocity": ControlMode.VELOCITY,
+    "acceleration": ControlMode.ACCELERATION,
+    "jerk": ControlMode.JERK,
+    "force": ControlMode.FORCE,
+    "force_velocity": ControlMode.FORCE_VELOCITY,
+}
+_WITH = {
+    "max_velocity": ControlMode.SPECIFIED_MAX_VEL_ACC,
+    "max_acceleration": ControlMode.SPECIFIED_MAX_VEL_ACC,
+    "time": ControlMode.SPECIFIED_TIME,
+    "k": ControlMode.SPECIFIED_GAINS,
+    "kz": ControlMode.SPECIFIED_GAINS,
+    "kp": ControlMode.SPECIFIED_GAINS,
+    "kb": ControlMode.SPECIFIED_GAINS,
+    "force_offset": ControlMode.SPECIFIED_FORCE_OFFSET,
+    "max_force": ControlMode.SPECIFIED_MAX_FORCE,
+}
+_TOGETHER = (("max_velocity", "max_acceleration"), ("k", "kz", "kp", "kb"))
+
+
+def command(
+    axis: int = 0,
+    *,
+    wait: int | object | None = None,
+    signal: int | object | None = None,
+    synch: bool = False,
+    relative: bool = False,
+    **values: float,
+) -> bytes:
+    """Make one axis write record; its control mode follows from the words that are given.
+
+    Args:
+        axis: index of the axis in the node.
+        wait: marker (or its number) to wait for before it starts.
+        signal: marker (or its token) to signal when it ends.
+        synch: hold it until the external synch.
+        relative: ``position`` counts from where the preceding command ends.
+        **values: ``position``, ``velocity``, ``acceleration``, ``jerk``, ``force`` or
+            ``force_velocity`` say what is commanded; ``position`` with ``velocity`` passes the
+            position at that velocity. ``time`` [s], ``max_velocity`` with ``max_acceleration``,
+            ``k kz kp kb`` (all four), ``force_offset`` and ``max_force`` may be added. SI units.
+
+    Returns:
+        The packed record; records are joined with ``+`` or given to ``write`` as a list.
+
+    Raises:
+        ValueError: an unknown word, nothing commanded, or words of a group missing.
+
+    Example:
+        >>> len(command(position=0.1, time=0.5))
+        144
+    """
+    fields = dict(_DEFAULT)
+    mode = ControlMode(0)
+    for name, value in values.items():
+        flag = _QUANTITY.get(name) or _WITH.get(name)
+        if flag is None:
+            raise ValueError(
+                f"make command: unknown word {name}; there are: {', '.join([*_QUANTITY, *_WITH])}"
+            )
+        fields[name] = float(value)
+        mode |= flag
+    for group in _TOGETHER:
+        missing = [name for name in group if name not in values]
+        if missing and len(missing) < len(group):
+            raise ValueError(f"make command: {', '.join(missing)} missing; {', '.join(group)} go together")
+    if not mode & 0x3F:
+        raise ValueError(f"make command: nothing commanded; give one of {', '.join(_QUANTITY)}")
+    fields["axis"] = axis
+    if wait is not None:
+        mode |= ControlMode.SPECIFIED_WAIT_MARKER
+        fields["wait_marker_number"] = int(wait)  # type: ignore[call-overload]
+    if signal is not None:
+        mode |= ControlMode.SPECIFIED_SIGNAL_MARKER
+        fields["signal_marker_number"] = int(signal)  # type: ignore[call-overload]
+    if synch:
+        mode |= ControlMode.WAIT_FOR_EXTERNAL_SYNCH
+    if relative:
+        mode |= ControlMode.RELATIVE
+    fields["control_mode"] = int(mode)
+    return AXIS_WRITE.pack(*fields.values())

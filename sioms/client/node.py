@@ -1,0 +1,501 @@
+"""Open nodes: reading is a copy out of shared memory, everything else a message to the driver.
+
+Concurrency: a node may be used by many threads; each request has its own answer. Closing ends the
+requests of other threads with EBADF.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from mmap import PROT_READ, mmap
+from select import POLLIN, poll
+from time import monotonic, monotonic_ns
+
+from sioms.protocol.flags import NodeClass, PageState, Request, WriteFlag
+from sioms.protocol.messages import MAX_INLINE, MAX_WRITE, HandleVerb, encode
+from sioms.protocol.nodeinfo import NodeInfo
+from sioms.protocol.page import NotReadable, PageReader
+from sioms.protocol.records import ANALOG_WRITE, BINARY_WRITE
+
+from .channel import Call, Channel
+from .command import command
+from .snapshot import SNAPSHOT, AnalogSnapshot, AxisSnapshot, BinarySnapshot, Layout
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from typing import Any, Self
+
+    Records = bytes | bytearray | memoryview | Iterable[bytes]
+
+_KEEPALIVE = encode(HandleVerb.KEEPALIVE, 0)
+SYNCH_LEAD_S = 0.01
+"""How far ahead a synchronised start lies: long enough for every driver to hear of it."""
+
+
+class Event:
+    """An edge on a binary node: the states before and after, and when.
+
+    Attributes:
+        initial, final: data when waiting began, and after the edge.
+        stamp_ns: time of the edge as the device gave it [ns, CLOCK_MONOTONIC].
+        number: snapshot that showed it; pass the event to the next wait and none is lost.
+    """
+
+    __slots__ = ("final", "initial", "number", "stamp_ns")
+
+    def __init__(self, initial: int, final: int, stamp_ns: int, number: int) -> None:
+        self.initial = initial
+        self.final = final
+        self.stamp_ns = stamp_ns
+        self.number = number
+
+    def __repr__(self) -> str:
+        return f"Event(initial={self.initial:#x}, final={self.final:#x}, stamp_ns={self.stamp_ns})"
+
+
+class NodeCore:
+    """What the blocking and the asyncio face of an open node share; no waiting in it.
+
+    Attributes:
+        info: what the node is (GET_IO_STRUCT_INFO).
+        name: node name.
+    """
+
+    def __init__(
+        self, info: NodeInfo, handle: int, fds: list[int], channels: list[int], bit: int, channel: Channel
+    ) -> None:
+        self.info = info
+        self.name = info.name
+        self.handle = handle
+        self._channel = channel
+        self._event = fds[1]
+        size = os.fstat(fds[0]).st_size
+        self._map: mmap | None = mmap(fds[0], size, prot=PROT_READ)
+        os.close(fds[0])
+        self._page = PageReader(self._map)
+        self._layout = Layout(info.node_class, self._page.channels, channels, bit)
+        self._snapshot = SNAPSHOT[info.node_class]
+        self._latest = self._page.latest
+        self._subscribed = 0
+
+    @property
+    def closed(self) -> bool:
+        """Whether it has been closed."""
+        return self._map is None
+
+    def read(self) -> Any:
+        """Return the newest snapshot of all channels: a copy of memory, no system call.
+
+        Raises:
+            OSError: EIO, the device is starting, lost, hung or in fault, with the reason; never old
+                data as new. EBADF, the node is closed.
+        """
+        try:
+            raw = self._latest(monotonic_ns())
+        except (NotReadable, ValueError) as error:
+            raise self._unreadable(error) from None
+        if self._subscribed:
+            self._drain()
+        return self._snapshot(raw, self._layout)
+
+    def history(self, after: int) -> list[Any]:
+        """Return the snapshots after a given number that the page still holds, oldest first.
+
+        Args:
+            after: number of the last snapshot seen; 0 for all.
+        """
+        self.read()
+        page = self._page
+        first = max(after + 1, page.head - page.slots + 2, 1)
+        raws = [page.numbered(number) for number in range(first, page.head + 1)]
+        return [self._snapshot(raw, self._layout) for raw in raws if raw is not None]
+
+    def fileno(self) -> int:
+        """Return a descriptor that is readable when there is new data, for selectors and asyncio.
+
+        The first call subscribes; ``read`` makes it unreadable until the next publication.
+        """
+        if not self._subscribed:
+            self.subscribe(1)
+        return self._event
+
+    def subscribe(self, every: int) -> None:
+        """Have ``fileno`` become readable with every n-th publication, -1: with edges only, 0: not at all."""
+        raise NotImplementedError
+
+    def keepalive(self) -> None:
+        """Tell the driver that this client is alive, for nodes opened with a lease; any request does, too."""
+        self._channel.notice(_KEEPALIVE)
+
+    def room(self) -> int:
+        """Return how many commands the fullest of the node's command buffers still takes."""
+        buffered = self.read().buffered
+        return self.info.buffer_capacity - int(max(buffered))
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.name}{' closed' if self.closed else ''}>"
+
+    # --- requests as values ----------------------------------------------------------------------
+
+    def _ioctl(self, request: Request, argument: object = None, timeout: float | None = 0.0) -> Call:
+        what = f"{request.name} on {self.name}"
+        return Call(what, HandleVerb.IOCTL, int(request), argument, timeout, limit_s=timeout)
+
+    def _write(self, records: Records, timeout: float | None, replace: bool) -> Call:
+        data = records if isinstance(records, bytes) else _join(records)
+        flags = WriteFlag.REPLACE if replace else WriteFlag.APPEND
+        what = f"write {self.name}"
+        if len(data) <= MAX_INLINE:
+            return Call(what, HandleVerb.WRITE, int(flags), timeout, data, limit_s=timeout)
+        if len(data) > MAX_WRITE:
+            raise OSError(errno.EMSGSIZE, f"{what}: {len(data)} bytes of records; at most {MAX_WRITE}")
+        fd = os.memfd_create("sioms-write", os.MFD_CLOEXEC)
+        os.write(fd, data)
+        return Call(what, HandleVerb.WRITE, int(flags), timeout, None, fds=(fd,), limit_s=timeout)
+
+    def _outputs(self, values: Sequence[float]) -> bytes:
+        count = len(self.info.channels)
+        if len(values) != count:
+            raise OSError(errno.EINVAL, f"write {self.name}: {len(values)} values; want {count}")
+        if self.info.node_class is NodeClass.BINARY:
+            return b"".join([BINARY_WRITE.pack(i, 0, int(value), 0) for i, value in enumerate(values)])
+        return b"".join([ANALOG_WRITE.pack(i, 0, value) for i, value in enumerate(values)])
+
+    def _find_event(self, mask: int, state: int, after: int) -> Event | None:
+        """Look through the snapshots after a number for a change of the masked bits."""
+        for snapshot in self.history(after):
+            final = snapshot.data[0]
+            if (final ^ state) & mask:
+                return Event(state, final, snapshot.changed_ns[0], snapshot.number)
+        return None
+
+    def _start_of(self, last: Event | BinarySnapshot | None) -> tuple[int, int]:
+        """Return (state, number) from which a wait for an event begins."""
+        if self.info.node_class is not NodeClass.BINARY or len(self.info.channels) != 1:
+            raise OSError(
+                errno.EINVAL, f"wait for an event on {self.name}: want a node of one binary channel"
+            )
+        if isinstance(last, Event):
+            return last.final, last.number
+        start: BinarySnapshot = last if last is not None else self.read()
+        return start.data[0], start.number
+
+    def _drain(self) -> None:
+        try:
+            os.read(self._event, 8)
+        except BlockingIOError:
+            return
+
+    def _unreadable(self, error: Exception) -> OSError:
+        if self._map is None:
+            return OSError(errno.EBADF, f"read {self.name}: it is closed")
+        if isinstance(error, NotReadable):
+            why = error.reason or "no reason given"
+            state = {
+                PageState.STALE: "its driver is gone or hung",
+                PageState.STARTING: "its device is starting",
+            }
+            what = state.get(error.state, f"its device is in {error.state.name.lower().replace('_', ' ')}")
+            return OSError(errno.EIO, f"read {self.name}: {what}: {why}")
+        raise error
+
+    def _release(self) -> None:
+        if self._map is None:
+            return
+        self._channel.close()
+        self._page.release()
+        self._map.close()
+        self._map = None
+        os.close(self._event)
+
+
+class Node(NodeCore):
+    """An open node, with calls that wait. Use it in a ``with`` block: closing halts its axes."""
+
+    def __init__(self, core: tuple[Any, ...], close: Callable[[int], None]) -> None:
+        super().__init__(*core)
+        self._close = close
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the node: axes halt, buffers empty, outputs become safe. Returns when the node is free."""
+        if self._map is not None:
+            self._release()
+            self._close(self.handle)
+
+    def subscribe(self, every: int) -> None:
+        """Have ``fileno`` become readable with every n-th publication, -1: with edges only, 0: not at all."""
+        if every != self._subscribed:
+            self._channel.call(Call(f"subscribe to {self.name}", HandleVerb.SUBSCRIBE, every))
+            self._subscribed = every
+
+    def ioctl(self, request: Request, argument: object = None, timeout: float | None = 0.0) -> Any:
+        """Send a request to the driver and return its answer.
+
+        Args:
+            request: one of Request.
+            argument: what the request takes.
+            timeout: how long a request that waits may wait [s]; None = for ever.
+
+        Raises:
+            OSError: with the errno and the sentence of the driver.
+        """
+        return self._channel.call(self._ioctl(request, argument, timeout)).value
+
+    def write(self, records: Records, timeout: float | None = 0.0, *, replace: bool = False) -> int:
+        """Write records, all or none.
+
+        Args:
+            records: packed records, joined or as an iterable (see ``command``), or a numpy array of
+                the record type.
+            timeout: how long to wait for room in the command buffer [s]; 0: not; None: for ever.
+            replace: empty the buffer first and re-plan from the present state.
+
+        Returns:
+            The driver's tick when they were taken.
+
+        Raises:
+            OSError: EINVAL, ERANGE a bad record; EAGAIN, ETIMEDOUT no room; EPERM stopped by
+                emergency stop; EIO the device is lost. Nothing was taken.
+        """
+        call = self._write(records, timeout, replace)
+        try:
+            return int(self._channel.call(call).value)  # type: ignore[call-overload]
+        finally:
+            for fd in call.fds:
+                os.close(fd)
+
+    def wait_new(self, after: int, timeout: float | None = None) -> Any:
+        """Wait for a snapshot newer than a given number and return the newest.
+
+        Raises:
+            TimeoutError: none came.
+        """
+        if not self._subscribed:
+            self.subscribe(1)
+        deadline = None if timeout is None else monotonic() + timeout
+        while True:
+            snapshot = self.read()
+            if snapshot.number > after:
+                return snapshot
+            self._poll(deadline, f"wait for new data of {self.name}")
+
+    def stop_all(self) -> None:
+        """Emergency stop of this node: maximum deceleration, buffers emptied, latched until ``reset``."""
+        self.ioctl(Request.EMERGENCY_STOP)
+
+    emergency_stop = stop_all
+
+    def reset(self) -> None:
+        """Clear a latched stop or fault of this node. Nothing resumes."""
+        self.ioctl(Request.RESET)
+
+    def cancel_waits(self) -> int:
+        """End the waits of all sessions on this node with ECANCELED; return how many there were."""
+        return int(self.ioctl(Request.CANCEL_WAITS))
+
+    def statistics(self) -> dict[str, Any]:
+        """Return the driver's tick times and link counters."""
+        value: dict[str, Any] = self.ioctl(Request.GET_STATISTICS)
+        return value
+
+    def _poll(self, deadline: float | None, what: str) -> None:
+        """Wait until the eventfd is readable, then look at the page's state at least every 50 ms."""
+        left = None if deadline is None else deadline - monotonic()
+        if left is not None and left <= 0:
+            raise TimeoutError(errno.ETIMEDOUT, f"{what}: nothing within its time-out")
+        poller = poll()
+        poller.register(self._event, POLLIN)
+        # A hung driver wakes nobody: look at its lease now and then.
+        if poller.poll(50 if left is None else min(50.0, left * 1e3)):
+            return
+        self._page.check(monotonic_ns()) if self._map is not None else None
+
+
+class AxisNode(Node):
+    """Axes. Positions in the channel's unit (m or rad), forces in N or N*m."""
+
+    if TYPE_CHECKING:
+
+        def read(self) -> AxisSnapshot: ...
+
+    def move(
+        self,
+        position: float,
+        axis: int = 0,
+        *,
+        timeout: float | None = 0.0,
+        replace: bool = False,
+        **words: Any,
+    ) -> int:
+        """Append a position command; see ``command`` for the further words."""
+        return self.write(command(axis, position=position, **words), timeout, replace=replace)
+
+    def command(
+        self, axis: int = 0, *, timeout: float | None = 0.0, replace: bool = False, **words: Any
+    ) -> int:
+        """Append one command; see ``sioms.command`` for the words."""
+        return self.write(command(axis, **words), timeout, replace=replace)
+
+    def wait_until_idle(self, timeout: float | None = None) -> None:
+        """Wait until all axes of the node stand still and their buffers are empty.
+
+        Raises:
+            OSError: ETIMEDOUT; ECANCELED stopped; EIO fault; EPIPE a marker waited for was freed.
+        """
+        self.ioctl(Request.WAIT_UNTIL_IDLE, None, timeout)
+
+    def synch(self, start_ns: int | None = None) -> int:
+        """Send the external synch; return the instant at which the axes start [ns, CLOCK_MONOTONIC]."""
+        return int(self.ioctl(Request.SEND_EXTERNAL_SYNCH, start_ns))
+
+    def stop(self) -> None:
+        """Stop at maximum deceleration and empty the buffers; not latched."""
+        self.ioctl(Request.STOP)
+
+    def flush(self) -> None:
+        """Empty the buffers; the running command goes on."""
+        self.ioctl(Request.FLUSH)
+
+    def home(self) -> None:
+        """Start homing; ``wait_until_idle`` waits for its end."""
+        self.ioctl(Request.HOME)
+
+    def zero(self) -> None:
+        """Make the present position 0."""
+        self.ioctl(Request.ZERO_DEVICE)
+
+    def calibrate(self, *positions: float) -> None:
+        """Give the present position of each axis a new value, without motion."""
+        self.ioctl(Request.CALIBRATE_DEVICE, [float(p) for p in positions])
+
+    def limits(self) -> dict[str, list[float | None]]:
+        """Return the limits in force by name, one value an axis, None where there is none."""
+        value: dict[str, list[float | None]] = self.ioctl(Request.GET_LIMITS)
+        return value
+
+    def set_limits(self, **limits: float | None) -> None:
+        """Narrow the limits of all axes of the node, e.g. ``position_max=0.2``."""
+        self.ioctl(Request.SET_LIMITS, limits)
+
+    def wait_room(self, commands: int = 1, timeout: float | None = None) -> None:
+        """Wait until the command buffers take so many more commands.
+
+        Raises:
+            TimeoutError: they did not.
+        """
+        deadline = None if timeout is None else monotonic() + timeout
+        if not self._subscribed:
+            self.subscribe(1)
+        while self.room() < commands:
+            self._poll(deadline, f"wait for room on {self.name}")
+
+
+class AnalogNode(Node):
+    """Analog channels in their declared units."""
+
+    if TYPE_CHECKING:
+
+        def read(self) -> AnalogSnapshot: ...
+
+    def set(self, *values: float) -> int:
+        """Write all output channels."""
+        return self.write(self._outputs(values))
+
+    def zero(self, samples: int = 1, timeout: float | None = 10.0) -> list[float]:
+        """Take the mean of the next readings as offset; return what it was."""
+        value: list[float] = self.ioctl(Request.ZERO_DEVICE, samples, timeout)
+        return value
+
+    def set_gains(self, gains: Sequence[float]) -> None:
+        """Set the gain matrix: n*n numbers in rows, or the n of its diagonal."""
+        self.ioctl(Request.SET_GAINS, [float(g) for g in gains])
+
+    def gains(self) -> list[float]:
+        """Return the gain matrix, n*n numbers in rows."""
+        value: list[float] = self.ioctl(Request.GET_GAINS)
+        return value
+
+
+class BinaryNode(Node):
+    """Binary ports and bits."""
+
+    if TYPE_CHECKING:
+
+        def read(self) -> BinarySnapshot: ...
+
+    def set(self, *values: int) -> int:
+        """Write all ports of the node, or its bit."""
+        return self.write(self._outputs(values))
+
+    def wait_event(
+        self, mask: int = -1, last: Event | BinarySnapshot | None = None, timeout: float | None = None
+    ) -> Event:
+        """Wait until a masked bit differs from the last state seen.
+
+        Args:
+            mask: bits to watch.
+            last: the event or snapshot seen last; every edge after it counts, also one that is over
+                by now, as far as the page's history reaches. None: the present state.
+            timeout: how long [s]; None = for ever.
+
+        Raises:
+            TimeoutError: nothing changed.
+        """
+        state, number = self._start_of(last)
+        if self._subscribed == 0:
+            self.subscribe(-1)
+        deadline = None if timeout is None else monotonic() + timeout
+        while True:
+            event = self._find_event(mask, state, number)
+            if event is not None:
+                return event
+            number = max(number, self._page.head)
+            self._poll(deadline, f"wait for an event on {self.name}")
+
+
+NODE: dict[NodeClass, type[Node]] = {
+    NodeClass.AXIS: AxisNode,
+    NodeClass.ANALOG: AnalogNode,
+    NodeClass.BINARY: BinaryNode,
+}
+
+
+def select(
+    readable: Iterable[NodeCore] = (), room: Iterable[AxisNode] = (), timeout: float | None = None
+) -> tuple[list[NodeCore], list[AxisNode]]:
+    """Wait for new data or for room in a command buffer, on several nodes at once.
+
+    Args:
+        readable: nodes whose next publication is waited for.
+        room: axis nodes that shall take at least one more command.
+        timeout: how long [s]; None = for ever; 0 = only look.
+
+    Returns:
+        The nodes with new data, and those with room; both empty when the time is over.
+    """
+    readable, room = list(readable), list(room)
+    deadline = None if timeout is None else monotonic() + timeout
+    poller = poll()
+    for node in {*readable, *room}:
+        poller.register(node.fileno(), POLLIN)
+    while True:
+        roomy = [node for node in room if node.room() > 0]
+        left = None if deadline is None else max(0.0, deadline - monotonic())
+        events = {fd for fd, _ in poller.poll(0 if roomy else 50 if left is None else min(50.0, left * 1e3))}
+        fresh = [node for node in readable if node.fileno() in events]
+        if fresh or roomy or left == 0:
+            return fresh, roomy
+
+
+def _join(records: Any) -> bytes:
+    if hasattr(records, "tobytes"):
+        return bytes(records.tobytes())
+    return bytes(records) if isinstance(records, bytearray) else b"".join(records)

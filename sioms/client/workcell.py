@@ -1,0 +1,264 @@
+"""The connection to a daemon: names, opens, markers, stops."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from _socket import socket
+from mmap import mmap
+from time import monotonic_ns
+
+from sioms.protocol.flags import PROTOCOL_VERSION, Access, NodeClass
+from sioms.protocol.latch import REQUEST_SIZE, StopRequest
+from sioms.protocol.messages import ClientVerb
+from sioms.protocol.nodeinfo import NodeInfo
+from sioms.protocol.socketpath import socket_path
+
+from .channel import Call, Channel, connect
+from .node import NODE, SYNCH_LEAD_S, AxisNode
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any, Self
+
+_ACCESS = {"r": Access.READ, "w": Access.WRITE, "rw": Access.READ | Access.WRITE}
+
+
+class NodeEntry:
+    """A line of the node list.
+
+    Attributes:
+        name, node_class, channels, read_only, device: what and whose.
+        state: state of the device: up, starting, restarting, fault ...
+        holder: who has it open for output, '' when it is free.
+    """
+
+    __slots__ = ("bit", "channels", "device", "holder", "name", "node_class", "read_only", "state")
+
+    def __init__(self, packed: list) -> None:  # type: ignore[type-arg]
+        self.name, cls, self.channels, self.read_only, self.device, self.state, self.holder, self.bit = packed
+        self.node_class = NodeClass(cls)
+
+    def __repr__(self) -> str:
+        return f"<{self.node_class.name.lower()} node {self.name}>"
+
+
+class Marker:
+    """A reserved marker.
+
+    Attributes:
+        token: number and key in one integer, below 2**50; needed to signal and to free.
+        number: enough to wait.
+    """
+
+    __slots__ = ("_cell", "number", "token")
+
+    def __init__(self, cell: Workcell, token: int) -> None:
+        self._cell = cell
+        self.token = token
+        self.number = token & 1023
+
+    def __int__(self) -> int:
+        return self.token
+
+    def signal(self) -> None:
+        """Signal it; once is enough, more has no effect."""
+        self._cell.signal_marker(self.token)
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait until it is signalled; return when that was [ns, CLOCK_MONOTONIC]."""
+        return self._cell.wait_marker(self.token, timeout)
+
+    def free(self) -> None:
+        """Free it; who waits for it gets EPIPE."""
+        self._cell.free_marker(self.token)
+
+    def __repr__(self) -> str:
+        return f"<Marker {self.number}>"
+
+
+def open_call(name: str, mode: str, timeout: float | None, lease: float) -> Call:
+    """Make the request that opens a node."""
+    access = _ACCESS.get(mode)
+    if access is None:
+        raise OSError(errno.EINVAL, f"open {name}: mode {mode!r}; want 'r', 'w' or 'rw'")
+    return Call(f"open {name}", ClientVerb.OPEN, name, int(access), timeout, float(lease), limit_s=timeout)
+
+
+def node_parts(value: Any, fds: list[int]) -> tuple[Any, ...]:
+    """Turn the answer to an open into the arguments of a node."""
+    handle, packed, channels, bit = value
+    info = NodeInfo(packed)
+    return info, handle, fds[:2], list(channels), bit, Channel(socket(fileno=fds[2]), f"node {info.name}")
+
+
+class Workcell:
+    """A session with the daemon. Use it in a ``with`` block, or close it; the end of the process does.
+
+    Args:
+        path: the daemon's socket; None for $SIOMS_SOCKET or the usual places.
+        name: what this client calls itself in messages and lists.
+
+    Raises:
+        OSError: no daemon there, or of another protocol version.
+
+    Concurrency: may be used by many threads.
+    """
+
+    def __init__(self, path: str | None = None, name: str | None = None) -> None:
+        self._channel = Channel(connect(path or socket_path()), "the daemon")
+        title = os.path.basename(sys.argv[0]) if name is None and sys.argv and sys.argv[0] else name or ""
+        answer = self._channel.call(Call("hello", ClientVerb.HELLO, PROTOCOL_VERSION, title))
+        _, self.name, self.rights = answer.value  # type: ignore[misc]
+        self._request: StopRequest | None = None
+        if answer.fds:
+            self._request = StopRequest(memoryview(mmap(answer.fds[0], REQUEST_SIZE)))
+            os.close(answer.fds[0])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the session: its nodes are closed and its markers freed."""
+        self._channel.close()
+
+    def fileno(self) -> int:
+        """Return the descriptor of the session's socket; it becomes readable when the daemon goes."""
+        return self._channel.fileno()
+
+    # --- nodes -----------------------------------------------------------------------------------
+
+    def open(self, name: str, mode: str = "r", timeout: float | None = 0.0, *, lease: float = 0.0) -> Any:
+        """Open a node.
+
+        Args:
+            name: node name.
+            mode: 'r', 'w' or 'rw'. A node that can be written is exclusive in whatever mode; its
+                ``.readonly`` companion opens any number of times.
+            timeout: how long to wait for it to be free [s]; 0: not; None: for ever.
+            lease: longest silence of this client [s] before its axes are halted, for programs that may
+                hang; 0: none. Any request, or ``keepalive``, renews it.
+
+        Returns:
+            An AxisNode, AnalogNode or BinaryNode.
+
+        Raises:
+            OSError: ENOENT no such node; EBUSY held, by whom; EACCES no right; EIO device lost;
+                ETIMEDOUT not free in time.
+        """
+        answer = self._channel.call(open_call(name, mode, timeout, lease))
+        core = node_parts(answer.value, answer.fds)
+        return NODE[core[0].node_class](core, self._close_handle)
+
+    def _close_handle(self, handle: int) -> None:
+        try:
+            self._channel.call(Call("close", ClientVerb.CLOSE, handle))
+        except OSError as error:
+            # The daemon has gone, or knows no such handle any more: the driver has halted the axes
+            # at the end of file of the node's own socket either way.
+            if error.errno not in (errno.EIO, errno.EBADF):
+                raise
+
+    def nodes(self) -> list[NodeEntry]:
+        """Return all nodes that this user may read."""
+        value = self._call("list nodes", ClientVerb.LIST)
+        return [NodeEntry(packed) for packed in value]
+
+    def info(self, name: str) -> NodeInfo:
+        """Return what a node is, without opening it."""
+        return NodeInfo(self._call(f"get information of {name}", ClientVerb.INFO, name))
+
+    def status(self) -> dict[str, Any]:
+        """Return devices, sessions, holders and the state of the emergency stop."""
+        value: dict[str, Any] = self._call("get status", ClientVerb.STATUS)
+        return value
+
+    def synch(self, *nodes: AxisNode, lead: float = SYNCH_LEAD_S) -> int:
+        """Start the waiting commands of several nodes at the same instant.
+
+        Args:
+            nodes: open axis nodes, of any number of devices.
+            lead: how far ahead the instant lies [s].
+
+        Returns:
+            The instant [ns, CLOCK_MONOTONIC].
+
+        Raises:
+            OSError: ETIME, a driver heard of it too late; the nodes that had started are stopped.
+        """
+        start_ns = monotonic_ns() + int(lead * 1e9)
+        told: list[AxisNode] = []
+        try:
+            for node in nodes:
+                node.synch(start_ns)
+                told.append(node)
+        except OSError:
+            for node in told:
+                node.stop()
+            raise
+        return start_ns
+
+    # --- markers ---------------------------------------------------------------------------------
+
+    def reserve_marker(self) -> Marker:
+        """Reserve a marker; it is freed with the session."""
+        return self.reserve_markers(1)[0]
+
+    def reserve_markers(self, count: int, *, persist: bool = False) -> list[Marker]:
+        """Reserve markers, all or none.
+
+        Args:
+            count: how many.
+            persist: keep them beyond the end of the session.
+        """
+        tokens = self._call(f"reserve {count} markers", ClientVerb.RESERVE_MARKER, count, persist)
+        return [Marker(self, token) for token in tokens]
+
+    def free_marker(self, token: int) -> None:
+        """Free a marker; needs its token."""
+        self._call("free marker", ClientVerb.FREE_MARKER, int(token))
+
+    def signal_marker(self, token: int) -> None:
+        """Signal a marker; needs its token."""
+        self._call("signal marker", ClientVerb.SIGNAL_MARKER, int(token))
+
+    def wait_marker(self, number: int, timeout: float | None = None) -> int:
+        """Wait until a marker is signalled; return when that was [ns, CLOCK_MONOTONIC]."""
+        return int(
+            self._call("wait for marker", ClientVerb.WAIT_MARKER, int(number), timeout, limit_s=timeout)
+        )
+
+    # --- stops -----------------------------------------------------------------------------------
+
+    def emergency_stop(self, node: str = "", why: str = "") -> None:
+        """Stop the whole workcell, or one node, and latch the stop until it is reset.
+
+        Takes effect in every driver's next tick even while the daemon is busy or hung. This is a
+        software stop, not a safety-rated function.
+
+        Args:
+            node: a node, '' for the whole workcell.
+            why: for the log and for who asks why nothing moves.
+        """
+        if not node and self._request is not None:
+            self._request.request(monotonic_ns())
+        self._call("emergency stop", ClientVerb.EMERGENCY_STOP, node, why)
+
+    def reset(self, node: str = "") -> None:
+        """Clear the latched stop of the workcell or of a node. Nothing resumes by itself."""
+        self._call("reset", ClientVerb.RESET, node)
+
+    def reload(self) -> None:
+        """Let the daemon take up its configuration anew.
+
+        Raises:
+            OSError: EINVAL with all errors; nothing was taken up.
+        """
+        self._call("reload", ClientVerb.RELOAD, limit_s=60.0)
+
+    def _call(self, what: str, verb: ClientVerb, *arguments: object, limit_s: float | None = 0.0) -> Any:
+        return self._channel.call(Call(what, verb, *arguments, limit_s=limit_s)).value
