@@ -259,7 +259,10 @@ class Validator:
             held = (mode & int(flag)) != 0
             tokens = commands[field]
             for token in np.unique(tokens[held]).tolist():
-                captured = self._markers.capture(token, signal=flag is M.SPECIFIED_SIGNAL_MARKER)
                 rows = held & (tokens == token)
+                try:
+                    captured = self._markers.capture(token, signal=flag is M.SPECIFIED_SIGNAL_MARKER)
+                except CommandError as e:
+                    raise self.refuse(e.errno, commands, int(rows.argmax()), f"{field}: {e}") from None
                 commands[field][rows], commands[generation][rows] = captured
             commands[field][~held] = 0

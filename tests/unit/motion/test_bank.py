@@ -1,0 +1,381 @@
+"""The bank's verbs and buffer semantics (specification 3.3 to 3.5), on an invented clock."""
+
+import errno
+
+import numpy as np
+import pytest
+from motion_rig import MODE, TICK_NS, Rig, axis
+
+from sioms.motion import SWITCH_HOME, SWITCH_MINUS, SWITCH_PLUS, AxisKind, CommandError, EventKind, Homing
+from sioms.protocol.flags import AxisStatus as S
+
+TIMED = MODE.POSITION | MODE.SPECIFIED_TIME
+
+
+def dropped(rig):
+    return [(e.axes, e.errno) for e in rig.events if e.kind is EventKind.DROPPED]
+
+
+def test_fields_are_one_block_and_integers_are_int64():
+    rig = Rig([axis(), axis()])
+    assert rig.bank.fields.flags.c_contiguous
+    rig.write(mode=[MODE.POSITION] * 3, position=[0.1, 0.2, 0.3])
+    rig.tick()
+    assert rig.field("buffered") == 2 and rig.field("in_motion") == 1 and rig.field("in_motion", 1) == 0
+    assert rig.field("status") & S.MOVING
+
+
+def test_velocity_lasts_until_the_next_command_which_starts_without_a_jump():
+    rig = Rig([axis()])
+    rig.write(mode=MODE.VELOCITY, velocity=0.5)
+    rig.tick(1500)
+    assert rig.field("commanded_velocity") == pytest.approx(0.5)
+    assert not rig.bank.is_idle([0])
+    rig.write(mode=MODE.POSITION, position=0.2)
+    rig.run()
+    assert rig.field("commanded_position") == pytest.approx(0.2, abs=1e-9)
+    v = rig.trace("commanded_velocity")
+    assert np.abs(np.diff(v)).max() <= 5.0 * 1e-3 * (1 + 1e-6)
+
+
+def test_timed_velocity_that_nothing_follows_stops_at_maximum_deceleration():
+    rig = Rig([axis()])
+    rig.write(mode=MODE.VELOCITY | MODE.SPECIFIED_TIME, velocity=1.0, time=1.0)
+    rig.run()
+    # 1 m/s is reached with jerk 100: 0.05 + 0.15 + 0.05 s, half the way; then it stops within v^2 / 2a.
+    assert rig.field("commanded_position") == pytest.approx(1.0 * (1.0 - 0.125) + 1.0 / 10.0, abs=1e-9)
+
+
+def test_timed_force_ends_in_holding_where_the_axis_is():
+    rig = Rig([axis()], plant=lambda output, dt: np.array([0.25]))
+    rig.tick(5)
+    rig.write(mode=MODE.FORCE | MODE.SPECIFIED_TIME, force=3.0, time=0.1)
+    rig.tick(50)
+    assert rig.field("force") == 3.0
+    assert rig.field("status") & S.FORCE_MODE
+    rig.tick(60)
+    assert rig.bank.is_idle([0])
+    assert rig.field("force") == 0.0
+    assert rig.field("commanded_position") == 0.25
+
+
+def test_force_velocity_ramps_and_saturates():
+    rig = Rig([axis(k=0.0)], plant=lambda output, dt: np.zeros(1))
+    rig.write(mode=MODE.FORCE | MODE.SPECIFIED_TIME, force=2.0, time=0.1)
+    rig.write(mode=MODE.FORCE_VELOCITY, force_velocity=20.0)
+    rig.tick(300)
+    assert rig.field("force") == pytest.approx(2.0 + 20.0 * 0.2, abs=1e-9)
+    rig.tick(1000)
+    assert rig.field("force") == 10.0
+
+
+def test_specified_settings_persist_and_are_published():
+    rig = Rig([axis()])
+    rig.write(
+        mode=[MODE.POSITION | MODE.SPECIFIED_GAINS | MODE.SPECIFIED_MAX_VEL_ACC, MODE.POSITION],
+        position=[0.5, 0.0], k=7.0, kz=-0.5, kp=0.1, kb=-2.0, max_velocity=0.25, max_acceleration=1.0,
+    )  # fmt: skip
+    rig.run()
+    assert [rig.field(f) for f in ("k", "kz", "kp", "kb")] == [7.0, -0.5, 0.1, -2.0]
+    assert np.abs(rig.trace("commanded_velocity")).max() == pytest.approx(0.25, rel=1e-6)
+
+
+def test_marker_holds_and_signal_fires_in_the_tick_of_the_end():
+    rig = Rig([axis(), axis()])
+    token = rig.markers.reserve(9)
+    rig.write(
+        mode=[TIMED | MODE.SPECIFIED_SIGNAL_MARKER, MODE.POSITION | MODE.SPECIFIED_WAIT_MARKER],
+        axis=[0, 1], position=[0.1, 0.2], time=0.5, signal_marker_number=token, wait_marker_number=9,
+    )  # fmt: skip
+    begin = rig.now_ns
+    rig.tick(499)
+    assert not rig.markers.signals
+    assert rig.field("status", 1) & S.WAITING_MARKER and rig.field("commanded_position", 1) == 0.0
+    rig.tick(1)
+    assert rig.markers.signals == [(9, begin + 500 * TICK_NS)]
+    rig.tick(2)
+    assert not rig.field("status", 1) & S.WAITING_MARKER
+    rig.run()
+    assert rig.field("commanded_position", 1) == pytest.approx(0.2)
+
+
+def test_freed_marker_drops_the_buffer_with_epipe():
+    rig = Rig([axis()])
+    rig.markers.reserve(9)
+    rig.write(mode=[MODE.POSITION | MODE.SPECIFIED_WAIT_MARKER, MODE.POSITION], position=[1.0, 2.0],
+              wait_marker_number=9)  # fmt: skip
+    rig.tick(3)
+    rig.markers.table.free(9)
+    rig.markers.reserve(9)
+    rig.tick(3)
+    assert dropped(rig) == [((0,), errno.EPIPE)]
+    assert rig.bank.is_idle([0]) and rig.field("buffered") == 0
+
+
+def test_synch_starts_all_at_the_same_exact_instant():
+    rig, other = Rig([axis(), axis()]), Rig([axis()], tick_ns=700_000)
+    for r in (rig, other):
+        r.write(mode=[MODE.POSITION | MODE.WAIT_FOR_EXTERNAL_SYNCH] * len(r.axes), axis=r.axes, position=1.0)
+        r.tick(5)
+        assert r.field("status") & S.WAITING_SYNCH
+    start = max(rig.now_ns, other.now_ns) + 3_141_592
+    for r in (rig, other):
+        assert r.bank.synch(r.axes, start, r.now_ns) == tuple(r.axes)
+    tau = 0.04  # in the first jerk phase p = j t^3 / 6
+    for r in (rig, other):
+        while r.now_ns + r.tick_ns <= start + tau * 1e9:
+            r.tick()
+        t = (r.now_ns - start) * 1e-9
+        for i in r.axes:
+            assert r.field("commanded_position", i) == pytest.approx(100 * t**3 / 6, rel=1e-6)
+
+
+def test_synch_leaves_axes_that_wait_for_nothing():
+    rig = Rig([axis(), axis()])
+    rig.write(mode=TIMED, axis=1, position=0.5, time=1.0)
+    rig.write(mode=MODE.POSITION | MODE.WAIT_FOR_EXTERNAL_SYNCH, axis=1, position=0.0)
+    rig.tick(2)
+    assert rig.bank.synch([0, 1], rig.now_ns + 10**6, rig.now_ns) == ()
+    rig.tick(1500)
+    assert rig.field("status", 1) & S.WAITING_SYNCH
+
+
+def test_late_synch_stops_instead_of_hurrying():
+    rig = Rig([axis()])
+    rig.write(mode=MODE.POSITION | MODE.WAIT_FOR_EXTERNAL_SYNCH, position=1.0)
+    rig.tick(2)
+    assert rig.bank.synch([0], rig.now_ns - 5 * TICK_NS, rig.now_ns) == ()
+    rig.tick(2)
+    assert dropped(rig) == [((0,), errno.ETIME)]
+    assert rig.field("commanded_position") == 0.0
+
+
+def test_replace_empties_the_buffer_and_replans_without_a_jump():
+    rig = Rig([axis()])
+    rig.write(mode=[MODE.POSITION] * 3, position=[1.0, 2.0, 3.0])
+    rig.tick(400)
+    rig.write(replace=True, mode=MODE.POSITION, position=0.1)
+    assert rig.field("buffered") <= 2
+    rig.run()
+    assert rig.field("commanded_position") == pytest.approx(0.1, abs=1e-9)
+    v = rig.trace("commanded_velocity")
+    assert np.abs(np.diff(v)).max() <= 5.0e-3 * (1 + 1e-6)
+    assert rig.trace("commanded_position").max() < 1.0
+
+
+def test_stop_halts_within_v_over_a_and_empties_the_buffer():
+    rig = Rig([axis()])
+    rig.write(mode=[MODE.VELOCITY, MODE.POSITION | MODE.WAIT_FOR_EXTERNAL_SYNCH], velocity=2.0, position=1.0)
+    rig.tick(800)
+    place = rig.field("commanded_position")
+    rig.bank.stop([0], rig.now_ns)
+    rig.tick(1)
+    assert rig.field("status") & S.STOPPING and rig.field("buffered") == 0
+    took = rig.run()
+    assert took == pytest.approx(2.0 / 5.0, abs=2e-3)
+    assert rig.field("commanded_position") == pytest.approx(place + 2.0**2 / 10.0, abs=1e-6)
+
+
+def test_emergency_stop_latches_and_nothing_resumes():
+    rig = Rig([axis(), axis()], plant=lambda output, dt: np.zeros(2))
+    rig.write(mode=MODE.FORCE, axis=1, force=5.0)
+    rig.write(mode=[MODE.POSITION] * 2, position=[1.0, 2.0])
+    rig.tick(100)
+    assert rig.field("force", 1) == 5.0
+    rig.bank.emergency_stop([0, 1], rig.now_ns)
+    rig.tick(1)
+    assert rig.field("force", 1) == 0.0
+    assert rig.field("status") & S.EMERGENCY_STOP
+    with pytest.raises(CommandError) as caught:
+        rig.write(mode=MODE.POSITION, position=0.0)
+    assert caught.value.errno == errno.EPERM
+    rig.tick(1000)
+    assert rig.bank.is_idle([0, 1])
+    assert ((0, 1), errno.ECANCELED) in dropped(rig)
+    rest = rig.field("commanded_position")
+    rig.bank.reset([0, 1])
+    rig.tick(500)
+    assert rig.field("commanded_position") == rest
+    assert not rig.field("status") & S.EMERGENCY_STOP
+    rig.write(mode=MODE.POSITION, position=rest)
+
+
+@pytest.mark.parametrize("mode", [dict(mode=MODE.VELOCITY, velocity=1.7), dict(mode=MODE.ACCELERATION, acceleration=5.0),
+                                  dict(mode=MODE.JERK, jerk=80.0)])  # fmt: skip
+@pytest.mark.parametrize("tick_ns", [TICK_NS, 13_000_000])
+def test_soft_limit_is_reached_and_not_passed(mode, tick_ns):
+    rig = Rig([axis()], tick_ns=tick_ns)
+    rig.write(**mode)
+    rig.run()
+    assert 3.0 - 1e-6 < rig.field("commanded_position") <= 3.0
+    assert rig.trace("commanded_position").max() <= 3.0
+    assert rig.field("status") & S.LIMIT_PLUS
+    assert dropped(rig) == [((0,), errno.ERANGE)]
+    rig.write(**{k: (-v if k != "mode" else v) for k, v in mode.items()})
+    rig.tick(50)
+    assert rig.field("commanded_position") < 3.0 and not rig.field("status") & S.LIMIT_PLUS
+
+
+def test_following_error_is_a_fault_with_zero_force():
+    rig = Rig([axis(following_error_max=0.05)], plant=lambda output, dt: np.zeros(1))
+    rig.write(mode=MODE.POSITION, position=1.0)
+    rig.tick(1000)
+    assert rig.field("status") & S.FAULT and rig.field("status") & S.FOLLOWING_ERROR
+    assert rig.field("force") == 0.0
+    assert "following error" in rig.bank.fault_text(0)
+    assert np.abs(rig.trace("following_error")).max() < 0.05 + 2e-3
+    with pytest.raises(CommandError) as caught:
+        rig.write(mode=MODE.POSITION, position=0.0)
+    assert caught.value.errno == errno.EIO
+    rig.bank.reset([0])
+    rig.tick(5)
+    assert rig.field("force") == 0.0 and not rig.field("status") & S.FAULT
+
+
+def test_stepper_that_loses_steps_is_stalled_and_stops():
+    rig = Rig([axis(kind=AxisKind.STEPPER, k=None, following_error_max=0.01)], plant=lambda output, dt: np.zeros(1))
+    rig.write(mode=MODE.POSITION, position=1.0)
+    rig.tick(1500)
+    assert rig.field("status") & S.STALLED
+    assert rig.bank.is_idle([0])
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+def test_non_finite_measurement_is_a_fault_with_zero_force(value):
+    rig = Rig([axis(), axis()])
+    rig.write(mode=[MODE.POSITION] * 2, axis=[0, 1], position=1.0)
+    rig.tick(200)
+    rig.raw = np.array([value, rig.raw[1]])
+    output = rig.bank.tick(rig.now_ns + TICK_NS, rig.raw)
+    assert output[0] == 0.0 and np.isfinite(output).all() and np.isfinite(rig.bank.fields[:10]).all()
+    assert rig.field("status") & S.FAULT and not rig.field("status", 1) & S.FAULT
+
+
+def test_late_tick_stops_from_where_it_was():
+    rig = Rig([axis()])
+    rig.write(mode=MODE.VELOCITY, velocity=2.0)
+    rig.tick(600)
+    place = rig.field("commanded_position")
+    rig.now_ns += 200 * TICK_NS
+    rig.tick(1)
+    assert rig.field("commanded_position") == pytest.approx(place, abs=1e-2)
+    assert rig.field("status") & S.FAULT
+    rig.run()
+    assert rig.field("commanded_position") == pytest.approx(place + 0.4, abs=1e-6)
+
+
+def test_infeasible_at_planning_stops_with_a_latched_fault():
+    rig = Rig([axis()])
+    rig.write(mode=MODE.VELOCITY | MODE.SPECIFIED_TIME, velocity=1.0, time=0.5)
+    rig.write(mode=[TIMED, MODE.POSITION], position=[-2.0, 0.0], time=0.3)  # begins in a state not known at the write
+    rig.run()
+    assert rig.field("status") & S.FAULT
+    assert "too short" in rig.bank.fault_text(0)
+    assert dropped(rig) == [((0,), errno.ERANGE)]
+    assert rig.field("commanded_position") > 0.0
+
+
+def test_pass_through_reaches_position_with_velocity():
+    rig = Rig([axis()])
+    passing = MODE.POSITION | MODE.VELOCITY
+    rig.write(mode=[passing, passing | MODE.ACCELERATION, MODE.POSITION], position=[0.5, 1.0, 1.5],
+              velocity=[1.0, 0.5, 0.0], acceleration=[0.0, -1.0, 0.0])  # fmt: skip
+    rig.run()
+    p, v = rig.trace("commanded_position"), rig.trace("commanded_velocity")
+    for place, speed in ((0.5, 1.0), (1.0, 0.5)):
+        assert np.interp(place, p, v) == pytest.approx(speed, abs=5e-3)
+    assert rig.field("commanded_position") == pytest.approx(1.5)
+
+
+def test_calibrate_moves_coordinates_not_the_axis():
+    rig = Rig([axis(), axis(kind=AxisKind.STEPPER, k=None)], start=[0.7, 0.7])
+    rig.bank.calibrate([0, 1], [0.1, 0.2])
+    rig.tick(1)
+    assert [rig.field("position", i) for i in (0, 1)] == pytest.approx([0.1, 0.2])
+    assert rig.field("force") == pytest.approx(0.0, abs=1e-12)
+    assert rig.bank.tick(rig.now_ns + TICK_NS, rig.raw)[1] == pytest.approx(0.7)
+    rig.write(mode=MODE.POSITION, position=0.5)
+    with pytest.raises(CommandError) as caught:
+        rig.bank.zero([0])
+    assert caught.value.errno == errno.EBUSY
+    with pytest.raises(CommandError) as caught:
+        rig.bank.calibrate([1], [3.5])
+    assert caught.value.errno == errno.ERANGE
+
+
+def test_limits_can_be_narrowed_and_restored_never_widened():
+    rig = Rig([axis(), axis()])
+    rig.bank.set_limits([0, 1], position_max=[0.5, 0.6], velocity_max=0.25)
+    assert rig.bank.get_limits([0, 1])["position_max"] == [0.5, 0.6]
+    with pytest.raises(CommandError):
+        rig.write(mode=MODE.POSITION, position=0.55)
+    rig.write(mode=MODE.POSITION, position=0.4)
+    rig.run()
+    assert rig.trace("commanded_velocity").max() == pytest.approx(0.25, rel=1e-6)
+    for wrong in (dict(position_max=4.0), dict(velocity_max=-1.0), dict(nothing=1.0), dict(position_max=0.3)):
+        with pytest.raises(CommandError):
+            rig.bank.set_limits([0], **wrong)
+    rig.bank.set_limits([0, 1], position_max=None, velocity_max=None)
+    assert rig.bank.get_limits([0])["position_max"] == [3.0]
+
+
+def test_end_switch_stops_one_way_only():
+    rig = Rig([axis()])
+    rig.switches = lambda raw: np.array([SWITCH_PLUS if raw[0] > 0.5 else 0])
+    rig.write(mode=MODE.VELOCITY, velocity=0.3)
+    rig.run()
+    assert 0.5 < rig.field("commanded_position") < 0.5 + 0.3**2 / 10 + 2e-3
+    assert rig.field("status") & S.SWITCH_PLUS
+    rig.write(mode=MODE.POSITION, position=0.0)
+    rig.run()
+    assert rig.field("commanded_position") == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("start", [0.7, 0.32, 0.05])
+def test_homing_finds_the_same_edge_from_everywhere(start):
+    homing = Homing(velocity=0.5, slow_velocity=0.02, direction=-1, offset=0.1, required=True)
+    rig = Rig([axis(homing=homing, position_min=-0.5)], start=[start])
+
+    def switches(raw):
+        home = SWITCH_HOME if 0.30 < raw[0] < 0.35 else 0
+        return np.array([home | (SWITCH_MINUS if raw[0] < 0.0 else 0)])
+
+    rig.switches = switches
+    with pytest.raises(CommandError, match="home required"):
+        rig.write(mode=MODE.POSITION, position=0.2)
+    rig.bank.home([0], rig.now_ns)
+    rig.tick(2)
+    assert rig.field("status") & S.HOMING and not rig.bank.is_idle([0])
+    rig.run()
+    assert EventKind.HOMED in rig.kinds()
+    assert rig.field("status") & S.HOMED
+    # the edge at which it leaves the switch upwards lies at raw 0.35 and is position 0.1
+    assert rig.raw[0] - rig.field("position") == pytest.approx(0.25, abs=0.02 * 2e-3)
+    rig.write(mode=MODE.POSITION, position=0.2)
+    rig.run()
+    assert rig.raw[0] == pytest.approx(0.45, abs=1e-4)
+
+
+def test_homing_that_finds_nothing_is_a_fault():
+    rig = Rig([axis(homing=Homing(velocity=0.5, slow_velocity=0.02, travel=0.4))])
+    rig.switches = lambda raw: np.zeros(1, dtype=np.int64)
+    rig.bank.home([0], rig.now_ns)
+    rig.tick(1500)
+    assert "no home switch" in rig.bank.fault_text(0)
+    assert not rig.field("status") & (S.HOMED | S.HOMING)
+
+
+def test_force_mode_keeps_position_limits():
+    state = {"v": 0.0}
+
+    def mass(output, dt):
+        state["v"] += output[0] / 2.0 * dt
+        return rig.raw + state["v"] * dt
+
+    rig = Rig([axis(k=400.0, kb=-20.0, position_max=0.3)])
+    rig.plant = mass
+    rig.write(mode=MODE.FORCE, force=2.0)
+    rig.tick(6000)
+    assert dropped(rig) == [((0,), errno.ERANGE)]
+    assert 0.29 < rig.trace("position").max() < 0.3 + 0.01
+    assert not rig.field("status") & S.FORCE_MODE

@@ -1,0 +1,76 @@
+"""The control laws against the formula of section F.2.4, written out term by term."""
+
+import numpy as np
+import pytest
+
+from sioms.motion import AxisKind, AxisSettings
+from sioms.motion.law import ControlLaw
+
+
+def law_of(*settings, tick_s=1e-3):
+    return ControlLaw(settings, tick_s, np.zeros((4, len(settings))))
+
+
+def test_servo_law_is_that_of_the_text_over_a_random_run():
+    k, kz, kp, kb, offset, limit = 30.0, -0.7, 0.2, -4.0, 0.5, 8.0
+    law = law_of(AxisSettings("x", k=k, kz=kz, kp=kp, kb=kb, force_offset=offset, force_max=limit))
+    rng = np.random.default_rng(3)
+    e_last = tau_last = 0.0
+    clipped = 0
+    for _ in range(200):
+        desired, actual, v = rng.normal(0, 0.3, 3)
+        law.step(np.array([desired]), np.zeros(1), np.array([actual]), np.array([v]), 1e-3)
+        e = desired - actual
+        u = k * (e + kz * e_last) - kp * tau_last + kb * v + offset
+        tau = min(max(u, -limit), limit)
+        assert law.output[0] == pytest.approx(tau, abs=1e-12)
+        assert bool(law.saturated[0]) == (u != tau)
+        clipped += u != tau
+        e_last, tau_last = e, tau
+    assert 0 < clipped < 200
+
+
+def test_the_clipped_torque_is_fed_back_not_the_wish():
+    law = law_of(AxisSettings("x", k=100.0, kp=0.5, force_max=1.0))
+    for desired, expected in ((1.0, 1.0), (0.0, -0.5)):  # tau[0] = 1, u[1] = -0.5 * 1
+        law.step(np.array([desired]), np.zeros(1), np.zeros(1), np.zeros(1), 1e-3)
+        assert law.output[0] == expected
+
+
+def test_force_mode_is_force_plus_damping_plus_offset():
+    law = law_of(*[AxisSettings("x", k=100.0, kb=-2.0, force_offset=0.25, force_max=10.0)] * 2)
+    law.step(np.array([3.0, 1.0]), np.zeros(2), np.zeros(2), np.array([0.5, 0.0]), 1e-3, np.array([True, False]))
+    assert law.output.tolist() == [3.0 - 2.0 * 0.5 + 0.25, 10.0]
+
+
+def test_stepper_is_dead_beat_by_default():
+    law = law_of(AxisSettings("x", kind=AxisKind.STEPPER, velocity_max=1.0, acceleration_max=10.0))
+    t = np.arange(1, 300) * 1e-3
+    for position in 0.5 * 9.0 * np.minimum(t, 0.1) ** 2 + 0.9 * np.maximum(t - 0.1, 0):
+        law.step(np.array([position]), np.zeros(1), np.zeros(1), np.zeros(1), 1e-3)
+        assert law.slewed[0] == pytest.approx(position, abs=1e-12)
+
+
+def test_stepper_output_keeps_velocity_and_acceleration_on_a_jump():
+    law = law_of(AxisSettings("x", kind=AxisKind.STEPPER, velocity_max=1.0, acceleration_max=10.0))
+    positions, velocities = [0.0], [0.0]
+    for _ in range(500):
+        law.step(np.array([5.0]), np.zeros(1), np.zeros(1), np.zeros(1), 1e-3)
+        positions.append(float(law.slewed[0]))
+        velocities.append(float(law.output[0]))
+    assert max(np.abs(np.diff(positions))) <= 1e-3 * (1 + 1e-5)
+    assert max(np.abs(np.diff(velocities))) <= 1e-2 * (1 + 1e-5)
+    assert law.saturated[0]
+
+
+def test_servo_and_stepper_do_not_touch_each_other():
+    mixed = law_of(
+        AxisSettings("a", k=20.0, kb=-1.0, force_max=5.0), AxisSettings("b", kind=AxisKind.STEPPER, velocity_max=1.0)
+    )
+    alone = law_of(AxisSettings("a", k=20.0, kb=-1.0, force_max=5.0))
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        p, v = rng.normal(0, 0.1, 2)
+        mixed.step(np.array([p, 0.0]), np.zeros(2), np.zeros(2), np.array([v, 0.0]), 1e-3)
+        alone.step(np.array([p]), np.zeros(1), np.zeros(1), np.array([v]), 1e-3)
+        assert mixed.output[0] == alone.output[0]
