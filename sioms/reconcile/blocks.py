@@ -22,7 +22,7 @@ def block_ids(problem: Problem, sample_time_s: float, block_s: float = BLOCK_S) 
     """Number the blocks of all records as ``Problem.residual`` lays them out."""
     size, out, first = max(int(block_s / sample_time_s), 1), [], 0
     for r in problem.session.records:
-        n = len(r) - problem.skip
+        n = len(range(len(r))[problem.span(r)])
         count = max(n // size, 1)
         ids = np.minimum(np.arange(n) // size, count - 1)
         out.append(ids + first)

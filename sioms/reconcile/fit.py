@@ -16,7 +16,7 @@ from sioms.reconcile.effect import Array, Parameter
 from sioms.reconcile.effects import known
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import Noise
-from sioms.reconcile.records import Session
+from sioms.reconcile.records import Record, Session
 from sioms.reconcile.simulate import Run, pack, track
 
 BASE = "base"
@@ -37,11 +37,22 @@ class Free:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Records to fit and the observer to fit them with."""
+    """Records to fit and the observer to fit them with.
+
+    Attributes:
+        begin, end: share of each record that counts; the rest is simulated but not looked at.
+    """
 
     session: Session
     noise: Noise
     skip: int = 50
+    begin: float = 0.0
+    end: float = 1.0
+
+    def span(self, record: Record) -> slice:
+        """Samples of a record that count: from ``begin`` to ``end`` of it, never the first ``skip``."""
+        n = len(record)
+        return slice(max(self.skip, int(self.begin * n)), int(self.end * n))
 
     def runs(self, model: AxisModel) -> list[Run]:
         """Track every record; the heat state carries over."""
@@ -55,13 +66,12 @@ class Problem:
 
     def residual(self, model: AxisModel) -> Array:
         """Innovations over their expected standard deviation, all records in a row, without the starts."""
-        parts = [r.innovation[self.skip :] for r in self.runs(model)]
-        e: Array = np.concatenate(parts) / self.noise.innovation
+        e = self.join([r.innovation for r in self.runs(model)]) / self.noise.innovation
         return np.clip(np.nan_to_num(e, nan=1e6, posinf=1e6, neginf=-1e6), -1e6, 1e6)
 
     def join(self, parts: Sequence[Array]) -> Array:
         """Lay per-record arrays out as ``residual`` does."""
-        return np.concatenate([p[self.skip :] for p in parts])
+        return np.concatenate([p[self.span(r)] for p, r in zip(parts, self.session.records, strict=True)])
 
 
 @dataclass(frozen=True, slots=True)

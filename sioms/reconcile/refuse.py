@@ -75,8 +75,7 @@ def smoother_share(problem: Problem, fit: Fit, folds: int = 5) -> float:
     """Share of the residual's energy that the generic smoother explains on blocks it has not seen."""
     motions = instrument_motion(problem, fit.model)
     columns = basis(motions, fit.model, dead_band(problem, fit.model))
-    parts = [response(fit.model, problem.noise, c)[problem.skip :] for c in columns]
-    f = np.concatenate(parts) / problem.noise.innovation
+    f = problem.join([response(fit.model, problem.noise, c) for c in columns]) / problem.noise.innovation
     size = np.sqrt(np.mean(f**2, axis=0))
     f = f[:, size > 1e-12] / size[size > 1e-12]
     ids = block_ids(problem, fit.model.sample_time_s)

@@ -200,8 +200,7 @@ def _orthonormal(j: Array) -> Array:
 
 def _filtered(problem: Problem, model: AxisModel, columns: list[Array]) -> Array:
     """Pass force columns of every record into the domain of the residual, shape (n, k)."""
-    parts = [response(model, problem.noise, c)[problem.skip :] for c in columns]
-    e: Array = np.concatenate(parts) / problem.noise.innovation
+    e: Array = problem.join([response(model, problem.noise, c) for c in columns]) / problem.noise.innovation
     return e
 
 

@@ -1,0 +1,321 @@
+"""The workflow for a motor axis: locate, name, add, show, refuse.
+
+``analyse`` takes records and a nominal model and returns a ``Verdict``. It is deterministic by ``seed`` and
+reads and writes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sioms.reconcile.ambiguity import Rival, rivals
+from sioms.reconcile.blocks import better, block_ids, bootstrap
+from sioms.reconcile.channels import Finding, drive, index_fit, index_scale, lattice
+from sioms.reconcile.checks import check, check_scale
+from sioms.reconcile.effect import Array
+from sioms.reconcile.effects import known, library
+from sioms.reconcile.effects.terms import TERM_PREFIX, TERMS
+from sioms.reconcile.excitation import Gate, gate
+from sioms.reconcile.experiment import Experiment, separate
+from sioms.reconcile.fit import BASE, Fit, Problem, refit
+from sioms.reconcile.locate import Place, Spectrum, force_residual, locate, spectra
+from sioms.reconcile.model import AxisModel
+from sioms.reconcile.noise import Noise, drive_noise, effective_samples, observer, sensor_noise
+from sioms.reconcile.records import Session
+from sioms.reconcile.refuse import bursts, smoother_share
+from sioms.reconcile.search import FLOOR, GAIN, Found, Searcher, Step
+from sioms.reconcile.simulate import simulate
+from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome, Trace, Verdict
+
+#: Share at the end of every record that takes no part in any choice.
+UNTOUCHED = 0.2
+#: A generic smoother explaining this share more than the named model: something is missing.
+UNEXPLAINED = 0.2
+#: Loudest tenth of the time holds this share of the residual's energy: bursts.
+BURSTS = 0.8
+#: Below this multiple of the expected innovation nothing is called unexplained or a burst.
+QUIET = 1.6
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """Settings of one analysis.
+
+    Attributes:
+        seed: of permutations and bootstrap.
+        replicates: bootstrap replicates.
+        pictures: keep curves and localisation for the report.
+    """
+
+    seed: int = 1
+    replicates: int = 200
+    pictures: bool = True
+    progress: Callable[[str], None] = field(default=lambda text: None)
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """State after channels and gate, before any mechanics."""
+
+    model: AxisModel
+    problem: Problem
+    final: Problem
+    findings: tuple[Finding, ...]
+    names: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def analyse(session: Session, nominal: AxisModel, options: Options | None = None) -> Verdict:
+    """Find what the nominal model lacks.
+
+    Args:
+        session: recordings of one axis, in order.
+        nominal: the model to be corrected; effects already in it may be re-estimated and may leave.
+
+    Returns:
+        The verdict with its evidence.
+
+    Raises:
+        BadInputError: the data cannot be used.
+    """
+    o = options or Options()
+    ready = prepare(session, nominal, o)
+    o.progress("excitation: what can these records show")
+    excited = gate(ready.problem, ready.model, ready.names)
+    names = tuple(n for n in ready.names if n not in excited.missing)
+    searcher = Searcher(ready.problem, tuple(f.effect for f in ready.findings), names, progress=o.progress)
+    found = searcher.run(ready.model)
+    share = smoother_share(ready.problem, found.fit)
+    burst, _ = bursts(ready.problem, found.fit)
+    rejected: tuple[str, ...] = ()
+    odd = found.fit.ratio > QUIET and share > UNEXPLAINED
+    if odd:
+        o.progress(f"a smoother explains {100 * share:.0f} % of what remains: searching for a term")
+        before = found
+        searcher.names = names + tuple(t.name for t in TERMS if ready.model.applicable(t))
+        found = searcher.run(ready.model)
+        rejected = tuple(n for n in before.fit.model.effects if n not in found.fit.model.effects)
+        share = smoother_share(ready.problem, found.fit)
+        searcher.names = names
+    o.progress("identifiability: look-alikes in the place of each effect")
+    others = rivals(searcher, found)
+    return _conclude(ready, nominal, o, excited, found, searcher, others, odd, share, burst, rejected)
+
+
+def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
+    """Check the input, read the noise floor and go through the channels."""
+    notes = list(check(session, nominal))
+    o.progress("channels: sensor, then drive")
+    findings: list[Finding] = []
+    model = nominal
+    coarse = lattice(session, nominal)
+    scale = index_scale(session, nominal)
+    findings += [f for f in (coarse, scale) if f is not None]
+    driven = drive(session, nominal)
+    findings += driven
+    for f in findings:
+        model = model.with_effect(f.effect, dict(f.values))
+    factor = coarse.values["factor"] if coarse is not None else 1.0
+    late = next((f.values["delay"] for f in driven if f.effect == "delay"), 0.0)
+    noise = observer(nominal, sensor_noise(session, nominal.resolution * factor),
+                     drive_noise(session, nominal.rated_force, round(late / nominal.sample_time_s)))
+    problem = Problem(session, noise, end=1.0 - UNTOUCHED)
+    check_scale(problem, nominal)
+    problem = _calibrated(problem, session, model)
+    excluded = {"encoder_quantisation"}
+    if index_fit(session, nominal) is not None:
+        excluded.add("encoder_scale")
+    if any(r.force_measured is not None for r in session.records):
+        excluded |= {"delay", "lag", "saturation"}
+    names = tuple(n for n, e in library().items() if e.rankable and nominal.applicable(e) and n not in excluded)
+    final = replace(problem, begin=1.0 - UNTOUCHED, end=1.0)
+    return Prepared(model, problem, final, tuple(findings), names, tuple(notes))
+
+
+def _calibrated(problem: Problem, session: Session, model: AxisModel) -> Problem:
+    """Where no force was measured, raise the drive noise until the quiet half of the data fits it."""
+    if any(r.force_measured is not None for r in session.records):
+        return problem
+    fit = refit(problem, model, iterations=3)
+    ids = block_ids(problem, model.sample_time_s, 0.1)
+    energy = np.bincount(ids, weights=fit.residual**2) / np.bincount(ids)
+    quiet = float(np.sqrt(np.quantile(energy, 0.25)))
+    drive = problem.noise.drive * max(quiet, 1.0)
+    return replace(problem, noise=observer(model, problem.noise.sensor, drive))
+
+
+def _conclude(ready: Prepared, nominal: AxisModel, o: Options, excited: Gate, found: Found, searcher: Searcher,
+              others: Sequence[Rival], odd: bool, share: float, burst: float, rejected: tuple[str, ...]) -> Verdict:
+    rng = np.random.default_rng(o.seed)
+    o.progress("untouched samples: gap before and after")
+    gaps = _gaps(ready, nominal, found.fit.model)
+    whole = replace(ready.problem, end=1.0)
+    fit = refit(whole, found.fit.model, searcher.frozen, 12)
+    if fit.cost > float(np.sum(whole.residual(found.fit.model) ** 2)):
+        fit = replace(fit, model=found.fit.model)
+    intervals = _intervals(whole, fit, o.replicates, rng)
+    named, terms = _describe(ready, fit, found, searcher, others, intervals, rng)
+    open_rivals = [r for r in others if r.open]
+    disturbance = found.fit.ratio > QUIET and burst > BURSTS and share < UNEXPLAINED and not any(
+        n == "backlash" for n in found.fit.model.effects)
+    outcome = _outcome(bool(named), bool(terms) or disturbance or (found.fit.ratio > QUIET and share > UNEXPLAINED),
+                       bool(open_rivals))
+    alternatives = tuple(_set(r, fit.model) for r in open_rivals) if outcome is Outcome.AMBIGUOUS else ()
+    plan = _plan(ready, nominal, fit.model, open_rivals) if outcome is Outcome.AMBIGUOUS else None
+    notes = list(ready.notes)
+    if disturbance:
+        notes.append(f"the residual comes in bursts ({100 * burst:.0f} % of its energy in a tenth of the time) that no state "
+                     "of the axis orders: a disturbance from outside, not an effect")
+    places: tuple[Place, ...] = ()
+    spectrum: tuple[Spectrum, Spectrum] | None = None
+    traces: tuple[Trace, ...] = ()
+    if o.pictures:
+        o.progress("locating the disagreement")
+        places = tuple(locate(whole, nominal, rng))
+        spectrum = spectra(whole, nominal)
+        traces = _traces(whole, nominal, fit.model)
+    return Verdict(outcome, nominal, _without_terms(fit.model), tuple(named), alternatives, tuple(terms), gaps,
+                   found.ladder, ready.findings, excited, places, spectrum, plan, found.fit.ratio, share, burst,
+                   effective_samples(found.fit.residual), len(found.fit.residual), tuple(notes), traces, rejected)
+
+
+def _outcome(named: bool, unexplained: bool, ambiguous: bool) -> Outcome:
+    if unexplained:
+        return Outcome.UNEXPLAINED
+    if ambiguous:
+        return Outcome.AMBIGUOUS
+    return Outcome.NAMED if named else Outcome.NONE
+
+
+def _without_terms(model: AxisModel) -> AxisModel:
+    """Keep nameless terms in the model file too: they are switchable like every effect."""
+    return model
+
+
+def _set(r: Rival, model: AxisModel) -> tuple[str, ...]:
+    return tuple(r.rival if n == r.effect else n for n in model.effects)
+
+
+def _gaps(ready: Prepared, nominal: AxisModel, model: AxisModel) -> tuple[Gap, ...]:
+    """Compare on the untouched ends of the records, by tracking and, where it can be, in closed loop."""
+    p = ready.final
+    unit = nominal.force_unit
+    k = p.noise.drive  # one expected innovation answers to one drive noise
+    before, after = (float(np.sqrt(np.mean(p.residual(m) ** 2))) for m in (nominal, model))
+    out = [Gap("force, short windows", unit, before * k, after * k, k)]
+    if nominal.controller is None or any(r.command is None for r in p.session.records):
+        return tuple(out)
+    force: dict[str, list[Array]] = {"before": [], "after": []}
+    position: dict[str, list[Array]] = {"before": [], "after": []}
+    for label, m in (("before", nominal), ("after", model)):
+        temperature = 0.0
+        for r in p.session.records:
+            run = simulate(m, r.command if r.command is not None else r.position, temperature)
+            temperature = run.end_temperature if p.session.continuous else 0.0
+            force[label].append(run.force - r.force)
+            position[label].append(run.position - r.position)
+    rms = {c: {label: float(np.sqrt(np.mean(np.nan_to_num(p.join(v), nan=1e9) ** 2))) for label, v in d.items()}
+           for c, d in (("force", force), ("position", position))}
+    out.append(Gap("force, closed loop", unit, rms["force"]["before"], rms["force"]["after"], k))
+    out.append(Gap("position, closed loop", nominal.position_unit, rms["position"]["before"],
+                   rms["position"]["after"], p.noise.sensor))
+    return tuple(out)
+
+
+def _intervals(problem: Problem, fit: Fit, replicates: int, rng: np.random.Generator) -> dict[tuple[str, str], tuple[float, float]]:
+    """95 % intervals per (effect, symbol), by block bootstrap."""
+    ids = block_ids(problem, fit.model.sample_time_s)
+    moves = bootstrap(fit, ids, replicates, rng) * np.array([f.scale for f in fit.free])[None, :]
+    spread = 1.96 * np.std(moves, axis=0) if len(fit.free) else np.zeros(0)
+    out = {}
+    for f, s in zip(fit.free, spread, strict=True):
+        value = getattr(fit.model, f.symbol) if f.effect == BASE else fit.model.effects[f.effect][f.symbol]
+        out[f.effect, f.symbol] = (value - float(s), value + float(s))
+    return out
+
+
+def _describe(ready: Prepared, fit: Fit, found: Found, searcher: Searcher, others: Sequence[Rival],
+              intervals: dict[tuple[str, str], tuple[float, float]],
+              rng: np.random.Generator) -> tuple[list[NamedEffect], list[NamedEffect]]:
+    """Describe every effect of the model, the largest first; terms apart."""
+    named: list[NamedEffect] = []
+    for name in fit.model.effects:
+        saved, errors, frequency = _worth(found, searcher, name, rng)
+        effect = known()[name]
+        finding = next((f for f in ready.findings if f.effect == name), None)
+        spans = dict(intervals)
+        if finding is not None:
+            spans.update({(name, s): (finding.values[s] - 1.96 * e, finding.values[s] + 1.96 * e)
+                          for s, e in finding.errors.items()})
+        estimates = tuple(Estimate(p.symbol, fit.model.effects[name][p.symbol],
+                                   *spans.get((name, p.symbol), (fit.model.effects[name][p.symbol],) * 2),
+                                   fit.model.unit(p), p.text) for p in effect.parameters)
+        evidence = [finding.evidence] if finding is not None else []
+        evidence.append(f"without it {100 * saved:.1f} % of the residual energy would come back ({errors:.1f} standard errors)")
+        ruled = {r.rival: f"reproduces all but {100 * r.missed:.1f} % of it, {r.errors:.1f} standard errors worse"
+                 for r in others if r.effect == name and not r.open}
+        ruled.update({rival: f"saved {100 * gain:.0f} % where this saved {100 * s.saved:.0f} %" for s in found.ladder
+                      if s.effect == name for rival, gain in s.rivals.items()
+                      if rival in effect.lookalikes and rival not in ruled and rival not in fit.model.effects})
+        still = {r.rival: f"leaves only {100 * r.missed:.1f} % of it unexplained" for r in others if r.effect == name and r.open}
+        ruled = {k: v for k, v in ruled.items() if k not in still}
+        named.append(NamedEffect(name, effect.title, effect.equation, effect.channel.value, estimates, saved, errors,
+                                 frequency, tuple(evidence), ruled, still))
+    named.sort(key=lambda e: -e.saved)
+    return ([e for e in named if not e.name.startswith(TERM_PREFIX)],
+            [e for e in named if e.name.startswith(TERM_PREFIX)])
+
+
+def _worth(found: Found, searcher: Searcher, name: str, rng: np.random.Generator) -> tuple[float, float, float]:
+    """How much an effect saves beyond the others, in how many standard errors and bootstrap replicates."""
+    bare = refit(searcher.problem, found.fit.model.without_effect(name), searcher.frozen, 4)
+    loss = searcher.loss(bare)
+    saved, errors = better(found.losses, loss)
+    d, n = loss - found.losses, len(loss)
+    draws = rng.integers(0, n, (200, n))
+    frequency = float(np.mean(d[draws].sum(1) > GAIN * loss[draws].sum(1)))
+    return saved, errors, frequency
+
+
+def _plan(ready: Prepared, nominal: AxisModel, model: AxisModel, open_rivals: Sequence[Rival]) -> Experiment | None:
+    """Choose the experiment that separates the model from its open rivals."""
+    r = ready.problem.session.records
+    travel = max(float(np.max(np.abs(q.position - q.position[0]))) for q in r)
+    travel = max(travel, 1.1 * nominal.pitch) if nominal.rotary else travel
+    models = [model, *(q.fit.model for q in open_rivals)]
+    return separate(models, travel, ready.problem.noise.drive)
+
+
+def _traces(problem: Problem, nominal: AxisModel, model: AxisModel) -> tuple[Trace, ...]:
+    """Keep curves for the pictures: force residual and, in closed loop, the force a user sees."""
+    _, before = force_residual(problem, nominal)
+    base = nominal.inertia / problem.noise.innovation  # noqa: F841 - kept for clarity of units below
+    out, temperature = [], {"n": 0.0, "m": 0.0}
+    after = _remaining(problem, model, before)
+    for i, r in enumerate(problem.session.records):
+        if nominal.controller is not None and r.command is not None:
+            n = simulate(nominal, r.command, temperature["n"])
+            m = simulate(model, r.command, temperature["m"])
+            temperature = {"n": n.end_temperature, "m": m.end_temperature}
+            fb, fa = n.force, m.force
+        else:
+            fb, fa = r.force + before[i], r.force + after[i]
+        t = np.arange(len(r)) * nominal.sample_time_s
+        out.append(Trace(r.name, t, r.force, fb, fa, before[i], after[i]))
+    return tuple(out)
+
+
+def _remaining(problem: Problem, model: AxisModel, like: Sequence[Array]) -> list[Array]:
+    """Force residual that the corrected model leaves, from its innovations through a low-pass observer."""
+    out = []
+    gain = problem.noise.gain[1] / model.sample_time_s
+    for run, b in zip(problem.runs(model), like, strict=True):
+        smooth = np.convolve(run.innovation, np.full(20, 1.0 / 20.0), mode="same")
+        out.append(np.clip(model.inertia * gain * smooth, -10 * np.ptp(b) - 1e-30, 10 * np.ptp(b) + 1e-30))
+    return out
+
+
+__all__ = ["FLOOR", "Noise", "Options", "Step", "analyse", "prepare"]

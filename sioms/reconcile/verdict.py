@@ -1,0 +1,131 @@
+"""What the workflow says, as data: the report, the JSON and the terminal summary are made from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+from sioms.reconcile.channels import Finding
+from sioms.reconcile.effect import Array
+from sioms.reconcile.excitation import Gate
+from sioms.reconcile.experiment import Experiment
+from sioms.reconcile.locate import Place, Spectrum
+from sioms.reconcile.model import AxisModel
+from sioms.reconcile.search import Step
+
+
+class Outcome(Enum):
+    """The verdict; the value is what verdict.json says."""
+
+    NONE = "none"
+    NAMED = "named"
+    UNEXPLAINED = "unexplained"
+    AMBIGUOUS = "ambiguous"
+
+
+#: Exit status per verdict.
+EXIT = {Outcome.NONE: 0, Outcome.NAMED: 0, Outcome.UNEXPLAINED: 3, Outcome.AMBIGUOUS: 4}
+EXIT_BAD_INPUT = 2
+
+
+class BadInputError(ValueError):
+    """The data or the model cannot be used; the message says what is wrong and what would be right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """One parameter with its 95 % interval (block bootstrap)."""
+
+    symbol: str
+    value: float
+    low: float
+    high: float
+    unit: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class NamedEffect:
+    """One effect of the verdict.
+
+    Attributes:
+        saved: share of the remaining residual energy that it explains, beyond all the others.
+        errors: standard errors of that, over blocks.
+        frequency: share of block bootstrap replicates in which it earns its place.
+        evidence: sentences; ruled_out, open: look-alikes with the reason.
+    """
+
+    name: str
+    title: str
+    equation: str
+    channel: str
+    parameters: tuple[Estimate, ...]
+    saved: float
+    errors: float
+    frequency: float
+    evidence: tuple[str, ...]
+    ruled_out: dict[str, str] = field(default_factory=dict)
+    open: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Disagreement on samples that took no part in any choice, before and after.
+
+    Attributes:
+        before, after, floor: root mean square, in ``unit``; frozen model parameters.
+        session: after re-estimating session parameters on the first part, or None where there are none.
+    """
+
+    channel: str
+    unit: str
+    before: float
+    after: float
+    floor: float
+    session: float | None = None
+
+    @property
+    def closed(self) -> float:
+        """Share of the gap above the floor that the model closes."""
+        gap = self.before - self.floor
+        return (self.before - self.after) / gap if gap > 0.0 else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """Curves of one record for the pictures: measured, and simulated before and after."""
+
+    name: str
+    time_s: Array
+    measured: Array
+    before: Array
+    after: Array
+    residual_before: Array
+    residual_after: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Everything the workflow found out about one axis."""
+
+    outcome: Outcome
+    nominal: AxisModel
+    model: AxisModel
+    effects: tuple[NamedEffect, ...]
+    alternatives: tuple[tuple[str, ...], ...]
+    symbolic: tuple[NamedEffect, ...]
+    gaps: tuple[Gap, ...]
+    ladder: tuple[Step, ...]
+    findings: tuple[Finding, ...]
+    gate: Gate
+    places: tuple[Place, ...]
+    spectra: tuple[Spectrum, Spectrum] | None
+    experiment: Experiment | None
+    ratio: float
+    smoother_share: float
+    burst_share: float
+    effective_samples: float
+    samples: int
+    notes: tuple[str, ...]
+    traces: tuple[Trace, ...]
+    rejected: tuple[str, ...] = ()
