@@ -414,7 +414,7 @@ class Clients:
 
     def _list(self, session: Session) -> list[object]:
         names = self._server.names
-        listed = []
+        listed: list[object] = []
         for node in names.nodes.values():
             if self.rights.on_node(session.peer, node.name) & Right.READ:
                 holder = self._claims.holder(node)

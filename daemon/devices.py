@@ -228,6 +228,8 @@ class DriverProcess:
             fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _SEALS)
         self._readers = [PageReader(m) for m in self._maps]
         self.page_fds = fds
+        if self.state is State.ENDING:
+            return  # it was told to end before it was ready, and will
         self.state = State.UP
         self.reason = ""
         self._log("info", "device up", device=self.name, pid=self.pid, generation=self.generation)

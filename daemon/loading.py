@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from .config import Config, parse
@@ -73,10 +74,10 @@ class Loader:
         for name, device in config.devices.items():
             self._nursery.describe(
                 name, device.common.driver, device.settings, config.folder,
-                lambda value, errno_, text, _fds, n=name: self._described(n, value, errno_, text),
+                partial(self._described, name),
             )  # fmt: skip
 
-    def _described(self, name: str, value: Any, errno_: int, text: str) -> None:
+    def _described(self, name: str, value: Any, errno_: int, text: str, _fds: list[int]) -> None:
         if name not in self._waiting:
             return
         self._waiting.discard(name)

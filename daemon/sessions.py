@@ -7,6 +7,7 @@ import os
 import pwd
 import socket
 import struct
+import sys
 from dataclasses import dataclass, field
 
 from sioms.protocol.flags import Access
@@ -102,7 +103,7 @@ def peer_of(sock: socket.socket) -> Peer:
 def pidfd_of(sock: socket.socket, pid: int) -> int:
     """Return a descriptor of the peer's process; -1 when there is none to be had."""
     try:
-        return struct.unpack("i", sock.getsockopt(socket.SOL_SOCKET, _SO_PEERPIDFD, 4))[0]
+        return int.from_bytes(sock.getsockopt(socket.SOL_SOCKET, _SO_PEERPIDFD, 4), sys.byteorder)
     except OSError:
         pass
     try:

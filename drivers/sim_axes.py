@@ -54,6 +54,7 @@ AxisTable: Any = table_type(
     AxisSettings,
     without=("kind", "modes"),
     extra={
+        "description": (str, ""),
         "bandwidth_hz": (float, 30.0),
         "motor": (table_type(Motor) | None, None),
         "stepper": (table_type(Stepper) | None, None),
@@ -242,7 +243,9 @@ def _axis_channel(axis: Any) -> ChannelInfo:
     if axis.stepper is None:
         limits["force"] = axis.force_max
         modes = ALL_MODES
-    return ChannelInfo(axis.name, axis.unit, axis.position_min, axis.position_max, 0, int(modes), limits)
+    return ChannelInfo(
+        axis.name, axis.unit, axis.position_min, axis.position_max, 0, int(modes), limits, axis.description
+    )  # fmt: skip
 
 
 def _plant_channels(axes: Sequence[Any]) -> list[ChannelInfo]:

@@ -16,7 +16,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
         '; did you mean mod0?'
     """
     known = list(known)
-    close = get_close_matches(word, known, 1, 0.6)
+    close = get_close_matches(word, known, 1, 0.7)
     if close:
         return f"; did you mean {close[0]}?"
     return f"; there are: {', '.join(known)}" if 0 < len(known) <= 12 else ""

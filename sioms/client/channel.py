@@ -27,6 +27,10 @@ from time import monotonic
 
 from sioms.protocol.messages import MAX_PACKET, MalformedMessage, decode, encode
 
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any
+
 _CMSG_CLOEXEC = 0x40000000
 _ANCILLARY = CMSG_SPACE(8 * 4)
 _FOREVER = pack("ll", 0, 0)
@@ -59,7 +63,7 @@ class Answer:
 
     __slots__ = ("fds", "value")
 
-    def __init__(self, value: object, fds: list[int]) -> None:
+    def __init__(self, value: Any, fds: list[int]) -> None:
         self.value = value
         self.fds = fds
 
@@ -166,7 +170,7 @@ class Channel:
                         turn.acquire()
                         self._waiting[number] = turn
             if found is not None:
-                return self._result(found)
+                return self.result(found)
             if not lead:
                 left = -1 if deadline is None else max(0.0, deadline - monotonic())
                 turn.acquire(True, left)
@@ -185,7 +189,7 @@ class Channel:
                         self._waiting.pop(next(iter(self._waiting))).release()  # type: ignore[attr-defined]
             if found is None:
                 raise self._late(call)
-            return self._result(found)
+            return self.result(found)
 
     def take(self) -> tuple[list, list[int]] | None:  # type: ignore[type-arg]
         """Read one packet without waiting, for event loops; None when there is none.
@@ -204,7 +208,7 @@ class Channel:
             if self._ended is None:
                 self._ended = (errno.EBADF, f"{self.name} is closed")
             if self._sock.fileno() >= 0:
-                try:
+                try:  # noqa: SIM105  # contextlib costs a shell tool a millisecond
                     self._sock.shutdown(SHUT_RDWR)
                 except OSError:
                     pass  # the other side was gone already
@@ -266,7 +270,8 @@ class Channel:
             seconds = int(coarse)
             self._sock.setsockopt(SOL_SOCKET, SO_RCVTIMEO, pack("ll", seconds, int((coarse - seconds) * 1e6)))
 
-    def _result(self, found: tuple[list, list[int]]) -> Answer:  # type: ignore[type-arg]
+    def result(self, found: tuple[list, list[int]]) -> Answer:  # type: ignore[type-arg]
+        """Turn a packet into an answer, or raise its refusal."""
         message, fds = found
         if message[2]:
             for fd in fds:

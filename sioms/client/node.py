@@ -25,9 +25,9 @@ from .snapshot import SNAPSHOT, AnalogSnapshot, AxisSnapshot, BinarySnapshot, La
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
-    from typing import Any, Self
+    from typing import Any, Self, TypeAlias
 
-    Records = bytes | bytearray | memoryview | Iterable[bytes]
+    Records: TypeAlias = bytes | bytearray | memoryview | Iterable[bytes]
 
 _KEEPALIVE = encode(HandleVerb.KEEPALIVE, 0)
 SYNCH_LEAD_S = 0.01
@@ -131,8 +131,8 @@ class NodeCore:
 
     def room(self) -> int:
         """Return how many commands the fullest of the node's command buffers still takes."""
-        buffered = self.read().buffered
-        return self.info.buffer_capacity - int(max(buffered))
+        fullest: int = max(self.read().buffered)
+        return self.info.buffer_capacity - fullest
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name}{' closed' if self.closed else ''}>"
@@ -267,7 +267,8 @@ class Node(NodeCore):
         """
         call = self._write(records, timeout, replace)
         try:
-            return int(self._channel.call(call).value)  # type: ignore[call-overload]
+            tick: int = self._channel.call(call).value
+            return tick
         finally:
             for fd in call.fds:
                 os.close(fd)

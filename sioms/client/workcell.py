@@ -110,7 +110,7 @@ class Workcell:
         self._channel = Channel(connect(path or socket_path()), "the daemon")
         title = os.path.basename(sys.argv[0]) if name is None and sys.argv and sys.argv[0] else name or ""
         answer = self._channel.call(Call("hello", ClientVerb.HELLO, PROTOCOL_VERSION, title))
-        _, self.name, self.rights = answer.value  # type: ignore[misc]
+        _, self.name, self.rights = answer.value
         self._request: StopRequest | None = None
         if answer.fds:
             self._request = StopRequest(memoryview(mmap(answer.fds[0], REQUEST_SIZE)))

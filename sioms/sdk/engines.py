@@ -15,7 +15,7 @@ from .connection import Connection
 from .driver import LineDriver, LineUnit, Refusal, StreamDriver, TickDriver
 from .exchange import DeviceError, LinkError
 from .handles import Handle
-from .line import Counters, Line, Priority
+from .line import Counters, Done, Line, Priority
 from .requests import LATER
 
 if TYPE_CHECKING:
@@ -410,12 +410,8 @@ class LineEngine(_Connected):
             return
         for state in self._units:
             if state.is_up:
-                self.guarded(
-                    lambda state=state: line.submit(  # type: ignore[misc]
-                        state.unit.close(), Priority.ACT, lambda v, e: None, now_ns
-                    ),
-                    now_ns,
-                )
+                done: Done = lambda _value, _error: None  # noqa: E731
+                self.guarded(partial(line.submit, state.unit.close(), Priority.ACT, done, now_ns), now_ns)
 
 
 class StreamEngine(_Connected):

@@ -16,11 +16,12 @@ from typing import Any
 import msgspec
 
 from .codec import modbus_pdu as pdus
-from .codec.modbus import Unit
+from .codec.modbus import RtuUnit, SerialLine, TcpUnit, Unit
 from .codec.modbus_pdu import MAX_READ_BITS, MAX_READ_REGISTERS, Pdu
 from .exchange import DeviceError, Exchange, Pause, Steps
 from .registers import RANGES, UNITS, Gearing, rounded, to_raw, to_words, width
 from .regmap import Command, Identify, Item, RegisterMap, Signal, Write
+from .settings import LineSettings
 
 Values = dict[str, Any]
 """Signal name to value: float in SI, text, a list of floats for an array, an integer for bits."""
@@ -192,6 +193,19 @@ class MappedUnit:
             f"{source} {si:g} is {raw:g} {item.unit} in the register, which takes {low} to {high}; "
             f"{bounds[0]:.6g} to {bounds[1]:.6g} is right"
         )
+
+
+def unit_on(line: LineSettings, address: int, turnaround_s: float) -> Unit:
+    """Return the unit with this address behind a serial line or a TCP connection.
+
+    Raises:
+        ValueError: the line carries no Modbus, or the address is impossible on it.
+    """
+    if line.serial is not None:
+        return RtuUnit(address, SerialLine(line.baud, line.bits_per_character), turnaround_s)
+    if line.tcp is not None:
+        return TcpUnit(address, turnaround_s)
+    raise ValueError("line = udp: Modbus runs on serial and tcp")
 
 
 def _order(item: tuple[Signal, str]) -> tuple[str, int]:

@@ -24,7 +24,8 @@ def main(fd: int) -> None:
     """Serve the daemon until it closes the socket."""
     sock = socket.socket(fileno=fd)
     os.set_inheritable(fd, False)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the daemon decides what Ctrl-C means
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # what these mean is for the daemon to decide
+        signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel reaps; the daemon watches by pidfd
     while True:
         packet, fds, _, _ = socket.recv_fds(sock, 1 << 20, 8)

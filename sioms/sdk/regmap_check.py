@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import difflib
 import types
 import typing
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+
+from sioms.wording import did_you_mean
 
 from .codec.modbus_pdu import MAX_READ_BITS, MAX_READ_REGISTERS, MAX_WRITE_REGISTERS
 from .registers import RANGES, UNITS, to_words, width
@@ -34,12 +35,6 @@ SOURCES = {
     "position": "{u}", "velocity": "{u}/s", "speed": "{u}/s", "acceleration": "{u}/s^2", "deceleration": "{u}/s^2",
     "force": "N", "timeout": "s",
 }  # fmt: skip
-
-
-def did_you_mean(name: str, known: Collection[str]) -> str:
-    """Return ``; did you mean X`` or, without a near name, the list of what is known."""
-    near = difflib.get_close_matches(name, known, 1)
-    return f"; did you mean {near[0]}" if near else f"; one of {', '.join(sorted(known))} is right"
 
 
 def schema_problems(value: Any, expected: Any, place: str = "") -> list[str]:

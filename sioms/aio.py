@@ -1,0 +1,269 @@
+"""The asyncio face of the client library.
+
+    async with await sioms.aio.connect() as cell:
+        async with await cell.open("mod0", "rw") as mod0:
+            await mod0.write(sioms.command(0, position=0.1))
+            await mod0.wait_until_idle()
+
+Requests are the same values that the blocking face sends (``sioms.client.node``); only the waiting
+differs. Reading needs no waiting: ``read`` is an ordinary call.
+
+Concurrency: one event loop, any number of its tasks. Cancelling a task cancels its request.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+from collections.abc import AsyncIterator
+from typing import TYPE_CHECKING, Any, Self
+
+from sioms.protocol.flags import PROTOCOL_VERSION, Request
+from sioms.protocol.messages import ClientVerb, HandleVerb
+from sioms.protocol.nodeinfo import NodeInfo
+from sioms.protocol.socketpath import socket_path
+
+from .client.channel import Answer, Call, Channel
+from .client.channel import connect as connect_socket
+from .client.command import command
+from .client.node import Event, NodeCore
+from .client.workcell import node_parts, open_call
+
+if TYPE_CHECKING:
+    from .client.node import Records
+
+
+class _Requests:
+    """Requests in flight on a channel, answered by the event loop."""
+
+    def __init__(self, channel: Channel, cancel_verb: int) -> None:
+        self._channel = channel
+        self._cancel_verb = cancel_verb
+        self._futures: dict[int, asyncio.Future[Answer]] = {}
+        self._abandoned: dict[int, Call] = {}
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(channel.fileno(), self._readable)
+
+    async def call(self, call: Call) -> Answer:
+        """Send a request and wait for its answer; a cancelled task cancels the request."""
+        number = self._channel.send(call)
+        future: asyncio.Future[Answer] = self._loop.create_future()
+        self._futures[number] = future
+        try:
+            return await future
+        except asyncio.CancelledError:
+            if self._futures.pop(number, None) is not None:
+                self._abandoned[number] = call
+                self._channel.send(Call("cancel", self._cancel_verb, number))
+            raise
+
+    def close(self) -> None:
+        """Stop reading; requests in flight end with EBADF."""
+        if not self._channel.closed:
+            self._loop.remove_reader(self._channel.fileno())
+            self._channel.close()
+        self._fail(OSError(errno.EBADF, f"{self._channel.name} is closed"))
+
+    def _readable(self) -> None:
+        try:
+            while (packet := self._channel.take()) is not None:
+                message, fds = packet
+                future = self._futures.pop(message[1], None)
+                if future is None or future.done():
+                    for fd in fds:
+                        os.close(fd)
+                    call = self._abandoned.pop(message[1], None)
+                    if call is not None and call.verb == ClientVerb.OPEN and fds:
+                        # Opened just before the cancel arrived: nobody will close it but us.
+                        self._channel.send(Call("close", ClientVerb.CLOSE, message[3][0]))
+                    continue
+                try:
+                    future.set_result(self._channel.result(packet))
+                except OSError as error:
+                    future.set_exception(error)
+        except OSError as error:
+            self._loop.remove_reader(self._channel.fileno())
+            self._fail(error)
+
+    def _fail(self, error: OSError) -> None:
+        futures, self._futures = self._futures, {}
+        for future in futures.values():
+            if not future.done():
+                future.set_exception(error)
+                future.exception()  # whoever still waits gets it; who does not must not be warned
+
+
+class AsyncNode(NodeCore):
+    """An open node in an event loop; see the blocking nodes for what the calls do."""
+
+    def __init__(self, core: tuple[Any, ...], cell: AsyncWorkcell) -> None:
+        super().__init__(*core)
+        self._cell = cell
+        self._requests = _Requests(self._channel, HandleVerb.CANCEL)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close the node: axes halt, buffers empty, outputs become safe. Returns when the node is free."""
+        if not self.closed:
+            self._requests.close()
+            self._release()
+            await self._cell.forget(self.handle)
+
+    async def ioctl(self, request: Request, argument: object = None, timeout: float | None = 0.0) -> Any:
+        """Send a request to the driver and return its answer."""
+        return (await self._requests.call(self._ioctl(request, argument, timeout))).value
+
+    async def write(self, records: Records, timeout: float | None = 0.0, *, replace: bool = False) -> int:
+        """Write records, all or none; see ``Node.write``."""
+        call = self._write(records, timeout, replace)
+        try:
+            tick: int = (await self._requests.call(call)).value
+            return tick
+        finally:
+            for fd in call.fds:
+                os.close(fd)
+
+    async def command(
+        self, axis: int = 0, *, timeout: float | None = 0.0, replace: bool = False, **words: Any
+    ) -> int:
+        """Append one command; see ``sioms.command`` for the words."""
+        return await self.write(command(axis, **words), timeout, replace=replace)
+
+    async def set(self, *values: float) -> int:
+        """Write all channels of a binary or analog output."""
+        return await self.write(self._outputs(values))
+
+    async def wait_until_idle(self, timeout: float | None = None) -> None:
+        """Wait until all axes of the node stand still and their buffers are empty."""
+        await self.ioctl(Request.WAIT_UNTIL_IDLE, None, timeout)
+
+    async def subscribed(self, every: int) -> None:
+        """Have the node's descriptor become readable with every n-th publication, -1: with edges only."""
+        if every != self._subscribed:
+            await self._requests.call(Call(f"subscribe to {self.name}", HandleVerb.SUBSCRIBE, every))
+            self._subscribed = every
+
+    async def snapshots(self, every: int = 1) -> AsyncIterator[Any]:
+        """Yield the newest snapshot after every n-th publication, for ever."""
+        await self.subscribed(every)
+        number = 0
+        while True:
+            snapshot = self.read()
+            if snapshot.number > number:
+                number = snapshot.number
+                yield snapshot
+            await self._wake()
+
+    async def wait_event(self, mask: int = -1, last: Any = None, timeout: float | None = None) -> Event:
+        """Wait until a masked bit differs from the last state seen; see ``BinaryNode.wait_event``."""
+        state, number = self._start_of(last)
+        if self._subscribed == 0:
+            await self.subscribed(-1)
+        async with asyncio.timeout(timeout):
+            while True:
+                event = self._find_event(mask, state, number)
+                if event is not None:
+                    return event
+                number = max(number, self._page.head)
+                await self._wake()
+
+    async def _wake(self) -> None:
+        """Wait for the eventfd, and look at the page at least every 50 ms: a hung driver wakes nobody."""
+        loop = asyncio.get_running_loop()
+        woken = loop.create_future()
+
+        def wake() -> None:
+            if not woken.done():
+                woken.set_result(None)
+
+        loop.add_reader(self._event, wake)
+        try:
+            async with asyncio.timeout(0.05):
+                await woken
+        except TimeoutError:
+            return
+        finally:
+            loop.remove_reader(self._event)
+
+
+class AsyncWorkcell:
+    """A session with the daemon in an event loop; made by ``connect``."""
+
+    def __init__(self, requests: _Requests) -> None:
+        self._requests = requests
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._requests.close()
+
+    async def open(
+        self, name: str, mode: str = "r", timeout: float | None = 0.0, *, lease: float = 0.0
+    ) -> AsyncNode:
+        """Open a node; see ``Workcell.open``."""
+        answer = await self._requests.call(open_call(name, mode, timeout, lease))
+        return AsyncNode(node_parts(answer.value, answer.fds), self)
+
+    async def info(self, name: str) -> NodeInfo:
+        """Return what a node is, without opening it."""
+        return NodeInfo(await self._call(f"get information of {name}", ClientVerb.INFO, name))
+
+    async def status(self) -> dict[str, Any]:
+        """Return devices, sessions, holders and the state of the emergency stop."""
+        value: dict[str, Any] = await self._call("get status", ClientVerb.STATUS)
+        return value
+
+    async def reserve_marker(self) -> int:
+        """Reserve a marker; return its token."""
+        tokens: list[int] = await self._call("reserve marker", ClientVerb.RESERVE_MARKER, 1, False)
+        return tokens[0]
+
+    async def signal_marker(self, token: int) -> None:
+        """Signal a marker."""
+        await self._call("signal marker", ClientVerb.SIGNAL_MARKER, token)
+
+    async def wait_marker(self, number: int, timeout: float | None = None) -> int:
+        """Wait until a marker is signalled; return when that was [ns, CLOCK_MONOTONIC]."""
+        stamp_ns: int = await self._call("wait for marker", ClientVerb.WAIT_MARKER, number, timeout)
+        return stamp_ns
+
+    async def emergency_stop(self, node: str = "", why: str = "") -> None:
+        """Stop the workcell or a node, latched until reset."""
+        await self._call("emergency stop", ClientVerb.EMERGENCY_STOP, node, why)
+
+    async def reset(self, node: str = "") -> None:
+        """Clear the latched stop of the workcell or of a node."""
+        await self._call("reset", ClientVerb.RESET, node)
+
+    async def forget(self, handle: int) -> None:
+        """Tell the daemon that a node was closed."""
+        try:
+            await self._call("close", ClientVerb.CLOSE, handle)
+        except OSError as error:
+            if error.errno not in (errno.EIO, errno.EBADF):
+                raise
+
+    async def _call(self, what: str, verb: ClientVerb, *arguments: object) -> Any:
+        return (await self._requests.call(Call(what, verb, *arguments))).value
+
+
+async def connect(path: str | None = None, name: str = "") -> AsyncWorkcell:
+    """Open a session with the daemon.
+
+    Args:
+        path: the daemon's socket; None for $SIOMS_SOCKET or the usual places.
+        name: what this client calls itself.
+    """
+    channel = Channel(connect_socket(path or socket_path()), "the daemon")
+    requests = _Requests(channel, ClientVerb.CANCEL)
+    answer = await requests.call(Call("hello", ClientVerb.HELLO, PROTOCOL_VERSION, name))
+    for fd in answer.fds:
+        os.close(fd)  # the stop-request page: a hung daemon is for blocking clients to overcome
+    return AsyncWorkcell(requests)
