@@ -201,11 +201,10 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def strain_table(self) -> StrainTable:
         """Tabulate the strains under round contacts; takes about a tenth of a second."""
         angles, outer, spectra = np.asarray(self.angles_rad), self.geometry.outer_m, self.spectra()
-        if self.identified is not None:
-            return strain_table(outer, angles, np.asarray(self.identified.rows), None, spectra)
         full = self.e_map()
         half = full.shape[1] // 2
-        return strain_table(outer, angles, full[:, :half], full[:, half:], spectra)
+        normal = full[:, :half] if self.identified is None else np.asarray(self.identified.rows)
+        return strain_table(outer, angles, normal, full[:, half:], spectra)
 
     def width_table(self) -> WidthTable:
         """Return the width table of the file, or compute it."""

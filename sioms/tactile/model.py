@@ -102,7 +102,7 @@ class StrainTable:
 
 
 def strain_table(
-    outer_m: float, angles: Floats, normal: Floats, shear: Floats | None, spectra: Spectra
+    outer_m: float, angles: Floats, normal: Floats, shear: Floats, spectra: Spectra
 ) -> StrainTable:
     """Sum the strains of a finger on the grid.
 
@@ -110,7 +110,7 @@ def strain_table(
         outer_m: rb [m].
         angles: element angles [rad], shape (ns,); they give the arc.
         normal: pressure columns of E [1/Pa], shape (ns, 2 nc + 1).
-        shear: tangential columns of E, same shape, or None when unknown (an identified map).
+        shear: tangential columns of E, same shape.
         spectra: tractions, for the same nc.
     """
     highest = normal.shape[1] // 2
@@ -118,7 +118,7 @@ def strain_table(
     count = int(np.ceil((top - lowest) / ANGLE_STEP)) + 1
     t = lowest + ANGLE_STEP * np.arange(count)
     pressed = _carry(normal, t, highest, odd=False)
-    dragged = _carry(shear, t, highest, odd=True) if shear is not None and spectra.shear.any() else None
+    dragged = _carry(shear, t, highest, odd=True) if spectra.shear.any() else None
     scale = -1.0 / (np.pi * outer_m)  # a unit load presses: p < 0
     weight = np.where(np.arange(highest + 1) == 0, 0.5, 1.0)
     nodes = np.empty((spectra.half_widths.size, count, 4, angles.size))

@@ -1,0 +1,361 @@
+"""Calibrate a finger from recorded touches: the whole procedure, from outputs to a finger's file.
+
+In order: quadratic, contact model, uniform fit (one depth and Poisson's ratio), fit per element, direct
+identification; each step kept only if the touches left out of it are predicted better.  What the data cannot
+support stays at its nominal value and is said so in `warnings`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.tactile.calibrate import (
+    REFERENCE_LOAD,
+    ElementFit,
+    Freedom,
+    fit_elements,
+    fit_uniform,
+    starts,
+    strain_of,
+)
+from sioms.tactile.contact import width_for_load
+from sioms.tactile.cylinder import Cylinder, respond
+from sioms.tactile.emap import e_map
+from sioms.tactile.finger import ContactKind, ContactModel, Elements, Finger, Geometry, IdentifiedMap
+from sioms.tactile.identify import Identified, corrected, series_of, truncated
+from sioms.tactile.indenter import Wedge
+from sioms.tactile.linearity import Quadratic, find_quadratic, linearise
+from sioms.tactile.touches import Touches, TouchLoads, touch_loads
+from sioms.tactile.width import WidthTable, hertz_table, rigid_core_table
+
+Floats = NDArray[np.float64]
+Fits = list[ElementFit | None]
+
+HIGHEST = 60  # wave numbers of calibration
+FEWEST_TOUCHES = 30
+SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of full adhesion, tried in turn
+_BETTER = 0.97  # a richer model must bring the left-out residual below this share of the simpler one's
+_POISSON_DEVIATION = 0.03
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """Say what calibration may do.
+
+    Args:
+        edge_half_angle_rad: of the indenters with radius zero.
+        identify: allow an identified map.
+        contact: fix the contact model; None lets the data choose.
+    """
+
+    edge_half_angle_rad: float = np.pi / 4
+    identify: bool = True
+    contact: ContactKind | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """Hold the finger and everything a report wants to show; strains and residuals as fractions.
+
+    Args:
+        finger: the result.
+        touches: with linear outputs.
+        loads: their tractions.
+        quadratic: or None if the loads did not support it.
+        uniform: elements with common depth and Poisson's ratio.
+        elements: elements with their own depth.
+        peak: model strain of a 200 N/m edge, the unit of residuals.
+        contacts: left-out residual (of peak) of each contact model tried, by name.
+        truncated: E by the source's way.
+        corrected: E by the smallest change of the model.
+        residuals: root mean square over left-out touches per element, of peak, by method.
+        warnings: what the data could not support.
+    """
+
+    finger: Finger
+    touches: Touches
+    loads: TouchLoads
+    quadratic: Quadratic | None
+    uniform: Fits
+    elements: Fits
+    peak: float
+    contacts: dict[str, float]
+    truncated: Identified | None
+    corrected: Identified | None
+    residuals: dict[str, Floats]
+    warnings: list[str] = field(default_factory=list)
+
+
+def calibrate(
+    nominal: Finger,
+    touches: Touches,
+    options: Options = Options(),
+    tick: Callable[[str], None] = lambda what: None,
+) -> Calibration:
+    """Calibrate a finger.
+
+    Args:
+        nominal: the finger as built; angles within 8 degrees, depth and gain roughly.
+        touches: averaged touches with raw outputs.
+        options: what is allowed.
+        tick: called with a few words at every step of progress.
+
+    Raises:
+        ValueError: too few touches, wrong number of elements, or outputs of the wrong sign.
+    """
+    warnings: list[str] = []
+    _check(nominal, touches, warnings)
+    body = nominal.cylinder
+    widths = rigid_core_table(body)
+    tick("loads of the touches")
+    loads = touch_loads(body, widths, touches, HIGHEST, options.edge_half_angle_rad)
+    quadratic = _quadratic(nominal, touches, loads, warnings)
+    tick("quadratic")
+    if quadratic is not None:
+        touches = touches.with_output(linearise(touches.output, quadratic.value))
+    begin = starts(body, np.array(nominal.angles_rad), np.array(nominal.elements.radius_m), touches)
+    for element, fit in enumerate(begin):
+        if fit is None:
+            warnings.append(f"element {element}: too few touches within 25 degrees; left out of the finger")
+    if sum(fit is not None for fit in begin) < 4:
+        raise ValueError(
+            "calibrate finger: fewer than 4 elements have touches near them; probe more of the finger"
+        )
+    kind, adhesion, contacts, loads, widths = _contact(body, begin, touches, loads, widths, options, tick)
+    uniform, (depth, nu), (depth_sd, nu_sd) = fit_uniform(
+        body, begin, touches, loads, adhesion, lambda: tick("uniform fit")
+    )
+    if nu_sd > _POISSON_DEVIATION or nu > 0.4995 or nu < 0.36:
+        warnings.append(
+            f"Poisson's ratio is not supported by the data ({nu:.3f} +- {nu_sd:.3f}): kept at {body.poisson}"
+        )
+        uniform, (depth, _), (depth_sd, _) = fit_uniform(
+            body, begin, touches, loads, adhesion, lambda: tick("uniform fit"), free_poisson=False
+        )
+        nu = body.poisson
+    del depth, depth_sd
+    body = Cylinder(body.core_m, body.outer_m, nu, body.shear_pa)
+    own = fit_elements(
+        body, [_with(fit, poisson=nu) for fit in uniform], touches, loads, adhesion, Freedom(True, False),
+        lambda: tick("element fit"),
+    )  # fmt: skip
+    peak = edge_peak(body, own, options.edge_half_angle_rad)
+    residuals = {
+        "uniform": _left_out(body, uniform, touches, loads, adhesion, Freedom(False, False), peak),
+        "elements": _left_out(body, own, touches, loads, adhesion, Freedom(True, False), peak),
+    }
+    tick("left-out residuals")
+    best = own if np.nanmean(residuals["elements"]) < _BETTER * np.nanmean(residuals["uniform"]) else uniform
+    cut, direct = _identify(body, best, touches, loads, adhesion, options, warnings)
+    tick("identification")
+    known = np.array([fit is not None for fit in best])
+    for name, found in (("truncated", cut), ("corrected", direct)):
+        if found is not None:
+            residuals[name] = np.full(known.size, np.nan)
+            residuals[name][known] = found.left_out / peak
+    finger = _finger(nominal, body, best, kind, adhesion, widths, quadratic, touches, residuals, direct, peak)
+    return Calibration(
+        finger, touches, loads, quadratic, uniform, own, peak, contacts, cut, direct, residuals, warnings
+    )
+
+
+def _check(nominal: Finger, touches: Touches, warnings: list[str]) -> None:
+    count = len(nominal.angles_rad)
+    if touches.output.shape[1] != count:
+        raise ValueError(
+            f"calibrate finger: touches have {touches.output.shape[1]} elements; the finger has {count}"
+        )
+    if len(touches) < FEWEST_TOUCHES:
+        raise ValueError(
+            f"calibrate finger: {len(touches)} touches; need at least {FEWEST_TOUCHES} over all elements"
+        )
+    if not np.all(touches.load > 0.0):
+        raise ValueError(
+            f"calibrate finger: a touch has load {touches.load.min()} N/m; pressing loads are positive"
+        )
+    strongest = touches.output[np.arange(len(touches)), np.abs(touches.output).argmax(axis=1)]
+    if np.median(strongest) < 0.0:
+        raise ValueError(
+            "calibrate finger: pressing lowers the output; compression must be positive: change its sign"
+        )
+    ratio = np.nanmedian(touches.force / touches.load)
+    if np.isfinite(ratio) and abs(ratio - 1.0) > 0.02:
+        warnings.append(
+            f"the load cell reads {100 * (ratio - 1):+.1f} % of the commanded load: one of them is out of scale; "
+            "the commanded load was used"
+        )
+
+
+def _quadratic(nominal: Finger, touches: Touches, loads: TouchLoads, warnings: list[str]) -> Quadratic | None:
+    body, count = nominal.cylinder, touches.output.shape[1]
+    model = np.stack(
+        [
+            strain_of(body, angle, radius, body.poisson, touches, loads, 0.0)
+            for angle, radius in zip(nominal.angles_rad, nominal.elements.radius_m, strict=True)
+        ],
+        axis=1,
+    )
+    found = find_quadratic(touches, model)
+    if found is None:
+        warnings.append(
+            "no place was touched with three loads or more over a factor of two: quadratic not fitted"
+        )
+        return None
+    few = int(np.count_nonzero(found.groups < 2))
+    if few:
+        warnings.append(
+            f"{few} of {count} elements have too few load series: their quadratic is the common {found.common:.3g}"
+        )
+    return found
+
+
+def _contact(
+    body: Cylinder, begin: Fits, touches: Touches, loads: TouchLoads, widths: WidthTable, options: Options,
+    tick: Callable[[str], None],
+) -> tuple[ContactKind, float, dict[str, float], TouchLoads, WidthTable]:  # fmt: skip
+    """Choose the contact model by the residual of a fit with free depths."""
+    half = hertz_table(body)
+    other = touch_loads(body, half, touches, HIGHEST, options.edge_half_angle_rad)
+    tried: dict[str, tuple[ContactKind, float, TouchLoads, WidthTable]] = {
+        "hertz": ("hertz", 0.0, other, half)
+    }
+    for share in SHARES:
+        name = "frictionless" if share == 0.0 else f"adhesion {share:g}"
+        tried[name] = ("frictionless" if share == 0.0 else "adhering", share, loads, widths)
+    if options.contact is not None:
+        tried = {name: entry for name, entry in tried.items() if entry[0] == options.contact}
+    score: dict[str, float] = {}
+    for name, (_, share, tractions, _) in tried.items():
+        fits = fit_elements(body, begin, touches, tractions, share, Freedom(True, False))
+        score[name] = float(np.sqrt(np.mean([fit.residual**2 for fit in fits if fit is not None])))
+        tick(f"contact model {name}")
+    best = min(score, key=lambda name: score[name])
+    if "frictionless" in score and score[best] > _BETTER * score["frictionless"]:
+        best = "frictionless"
+    kind, share, tractions, table = tried[best]
+    return kind, share, score, tractions, table
+
+
+def edge_peak(body: Cylinder, fits: Fits, half_angle: float) -> float:
+    """Return the mean over elements of the model strain right under a 200 N/m edge, positive."""
+    series = width_for_load(body, Wedge(half_angle), REFERENCE_LOAD).series(0.0, HIGHEST)[
+        : 2 * HIGHEST + 1 : 2
+    ]
+    radii = [fit.radius_m for fit in fits if fit is not None]
+    return float(-np.mean(respond(body, np.arange(HIGHEST + 1), radii).e_rr[:, :, 0].T @ series))
+
+
+def _with(fit: ElementFit | None, poisson: float) -> ElementFit | None:
+    return None if fit is None else dataclasses.replace(fit, poisson=poisson)
+
+
+def _left_out(
+    body: Cylinder,
+    fits: Fits,
+    touches: Touches,
+    loads: TouchLoads,
+    adhesion: float,
+    freedom: Freedom,
+    peak: float,
+) -> Floats:
+    """Return each element's residual, of peak, on every other touch when fitted to the rest, both ways round."""
+    square, count = np.zeros(len(fits)), np.zeros(len(fits))
+    for parity in (0, 1):
+        train = np.arange(len(touches)) % 2 == parity
+        trained = fit_elements(
+            body,
+            fits,
+            touches.pick(train),
+            TouchLoads(loads.normal[train], loads.shear[train]),
+            adhesion,
+            freedom,
+        )
+        test, tractions = touches.pick(~train), TouchLoads(loads.normal[~train], loads.shear[~train])
+        for element, fit in enumerate(trained):
+            if fit is None:
+                continue
+            strain = strain_of(body, fit.angle_rad, fit.radius_m, fit.poisson, test, tractions, adhesion)
+            near = np.abs(test.angle_rad - fit.angle_rad) <= np.radians(25.0)
+            miss = (fit.gain * test.output[:, element] + strain)[near]
+            square[element] += float(miss @ miss)
+            count[element] += miss.size
+    return np.asarray(np.sqrt(square / np.where(count > 0, count, np.nan)) / peak)
+
+
+def _identify(
+    body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, adhesion: float, options: Options,
+    warnings: list[str],
+) -> tuple[Identified | None, Identified | None]:  # fmt: skip
+    if not options.identify:
+        return None, None
+    known = [(element, fit) for element, fit in enumerate(fits) if fit is not None]
+    gain = np.array([fit.gain for _, fit in known])
+    strain = -touches.output[:, [element for element, _ in known]] * gain
+    pressure, shear = series_of(touches, loads)
+    full = e_map(
+        body, [fit.angle_rad for _, fit in known], [fit.radius_m for _, fit in known], HIGHEST, body.poisson
+    )
+    normal, tangential = np.split(full, 2, axis=1)
+    covered = float(np.ptp(touches.angle_rad)) / np.ptp([fit.angle_rad for _, fit in known])
+    if covered < 0.8:
+        warnings.append(
+            f"touches cover {100 * covered:.0f} % of the elements' arc: no map identified, the model is used"
+        )
+        return None, None
+    # the source's way leaves the tangential part in E; the corrected map takes it from the model
+    by_shear = adhesion * shear @ tangential.T
+    return truncated(pressure, strain), corrected(pressure, strain - by_shear, normal)
+
+
+def _finger(
+    nominal: Finger, body: Cylinder, fits: Fits, kind: ContactKind, adhesion: float, widths: WidthTable,
+    quadratic: Quadratic | None, touches: Touches, residuals: dict[str, Floats], direct: Identified | None,
+    peak: float,
+) -> Finger:  # fmt: skip
+    count = len(fits)
+    base = nominal.elements
+
+    def column(name: str, fallback: tuple[float, ...]) -> tuple[float, ...]:
+        return tuple(fallback[e] if fit is None else float(getattr(fit, name)) for e, fit in enumerate(fits))
+
+    method = (
+        "uniform"
+        if np.nanmean(residuals["uniform"]) <= np.nanmean(residuals["elements"]) / _BETTER
+        else "elements"
+    )
+    misfit, rows = residuals[method], None
+    if direct is not None and np.nanmean(residuals["corrected"]) < _BETTER * np.nanmean(misfit):
+        misfit, method, rows = residuals["corrected"], "corrected", np.zeros((count, direct.rows.shape[1]))
+        rows[[e for e, fit in enumerate(fits) if fit is not None]] = direct.rows
+    # what averaging left of the noise is no misfit
+    own = np.array(column("gain", base.gain)) * touches.noise * np.sqrt(2.0 / 20.0) / peak
+    misfit = np.sqrt(np.maximum(misfit**2 - np.where(np.isfinite(own), own, 0.0) ** 2, (0.2 * misfit) ** 2))
+    noise = np.where(np.isfinite(touches.noise) & (touches.noise > 0.0), touches.noise, np.array(base.noise))
+    elements = Elements(
+        angle_rad=column("angle_rad", base.angle_rad),
+        radius_m=column("radius_m", base.radius_m),
+        poisson=(body.poisson,) * count,
+        gain=column("gain", base.gain),
+        quadratic=tuple((quadratic.value if quadratic is not None else np.zeros(count)).tolist()),
+        noise=tuple(noise.tolist()),
+        misfit=tuple(np.where(np.isfinite(misfit), misfit, 0.0).tolist()),
+        used=tuple(fit is not None for fit in fits),
+    )
+    table = rigid_core_table(body) if kind != "hertz" else widths
+    return msgspec.structs.replace(
+        nominal,
+        geometry=Geometry(body.core_m, body.outer_m, body.poisson, body.shear_pa),
+        elements=elements,
+        contact=ContactModel(
+            kind, adhesion, tuple(table.half_widths.tolist()), tuple(table.ratio.tolist()),
+            nominal.contact.most_load_n_per_m,
+        ),
+        identified=None if rows is None else IdentifiedMap(tuple(tuple(row) for row in rows.tolist())),
+        notes={**nominal.notes, "map": method},
+    )  # fmt: skip
