@@ -100,7 +100,7 @@ class StepperBank:
         self._rotor = FrictionStep(
             self._state, mass, Directed.both(viscous), sliding, sliding, self._substep_s
         )
-        self._damping_of_move = viscous / tick_s
+        self._viscous, self._damping_of_move = viscous, viscous / tick_s
         self._micro = self._step / _column(steppers, "microsteps")
         self._wave_number = math.pi / (2 * self._step)
         self._hold, self._load = _column(steppers, "hold_force"), _column(steppers, "load_force")
@@ -159,11 +159,25 @@ class StepperBank:
         np.multiply(force, np.sinc(work), out=force)
         np.multiply(force, self._strength, out=force)
         np.add(force, self._load, out=force)
-        # In step the windings damp the motion against the field, not against the ground.
-        np.multiply(self._move, self._in_step, out=field)
-        np.multiply(field, self._damping_of_move, out=field)
-        np.add(force, field, out=force)
+        self._damp_against_field()
         self._rotor.step(force)
+
+    def _damp_against_field(self) -> None:
+        """Damp rotors in step against the field, with its force at most, instead of against the ground.
+
+        The friction step brakes by b v; adding clip(b (v_field - v)) + b v leaves the clipped part.
+        """
+        brake, relative = self._field, self._work
+        np.multiply(self.velocity, self._viscous, out=brake)
+        np.multiply(self._move, self._damping_of_move, out=relative)
+        np.subtract(relative, brake, out=relative)
+        np.minimum(relative, self._strength, out=relative)
+        np.add(brake, relative, out=brake)
+        np.add(relative, self._strength, out=relative)
+        np.minimum(relative, 0.0, out=relative)
+        np.subtract(brake, relative, out=brake)
+        np.multiply(brake, self._in_step, out=brake)
+        np.add(self._force, brake, out=self._force)
 
     def _sense(self) -> None:
         """Set step loss and switches."""

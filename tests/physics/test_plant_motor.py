@@ -248,3 +248,40 @@ def test_presliding_springs_back():
     assert bank.position[0] == pytest.approx(0.02 / 1e4, rel=0.02)
     run(bank, 12.0, 4000)
     assert bank.velocity[0] == pytest.approx((12.0 - 2.0) / 50.0, rel=1e-3)
+
+
+def test_stop_under_viscous_friction_agrees_with_quadrature():
+    """One long tick: the velocity comes to zero under b and c together, then the force drives it back."""
+    bank = one(mass=0.5, viscous=20.0, coulomb=1.0, tick_s=0.1)
+    bank.velocity[:] = 0.4
+    bank.advance(np.array([-3.0]))
+
+    def stopped(t, y):
+        return y[1]
+
+    stopped.terminal = True
+    there = solve_ivp(
+        lambda t, y: [y[1], (-3 - 1 - 20 * y[1]) / 0.5],
+        (0, 0.1),
+        [0, 0.4],
+        rtol=1e-11,
+        atol=1e-14,
+        events=stopped,
+    )
+    rest = [there.y[0, -1], 0.0]
+    back = solve_ivp(
+        lambda t, y: [y[1], (-3 + 1 - 20 * y[1]) / 0.5], (there.t[-1], 0.1), rest, rtol=1e-11, atol=1e-14
+    )
+    assert bank.position[0] == pytest.approx(back.y[0, -1], rel=1e-8)
+    assert bank.velocity[0] == pytest.approx(back.y[1, -1], rel=1e-8)
+
+
+def test_wall_within_the_reach_of_a_strong_push_is_not_jumped():
+    """From rest just before the wall: the same motion as when the substeps are forced by a void effect."""
+    parameters = {"mass": 0.1, "wall": Wall(position=1e-6, stiffness=1e4)}
+    bank, stepped = one(**parameters), one({"gravity": {"amplitude": 0.0}}, **parameters)
+    for _ in range(50):
+        bank.advance(np.array([50.0]))
+        stepped.advance(np.array([50.0]))
+        assert bank.position[0] == pytest.approx(stepped.position[0], rel=1e-12)
+    assert bank.contact_force[0] > 0

@@ -117,3 +117,14 @@ def test_switches_follow_the_rotor():
 def test_refuses_what_no_stepper_can_be(change, word):
     with pytest.raises(ValueError, match=word):
         StepperBank([Stepper(**{"mass": 0.4, "step": 2e-4, "hold_force": 60.0} | change)], TICK_S)
+
+
+def test_field_far_too_fast_does_not_lock_by_aliasing():
+    """A field that turns once in every substep has no mean force: the rotor stays."""
+    bank = StepperBank([BELT], TICK_S)
+    turn = 4 * BELT.step * bank.substeps
+    field = 0.0
+    for _ in range(200):
+        field += turn
+        bank.advance(np.array([field + BELT.step]))
+    assert bank.stalled[0] and abs(bank.position[0]) < 8 * BELT.step
