@@ -200,8 +200,8 @@ def test_emergency_stop_latches_and_nothing_resumes():
     rig.write(mode=MODE.POSITION, position=rest)
 
 
-@pytest.mark.parametrize("mode", [dict(mode=MODE.VELOCITY, velocity=1.7), dict(mode=MODE.ACCELERATION, acceleration=5.0),
-                                  dict(mode=MODE.JERK, jerk=80.0)])  # fmt: skip
+@pytest.mark.parametrize("mode", [{"mode": MODE.VELOCITY, "velocity": 1.7}, {"mode": MODE.ACCELERATION, "acceleration": 5.0},
+                                  {"mode": MODE.JERK, "jerk": 80.0}])  # fmt: skip
 @pytest.mark.parametrize("tick_ns", [TICK_NS, 13_000_000])
 def test_soft_limit_is_reached_and_not_passed(mode, tick_ns):
     rig = Rig([axis()], tick_ns=tick_ns)
@@ -312,7 +312,7 @@ def test_limits_can_be_narrowed_and_restored_never_widened():
     rig.write(mode=MODE.POSITION, position=0.4)
     rig.run()
     assert rig.trace("commanded_velocity").max() == pytest.approx(0.25, rel=1e-6)
-    for wrong in (dict(position_max=4.0), dict(velocity_max=-1.0), dict(nothing=1.0), dict(position_max=0.3)):
+    for wrong in ({"position_max": 4.0}, {"velocity_max": -1.0}, {"nothing": 1.0}, {"position_max": 0.3}):
         with pytest.raises(CommandError):
             rig.bank.set_limits([0], **wrong)
     rig.bank.set_limits([0, 1], position_max=None, velocity_max=None)
@@ -379,3 +379,43 @@ def test_force_mode_keeps_position_limits():
     assert dropped(rig) == [((0,), errno.ERANGE)]
     assert 0.29 < rig.trace("position").max() < 0.3 + 0.01
     assert not rig.field("status") & S.FORCE_MODE
+
+
+def test_a_replaced_command_does_not_signal_its_marker():
+    rig = Rig([axis()])
+    token = rig.markers.reserve(4)
+    rig.write(mode=MODE.POSITION | MODE.SPECIFIED_SIGNAL_MARKER, position=1.0, signal_marker_number=token)
+    rig.tick(100)
+    rig.write(replace=True, mode=MODE.POSITION, position=0.0)
+    rig.run()
+    assert rig.markers.signals == []
+
+
+def test_an_emptied_buffer_says_nothing_about_where_the_next_command_begins():
+    rig = Rig([axis()])
+    rig.write(mode=MODE.POSITION, position=2.0)
+    rig.tick(300)
+    rig.bank.stop([0], rig.now_ns)
+    rig.write(mode=MODE.POSITION | MODE.RELATIVE, position=1.5)  # from 2.0 it would lead out of the limits
+    rig.run()
+    assert not rig.bank.fault_text(0)
+    assert rig.field("commanded_position") < 2.5
+
+
+def test_flush_lets_the_running_command_end():
+    rig = Rig([axis()])
+    rig.write(mode=[MODE.POSITION, MODE.POSITION], position=[0.5, 1.0])
+    rig.tick(100)
+    rig.bank.flush([0])
+    rig.run()
+    assert rig.field("commanded_position") == pytest.approx(0.5)
+
+
+def test_flush_of_a_waiting_axis_is_idle_at_once():
+    rig = Rig([axis()])
+    rig.write(mode=MODE.POSITION | MODE.WAIT_FOR_EXTERNAL_SYNCH, position=0.5)
+    rig.tick(3)
+    assert not rig.bank.is_idle([0])
+    rig.bank.flush([0])
+    assert rig.bank.is_idle([0])
+    assert [e.kind for e in rig.bank.take_events()] == [EventKind.IDLE]

@@ -1,0 +1,226 @@
+"""DriveBank against a drive of a few lines that makes its own trapezoid and confirms with a delay."""
+
+import errno
+
+import numpy as np
+import pytest
+from motion_rig import MODE, Markers, axis, records
+
+from sioms.motion import ActionKind, CommandError, DriveBank, EventKind
+from sioms.protocol.flags import AxisStatus as S
+
+MODES = (
+    MODE.POSITION | MODE.VELOCITY | MODE.RELATIVE | MODE.SPECIFIED_TIME | MODE.WAIT_FOR_EXTERNAL_SYNCH
+    | MODE.SPECIFIED_WAIT_MARKER | MODE.SPECIFIED_SIGNAL_MARKER | MODE.SPECIFIED_MAX_VEL_ACC
+)  # fmt: skip
+POLL_NS = 10_000_000
+
+
+class Drive:
+    """Moves with constant velocity to its target; takes one poll to begin."""
+
+    def __init__(self):
+        self.position, self.velocity, self.target, self.wish = 0.0, 0.0, None, None
+        self.fault, self.log = "", []
+
+    def take(self, action):
+        self.log.append(action.kind)
+        if action.kind is ActionKind.START:
+            c = action.command
+            if c.control_mode & MODE.POSITION:
+                self.target, self.wish = c.position, action.velocity_max
+            else:
+                self.target, self.wish = None, c.velocity
+        elif action.is_stop:
+            self.target, self.wish, self.velocity = None, 0.0, 0.0
+        elif action.kind is ActionKind.RESET:
+            self.fault = ""
+
+    def step(self, dt):
+        if self.wish is None:
+            return
+        if self.target is None:
+            self.velocity = self.wish
+            self.position += self.velocity * dt
+            return
+        left = self.target - self.position
+        go = np.clip(left, -abs(self.wish) * dt, abs(self.wish) * dt)
+        self.position += go
+        self.velocity = go / dt if abs(left) > 0 else 0.0
+
+
+class Cell:
+    def __init__(self, n=2):
+        self.markers = Markers()
+        self.bank = DriveBank([axis(modes=MODES) for _ in range(n)], markers=self.markers)
+        self.drives = [Drive() for _ in range(n)]
+        self.now_ns, self.axes, self.events, self.starts = 10**9, list(range(n)), [], []
+        self.poll()
+
+    def poll(self, count=1):
+        for _ in range(count):
+            self.now_ns += POLL_NS
+            for d in self.drives:
+                d.step(POLL_NS * 1e-9)
+            velocity = np.array([d.velocity for d in self.drives])
+            moving = np.abs(velocity) > 0
+            self.bank.poll(
+                self.now_ns, np.array([d.position for d in self.drives]), velocity, moving, ~moving,
+                [d.fault for d in self.drives],
+            )  # fmt: skip
+            self.send()
+            self.events += self.bank.take_events()
+
+    def send(self):
+        for action in self.bank.take_actions():
+            self.drives[action.axis].take(action)
+            if action.kind is ActionKind.START:
+                self.starts.append((self.now_ns, action.axis))
+            self.bank.action_done(action, self.now_ns)
+
+    def write(self, *, replace=False, **fields):
+        self.bank.append(records(**fields), self.axes, self.now_ns, replace=replace)
+        self.send()
+
+    def status(self, i=0):
+        return int(self.bank.fields[11].view(np.int64)[i])
+
+
+def test_commands_run_in_order_each_after_the_drive_is_done():
+    cell = Cell()
+    cell.write(mode=[MODE.POSITION, MODE.POSITION | MODE.RELATIVE], position=[0.5, 0.25])
+    assert cell.drives[0].log == [ActionKind.START]
+    cell.poll(20)
+    assert cell.drives[0].log == [ActionKind.START]
+    cell.poll(60)
+    assert cell.drives[0].position == pytest.approx(0.75)
+    assert cell.bank.is_idle([0])
+    kinds = [e.kind for e in cell.events]
+    assert kinds.count(EventKind.ENDED) == 2 and kinds[-1] is EventKind.IDLE
+
+
+def test_modes_that_the_drive_lacks_are_refused_before_anything_moves():
+    cell = Cell()
+    with pytest.raises(CommandError) as caught:
+        cell.write(mode=[MODE.POSITION, MODE.JERK], position=0.5, jerk=1.0)
+    assert caught.value.errno == errno.EINVAL and "JERK" in str(caught.value)
+    cell.poll(5)
+    assert cell.drives[0].log == []
+
+
+def test_timed_velocity_stops_when_nothing_follows():
+    cell = Cell()
+    cell.write(mode=MODE.VELOCITY | MODE.SPECIFIED_TIME, velocity=1.0, time=0.5)
+    cell.poll(80)
+    assert cell.drives[0].log == [ActionKind.START, ActionKind.STOP]
+    assert cell.drives[0].position == pytest.approx(0.5, abs=0.02)
+    assert cell.bank.is_idle([0])
+
+
+def test_velocity_lasts_until_the_next_command():
+    cell = Cell()
+    cell.write(mode=MODE.VELOCITY, velocity=0.5)
+    cell.poll(50)
+    assert not cell.bank.is_idle([0])
+    cell.write(mode=MODE.POSITION, position=0.0)
+    cell.poll(60)
+    assert cell.drives[0].position == pytest.approx(0.0) and cell.bank.is_idle([0])
+
+
+def test_synch_and_markers_hold_and_release():
+    cell = Cell()
+    token = cell.markers.reserve(3)
+    cell.write(mode=[MODE.POSITION | MODE.WAIT_FOR_EXTERNAL_SYNCH | MODE.SPECIFIED_SIGNAL_MARKER,
+                     MODE.POSITION | MODE.SPECIFIED_WAIT_MARKER], axis=[0, 1], position=0.3,
+               signal_marker_number=token, wait_marker_number=3)  # fmt: skip
+    cell.poll(5)
+    assert cell.status(0) & S.WAITING_SYNCH and cell.status(1) & S.WAITING_MARKER
+    start = cell.now_ns + 25_000_000
+    assert cell.bank.synch([0, 1], start, cell.now_ns) == (0,)
+    assert cell.bank.due_ns == start
+    cell.bank.advance(start)
+    cell.now_ns = start
+    cell.send()
+    assert cell.starts == [(start, 0)]
+    cell.poll(60)
+    assert cell.markers.signals[0][0] == 3
+    assert cell.drives[1].position == pytest.approx(0.3)
+    assert cell.bank.is_idle([0, 1])
+
+
+def test_emergency_stop_latches_and_is_the_fastest_stop():
+    cell = Cell()
+    cell.write(mode=[MODE.POSITION] * 2, position=[1.0, 2.0])
+    cell.poll(10)
+    cell.bank.emergency_stop([0], cell.now_ns)
+    cell.send()
+    assert cell.drives[0].log[-1] is ActionKind.QUICK_STOP
+    cell.poll(5)
+    place = cell.drives[0].position
+    with pytest.raises(CommandError) as caught:
+        cell.write(mode=MODE.POSITION, position=0.0)
+    assert caught.value.errno == errno.EPERM
+    cell.bank.reset([0])
+    cell.poll(50)
+    assert cell.drives[0].position == place and cell.bank.is_idle([0])
+
+
+def test_fault_of_the_drive_drops_the_buffer_and_is_cleared_by_reset():
+    cell = Cell()
+    cell.write(mode=[MODE.POSITION] * 2, position=[1.0, 2.0])
+    cell.poll(5)
+    cell.drives[0].fault = "overcurrent (0x0E0)"
+    cell.poll(2)
+    assert cell.status() & S.FAULT and cell.bank.fault_text(0) == "overcurrent (0x0E0)"
+    assert [e.errno for e in cell.events if e.kind is EventKind.DROPPED] == [errno.EIO]
+    cell.poll(3)
+    cell.bank.reset([0])
+    cell.poll(2)
+    assert cell.drives[0].log[-1] is ActionKind.RESET
+    assert not cell.status() & S.FAULT
+    cell.write(mode=MODE.POSITION, position=0.0)
+    cell.poll(60)
+    assert cell.drives[0].position == pytest.approx(0.0)
+
+
+def test_a_refused_start_is_a_fault_and_the_axis_is_stopped():
+    cell = Cell()
+    cell.bank.append(records(mode=MODE.POSITION, position=1.0), cell.axes, cell.now_ns)
+    (action,) = cell.bank.take_actions()
+    cell.bank.action_failed(action, "illegal data value", cell.now_ns)
+    assert "illegal data value" in cell.bank.fault_text(0)
+    (stop,) = cell.bank.take_actions()
+    assert stop.kind is ActionKind.QUICK_STOP
+
+
+def test_done_of_the_command_before_does_not_end_the_new_one():
+    cell = Cell(1)
+    cell.bank.append(records(mode=MODE.POSITION, position=1.0), [0], cell.now_ns)
+    actions = cell.bank.take_actions()
+    still = np.zeros(1, dtype=bool)
+    for _ in range(20):  # the command is on the line, the drive still says done
+        cell.now_ns += POLL_NS
+        cell.bank.poll(cell.now_ns, np.zeros(1), np.zeros(1), still, ~still)
+        assert not cell.bank.is_idle([0])
+    cell.bank.action_done(actions[0], cell.now_ns)
+    cell.now_ns += POLL_NS
+    cell.bank.poll(cell.now_ns, np.zeros(1), np.zeros(1), still, ~still)
+    assert not cell.bank.is_idle([0])
+
+
+def test_homing_is_the_drives_own():
+    from sioms.motion import Homing
+
+    cell = Cell(1)
+    cell.bank = DriveBank([axis(modes=MODES, homing=Homing(0.1, 0.01, required=True))], markers=cell.markers)
+    cell.poll()
+    with pytest.raises(CommandError, match="home required"):
+        cell.write(mode=MODE.POSITION, position=0.1)
+    cell.bank.home([0], cell.now_ns)
+    cell.send()
+    assert cell.drives[0].log == [ActionKind.HOME]
+    cell.drives[0].target, cell.drives[0].wish = -0.1, 0.1
+    cell.poll(5)
+    assert cell.status() & S.HOMING
+    cell.poll(200)
+    assert cell.status() & S.HOMED and cell.bank.is_idle([0])
