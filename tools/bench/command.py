@@ -1,0 +1,77 @@
+"""The command line of ``sioms bench``: which sub-benches run, how long, and where the figures go."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from typing import Any
+
+from .figures import Report
+from .options import Options
+
+BENCHES: dict[str, tuple[str, str]] = {
+    "read": ("reading", "read of 4 axes and of 48 analog channels, against a bare round trip"),
+    "update": ("reading", "publication to awake subscriber at 100 Hz and 1 kHz"),
+    "write": ("writing", "write to acknowledgement: 1, 16 and 10,000 commands"),
+    "open": ("opening", "open and close, descriptors and memory gained by --soak N of them"),
+    "race": ("opening", "two writers racing for one output"),
+    "start": ("starting", "daemon start to ready, memory of daemon and drivers"),
+    "restart": ("starting", "driver killed to its node back"),
+    "axes": ("axes", "axes that one core carries at 1, 2, 3 and 5 kHz, and where a tick's time goes"),
+    "motion": ("motion", "idle wait against ideal end, start skew of two processes, marker to waiting axis"),
+    "edge": ("motion", "edge of a light beam to a waiting client awake"),
+    "client": ("deaths", "client killed, or hung with a lease, to its axes halting"),
+    "daemon": ("deaths", "daemon killed to all axes halting"),
+    "stop": ("stopping", "emergency stop to 16 axes in 4 processes acting on it, from Python and from the shell"),
+    "pipe": ("pipes", "start of devin; devin piped into devout as a 1 kHz loop"),
+    "protocol": ("fuzzing", "malformed frames on the sockets of daemon and drivers"),
+}
+"""Name of a sub-bench: the module that holds it, as a function of its name, and what it measures."""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add ``bench`` to the subcommands of ``sioms``."""
+    parser = subparsers.add_parser(
+        "bench", help="measure latencies and throughput on this machine", description=__doc__
+    )
+    add_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the bench."""
+    names = "\n".join(f"  {name:10} {text}" for name, (_, text) in BENCHES.items())
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.description = f"Measure the promises of SIOMS on this machine.\n\nsub-benches:\n{names}"
+    parser.add_argument("names", nargs="*", metavar="NAME", help="sub-benches to run; all when none is named")
+    parser.add_argument("--quick", action="store_true", help="few trials: seconds instead of minutes")
+    parser.add_argument("--trials", type=int, metavar="N", help="trials of each kill, hang and stop")
+    parser.add_argument("--soak", type=int, metavar="N", help="opens and closes of the sub-bench open")
+    parser.add_argument("--frames", type=int, metavar="N", help="frames of the sub-bench protocol")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of random frames")
+    parser.add_argument("--json", metavar="FILE", help="write all figures to a file")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the sub-benches; return 0, or 2 for a name that is none.
+
+    A missed bar is reported and is no failure: the figures are this machine's, not the code's alone.
+    """
+    wrong = [name for name in args.names if name not in BENCHES]
+    if wrong:
+        print(f"sioms bench: no sub-bench {wrong[0]}; there are: {', '.join(BENCHES)}", file=sys.stderr)
+        return 2
+    options = Options(args.quick, args.trials, args.soak, args.frames, args.seed)
+    report = Report()
+    try:
+        for name in args.names or BENCHES:
+            module, text = BENCHES[name]
+            report.begin(name, text)
+            getattr(importlib.import_module(f".{module}", __package__), f"bench_{name}")(options, report)
+    except KeyboardInterrupt:
+        report.note("interrupted: what follows is not complete")
+    report.summary()
+    if args.json:
+        report.write(args.json, quick=args.quick)
+    return 0

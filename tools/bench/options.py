@@ -1,0 +1,30 @@
+"""How long a bench measures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What the command line asks for.
+
+    Attributes:
+        quick: seconds instead of minutes.
+        trials, soak, frames: counts that were asked for, None for the usual.
+        seed: of random numbers.
+    """
+
+    quick: bool = False
+    trials: int | None = None
+    soak: int | None = None
+    frames: int | None = None
+    seed: int = 1
+
+    def count(self, quick: int, full: int) -> int:
+        """Return how many samples to take."""
+        return quick if self.quick else full
+
+    def kills(self, quick: int, full: int) -> int:
+        """Return how many kills, hangs or stops to try."""
+        return self.trials if self.trials is not None else self.count(quick, full)

@@ -1,0 +1,42 @@
+"""Generated configurations of simulated devices."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+def axes(
+    name: str, count: int = 4, *, tick_hz: float = 1000.0, history: int = 64, capacity: int = 16384,
+    velocity: float = 1.0, acceleration: float = 10.0, limits: bool = True, axis_keys: str = "",
+) -> str:  # fmt: skip
+    """Return a device of simulated servo axes, named a0, a1 ...
+
+    Args:
+        name: of the device.
+        count: of axes.
+        tick_hz, history, capacity: keys of the device.
+        velocity, acceleration: limits of each axis [m/s, m/s^2].
+        limits: whether the axes have soft limits, at -0.4 and 0.4 m.
+        axis_keys: further lines of each axis.
+    """
+    soft = "position_min = -0.4\nposition_max = 0.4\n" if limits else ""
+    one = (
+        f"velocity_max = {velocity}\nacceleration_max = {acceleration}\njerk_max = 1000.0\nforce_max = 60.0\n{soft}"
+        f"motor = {{ mass = 1.0, viscous = 2.0, encoder_step = 1e-6 }}\n{axis_keys}\n"
+    )
+    head = f'[device.{name}]\ndriver = "sim-axes"\ntick_hz = {tick_hz}\nhistory = {history}\ncapacity = {capacity}\n'
+    return head + "".join(f'[[device.{name}.axis]]\nname = "a{i}"\n{one}' for i in range(count))
+
+
+def wave(name: str, period_s: float, *, tick_hz: float = 1000.0) -> str:
+    """Return a device with one input bit that a light beam breaks periodically."""
+    return (
+        f'[device.{name}]\ndriver = "sim-io"\ninputs = 1\ntick_hz = {tick_hz}\n'
+        f"[[device.{name}.wave]]\nbit = 0\nperiod_s = {period_s}\nhigh_s = {period_s / 2}\n"
+    )
+
+
+def workcell(devices: Sequence[str], **keys: object) -> str:
+    """Return a configuration of devices; keys are those of [workcell]."""
+    lines = "".join(f"{key} = {value}\n" for key, value in keys.items())
+    return f'[workcell]\nname = "bench"\n{lines}' + "\n".join(devices)
