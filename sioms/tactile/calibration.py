@@ -239,7 +239,20 @@ def _contact(
     if "frictionless" in score and score[best] > _BETTER * score["frictionless"]:
         best = "frictionless"
     kind, share, tractions, table = tried[best]
+    if kind == "adhering" and options.contact is None:
+        share = _between(
+            {entry[1]: score[name] for name, entry in tried.items() if entry[0] != "hertz"}, share
+        )
     return kind, share, score, tractions, table
+
+
+def _between(score: dict[float, float], best: float) -> float:
+    """Return the share at the vertex of the parabola through the squares about the best one tried, within 0 to 1."""
+    shares = sorted(score)
+    place = min(max(shares.index(best), 1), len(shares) - 2)
+    near = shares[place - 1 : place + 2]
+    bend, tilt, _ = np.polyfit(near, [score[share] ** 2 for share in near], 2)
+    return float(np.clip(-tilt / (2.0 * bend), near[0], near[-1])) if bend > 0.0 else best
 
 
 def edge_peak(body: Cylinder, fits: Fits, half_angle: float) -> float:
