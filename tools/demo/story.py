@@ -1,0 +1,273 @@
+"""The story that the demo tells."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from importlib.resources import files
+
+import sioms
+from sioms.client.command import command
+
+from . import measure
+from .recorder import Recorder
+from .rig import Process, daemon, tool
+
+
+def tell(out: str, quick: bool, wire: bool) -> int:
+    """Run the demo; return the exit status."""
+    os.makedirs(out, exist_ok=True)
+    config = str(files("sioms").joinpath("etc/demo.toml"))
+    with tempfile.TemporaryDirectory(prefix="sioms-demo-") as folder:
+        _chapter("Start the daemon", f"siomsd --config {os.path.relpath(config)}")
+        began = time.monotonic()
+        process = daemon(config, f"{folder}/demo.sock")
+        try:
+            with sioms.Workcell(name="demo") as cell:
+                _say(f"ready after {time.monotonic() - began:.2f} s")
+                _list_nodes(cell)
+                _Show(cell, out).run(quick)
+        finally:
+            process.end()
+        if wire:
+            from .wire import show
+
+            show(folder)
+    print(f"\nPicture: {out}/demo.png")
+    return 0
+
+
+def _chapter(title: str, text: str = "") -> None:
+    print(f"\n\033[1m{title}\033[0m" + (f"   {text}" if text else ""), flush=True)
+
+
+def _say(text: str) -> None:
+    print(f"  {text}", flush=True)
+
+
+def _list_nodes(cell: sioms.Workcell) -> None:
+    _chapter("What there is", "sioms list")
+    shown = [node for node in cell.nodes() if node.name.count(".") == 0]
+    for node in shown:
+        kind = node.node_class.name.lower()
+        _say(
+            f"{node.name:10} {kind:7} {node.channels:3} channel{'s' if node.channels > 1 else ' '}  {node.device}: {node.state}"
+        )
+    _say(f"... and {len(cell.nodes()) - len(shown)} more: single axes and bits, groups, read-only companions")
+
+
+class _Show:
+    """The chapters on the simulated workcell, recorded from the side."""
+
+    def __init__(self, cell: sioms.Workcell, out: str) -> None:
+        self._cell = cell
+        self._out = out
+        self._recorder = recorder = Recorder(cell)
+        positions = recorder.add(
+            "mod0.readonly",
+            **{"mod0 x": lambda s: s.position[0] * 1e3, "mod0 y": lambda s: s.position[1] * 1e3},
+        )
+        velocities = recorder.add(
+            "mod0.xy.readonly", **{"mod0 x": lambda s: s.velocity[0], "mod0 y": lambda s: s.velocity[1]}
+        )
+        others = recorder.add(
+            "mod1.readonly",
+            **{"mod1 x": lambda s: s.position[0] * 1e3, "mod1 z": lambda s: s.position[2] * 1e3},
+        )
+        others_v = recorder.add("mod1.xaxis.readonly", **{"mod1 x": lambda s: s.velocity[0]})
+        force = recorder.add("lord1", **{"lord1 fz": lambda s: s.data[2]})
+        motor = recorder.add("mod1.zaxis.readonly", **{"mod1 z motor": lambda s: s.force[0]})
+        beams = recorder.add(
+            "beams", **{f"beam{i}": lambda s, i=i: (s.data[0] >> i & 1) + 1.5 * i for i in range(3)}
+        )
+        self._rows = [
+            ("position [mm]", positions + others),
+            ("velocity [m/s]", velocities + others_v),
+            ("force [N]", force + motor),
+            ("beams (up = broken)", beams),
+        ]
+        self._chapters: list[tuple[float, str]] = []
+
+    def run(self, quick: bool) -> None:
+        """Play all chapters, draw the picture, measure."""
+        self._recorder.start()
+        try:
+            self._trajectory()
+            self._beam()
+            self._finger()
+            self._pipes()
+            self._kill()
+            self._stop()
+        finally:
+            self._recorder.stop()
+        _chapter("The picture", "position, velocity, force and events over time")
+        try:
+            from .picture import draw
+        except ImportError:
+            _say("left out: matplotlib is not installed (pip install sioms[report])")
+        else:
+            draw(f"{self._out}/demo.png", self._rows, self._recorder.events, self._chapters)
+            _say(f"{self._out}/demo.png")
+        self._latencies(quick)
+
+    def _begin(self, title: str, text: str, short: str) -> None:
+        _chapter(title, text)
+        self._chapters.append(((time.monotonic_ns() - self._recorder.start_ns) / 1e9, short))
+
+    def _note(self, text: str, stamp_ns: int | None = None) -> None:
+        self._recorder.event(text, stamp_ns)
+        _say(text)
+
+    def _trajectory(self) -> None:
+        self._begin(
+            "Two modules in step",
+            "buffers filled beforehand, one synchronised start, markers between the modules",
+            "markers and synch",
+        )
+        cell = self._cell
+        with cell.open("mod0", "rw") as mod0, cell.open("mod1", "rw") as mod1:
+            picked, placed = cell.reserve_markers(2)
+            mod0.write([
+                command(0, position=0.18, synch=True),
+                command(1, position=0.12, synch=True),
+                command(0, position=0.05, time=0.6, signal=picked),
+                command(0, position=0.30, wait=placed),
+                command(1, position=0.0, wait=placed),
+            ])  # fmt: skip
+            mod1.write([
+                command(0, position=0.10, synch=True),
+                command(0, position=0.25, wait=picked, signal=placed),
+                command(0, position=0.05),
+            ])  # fmt: skip
+            _say(
+                f"buffered: mod0 {list(mod0.read().buffered)}, mod1 {list(mod1.read().buffered)} commands; nothing moves yet"
+            )
+            start_ns = cell.synch(mod0, mod1)
+            self._note("synch: both modules start", start_ns)
+            self._note("marker 1: mod0 has picked", picked.wait(5.0))
+            self._note("marker 2: mod1 has made room", placed.wait(5.0))
+            mod0.wait_until_idle(5.0)
+            mod1.wait_until_idle(5.0)
+            self._note("both modules at rest")
+
+    def _beam(self) -> None:
+        self._begin(
+            "React to a light beam",
+            "a moving axis breaks a beam; the program waits for the edge",
+            "light beam",
+        )
+        with self._cell.open("mod0.xaxis", "rw") as axis, self._cell.open("beam0") as beam:
+            axis.move(0.0, max_velocity=0.25, max_acceleration=3.0)
+            broken = beam.wait_event(timeout=5.0)
+            awake_us = (time.monotonic_ns() - broken.stamp_ns) / 1e3
+            self._note("beam 0 broken", broken.stamp_ns)
+            free = beam.wait_event(last=broken, timeout=5.0)
+            axis.move(0.12, replace=True, max_velocity=0.6, max_acceleration=6.0)
+            self._note("beam 0 free again: turn back", free.stamp_ns)
+            width_mm = (free.stamp_ns - broken.stamp_ns) / 1e9 * 0.25 * 1e3
+            _say(
+                f"awake {awake_us:.0f} us after the edge; the edges' stamps make the beam {width_mm:.2f} mm wide (it is 40 mm)"
+            )
+            axis.wait_until_idle(5.0)
+
+    def _finger(self) -> None:
+        self._begin(
+            "Press on the tactile finger",
+            "a force-guarded move; the array sees where and how hard",
+            "tactile finger",
+        )
+        with (
+            self._cell.open("mod1.zaxis", "rw") as axis,
+            self._cell.open("lord1") as sensor,
+            self._cell.open("tactile0") as finger,
+        ):
+            sensor.zero(50)
+            finger.zero(20)
+            axis.command(velocity=0.02)
+            while abs(sensor.read().data[2]) < 0.5:
+                sensor.wait_new(sensor.read().number, 1.0)
+            self._note("touch: force above 0.5 N")
+            axis.command(force=6.0, time=0.8, replace=True)
+            time.sleep(0.7)
+            snapshot = finger.read()
+            self._note(f"pressed with {abs(sensor.read().data[2]):.2f} N")
+            peak = max(abs(v) for v in snapshot.data) or 1.0
+            for index, value in enumerate(snapshot.data):
+                _say(f"element {index:2} {value:+7.2f} %  {'#' * round(40 * abs(value) / peak)}")
+            axis.wait_until_idle(2.0)
+            axis.move(0.0)
+            axis.wait_until_idle(5.0)
+            self._note("finger free again")
+
+    def _pipes(self) -> None:
+        self._begin("From the shell", "the same nodes through pipes", "pipes")
+        for name, *arguments in (
+            ["devin", "mod0"],
+            ["devout", "-pt", "mod0.xaxis", "0.05", "0.4"],
+            ["devin", "-n0p", "mod0"],
+        ):
+            text = tool(name, *arguments)
+            _say(f"$ {name} {' '.join(arguments)}")
+            for line in text.splitlines():
+                _say(line)
+
+    def _kill(self) -> None:
+        self._begin("Kill a client in mid-motion", "SIGKILL; nobody is left to say stop", "client killed")
+        with self._cell.open("mod0.xaxis.readonly") as watch:
+            victim = Process(["sioms.tools.demo.victim", "mod0.xaxis", "0.2"], "moving")
+            time.sleep(0.6)
+            try:
+                self._cell.open("mod0.xaxis", "rw")
+            except OSError as error:
+                _say(f"before: {error.strerror}")
+            self._note("SIGKILL to the client", victim.kill())
+            time.sleep(0.15)
+            reading = watch.read()[0]
+            self._note(f"axis at rest: {abs(reading.velocity):.4f} m/s")
+            self._cell.open("mod0.xaxis", "rw").close()
+            _say("and free for the next client")
+
+    def _stop(self) -> None:
+        self._begin(
+            "Emergency stop", "any client may; latched until somebody entitled resets it", "emergency stop"
+        )
+        cell = self._cell
+        with cell.open("mod0", "rw") as mod0, cell.open("mod1", "rw") as mod1:
+            for node in (mod0, mod1):
+                node.write([command(axis, velocity=0.15) for axis in range(2)])
+            time.sleep(0.5)
+            self._note("emergency stop")
+            cell.emergency_stop(why="demo")
+            try:
+                mod0.move(0.0)
+            except OSError as error:
+                _say(f"a write now: {error.strerror}")
+            time.sleep(0.3)
+            cell.reset()
+            self._note("reset: nothing resumes by itself")
+            time.sleep(0.3)
+            for node in (mod0, mod1):
+                node.write([command(axis, position=0.0) for axis in range(2)])
+            self._note("new commands: back to zero")
+            mod0.wait_until_idle(5.0)
+            mod1.wait_until_idle(5.0)
+
+    def _latencies(self, quick: bool) -> None:
+        _chapter("How fast", "medians and worst cases of this run on this machine")
+        few, many = (5, 500) if quick else (25, 5000)
+        cell = self._cell
+        rows = [
+            measure.socket_round_trip(many),
+            measure.reading(cell, many),
+            measure.writing(cell, many // 5),
+            measure.edge_to_client(cell, few),
+            measure.kill_to_halt(cell, few),
+            measure.stop_to_halt(cell, few),
+        ]
+        base = rows[0].median_us
+        _say(f"{'':38} {'median':>11} {'worst':>12} {'trials':>7} {'round trips':>12}")
+        for row in rows:
+            _say(
+                f"{row.what:38} {row.median_us:8.1f} us {row.worst_us:9.1f} us {row.trials:7} {row.median_us / base:12.2f}"
+            )
