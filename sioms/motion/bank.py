@@ -260,6 +260,12 @@ class AxisBank:
         self._homing.begin(chosen, self._sequencer.is_idle(chosen), now_ns)
         self._sequencer.refresh(chosen)
 
+    def set_homed(self, axes: AxesLike, homed: bool = True) -> None:
+        """Note that a reference was found otherwise (absolute encoder, restored position) or lost."""
+        chosen = np.asarray(axes, dtype=np.int64)
+        self._queue.set_homed(chosen, homed, self._last_ns)
+        self._sequencer.refresh(chosen)
+
     def shift(self, axis: int, by: float) -> None:
         """Add to the coordinate of an axis, moving or not: actual and commanded position alike."""
         self._offset[axis] += by
@@ -383,7 +389,7 @@ class AxisBank:
         self._actuator[:] = law.output
         self._force[:] = law.output
         if not law.all_servo:
-            s = self.stepper
+            s = law.stepper_rows
             self._actuator[s] = law.slewed[s] - self._offset[s]
             self._force[s] = 0.0
             desired[s] = law.slewed[s]

@@ -228,12 +228,7 @@ class DriveBank:
 
     def set_homed(self, axes: AxesLike, homed: bool = True) -> None:
         """Note that the drive has found (or lost) its reference."""
-        chosen = np.asarray(axes, dtype=np.int64)
-        bit = int(AxisStatus.HOMED)
-        fresh = chosen[((self._queue.latched[chosen] & bit) != 0) != homed]
-        self._queue.latched[fresh] ^= bit
-        if homed:
-            self._queue.emit(EventKind.HOMED, fresh, self._last_ns)
+        self._queue.set_homed(np.asarray(axes, dtype=np.int64), homed, self._last_ns)
 
     # -- driver side ---------------------------------------------------------------------------
 

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import AxisStatus
 
 from .queue import CommandQueue
-from .types import SWITCH_HOME, SWITCH_MINUS, SWITCH_PLUS, AxisSettings, EventKind, Homing
+from .types import HOME_SWITCHES, SWITCH_MINUS, SWITCH_PLUS, AxisSettings, EventKind, Homing
 
-BITS = {"minus": SWITCH_MINUS, "plus": SWITCH_PLUS, "home": SWITCH_HOME}
 
 
 class Phase(Enum):
@@ -112,7 +111,7 @@ class HomingRuns:
 
     def _step(self, axis: int, run: Progress, switches: int, now_ns: int) -> str:
         mover, homing = self._mover, run.homing
-        closed = bool(switches & BITS[homing.switch])
+        closed = bool(switches & HOME_SWITCHES[homing.switch])
         if abs(mover.measured(axis) - run.start) > homing.travel:
             return f"homing found no {homing.switch} switch edge within {homing.travel:g} {self._settings[axis].unit}"
         match run.phase:

@@ -38,6 +38,9 @@ class ControlLaw:
         self.kz: Vector = gains[1]
         self.kp: Vector = gains[2]
         self.kb: Vector = gains[3]
+        for given in settings:
+            if given.kind is AxisKind.SERVO and given.k is None:
+                raise ValueError(f"axis {given.name}: a servo needs the gain k; without it nothing holds its position")
         default = [1.0 / tick_s if s.kind is AxisKind.STEPPER else 0.0 for s in settings]
         self.k[:] = [d if s.k is None else s.k for s, d in zip(settings, default, strict=True)]
         self.kz[:] = [s.kz for s in settings]
@@ -54,6 +57,10 @@ class ControlLaw:
         """Output position of steppers."""
         self.saturated = np.zeros(n, dtype=bool)
         self.all_servo = not self.stepper.any()
+        self.stepper_rows: slice | NDArray[np.int64] = np.flatnonzero(self.stepper)
+        """The stepper rows as an index; a slice when all are, which copies nothing."""
+        if self.stepper.all():
+            self.stepper_rows = slice(None)
         self._old = np.zeros(n)
         self._u = np.zeros(n)
         self._term = np.zeros(n)
@@ -79,7 +86,8 @@ class ControlLaw:
             force_rows: mask of the axes in force mode, None when there are none.
         """
         if not self.all_servo:
-            w_last, e_last = self.output[self.stepper], self.error[self.stepper]
+            rows = self.stepper_rows
+            w_last, e_last = self.output[rows].copy(), self.error[rows].copy()
         self._servo(desired, actual, velocity)
         if force_rows is not None:
             np.add(desired, self.kb * velocity, out=self._u, where=force_rows)
@@ -111,7 +119,7 @@ class ControlLaw:
     def _slew(
         self, desired: Vector, desired_velocity: Vector, w_last: Vector, e_last: Vector, dt: float
     ) -> None:
-        s = self.stepper
+        s = self.stepper_rows
         e = desired[s] - self.slewed[s]
         free = self.k[s] * (e + self.kz[s] * e_last) - self.kp[s] * w_last + self.kb[s] * desired_velocity[s]
         # Rounding must not count as saturation: a profile at full acceleration is within the limits.

@@ -331,6 +331,14 @@ class CommandQueue:
         """Return why an axis is in fault, empty when it is not."""
         return self._fault_text.get(axis, "")
 
+    def set_homed(self, axes: NDArray[np.int64], homed: bool, now_ns: int) -> None:
+        """Set or clear the HOMED bit of these axes; tell those that gained it."""
+        bit = int(AxisStatus.HOMED)
+        changed = axes[((self.latched[axes] & bit) != 0) != homed]
+        self.latched[changed] ^= bit
+        if homed:
+            self.emit(EventKind.HOMED, changed, now_ns)
+
     def unlatch(self, axes: NDArray[np.int64]) -> None:
         """Clear emergency stop and fault of these axes."""
         bits = AxisStatus.EMERGENCY_STOP | AxisStatus.FAULT | AxisStatus.FOLLOWING_ERROR | AxisStatus.STALLED

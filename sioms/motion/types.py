@@ -8,6 +8,7 @@ from sioms.protocol.flags import ControlMode
 
 SWITCH_MINUS, SWITCH_PLUS, SWITCH_HOME = 1, 2, 4
 """Bits of an axis in the ``switches`` argument of AxisBank.tick()."""
+HOME_SWITCHES = {"minus": SWITCH_MINUS, "plus": SWITCH_PLUS, "home": SWITCH_HOME}
 EVERY_MODE = ControlMode(0x7FFF)
 
 
@@ -108,6 +109,22 @@ class Homing:
     travel: float = float("inf")
     required: bool = False
 
+    def __post_init__(self) -> None:
+        """Refuse a homing that cannot work.
+
+        Raises:
+            ValueError: naming the field, its value and what would be right.
+        """
+        if not (self.velocity > 0 and self.slow_velocity > 0 and self.travel > 0):
+            raise ValueError(
+                f"homing: velocity {self.velocity:g}, slow_velocity {self.slow_velocity:g}, travel {self.travel:g}; "
+                "want positive numbers"
+            )
+        if self.direction not in (-1, 1):
+            raise ValueError(f"homing: direction {self.direction}; want -1 or 1")
+        if self.switch not in HOME_SWITCHES:
+            raise ValueError(f"homing: switch {self.switch!r}; want one of {', '.join(HOME_SWITCHES)}")
+
 
 @dataclass(frozen=True, slots=True)
 class AxisSettings:
@@ -151,6 +168,24 @@ class AxisSettings:
     following_error_max: float | None = None
     homing: Homing | None = None
     modes: ControlMode = EVERY_MODE
+
+    def __post_init__(self) -> None:
+        """Refuse settings that no axis can have.
+
+        Raises:
+            ValueError: naming the field, its value and what would be right.
+        """
+        low, high = self.position_min, self.position_max
+        if low is not None and high is not None and not low < high:
+            raise ValueError(f"axis {self.name}: position_min {low:g} is not below position_max {high:g}")
+        for name in ("velocity_max", "acceleration_max", "jerk_max", "force_max", "following_error_max"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"axis {self.name}: {name} {value:g}; want a positive number")
+        if not self.velocity_filter_s >= 0:
+            raise ValueError(f"axis {self.name}: velocity_filter_s {self.velocity_filter_s:g}; want 0 or more")
+        if not -1 < self.kp < 1:
+            raise ValueError(f"axis {self.name}: kp {self.kp:g} makes the law unstable; want between -1 and 1")
 
     @property
     def force_unit(self) -> str:

@@ -17,19 +17,19 @@ velocity = st.floats(-V, V)
 time_s = st.floats(1e-4, 1.5)
 
 command = st.one_of(
-    st.builds(lambda p: dict(mode=MODE.POSITION, position=p), position),
-    st.builds(lambda p: dict(mode=MODE.POSITION | MODE.RELATIVE, position=p), st.floats(-0.5, 0.5)),
-    st.builds(lambda p, t: dict(mode=MODE.POSITION | TIMED, position=p, time=t), position, time_s),
-    st.builds(lambda p, v: dict(mode=PASS, position=p, velocity=v), position, velocity),
-    st.builds(lambda p, v, t: dict(mode=PASS | TIMED, position=p, velocity=v, time=t), position, velocity, time_s),
-    st.builds(lambda v, t: dict(mode=MODE.VELOCITY | TIMED, velocity=v, time=t), velocity, time_s),
-    st.builds(lambda v: dict(mode=MODE.VELOCITY, velocity=v), velocity),
-    st.builds(lambda a, t: dict(mode=MODE.ACCELERATION | TIMED, acceleration=a, time=t), st.floats(-A, A), time_s),
-    st.builds(lambda j, t: dict(mode=MODE.JERK | TIMED, jerk=j, time=t), st.floats(-J, J), time_s),
+    st.builds(lambda p: {"mode": MODE.POSITION, "position": p}, position),
+    st.builds(lambda p: {"mode": MODE.POSITION | MODE.RELATIVE, "position": p}, st.floats(-0.5, 0.5)),
+    st.builds(lambda p, t: {"mode": MODE.POSITION | TIMED, "position": p, "time": t}, position, time_s),
+    st.builds(lambda p, v: {"mode": PASS, "position": p, "velocity": v}, position, velocity),
+    st.builds(lambda p, v, t: {"mode": PASS | TIMED, "position": p, "velocity": v, "time": t}, position, velocity, time_s),
+    st.builds(lambda v, t: {"mode": MODE.VELOCITY | TIMED, "velocity": v, "time": t}, velocity, time_s),
+    st.builds(lambda v: {"mode": MODE.VELOCITY, "velocity": v}, velocity),
+    st.builds(lambda a, t: {"mode": MODE.ACCELERATION | TIMED, "acceleration": a, "time": t}, st.floats(-A, A), time_s),
+    st.builds(lambda j, t: {"mode": MODE.JERK | TIMED, "jerk": j, "time": t}, st.floats(-J, J), time_s),
     st.builds(
-        lambda p, v, a: dict(
-            mode=MODE.POSITION | MODE.SPECIFIED_MAX_VEL_ACC, position=p, max_velocity=v, max_acceleration=a
-        ),
+        lambda p, v, a: {
+            "mode": MODE.POSITION | MODE.SPECIFIED_MAX_VEL_ACC, "position": p, "max_velocity": v, "max_acceleration": a
+        },
         position, st.floats(0.1, V), st.floats(0.5, A),
     ),
 )  # fmt: skip
@@ -89,7 +89,7 @@ def test_any_sequence_keeps_limits_and_continuity(steps, tick_ns):
 @given(st.lists(command, min_size=1, max_size=6), st.booleans())
 def test_planning_ahead_changes_nothing_but_when_the_work_is_done(commands, stepper):
     kind = AxisKind.STEPPER if stepper else AxisKind.SERVO
-    rigs = [Rig([axis(kind=kind, k=None)]) for _ in range(2)]
+    rigs = [Rig([axis(kind=kind, k=None if stepper else 100.0)]) for _ in range(2)]
     for fields in commands:
         for rig in rigs:
             apply(rig, "append", fields)
