@@ -9,6 +9,7 @@ Concurrency: none; a :class:`MappedUnit` belongs to one driver thread.
 from __future__ import annotations
 
 import errno
+import math
 from collections.abc import Generator, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -119,6 +120,17 @@ class MappedUnit:
         if write.function == "single":
             return pdus.write_register(write.address, words[0])
         return pdus.write_registers(write.address, words)
+
+    def in_register(self, name: str, source: str, si: float, more: int = 0) -> float:
+        """Return what becomes of a quantity in the register of a command, ``more`` steps further [SI]."""
+        items = [
+            item for write in self.rmap.commands[name].writes for item in write.items if item.source == source
+        ]
+        if not items:
+            return si
+        item, unit = items[0], UNITS[items[0].unit]
+        raw = rounded(self.gearing.from_si(si, unit, item.scale), item.round)
+        return self.gearing.to_si(raw + math.copysign(more, raw), unit, item.scale)
 
     def identify(self, settings: Mapping[str, Any]) -> Steps:
         """Read what tells the device from others and compare.

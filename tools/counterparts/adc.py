@@ -131,10 +131,8 @@ class FrontEnd:
         kind, options = payload[0], self.options
         form = list(FORMATS).index(options.format)
         if kind == 0x10:
-            return (
-                struct.pack("<BBBBI", 0x11, 1, options.channels, form, options.max_rate)
-                + options.name.encode()
-            )
+            name = str(options.name).encode()
+            return struct.pack("<BBBBI", 0x11, 1, options.channels, form, options.max_rate) + name
         if kind == 0x12 and len(payload) == 6:
             return bytes((0x1F, kind, self._start(*struct.unpack("<BI", payload[1:]))))
         if kind in (0x13, 0x14) and len(payload) == 2:

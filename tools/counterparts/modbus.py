@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
+import logging
 import socket
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -21,6 +23,9 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 from .faults import Faults
 from .ports import PtyPort
+
+# a port that is unplugged under it is no news here
+logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 ILLEGAL_FUNCTION = ExcCodes.ILLEGAL_FUNCTION
 ILLEGAL_VALUE = ExcCodes.ILLEGAL_VALUE
@@ -181,6 +186,7 @@ class TcpLine:
         self._public: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
         self._tasks: set[asyncio.Task[None]] = set()
+        self._serving: set[asyncio.Task[None]] = set()
 
     async def start(self) -> None:
         """Start the server and listen; ``port`` 0 becomes a free one."""
@@ -208,6 +214,7 @@ class TcpLine:
     async def close(self) -> None:
         """Stop everything."""
         await self.unplug()
+        await asyncio.gather(*self._serving, return_exceptions=True)
         await self._server.shutdown()  # type: ignore[no-untyped-call]
 
     def handlers(self) -> dict[str, Callable[..., object]]:
@@ -226,6 +233,10 @@ class TcpLine:
         return {**self._faults.handlers(), "unplug": start(self.unplug), "plug": start(self.plug)}
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        if task is not None:
+            self._serving.add(task)
+            task.add_done_callback(self._serving.discard)
         inner_reader, inner_writer = await asyncio.open_connection("127.0.0.1", self._inner)
         self._writers |= {writer, inner_writer}
         outward = asyncio.create_task(self._outward(inner_reader, writer))
@@ -242,10 +253,11 @@ class TcpLine:
             writer.close()
 
     async def _outward(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        while head := await reader.readexactly(6):
-            frame = head + await reader.readexactly(int.from_bytes(head[4:6], "big"))
-            delay_s, data = self._faults.outgoing(frame)
-            asyncio.get_running_loop().call_later(delay_s, writer.write, data)
+        with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
+            while head := await reader.readexactly(6):
+                frame = head + await reader.readexactly(int.from_bytes(head[4:6], "big"))
+                delay_s, data = self._faults.outgoing(frame)
+                asyncio.get_running_loop().call_later(delay_s, writer.write, data)
 
 
 def serial_parser(description: str, units: str = "1") -> argparse.ArgumentParser:

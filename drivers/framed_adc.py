@@ -1,0 +1,227 @@
+"""Tactile arrays and ADC front ends that push framed samples (COBS, CRC, own clock).
+
+The device is asked what it is, started at a rate, and kept alive by a hello every second; it stops by itself 5 s after
+the last. Each block carries the time at which it was sampled, by a running fit of the device's clock.
+
+    [device.tactile0]
+    driver = "framed-adc"
+    line = { serial = "/dev/ttyACM0", baud = 115200 }
+    channels = 16
+    rate_hz = 200
+    scale = 0.0005
+    unit = "N"
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+from collections.abc import Mapping, Sequence
+
+import msgspec
+import numpy as np
+
+from sioms.protocol.flags import AnalogStatus, NodeClass
+from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
+from sioms.sdk.codec import sample_stream as stream
+from sioms.sdk.codec.clock_fit import ClockFit
+from sioms.sdk.codec.cobs import FrameReceiver, frame
+from sioms.sdk.driver import Kit, StreamDriver
+from sioms.sdk.exchange import DeviceError, Send, Steps
+from sioms.sdk.settings import LineSettings
+
+_BYTES = {"i16": 2, "i32": 4, "f32": 4}
+_FIXED_BYTES = 10 + 2 + 2
+"""Header, CRC, code byte and closing zero of a sample frame."""
+LINE_SHARE = 0.95
+"""Part of the line's capacity that a stream may fill."""
+
+
+class FramedAdcSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Keys of the device.
+
+    Attributes:
+        line: the line that the device is on.
+        channels: number of values in a block; the device must have as many.
+        rate_hz: blocks per second.
+        scale, offset: value = (raw - offset) * scale; one number, or one a channel.
+        unit: of the values.
+        names: of the channels; c0, c1 ... without.
+        minimum, maximum: range of the values [unit].
+        device_name: what the device must call itself; anything when empty.
+        stream: number of the stream.
+        format: of the values, for the arithmetic of the line; the device must send it.
+        history: snapshots kept for readers.
+    """
+
+    line: LineSettings
+    channels: int
+    rate_hz: int = 200
+    scale: float | list[float] = 1.0
+    offset: float | list[float] = 0.0
+    unit: str = ""
+    names: list[str] = []
+    minimum: float | None = None
+    maximum: float | None = None
+    device_name: str = ""
+    stream: int = 1
+    format: str = "i16"
+    history: int = 256
+
+
+class FramedAdc(StreamDriver):
+    """A front end that pushes blocks of samples.
+
+    Concurrency: the one thread of the driver process.
+    """
+
+    Settings = FramedAdcSettings
+    heartbeat_s = stream.HEARTBEAT_S
+
+    @classmethod
+    def describe(cls, name: str, settings: FramedAdcSettings) -> Description:
+        """Tell the channels; raises ValueError for what neither frame nor line could carry."""
+        _check(settings)
+        names = settings.names or [f"c{i}" for i in range(settings.channels)]
+        channels = tuple(
+            ChannelInfo(each, settings.unit, settings.minimum, settings.maximum) for each in names
+        )
+        block = BlockSpec("", NodeClass.ANALOG, channels, history=settings.history)
+        return Description((block,), settings.rate_hz, lease_s=max(0.5, 10 / settings.rate_hz))
+
+    def __init__(self, name: str, settings: FramedAdcSettings, kit: Kit) -> None:
+        super().__init__(name, settings, kit)
+        self.line = settings.line
+        self.silence_s = max(0.25, 20 / settings.rate_hz)
+        self._block = AnalogBlock(self.describe(name, settings).blocks[0])
+        self._scale = np.broadcast_to(np.array(settings.scale, dtype=np.float64), settings.channels)
+        self._offset = np.broadcast_to(np.array(settings.offset, dtype=np.float64), settings.channels)
+        self._receiver = FrameReceiver()
+        self._fit = ClockFit(1000, stream.CLOCK_MODULUS_US)
+        self._sequence: int | None = None
+        self._lost = self._foreign = 0
+
+    @property
+    def blocks(self) -> Sequence[AnyBlock]:
+        """The channels."""
+        return (self._block,)
+
+    def open(self) -> Steps:
+        """Ask the device what it is, compare, and start the stream."""
+        settings = self.settings
+        about: stream.Hello = yield stream.hello()
+        if about.version != stream.PROTOCOL_VERSION:
+            raise self._not_this(f"speaks version {about.version} of the protocol; 1 is right")
+        if about.channels != settings.channels:
+            raise self._not_this(f"has {about.channels} channels; the configuration says {settings.channels}")
+        if about.format.name.lower() != settings.format:
+            raise self._not_this(
+                f"sends {about.format.name.lower()}; the configuration says {settings.format}"
+            )
+        if settings.device_name and about.name != settings.device_name:
+            raise self._not_this(
+                f"calls itself {about.name!r}; the configuration says {settings.device_name!r}"
+            )
+        if settings.rate_hz > about.max_rate_hz:
+            raise self._not_this(f"sends at most {about.max_rate_hz} Hz; rate_hz = {settings.rate_hz}")
+        self._sequence = None
+        yield stream.start(settings.stream, settings.rate_hz)
+
+    def feed(self, data: bytes, now_ns: int) -> int:
+        """Publish a snapshot for every good block."""
+        good = 0
+        for payload in self._receiver.feed(data):
+            block = stream.parse_samples(payload)
+            if block is None:
+                # acknowledgements and answers to the heartbeat come between the blocks
+                self._foreign += payload[0] not in (stream.Message.HELLO_REPLY, stream.Message.ACKNOWLEDGE)
+                continue
+            if block.stream != self.settings.stream or len(block.values) != self._block.n:
+                self._foreign += 1
+                continue
+            self._take(block, now_ns)
+            good += 1
+        return good
+
+    def heartbeat(self) -> Steps:
+        """Say hello; the answer is not waited for, so that it never stands in the way of samples."""
+        yield Send(frame(bytes((stream.Message.HELLO,))), "hello")
+
+    def counters(self) -> Mapping[str, int]:
+        """Return what the receiver saw."""
+        seen = self._receiver.counters
+        return {
+            "frames": seen.frames,
+            "bad_crc": seen.bad_crc,
+            "malformed": seen.malformed + seen.oversized,
+            "lost_blocks": self._lost,
+            "foreign_frames": self._foreign,
+            "clock_restarts": self._fit.restarts,
+        }
+
+    def close(self) -> Steps:
+        """Stop the stream."""
+        yield Send(frame(bytes((stream.Message.STOP, self.settings.stream))), "stop")
+
+    def _take(self, block: stream.SampleBlock, now_ns: int) -> None:
+        flags = 0
+        if self._sequence is not None:
+            lost = (block.sequence - self._sequence - 1) % stream.SEQUENCE_MODULUS
+            # a device that began anew counts from 0: that is no loss
+            if lost and lost < stream.SEQUENCE_MODULUS // 2:
+                self._lost += lost
+                flags = int(AnalogStatus.OVERRUN)
+        self._sequence = block.sequence
+        if block.flags & stream.SampleFlag.SATURATED:
+            flags |= int(AnalogStatus.SATURATED)
+        if block.flags & stream.SampleFlag.OVERRUN:
+            flags |= int(AnalogStatus.OVERRUN)
+        if block.flags & stream.SampleFlag.REFERENCE_FAULT:
+            flags |= int(AnalogStatus.INVALID)
+        data = self._block.data
+        np.subtract(block.values, self._offset, out=data)
+        np.multiply(data, self._scale, out=data)
+        self._block.flags[:] = flags | np.where(np.isfinite(data), 0, int(AnalogStatus.INVALID))
+        self._block.stamp_ns = self._fit.to_host(block.t_us, now_ns)
+        self.kit.publish(self._block, self._block.stamp_ns)
+
+    def _not_this(self, what: str) -> DeviceError:
+        return DeviceError(errno.ENODEV, f"identify {self.name} on {self.line}: the device {what}")
+
+
+def _check(settings: FramedAdcSettings) -> None:
+    """Raise ValueError for settings that contradict each other, the frame or the line."""
+    if settings.format not in _BYTES:
+        raise ValueError(f"format = {settings.format}; one of {', '.join(_BYTES)} is right")
+    size = _BYTES[settings.format]
+    most = (252 - 10) // size
+    if not 1 <= settings.channels <= most:
+        raise ValueError(f"channels = {settings.channels}; want 1 to {most} of format {settings.format}")
+    if not 0 <= settings.stream <= 255:
+        raise ValueError(f"stream = {settings.stream}; want 0 to 255")
+    if settings.names and len(settings.names) != settings.channels:
+        raise ValueError(f"names: {len(settings.names)} for {settings.channels} channels; want one each")
+    for key in ("scale", "offset"):
+        value = getattr(settings, key)
+        numbers = value if isinstance(value, list) else [value]
+        if isinstance(value, list) and len(value) != settings.channels:
+            raise ValueError(
+                f"{key}: {len(value)} for {settings.channels} channels; want one number, or one each"
+            )
+        if not all(map(math.isfinite, numbers)) or (key == "scale" and 0 in numbers):
+            raise ValueError(f"{key} = {value}; want finite numbers{', not 0' if key == 'scale' else ''}")
+    if settings.rate_hz < 1:
+        raise ValueError(f"rate_hz = {settings.rate_hz}; want 1 or more")
+    if settings.line.serial is not None:
+        _check_line(settings, _FIXED_BYTES + settings.channels * size)
+
+
+def _check_line(settings: FramedAdcSettings, frame_bytes: int) -> None:
+    line = settings.line
+    top_hz = LINE_SHARE * line.baud / line.bits_per_character / frame_bytes
+    if settings.rate_hz > top_hz:
+        raise ValueError(
+            f"rate_hz = {settings.rate_hz}: {frame_bytes} bytes a block at {line.baud} baud carry {top_hz:.0f} Hz; "
+            "want a lower rate or a faster line (a USB CDC port has no baud rate: give 12000000)"
+        )
