@@ -119,12 +119,20 @@ def test_refuses_what_no_stepper_can_be(change, word):
         StepperBank([Stepper(**{"mass": 0.4, "step": 2e-4, "hold_force": 60.0} | change)], TICK_S)
 
 
-def test_field_far_too_fast_does_not_lock_by_aliasing():
-    """A field that turns once in every substep has no mean force: the rotor stays."""
-    bank = StepperBank([BELT], TICK_S)
-    turn = 4 * BELT.step * bank.substeps
+def test_field_far_too_fast_does_not_drag_by_aliasing():
+    """A field of 4.02 steps a substep looks like one of 0.02 step to who samples it: the rotor must not follow."""
+    bank = StepperBank([Stepper(mass=0.4, step=2e-4, hold_force=60.0, coulomb=3.0)], TICK_S)
     field = 0.0
-    for _ in range(200):
-        field += turn
-        bank.advance(np.array([field + BELT.step]))
+    for _ in range(300):
+        field += 4.02 * BELT.step * bank.substeps
+        bank.advance(np.array([field]))
     assert bank.stalled[0] and abs(bank.position[0]) < 8 * BELT.step
+
+
+@pytest.mark.parametrize("corner, holds", [(math.inf, True), (0.05, False)])
+def test_pull_out_by_speed(corner, holds):
+    """At six times the corner speed 60 N fall to 60/sqrt(37) = 9.9 N, less than the friction."""
+    motor = Stepper(mass=0.4, step=2e-4, hold_force=60.0, coulomb=30.0, corner_velocity=corner)
+    bank = StepperBank([motor], TICK_S)
+    ramp(bank, 1.0, 0.3, 0.5)
+    assert bank.stalled[0] != holds

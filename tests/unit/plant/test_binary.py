@@ -37,6 +37,12 @@ def test_beam_needs_all_coordinates_of_a_box():
     assert beam.sample([0.6, 0.6], 2000) == [Edge(1000 + 833, False)]
 
 
+def test_grazing_a_corner_breaks_nothing():
+    beam = Beam([Box(((0, 0.0, 1.0), (1, 0.0, 1.0)))])
+    beam.sample([-1.0, 0.0], 0)
+    assert beam.sample([1.0, 2.0], 1000) == [] and not beam.broken
+
+
 def test_overlapping_boxes_are_one_object():
     beam = Beam([Box(((0, 0.1, 0.5),)), Box(((0, 0.4, 0.9),))])
     beam.sample([0.0], 0)
