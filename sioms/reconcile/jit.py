@@ -15,6 +15,7 @@ STATE_SIGNATURE = "float64(float64, float64, float64, float64, float64[::1])"
 
 try:
     import numba
+    from numba.typed import List as TypedList
 except ImportError:  # pragma: no cover - the plain path is run by a test in a subprocess
     numba = None
 
@@ -35,6 +36,19 @@ def state_function(function: F, *, cache: bool = True) -> F:
         return function
     compiled: F = numba.njit(STATE_SIGNATURE, cache=cache)(function)
     return compiled
+
+
+@kernel
+def _listed(functions: Any) -> Any:
+    out = TypedList()
+    for f in functions:
+        out.append(f)
+    return out
+
+
+def function_list(functions: tuple[Any, ...]) -> Any:
+    """Return state functions in the container that a compiled kernel takes at no cost per call."""
+    return functions if numba is None else _listed(functions)
 
 
 def plain(function: F) -> F:

@@ -19,7 +19,8 @@ class Controller:
     """Discrete servo law of the axis.
 
     u[n] = clip(k (e[n] + kz e[n-1]) - kp u[n-1] + kb v[n] + offset, +-limit), e = command - position,
-    v the first difference of position through one pole at ``velocity_filter_hz`` (0: no filter).
+    v the first difference of position through one pole at ``velocity_filter_hz`` (0: no filter), or, with
+    ``velocity_mean``, the difference of the mean of two samples.
     """
 
     k: float
@@ -29,6 +30,7 @@ class Controller:
     offset: float
     limit: float
     velocity_filter_hz: float
+    velocity_mean: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,4 +124,5 @@ def controller_row(model: AxisModel) -> Array:
         raise ValueError(f"simulate {model.name}: the model has no controller; a closed loop needs one")
     f = c.velocity_filter_hz
     alpha = 1.0 - np.exp(-2.0 * np.pi * f * model.sample_time_s) if f > 0.0 else 1.0
-    return np.array([c.k, c.kz, c.kp, c.kb, c.offset, c.limit, alpha], dtype=np.float64)
+    return np.array([c.k, c.kz, c.kp, c.kb, c.offset, c.limit, alpha,
+                     float(c.velocity_mean)], dtype=np.float64)

@@ -216,7 +216,8 @@ def _screen_state(problem: Problem, fit: Fit, effect: Effect, motions: list[Moti
         if not np.any(keep):
             continue
         coefficient = np.zeros(f.shape[1])
-        coefficient[keep] = np.linalg.lstsq(f[:, keep] / size[keep], rest, rcond=1e-8)[0] / size[keep]
+        unit = f[:, keep] / size[keep]
+        coefficient[keep] = np.linalg.lstsq(unit.T @ unit, unit.T @ rest, rcond=1e-8)[0] / size[keep]
         gain = 1.0 - float(np.sum((rest - f @ coefficient) ** 2)) / float(rest @ rest)
         if best is None or gain > best.gain:
             best = Start(effect.name, gain, _values(effect, fit.model, shape, coefficient, levels))

@@ -7,6 +7,7 @@ exist, only on their slots.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,11 @@ import numpy as np
 from sioms.reconcile import kernel as k
 from sioms.reconcile.effect import ROW, Array, Slot
 from sioms.reconcile.effects import known
-from sioms.reconcile.jit import state_function
+from sioms.reconcile.jit import function_list, state_function
 from sioms.reconcile.model import AxisModel, controller_row
 
-SLOTS = 8
+#: Places for effects of one kind; the kernel unpacks as many.
+SLOTS = 6
 
 @state_function
 def _nothing(x: float, v: float, u: float, temperature: float, p: Array) -> float:
@@ -30,7 +32,7 @@ class Packed:
     """A model as the kernel reads it."""
 
     plant: Array
-    functions: dict[Slot, tuple[Any, ...]]
+    functions: dict[Slot, Any]
     rows: dict[Slot, Array]
     counts: dict[Slot, int]
     substeps: int
@@ -96,8 +98,14 @@ def pack(model: AxisModel, substeps: int = 0) -> Packed:
     if transmission is not None:
         _couple(plant, *transmission)
     steps = substeps or _steps(transmission)
-    filled = {s: (*f, *[_nothing] * (SLOTS - len(f))) for s, f in functions.items()}
+    filled = {s: _container((*f, *[_nothing] * (SLOTS - len(f)))) for s, f in functions.items()}
     return Packed(plant, filled, rows, {s: len(f) for s, f in functions.items()}, steps)
+
+
+@lru_cache(maxsize=1024)
+def _container(functions: tuple[Any, ...]) -> Any:
+    """Keep one container per set of functions."""
+    return function_list(functions)
 
 
 def _steps(transmission: tuple[Slot, Array] | None) -> int:
