@@ -1,0 +1,168 @@
+"""How many axes one core carries, and where the time of a tick goes (tables F.8 and F.7 of the dissertation).
+
+One driver process of n simulated servo axes; half of them carry out random profiles out of filled
+buffers, the others hold. A tick is everything: stops and leases looked at, physics advanced and
+measured, plans, limits, control law, watching, publication of all readings.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from dataclasses import dataclass
+from typing import Any
+
+from sioms.client.command import command
+
+from .figures import Bar, Report
+from .options import Options
+from .rig import CpuTimes, Daemon
+from .workcells import workcell
+
+ORIGINAL = {1000: 90, 2000: 35, 3000: 19, 5000: 4}
+"""Axes of the best processor of table F.8, the 486DX2 at 66 MHz, by rate [Hz]."""
+WANTED = {1000: 2000, 5000: 200}
+FIRST_GUESS = {1000: 2500, 2000: 1000, 3000: 500, 5000: 200}
+MOST = 10_000
+GROUP = 20
+MOVES = 40
+SKIPPED = 0.001
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """What a number of axes took.
+
+    Attributes:
+        axes, rate: how many, how often [Hz].
+        phases: statistics of the driver's ticks [ns].
+        skipped: share of ticks that never ran.
+        share: of one core.
+    """
+
+    axes: int
+    rate: int
+    phases: dict[str, Any]
+    skipped: float
+    share: float
+
+    def p99_us(self, phase: str = "total_ns") -> float:
+        """Return the 99th percentile of a phase [us]."""
+        return float(self.phases[phase]["99.0"]) * 1e-3
+
+    @property
+    def carried(self) -> bool:
+        """Whether the ticks kept to the period."""
+        return self.p99_us() < 1e6 / self.rate and self.skipped <= SKIPPED
+
+
+def bench_axes(options: Options, report: Report) -> None:
+    """Search the most axes at each rate; quick: only look whether the wanted numbers are carried."""
+    seconds = options.count(1, 3)
+    best: dict[int, Load] = {}
+    for rate in [1000, 5000] if options.quick else [1000, 2000, 3000, 5000]:
+        found = _check(rate, seconds, report) if options.quick else _search(rate, seconds, report)
+        if found is not None:
+            best[rate] = found
+        bars = [Bar("value", WANTED[rate], True)] if rate in WANTED else []
+        notes = f"the 486DX2 of table F.8: {ORIGINAL[rate]}"
+        if found is not None:
+            notes += f"; p99 {found.p99_us():.0f} us of {1e6 / rate:.0f} us, core {found.share:.0%}"
+        count = found.axes if found is not None else 0
+        report.value(f"axes carried at {rate} Hz", count, "", bars=bars, notes=notes)
+    for load in [_measure(12, 1000, seconds), *best.values()]:
+        _break_down(load, report)
+
+
+def _check(rate: int, seconds: float, report: Report) -> Load | None:
+    load = _measure(WANTED[rate], rate, seconds)
+    _tell(load, report)
+    return load if load.carried else None
+
+
+def _search(rate: int, seconds: float, report: Report) -> Load | None:
+    """Return the largest load found that is carried: double or halve, then halve the interval four times."""
+    low, high, best, n = 0, MOST, None, FIRST_GUESS[rate]
+    for _ in range(7):
+        load = _measure(n, rate, seconds)
+        _tell(load, report)
+        if load.carried:
+            low, best = n, load
+        else:
+            high = n
+        if high - low <= max(10, high // 20):
+            break
+        n = (low + high) // 2 if high < MOST else min(2 * n, MOST)
+    return best
+
+
+def _tell(load: Load, report: Report) -> None:
+    word = "carried" if load.carried else "too many"
+    report.note(
+        f"{load.axes:6} axes at {load.rate} Hz: p50 {load.phases['total_ns']['50.0'] * 1e-3:7.0f} us, p99 {load.p99_us():7.0f} us, "
+        f"{load.skipped:.2%} of ticks left out, core {load.share:.0%}: {word}"
+    )
+
+
+def _measure(axes: int, rate: int, seconds: float) -> Load:
+    with Daemon(_config(axes, rate)) as daemon, daemon.cell() as cell:
+        watcher = cell.open("many.a0.readonly")
+        groups = [cell.open(f"group{i}", "rw", 5.0) for i in range(_groups(axes))]
+        for group in groups:
+            _fill(group)
+        time.sleep(0.3)
+        cpu = CpuTimes({"driver": daemon.device_pids()["many"]})
+        before = watcher.statistics(1)
+        time.sleep(seconds)
+        after = watcher.statistics(max(1, int(0.95 * seconds * rate)))
+        share = cpu.shares()["driver"]
+        moving = [sum(group.read().in_motion) for group in groups]
+        wanted = len(groups) * len(groups[0].info.channels)
+        if sum(moving) < wanted // 2:
+            text = "; ".join(daemon.log().splitlines()[-3:])
+            raise RuntimeError(f"load {axes} axes: {sum(moving)} of them move; want {wanted}; log: {text}")
+    ticks = after["ticks"] - before["ticks"]
+    left_out = after["skipped"] - before["skipped"]
+    return Load(axes, rate, after, left_out / max(1, ticks + left_out), share)
+
+
+def _groups(axes: int) -> int:
+    """Return how many groups of axes make half of them."""
+    return max(1, axes // (2 * GROUP))
+
+
+def _config(axes: int, rate: int) -> str:
+    device = (
+        f'[device.many]\ndriver = "sim-axes"\ntick_hz = {rate}\nhistory = 4\ncapacity = 64\n'
+        f'[[device.many.axis]]\nname = "a"\ncount = {axes}\nposition_min = -0.4\nposition_max = 0.4\nvelocity_max = 1.0\n'
+        "acceleration_max = 10.0\njerk_max = 1000.0\nforce_max = 60.0\nfollowing_error_max = 0.1\n"
+        "motor = { mass = 1.0, viscous = 2.0, coulomb = 1.0, stiction = 1.5, encoder_step = 1e-6 }\n"
+    )
+    size = min(GROUP, axes // 2)
+    names = [[f"a{g * GROUP + i}" for i in range(size)] for g in range(_groups(axes))]
+    groups = [f'[node.group{g}]\nof = "many"\nchannels = {members}\n' for g, members in enumerate(names)]
+    return workcell([device, *groups])
+
+
+def _fill(group: Any) -> None:
+    """Write random moves of some tenths of a second to all axes of a group."""
+    generator = random.Random(group.name)
+    axes = range(len(group.info.channels))
+    for _ in range(0, MOVES, 10):
+        group.write(
+            b"".join([command(a, position=generator.uniform(-0.2, 0.2)) for _ in range(10) for a in axes]), 5.0
+        )
+
+
+def _break_down(load: Load, report: Report) -> None:
+    """Say where the time of a tick goes, as table F.7 does."""
+    names = {
+        "late_ns": "scheduling", "input_ns": "stops, leases, simulated mechanics, measurement",
+        "control_ns": "plans, limits, law, watching", "publish_ns": "publication, waits, events", "total_ns": "whole tick",
+    }  # fmt: skip
+    for phase, text in names.items():
+        p = load.phases[phase]
+        report.value(
+            f"{load.axes} axes at {load.rate} Hz: {text}", p["50.0"] * 1e-3, "us",
+            notes=f"p99 {p['99.0'] * 1e-3:.0f}, max {p['100.0'] * 1e-3:.0f}",
+        )  # fmt: skip
