@@ -6,10 +6,13 @@ Everything is checked before anything is touched, and all errors of all devices 
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
+
+import msgpack
 
 from .config import Config, parse
 from .loop import Loop
@@ -84,7 +87,7 @@ class Loader:
         if errno_:
             self._errors.append(f"[device.{name}]: {text}")
         else:
-            errors, packed = value
+            errors, packed = msgpack.unpackb(zlib.decompress(value))
             self._errors += [f"[device.{name}]{error}" for error in errors]
             if packed is not None:
                 driver = self._config.devices[name].common.driver

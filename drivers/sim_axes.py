@@ -16,12 +16,14 @@ position of each load and the force with which it presses on its wall. Simulated
 from __future__ import annotations
 
 import errno
+import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from sioms.motion import SWITCH_HOME, SWITCH_MINUS, SWITCH_PLUS, AxisBank, AxisKind, AxisSettings
@@ -56,13 +58,15 @@ AxisTable: Any = table_type(
     extra={
         "description": (str, ""),
         "bandwidth_hz": (float, 30.0),
+        "count": (Annotated[int, Meta(ge=1, le=10_000)], 1),
         "motor": (table_type(Motor) | None, None),
         "stepper": (table_type(Stepper) | None, None),
     },
 )
 """Keys of an axis: those of AxisSettings, and ``motor`` or ``stepper``.
 
-``bandwidth_hz`` sets the gains of a servo that gives none.
+``bandwidth_hz`` sets the gains of a servo that gives none; ``count`` above 1 makes so many of it, with
+the numbers from 0 behind their name.
 """
 
 
@@ -100,13 +104,14 @@ class SimAxes(TickDriver):
         if not settings.axis:
             raise ValueError("axis: none given; want a table [[...axis]] for each axis")
         _build(settings)
+        axes = _axes(settings)
         return Description(
             (
                 BlockSpec(
-                    "", NodeClass.AXIS, tuple(_axis_channel(axis) for axis in settings.axis),
+                    "", NodeClass.AXIS, tuple(_axis_channel(axis) for axis in axes),
                     history=settings.history, capacity=settings.capacity,
                 ),
-                BlockSpec("plant", NodeClass.ANALOG, tuple(_plant_channels(settings.axis)), history=settings.history),
+                BlockSpec("plant", NodeClass.ANALOG, tuple(_plant_channels(axes)), history=settings.history),
             ),
             settings.tick_hz,
         )  # fmt: skip
@@ -141,6 +146,7 @@ class SimAxes(TickDriver):
                 self._advance(self._command)
         self._last_ns = now_ns
         self._measure()
+        self.inputs_ns = time.monotonic_ns()
         self._command = self.bank.tick(now_ns, self._reading, self._switches)
         self._show()
 
@@ -179,22 +185,33 @@ def _switch_bits(bank: MotorBank | StepperBank) -> NDArray[np.int64]:
     return bits
 
 
+def _axes(settings: SimAxesSettings) -> list[Any]:
+    """Return the axes one by one, those with a count as so many."""
+    axes: list[Any] = []
+    for axis in settings.axis:
+        if axis.count == 1:
+            axes.append(axis)
+        else:
+            axes += [msgspec.structs.replace(axis, name=f"{axis.name}{i}", count=1) for i in range(axis.count)]
+    return axes
+
+
 def _build(settings: SimAxesSettings) -> tuple[MotorBank | None, StepperBank | None, list[AxisSettings]]:
     """Make the plants and the settings of the bank.
 
     Raises:
         ValueError: an axis, a motor or an effect that cannot be.
     """
-    tick_s = 1 / settings.tick_hz
-    servos = [axis for axis in settings.axis if axis.motor is not None]
-    steppers = [axis for axis in settings.axis if axis.stepper is not None]
-    for axis in settings.axis:
+    tick_s, axes = 1 / settings.tick_hz, _axes(settings)
+    servos = [axis for axis in axes if axis.motor is not None]
+    steppers = [axis for axis in axes if axis.stepper is not None]
+    for axis in axes:
         if (axis.motor is None) == (axis.stepper is None):
             raise ValueError(f"axis {axis.name}: has neither or both of motor and stepper; want one of them")
     effects = _effects(settings, [axis.name for axis in servos])
     motors = MotorBank([from_table(Motor, a.motor) for a in servos], tick_s, effects) if servos else None
     rotors = StepperBank([from_table(Stepper, a.stepper) for a in steppers], tick_s) if steppers else None
-    return motors, rotors, [_axis_settings(axis, tick_s) for axis in settings.axis]
+    return motors, rotors, [_axis_settings(axis, tick_s) for axis in axes]
 
 
 def _effects(settings: SimAxesSettings, servos: Sequence[str]) -> tuple[Effect, ...]:

@@ -302,9 +302,13 @@ class Node(NodeCore):
         """End the waits of all sessions on this node with ECANCELED; return how many there were."""
         return int(self.ioctl(Request.CANCEL_WAITS))
 
-    def statistics(self) -> dict[str, Any]:
-        """Return the driver's tick times and link counters."""
-        value: dict[str, Any] = self.ioctl(Request.GET_STATISTICS)
+    def statistics(self, last: int | None = None) -> dict[str, Any]:
+        """Return the driver's tick times and link counters.
+
+        Args:
+            last: over so many of the last ticks; None for all that are kept.
+        """
+        value: dict[str, Any] = self.ioctl(Request.GET_STATISTICS, last)
         return value
 
     def _poll(self, deadline: float | None, what: str) -> None:

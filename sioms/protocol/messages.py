@@ -84,7 +84,7 @@ class NurseryVerb(IntEnum):
     """Between the daemon and the nursery, the process that forks the drivers."""
 
     DESCRIBE = 1
-    """[device, driver, table, folder] -> [errors, description]."""
+    """[device, driver, table, folder] -> [errors, description], packed and compressed by zlib."""
     SPAWN = 2
     """[device, driver, table, generation, options] -> pid; descriptors: control socket, latch, request page,
     markers -> pidfd."""

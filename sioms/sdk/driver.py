@@ -93,9 +93,14 @@ class Driver(ABC):
         name: device name in the configuration.
         settings: its validated table.
         kit: services.
+
+    Attributes:
+        inputs_ns: a driver that sets it in each tick to the time at which its readings were there
+            [ns, CLOCK_MONOTONIC] splits the tick's time in two in the statistics.
     """
 
     Settings: ClassVar[type[msgspec.Struct]]
+    inputs_ns = 0
 
     def __init__(self, name: str, settings: Any, kit: Kit) -> None:
         self.name = name

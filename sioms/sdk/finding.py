@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+from collections import Counter
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import entry_points
@@ -141,7 +142,7 @@ def _block_errors(blocks: Any) -> list[str]:
         channels = [channel.name for channel in block.channels]
         if not channels:
             errors.append(f": block {block.name!r} has no channel; want at least one")
-        for name in {c for c in channels if channels.count(c) > 1}:
+        for name in [c for c, count in Counter(channels).items() if count > 1]:
             errors.append(f": two channels are named {name}; names must differ")
         if names.count(block.name) > 1:
             errors.append(f": two blocks are named {block.name!r}; names must differ")

@@ -13,7 +13,10 @@ import signal
 import socket
 import sys
 import traceback
+import zlib
 from typing import Any
+
+import msgpack
 
 from sioms.protocol.messages import NurseryVerb, decode, refusal, reply
 
@@ -36,7 +39,8 @@ def main(fd: int) -> None:
         try:
             match NurseryVerb(message[0]):
                 case NurseryVerb.DESCRIBE:
-                    sock.send(reply(number, _describe(*message[2:])))
+                    # Thousands of alike channels would not fit into a packet.
+                    sock.send(reply(number, zlib.compress(msgpack.packb(_describe(*message[2:])), 1)))
                 case NurseryVerb.SPAWN:
                     _spawn(sock, number, fds, *message[2:])
         except Exception as error:  # a driver's describe may raise anything; the daemon must hear of it

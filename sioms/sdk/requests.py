@@ -216,7 +216,9 @@ def ioctl(
                 f"cancelled by {handle.who}",
             )
         case Request.GET_STATISTICS:
-            return runtime.statistics_report()
+            if argument is not None and (type(argument) is not int or argument < 1):
+                raise _refuse(errno.EINVAL, f"{what}: {argument!r} ticks; want a number from 1, or none")
+            return runtime.statistics_report(argument or 1 << 30)
         case Request.WAIT_UNTIL_EVENT:
             raise _refuse(errno.ENOTTY, f"{what}: is answered by the client library, out of the page")
         case Request.ZERO_DEVICE if isinstance(handle.block, AnalogBlock):

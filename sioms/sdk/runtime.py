@@ -248,9 +248,9 @@ class Runtime:
         block.bank.reset(np.array(channels, dtype=np.intp))
         self.engine.commands_written(block)
 
-    def statistics_report(self) -> dict[str, object]:
-        """Return what GET_STATISTICS tells: tick times, link counters, handles."""
-        report = self.statistics.summary()
+    def statistics_report(self, last: int) -> dict[str, object]:
+        """Return what GET_STATISTICS tells: times of the last ticks, link counters, handles."""
+        report = self.statistics.summary(last)
         report["tick_hz"] = self.engine.tick_hz
         report["handles"] = len(self._handles)
         counters = getattr(self.engine, "counters", None)
@@ -327,9 +327,7 @@ class Runtime:
                 self.publish(block, block.stamp_ns or scheduled_ns)
         self.after_publication(ticked_ns)
         ended_ns = time.monotonic_ns()
-        self.statistics.record(
-            began_ns - scheduled_ns, ticked_ns - began_ns, ended_ns - ticked_ns, ended_ns - scheduled_ns
-        )
+        self.statistics.record(scheduled_ns, began_ns, self.driver.inputs_ns, ticked_ns, ended_ns)
         if self._ending_ns:
             self._maybe_end(ended_ns)
         elif isinstance(engine, TickEngine):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-PHASES = ("late_ns", "driver_ns", "publish_ns", "total_ns")
+PHASES = ("late_ns", "input_ns", "control_ns", "publish_ns", "total_ns")
+"""Scheduled to begun; to the readings being there; to the outputs being set; to all being published; all of it."""
 _SIZE = 8192
 
 
 class TickStatistics:
-    """A ring of the last ticks' times. Recording costs about a microsecond.
+    """A ring of the last ticks' times. Recording costs about half a microsecond.
 
     Attributes:
         ticks: ticks done.
@@ -23,27 +24,40 @@ class TickStatistics:
         self.skipped = 0
         self.longest_ns = 0
 
-    def record(self, late_ns: int, driver_ns: int, publish_ns: int, total_ns: int) -> None:
-        """Note one tick."""
+    def record(self, scheduled_ns: int, began_ns: int, inputs_ns: int, ticked_ns: int, ended_ns: int) -> None:
+        """Note one tick by its instants; ``inputs_ns`` before ``began_ns`` means that it is not known."""
+        if inputs_ns < began_ns:
+            inputs_ns = began_ns
+        total_ns = ended_ns - scheduled_ns
         i = self.ticks & (_SIZE - 1)
         ring = self._ring
-        ring[0][i] = late_ns
-        ring[1][i] = driver_ns
-        ring[2][i] = publish_ns
-        ring[3][i] = total_ns
+        ring[0][i] = began_ns - scheduled_ns
+        ring[1][i] = inputs_ns - began_ns
+        ring[2][i] = ticked_ns - inputs_ns
+        ring[3][i] = ended_ns - ticked_ns
+        ring[4][i] = total_ns
         self.ticks += 1
         if total_ns > self.longest_ns:
             self.longest_ns = total_ns
 
-    def summary(self, percentiles: Sequence[float] = (50.0, 99.0, 99.9, 100.0)) -> dict[str, object]:
-        """Return counts, and percentiles of each phase over the last ticks [ns]."""
-        n = min(self.ticks, _SIZE)
+    def summary(
+        self, last: int = _SIZE, percentiles: Sequence[float] = (50.0, 90.0, 99.0, 99.9, 100.0)
+    ) -> dict[str, object]:
+        """Return counts, and percentiles of each phase [ns].
+
+        Args:
+            last: over so many of the last ticks, as far as they are kept.
+            percentiles: which ones.
+        """
+        n = min(self.ticks, _SIZE, last)
+        newest = self.ticks & (_SIZE - 1)
         result: dict[str, object] = {
             "ticks": self.ticks,
             "skipped": self.skipped,
             "longest_ns": self.longest_ns,
         }
         for phase, ring in zip(PHASES, self._ring, strict=True):
-            values = sorted(ring[:n])
+            begin = newest - n  # negative: the ring has been round, and slices of both ends are wanted
+            values = sorted(ring[begin:newest] if begin >= 0 else ring[begin:] + ring[:newest])
             result[phase] = {str(p): values[min(n - 1, int(n * p / 100))] for p in percentiles} if n else {}
         return result
