@@ -1,0 +1,179 @@
+"""devout: write a stream of numbers to devices (dissertation, section F.4.2).
+
+Decisions where the text leaves a choice are in docs/pipe-tools.md.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from select import POLLIN, poll
+
+from sioms.client.stream import Stream
+from sioms.client.workcell import Workcell
+
+from .columns import Columns
+from .options import Line, UsageError, fold
+from .pipe import complain, open_node, run
+from .tokens import Tokens
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+DEFAULT_COUNT = 100
+_CHUNK = 65536
+
+
+class BadInput(Exception):
+    """The input is not what the command line says it is; one sentence with the line."""
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run devout; return the exit status."""
+    return run("devout", _work, words)
+
+
+def _work(words: Sequence[str]) -> None:
+    line = fold("devout", words)
+    if not line.targets:
+        raise UsageError("no device named; try --help")
+    if line.trailing:
+        raise UsageError(f"-{next(iter(line.trailing))} holds for the device that follows it, and none follows")
+    tokens = Tokens("skip-bad-lines" in line.common)
+    if line.numbers:
+        tokens.feed((" ".join(line.numbers) + " ").encode())
+    if tokens.bad:
+        raise UsageError(tokens.bad.partition(": ")[2])
+    cell = Workcell(name="devout")
+    nodes = [open_node(cell, target.name, "rw") for target in line.targets]
+    columns = [Columns(t, n.info) for t, n in zip(line.targets, nodes, strict=True)]
+    writer = Writer(cell, [Stream(node) for node in nodes], columns, tokens)
+    try:
+        _iterate(line, writer)
+    except BadInput as bad:
+        raise OSError(errno.EINVAL, f"{bad}; stopped after {writer.iterations} complete iterations") from None
+    finally:
+        # Each close answers when the axes of the node are halting and it is free for the next.
+        for node in nodes:
+            node.close()
+
+
+def _iterate(line: Line, writer: Writer) -> None:
+    repeats = "r" in line.common or "L" in line.common
+    count = int(line.common.get("L", DEFAULT_COUNT)) if repeats else 1
+    wait = "w" in line.common
+    if wait and not all(c.has_end for c in writer.columns if c.is_axis):
+        raise UsageError(
+            "-w waits for the end of a motion, and a velocity, acceleration, jerk or force without a time has none; "
+            "add -t"
+        )
+    while writer.iterations != count and writer.fill():
+        writer.write()
+        if wait:
+            writer.wait_until_idle()
+    writer.drain()
+    if "W" not in line.common and writer.iterations:
+        writer.wait_until_idle()
+
+
+class Writer:
+    """Takes the numbers of each iteration from the input and writes them to the devices.
+
+    Args:
+        cell: the connection to the daemon; its end is noticed also while the input is silent.
+        streams: one per device, in the order of the command line.
+        columns: their columns.
+        tokens: the numbers, those of the command line first.
+
+    Attributes:
+        iterations: how many have been written.
+    """
+
+    def __init__(self, cell: Workcell, streams: list[Stream], columns: list[Columns], tokens: Tokens) -> None:
+        self.columns = columns
+        self.iterations = 0
+        self._streams = streams
+        self._cell = cell
+        self._tokens = tokens
+        self._at = 0
+        self._width = sum(c.count for c in columns)
+        self._ended = False
+        self._open_ended = [False] * len(columns)
+        self._poller = poll()
+        for fd in (0, cell.fileno(), *[stream.fileno() for stream in streams]):
+            self._poller.register(fd, POLLIN)
+
+    def fill(self) -> bool:
+        """Read until there are numbers enough for an iteration; False at the end of the input.
+
+        Raises:
+            BadInput: the input is wrong, or ends within an iteration.
+            OSError: the daemon or a driver has gone, or has refused something.
+        """
+        while self._at + self._width > len(self._tokens.numbers):
+            if self._tokens.bad:
+                raise BadInput(self._tokens.bad)
+            if self._ended:
+                return self._end()
+            self._tokens.numbers = self._tokens.numbers[self._at :]
+            self._at = 0
+            self._await_input()
+        return True
+
+    def write(self) -> None:
+        """Write one iteration to the devices.
+
+        Raises:
+            BadInput: a number that must be whole is not.
+            OSError: something was refused.
+        """
+        for i, (stream, columns) in enumerate(zip(self._streams, self.columns, strict=True)):
+            taken = self._tokens.numbers[self._at : self._at + columns.count]
+            values = [value for value, _ in taken]
+            try:
+                records = columns.records(values)
+            except ValueError as error:
+                raise BadInput(f"line {taken[0][1]}: {error}") from None
+            stream.write(records, replace=columns.replace)
+            if columns.is_axis:
+                self._open_ended[i] = columns.open_ended(values)
+            self._at += columns.count
+        self.iterations += 1
+
+    def drain(self) -> None:
+        """Wait until everything written is acknowledged."""
+        for stream in self._streams:
+            stream.drain()
+
+    def wait_until_idle(self) -> None:
+        """Wait until the axes stand still, except those whose motion has no end."""
+        self.drain()
+        for stream, columns, open_ended in zip(self._streams, self.columns, self._open_ended, strict=True):
+            if columns.is_axis and not open_ended:
+                stream.node.wait_until_idle()  # type: ignore[attr-defined]
+
+    def _await_input(self) -> None:
+        for fd, _ in self._poller.poll():
+            if fd == 0:
+                data = os.read(0, _CHUNK)
+                self._ended = not data
+                self._tokens.feed(data)
+                for text in self._tokens.skipped:
+                    complain("devout", text, 0)
+                self._tokens.skipped.clear()
+            elif fd == self._cell.fileno():
+                self._cell.status()  # nothing comes unasked but the end: this raises what it was
+        for stream in self._streams:
+            stream.settle()
+
+    def _end(self) -> bool:
+        left = len(self._tokens.numbers) - self._at
+        if left:
+            raise BadInput(
+                f"line {self._tokens.numbers[-1][1]}: the input ends after {left} of the {self._width} numbers "
+                "of an iteration"
+            )
+        if not self.iterations:
+            raise BadInput(f"the input is empty; want {self._width} numbers for an iteration")
+        return False

@@ -1,0 +1,112 @@
+"""What the pipe tools share: how they begin and end, and how a word becomes an open node."""
+
+from __future__ import annotations
+
+import _signal  # type: ignore[import-not-found]  # signal without enum
+import errno
+import os
+import sys
+
+from .options import HelpWanted, UsageError
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from typing import Any
+
+    from sioms.client.workcell import Workcell
+
+READONLY = ".readonly"
+
+
+def run(tool: str, work: Callable[[Sequence[str]], None], words: Sequence[str] | None) -> int:
+    """Run a tool as a filter: dies of SIGPIPE and SIGINT like any other, says one line when it fails.
+
+    Returns:
+        0; 1 after a failure; 2 when the command line was wrong.
+    """
+    if words is None:
+        # The interpreter's own handlers would turn both into tracebacks. A killed client's axes are halted
+        # by their driver, so there is nothing to clean up that is not cleaned up by the end itself.
+        _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
+        _signal.signal(_signal.SIGPIPE, _signal.SIG_DFL)
+        words = sys.argv[1:]
+    try:
+        work(words)
+    except HelpWanted as wanted:
+        from .manual import answer
+
+        return answer(tool, str(wanted))
+    except UsageError as error:
+        return complain(tool, str(error), 2)
+    except OSError as error:
+        return complain(tool, error.strerror or str(error), 1)
+    return 0
+
+
+def complain(tool: str, text: str, status: int) -> int:
+    """Say one line on standard error; return the exit status."""
+    line = f"{tool}: {' '.join(text.split())}\n"
+    try:
+        os.write(2, line.encode("utf-8", "replace"))
+    except OSError:  # nobody listens there; the status still tells
+        return status
+    return status
+
+
+def write_all(data: bytes) -> None:
+    """Write to standard output and return when all is out; nothing is kept back in a buffer."""
+    while data:
+        try:
+            data = data[os.write(1, data) :]
+        except BlockingIOError:  # whoever gave us this descriptor has made it non-blocking
+            from select import POLLOUT, poll
+
+            poller = poll()
+            poller.register(1, POLLOUT)
+            poller.poll()
+
+
+def base_name(word: str) -> str:
+    """Return the node that a path means: the last part of it, behind all soft links.
+
+    Example:
+        >>> base_name("~rws/dev/mod0"), base_name("mod0.xaxis")
+        ('mod0', 'mod0.xaxis')
+    """
+    return os.path.basename(os.path.realpath(word)) if "/" in word else word
+
+
+def names_of(word: str) -> list[str]:
+    """Return the names under which a word is looked up: itself, then what a soft link here points to."""
+    name = base_name(word)
+    if "/" not in word and os.path.islink(word):
+        return [name, os.path.basename(os.path.realpath(word))]
+    return [name]
+
+
+def open_node(cell: Workcell, word: str, mode: str, *, companion: bool = False) -> Any:
+    """Open the node that a word names.
+
+    Args:
+        cell: the connection.
+        word: node name, or a path or soft link that ends in one.
+        mode: 'r' or 'rw'.
+        companion: open its read-only companion where it has one, so that nobody is disturbed.
+
+    Raises:
+        OSError: it cannot be opened; of several names tried the error of the first.
+    """
+    names = names_of(word)
+    first: OSError | None = None
+    for name in names:
+        tries = [name + READONLY, name] if companion and not name.endswith(READONLY) else [name]
+        for attempt in tries:
+            try:
+                return cell.open(attempt, mode)
+            except OSError as error:
+                if error.errno != errno.ENOENT:
+                    raise
+                if attempt == names[0]:
+                    first = error
+    raise first or OSError(errno.ENOENT, f"open {word}: no such node")

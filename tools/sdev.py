@@ -1,0 +1,139 @@
+"""sdev: send requests to devices (dissertation, section F.4.3).
+
+Decisions where the text leaves a choice are in docs/pipe-tools.md.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+
+from sioms.client.workcell import Workcell
+from sioms.protocol.flags import NodeClass
+
+from .options import Line, Target, UsageError, fold
+from .pipe import READONLY, open_node, run
+from .tokens import Tokens
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from typing import Any
+
+_COMPANION = "sw"  # requests that need no ownership go through the read-only companion
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run sdev; return the exit status."""
+    return run("sdev", _work, words)
+
+
+def _work(words: Sequence[str]) -> None:
+    line = fold("sdev", words)
+    numbers = Tokens()
+    if line.numbers:
+        numbers.feed((" ".join(line.numbers) + " ").encode())
+    if numbers.bad:
+        raise UsageError(numbers.bad.partition(": ")[2])
+    _check(line)
+    cell = Workcell(name="sdev")
+    _stop(cell, line)
+    Setter(cell, numbers, bool(line.numbers)).carry_out(
+        [Target(t.name, {key: 0 for key in t.flags if key != "e"}) for t in line.targets]
+    )
+
+
+def _check(line: Line) -> None:
+    if not line.targets and list(line.trailing) != ["e"]:
+        raise UsageError("no device named; only -e alone does without: it stops the whole workcell")
+    if line.targets and line.trailing:
+        raise UsageError(f"-{next(iter(line.trailing))} holds for the device that follows it, and none follows")
+    for target in line.targets:
+        if not target.flags:
+            raise UsageError(f"{target.name}: nothing to do; an option holds for the device that follows it")
+
+
+def _stop(cell: Workcell, line: Line) -> None:
+    """Carry out the emergency stops, which overtake everything else on the command line."""
+    if not line.targets:
+        cell.emergency_stop(why="sdev -e")
+    for target in line.targets:
+        if "e" in target.flags:
+            node = open_node(cell, target.name, "r", companion=True)
+            cell.emergency_stop(node.name.removesuffix(READONLY), "sdev -e")
+
+
+class Setter:
+    """Carries out the requests of a command line, device by device, letter by letter.
+
+    Args:
+        cell: the connection.
+        numbers: those of the command line; more are read from standard input when they are needed.
+        given: whether there were any on the command line: then none may be left over.
+    """
+
+    def __init__(self, cell: Workcell, numbers: Tokens, given: bool) -> None:
+        self._cell = cell
+        self._numbers = numbers
+        self._given = given
+
+    def carry_out(self, targets: list[Target]) -> None:
+        """Open what is needed, check the numbers, then act.
+
+        Raises:
+            OSError: refused, or the numbers are not those needed; in the latter case nothing was done.
+            UsageError: a request that the class of the device does not know.
+        """
+        nodes = [self._open(target) for target in targets if target.flags]
+        plan = [
+            (node, key, self._take(node, key)) for node, target in nodes for key in target.flags
+        ]
+        if self._given and self._numbers.numbers:
+            raise UsageError(f"{len(self._numbers.numbers)} numbers too many; -c takes one an axis, -g n*n")
+        synched = [node for node, key, _ in plan if key == "s"]
+        for node, key, numbers in plan:
+            if key != "s":
+                self._act(node, key, numbers)
+            elif synched:
+                self._cell.synch(*synched)
+                synched = []
+        for node, _ in nodes:
+            node.close()
+
+    def _open(self, target: Target) -> tuple[Any, Target]:
+        companion = all(key in _COMPANION for key in target.flags)
+        # Mode 'r' is enough: a node that can be written is exclusive in whatever mode.
+        return open_node(self._cell, target.name, "r", companion=companion), target
+
+    def _take(self, node: Any, key: str) -> list[float]:
+        """Take the numbers that a request needs."""
+        node_class = node.info.node_class
+        wanted = NodeClass.ANALOG if key == "g" else NodeClass.AXIS
+        if key != "z" and node_class is not wanted:
+            raise UsageError(
+                f"-{key} on {node.name}: is for nodes of class {wanted.name.lower()}; this one is {node_class.name.lower()}"
+            )
+        count = len(node.info.channels)
+        need = {"c": count, "g": count * count}.get(key, 0)
+        tokens = self._numbers
+        while len(tokens.numbers) < need and not tokens.bad:
+            data = os.read(0, 65536)
+            tokens.feed(data)
+            if not data:
+                break
+        if len(tokens.numbers) < need:
+            why = tokens.bad or f"there are {len(tokens.numbers)}"
+            raise OSError(errno.EINVAL, f"-{key} on {node.name}: wants {need} numbers: {why}")
+        taken, tokens.numbers = tokens.numbers[:need], tokens.numbers[need:]
+        return [value for value, _ in taken]
+
+    def _act(self, node: Any, key: str, numbers: list[float]) -> None:
+        match key:
+            case "z":
+                node.zero()
+            case "w":
+                node.wait_until_idle()
+            case "c":
+                node.calibrate(*numbers)
+            case "g":
+                node.set_gains(numbers)
