@@ -97,7 +97,12 @@ class Connection:
             raise OSError(number, f"open {settings.serial}: {hint}") from None
         except (ValueError, termios.error) as error:
             raise OSError(errno.EINVAL, f"open {settings.serial} at {settings.baud} baud: {error}") from None
-        os.set_blocking(self._serial.fileno(), False)
+        fd = self._serial.fileno()
+        os.set_blocking(fd, False)
+        # VMIN 1: without data a read says EAGAIN, so that an empty read can only mean a hang-up.
+        attributes = termios.tcgetattr(fd)
+        attributes[6][termios.VMIN] = 1
+        termios.tcsetattr(fd, termios.TCSANOW, attributes)
 
     def _open_socket(self, settings: LineSettings) -> None:
         kind = socket.SOCK_STREAM if settings.tcp else socket.SOCK_DGRAM

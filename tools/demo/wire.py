@@ -1,0 +1,77 @@
+"""The part of the demo with real protocols: drives, sample stream and I/O block as processes of their own."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from importlib.resources import files
+
+import sioms
+
+from .rig import Process, daemon
+
+PORTS = {"/dev/ttyUSB0": "drives", "/dev/ttyACM0": "finger", "192.168.127.254:502": "io"}
+"""Port names of the configuration, and the counterpart that takes the place of each."""
+
+
+def bench(folder: str, stack: ExitStack) -> str:
+    """Start the counterparts; return the path of the configuration with their port names in it."""
+    drives, finger = f"{folder}/ttyUSB0", f"{folder}/ttyACM0"
+    base = "sioms.tools.counterparts"
+    io = Process([f"{base}.moxa", "--model", "E1212", "--port", "0"], "ready")
+    stack.callback(io.end)
+    stack.callback(Process([f"{base}.leadshine", "--link", drives, "--units", "1"], "ready").end)
+    stack.callback(Process([f"{base}.adc", "--link", finger, "--channels", "16"], "ready").end)
+    text = files("sioms").joinpath("etc/bench-modbus.toml").read_text()
+    names = {"drives": drives, "finger": finger, "io": io.ready_line.split()[-1]}
+    for port, counterpart in PORTS.items():
+        text = text.replace(port, names[counterpart])
+    path = f"{folder}/bench-modbus.toml"
+    with open(path, "w", encoding="utf-8") as file:
+        file.write(text)
+    return path
+
+
+def show(folder: str) -> None:
+    """Run the bench configuration and use its nodes like any others."""
+    print("\n\033[1mReal protocols\033[0m   the same verbs on a Modbus RTU drive, a framed sample stream and a Modbus TCP block", flush=True)
+    with ExitStack() as stack:
+        process = daemon(bench(folder, stack), f"{folder}/bench.sock")
+        stack.callback(process.end)
+        with sioms.Workcell(name="demo") as cell:
+            _wait_links(cell)
+            for device in cell.status()["devices"]:
+                print(f"  {device['name']:10} {device['driver']:12} {device['link']} {device['link_reason']}")
+            _move(cell)
+            with cell.open("tactile0") as finger:
+                first = finger.read()
+                time.sleep(1.0)
+                last = finger.read()
+                rate = (last.number - first.number) / (last.stamp_ns - first.stamp_ns) * 1e9
+                print(f"  tactile0   {rate:.0f} frames/s, {len(last)} elements, flags {set(last.flags)}")
+            with cell.open("io0.do", "rw") as outputs:
+                outputs.set(0b101)
+                print(f"  io0.do     outputs written and read back: {outputs.wait_new(outputs.read().number, 1.0).data[0]:#010b}")
+
+
+def _wait_links(cell: sioms.Workcell) -> None:
+    deadline = time.monotonic() + 15.0
+    while any(device["link"] != "good" for device in cell.status()["devices"]):
+        if time.monotonic() > deadline:
+            raise RuntimeError(f"a link did not come up: {cell.status()['devices']}")
+        time.sleep(0.05)
+
+
+def _move(cell: sioms.Workcell) -> None:
+    with cell.open("slide0", "rw") as axis:
+        began = time.monotonic()
+        axis.move(0.02)
+        axis.wait_until_idle(10.0)
+        print(f"  slide0     moved to {axis.read().position[0] * 1e3:.2f} mm in {time.monotonic() - began:.2f} s")
+        axis.command(velocity=-0.01)
+        time.sleep(0.4)
+        cell.emergency_stop(why="demo")
+        time.sleep(0.3)
+        reading = axis.read()[0]
+        print(f"  slide0     emergency stop: {reading.velocity * 1e3:.2f} mm/s at {reading.position * 1e3:.2f} mm")
+        cell.reset()
