@@ -2,6 +2,8 @@
 
 Besides the axes it shows a block ``plant`` with what the simulated world feels of them: the true
 position of each load and the force with which it presses on its wall. Simulated sensors read it.
+Light beams that look at its own axes may be part of the device, as a binary port ``beams``: they see
+the axes a tick earlier than those of another process.
 
     [device.mod0]
     driver = "sim-axes"
@@ -11,6 +13,9 @@ position of each load and the force with which it presses on its wall. Simulated
     acceleration_max = 5.0
     force_max = 40.0
     motor = { mass = 2.0, viscous = 4.0, coulomb = 3.0, stiction = 4.0, encoder_step = 1e-6 }
+    [[device.mod0.beam]]
+    name = "beam0"
+    boxes = [{ xaxis = [0.10, 0.14] }]
 """
 
 from __future__ import annotations
@@ -27,13 +32,14 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from sioms.motion import SWITCH_HOME, SWITCH_MINUS, SWITCH_PLUS, AxisBank, AxisKind, AxisSettings
+from sioms.plant.binary import Beam, Box, port_values
 from sioms.plant.effects import Effect, build_effects, parse_effects
 from sioms.plant.motor import MotorBank
 from sioms.plant.parameters import Motor
 from sioms.plant.stepper import Stepper, StepperBank
 from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
-from sioms.sdk.blocks import AnalogBlock, AnyBlock, AxisBlock, BlockSpec, Description
+from sioms.sdk.blocks import AnalogBlock, AnyBlock, AxisBlock, BinaryBlock, BlockSpec, Description
 from sioms.sdk.driver import Kit, TickDriver
 from sioms.sdk.tables import from_table, table_type
 
@@ -70,11 +76,24 @@ the numbers from 0 behind their name.
 """
 
 
+class BeamTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A light beam, the next bit of the port ``beams``: 1 while broken.
+
+    Attributes:
+        boxes: each a table of axis to [low, high]: broken while all axes of a box lie within.
+        name: for the reader of the configuration.
+    """
+
+    boxes: list[dict[str, tuple[float, float]]]
+    name: str = ""
+
+
 class SimAxesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Keys of the device.
 
     Attributes:
         axis: the axes.
+        beam: light beams that look at them.
         tick_hz: rate of the control loop.
         capacity: commands that each axis buffers.
         effects: effects beyond the motors' parameters, a table per axis name or "*".
@@ -83,6 +102,7 @@ class SimAxesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     axis: list[AxisTable]
+    beam: list[BeamTable] = []
     tick_hz: float = 1000.0
     capacity: int = 16384
     effects: dict[str, dict[str, Any]] = {}
@@ -105,26 +125,30 @@ class SimAxes(TickDriver):
             raise ValueError("axis: none given; want a table [[...axis]] for each axis")
         _build(settings)
         axes = _axes(settings)
-        return Description(
-            (
-                BlockSpec(
-                    "", NodeClass.AXIS, tuple(_axis_channel(axis) for axis in axes),
-                    history=settings.history, capacity=settings.capacity,
-                ),
-                BlockSpec("plant", NodeClass.ANALOG, tuple(_plant_channels(axes)), history=settings.history),
+        beams = len(_boxes(settings))
+        blocks = [
+            BlockSpec(
+                "", NodeClass.AXIS, tuple(_axis_channel(axis) for axis in axes),
+                history=settings.history, capacity=settings.capacity,
             ),
-            settings.tick_hz,
-        )  # fmt: skip
+            BlockSpec("plant", NodeClass.ANALOG, tuple(_plant_channels(axes)), history=settings.history),
+        ]  # fmt: skip
+        if beams:
+            port = ChannelInfo("in", minimum=0, maximum=2**beams - 1, width=beams)
+            blocks.append(BlockSpec("beams", NodeClass.BINARY, (port,), history=4 * settings.history))
+        return Description(tuple(blocks), settings.tick_hz)
 
     def __init__(self, name: str, settings: SimAxesSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
-        axes, plant = self.describe(name, settings).blocks
+        axes, plant, *port = self.describe(name, settings).blocks
         self._servos, self._steppers, configured = _build(settings)
         self._tick_ns = round(1e9 / settings.tick_hz)
         self.bank = AxisBank(
             configured, tick_s=1 / settings.tick_hz, markers=kit.markers, capacity=settings.capacity
         )
         self._axes, self._plant = AxisBlock(axes, self.bank), AnalogBlock(plant)
+        self._port = BinaryBlock(port[0]) if port else None
+        self._beams = [Beam(boxes) for boxes in _boxes(settings)]
         n = len(configured)
         stepper = np.array([axis.kind is AxisKind.STEPPER for axis in configured])
         self._servo_rows, self._stepper_rows = np.flatnonzero(~stepper), np.flatnonzero(stepper)
@@ -135,8 +159,8 @@ class SimAxes(TickDriver):
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
-        """The axes and the plant."""
-        return (self._axes, self._plant)
+        """The axes, the plant and, if there are any, the beams."""
+        return (self._axes, self._plant) if self._port is None else (self._axes, self._plant, self._port)
 
     def tick(self, now_ns: int) -> None:
         """Let the world go on under the last command up to now, measure, and command anew."""
@@ -149,6 +173,8 @@ class SimAxes(TickDriver):
         self.inputs_ns = time.monotonic_ns()
         self._command = self.bank.tick(now_ns, self._reading, self._switches)
         self._show()
+        if self._port is not None:
+            self._look(self._port, now_ns)
 
     def slack(self, now_ns: int, until_ns: int) -> None:
         """Plan profiles ahead while there is time."""
@@ -177,6 +203,15 @@ class SimAxes(TickDriver):
         if self._steppers is not None:
             data[self._stepper_rows, 0] = self._steppers.position
 
+    def _look(self, port: BinaryBlock, now_ns: int) -> None:
+        """Set the beams; of several edges in a tick all but the last are published at once."""
+        positions = self._plant.data[::2].tolist()
+        edges = [(e, bit) for bit, beam in enumerate(self._beams) for e in beam.sample(positions, now_ns)]
+        for index, (stamp_ns, value) in enumerate(port_values(int(port.data[0]), edges)):
+            if index:
+                self.kit.publish(port, now_ns)
+            port.set(0, value, stamp_ns)
+
 
 def _switch_bits(bank: MotorBank | StepperBank) -> NDArray[np.int64]:
     bits: NDArray[np.int64] = bank.at_limit_minus * SWITCH_MINUS
@@ -192,7 +227,9 @@ def _axes(settings: SimAxesSettings) -> list[Any]:
         if axis.count == 1:
             axes.append(axis)
         else:
-            axes += [msgspec.structs.replace(axis, name=f"{axis.name}{i}", count=1) for i in range(axis.count)]
+            axes += [
+                msgspec.structs.replace(axis, name=f"{axis.name}{i}", count=1) for i in range(axis.count)
+            ]
     return axes
 
 
@@ -212,6 +249,28 @@ def _build(settings: SimAxesSettings) -> tuple[MotorBank | None, StepperBank | N
     motors = MotorBank([from_table(Motor, a.motor) for a in servos], tick_s, effects) if servos else None
     rotors = StepperBank([from_table(Stepper, a.stepper) for a in steppers], tick_s) if steppers else None
     return motors, rotors, [_axis_settings(axis, tick_s) for axis in axes]
+
+
+def _boxes(settings: SimAxesSettings) -> list[list[Box]]:
+    """Return the boxes of each beam.
+
+    Raises:
+        ValueError: an axis that is not there, or an interval upside down.
+    """
+    names = [axis.name for axis in _axes(settings)]
+    for number, beam in enumerate(settings.beam):
+        for axis, (low, high) in (item for box in beam.boxes for item in box.items()):
+            if axis not in names:
+                raise ValueError(f"beam {number}: no axis {axis}; want one of {', '.join(names)}")
+            if not low <= high:
+                raise ValueError(f"beam {number}: interval {low:g} to {high:g} of {axis}; want low first")
+    return [
+        [
+            Box(tuple((names.index(axis), low, high) for axis, (low, high) in box.items()))
+            for box in beam.boxes
+        ]
+        for beam in settings.beam
+    ]
 
 
 def _effects(settings: SimAxesSettings, servos: Sequence[str]) -> tuple[Effect, ...]:

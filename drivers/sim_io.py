@@ -20,7 +20,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from sioms.plant.binary import Beam, Box, Edge, Gripper, SquareWave
+from sioms.plant.binary import Beam, Box, Edge, Gripper, SquareWave, port_values
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnyBlock, BinaryBlock, BlockSpec, Description
@@ -183,18 +183,11 @@ class SimIo(TickDriver):
                 self._waves.pop(table.bit, None)
 
     def _show(self, port: BinaryBlock, edges: list[tuple[Edge, int]], now_ns: int) -> None:
-        """Set the port edge by edge; all but the last are published at once."""
-        edges.sort(key=lambda item: item[0].stamp_ns)
-        changed_ns: int | None = None
-        for edge, bit in edges:
-            value = int(port.data[0])
-            new = value | 1 << bit if edge.level else value & ~(1 << bit)
-            if new == value:
-                continue
-            if changed_ns is not None and edge.stamp_ns != changed_ns:
+        """Set the port edge by edge; all but the last are published at once, so that none is lost."""
+        for index, (stamp_ns, value) in enumerate(port_values(int(port.data[0]), edges)):
+            if index:
                 self.kit.publish(port, now_ns)
-            port.set(0, new, edge.stamp_ns)
-            changed_ns = edge.stamp_ns
+            port.set(0, value, stamp_ns)
 
     def _wave_edges(self, now_ns: int) -> list[tuple[Edge, int]]:
         edges: list[tuple[Edge, int]] = []

@@ -21,6 +21,28 @@ class Edge:
     level: bool
 
 
+def port_values(value: int, edges: Sequence[tuple[Edge, int]]) -> list[tuple[int, int]]:
+    """Return how a port changes under edges of its bits.
+
+    Args:
+        value: of the port before.
+        edges: (edge, bit), in any order.
+
+    Returns:
+        (stamp_ns, value) for each instant at which the value changes, oldest first.
+    """
+    changes: list[tuple[int, int]] = []
+    for edge, bit in sorted(edges, key=lambda item: item[0].stamp_ns):
+        new = value | 1 << bit if edge.level else value & ~(1 << bit)
+        if new == value:
+            continue
+        if changes and changes[-1][0] == edge.stamp_ns:
+            changes.pop()
+        changes.append((edge.stamp_ns, new))
+        value = new
+    return changes
+
+
 @dataclass(frozen=True, slots=True)
 class Box:
     """Positions at which an object breaks a beam: every listed coordinate lies within its interval.

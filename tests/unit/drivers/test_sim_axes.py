@@ -108,6 +108,31 @@ def test_late_ticks_cost_the_world_no_time(bench):
     assert mod.blocks[1].data[0] == pytest.approx(1.0 * seconds**2 / 2, rel=1e-9)
 
 
+def test_a_count_makes_so_many_axes_with_all_their_channels():
+    settings = msgspec.convert(
+        {"axis": [SERVO | {"count": 3}], "beam": [{"boxes": [{"x2": [0, 1]}]}]}, SimAxes.Settings
+    )
+    axes, plant, beams = SimAxes.describe("mod0", settings).blocks
+    assert [c.name for c in axes.channels] == ["x0", "x1", "x2"] and len(plant.channels) == 6
+    assert beams.channels[0].width == 1
+
+
+def test_own_beams_show_the_crossing_in_the_tick_in_which_it_happens(bench):
+    mod = bench.make(
+        SimAxes,
+        "mod0",
+        {"axis": [SERVO], "beam": [{"boxes": [{"x": [0.3, 1.0]}]}, {"boxes": [{"x": [0.05, 0.06]}]}]},
+    )
+    port = mod.blocks[2]
+    bench.run(0.01)
+    bench.write(mod, control_mode=ControlMode.POSITION, position=0.2)
+    bench.run(1.0, until=lambda: port.data[0] == 0b10)
+    assert 0 <= bench.now_ns - port.words[1, 0] < 1_000_000
+    bench.run(1.0, until=lambda: port.data[0] == 0)
+    # 10 mm at 0.5 m/s at most, in the acceleration of 5 m/s^2 from 0.05 m on.
+    assert port.words[2, 0] == 2 and mod.blocks[1].data[0] > 0.06
+
+
 def test_hidden_effects_file(bench, tmp_path):
     file = tmp_path / "hidden.toml"
     file.write_text('[x]\ncoulomb = { level = 9.0 }\n["*"]\noffset = { force = 5.0 }\n')
@@ -128,6 +153,8 @@ def test_hidden_effects_file(bench, tmp_path):
         ({"axis": [{k: v for k, v in SERVO.items() if k != "motor"}]}, "neither or both"),
         ({"axis": [SERVO | {"motor": {"mass": -1.0}}]}, "mass -1"),
         ({"axis": [SERVO | {"bandwidth_hz": 500.0}]}, "bandwidth_hz 500"),
+        ({"axis": [SERVO], "beam": [{"boxes": [{"y": [0, 1]}]}]}, "no axis y"),
+        ({"axis": [SERVO], "beam": [{"boxes": [{"x": [1, 0]}]}]}, "low first"),
         ({"axis": [SERVO], "effects": {"y": {}}}, "no such axis"),
         ({"axis": [SERVO], "effects_file": "/nowhere.toml"}, "No such file"),
     ],
