@@ -49,7 +49,7 @@ ALWAYS_MODES = (
     | ControlMode.SPECIFIED_SIGNAL_MARKER
 )
 """What the bank adds to the modes that a drive has."""
-DEAD_MAN_SHARE = 0.6
+DEAD_MAN_SHARE = 0.75
 """Part of a device's dead-man time that a round of polls may take."""
 
 _SERVO_KEYS = ("kind", "modes", "homing", "jerk_max", "force_max", "k", "kz", "kp", "kb", "force_offset")
@@ -194,7 +194,9 @@ class _Drive:
                 "acceleration": axis.acceleration_max,
                 "deceleration": axis.acceleration_max,
             }
-            for name in {"position", "velocity", "jog_speed"} & set(rmap.commands):
+            for name in ("jog_speed", "position", "velocity"):
+                if name not in rmap.commands:
+                    continue
                 try:
                     self.mapped.check(rmap.commands[name], quantities)
                 except ValueError as error:

@@ -9,7 +9,6 @@ Concurrency: none; a :class:`MappedUnit` belongs to one driver thread.
 from __future__ import annotations
 
 import errno
-import math
 from collections.abc import Generator, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,6 +25,8 @@ from .settings import LineSettings
 
 Values = dict[str, Any]
 """Signal name to value: float in SI, text, a list of floats for an array, an integer for bits."""
+
+SIZES = ("speed", "acceleration", "deceleration")
 
 _READ = {
     "coil": pdus.READ_COILS,
@@ -122,15 +123,15 @@ class MappedUnit:
         return pdus.write_registers(write.address, words)
 
     def in_register(self, name: str, source: str, si: float, more: int = 0) -> float:
-        """Return what becomes of a quantity in the register of a command, ``more`` steps further [SI]."""
+        """Return the size that a quantity has in the register of a command, ``more`` steps further [SI]."""
         items = [
             item for write in self.rmap.commands[name].writes for item in write.items if item.source == source
         ]
         if not items:
             return si
-        item, unit = items[0], UNITS[items[0].unit]
-        raw = rounded(self.gearing.from_si(si, unit, item.scale), item.round)
-        return self.gearing.to_si(raw + math.copysign(more, raw), unit, item.scale)
+        item = items[0]
+        raw = rounded(self._raw(item, si), item.round) + more
+        return abs(self.gearing.to_si(raw, UNITS[item.unit], item.scale))
 
     def identify(self, settings: Mapping[str, Any]) -> Steps:
         """Read what tells the device from others and compare.
@@ -181,12 +182,17 @@ class MappedUnit:
             return raw
         return self.gearing.to_si(raw, UNITS[signal.unit], signal.scale, signal.offset)
 
+    def _raw(self, item: Item, si: float) -> float:
+        """Return a quantity as the register counts it; speeds and accelerations have no direction."""
+        raw = self.gearing.from_si(si, UNITS[item.unit], item.scale)
+        return abs(raw) if item.source in SIZES else raw
+
     def _item(self, item: Item, quantities: Mapping[str, float]) -> tuple[int, ...]:
         if item.value is not None:
             return to_words(item.value, item.type, self.rmap.word_order)
         source = str(item.source)
         si = quantities[source]
-        raw = self.gearing.from_si(si, UNITS[item.unit], item.scale)
+        raw = self._raw(item, si)
         if item.type in RANGES:
             raw = rounded(raw, item.round)
             low, high = RANGES[item.type]

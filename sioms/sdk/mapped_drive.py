@@ -178,7 +178,7 @@ class DriveUnit(LineUnit):
         if under < 0 or distance == 0:
             return top
         speed = (rate * duration_s - math.sqrt(under)) / 2
-        return min(top, abs(self._mapped.in_register("position", "speed", speed, more=1)))
+        return min(top, self._mapped.in_register("position", "speed", speed, more=1))
 
     def _start_jog(self, velocity: float, epoch: int) -> Steps:
         """Begin or turn a jog; it is sent again by every poll, until it is stopped."""

@@ -1,0 +1,485 @@
+"""Modbus drivers against the simulated devices' register models, on an invented clock: no line, no sleeping."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from sioms.drivers.modbus_axis import ModbusAxis
+from sioms.drivers.modbus_io import ModbusIo
+from sioms.motion import CommandError, DriveAction
+from sioms.protocol.flags import AxisStatus, ControlMode
+from sioms.protocol.markers import TABLE_SIZE, MarkerTable
+from sioms.protocol.records import NodeClass, numpy_dtype
+from sioms.sdk.codec.modbus import frame_rtu, frame_tcp
+from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Pause, Steps
+from sioms.sdk.markers import Markers
+from sioms.tools.counterparts import leadshine, moxa, oriental_az
+
+EXCHANGE_S = 0.003
+
+
+class Kit:
+    """What a line driver needs of the kit."""
+
+    def __init__(self) -> None:
+        self.markers = Markers(MarkerTable(memoryview(bytearray(TABLE_SIZE))), lambda number: None)
+
+
+class Bus:
+    """A line whose drives are register models; each exchange takes 3 ms of the invented time."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+        self.drives: dict[int, Any] = {}
+        self.sent: list[bytes] = []
+        self.broken: Callable[[Exchange], bytes | None] = lambda exchange: None
+
+    def clock_ns(self) -> int:
+        return round(self.now_s * 1e9)
+
+    def answer(self, request: bytes) -> bytes:
+        drive, function, address = self.drives[request[0]], request[1], int.from_bytes(request[2:4], "big")
+        if function == 3:
+            words = drive.read(3, address, int.from_bytes(request[4:6], "big"))
+            if not isinstance(words, list):
+                return frame_rtu(request[0], bytes((0x83, int(words))))
+            return frame_rtu(request[0], bytes((3, 2 * len(words))) + np.array(words, ">u2").tobytes())
+        values = [int.from_bytes(request[4:6], "big")]
+        if function == 16:
+            values = np.frombuffer(request[7:-2], ">u2").tolist()
+        refused = drive.write(function, address, values)
+        if refused:
+            return frame_rtu(request[0], bytes((function | 0x80, int(refused))))
+        return request if function == 6 else frame_rtu(request[0], request[1:6])
+
+    def run(self, steps: Steps) -> Any:
+        """Run a hook to its end."""
+        value: Any = None
+        failure: Exception | None = None
+        try:
+            while True:
+                step = steps.throw(failure) if failure else steps.send(value)
+                value, failure = None, None
+                if isinstance(step, Pause):
+                    self.now_s += step.duration_s
+                    continue
+                assert isinstance(step, Exchange)
+                self.now_s += EXCHANGE_S
+                self.sent.append(step.data)
+                try:
+                    reply = self.broken(step) or self.answer(step.data)
+                    assert step.want(reply) == len(reply)
+                    value = step.decode(reply)
+                except (LinkError, DeviceError) as error:
+                    failure = error
+        except StopIteration as end:
+            return end.value
+
+
+class Rig:
+    """A driver of one drive, polled at 50 Hz as the kit does."""
+
+    def __init__(self, family: str, model: Any, table: dict[str, Any]) -> None:
+        self.bus = Bus()
+        self.drive = model(lambda: self.bus.now_s)
+        self.bus.drives[1] = self.drive
+        device = {"map": family, "line": {"serial": "/dev/null"}, "axis": [{"name": "x", **table}]}
+        self.driver = ModbusAxis("mod0", msgspec.convert(device, ModbusAxis.Settings), Kit())
+        self.unit: Any = self.driver.units[0]
+        self.unit._clock = self.bus.clock_ns
+        self.bank = self.unit.bank
+        self.bus.run(self.unit.open())
+        self.poll()
+
+    def poll(self) -> None:
+        self.bus.run(self.unit.poll())
+        for action in self.bank.take_actions():
+            self.act(action)
+
+    def act(self, action: DriveAction) -> None:
+        now_ns = self.bus.clock_ns()
+        try:
+            self.bus.run(self.unit.act(action))
+        except (DeviceError, LinkError) as error:
+            self.bank.action_failed(action, str(error), now_ns)
+        else:
+            self.bank.action_done(action, self.bus.clock_ns())
+
+    def go(self, duration_s: float) -> None:
+        end_s = self.bus.now_s + duration_s
+        while self.bus.now_s < end_s:
+            start_s = self.bus.now_s
+            self.poll()
+            self.bus.now_s = max(self.bus.now_s, start_s + 0.02)
+
+    def until_idle(self, limit_s: float = 30.0) -> float:
+        """Poll until the axis is idle; returns how long that took."""
+        start_s = self.bus.now_s
+        while not self.bank.is_idle([0]):
+            self.go(0.02)
+            assert self.bus.now_s < start_s + limit_s, "never idle"
+        return self.bus.now_s - start_s
+
+    def write(self, mode: ControlMode, **fields: float) -> None:
+        records = np.zeros(1, numpy_dtype(NodeClass.AXIS))
+        records["control_mode"] = int(mode)
+        for name, value in fields.items():
+            records[name] = value
+        self.bank.append(records, [0], self.bus.clock_ns())
+
+    @property
+    def position(self) -> float:
+        return float(self.bank.fields[0, 0])
+
+    @property
+    def status(self) -> AxisStatus:
+        return AxisStatus(int(self.bank.fields.view(np.int64)[11, 0]))
+
+
+LIMITS = {"position_min": -0.5, "position_max": 0.5, "velocity_max": 0.1, "acceleration_max": 1.0}
+
+
+def leadshine_rig(**more: Any) -> Rig:
+    return Rig("leadshine", leadshine.Drive, LIMITS | {"travel_per_turn": 0.01, "homing": True} | more)
+
+
+def az_rig(**more: Any) -> Rig:
+    table = LIMITS | {"travel_per_turn": 0.01, "pulses_per_turn": 1000.0, "homing": True}
+    return Rig("oriental_az", lambda clock: oriental_az.Drive(clock, 0.2), table | more)
+
+
+RIGS = pytest.mark.parametrize("make", [leadshine_rig, az_rig])
+
+
+@RIGS
+def test_a_move_takes_its_time_and_arrives(make: Callable[..., Rig]) -> None:
+    rig = make()
+    rig.write(ControlMode.POSITION, position=0.1)
+    # trapezoid: 0.1/0.1 + 0.1/1.0 = 1.1 s
+    assert rig.until_idle() == pytest.approx(1.1, abs=0.1)
+    assert rig.position == pytest.approx(0.1, abs=1e-5)
+    rig.write(ControlMode.POSITION | ControlMode.RELATIVE, position=-0.02)
+    rig.until_idle()
+    assert rig.position == pytest.approx(0.08, abs=1e-5)
+    assert not rig.status & (AxisStatus.MOVING | AxisStatus.FAULT)
+
+
+@RIGS
+@pytest.mark.parametrize("duration_s", [0.5, 1.0, 3.0])
+def test_a_move_of_given_time_is_there_in_time(make: Callable[..., Rig], duration_s: float) -> None:
+    rig = make()
+    rig.write(ControlMode.POSITION | ControlMode.SPECIFIED_TIME, position=-0.04, time=duration_s)
+    took_s = rig.until_idle()
+    assert took_s == pytest.approx(duration_s, abs=0.06)
+    assert rig.position == pytest.approx(-0.04, abs=1e-5)
+
+
+@RIGS
+def test_limits_of_a_command_reach_the_drive(make: Callable[..., Rig]) -> None:
+    rig = make()
+    mode = ControlMode.POSITION | ControlMode.SPECIFIED_MAX_VEL_ACC
+    rig.write(mode, position=0.1, max_velocity=0.02, max_acceleration=0.2)
+    rig.go(1.0)
+    assert rig.bank.fields[1, 0] == pytest.approx(0.02, rel=0.02)
+    assert rig.until_idle() == pytest.approx(0.1 / 0.02 + 0.02 / 0.2 - 1.0, rel=0.05)
+
+
+@RIGS
+def test_velocity_goes_on_while_polled_and_ends_without(make: Callable[..., Rig]) -> None:
+    rig = make()
+    for velocity in (-0.05, 0.02):
+        rig.write(ControlMode.VELOCITY, velocity=velocity)
+        rig.go(1.5)
+        assert rig.bank.fields[1, 0] == pytest.approx(velocity, rel=0.02)
+    rig.bus.now_s += 1.0
+    # nobody polled: the drive's own dead-man has ended the motion
+    assert rig.drive.state()["velocity"] == 0
+
+
+@RIGS
+def test_stop_and_emergency_stop(make: Callable[..., Rig]) -> None:
+    rig = make()
+    for verb, latch in (("stop", False), ("emergency_stop", True)):
+        rig.write(ControlMode.VELOCITY, velocity=0.1)
+        rig.go(0.5)
+        assert rig.drive.state()["velocity"] > 0
+        getattr(rig.bank, verb)([0], rig.bus.clock_ns())
+        for action in rig.bank.take_actions():
+            rig.act(action)
+        rig.until_idle(1.0)
+        assert rig.drive.state()["velocity"] == 0
+        assert bool(rig.status & AxisStatus.EMERGENCY_STOP) is latch
+    with pytest.raises(CommandError, match="emergency stop"):
+        rig.write(ControlMode.VELOCITY, velocity=0.1)
+    rig.bank.reset([0])
+    rig.go(0.1)
+    rig.write(ControlMode.POSITION, position=0.0)
+    rig.until_idle()
+    assert rig.position == pytest.approx(0.0, abs=1e-5)
+
+
+@RIGS
+@pytest.mark.parametrize("verb", ["stop", "emergency_stop"])
+def test_a_stop_voids_a_start_that_still_waits_for_the_line(make: Callable[..., Rig], verb: str) -> None:
+    """The kit lets a stop overtake; what was asked before must not move the axis after it."""
+    rig = make()
+    rig.write(ControlMode.VELOCITY, velocity=0.1)
+    rig.bus.run(rig.unit.poll())
+    waiting = [rig.unit.act(action) for action in rig.bank.take_actions()]
+    assert len(waiting) == 1
+    getattr(rig.bank, verb)([0], rig.bus.clock_ns())
+    for action in rig.bank.take_actions():
+        rig.act(action)
+    sent = len(rig.bus.sent)
+    rig.bus.run(waiting[0])
+    assert len(rig.bus.sent) == sent
+    rig.go(0.3)
+    assert rig.drive.state()["velocity"] == 0
+
+
+def test_a_stop_between_the_messages_of_a_jog(make: Callable[..., Rig] = leadshine_rig) -> None:
+    rig = make()
+    rig.write(ControlMode.VELOCITY, velocity=0.05)
+    rig.bus.run(rig.unit.poll())
+    (action,) = rig.bank.take_actions()
+    jog = rig.unit.act(action)
+    first = jog.send(None)
+    assert first.data[2:4] == bytes.fromhex("01e1")
+    rig.bus.run(rig.unit.stop())
+    with pytest.raises(StopIteration):
+        jog.send(None)
+    rig.go(0.2)
+    assert rig.drive.state()["velocity"] == 0
+
+
+@RIGS
+def test_homing(make: Callable[..., Rig]) -> None:
+    rig = make()
+    rig.write(ControlMode.POSITION, position=0.03)
+    rig.until_idle()
+    rig.bank.home([0], rig.bus.clock_ns())
+    rig.until_idle()
+    assert rig.status & AxisStatus.HOMED and not rig.status & AxisStatus.HOMING
+    assert rig.position == 0
+
+
+@RIGS
+def test_an_alarm_in_motion_is_told_by_name_and_reset(make: Callable[..., Rig]) -> None:
+    rig = make()
+    rig.write(ControlMode.POSITION, position=0.4)
+    rig.go(0.5)
+    rig.drive.raise_alarm(0x40 if make is leadshine_rig else 0x30)
+    rig.until_idle(2.0)
+    assert rig.status & AxisStatus.FAULT
+    assert ("current sensing" if make is leadshine_rig else "overload") in rig.bank.fault_text(0)
+    rig.bank.reset([0])
+    rig.go(0.2)
+    assert not rig.status & AxisStatus.FAULT and rig.drive.state()["alarm"] == 0
+    rig.write(ControlMode.POSITION, position=0.0)
+    rig.until_idle()
+    assert rig.position == pytest.approx(0.0, abs=1e-5)
+
+
+def test_an_alarm_that_only_a_power_cycle_clears_is_not_reset() -> None:
+    rig = az_rig()
+    rig.drive.raise_alarm(0x41)
+    rig.go(0.1)
+    rig.bank.reset([0])
+    rig.go(0.2)
+    assert rig.status & AxisStatus.FAULT
+    assert "only a power cycle clears it" in rig.bank.fault_text(0)
+
+
+def test_over_travel_faults_the_az() -> None:
+    rig = az_rig()
+    rig.drive.mover.high = 2000
+    rig.write(ControlMode.POSITION, position=0.1)
+    rig.until_idle()
+    assert "hardware over-travel" in rig.bank.fault_text(0)
+    assert rig.position == pytest.approx(0.02)
+
+
+def test_a_disabled_drive_is_told() -> None:
+    rig = leadshine_rig()
+    rig.drive.write(6, 0x000F, [0])
+    rig.go(0.1)
+    assert rig.bank.fault_text(0) == "the drive is switched off"
+
+
+def test_a_reversed_axis() -> None:
+    rig = leadshine_rig(travel_per_turn=-0.01)
+    rig.write(ControlMode.POSITION, position=0.02)
+    rig.until_idle()
+    assert rig.drive.state()["position"] == -20000 and rig.position == pytest.approx(0.02)
+    rig.write(ControlMode.VELOCITY, velocity=0.05)
+    rig.go(0.5)
+    assert rig.drive.state()["velocity"] < 0 < rig.bank.fields[1, 0]
+
+
+def test_a_drive_with_another_gearing_is_refused() -> None:
+    with pytest.raises(DeviceError, match="pulses_per_turn is 10000; the configuration says") as caught:
+        leadshine_rig(pulses_per_turn=1600.0)
+    assert caught.value.errno == errno.ENODEV
+
+
+def test_the_drive_cannot_pass_a_position() -> None:
+    rig = leadshine_rig()
+    try:
+        rig.write(ControlMode.POSITION | ControlMode.VELOCITY, position=0.1, velocity=0.01)
+    except CommandError:
+        return
+    rig.go(0.2)
+    assert "cannot pass a position" in rig.bank.fault_text(0)
+    assert rig.drive.state()["position"] == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"map": "leadshin"}, "leadshin.toml"),
+        ({"map": "moxa_e1200"}, "describes no axis"),
+        ({"line": {"udp": "h:1"}}, "Modbus runs on serial and tcp"),
+        (
+            {"poll_hz": 20.0},
+            "poll_hz = 20: a round takes 50 ms and the drive stops after 50 ms; want at least 26.7",
+        ),
+        (
+            {"line": {"serial": "/x", "baud": 9600}},
+            "1 drives on the line: a round takes .* want a faster line",
+        ),
+        ({"axis": []}, "axis: none given"),
+        ({"axis": [{"name": "a"}, {"name": "b"}]}, "2 drives have address 1"),
+        ({"axis": [{"name": "a", "velocity_max": 1e3}]}, "axis a: speed 1000 is .* in the register"),
+        ({"axis": [{"name": "a", "position_max": 1e7}]}, "axis a: position 1e.07"),
+        ({"axis": [{"name": "a", "address": 300}]}, "address of a unit is 300"),
+        ({"axis": [{"name": "a", "travel_per_turn": 0.0}]}, "axis a: travel_per_turn is 0"),
+        (
+            {"axis": [{"name": "a", "override": {"signals": {"status": {"addres": 1}}}}]},
+            "signals.status.addres: unknown key; did you mean address",
+        ),
+    ],
+)
+def test_bad_configurations(change: dict[str, Any], words: str) -> None:
+    table = {"map": "leadshine", "line": {"serial": "/x"}, "axis": [{"name": "a"}], **change}
+    with pytest.raises(ValueError, match=words):
+        ModbusAxis.describe("mod0", msgspec.convert(table, ModbusAxis.Settings))
+
+
+def test_several_drives_are_several_blocks() -> None:
+    axes = [{"name": "x", "address": 1}, {"name": "y", "address": 2, "velocity_by": "path"}]
+    table = {"map": "leadshine", "line": {"serial": "/x"}, "axis": axes}
+    description = ModbusAxis.describe("mod0", msgspec.convert(table, ModbusAxis.Settings))
+    assert [(block.name, block.channels[0].name) for block in description.blocks] == [("x", "x"), ("y", "y")]
+
+
+class TestIo:
+    def make(self, **table: Any) -> tuple[Any, moxa.Block]:
+        settings = {"map": "moxa_e1200", "line": {"tcp": "h:502"}, "model": "E1212", **table}
+        driver = ModbusIo("io0", msgspec.convert(settings, ModbusIo.Settings), Kit())
+        return driver.units[0], moxa.Block(settings["model"])
+
+    def run(self, block: moxa.Block, steps: Steps) -> None:
+        value = None
+        with pytest.raises(StopIteration):
+            while True:
+                exchange = steps.send(value)
+                value = exchange.decode(self.answer(block, exchange.data))
+
+    def answer(self, block: moxa.Block, request: bytes) -> bytes:
+        function, address = request[7], int.from_bytes(request[8:10], "big")
+        count = int.from_bytes(request[10:12], "big")
+        if function == 4:
+            words = block.read_input(address, count)
+            body = bytes((4, 2 * count)) + np.array(words, ">u2").tobytes()
+        elif function == 15:
+            bits = int.from_bytes(request[13:], "little")
+            assert block.write_bits(address, [bits >> i & 1 for i in range(count)]) is None
+            body = request[7:12]
+        else:
+            bits = sum(bit << i for i, bit in enumerate(block.read_bits(function, address, count)))
+            size = (count + 7) // 8
+            body = bytes((function, size)) + bits.to_bytes(size, "little")
+        return frame_tcp(int.from_bytes(request[:2], "big"), 1, body)
+
+    def test_ports(self) -> None:
+        unit, block = self.make(safe={"do": 3})
+        inputs, outputs = unit.blocks
+        assert (inputs.spec.name, outputs.spec.name) == ("", "do")
+        assert outputs.spec.safe == (3,) and not inputs.spec.writable
+        self.run(block, unit.open())
+        block.set_input(4, 1)
+        self.run(block, unit.write_outputs(outputs.spec, [0], [0x81]))
+        self.run(block, unit.poll())
+        assert block.do == [1, 0, 0, 0, 0, 0, 0, 1]
+        assert (inputs.data[0], outputs.data[0]) == (0x10, 0x81)
+        self.run(block, unit.poll())
+        assert inputs.words[2, 0] == 1
+
+    def test_analog(self) -> None:
+        unit, block = self.make(model="E1240")
+        (values,) = unit.blocks
+        assert [c.name for c in values.spec.channels][:2] == ["ai0", "ai1"] and values.spec.channels[
+            0
+        ].unit == "V"
+        block.ramps[2] = (0.0, 0.0, 5.0, 0.0)
+        block.ramps[3] = (0.0, 0.0, 12.0, 0.0)
+        self.run(block, unit.open())
+        self.run(block, unit.poll())
+        assert values.data[2] == pytest.approx(5.0, abs=1e-3) and values.flags.tolist() == [
+            0,
+            0,
+            0,
+            1,
+            0,
+            0,
+            0,
+            0,
+        ]
+
+    def test_another_model_is_refused(self) -> None:
+        unit, _ = self.make()
+        with pytest.raises(DeviceError, match="model is 'E1240'; the configuration says E1212"):
+            self.run(moxa.Block("E1240"), unit.open())
+
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            ({"model": "E1122"}, "not in the map; did you mean E1"),
+            ({"model": ""}, "model: none given; one of E1210"),
+            ({"model": "", "channels": {"dii": 4}}, "channels.dii: no such port; did you mean di"),
+            ({"channels": {"di": 40}}, "channels.di = 40; want 0 to 16"),
+            ({"safe": {"di": 1}}, "safe.di: no output of this device"),
+            ({"safe": {"do": 256}}, "safe.do = 256; want a whole number from 0 to 255"),
+            ({"main": "ai"}, "main = ai: no port of this device"),
+            ({"watchdog_s": 1.0}, "the map cannot set one"),
+            ({"map": "leadshine"}, "describes no ports"),
+        ],
+    )
+    def test_bad_configurations(self, change: dict[str, Any], words: str) -> None:
+        table = {"map": "moxa_e1200", "line": {"tcp": "h:502"}, "model": "E1212", **change}
+        with pytest.raises(ValueError, match=words):
+            ModbusIo.describe("io0", msgspec.convert(table, ModbusIo.Settings))
+
+    def test_wago_watchdog(self) -> None:
+        table = {
+            "map": "wago_750",
+            "line": {"tcp": "h:502"},
+            "channels": {"di": 8, "do": 4},
+            "watchdog_s": 1.5,
+        }
+        driver = ModbusIo("io0", msgspec.convert(table, ModbusIo.Settings), Kit())
+        steps, sent, value = driver.units[0].open(), [], None
+        with pytest.raises(StopIteration):
+            while True:
+                exchange = steps.send(value)
+                sent.append(exchange.data[7:].hex(" "))
+                number = int.from_bytes(exchange.data[:2], "big")
+                body = exchange.data[7:] if exchange.data[7] == 6 else bytes.fromhex("03 02 02 ee")
+                value = exchange.decode(frame_tcp(number, 1, body))
+        assert sent[:3] == ["06 10 07 00 01", "03 20 11 00 01", "06 10 00 00 0f"]
