@@ -115,11 +115,27 @@ def calibrate(
     widths = rigid_core_table(body)
     tick("loads of the touches")
     loads = touch_loads(body, widths, touches, HIGHEST, options.edge_half_angle_rad)
-    quadratic = _quadratic(nominal, touches, loads, warnings)
-    tick("quadratic")
-    if quadratic is not None:
-        touches = touches.with_output(linearise(touches.output, quadratic.value))
+    recorded = touches
     begin = starts(body, np.array(nominal.angles_rad), np.array(nominal.elements.radius_m), touches)
+    quadratic = _quadratic(body, begin, recorded, loads)
+    if quadratic is None:
+        warnings.append(
+            "no place was touched with three loads or more over a factor of two: quadratic not fitted"
+        )
+    else:
+        # how much the contact's growth costs depends on the depth, so the depths are fitted before the second
+        # look
+        touches = recorded.with_output(linearise(recorded.output, quadratic.value))
+        deep = fit_elements(body, begin, touches, loads, 0.0, Freedom(True, True), lambda: tick("first fit"))
+        quadratic = _quadratic(body, deep, recorded, loads) or quadratic
+        touches = recorded.with_output(linearise(recorded.output, quadratic.value))
+        few = int(np.count_nonzero(~np.isfinite(quadratic.deviation)))
+        if few:
+            warnings.append(
+                f"{few} of {quadratic.value.size} elements have too few load series for a quadratic of their own: "
+                f"theirs is the common {quadratic.common:.3g}"
+            )
+    tick("quadratic")
     for element, fit in enumerate(begin):
         if fit is None:
             warnings.append(f"element {element}: too few touches within 25 degrees; left out of the finger")
@@ -192,27 +208,15 @@ def _check(nominal: Finger, touches: Touches, warnings: list[str]) -> None:
         )
 
 
-def _quadratic(nominal: Finger, touches: Touches, loads: TouchLoads, warnings: list[str]) -> Quadratic | None:
-    body, count = nominal.cylinder, touches.output.shape[1]
-    model = np.stack(
-        [
-            strain_of(body, angle, radius, body.poisson, touches, loads, 0.0)
-            for angle, radius in zip(nominal.angles_rad, nominal.elements.radius_m, strict=True)
-        ],
-        axis=1,
-    )
-    found = find_quadratic(touches, model)
-    if found is None:
-        warnings.append(
-            "no place was touched with three loads or more over a factor of two: quadratic not fitted"
-        )
-        return None
-    few = int(np.count_nonzero(found.groups < 2))
-    if few:
-        warnings.append(
-            f"{few} of {count} elements have too few load series: their quadratic is the common {found.common:.3g}"
-        )
-    return found
+def _quadratic(body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads) -> Quadratic | None:
+    silent = np.zeros(len(touches))
+    model = [
+        silent
+        if fit is None
+        else strain_of(body, fit.angle_rad, fit.radius_m, fit.poisson, touches, loads, 0.0)
+        for fit in fits
+    ]
+    return find_quadratic(touches, np.stack(model, axis=1))
 
 
 def _contact(

@@ -111,7 +111,7 @@ def _pairs(touches: Touches, model: Floats, groups: list[NDArray[np.intp]], elem
     out = []
     for group in groups:
         strain = -model[group, element]
-        if strain.max() > _STRONG * -model[group].min():
+        if strain.max() > _STRONG * -model[group].min() > 0.0:
             out.append((touches.output[group, element], strain))
     return out
 

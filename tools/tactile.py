@@ -1,0 +1,128 @@
+"""`sioms tactile design|reproduce|calibrate|bench`: work with elastic cylindrical fingers from the shell.
+
+Long work tells on stderr what it is doing; reports are single HTML pages.  Numerical and drawing libraries
+are imported when a subcommand runs, not before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the `tactile` command to the `sioms` parser."""
+    parser = subparsers.add_parser("tactile", help="design, calibrate and measure elastic fingers")
+    commands = parser.add_subparsers(dest="tactile_command", required=True, metavar="COMMAND")
+
+    design = commands.add_parser("design", help="predict what a finger will be able to tell")
+    design.add_argument("--core-mm", type=float, default=9.6, help="core radius (default 9.6)")
+    design.add_argument("--outer-mm", type=float, default=12.7, help="outer radius (default 12.7)")
+    design.add_argument(
+        "--depth-mm", type=float, default=2.4, help="effective depth of the elements (default 2.4)"
+    )
+    design.add_argument("--elements", type=int, default=16, help="number of elements (default 16)")
+    design.add_argument("--pitch-deg", type=float, default=9.22, help="angle between elements (default 9.22)")
+    design.add_argument("--poisson", type=float, default=0.46, help="Poisson's ratio (default 0.46)")
+    design.add_argument("--shear-pa", type=float, default=8.3e4, help="shear modulus in Pa (default 8.3e4)")
+    design.add_argument(
+        "--noise-percent", type=float, default=0.1, help="strain noise in per cent (default 0.1)"
+    )
+    design.add_argument(
+        "-o", "--output", type=Path, default=Path("design.html"), help="report (default design.html)"
+    )
+
+    reproduce = commands.add_parser(
+        "reproduce", help="recompute the published figures and tables beside their values"
+    )
+    reproduce.add_argument("-o", "--output", type=Path, default=Path("reproduce.html"), help="report")
+    reproduce.add_argument("--quick", action="store_true", help="a tenth of the Monte Carlo frames")
+
+    calibrate = commands.add_parser("calibrate", help="calibrate a finger from recorded touches")
+    calibrate.add_argument(
+        "data", type=Path, help="folder with recordings (*.npz) and nominal.json or nominal.toml"
+    )
+    calibrate.add_argument("-o", "--output", type=Path, default=Path("finger.toml"), help="calibrated finger")
+    calibrate.add_argument("-r", "--report", type=Path, help="report (default: the output's name with .html)")
+    calibrate.add_argument(
+        "--contact", choices=("frictionless", "adhering", "hertz"), help="contact model, not chosen"
+    )
+    calibrate.add_argument("--no-map", action="store_true", help="do not identify the E map directly")
+    calibrate.add_argument(
+        "--edge-deg", type=float, default=45.0, help="half angle of the edge indenter (default 45)"
+    )
+
+    bench = commands.add_parser("bench", help="measure the speed and the errors of shape estimation")
+    bench.add_argument("--frames", type=int, default=2000, help="frames for each figure (default 2000)")
+    bench.add_argument("--finger", type=Path, help="a calibrated finger (default: the published one)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the chosen subcommand; return the exit status, 1 with a message for what the user can mend."""
+    try:
+        match args.tactile_command:
+            case "design":
+                from sioms.tools.tactile_design import design
+
+                return design(args)
+            case "reproduce":
+                from sioms.tools.tactile_reproduce import reproduce
+
+                return reproduce(args)
+            case "calibrate":
+                from sioms.tools.tactile_calibrate import calibrate
+
+                return calibrate(args)
+            case "bench":
+                from sioms.tools.tactile_bench import bench
+
+                return bench(args)
+    except (ValueError, OSError, KeyError) as error:
+        print(f"sioms tactile {args.tactile_command}: {error}", file=sys.stderr)
+        return 1
+    except ImportError as error:
+        print(f"sioms tactile {args.tactile_command}: {error}; pip install sioms[report]", file=sys.stderr)
+        return 1
+    raise AssertionError(args.tactile_command)
+
+
+class Progress:
+    """Tell on stderr what is being done: one rewritten line on a terminal, one line a step elsewhere."""
+
+    def __init__(self, total: int | None = None) -> None:
+        self._begin, self._done, self._total = time.monotonic(), 0, total
+        self._rewrite = sys.stderr.isatty()
+        self._last = ""
+
+    def __call__(self, what: str) -> None:
+        """Count a step and say what it was."""
+        self._done += 1
+        if what == self._last and not self._rewrite:
+            return
+        self._last = what
+        count = f"{self._done}" if self._total is None else f"{self._done}/{self._total}"
+        line = f"[{time.monotonic() - self._begin:6.1f} s] {count:>7} {what}"
+        print(
+            f"\r\033[K{line}" if self._rewrite else line,
+            end="" if self._rewrite else "\n",
+            file=sys.stderr,
+            flush=True,
+        )
+
+    def close(self) -> None:
+        """End the line."""
+        if self._rewrite:
+            print(file=sys.stderr)
+
+
+def main() -> int:
+    """Run as a program of its own (`python -m sioms.tools.tactile`)."""
+    parser = argparse.ArgumentParser(prog="sioms")
+    add_parser(parser.add_subparsers(dest="command", required=True))
+    return run(parser.parse_args())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
