@@ -245,7 +245,7 @@ class DriveUnit(LineUnit):
             done = self._bit(values, name) if name else not moving
         if done and self._homes and not moving:
             self._homes = False
-        return moving, done and not moving
+        return moving, done
 
     def _velocity(self, values: Values, now_ns: int) -> float:
         """Return the drive's velocity, or the difference of positions when it tells none."""
