@@ -1,0 +1,177 @@
+"""Commands of ``sioms`` that ask the daemon, or about it: list, info, status, stop, reset, reload, check, driver."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import os
+import sys
+from collections.abc import Iterable, Sequence
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from time import monotonic_ns
+from typing import Any
+
+from sioms.client.workcell import NodeEntry, Workcell
+from sioms.protocol.flags import ControlMode, NodeClass
+from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
+
+READONLY = ".readonly"
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the commands of this module."""
+    one = subparsers.add_parser("list", help="list the nodes of the workcell")
+    one.add_argument("-v", "--verbose", action="store_true", help="also parts of nodes and read-only companions")
+    one.add_argument("--names", action="store_true", help="only names, one a line; nothing when no daemon is there")
+    one = subparsers.add_parser("info", help="tell what a node is")
+    one.add_argument("node", metavar="NODE")
+    subparsers.add_parser("status", help="tell how devices, sessions and the emergency stop stand")
+    subparsers.add_parser("reload", help="have the daemon take up its configuration anew")
+    one = subparsers.add_parser("stop", help="emergency stop; latches until `sioms reset`; no safety-rated function")
+    one.add_argument("node", metavar="NODE", nargs="?", default="", help="one node; the whole workcell without")
+    one = subparsers.add_parser("reset", help="clear a latched stop or fault; nothing resumes by itself")
+    one.add_argument("node", metavar="NODE", nargs="?", default="", help="one node; the whole workcell without")
+    one = subparsers.add_parser("check", help="check a configuration; exit status 2 when it is not good")
+    one.add_argument("config", metavar="CONFIG", help="configuration (TOML)")
+    one = subparsers.add_parser("driver", help="about drivers")
+    one.add_argument("action", choices=("list",), help="list: which are installed")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run one of the commands; return the exit status."""
+    match args.command:
+        case "list":
+            return _list(args.verbose, args.names)
+        case "info":
+            with Workcell(name="sioms") as cell:
+                print("\n".join(describe(cell.info(args.node))))
+        case "status":
+            with Workcell(name="sioms") as cell:
+                print("\n".join(status_lines(cell.status(), monotonic_ns())))
+        case "reload":
+            with Workcell(name="sioms") as cell:
+                cell.reload()
+        case "stop":
+            with Workcell(name="sioms") as cell:
+                cell.emergency_stop(args.node, "sioms stop")
+        case "reset":
+            with Workcell(name="sioms") as cell:
+                cell.reset(args.node)
+        case "check":
+            # Another program by design: tools know no daemon.
+            os.execv(sys.executable, [sys.executable, "-m", "sioms.daemon.main", "--check", "--config", args.config])
+        case "driver":
+            for line in table(("driver", "module", "what it is"), [_driver(e) for e in drivers()]):
+                print(line)
+    return 0
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return lines with aligned columns.
+
+    Example:
+        >>> table(("a", "b"), [("10", "x"), ("7", "yy")])
+        ['a   b', '10  x', '7   yy']
+    """
+    cells = [tuple(head), *[tuple(row) for row in rows]]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
+    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in cells]
+
+
+def _list(verbose: bool, names_only: bool) -> int:
+    if names_only:  # what completion asks: it must never get in the way of somebody typing
+        try:
+            with Workcell(name="sioms") as cell:
+                print("\n".join(entry.name for entry in cell.nodes() if not entry.name.endswith(READONLY)))
+        except OSError:
+            return 0
+        return 0
+    with Workcell(name="sioms") as cell:
+        entries = cell.nodes()
+    shown = entries if verbose else [entry for entry in entries if not is_part(entry, entries)]
+    rows = [
+        (e.name, e.node_class.name.lower(), str(e.channels), "read" if e.read_only else "read, write", e.device,
+         e.state, e.holder)
+        for e in shown
+    ]  # fmt: skip
+    print("\n".join(table(("node", "class", "channels", "access", "device", "state", "held by"), rows)))
+    return 0
+
+
+def is_part(entry: NodeEntry, entries: Iterable[NodeEntry]) -> bool:
+    """Tell whether a node is a companion, a channel or a bit of another one in the list."""
+    if entry.name.endswith(READONLY):
+        return True
+    parent = entry.name.rpartition(".")[0]
+    return any(
+        other.name == parent and other.device == entry.device and other.node_class == entry.node_class
+        and (other.channels > entry.channels or entry.bit >= 0)
+        for other in entries
+    )  # fmt: skip
+
+
+def describe(info: NodeInfo) -> list[str]:
+    """Return what a node is, in lines."""
+    access = "read only" if info.read_only else "read and write; exclusive, observe through .readonly"
+    lines = [
+        f"node:      {info.name}",
+        f"class:     {info.node_class.name.lower()}",
+        f"access:    {access}",
+        f"device:    {info.device} (driver {info.driver}, {info.tick_hz:g} Hz)",
+        f"structs:   {info.number_structs}; {info.read_struct_size} bytes read, {info.write_struct_size} written",
+    ]
+    if info.buffer_capacity:
+        lines.append(f"buffer:    {info.buffer_capacity} commands an axis")
+    lines.append("")
+    rows = [_channel(i, channel, info.node_class) for i, channel in enumerate(info.channels)]
+    return lines + table(("#", "channel", "unit", "from", "to", "further limits", "modes", "description"), rows)
+
+
+def _channel(index: int, channel: ChannelInfo, node_class: NodeClass) -> tuple[str, ...]:
+    low = "" if channel.minimum is None else f"{channel.minimum:g}"
+    high = "" if channel.maximum is None else f"{channel.maximum:g}"
+    limits = ", ".join(f"{name} {value:g}" for name, value in channel.limits.items())
+    modes = ""
+    if node_class is NodeClass.AXIS:
+        quantities = [m.name.lower().replace("_", " ") for m in ControlMode if m & 0x3F & channel.modes and m.name]
+        modes = ", ".join(quantities)
+    elif node_class is NodeClass.BINARY:
+        limits = f"{channel.width} bit{'s' * (channel.width != 1)}"
+    return str(index), channel.name, channel.unit, low, high, limits, modes, channel.description
+
+
+def status_lines(status: dict[str, Any], now_ns: int) -> list[str]:
+    """Return devices, sessions, holders and the emergency stop in lines."""
+    stopped = status["stopped_ns"]
+    lines = [f"workcell {status['workcell']}, daemon pid {status['pid']}"]
+    if stopped:
+        lines.append(f"EMERGENCY STOP for {(now_ns - stopped) / 1e9:.1f} s: {status['stop_source']}; `sioms reset` clears it")
+    rows = [
+        (d["name"], d["driver"], d["state"], d["link"], str(d["pid"] or ""), f"{d['tick_hz']:g} Hz", f"{d['age_s']:.0f} s",
+         str(d["deaths"]), d["reason"] or d["link_reason"])
+        for d in status["devices"]
+    ]  # fmt: skip
+    head = ("device", "driver", "state", "link", "pid", "rate", "up for", "deaths", "why")
+    lines += ["", *table(head, rows), ""]
+    holders = [(name, who, f"{held_s:.1f} s") for name, who, held_s in status["holders"]]
+    sessions = [(who, str(handles), str(waits), str(markers)) for who, handles, waits, markers in status["sessions"]]
+    lines += [*table(("held node", "by", "for"), holders), ""] if holders else []
+    return lines + table(("session", "handles", "waits", "markers"), sessions)
+
+
+def drivers() -> list[EntryPoint]:
+    """Return the installed drivers by name."""
+    return sorted(entry_points(group="sioms.drivers"), key=lambda entry: entry.name)
+
+
+def _driver(entry: EntryPoint) -> tuple[str, str, str]:
+    """Describe a driver by the first line of its module, which is read and not imported."""
+    try:
+        spec = find_spec(entry.module)
+        source = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
+        text = ast.get_docstring(ast.parse(source)) or ""
+    except (ImportError, OSError, SyntaxError) as error:
+        text = f"cannot be read: {error}"
+    return entry.name, entry.module, text.partition("\n")[0]

@@ -1,0 +1,102 @@
+"""``sioms``: the front door. Each command is a module, loaded only when it is called.
+
+A module of commands has ``add_parser(subparsers)``, which adds one or more of them, and
+``run(args) -> int``, the exit status. A module that is not there makes no command.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command: the module of sioms.tools that has it, and one line for the overview."""
+
+    module: str
+    text: str
+
+
+COMMANDS: dict[str, Command] = {
+    "demo": Command("demo", "show the simulated workcell at work"),
+    "list": Command("cell", "list the nodes of the workcell"),
+    "info": Command("cell", "tell what a node is: channels, units, limits"),
+    "status": Command("cell", "tell how devices, sessions and the emergency stop stand"),
+    "monitor": Command("monitor", "watch all nodes live, with the emergency stop on a key"),
+    "stop": Command("cell", "emergency stop of a node or of the whole workcell"),
+    "reset": Command("cell", "clear a latched stop or fault"),
+    "reload": Command("cell", "have the daemon take up its configuration anew"),
+    "check": Command("cell", "check a configuration"),
+    "driver": Command("cell", "tell which drivers are installed"),
+    "bench": Command("bench", "measure latencies and throughput on this machine"),
+    "tactile": Command("tactile", "design, calibrate and measure elastic fingers"),
+    "reconcile": Command("reconcile", "find where simulation and measurement disagree"),
+}
+DESCRIPTION = "The devices of a workcell behind one small interface. `sioms COMMAND --help` tells more."
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run a command; return its exit status."""
+    words = sys.argv[1:] if words is None else words
+    parser = argparse.ArgumentParser(prog="sioms", description=DESCRIPTION)
+    parser.add_argument("--version", action="store_true", help="print the version and exit")
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required="--version" not in words)
+    there = installed()
+    wanted = next((word for word in words if not word.startswith("-")), "")
+    module: Any = None
+    if wanted in there:
+        module = import_module(f"sioms.tools.{there[wanted].module}")
+        module.add_parser(subparsers)
+    else:
+        for name, command in there.items():
+            subparsers.add_parser(name, help=command.text)
+    args = parser.parse_args(words)
+    if args.version:
+        from .manual import answer
+
+        return answer("sioms", "version")
+    return _guarded(wanted, module, args)
+
+
+def installed() -> dict[str, Command]:
+    """Return the commands whose modules are there."""
+    found = {}
+    for name, command in COMMANDS.items():
+        try:
+            there = find_spec(f"sioms.tools.{command.module}") is not None
+        except ModuleNotFoundError:  # of a package that is not there
+            there = False
+        if there:
+            found[name] = command
+    return found
+
+
+def _guarded(name: str, module: Any, args: argparse.Namespace) -> int:
+    """Run a command; what a user can mend becomes one line, what he interrupts no line."""
+    try:
+        status = int(module.run(args))
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:
+        # Whoever read our output has enough. Nothing may be flushed into the broken pipe at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 128 + signal.SIGPIPE
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
+    except OSError as error:
+        text = error.strerror or str(error)
+        where = f": {error.filename}" if error.filename else ""
+        print(f"sioms {name}: {text}{where}", file=sys.stderr)
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
