@@ -22,7 +22,6 @@ from .queue import CommandQueue
 from .types import HOME_SWITCHES, SWITCH_MINUS, SWITCH_PLUS, AxisSettings, EventKind, Homing
 
 
-
 class Phase(Enum):
     """Where an axis is in its homing."""
 

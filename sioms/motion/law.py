@@ -6,7 +6,7 @@ velocity. In force mode ``u = force + kb v + tau_o``. Damping is ``kb < 0``.
 
 Stepper: the same form slews the output position: e is desired minus output position, the law gives
 the output velocity w (``kp`` acts on w[n-1], ``kb`` on the desired velocity), which is clipped to
-the limits of velocity and acceleration before it moves the output. k = 1/tick with the rest zero
+the limits of velocity and acceleration, and to what can be braked, before it moves the output. k = 1/tick with the rest zero
 is dead beat: the output is on the set-point in every tick as long as the limits allow it.
 """
 
@@ -122,10 +122,24 @@ class ControlLaw:
         s = self.stepper_rows
         e = desired[s] - self.slewed[s]
         free = self.k[s] * (e + self.kz[s] * e_last) - self.kp[s] * w_last + self.kb[s] * desired_velocity[s]
+        wish = self._brakable(free, e, desired_velocity[s], self.acceleration_limit[s], dt)
         # Rounding must not count as saturation: a profile at full acceleration is within the limits.
         v, a = self.velocity_limit[s] * (1 + 1e-6), self.acceleration_limit[s] * dt * (1 + 1e-6)
-        w = np.clip(np.clip(free, w_last - a, w_last + a), -v, v)
+        w = np.clip(np.clip(wish, w_last - a, w_last + a), -v, v)
         self.slewed[s] += w * dt
         self.output[s] = w
         self.error[s] = e
         self.saturated[s] = np.abs(w - free) > 1e-3 * v
+
+    @staticmethod
+    def _brakable(free: Vector, e: Vector, desired_velocity: Vector, a: Vector, dt: float) -> Vector:
+        """Bound the output velocity to what can still be braked on the way to the set-point.
+
+        The lag that is not the set-point's own travel in this tick is closed at most within the
+        tick, and at most as fast as a deceleration a can stop there; else an output that was
+        clipped, or a tick that came late, would swing about the set-point for ever.
+        """
+        lag = np.abs(e - desired_velocity * dt)
+        half = 0.5 * a * dt
+        most = np.minimum(lag / dt, np.sqrt(2 * a * lag + half * half) - half)
+        return np.clip(free, desired_velocity - most, desired_velocity + most)

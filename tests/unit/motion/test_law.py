@@ -46,8 +46,9 @@ def test_force_mode_is_force_plus_damping_plus_offset():
 def test_stepper_is_dead_beat_by_default():
     law = law_of(AxisSettings("x", kind=AxisKind.STEPPER, velocity_max=1.0, acceleration_max=10.0))
     t = np.arange(1, 300) * 1e-3
-    for position in 0.5 * 9.0 * np.minimum(t, 0.1) ** 2 + 0.9 * np.maximum(t - 0.1, 0):
-        law.step(np.array([position]), np.zeros(1), np.zeros(1), np.zeros(1), 1e-3)
+    velocity = 9.0 * np.minimum(t, 0.1)
+    for position, v in zip(0.5 * velocity * np.minimum(t, 0.1) + 0.9 * np.maximum(t - 0.1, 0), velocity, strict=True):
+        law.step(np.array([position]), np.array([v]), np.zeros(1), np.zeros(1), 1e-3)
         assert law.slewed[0] == pytest.approx(position, abs=1e-12)
 
 
@@ -74,3 +75,15 @@ def test_servo_and_stepper_do_not_touch_each_other():
         mixed.step(np.array([p, 0.0]), np.zeros(2), np.zeros(2), np.array([v, 0.0]), 1e-3)
         alone.step(np.array([p]), np.zeros(1), np.zeros(1), np.array([v]), 1e-3)
         assert mixed.output[0] == alone.output[0]
+
+
+@pytest.mark.parametrize("steps_s", [[1e-3], [1e-3, 1e-3, 7e-3, 1e-3], [0.025, 1e-3, 1e-3]])
+def test_stepper_comes_to_rest_on_a_jump_without_swinging(steps_s):
+    law = law_of(AxisSettings("x", kind=AxisKind.STEPPER, velocity_max=1.0, acceleration_max=10.0))
+    trace = []
+    for n in range(3000):
+        law.step(np.array([0.2]), np.zeros(1), np.zeros(1), np.zeros(1), steps_s[n % len(steps_s)])
+        trace.append(float(law.slewed[0]))
+    assert trace[-1] == pytest.approx(0.2, abs=1e-9)
+    assert max(trace) < 0.2 + 2 * 10.0 * max(steps_s) ** 2  # a long tick cannot be foreseen
+    assert law.output[0] == pytest.approx(0.0, abs=1e-6)
