@@ -125,6 +125,13 @@ MANUALS: dict[str, Manual] = {
         ],
     ),
 }
+DAEMON_OPTIONS = [
+    Option("", "config", "FILE", ALL, "configuration (TOML)"),
+    Option("", "socket", "PATH", ALL, "where to listen, instead of the configured or default path"),
+    Option("", "check", "", ALL, "check the configuration and exit"),
+    Option("", "log-level", "LEVEL", ALL, "debug, info, warning or error; info unless told"),
+    Option("", "help", "", ALL, "print help"),
+]
 STATUS = "0 on success; 1 after a failure, 2 after a wrong command line, each with one line on standard error."
 VARIABLES = "SIOMS_SOCKET is the daemon's socket; else /run/sioms/siomsd.sock, else one in the user's runtime folder."
 

@@ -1,0 +1,242 @@
+"""Write what is generated: manual pages (docs/man) and shell completions (etc/completion).
+
+    python -m sioms.tools.generate           write the files that differ
+    python -m sioms.tools.generate --check   write nothing; exit 1 and name the files that differ
+
+Everything comes out of the tables of options, manuals and commands, so that none of them can lie.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from .front import COMMANDS, DESCRIPTION
+from .manual import DAEMON_OPTIONS, MANUALS, STATUS, VARIABLES, option_groups, shape
+from .options import TOOLS, Option
+
+TREE = Path(__file__).resolve().parent.parent
+_NODE_COMMANDS = ("info", "monitor", "reset", "stop")
+
+
+def main() -> int:
+    """Write or check the generated files; return the exit status."""
+    parser = argparse.ArgumentParser(description="write manual pages and completions")
+    parser.add_argument("--check", action="store_true", help="write nothing; exit 1 when a file differs")
+    check = parser.parse_args().check
+    stale = [path for path, text in files().items() if not _is(TREE / path, text)]
+    for path in stale:
+        if not check:
+            (TREE / path).parent.mkdir(parents=True, exist_ok=True)
+            (TREE / path).write_text(files()[path], encoding="utf-8")
+        print(f"{path}: {'differs; run python -m sioms.tools.generate' if check else 'written'}")
+    return 1 if check and stale else 0
+
+
+def _is(path: Path, text: str) -> bool:
+    return path.is_file() and path.read_text(encoding="utf-8") == text
+
+
+def files() -> dict[str, str]:
+    """Return every generated file by its path in the tree."""
+    made = {f"docs/man/{tool}.1": tool_page(tool) for tool in TOOLS}
+    made["docs/man/sioms.1"] = front_page()
+    made["docs/man/siomsd.8"] = daemon_page()
+    made["etc/completion/sioms.bash"] = bash()
+    made["etc/completion/_sioms"] = zsh()
+    made["etc/completion/sioms.fish"] = fish()
+    return made
+
+
+# --- manual pages --------------------------------------------------------------------------------
+
+
+def roff(text: str) -> str:
+    """Escape text for roff: backslashes, hyphens that must stay hyphens, and lines that look like requests.
+
+    Example:
+        >>> roff("-v .5")
+        '\\\\-v .5'
+    """
+    text = text.replace("\\", "\\e").replace("-", "\\-").replace("~", "\\(ti").replace("`", "\\(ga")
+    return "\\&" + text if text[:1] in (".", "'") else text
+
+
+def _page(name: str, section: int, does: str, synopsis: list[str], parts: list[tuple[str, list[str]]]) -> str:
+    lines = [
+        f'.TH {name.upper()} {section} "" SIOMS "SIOMS manual"', ".SH NAME", f"{name} \\- {roff(does)}", ".SH SYNOPSIS",
+    ]  # fmt: skip
+    for usage in synopsis:
+        lines += [".PP", f".B {name}", roff(usage)]
+    for title, body in parts:
+        lines += [f".SH {title.upper()}", *body]
+    return "\n".join([*lines, ""])
+
+
+def _paragraphs(texts: tuple[str, ...] | list[str]) -> list[str]:
+    return [line for text in texts for line in (".PP", roff(text))]
+
+
+def _options(options: list[Option]) -> list[str]:
+    return [line for o in options for line in (".TP", f".B {roff(shape(o).strip())}", roff(o.text))]
+
+
+def _see_also(name: str) -> list[str]:
+    pages = [*[(tool, 1) for tool in TOOLS], ("sioms", 1), ("siomsd", 8)]
+    return [", ".join(f"\\fB{page}\\fR({section})" for page, section in pages if page != name)]
+
+
+def tool_page(tool: str) -> str:
+    """Return the manual page of a pipe tool."""
+    manual = MANUALS[tool]
+    options: list[str] = []
+    for title, group in option_groups(tool):
+        options += [f".SS {roff(title[0].upper() + title[1:])}", *_options(group)]
+    examples = [line for what, command in manual.examples for line in (".TP", f".B {roff(command)}", roff(what))]
+    return _page(
+        tool, 1, manual.does, list(manual.synopsis),
+        [
+            ("description", _paragraphs(list(manual.text))),
+            ("options", options),
+            ("examples", examples),
+            ("exit status", [roff(STATUS)]),
+            ("environment", [roff(VARIABLES)]),
+            ("see also", _see_also(tool)),
+        ],
+    )  # fmt: skip
+
+
+def front_page() -> str:
+    """Return the manual page of ``sioms``."""
+    commands = [line for name, c in COMMANDS.items() for line in (".TP", f".B {name}", roff(c.text))]
+    return _page(
+        "sioms", 1, "look at a workcell and command it", ["COMMAND [ARGUMENT]..."],
+        [
+            ("description", _paragraphs([DESCRIPTION])),
+            ("commands", commands),
+            ("environment", [roff(VARIABLES)]),
+            ("see also", _see_also("sioms")),
+        ],
+    )  # fmt: skip
+
+
+def daemon_page() -> str:
+    """Return the manual page of ``siomsd``."""
+    text = [
+        "siomsd reads a configuration, starts a driver process for each device, and shows the devices as nodes of "
+        "class axis, analog and binary on a Unix socket.",
+        "SIGHUP takes up added, removed and changed devices without touching the others, as `sioms reload` does. "
+        "SIGTERM and SIGINT stop all motion and end it.",
+    ]
+    return _page(
+        "siomsd", 8, "device daemon of a workcell", ["--config FILE [OPTION]..."],
+        [
+            ("description", _paragraphs(text)),
+            ("options", _options(DAEMON_OPTIONS)),
+            ("exit status", [roff("0 after an ordinary end; 1 when it cannot listen; 2 when the configuration is wrong.")]),
+            ("environment", [roff(VARIABLES)]),
+            ("see also", _see_also("siomsd")),
+        ],
+    )  # fmt: skip
+
+
+# --- completions ---------------------------------------------------------------------------------
+
+
+def _words(tool: str) -> str:
+    options = [o for _, group in option_groups(tool) for o in group]
+    letters = [f"-{o.letter}" for o in options if o.letter]
+    return " ".join([*letters, *[f"--{o.long}{'=' if o.value else ''}" for o in options]])
+
+
+def bash() -> str:
+    """Return the completion for bash."""
+    lines = [
+        "# Completion for bash; node names come from the running daemon. Generated by sioms.tools.generate.",
+        "_sioms_nodes() { sioms list --names 2>/dev/null; }",
+        "_sioms_tool() {",
+        '    local word=${COMP_WORDS[COMP_CWORD]} options=""',
+        "    case $1 in",
+        *[f"    {tool}) options='{_words(tool)}' ;;" for tool in TOOLS],
+        "    esac",
+        "    if [[ $word == -* ]]; then",
+        '        mapfile -t COMPREPLY < <(compgen -W "$options" -- "$word")',
+        "        [[ ${COMPREPLY[0]} == *= ]] && compopt -o nospace",
+        "    elif [[ $1 != smarkers ]]; then",
+        '        mapfile -t COMPREPLY < <(compgen -W "$(_sioms_nodes)" -- "$word")',
+        "    fi",
+        "}",
+        "_sioms() {",
+        "    local word=${COMP_WORDS[COMP_CWORD]}",
+        "    if ((COMP_CWORD == 1)); then",
+        f"        mapfile -t COMPREPLY < <(compgen -W '{' '.join(COMMANDS)} --help --version' -- \"$word\")",
+        "        return",
+        "    fi",
+        "    case ${COMP_WORDS[1]} in",
+        f"    {' | '.join(_NODE_COMMANDS)}) mapfile -t COMPREPLY < <(compgen -W \"$(_sioms_nodes)\" -- \"$word\") ;;",
+        "    driver) mapfile -t COMPREPLY < <(compgen -W list -- \"$word\") ;;",
+        '    *) mapfile -t COMPREPLY < <(compgen -f -- "$word") ;;',
+        "    esac",
+        "}",
+        f"complete -F _sioms_tool {' '.join(TOOLS)}",
+        "complete -F _sioms sioms",
+    ]
+    return "\n".join([*lines, ""])
+
+
+def _quoted(text: str) -> str:
+    return text.replace("'", "'\\''").replace("[", "(").replace("]", ")").replace(":", ";")
+
+
+def zsh() -> str:
+    """Return the completion for zsh."""
+    lines = [
+        f"#compdef {' '.join(TOOLS)} sioms",
+        "# Completion for zsh; node names come from the running daemon. Generated by sioms.tools.generate.",
+        "_sioms_nodes() { local -a nodes; nodes=(${(f)\"$(sioms list --names 2>/dev/null)\"}); compadd -a nodes }",
+        "case $service in",
+    ]
+    for tool in TOOLS:
+        lines.append(f"{tool})")
+        lines.append("    _arguments \\")
+        for _, group in option_groups(tool):
+            for o in group:
+                glue = "=-" if o.value else ""
+                value = f":{o.value}:" if o.value else ""
+                lines.append(f"        '*--{o.long}{glue}[{_quoted(o.text)}]{value}' \\")
+                if o.letter:
+                    lines.append(f"        '*-{o.letter}{'-' if o.value else ''}[{_quoted(o.text)}]{value}' \\")
+        lines.append("        '*:marker:'" if tool == "smarkers" else "        '*:node:_sioms_nodes'")
+        lines.append("    ;;")
+    lines += ["sioms)", "    if ((CURRENT == 2)); then", "        local -a commands", "        commands=("]
+    lines += [f"            '{name}:{_quoted(c.text)}'" for name, c in COMMANDS.items()]
+    lines += [
+        "        )", "        _describe command commands", "    else", "        case $words[2] in",
+        f"        {'|'.join(_NODE_COMMANDS)}) _sioms_nodes ;;", "        driver) compadd list ;;", "        *) _files ;;",
+        "        esac", "    fi", "    ;;", "esac", "",
+    ]  # fmt: skip
+    return "\n".join(lines)
+
+
+def fish() -> str:
+    """Return the completion for fish."""
+    lines = ["# Completion for fish; node names come from the running daemon. Generated by sioms.tools.generate."]
+    for tool in TOOLS:
+        nodes = "" if tool == "smarkers" else " -a '(sioms list --names 2>/dev/null)'"
+        lines.append(f"complete -c {tool} -f{nodes}")
+        for _, group in option_groups(tool):
+            for o in group:
+                short = f" -s {o.letter}" if o.letter else ""
+                lines.append(f"complete -c {tool}{short} -l {o.long}{' -x' if o.value else ''} -d '{_quoted(o.text)}'")
+    lines.append("complete -c sioms -n __fish_use_subcommand -f")
+    for name, command in COMMANDS.items():
+        lines.append(f"complete -c sioms -n __fish_use_subcommand -a {name} -d '{_quoted(command.text)}'")
+    lines.append(
+        f"complete -c sioms -n '__fish_seen_subcommand_from {' '.join(_NODE_COMMANDS)}' -f -a '(sioms list --names 2>/dev/null)'"
+    )
+    return "\n".join([*lines, ""])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
