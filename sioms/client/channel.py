@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from typing import Any
 
 _CMSG_CLOEXEC = 0x40000000
+_DONTWAIT = 0x40
 _ANCILLARY = CMSG_SPACE(8 * 4)
 _FOREVER = pack("ll", 0, 0)
 GRACE_S = 2.0
@@ -198,7 +199,7 @@ class Channel:
             OSError: the other side is gone, or has ended this channel with a reason.
         """
         try:
-            return self._packet(0x40)  # MSG_DONTWAIT
+            return self._packet(_DONTWAIT)
         except BlockingIOError:
             return None
 
@@ -286,8 +287,22 @@ class Channel:
             elif self._sock.fileno() < 0:
                 self._ended = (errno.EBADF, f"{self.name} is closed")
             else:
-                self._ended = (errno.EIO, f"{self.name}: the process behind it has gone; open it again")
+                gone = (errno.EIO, f"{self.name}: the process behind it has gone; open it again")
+                self._ended = self._last_word() or gone
         return OSError(*self._ended)
+
+    def _last_word(self) -> tuple[int, str] | None:
+        """Return why the other side has ended this channel, if it said so; keep the answers before that."""
+        for _ in range(2):  # a reset is reported once, ahead of what is still there to read
+            try:
+                while packet := self._sock.recv(MAX_PACKET, _DONTWAIT):
+                    message = decode(packet)
+                    if message[1] == 0:
+                        return int(message[2]), str(message[3])  # type: ignore[call-overload]
+                    self._answers[message[1]] = (message, [])
+            except (OSError, MalformedMessage):
+                continue
+        return None
 
     def _late(self, call: Call) -> OSError:
         return OSError(errno.ETIMEDOUT, f"{call.what}: {self.name} does not answer; is its process hung?")
