@@ -97,6 +97,9 @@ class Clients:
         session = Session(sock, peer, pidfd_of(sock, peer.pid))
         self._sessions.add(session)
         self._server.loop.watch(sock.fileno(), lambda: self._receive(session))
+        if session.pidfd >= 0:
+            # A child that it forked may hold the socket open after its death.
+            self._server.loop.watch(session.pidfd, lambda: self._end_session(session, ""))
 
     def _receive(self, session: Session) -> None:
         for _ in range(16):  # a chatty client gets its turn, not the loop
@@ -133,7 +136,7 @@ class Clients:
             self._send(session, refusal(number, error.errno, str(error)))
         except MarkerError as error:
             self._send(session, refusal(number, error.errno, str(error)))
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, LookupError, OverflowError) as error:
             raise _Malformed(f"{verb.name} with arguments {arguments!r:.80}: {error}") from None
         else:
             if value is not _LATER:
@@ -194,6 +197,7 @@ class Clients:
         for handle in list(session.handles.values()):
             self._detach(handle)
         if session.pidfd >= 0:
+            self._server.loop.unwatch(session.pidfd)
             os.close(session.pidfd)
 
     # --- waiting requests ------------------------------------------------------------------------
