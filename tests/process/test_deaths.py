@@ -1,0 +1,237 @@
+"""What dies or hangs in mid-motion: client, driver, daemon, nursery. Motion ends, nodes reopen, nobody reads old data as new."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import time
+from collections.abc import Callable
+
+import pytest
+from daemon_rig import WORKCELL, Client, Daemon, at_rest, jog, raises, wait_for
+
+import sioms
+
+
+def test_killed_client_halts_its_axes_and_frees_the_node(
+    daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client]
+) -> None:
+    victim = client(daemon, jog("mod0.xaxis", 0.2))
+    with cell.open("mod0.readonly") as seen:
+        before = seen.read().position[0]
+        victim.kill()
+        killed = time.monotonic()
+        with cell.open("mod0.xaxis", "rw", timeout=2.0) as axis:
+            assert time.monotonic() - killed < 1.0
+            assert axis.read().buffered[0] == 0
+            at_rest(axis, 1.0)
+            # 0.2 m/s at 10 m/s^2 is 2 mm; a loaded machine may be late, a motion that goes on would run 200 mm/s
+            assert axis.read().position[0] - before < 0.15
+            rest = axis.read().position[0]
+            axis.wait_new(axis.read().number + 50, 2.0)
+            assert abs(axis.read().position[0] - rest) < 2e-3  # 0.2 m/s would be 10 mm
+
+
+def test_killed_client_with_a_child_that_holds_the_sockets_open(
+    daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client]
+) -> None:
+    fork = "marker = cell.reserve_marker()\nif os.fork() == 0: hold()\nsay('token', marker.token)\nhold()\n"
+    victim = client(daemon, jog("mod0.xaxis", 0.2) + fork)
+    token = int(victim.wait_line(r"token (\d+)").group(1))
+    victim.kill()
+    with cell.open("mod0.xaxis", "rw", timeout=3.0) as axis:
+        at_rest(axis, 1.0)
+    with raises(errno.EINVAL, "not reserved"):  # its marker went with it
+        cell.wait_marker(token & 1023, 0.0)
+
+
+def test_killed_client_drops_outputs_to_safe(
+    daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client]
+) -> None:
+    with cell.open("io0.readonly") as seen:
+        victim = client(daemon, "io = cell.open('io0', 'rw')\nio.set(0b101)\nsay('ready')\nhold()")
+        wait_for(lambda: seen.read().data[0] == 0b101, "outputs set")
+        victim.kill()
+        wait_for(lambda: seen.read().data[0] == 0, "outputs safe", 2.0)
+
+
+def test_hung_client_with_a_lease_loses_its_axes(
+    daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client]
+) -> None:
+    keep = "while True:\n    node.keepalive(); time.sleep(0.02)\n"
+    victim = client(daemon, jog("mod0.xaxis", 0.1, lease=0.2) + keep)
+    with cell.open("mod0.readonly") as seen:
+        seen.wait_new(seen.read().number + 500, 5.0)
+        assert seen.read().in_motion[0], "a client that keeps its lease keeps its motion"
+        with daemon.frozen(victim.pid):
+            assert at_rest(seen, 3.0) < 1.5
+            with cell.open("mod0.xaxis", "rw", timeout=1.0):
+                pass
+        victim.wait_line("TimeoutError|silent for longer than its lease of 0.2 s|process behind it has gone")
+
+
+def test_killed_driver_gives_eio_with_reason_and_comes_back_at_rest(
+    daemon: Daemon, cell: sioms.Workcell
+) -> None:
+    before = daemon.device("mod0")
+    others = {name: daemon.device(name)["pid"] for name in ("mod1", "io0", "force0")}
+    axis = cell.open("mod0.xaxis", "rw")
+    axis.command(velocity=0.1)
+    last = axis.read()
+    os.kill(before["pid"], signal.SIGKILL)
+    wait_for(lambda: _errno(axis.read) == errno.EIO, "reads are refused", 2.0)
+    with raises(errno.EIO, "read mod0.xaxis", "driver"):
+        axis.read()
+    with raises(errno.EIO, "mod0.xaxis"):
+        axis.command(velocity=0.1)
+    after = daemon.wait_up("mod0", before["generation"] + 1)
+    assert after["pid"] != before["pid"]
+    with raises(errno.EIO):  # the old handle stays dead: a new process has new numbers
+        axis.read()
+    axis.close()
+    with cell.open("mod0.xaxis", "rw", timeout=2.0) as again:
+        reading = again.read()
+        assert not reading.in_motion[0] and reading.buffered[0] == 0
+        assert reading.number != last.number
+        again.move(0.01)
+        again.wait_until_idle(5.0)
+    assert {name: daemon.device(name)["pid"] for name in others} == others
+
+
+def test_hung_driver_is_stale_then_killed_and_restarted(daemon: Daemon, cell: sioms.Workcell) -> None:
+    before = daemon.device("force0")
+    with cell.open("force0") as node:
+        node.read()
+        with daemon.frozen(before["pid"]):
+            wait_for(lambda: _errno(node.read) == errno.EIO, "stale", 2.0)
+            with raises(errno.EIO, "has not ticked for"):
+                node.read()
+            daemon.wait_up("force0", before["generation"] + 1)
+    daemon.said("event=\"device lost\" device=force0 .*hung for")
+    with cell.open("force0") as node:
+        assert node.read().data[2] == pytest.approx(3.0)
+
+
+def test_killed_nursery_harms_no_driver_and_a_new_one_restarts_them(
+    daemon: Daemon, cell: sioms.Workcell
+) -> None:
+    with cell.open("mod1", "rw") as axis:
+        axis.command(velocity=0.05)
+        os.kill(daemon.nursery(), signal.SIGKILL)
+        number = axis.read().number
+        axis.wait_new(number + 300, 3.0)
+        assert axis.read().in_motion[0]
+        axis.stop()
+    before = daemon.device("io0")
+    os.kill(before["pid"], signal.SIGKILL)
+    daemon.wait_up("io0", before["generation"] + 1)
+
+
+def test_five_deaths_in_a_minute_are_a_fault_until_reset(start_daemon: Callable[..., Daemon]) -> None:
+    daemon = start_daemon('[device.io0]\ndriver = "sim-io"\ninputs = 1\n')
+    for generation in range(1, 6):
+        pid = daemon.wait_up("io0", generation)["pid"]
+        os.kill(pid, signal.SIGKILL)
+        wait_for(lambda pid=pid: daemon.device("io0")["pid"] != pid, "death noticed")
+    wait_for(lambda: daemon.device("io0")["state"] == "fault", "fault")
+    with daemon.cell() as cell:
+        with raises(errno.EIO, "open io0: device io0 is fault"):
+            cell.open("io0")
+        cell.reset("io0")
+        daemon.wait_up("io0", 6)
+        cell.open("io0").close()
+
+
+def test_killed_daemon_stops_all_drivers(
+    start_daemon: Callable[..., Daemon], client: Callable[..., Client]
+) -> None:
+    daemon = start_daemon()
+    pids = [daemon.device(name)["pid"] for name in ("mod0", "mod1", "io0", "force0")]
+    cell = daemon.cell()
+    axis, other = cell.open("mod0.xaxis", "rw"), cell.open("mod1", "rw")
+    axis.command(velocity=0.3)
+    other.command(velocity=0.3)
+    os.kill(daemon.pid, signal.SIGKILL)
+    killed = time.monotonic()
+    for node in (axis, other):
+        last = _last(node)
+        assert not any(last.in_motion) and abs(last.velocity[0]) < 0.1, "the last thing published is rest"
+        with raises(errno.EIO, node.name):
+            node.read()
+        with raises(errno.EIO, node.name):
+            node.command(velocity=0.1)
+    wait_for(lambda: not any(_alive(pid) for pid in pids), "drivers ended", 5.0)
+    print(f"daemon SIGKILL to all drivers gone: {(time.monotonic() - killed) * 1e3:.0f} ms")
+    with raises(errno.EIO):
+        cell.status()
+
+
+def test_hung_daemon_costs_the_writers_their_axes_only(
+    start_daemon: Callable[..., Daemon],
+) -> None:
+    daemon = start_daemon(WORKCELL.replace('name = "test"', 'name = "test"\ndaemon_lease_s = 0.3'))
+    with daemon.cell() as cell:
+        seen = cell.open("mod0.readonly")
+        axis = cell.open("mod0.xaxis", "rw")
+        axis.command(velocity=0.2)
+        with daemon.frozen(daemon.pid):
+            assert at_rest(seen, 3.0) < 2.0
+            with raises(errno.ETIMEDOUT, "the daemon has been silent for more than 0.3 s"):
+                axis.command(velocity=0.1)
+            seen.read()
+        cell.open("mod0.xaxis", "rw", timeout=3.0).close()
+        seen.close()
+
+
+def test_loss_of_a_device_stops_the_workcell_where_configured(start_daemon: Callable[..., Daemon]) -> None:
+    daemon = start_daemon(WORKCELL.replace("[device.force0]\n", '[device.force0]\non_loss = "stop"\n'))
+    with daemon.cell() as cell, cell.open("mod0.xaxis", "rw") as axis:
+        axis.command(velocity=0.2)
+        os.kill(daemon.device("force0")["pid"], signal.SIGKILL)
+        at_rest(axis, 3.0)
+        assert "device force0 lost" in wait_for(lambda: cell.status()["stop_source"], "latched")
+        with raises(errno.EPERM, "emergency stop"):
+            axis.command(velocity=0.1)
+        daemon.wait_up("force0", 2)
+        cell.reset()
+        axis.move(0.0)
+        axis.wait_until_idle(5.0)
+
+
+def test_sigterm_while_axes_move_ends_in_rest_and_leaves_nothing(start_daemon: Callable[..., Daemon]) -> None:
+    daemon = start_daemon()
+    pids = [daemon.device(name)["pid"] for name in ("mod0", "mod1", "io0", "force0")]
+    cell = daemon.cell()
+    axis = cell.open("mod0.xaxis", "rw")
+    axis.command(velocity=0.5)
+    wait_for(lambda: axis.read().velocity[0] > 0.4, "moving")
+    daemon.running.signal(signal.SIGTERM)
+    last = _last(axis)
+    assert not last.in_motion[0] and abs(last.velocity[0]) < 0.1
+    assert daemon.running.wait_exit(10.0) == 0
+    assert not os.path.exists(daemon.socket)
+    wait_for(lambda: not any(_alive(pid) for pid in pids), "drivers ended", 5.0)
+
+
+def _errno(call: Callable[[], object]) -> int | None:
+    try:
+        call()
+    except OSError as error:
+        return error.errno
+    return None
+
+
+def _last(node: sioms.Node) -> sioms.client.snapshot.Snapshot:
+    """Wait until reads are refused; return what was published last, which no read shows any more."""
+    wait_for(lambda: _errno(node.read) == errno.EIO, f"{node.name} is refused", 5.0)
+    raw = wait_for(lambda: node._page.numbered(node._page.head), "the last snapshot")
+    return node._snapshot(raw, node._layout)
+
+
+def _alive(pid: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
