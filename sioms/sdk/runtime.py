@@ -590,7 +590,7 @@ class Runtime:
                 if flags & socket.MSG_TRUNC:
                     raise MalformedMessage(f"packet longer than {MAX_PACKET} bytes")
                 self._serve(handle, decode(packet), fds)
-            except (MalformedMessage, ValueError, TypeError) as error:
+            except (MalformedMessage, ValueError, TypeError, LookupError, OverflowError) as error:
                 self.log(
                     "warning", f"{handle.node}: connection of {handle.who} ended: malformed message: {error}"
                 )
