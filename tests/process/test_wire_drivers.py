@@ -1,0 +1,236 @@
+"""Drivers of real protocols under the real daemon, against simulated devices on ptys and TCP.
+
+The second drive of the bus is configured and not there, in all tests: a dead unit must not disturb the others. Starting
+a cell takes seconds on a busy machine, so each test tells a whole story in one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import sioms
+from sioms.protocol.flags import AnalogStatus, AxisStatus
+
+CONFIG = """
+[workcell]
+name = "wire"
+[device.bus0]
+driver = "modbus-axis"
+map = "leadshine"
+line = {{ serial = "{folder}/drives", baud = 115200 }}
+poll_hz = 30.0
+[[device.bus0.axis]]
+name = "x"
+address = 1
+travel_per_turn = 0.01
+velocity_max = 0.2
+acceleration_max = 2.0
+[[device.bus0.axis]]
+name = "y"
+address = 2
+velocity_by = "path"
+travel_per_turn = 0.01
+velocity_max = 0.2
+acceleration_max = 2.0
+[device.finger0]
+driver = "framed-adc"
+line = {{ serial = "{folder}/finger", baud = 921600 }}
+channels = 16
+rate_hz = 500
+scale = 0.0005
+unit = "N"
+[device.io0]
+driver = "modbus-io"
+map = "moxa_e1200"
+model = "E1212"
+line = {{ tcp = "{io}" }}
+safe = {{ do = 0 }}
+"""
+
+
+class Cell:
+    """Counterparts, a daemon, and a client."""
+
+    def __init__(self, start: Callable[..., Any], folder: Path) -> None:
+        self._start = start
+        self.drives = self._counterpart("leadshine", "--link", folder / "drives", "--units", "1")
+        self.finger = self._counterpart("adc", "--link", folder / "finger")
+        self.io = self._counterpart("moxa", "--model", "E1212")
+        config = folder / "wire.toml"
+        port = self.io.wait_line(r"^ready (\S+)$").group(1)
+        config.write_text(CONFIG.format(folder=folder, io=port))
+        self.socket = str(folder / "s")
+        command = [sys.executable, "-m", "sioms.daemon.main", "--config", config, "--socket", self.socket]
+        self.daemon = start(command)
+        self.daemon.wait_line("event=ready")
+        self.client = sioms.Workcell(self.socket)
+
+    def _counterpart(self, name: str, *options: object) -> Any:
+        process = self._start([sys.executable, "-m", f"sioms.tools.counterparts.{name}", *map(str, options)])
+        process.wait_line("^ready ")
+        return process
+
+    def tell(self, process: Any, line: str) -> Any:
+        """Send a command to a counterpart and return its answer's value."""
+        before = len(process.lines)
+        process.process.stdin.write(line + "\n")
+        process.process.stdin.flush()
+        deadline = time.monotonic() + 5
+        while len(process.lines) == before:
+            assert time.monotonic() < deadline, f"no answer to {line}"
+            time.sleep(0.001)
+        answer = process.lines[before]
+        assert answer.startswith("ok"), answer
+        return json.loads(answer[3:]) if answer[3:] else None
+
+    def device(self, name: str) -> dict[str, Any]:
+        """Return what the daemon says of a device."""
+        return next(device for device in self.client.status()["devices"] if device["name"] == name)
+
+    def velocity(self) -> float:
+        return float(self.tell(self.drives, "state")["velocity"])
+
+    def reads(self, name: str) -> bool:
+        """Tell whether a node can be read."""
+        try:
+            with self.client.open(f"{name}.readonly" if name == "bus0.x" else name) as node:
+                node.read()
+        except OSError:
+            return False
+        return True
+
+
+@pytest.fixture
+def cell(start: Callable[..., Any], short_folder: Path, wait_until: Callable[..., None]) -> Iterator[Cell]:
+    made = Cell(start, short_folder)
+    for name in ("bus0.x", "finger0", "io0"):
+        wait_until(lambda name=name: made.reads(name), what=f"{name} readable")
+    yield made
+    made.client.close()
+
+
+JOG = """
+import sys, time, sioms
+node = sioms.Workcell(sys.argv[1]).open("bus0.x", "rw")
+node.command(velocity=0.05)
+print("moving", flush=True)
+time.sleep(60)
+"""
+
+
+def jog(cell: Cell, start: Callable[..., Any], wait_until: Callable[..., None]) -> Any:
+    """Let a client of its own jog the first drive."""
+    client = start([sys.executable, "-c", JOG, cell.socket])
+    client.wait_line("moving")
+    wait_until(lambda: cell.velocity() > 40000, what="the drive moving")
+    return client
+
+
+def test_deaths_in_motion_stop_the_drive(
+    cell: Cell, start: Callable[..., Any], wait_until: Callable[..., None]
+) -> None:
+    client = jog(cell, start, wait_until)
+    client.process.kill()
+    wait_until(lambda: cell.velocity() == 0, 2.0, "rest after the client's death")
+    wait_until(lambda: cell.device("bus0")["pid"], what="the driver's pid")
+    client = jog(cell, start, wait_until)
+    driver = cell.device("bus0")["pid"]
+    os.kill(driver, signal.SIGKILL)
+    wait_until(lambda: cell.velocity() == 0, 2.0, "rest after the driver's death")
+    client.process.kill()
+    wait_until(lambda: cell.device("bus0")["pid"] not in (0, None, driver), what="a new driver")
+    wait_until(lambda: cell.reads("bus0.x"), what="the axis again")
+    assert cell.velocity() == 0, "motion must not resume"
+    jog(cell, start, wait_until)
+    cell.daemon.process.kill()
+    wait_until(lambda: cell.velocity() == 0, 2.0, "rest after the daemon's death")
+
+
+def test_faults_of_the_serial_line(cell: Cell, wait_until: Callable[..., None]) -> None:
+    with cell.client.open("bus0.x", "rw") as x:
+        # the dead drive beside it takes little of the line
+        first, began = x.read().number, time.monotonic()
+        x.move(0.05)
+        x.wait_until_idle(5.0)
+        time.sleep(1.0)
+        assert x.read().position[0] == pytest.approx(0.05)
+        rate = (x.read().number - first) / (time.monotonic() - began)
+        assert rate > 12, f"{rate:.1f} polls a second"
+        assert not cell.reads("bus0.y")
+        # noise: polls are repeated, nobody notices
+        cell.tell(cell.drives, "noise 2")
+        wait_until(lambda: x.statistics()["link"]["garbled"] >= 1, what="noise seen")
+        assert x.read().position[0] == pytest.approx(0.05)
+        # replies lost: the link is lost, reading says so, and it comes back
+        cell.tell(cell.drives, "mute")
+        wait_until(lambda: not cell.reads("bus0.x"), what="the loss")
+        with pytest.raises(OSError, match="bus0"):
+            x.read()
+        cell.tell(cell.drives, "clear")
+        wait_until(lambda: cell.reads("bus0.x"), what="the link again")
+        # a cable pulled and put back
+        cell.tell(cell.drives, "unplug 0.3")
+        wait_until(lambda: not cell.reads("bus0.x"), what="the loss")
+        wait_until(lambda: cell.reads("bus0.x"), what="the link again")
+        x.reset()
+        x.move(0.0)
+        x.wait_until_idle(5.0)
+        # a start whose reply is damaged is not sent again: the axis is stopped and says why
+        cell.tell(cell.drives, "cut 1000")
+        with pytest.raises(OSError, match="bus0"):
+            x.move(0.2)
+            x.wait_until_idle(5.0)
+        cell.tell(cell.drives, "clear")
+        wait_until(lambda: cell.reads("bus0.x"), what="the link again")
+        wait_until(lambda: cell.velocity() == 0, what="rest")
+        # an alarm in motion: named, latched, reset
+        x.reset()
+        x.move(-0.2)
+        wait_until(lambda: cell.velocity() != 0, what="motion")
+        cell.tell(cell.drives, "alarm 0x40")
+        wait_until(lambda: x.read().status[0] & AxisStatus.FAULT, what="the fault")
+        with pytest.raises(OSError, match="current sensing"):
+            x.move(0.0)
+        x.reset()
+        wait_until(lambda: not x.read().status[0] & AxisStatus.FAULT, what="the reset")
+
+
+def test_the_stream_and_the_outputs(
+    cell: Cell, start: Callable[..., Any], wait_until: Callable[..., None]
+) -> None:
+    with cell.client.open("finger0") as finger:
+        cell.tell(cell.finger, "touch 2 1 1")
+        wait_until(lambda: sum(finger.read().data) == pytest.approx(2.0, abs=0.1), what="the touch")
+        assert 0 <= time.monotonic_ns() - finger.read().stamp_ns < 500e6
+        cell.tell(cell.finger, "lose 4")
+        wait_until(lambda: finger.statistics()["stream"]["lost_blocks"] >= 4, what="the losses counted")
+        flags = {flag for old in finger.history(0) for flag in old.flags}
+        assert AnalogStatus.OVERRUN in flags
+        cell.tell(cell.finger, "unplug 0.3")
+        wait_until(lambda: not cell.reads("finger0"), what="the loss")
+        wait_until(lambda: cell.reads("finger0"), what="the link again")
+        assert sum(finger.read().data) == pytest.approx(2.0, abs=0.1)
+    program = """
+import sys, time, sioms
+node = sioms.Workcell(sys.argv[1]).open("io0.do", "rw")
+node.set(0x55)
+print("set", flush=True)
+time.sleep(60)
+"""
+    cell.tell(cell.io, "loop on")
+    client = start([sys.executable, "-c", program, cell.socket])
+    client.wait_line("set")
+    assert cell.tell(cell.io, "state")["do"] == [1, 0, 1, 0, 1, 0, 1, 0]
+    with cell.client.open("io0") as inputs:
+        wait_until(lambda: inputs.read().data[0] == 0x55, what="the loop")
+        client.process.kill()
+        wait_until(lambda: inputs.read().data[0] == 0, 2.0, "the safe value")
