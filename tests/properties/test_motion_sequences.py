@@ -70,7 +70,7 @@ def check_set_points(rig):
     assert np.abs(np.diff(p) - 0.5 * (v[1:] + v[:-1]) * h).max(initial=0) <= A * h * h
 
 
-@settings(max_examples=120)
+@settings(max_examples=60)
 @given(st.lists(step, min_size=1, max_size=8), st.sampled_from([1_000_000, 700_000, 5_000_000]))
 def test_any_sequence_keeps_limits_and_continuity(steps, tick_ns):
     rig = Rig([axis()], tick_ns=tick_ns)
@@ -145,7 +145,7 @@ def test_timed_pieces_end_where_and_when_they_say(pieces):
 state = st.tuples(position, velocity, st.floats(-A, A))
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(state, state, st.floats(0.01, 3.0))
 def test_quintic_meets_both_ends_and_bernstein_encloses_it(begin, end, time):
     c = quintic(begin, end, time)
@@ -164,7 +164,7 @@ def test_quintic_meets_both_ends_and_bernstein_encloses_it(begin, end, time):
             assert leaves(bernstein, values.min(), middle)
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(command, st.tuples(st.floats(-1, 1), velocity, st.floats(-A, A)))
 def test_a_plan_begins_where_it_is_told_and_is_continuous(fields, begin):
     from sioms.motion.commands import COMMAND_DTYPE, Command
