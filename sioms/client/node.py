@@ -13,12 +13,12 @@ from select import POLLIN, poll
 from time import monotonic, monotonic_ns
 
 from sioms.protocol.flags import NodeClass, PageState, Request, WriteFlag
-from sioms.protocol.messages import MAX_INLINE, MAX_WRITE, HandleVerb, encode
+from sioms.protocol.messages import MAX_INLINE, MAX_WRITE, HandleVerb
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.page import NotReadable, PageReader
 from sioms.protocol.records import ANALOG_WRITE, BINARY_WRITE
 
-from .channel import Call, Channel
+from .channel import KEEPALIVE, Call, Channel
 from .command import command
 from .snapshot import SNAPSHOT, AnalogSnapshot, AxisSnapshot, BinarySnapshot, Layout
 
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
     Records: TypeAlias = bytes | bytearray | memoryview | Iterable[bytes]
 
-_KEEPALIVE = encode(HandleVerb.KEEPALIVE, 0)
 SYNCH_LEAD_S = 0.01
 """How far ahead a synchronised start lies: long enough for every driver to hear of it."""
 
@@ -100,13 +99,15 @@ class NodeCore:
             self._drain()
         return self._snapshot(raw, self._layout)
 
-    def history(self, after: int) -> list[Any]:
+    def history(self, after: int, *, gone: bool = False) -> list[Any]:
         """Return the snapshots after a given number that the page still holds, oldest first.
 
         Args:
             after: number of the last snapshot seen; 0 for all.
+            gone: also of a device that is lost, hung or gone, to look at what happened to it.
         """
-        self.read()
+        if not gone:
+            self.read()
         page = self._page
         first = max(after + 1, page.head - page.slots + 2, 1)
         raws = [page.numbered(number) for number in range(first, page.head + 1)]
@@ -127,7 +128,7 @@ class NodeCore:
 
     def keepalive(self) -> None:
         """Tell the driver that this client is alive, for nodes opened with a lease; any request does, too."""
-        self._channel.notice(_KEEPALIVE)
+        self._channel.notice(KEEPALIVE)
 
     def room(self) -> int:
         """Return how many commands the fullest of the node's command buffers still takes."""
@@ -214,9 +215,10 @@ class NodeCore:
 class Node(NodeCore):
     """An open node, with calls that wait. Use it in a ``with`` block: closing halts its axes."""
 
-    def __init__(self, core: tuple[Any, ...], close: Callable[[int], None]) -> None:
+    def __init__(self, core: tuple[Any, ...], close: Callable[[int], None], lease: float = 0.0) -> None:
         super().__init__(*core)
         self._close = close
+        self._channel.keepalive_s = lease / 3
 
     def __enter__(self) -> Self:
         return self
@@ -319,8 +321,11 @@ class Node(NodeCore):
         poller = poll()
         poller.register(self._event, POLLIN)
         # A hung driver wakes nobody: look at its lease now and then.
-        if poller.poll(50 if left is None else min(50.0, left * 1e3)):
+        step_s = min(0.05, self._channel.keepalive_s or 0.05)
+        if poller.poll(1e3 * (step_s if left is None else min(step_s, left))):
             return
+        if self._channel.keepalive_s:
+            self.keepalive()
         self._page.check(monotonic_ns()) if self._map is not None else None
 
 

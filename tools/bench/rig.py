@@ -85,6 +85,14 @@ class Daemon:
         """Return a new session."""
         return Workcell(self.socket, name)
 
+    def ended(self) -> bool:
+        """Tell whether the daemon has ended by itself."""
+        try:
+            self.process.wait(0.05)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
     def log(self) -> str:
         """Return what the daemon has logged."""
         return self.log_path.read_text(encoding="utf-8", errors="replace")

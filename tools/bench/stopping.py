@@ -1,0 +1,117 @@
+"""Emergency stop: 16 axes in 4 driver processes with full buffers, while others wait and read."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from sioms.client.command import command
+
+from .baseline import interpreter_ns, run_ns
+from .deaths import SPEED, wait_cruising
+from .figures import Bar, Report
+from .options import Options
+from .rig import CpuTimes, Daemon
+from .watching import HISTORY, Watch, halting_ns, standing_ns
+from .workcells import axes, workcell
+
+MODULES = 4
+CAPACITY = 256
+TICK_MS = 1.0
+LONG_S = 30.0
+
+
+def bench_stop(options: Options, report: Report) -> None:
+    """From the call to every driver decelerating and to the last axis at rest."""
+    devices = [
+        axes(f"mod{i}", history=HISTORY, capacity=CAPACITY, acceleration=25.0, limits=False) for i in range(MODULES)
+    ]  # fmt: skip
+    with Daemon(workcell(devices)) as daemon, daemon.cell() as cell:
+        nodes = [cell.open(f"mod{i}", "rw") for i in range(MODULES)]
+        daemon.fork(lambda: _wait_for_ever(daemon))
+        daemon.fork(lambda: _read_for_ever(daemon))
+        cpu = CpuTimes({"daemon": daemon.pid, **daemon.device_pids()})
+        count = options.kills(20, 1000)
+        acted, rested, calls = _trials(count, cell, nodes, report, lambda: cell.emergency_stop(why="bench"))
+        report.samples("emergency stop, call returns", calls, "ms")
+        bars = [Bar("max", 2 * TICK_MS), Bar("p99", 2 * TICK_MS)]
+        report.samples("emergency stop to all 4 drivers decelerating", acted, "ms", bars=bars)
+        bars = [Bar("p50", 5.0), Bar("p99", 10.0)]
+        report.samples("emergency stop to the last of 16 axes at rest", rested, "ms", bars=bars, cpu=cpu.shares())
+        _shell(options, report, daemon, cell, nodes)
+
+
+def _trials(
+    count: int, cell: Any, nodes: list[Any], report: Report, stop: Callable[[], object]
+) -> tuple[list[int], list[int], list[int]]:
+    """Stop moving axes again and again.
+
+    Returns:
+        When all decelerate, when all stand, and how long the call takes [ns].
+    """
+    acted, rested, calls = [], [], []
+    for trial in range(count):
+        _fill(nodes)
+        watches = [Watch(node) for node in nodes]
+        begin = time.monotonic_ns()
+        stop()
+        calls.append(time.monotonic_ns() - begin)
+        acted.append(max(halting_ns(watch, begin) for watch in watches) - begin)
+        rested.append(max(standing_ns(watch, begin) for watch in watches) - begin)
+        cell.reset()
+        report.progress(f"stop: {trial} of {count}")
+    return acted, rested, calls
+
+
+def _fill(nodes: list[Any]) -> None:
+    """Fill all buffers with moves that last far longer than the trial, and wait until all axes go."""
+    for node in nodes:
+        count = len(node.info.channels)
+        commands = [command(a, velocity=SPEED, time=LONG_S) for _ in range(CAPACITY) for a in range(count)]
+        node.write(commands, 5.0)
+    for node in nodes:
+        wait_cruising(node)
+
+
+def _wait_for_ever(daemon: Daemon) -> None:
+    """Be the client that waits for the end of a motion that never ends."""
+    with daemon.cell("waiter") as cell, cell.open("mod0.readonly") as node:
+        while True:
+            with contextlib.suppress(OSError):  # stopped: that is what this client is for
+                node.wait_until_idle()
+            time.sleep(0.01)
+
+
+def _read_for_ever(daemon: Daemon) -> None:
+    """Be the client that reads every publication at 1 kHz."""
+    with daemon.cell("reader") as cell, cell.open("mod1.readonly") as node:
+        number = 0
+        while True:
+            number = node.wait_new(number, 5.0).number
+
+
+def _shell(options: Options, report: Report, daemon: Daemon, cell: Any, nodes: list[Any]) -> None:
+    """The same from the shell: ``sdev -e``, from its start."""
+    tool = Path(sys.executable).with_name("sdev")
+    if not tool.exists():
+        report.note(f"sdev is not installed beside {sys.executable}: left out")
+        return
+    environment = dict(os.environ, SIOMS_SOCKET=daemon.socket)
+    bare: list[int] = []
+    acted: list[int] = []
+    rested: list[int] = []
+    calls: list[int] = []
+    for _ in range(options.kills(10, 100)):
+        bare.append(interpreter_ns())
+        found = _trials(1, cell, nodes, report, lambda: run_ns([str(tool), "-e"], environment))
+        for samples, more in zip((acted, rested, calls), found, strict=True):
+            samples += more
+    base = report.samples("bare interpreter, start to exit", bare, "ms")
+    report.samples("sdev -e from start to all drivers decelerating", acted, "ms", baseline=base, bars=[Bar("ratio", 2.0)])
+    report.samples("sdev -e from start to the last axis at rest", rested, "ms", baseline=base)
+    report.samples("sdev -e from start to exit", calls, "ms", baseline=base)
