@@ -582,11 +582,11 @@ class Runtime:
                 return
             except OSError:
                 packet, fds, flags = b"", [], 0
-            if not packet:
-                self._drop_handle(handle)
-                return
             handle.heard_ns = time.monotonic_ns()
             try:
+                if not packet:
+                    self._drop_handle(handle)
+                    return
                 if flags & socket.MSG_TRUNC:
                     raise MalformedMessage(f"packet longer than {MAX_PACKET} bytes")
                 self._serve(handle, decode(packet), fds)
