@@ -1,0 +1,454 @@
+"""The pipe tools and the sioms command as processes, against a real daemon with simulated devices."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from daemon_rig import FORCE, Client, Daemon, axes, daemons, wait_for
+
+import sioms
+
+BIN = Path(sys.prefix) / "bin"
+CELL = (
+    '[workcell]\nname = "tools"\n'
+    + axes("mod0", "xaxis", "yaxis", "zaxis", "taxis")
+    + axes("mod1", "xaxis")
+    + FORCE.replace("force0", "lord1")
+    + '\n[device.gripper0]\ndriver = "sim-io"\noutputs = 8\nsafe = 0\n'
+    + '\n[device.tactile0]\ndriver = "sim-tactile"\n'
+    + '\n[node.atod0]\nof = "lord1"\nchannels = ["fx"]\n'
+)
+AXIS_LINE = r"[0-3] [01] -?\d\.\d{4}e[+-]\d\d -?\d\.\d{4}e[+-]\d\d -?\d\.\d\de[+-]\d\d"
+Shell = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture(scope="module")
+def shared_daemon() -> Iterator[Daemon]:
+    with daemons() as start:
+        yield start(CELL)
+
+
+def environment(socket: str) -> dict[str, str]:
+    return {**os.environ, "SIOMS_SOCKET": socket, "PATH": f"{BIN}:{os.environ['PATH']}"}
+
+
+@pytest.fixture
+def shell(daemon: Daemon, tmp_path: Path) -> Shell:
+    """Run a line of bash with the tools on its path, in a fresh folder."""
+
+    def run(line: str, text: str = "", socket: str = daemon.socket) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            ["bash", "-c", line], input=text, capture_output=True, text=True, cwd=tmp_path,
+            env=environment(socket), timeout=30,
+        )  # fmt: skip
+
+    return run
+
+
+def good(result: subprocess.CompletedProcess[str]) -> str:
+    assert (result.returncode, result.stderr) == (0, "")
+    return result.stdout
+
+
+def refused(result: subprocess.CompletedProcess[str], *words: str, status: int = 1) -> str:
+    """Check that it failed with one line on stderr that says these words, and with nothing on stdout."""
+    assert result.returncode == status, result.stderr
+    assert result.stderr.count("\n") == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    for word in words:
+        assert word in result.stderr
+    return result.stderr
+
+
+def halted(cell: sioms.Workcell, name: str = "mod0") -> None:
+    node = cell.open(f"{name}.readonly")
+    wait_for(lambda: not any(node.read().in_motion), f"{name} at rest")
+
+
+# --- the examples of section F.4 -----------------------------------------------------------------
+
+
+def test_devin_of_a_module(shell: Shell) -> None:
+    assert re.fullmatch(rf"({AXIS_LINE}\n){{4}}", good(shell("devin mod0")))
+
+
+def test_devin_of_several_devices(shell: Shell) -> None:
+    text = good(shell("devin mod0 gripper0 atod0"))
+    assert re.fullmatch(rf"({AXIS_LINE}\n){{4}}0 0\n0 1\.00e\+00\n", text)
+
+
+def test_devin_by_path_and_by_soft_link(shell: Shell) -> None:
+    plain = good(shell("devin -p mod0"))
+    assert good(shell("devin -p ~rws/dev/mod0")) == plain
+    assert good(shell("ln -s ~rws/dev/mod0 m0; devin -p m0; rm m0")) == plain
+    assert good(shell("ln -s ~rws/dev/mod0 m0; devin -p ./m0; rm m0")) == plain
+
+
+def test_devin_of_single_values(shell: Shell) -> None:
+    assert good(shell("devin -p atod0")) == "1.00e+00 "
+    assert re.fullmatch(r"0 -?\d\.\d{4}e[+-]\d\d\n", good(shell("devin -n0pN mod0")))
+    assert re.fullmatch(r"(-?\d\.\d{4}e[+-]\d\d ){3}", good(shell("devin -l1h3v mod0")))
+
+
+def test_devin_timed(shell: Shell) -> None:
+    assert good(shell("devin -t0.001 -n0 lord1")) == "1.00e+00 " * 100
+    lines = good(shell("devin -t0.01 -L5 lord1 -N")).splitlines()
+    assert [line.split()[2:4] for line in lines] == [["1.00e+00", "2.00e+00"]] * 5
+    assert [float(line.split()[0]) for line in lines] == sorted(float(line.split()[0]) for line in lines)
+
+
+def test_damper_in_a_pipe(shell: Shell, cell: sioms.Workcell) -> None:
+    node = cell.open("mod0.readonly")
+    before = node.read().position[0]
+    good(shell("set -o pipefail; devin -t0.005 -n3 -L60 lord1 | devout -rv -L-1 -W mod0.xaxis"))
+    assert 0.015 < node.read().position[0] - before < 0.06  # 0.1 N m make 0.1 m/s for 0.3 s
+    halted(cell)
+
+
+# --- filters -------------------------------------------------------------------------------------
+
+
+def test_a_reader_that_has_enough_ends_devin(shell: Shell) -> None:
+    result = shell("devin -t0.001 -L-1 -n0 lord1 | head -c 90; echo ${PIPESTATUS[0]}")
+    assert good(result) == "1.00e+00 " * 10 + f"{128 + signal.SIGPIPE}\n"
+
+
+def test_ctrl_c_ends_devin_without_a_word(daemon: Daemon) -> None:
+    process = subprocess.Popen(
+        [BIN / "devin", "-t0.001", "-L-1", "lord1"], env=environment(daemon.socket),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stdout is not None
+    process.stdout.read(10)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=5)
+    assert (process.returncode, said) == (-signal.SIGINT, b"")
+
+
+def test_each_sample_is_flushed(daemon: Daemon) -> None:
+    process = subprocess.Popen(
+        [BIN / "devin", "-t100", "-n0", "lord1"], env=environment(daemon.socket), stdout=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    assert os.read(process.stdout.fileno(), 100) == b"1.00e+00 "
+    process.kill()
+    process.communicate()
+
+
+@pytest.fixture
+def devout(daemon: Daemon) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+    running: list[subprocess.Popen[bytes]] = []
+
+    def start(*arguments: str, socket: str = daemon.socket) -> subprocess.Popen[bytes]:
+        running.append(
+            subprocess.Popen(
+                [BIN / "devout", *arguments], env=environment(socket), stdin=subprocess.PIPE,
+                stderr=subprocess.PIPE, bufsize=0,
+            )  # fmt: skip
+        )
+        return running[-1]
+
+    yield start
+    for one in running:
+        one.kill()
+        one.communicate()
+
+
+def feed(process: subprocess.Popen[bytes], text: bytes) -> None:
+    assert process.stdin is not None
+    process.stdin.write(text)
+
+
+def moving(cell: sioms.Workcell, speed: float, axis: int = 0) -> None:
+    node = cell.open("mod0.readonly")
+    wait_for(lambda: abs(node.read().velocity[axis] - speed) < 0.02, f"{speed} m/s")
+
+
+def test_each_row_takes_over_from_the_last(devout: Callable[..., subprocess.Popen[bytes]], cell: sioms.Workcell) -> None:
+    process = devout("-rv", "-L-1", "mod0.xaxis")
+    for speed in (0.1, -0.1):
+        feed(process, f"{speed} ".encode())
+        moving(cell, speed)
+    process.communicate()
+    assert process.returncode == 0
+    halted(cell)
+
+
+def test_a_killed_devout_leaves_its_axes_halted(
+    devout: Callable[..., subprocess.Popen[bytes]], cell: sioms.Workcell
+) -> None:
+    process = devout("-rv", "-L-1", "mod0.xaxis")
+    feed(process, b"0.1 ")
+    moving(cell, 0.1)
+    process.kill()
+    halted(cell)
+    cell.open("mod0.xaxis", "w", timeout=5.0).close()
+
+
+def test_a_bad_number_halts_and_is_named(devout: Callable[..., subprocess.Popen[bytes]], cell: sioms.Workcell) -> None:
+    process = devout("-rv", "-L-1", "mod0.xaxis")
+    feed(process, b"0.1\n0.1\n")
+    moving(cell, 0.1)
+    feed(process, b"0.1 o.1 0.1\n")
+    _, said = process.communicate(timeout=10)
+    assert process.returncode == 1
+    assert said.decode() == "devout: line 3: 'o.1' is no finite number; stopped after 3 complete iterations\n"
+    halted(cell)
+    cell.open("mod0.xaxis", "w").close()
+
+
+def test_bad_lines_are_left_out_when_asked(shell: Shell, cell: sioms.Workcell) -> None:
+    result = shell("devout --skip-bad-lines -r -L-1 gripper0", "1\nx\n3\n")
+    assert (result.returncode, result.stderr) == (0, "devout: line 2: 'x' is no finite number; line left out\n")
+
+
+def test_positions_are_waited_for(shell: Shell, cell: sioms.Workcell) -> None:
+    good(shell("devout -n2 mod0 0.1"))
+    assert abs(cell.open("mod0.readonly").read().position[2] - 0.1) < 1e-3
+    good(shell("devout -rw -L-1 mod0.zaxis", "0.05\n0.02\n0\n"))
+    assert abs(cell.open("mod0.readonly").read().position[2]) < 1e-3
+
+
+def test_pieces_with_times_queue_up_and_none_is_lost(shell: Shell, cell: sioms.Workcell) -> None:
+    before = cell.open("mod0.readonly").read().position[1]
+    rows = "".join([f"{0.2 * i / 100} 0.001\n" for i in range(100)] + ["0.2 0.001\n"] * 400 + ["0 0.2\n"])
+    good(shell("devout -rvt -L-1 mod0.yaxis", rows))
+    moved = cell.open("mod0.readonly").read().position[1] - before
+    assert abs(moved - (0.01 + 0.08 + 0.2**2 / 2 / 10)) < 0.003  # ramp, run, and the way of braking
+
+
+def test_input_that_ends_within_an_iteration(shell: Shell) -> None:
+    refused(shell("devout -r -L-1 mod0", "0 0 0 0\n0 0\n"), "line 2", "2 of the 4 numbers", "after 1 complete")
+
+
+def test_one_iteration_without_r_and_as_many_as_said(shell: Shell) -> None:
+    assert good(shell("(devout gripper0; cat) | wc -l", "1\n" + "0\n" * 100000)) != "0\n"
+    good(shell("devout -r -L2 gripper0", "1 2 this is not read"))
+
+
+# --- what is refused -----------------------------------------------------------------------------
+
+
+def test_no_daemon(shell: Shell) -> None:
+    for line in ("devin mod0", "devout mod0 1 2 3 4", "sdev -e", "smarkers -r", "sioms list", "sioms monitor"):
+        refused(shell(line, socket="/tmp/there-is-no-such.sock"), "no daemon listens there", "siomsd --config")
+
+
+def test_unknown_node(shell: Shell) -> None:
+    for line in ("devin mod9", "devout mod9 1", "sdev -w mod9", "sioms info mod9"):
+        refused(shell(line), "mod9: no such node; did you mean mod")
+
+
+def test_a_held_node_names_its_holder_and_can_be_read(
+    shell: Shell, daemon: Daemon, client: Callable[..., Client]
+) -> None:
+    holder = client(daemon, "node = cell.open('mod0', 'rw'); say('ready'); hold()")
+    refused(shell("devout mod0.xaxis 0.1"), f"held by pid {holder.pid}", "victim", "mod0.xaxis.readonly")
+    assert re.fullmatch(rf"({AXIS_LINE}\n){{4}}", good(shell("devin mod0")))
+    good(shell("sdev -w mod0"))
+    refused(shell("sdev -z mod0"), f"held by pid {holder.pid}")
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("devin", "no device named"),
+        ("devin -h mod0", "for help use --help"),
+        ("devin mod0 -v", "holds for the device that follows it"),
+        ("devin -n4 mod0", "structure 4; want 0 to 3"),
+        ("devout -v gripper0 1", "class binary"),
+        ("devout -rvw mod0.xaxis 1", "add -t"),
+        ("sdev mod0", "nothing to do"),
+        ("sdev -z", "no device named"),
+        ("sdev -c 1 2 3 4 5 mod0", "1 numbers too many"),
+        ("sdev -g mod0", "class analog"),
+        ("smarkers 5", "want -r alone"),
+        ("smarkers -w foo", "want a marker"),
+        ("smarkers -s", "no marker named"),
+    ],
+)
+def test_wrong_command_lines(shell: Shell, line: str, words: str) -> None:
+    refused(shell(line), words, status=2)
+
+
+def test_values_that_a_device_cannot_take(shell: Shell) -> None:
+    refused(shell("devout mod0.xaxis 5"), "position 5 m", "-1 to 1 m")
+    refused(shell("devout gripper0 256"), "data 256; want 0 to 255")
+    refused(shell("devout gripper0 1.5"), "whole number")
+    refused(shell("devout -t mod0.xaxis 0 0"), "time 0 s")
+    refused(shell("sdev -c mod0", "1 2"), "wants 4 numbers: there are 2")
+    refused(shell("devout lord1 1"), "read-only node")
+
+
+def test_the_daemons_death_ends_devout(
+    start_daemon: Callable[..., Daemon], devout: Callable[..., subprocess.Popen[bytes]]
+) -> None:
+    mine = start_daemon()
+    process = devout("-rv", "-L-1", "mod0.xaxis", socket=mine.socket)
+    feed(process, b"0.1 ")
+    with mine.cell() as cell:
+        node = cell.open("mod0.readonly")
+        wait_for(lambda: node.read().velocity[0] > 0.05, "motion")
+    os.kill(mine.pid, signal.SIGKILL)
+    assert process.wait(10) == 1  # while its input is silent
+    assert process.stderr is not None
+    assert process.stderr.read().count(b"\n") == 1
+
+
+# --- sdev and smarkers ---------------------------------------------------------------------------
+
+
+def test_sdev_calibrates_and_zeroes(shell: Shell, cell: sioms.Workcell) -> None:
+    good(shell("sdev -c 0.1 0.2 -0.3 0.4 mod0"))
+    assert good(shell("devin -p mod0")).split() == ["1.0000e-01", "2.0000e-01", "-3.0000e-01", "4.0000e-01"]
+    good(shell("sdev -c mod0.xaxis -z mod0.yaxis", "0.5\n"))
+    assert good(shell("devin -p -h1 mod0")).split() == ["5.0000e-01", "0.0000e+00"]
+    good(shell("sdev -z mod0"))
+
+
+def test_sdev_zeroes_a_sensor_and_sets_gains(shell: Shell) -> None:
+    good(shell("sdev -z lord1"))
+    assert good(shell("devin -n0p lord1")) == "0.00e+00 "
+    good(shell("sdev -g tactile0", " ".join(["2 " + "0 " * 16] * 15) + " 2"))
+    refused(shell("sdev -g tactile0", "1 2 3"), "wants 256 numbers: there are 3")
+
+
+def test_sdev_stops_the_workcell_and_writes_stay_refused_until_reset(shell: Shell, cell: sioms.Workcell) -> None:
+    node = cell.open("mod0.xaxis", "rw")
+    node.command(velocity=0.1)
+    good(shell("sdev -e"))
+    halted(cell)
+    node.close()
+    refused(shell("devout mod0.xaxis 0"), "emergency stop")
+    assert "EMERGENCY STOP" in good(shell("sioms status"))
+    good(shell("sioms reset"))
+    good(shell("devout -v -W mod0.xaxis 0"))
+
+
+def test_sdev_stops_one_node_that_somebody_else_holds(shell: Shell, cell: sioms.Workcell) -> None:
+    held, other = cell.open("mod0.xaxis", "rw"), cell.open("mod1", "rw")
+    held.command(velocity=0.05)
+    other.command(velocity=0.05)
+    good(shell("sdev -e mod0.xaxis"))
+    wait_for(lambda: not held.read().in_motion[0], "the stop")
+    assert other.read().in_motion[0]
+    good(shell("sioms reset mod0.xaxis"))
+    held.close()
+    other.close()
+
+
+def test_sdev_synchronises_two_devices(shell: Shell, cell: sioms.Workcell) -> None:
+    nodes = [cell.open("mod0.xaxis", "rw"), cell.open("mod1", "rw")]
+    for node in nodes:
+        node.command(velocity=0.1, time=0.3, synch=True)
+    before = [node.read().number for node in nodes]
+    good(shell("sdev -s mod0.xaxis -s mod1"))
+    starts = []
+    for node, after in zip(nodes, before, strict=True):
+        moved = wait_for(lambda n=node, a=after: [s for s in n.history(a) if s.in_motion[0]], "the start")
+        starts.append(moved[0].stamp_ns)
+    assert abs(starts[0] - starts[1]) < 20e6  # one instant; the ticks of two processes may be late on a busy machine
+    good(shell("sdev -w mod0.xaxis -w mod1"))
+    for node in nodes:
+        assert not node.read().in_motion[0]
+        node.close()
+
+
+def test_markers_by_shell(shell: Shell) -> None:
+    assert good(shell("M=$(smarkers -r); (sleep 0.1; smarkers -s $M) & smarkers -w $((M % 1024)) && smarkers -f $M")) == ""
+    tokens = good(shell("smarkers -r 3")).split()
+    assert len(set(tokens)) == 3
+    good(shell(f"smarkers -sf {' '.join(tokens)}"))
+    refused(shell(f"smarkers -w {tokens[0]}"), "not reserved")
+
+
+def test_an_axis_signals_a_marker_of_the_shell(shell: Shell) -> None:
+    good(shell("M=$(smarkers -r); devout -ps -W mod0.taxis 0.01 $M; devout -ps mod0.taxis 0 $M; smarkers -w $M; smarkers -f $M"))
+
+
+# --- sioms ---------------------------------------------------------------------------------------
+
+
+def test_sioms_tells_about_the_workcell(shell: Shell) -> None:
+    listed = good(shell("sioms list"))
+    assert re.search(r"^mod0 +axis +4 +read, write +mod0 +up$", listed, re.M)
+    assert "mod0.xaxis" not in listed
+    assert "mod0.xaxis.readonly" in good(shell("sioms list -v"))
+    assert re.search(r"xaxis +m +-1 +1 +velocity 1", good(shell("sioms info mod0")))
+    assert re.search(r"^mod0 +sim-axes +up +good", good(shell("sioms status")), re.M)
+    assert re.search(r"^sim-axes +sioms.drivers.sim_axes +\S", good(shell("sioms driver list")), re.M)
+    assert good(shell("sioms list | head -1")).startswith("node")
+    assert "gripper0.bit3" in good(shell("sioms list --names")).split()
+
+
+def test_sioms_checks_a_configuration(shell: Shell, daemon: Daemon, tmp_path: Path) -> None:
+    assert "good" in good(shell(f"sioms check {daemon.config}"))
+    (tmp_path / "bad.toml").write_text('[device.mod0]\ndriver = "sim-axis"\n[device.b]\ndriver = "sim-io"\n')
+    result = shell("sioms check bad.toml")
+    assert result.returncode == 2
+    assert "did you mean sim-axes" in result.stderr
+    assert "[device.b]" in result.stderr
+
+
+def test_sioms_reloads(shell: Shell) -> None:
+    good(shell("sioms reload"))
+
+
+def test_an_unknown_command(shell: Shell) -> None:
+    result = shell("sioms lst")
+    assert result.returncode == 2
+    assert "invalid choice" in result.stderr
+
+
+def test_monitor_prints_one_picture_into_a_pipe(shell: Shell) -> None:
+    text = good(shell("sioms monitor"))
+    assert "workcell tools" in text
+    assert "\x1b" not in text
+    assert re.search(r"yaxis .* m .* idle", text)
+
+
+def test_monitor_in_a_terminal_stops_and_resets_by_key(daemon: Daemon, cell: sioms.Workcell) -> None:
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execve(BIN / "sioms", ["sioms", "monitor"], {**environment(daemon.socket), "TERM": "xterm", "LINES": "40"})
+    seen = bytearray()
+
+    def shows(text: bytes) -> None:
+        deadline = time.monotonic() + 15
+        while text not in seen:
+            assert time.monotonic() < deadline, f"{text!r} not shown in {bytes(seen[-3000:])!r}"
+            if select.select([terminal], [], [], 0.1)[0]:
+                seen.extend(os.read(terminal, 65536))
+
+    try:
+        shows(b"mod0")
+        shows(b"taxis")
+        os.write(terminal, b" ")
+        wait_for(lambda: cell.status()["stopped_ns"], "the stop")
+        shows(b"EMERGENCY STOP for")
+        os.write(terminal, b"R")
+        shows(b"Motion may be commanded again")
+        os.write(terminal, b"n")
+        shows(b"reset left alone")
+        assert cell.status()["stopped_ns"]
+        os.write(terminal, b"R")
+        seen.clear()
+        shows(b"Motion may be commanded again")
+        os.write(terminal, b"y")
+        wait_for(lambda: not cell.status()["stopped_ns"], "the reset")
+        os.write(terminal, b"q")
+        seen.clear()
+        shows(b"\x1b[?1049l")
+        assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+    finally:
+        os.close(terminal)
