@@ -7,6 +7,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sioms.drivers.framed_adc import FramedAdc
 from sioms.protocol.flags import AnalogStatus
@@ -88,6 +90,20 @@ def test_a_restarted_device_is_no_loss() -> None:
     counters = rig.driver.counters()
     assert counters["lost_blocks"] == 0 and counters["clock_restarts"] == 1
     assert (rig.now_s + 0.001) * 1e9 - rig.published[-1][0] < 12e6
+
+
+@given(
+    st.lists(st.binary(max_size=40), max_size=30), st.lists(st.binary(min_size=1, max_size=60), max_size=10)
+)
+def test_any_bytes_and_any_payloads_are_taken(noise: list[bytes], payloads: list[bytes]) -> None:
+    """Noise is counted; so are well-framed messages of other streams, lengths and kinds."""
+    rig = Rig(channels=2)
+    for piece in [*noise, b"\0", *map(adc.frame, payloads)]:
+        rig.now_s += 0.01
+        rig.driver.feed(piece, round(rig.now_s * 1e9))
+    stamps = [stamp for stamp, _, _ in rig.published]
+    assert stamps == sorted(stamps)
+    assert rig.driver.counters()["frames"] >= len(payloads)
 
 
 @pytest.mark.parametrize(

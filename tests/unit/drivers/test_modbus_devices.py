@@ -482,4 +482,5 @@ class TestIo:
                 number = int.from_bytes(exchange.data[:2], "big")
                 body = exchange.data[7:] if exchange.data[7] == 6 else bytes.fromhex("03 02 02 ee")
                 value = exchange.decode(frame_tcp(number, 1, body))
-        assert sent[:3] == ["06 10 07 00 01", "03 20 11 00 01", "06 10 00 00 0f"]
+        assert sent[:2] == ["06 10 07 00 01", "03 20 11 00 01"]
+        assert sent[2:5] == ["06 10 05 aa aa", "06 10 05 55 55", "06 10 00 00 0f"]
