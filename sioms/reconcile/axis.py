@@ -21,14 +21,15 @@ from sioms.reconcile.effects.terms import TERM_PREFIX, TERMS
 from sioms.reconcile.excitation import Gate, gate
 from sioms.reconcile.experiment import Experiment, separate
 from sioms.reconcile.fit import BASE, Fit, Problem, refit
+from sioms.reconcile.gaps import measure
 from sioms.reconcile.locate import Place, Spectrum, force_residual, locate, spectra
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.noise import Noise, drive_noise, effective_samples, observer, sensor_noise
+from sioms.reconcile.noise import drive_noise, effective_samples, observer, sensor_noise
 from sioms.reconcile.records import Session
 from sioms.reconcile.refuse import bursts, smoother_share
-from sioms.reconcile.search import FLOOR, GAIN, Found, Searcher, Step
+from sioms.reconcile.search import GAIN, Found, Searcher
 from sioms.reconcile.simulate import simulate
-from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome, Trace, Verdict
+from sioms.reconcile.verdict import Estimate, NamedEffect, Outcome, Trace, Verdict
 
 #: Share at the end of every record that takes no part in any choice.
 UNTOUCHED = 0.2
@@ -151,7 +152,7 @@ def _conclude(ready: Prepared, nominal: AxisModel, o: Options, excited: Gate, fo
               others: Sequence[Rival], odd: bool, share: float, burst: float, rejected: tuple[str, ...]) -> Verdict:
     rng = np.random.default_rng(o.seed)
     o.progress("untouched samples: gap before and after")
-    gaps = _gaps(ready, nominal, found.fit.model)
+    gaps = measure(ready.final, nominal, found.fit.model)
     whole = replace(ready.problem, end=1.0)
     fit = refit(whole, found.fit.model, searcher.frozen, 12)
     if fit.cost > float(np.sum(whole.residual(found.fit.model) ** 2)):
@@ -177,7 +178,7 @@ def _conclude(ready: Prepared, nominal: AxisModel, o: Options, excited: Gate, fo
         places = tuple(locate(whole, nominal, rng))
         spectrum = spectra(whole, nominal)
         traces = _traces(whole, nominal, fit.model)
-    return Verdict(outcome, nominal, _without_terms(fit.model), tuple(named), alternatives, tuple(terms), gaps,
+    return Verdict(outcome, nominal, fit.model, tuple(named), alternatives, tuple(terms), gaps,
                    found.ladder, ready.findings, excited, places, spectrum, plan, found.fit.ratio, share, burst,
                    effective_samples(found.fit.residual), len(found.fit.residual), tuple(notes), traces, rejected)
 
@@ -190,39 +191,8 @@ def _outcome(named: bool, unexplained: bool, ambiguous: bool) -> Outcome:
     return Outcome.NAMED if named else Outcome.NONE
 
 
-def _without_terms(model: AxisModel) -> AxisModel:
-    """Keep nameless terms in the model file too: they are switchable like every effect."""
-    return model
-
-
 def _set(r: Rival, model: AxisModel) -> tuple[str, ...]:
     return tuple(r.rival if n == r.effect else n for n in model.effects)
-
-
-def _gaps(ready: Prepared, nominal: AxisModel, model: AxisModel) -> tuple[Gap, ...]:
-    """Compare on the untouched ends of the records, by tracking and, where it can be, in closed loop."""
-    p = ready.final
-    unit = nominal.force_unit
-    k = p.noise.drive  # one expected innovation answers to one drive noise
-    before, after = (float(np.sqrt(np.mean(p.residual(m) ** 2))) for m in (nominal, model))
-    out = [Gap("force, short windows", unit, before * k, after * k, k)]
-    if nominal.controller is None or any(r.command is None for r in p.session.records):
-        return tuple(out)
-    force: dict[str, list[Array]] = {"before": [], "after": []}
-    position: dict[str, list[Array]] = {"before": [], "after": []}
-    for label, m in (("before", nominal), ("after", model)):
-        temperature = 0.0
-        for r in p.session.records:
-            run = simulate(m, r.command if r.command is not None else r.position, temperature)
-            temperature = run.end_temperature if p.session.continuous else 0.0
-            force[label].append(run.force - r.force)
-            position[label].append(run.position - r.position)
-    rms = {c: {label: float(np.sqrt(np.mean(np.nan_to_num(p.join(v), nan=1e9) ** 2))) for label, v in d.items()}
-           for c, d in (("force", force), ("position", position))}
-    out.append(Gap("force, closed loop", unit, rms["force"]["before"], rms["force"]["after"], k))
-    out.append(Gap("position, closed loop", nominal.position_unit, rms["position"]["before"],
-                   rms["position"]["after"], p.noise.sensor))
-    return tuple(out)
 
 
 def _intervals(problem: Problem, fit: Fit, replicates: int, rng: np.random.Generator) -> dict[tuple[str, str], tuple[float, float]]:
@@ -292,7 +262,6 @@ def _plan(ready: Prepared, nominal: AxisModel, model: AxisModel, open_rivals: Se
 def _traces(problem: Problem, nominal: AxisModel, model: AxisModel) -> tuple[Trace, ...]:
     """Keep curves for the pictures: force residual and, in closed loop, the force a user sees."""
     _, before = force_residual(problem, nominal)
-    base = nominal.inertia / problem.noise.innovation  # noqa: F841 - kept for clarity of units below
     out, temperature = [], {"n": 0.0, "m": 0.0}
     after = _remaining(problem, model, before)
     for i, r in enumerate(problem.session.records):
@@ -303,7 +272,7 @@ def _traces(problem: Problem, nominal: AxisModel, model: AxisModel) -> tuple[Tra
             fb, fa = n.force, m.force
         else:
             fb, fa = r.force + before[i], r.force + after[i]
-        t = np.arange(len(r)) * nominal.sample_time_s
+        t = np.arange(len(r), dtype=np.float64) * nominal.sample_time_s
         out.append(Trace(r.name, t, r.force, fb, fa, before[i], after[i]))
     return tuple(out)
 
@@ -317,5 +286,3 @@ def _remaining(problem: Problem, model: AxisModel, like: Sequence[Array]) -> lis
         out.append(np.clip(model.inertia * gain * smooth, -10 * np.ptp(b) - 1e-30, 10 * np.ptp(b) + 1e-30))
     return out
 
-
-__all__ = ["FLOOR", "Noise", "Options", "Step", "analyse", "prepare"]

@@ -6,11 +6,11 @@ found here is measured directly, so the later fits keep it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import minimize_scalar
 
 from sioms.reconcile.effect import Array
 from sioms.reconcile.model import AxisModel
@@ -139,8 +139,8 @@ def drive(session: Session, model: AxisModel) -> list[Finding]:
     def misfit(delay: float, lag: float) -> float:
         total = 0.0
         for r in records:
-            assert_measured = r.force_measured if r.force_measured is not None else r.force
-            e = assert_measured - drive_output(r.force, max(delay, 0.0), max(lag, 0.0), limit, dt)
+            measured = r.force_measured if r.force_measured is not None else r.force
+            e = measured - drive_output(r.force, max(delay, 0.0), max(lag, 0.0), limit, dt)
             total += float(np.sum(e[20:] ** 2))
         return total
 
@@ -152,7 +152,8 @@ def drive(session: Session, model: AxisModel) -> list[Finding]:
                              "while the command goes on"))
     none = misfit(0.0, 0.0)
     delay = _delay(misfit, dt)
-    lag = minimize(lambda p: misfit(0.0, p[0] * dt), [1.0], method="Nelder-Mead", options={"maxfev": 25}).x[0] * dt
+    lag = dt * float(minimize_scalar(lambda p: misfit(0.0, float(p) * dt), bounds=(0.0, 20.0), method="bounded",
+                                     options={"maxiter": 25}).x)
     scores = {"delay": misfit(delay, 0.0), "lag": misfit(0.0, max(lag, 0.0))}
     name = min(scores, key=lambda s: scores[s])
     value = delay if name == "delay" else lag
@@ -168,14 +169,13 @@ def drive(session: Session, model: AxisModel) -> list[Finding]:
     return found
 
 
-def _delay(misfit: object, dt: float) -> float:
-    """Search whole samples first, then within one."""
-    call = misfit  # a callable (delay, lag) -> sum of squares
+def _delay(misfit: Callable[[float, float], float], dt: float) -> float:
+    """Search half samples first, then between."""
     grid = np.arange(0.0, 20.5, 0.5) * dt
-    start = grid[int(np.argmin([call(d, 0.0) for d in grid]))]  # type: ignore[operator]
-    best = minimize(lambda p: call(p[0] * dt, 0.0), [start / dt], method="Nelder-Mead",  # type: ignore[operator]
-                    options={"maxfev": 40, "xatol": 1e-4, "initial_simplex": [[start / dt], [start / dt + 0.3]]})
-    return float(max(best.x[0], 0.0) * dt)
+    start = float(grid[int(np.argmin([misfit(float(d), 0.0) for d in grid]))] / dt)
+    best = minimize_scalar(lambda p: misfit(float(p) * dt, 0.0), bounds=(max(start - 0.6, 0.0), start + 0.6),
+                           method="bounded", options={"xatol": 1e-4})
+    return float(best.x) * dt
 
 
 def _white(records: list[Record]) -> float:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,9 @@ ROW = 8
 TURN = ROW - 1
 
 Array = NDArray[np.float64]
-StateFunction = Callable[..., float]
+#: A float in the compiled time step, an array of axes in a vectorised plant.
+Number = Any
+StateFunction = Callable[..., Number]
 
 
 class Channel(Enum):

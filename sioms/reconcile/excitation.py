@@ -57,8 +57,8 @@ def gate(problem: Problem, model: AxisModel, names: tuple[str, ...]) -> Gate:
         for b in shown[i + 1 :]:
             alike = b in lib[a].lookalikes or a in lib[b].lookalikes
             contained = b in lib[a].replaces or a in lib[b].replaces
-            if alike and not contained and (c := common(columns[a], columns[b])) > SAME:
-                pairs.append((a, b, c))
+            if alike and not contained and (same := common(columns[a], columns[b])) > SAME:
+                pairs.append((a, b, same))
     return Gate(traces, tuple(sorted(pairs, key=lambda p: -p[2])), missing)
 
 

@@ -35,7 +35,7 @@ def catalogue(model: AxisModel, travel: float, duration_s: float = DURATION_S) -
     Args:
         travel: largest displacement from the start to either side, [{x}].
     """
-    t = np.arange(int(duration_s / model.sample_time_s)) * model.sample_time_s
+    t = np.arange(int(duration_s / model.sample_time_s), dtype=np.float64) * model.sample_time_s
     unit, fast = model.position_unit, 0.6 * model.max_speed
     yield ("slow_reversals", f"reversals at {0.02 * fast:.3g}, {0.05 * fast:.3g} and {0.1 * fast:.3g} {unit}/s",
            _legs(t, [s * fast for s in (0.02, -0.02, 0.05, -0.05, 0.1, -0.1)], travel, model))

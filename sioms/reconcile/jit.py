@@ -5,7 +5,9 @@ The plain path gives the same numbers some sixty times slower (docs/reconcile.md
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any, TypeVar
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -13,11 +15,14 @@ F = TypeVar("F", bound=Callable[..., Any])
 #: Signature of every state function of an effect: (x, v, u, temperature, parameters) -> value.
 STATE_SIGNATURE = "float64(float64, float64, float64, float64, float64[::1])"
 
+numba: Any = None
+TypedList: Any = list
 try:
-    import numba
-    from numba.typed import List as TypedList
-except ImportError:  # pragma: no cover - the plain path is run by a test in a subprocess
-    numba = None
+    if os.environ.get("SIOMS_PLAIN") is None:  # set it to run without compiling
+        numba = import_module("numba")
+        TypedList = import_module("numba.typed").List
+except ImportError:
+    pass
 
 COMPILED = numba is not None
 

@@ -57,11 +57,11 @@ def coupling(plant: Array, dx: float, dv: float) -> float:
     half = 0.5 * plant[GAP]
     if dx > half:
         f = plant[STIFF] * (dx - half) + plant[DAMP] * dv
-        return max(f, 0.0) if half > 0.0 else f
+        return max(f, 0.0) if half > 0.0 else float(f)
     if dx < -half:
         f = plant[STIFF] * (dx + half) + plant[DAMP] * dv
-        return min(f, 0.0) if half > 0.0 else f
-    return 0.0 if half > 0.0 else plant[STIFF] * dx + plant[DAMP] * dv
+        return min(f, 0.0) if half > 0.0 else float(f)
+    return 0.0 if half > 0.0 else float(plant[STIFF] * dx + plant[DAMP] * dv)
 
 
 @kernel

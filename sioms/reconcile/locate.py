@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt, welch
 
 from sioms.reconcile.effect import Array
@@ -108,15 +109,14 @@ def locate(problem: Problem, model: AxisModel, rng: np.random.Generator, shifts:
     return sorted(out, key=lambda q: -q.explained)
 
 
-def _bins(v: Array) -> Array:
+def _bins(v: Array) -> NDArray[np.int64]:
     """Bin numbers with about equal counts, without empty bins."""
     edges = np.unique(np.quantile(v, np.linspace(0.0, 1.0, BINS + 1)[1:-1]))
     number = np.searchsorted(edges, v, side="right")
-    out: Array = np.unique(number, return_inverse=True)[1]
-    return out
+    return np.asarray(np.unique(number, return_inverse=True)[1], dtype=np.int64)
 
 
-def _between(r: Array, bins: Array) -> float:
+def _between(r: Array, bins: NDArray[np.int64]) -> float:
     count = np.maximum(np.bincount(bins), 1)
     mean = np.bincount(bins, weights=r) / count
     centred = mean - r.mean()

@@ -8,6 +8,7 @@ displacement since reversal. It names nothing; it only keeps the named model hon
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sioms.reconcile.blocks import block_ids
 from sioms.reconcile.effect import Array
@@ -94,7 +95,7 @@ def smoother_share(problem: Problem, fit: Fit, folds: int = 5) -> float:
     return best
 
 
-def bursts(problem: Problem, fit: Fit) -> tuple[float, Array]:
+def bursts(problem: Problem, fit: Fit) -> tuple[float, NDArray[np.bool_]]:
     """Measure how far the residual comes in bursts.
 
     Returns:

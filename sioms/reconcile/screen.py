@@ -183,7 +183,7 @@ def instrument_motion(problem: Problem, model: AxisModel) -> list[Motion]:
 
 def dead_band(problem: Problem, model: AxisModel) -> float:
     """Speed below which the sign of the smoothed speed is not known: three times its noise."""
-    return 3.0 * problem.noise.sensor * np.sqrt(problem.noise.gain[1] / model.sample_time_s)
+    return float(3.0 * problem.noise.sensor * np.sqrt(problem.noise.gain[1] / model.sample_time_s))
 
 
 def _orthonormal(j: Array) -> Array:
@@ -192,7 +192,7 @@ def _orthonormal(j: Array) -> Array:
     norms = np.linalg.norm(j, axis=0)
     kept = j[:, norms > 0] / norms[norms > 0]
     if kept.shape[1] == 0:
-        return kept
+        return np.empty((j.shape[0], 0))
     u, s, _ = np.linalg.svd(kept, full_matrices=False)
     basis: Array = u[:, s > 1e-6 * s[0]]
     return basis

@@ -25,6 +25,9 @@ SURE = 2.0  # least number of standard errors of that saving
 FLOOR = 1.15  # stop at this multiple of the expected innovation
 TRIES = 4  # candidates refitted per step
 STEPS = 6
+#: A saving below ``SPECIFIC`` counts only where no unrelated effect saves ``NEARLY`` as much.
+SPECIFIC = 0.3
+NEARLY = 0.5
 PERIODIC_SURE = 3.0  # for effects whose order is searched over tens of values
 
 
@@ -139,6 +142,8 @@ class Searcher:
             return None
         name = simplest(good)
         new, loss, gain, _ = good[name]
+        if gain < SPECIFIC and unspecific(name, {n: t[2] for n, t in tried.items()}):
+            return None
         rivals = {n: t[2] for n, t in tried.items() if n != name}
         return new, loss, Step("add", name, new.ratio, gain, rivals)
 
@@ -192,6 +197,13 @@ def replaced(model: AxisModel, name: str) -> bool:
 def size(name: str) -> int:
     """Number of parameters of an effect."""
     return len(known()[name].parameters)
+
+
+def unspecific(name: str, gains: dict[str, float]) -> bool:
+    """Say whether an effect of quite another kind saves nearly as much: then the residual has no name yet."""
+    lib = known()
+    family = {name, *lib[name].lookalikes, *lib[name].replaces, *(n for n in lib if name in lib[n].lookalikes)}
+    return any(g > NEARLY * gains[name] for n, g in gains.items() if n not in family)
 
 
 def simplest(good: dict[str, tuple[Fit, Array, float, float]]) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sioms.reconcile import kernel as k
-from sioms.reconcile.effect import ROW, Array, Slot
+from sioms.reconcile.effect import ROW, Array, Number, Slot
 from sioms.reconcile.effects import known
 from sioms.reconcile.jit import function_list, state_function
 from sioms.reconcile.model import AxisModel, controller_row
@@ -22,7 +22,7 @@ from sioms.reconcile.model import AxisModel, controller_row
 SLOTS = 6
 
 @state_function
-def _nothing(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def _nothing(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """Fill an empty place."""
     return 0.0 * x
 

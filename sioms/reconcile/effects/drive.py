@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from sioms.reconcile.effect import TURN, Array, Channel, Effect, Parameter, Ref, Slot
+from sioms.reconcile.effect import TURN, Array, Channel, Effect, Number, Parameter, Ref, Slot
 from sioms.reconcile.jit import state_function
 
 
 @state_function
-def ripple_gain(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def ripple_gain(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """1 + depth sin(n theta + phase)."""
     return 1.0 + p[0] * np.sin(p[2] * p[TURN] * x + p[1])
 

@@ -9,48 +9,48 @@ from __future__ import annotations
 
 import numpy as np
 
-from sioms.reconcile.effect import TURN, Array, Channel, Effect, Parameter, Ref, Slot
+from sioms.reconcile.effect import TURN, Array, Channel, Effect, Number, Parameter, Ref, Slot
 from sioms.reconcile.jit import state_function
 
 
 @state_function
-def viscous_force(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def viscous_force(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-b v."""
     return -p[0] * v
 
 
 @state_function
-def direction_force(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def direction_force(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-d |v|: adds d to the viscous coefficient forward, subtracts it backward."""
     return -p[0] * np.abs(v)
 
 
 @state_function
-def quadratic_force(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def quadratic_force(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-c v |v|."""
     return -p[0] * v * np.abs(v)
 
 
 @state_function
-def coulomb_level(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def coulomb_level(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """Fc."""
     return p[0] + 0.0 * v
 
 
 @state_function
-def position_level(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def position_level(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """Fc + Fm sin(n theta + phase)."""
     return p[0] + p[1] * np.sin(p[3] * p[TURN] * x + p[2])
 
 
 @state_function
-def stribeck_level(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def stribeck_level(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """Fc + (Fs - Fc) exp(-(v / vs)^2)."""
     return p[0] + (p[1] - p[0]) * np.exp(-((v / p[2]) ** 2))
 
 
 @state_function
-def load_level(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def load_level(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """mu |u|."""
     return p[0] * np.abs(u)
 

@@ -4,31 +4,31 @@ from __future__ import annotations
 
 import numpy as np
 
-from sioms.reconcile.effect import TURN, Array, Channel, Effect, Parameter, Ref, Slot
+from sioms.reconcile.effect import TURN, Array, Channel, Effect, Number, Parameter, Ref, Slot
 from sioms.reconcile.jit import state_function
 
 
 @state_function
-def offset_force(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def offset_force(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """A constant."""
     return p[0] + 0.0 * x
 
 
 @state_function
-def gravity_force(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def gravity_force(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """amp sin(theta + phase)."""
     return p[0] * np.sin(p[TURN] * x + p[1])
 
 
 @state_function
-def cogging_force(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def cogging_force(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """amp sin(n theta + phase) + amp2 sin(2 n theta + phase2)."""
     a = p[2] * p[TURN] * x
     return p[0] * np.sin(a + p[1]) + p[3] * np.sin(2.0 * a + p[4])
 
 
 @state_function
-def spring_force(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def spring_force(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-k x."""
     return -p[0] * x
 

@@ -5,72 +5,70 @@ A term describes the residual in symbols; it claims no cause and is kept out of 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
-from sioms.reconcile.effect import TURN, Array, Channel, Effect, Parameter, Ref, Slot
+from sioms.reconcile.effect import TURN, Array, Channel, Effect, Number, Parameter, Ref, Slot, StateFunction
 from sioms.reconcile.jit import state_function
 
 TERM_PREFIX = "term_"
 
 
 @state_function
-def square(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def square(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-k x^2."""
     return -p[0] * x * x
 
 
 @state_function
-def cube(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def cube(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-k x^3."""
     return -p[0] * x * x * x
 
 
 @state_function
-def even_drag(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def even_drag(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-c v^2."""
     return -p[0] * v * v
 
 
 @state_function
-def cubic_drag(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def cubic_drag(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-c v^3."""
     return -p[0] * v * v * v
 
 
 @state_function
-def falling_drag(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def falling_drag(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-c v / (1 + (v/v0)^2)."""
     return -p[0] * v / (1.0 + (v / p[1]) ** 2)
 
 
 @state_function
-def levelling_drag(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def levelling_drag(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-f tanh(v/v0)."""
     return -p[0] * np.tanh(v / p[1])
 
 
 @state_function
-def place_drag(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def place_drag(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-c x v."""
     return -p[0] * x * v
 
 
 @state_function
-def turn_drag(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def turn_drag(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-c v sin(n theta + phase)."""
     return -p[0] * v * np.sin(p[2] * p[TURN] * x + p[1])
 
 
 @state_function
-def wave(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def wave(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """amp sin(kappa theta + phase), kappa any number."""
     return p[0] * np.sin(p[2] * p[TURN] * x + p[1])
 
 
 @state_function
-def load_square(x: float, v: float, u: float, temperature: float, p: Array) -> float:
+def load_square(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-g u |u|, with g per unit of force."""
     return -p[0] * u * np.abs(u)
 
@@ -84,7 +82,7 @@ def _size(symbol: str, unit: str, ref: Ref, text: str = "size") -> Parameter:
     return Parameter(symbol, unit, ref, -50.0, 50.0, 0.05, text)
 
 
-def _term(name: str, equation: str, function: Callable[..., float] | None, *parameters: Parameter,
+def _term(name: str, equation: str, function: StateFunction | None, *parameters: Parameter,
           slot: Slot = Slot.FORCE, replaces: tuple[str, ...] = (),
           lookalikes: tuple[str, ...] = ()) -> Effect:
     return Effect(name=TERM_PREFIX + name, title=equation, channel=Channel.MECHANICS, slot=slot, function=function,
