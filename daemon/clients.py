@@ -227,9 +227,9 @@ class Clients:
         return wait.session.waits.pop(wait.number, None) is not None
 
     def _timed_out(self, wait: Wait, limit_s: float) -> None:
-        holder = getattr(wait, "why", "")
+        why = f": {wait.why()}" if wait.why is not None else ""
         self._answer(
-            wait, refusal(wait.number, errno.ETIMEDOUT, f"{wait.what}: nothing within {limit_s:g} s{holder}")
+            wait, refusal(wait.number, errno.ETIMEDOUT, f"{wait.what}: not within {limit_s:g} s{why}")
         )
 
     def _cancel(self, session: Session, number: int) -> bool:
@@ -297,6 +297,7 @@ class Clients:
         if timeout_s is not None and float(timeout_s) <= 0:
             raise obstacle
         wait = self._wait(session, number, timeout_s, f"open {name}")
+        wait.why = lambda: str(self._obstacle(node) or "it has just become free").removeprefix(f"open {name}: ")
 
         def retry() -> bool:
             if self._obstacle(node) is not None:

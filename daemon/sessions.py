@@ -8,6 +8,7 @@ import pwd
 import socket
 import struct
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from sioms.protocol.flags import Access
@@ -49,12 +50,18 @@ class Handle:
 
 @dataclass(slots=True, eq=False)
 class Wait:
-    """A request that is not answered yet."""
+    """A request that is not answered yet.
+
+    Attributes:
+        what: the request in words.
+        why: tells at its time-out what stands in the way.
+    """
 
     number: int
     session: Session
     timer: Timer | None
     what: str
+    why: Callable[[], str] | None = None
 
 
 @dataclass(slots=True, eq=False)
