@@ -173,6 +173,15 @@ def test_unplugging_and_replugging(counterpart: Callable[..., Counterpart], link
         assert ask(port, DRIVE.read_holding(0x1003, 1)) == (2,)
 
 
+def test_a_port_takes_masters_with_parity_one_after_the_other(
+    counterpart: Callable[..., Counterpart], link: Path
+) -> None:
+    counterpart("oriental_az", "--link", link)
+    for _ in range(3):
+        with serial.Serial(str(link), 230400, parity="E", timeout=0.005, exclusive=True) as port:
+            assert ask(port, DRIVE.read_holding(0x7E, 2)) == (0, 1 << 5 | 1 << 14)
+
+
 def test_a_jog_ends_when_its_host_falls_silent(counterpart: Callable[..., Counterpart], link: Path) -> None:
     drive = counterpart("leadshine", "--link", link)
     with open_port(str(link)) as port:

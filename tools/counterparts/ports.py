@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import termios
 import tty
 from collections.abc import Callable
 from pathlib import Path
@@ -70,4 +71,16 @@ class PtyPort:
         except OSError:
             return
         if data:
+            self._allow_parity()
             self._received(data)
+
+    def _allow_parity(self) -> None:
+        """Let the next master ask for parity, which a pty does not have.
+
+        Linux refuses (EINVAL) settings of which it takes nothing over. A flag without effect (ECHOCTL while nothing
+        is echoed), which every master clears, leaves something to take.
+        """
+        settings = termios.tcgetattr(self._slave)
+        if not settings[3] & termios.ECHOCTL:
+            settings[3] |= termios.ECHOCTL
+            termios.tcsetattr(self._slave, termios.TCSANOW, settings)
