@@ -1,0 +1,163 @@
+"""The axis simulation against scipy's solvers, closed solutions, energy and order of convergence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from sioms.reconcile.model import AxisModel, Controller
+from sioms.reconcile.noise import observer, response, rigid
+from sioms.reconcile.simulate import simulate, track
+
+DT = 1e-3
+LOOP = Controller(20.0, -0.985, -0.7, -1e-4, 0.0, 1.8, 100.0)
+AXIS = AxisModel(True, DT, 2e-3, 1e-3, 1e-9, 2 * np.pi, 0.7, 20.0, LOOP)
+TIME = np.arange(1500) * DT
+COMMAND = 1.2 * np.sin(2 * np.pi * 1.1 * TIME) + 0.3 * np.sin(2 * np.pi * 4.3 * TIME)
+Rate = Callable[[float, np.ndarray, float], list[float]]
+
+
+def reference(rate: Rate, states: int, read: Callable[[np.ndarray], float] = lambda s: float(s[0])) -> tuple[np.ndarray, np.ndarray]:
+    """Close the loop around an ODE, sample by sample, with a solver of its own (DOP853, 1e-11)."""
+    state, e0, u0, y0, v = np.zeros(states), 0.0, 0.0, 0.0, 0.0
+    alpha = 1 - np.exp(-2 * np.pi * 100 * DT)
+    ys, us = [], []
+    for c in COMMAND:
+        y = read(state)
+        v += alpha * ((y - y0) / DT - v)
+        e = c - y
+        u = float(np.clip(20.0 * (e - 0.985 * e0) + 0.7 * u0 - 1e-4 * v, -1.8, 1.8))
+        e0, u0, y0 = e, u, y
+        ys.append(y)
+        us.append(u)
+        state = solve_ivp(rate, (0, DT), state, args=(u,), method="DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
+    return np.array(ys), np.array(us)
+
+
+def gravity(t: float, s: np.ndarray, u: float) -> list[float]:
+    return [s[1], (u - 1e-3 * s[1] + 0.2 * np.sin(s[0] + 0.4) + 0.05 * np.sin(7 * s[0] + 1.0)) / 2e-3]
+
+
+def two_masses(t: float, s: np.ndarray, u: float) -> list[float]:
+    jm, jl = 2e-3 * 0.45, 2e-3 * 0.55
+    k = (2 * np.pi * 18) ** 2 * 2e-3 * 0.55 * 0.45
+    d = 2 * 0.05 * np.sqrt(k * 2e-3 * 0.55 * 0.45)
+    link = k * (s[0] - s[2]) + d * (s[1] - s[3])
+    return [s[1], (u - 1e-3 * s[1] - link) / jm, s[3], link / jl]
+
+
+def warm(t: float, s: np.ndarray, u: float) -> list[float]:
+    return [s[1], (u * (1 - 0.6 * s[2]) - 1e-3 * s[1]) / 2e-3, ((u / 0.7) ** 2 - s[2]) / 2.0]
+
+
+CASES = {
+    "gravity and cogging": (gravity, 2, {"gravity": {"amp": 0.2, "phase": 0.4},
+                                         "cogging": {"amp": 0.05, "phase": 1.0, "n": 7.0, "amp2": 0.0, "phase2": 0.0}}),
+    "two masses": (two_masses, 4, {"elastic": {"f_res": 18.0, "load_fraction": 0.55, "zeta": 0.05}}),
+    "heat": (warm, 3, {"thermal_gain": {"loss": 0.6, "tau": 2.0}}),
+}
+
+
+@pytest.mark.parametrize("case", sorted(CASES))
+def test_the_closed_loop_agrees_with_scipy_far_below_a_count(case: str) -> None:
+    rate, states, effects = CASES[case]
+    model = AXIS
+    for name, values in effects.items():
+        model = model.with_effect(name, values)
+    run = simulate(model, COMMAND)
+    y, u = reference(rate, states)
+    count = 1e-4  # a fine encoder of such an axis
+    assert np.max(np.abs(run.position - y)) < 0.3 * count
+    assert np.max(np.abs(run.force - u)) < 0.004 * 0.7  # the drive noise of a good drive
+
+
+def test_the_error_falls_with_the_square_of_the_step() -> None:
+    model = AXIS.with_effect("gravity", {"amp": 0.2, "phase": 0.4})
+    fine = replace(model, resolution=1e-13)
+    best = simulate(fine, COMMAND, substeps=64).position
+    errors = [float(np.max(np.abs(simulate(fine, COMMAND, substeps=n).position - best))) for n in (1, 2, 4)]
+    assert 3.0 < errors[0] / errors[1] < 5.0
+    assert 3.0 < errors[1] / errors[2] < 5.0
+
+
+def test_coulomb_friction_stops_where_energy_says_and_holds() -> None:
+    """J v0^2 / 2 = Fc s; afterwards a force below Fc moves nothing."""
+    coast = replace(AXIS, viscous=0.0, controller=None).with_effect("coulomb", {"Fc": 0.05})
+    push, level = 0.4, 0.05
+    force = np.concatenate([np.full(20, push), np.zeros(400), np.full(100, 0.9 * level)])
+    run = track(coast, np.zeros(len(force)), force, (0.0, 0.0))
+    a = (push - level) / 2e-3
+    x0, v0 = 0.5 * a * 0.02**2, a * 0.02
+    stop = x0 + 0.5 * 2e-3 * v0**2 / level
+    assert run.x[-1] == pytest.approx(stop, rel=1e-9)
+    assert np.all(run.v[-150:] == 0.0)
+
+
+@pytest.mark.parametrize("force", [0.11, -0.11])
+def test_stribeck_friction_holds_up_to_breakaway_and_then_runs_away(force: float) -> None:
+    model = replace(AXIS, viscous=0.0, controller=None).with_effect("stribeck", {"Fc": 0.05, "Fs": 0.1, "vs": 0.1})
+    held = track(model, np.zeros(200), np.full(200, 0.9 * force), (0.0, 0.0))
+    assert np.all(held.x == 0.0)
+    free = track(model, np.zeros(200), np.full(200, force), (0.0, 0.0))
+    assert np.sign(free.v[-1]) == np.sign(force)
+    assert abs(free.v[-1]) > 0.15 * (abs(force) - 0.05) / 2e-3
+
+
+def test_dahl_friction_builds_up_exponentially_over_its_length() -> None:
+    """Pushed slowly one way, F = Fc (1 - exp(-x / xs)): the closed solution of Dahl's equation."""
+    model = replace(AXIS, viscous=0.0, controller=None).with_effect("presliding", {"Fc": 0.05, "xs": 1e-2})
+    ramp = 0.04 * np.arange(4000) / 4000
+    run = track(model, np.zeros(4000), ramp, (0.0, 0.0))
+    wanted = -1e-2 * np.log(1.0 - ramp / 0.05)
+    assert np.all(run.v[500:] > 0.0)
+    np.testing.assert_allclose(run.x[1000:], wanted[1000:], rtol=0.04)
+
+
+def test_backlash_conserves_momentum_and_hides_the_load() -> None:
+    model = replace(AXIS, viscous=0.0, controller=None).with_effect("backlash", {"gap": 0.5, "load_fraction": 0.6, "f_contact": 120.0, "zeta": 0.1})
+    push = np.concatenate([np.full(20, 0.2), np.zeros(4000)])
+    run = track(model, np.zeros(len(push)), push, (0.0, 0.0))
+    assert run.v[21] == pytest.approx(0.2 * 0.02 / (0.4 * 2e-3), rel=1e-6)  # the motor alone
+    assert np.mean(run.v[-2000:]) == pytest.approx(0.2 * 0.02 / 2e-3, rel=0.02)  # both together
+
+
+def test_a_delay_moves_the_force_by_its_time() -> None:
+    model = replace(AXIS, controller=None).with_effect("delay", {"delay": 2.4e-3})
+    force = np.zeros(20)
+    force[5] = 1.0
+    run = track(model, np.zeros(20), force, (0.0, 0.0))
+    np.testing.assert_allclose(run.applied[7:9], [0.6, 0.4], atol=1e-9)
+    assert np.sum(np.arange(20) * run.applied) == pytest.approx(5 + 2.4, abs=1e-9)
+
+
+def test_the_linear_filter_is_the_answer_of_the_observer_to_a_missing_force() -> None:
+    """Track a motion made with an extra force; the innovation must be that force through ``response``."""
+    noise = observer(AXIS, 1e-4, 2e-3)
+    t = np.arange(2000) * DT
+    known_force, extra = 0.1 * np.sin(7 * t), 0.02 * np.sin(11 * t + 1)
+    a, b = rigid(AXIS)
+    s, y = np.zeros(2), []
+    for f in known_force + extra:
+        y.append(s[0])
+        s = a @ s + b * f
+    run = track(replace(AXIS, controller=None), np.array(y), known_force, noise.gain)
+    expected = response(AXIS, noise, extra)
+    np.testing.assert_allclose(run.innovation, expected, atol=2e-4 * np.max(np.abs(expected)))
+
+
+def test_the_expected_innovation_is_what_a_right_model_leaves() -> None:
+    """Noise of known size through an exact recursion: variance as designed, and white."""
+    rng = np.random.default_rng(5)
+    noise = observer(AXIS, 1e-4, 2e-3)
+    a, b = rigid(AXIS)
+    s, y, n = np.zeros(2), [], 20000
+    for f in 2e-3 * rng.standard_normal(n):
+        y.append(s[0] + 1e-4 * rng.standard_normal())
+        s = a @ s + b * f
+    e = track(replace(AXIS, controller=None), np.array(y), np.zeros(n), noise.gain).innovation[200:]
+    assert np.std(e) == pytest.approx(noise.innovation, rel=0.03)
+    assert abs(np.corrcoef(e[1:], e[:-1])[0, 1]) < 0.03

@@ -1,0 +1,144 @@
+"""Effects, packing, model files and column files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sioms.reconcile.effect import Slot
+from sioms.reconcile.effects import known, library
+from sioms.reconcile.model import AxisModel, Controller
+from sioms.reconcile.records import Record, Session
+from sioms.reconcile.simulate import pack, simulate
+from sioms.reconcile.verdict import BadInputError
+from sioms.tools.reconcile_input import model_from, read_data, read_model, write_model
+
+AXIS = AxisModel(True, 1e-3, 2e-3, 1e-3, 1e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0))
+#: The list of the specification: every one of these must be nameable.
+DEMANDED = {"viscous", "viscous_direction", "coulomb", "coulomb_position", "stribeck", "presliding", "load_friction", "backlash", "cogging",
+            "torque_ripple", "gravity", "offset", "delay", "lag", "saturation", "elastic", "encoder_scale", "eccentricity",
+            "encoder_quantisation", "payload", "thermal_gain", "spring", "quadratic_drag"}
+
+
+def test_the_library_holds_what_is_demanded() -> None:
+    assert set(library()) >= DEMANDED
+
+
+@pytest.mark.parametrize("name", sorted(known()))
+def test_an_effect_says_everything_about_itself(name: str) -> None:
+    effect = known()[name]
+    assert effect.equation
+    assert effect.parameters
+    assert set(effect.lookalikes) <= set(known())
+    assert set(effect.replaces) <= set(known())
+    for p in effect.parameters:
+        assert p.lower <= p.start <= p.upper, p.symbol
+        assert "{" not in AXIS.unit(p)
+    if name in library():
+        assert effect.signature
+        assert effect.separate
+        assert effect.lookalikes
+
+
+@pytest.mark.parametrize("name", sorted(n for n, e in known().items() if e.function is not None))
+def test_state_functions_take_arrays_of_axes(name: str) -> None:
+    effect = known()[name]
+    rng = np.random.default_rng(3)
+    x, v, u, t = rng.normal(size=(4, 5))
+    p = effect.row(np.array([q.start * AXIS.scale(q) for q in effect.parameters]), AXIS.pitch)
+    together = effect.evaluate(x, v, u, t, p)
+    alone = [float(effect.function(*(float(a[i]) for a in (x, v, u, t)), p)) for i in range(5)]  # type: ignore[misc]
+    np.testing.assert_allclose(together, alone, rtol=1e-12)
+    each = effect.evaluate(x, v, u, t, np.repeat(p[:, None], 5, axis=1))
+    np.testing.assert_allclose(each, together, rtol=1e-12)
+
+
+def test_an_effect_without_state_function_cannot_be_evaluated() -> None:
+    z = np.zeros(2)
+    with pytest.raises(TypeError, match="delay"):
+        library()["delay"].evaluate(z, z, z, z, z)
+
+
+def test_unknown_parameters_are_refused() -> None:
+    with pytest.raises(ValueError, match="Fc"):
+        AXIS.with_effect("coulomb", {"fc": 1.0})
+
+
+def test_more_effects_than_places_are_refused() -> None:
+    model = AXIS
+    forces = [e for e in known().values() if e.slot is Slot.FORCE][:7]
+    for e in forces:
+        model = model.with_effect(e.name, {p.symbol: p.start for p in e.parameters})
+    with pytest.raises(ValueError, match="more than 6"):
+        pack(model)
+
+
+def test_a_model_survives_its_file(tmp_path: Path) -> None:
+    model = AXIS.with_effect("coulomb", {"Fc": 0.05}).with_effect("cogging", {"amp": 0.1, "phase": 1.0, "n": 7.0, "amp2": 0.0, "phase2": 0.0})
+    (tmp_path / "m.toml").write_text(write_model(model))
+    assert read_model(tmp_path / "m.toml") == model
+
+
+def test_an_effect_can_be_switched_off_in_the_file(tmp_path: Path) -> None:
+    text = write_model(AXIS.with_effect("coulomb", {"Fc": 0.05})).replace("on = true", "on = false")
+    (tmp_path / "m.toml").write_text(text)
+    assert read_model(tmp_path / "m.toml") == AXIS
+
+
+@pytest.mark.parametrize(("change", "says"), [
+    ({"kind": "round"}, "rotary or linear"), ({"speling": 1}, "nobody reads speling"),
+])
+def test_a_model_file_is_checked(change: dict[str, object], says: str) -> None:
+    axis: dict[str, object] = {"name": "a", "kind": "linear", "sample_time_s": 1e-3, "inertia": 1.0, "viscous": 1.0, "resolution": 1e-6,
+                               "pitch": 0.01, "rated_force": 1.0, "max_speed": 1.0}
+    with pytest.raises(ValueError, match=says):
+        model_from({"axis": axis | change})
+
+
+def _write(folder: Path, columns: str, data: str = "t,x,f\n0,0,1\n0.001,1,2\n0.002,2,3\n") -> None:
+    (folder / "run.csv").write_text(data)
+    (folder / "columns.toml").write_text(columns)
+
+
+def test_columns_are_converted(tmp_path: Path) -> None:
+    _write(tmp_path, '[columns]\nposition = { name = "x", unit = "deg" }\nforce = { name = "f", unit = "mN m", scale = 2.0 }\n')
+    record = read_data(tmp_path, AXIS).records[0]
+    np.testing.assert_allclose(record.position, np.radians([0, 1, 2]))
+    np.testing.assert_allclose(record.force, [2e-3, 4e-3, 6e-3])
+
+
+@pytest.mark.parametrize(("columns", "says"), [
+    ('[columns]\nposition = { name = "y" }\nforce = { name = "f" }\n', "no column 'y'"),
+    ('[columns]\nposition = { name = "x", unit = "furlong" }\nforce = { name = "f" }\n', "furlong"),
+    ('[columns]\nposition = { name = "x" }\n', "names no force"),
+    ('[columns]\nposition = { name = "x" }\nforce = { name = "f" }\nspeed = { name = "f" }\n', "nobody reads speed"),
+    ("[columns\n", "columns.toml"),
+])
+def test_bad_column_files_say_what_is_wrong(tmp_path: Path, columns: str, says: str) -> None:
+    _write(tmp_path, columns)
+    with pytest.raises(BadInputError, match=says):
+        read_data(tmp_path, AXIS)
+
+
+def test_missing_data_say_so(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="no such file"):
+        read_data(tmp_path / "nothing", AXIS)
+    (tmp_path / "run.csv").write_text("a\n1\n")
+    with pytest.raises(BadInputError, match="column description"):
+        read_data(tmp_path, AXIS)
+
+
+def test_a_closed_loop_needs_a_controller() -> None:
+    bare = AxisModel(True, 1e-3, 2e-3, 1e-3, 1e-4, 6.28, 0.7, 20.0)
+    with pytest.raises(ValueError, match="no controller"):
+        simulate(bare, np.zeros(10))
+
+
+def test_a_session_keeps_its_heat_only_when_whole() -> None:
+    r = Record("a", np.zeros(10), np.zeros(10))
+    session = Session((r, r, r))
+    assert session.subset([0, 1, 2]).continuous
+    assert not session.subset([0, 2]).continuous
+    assert session.samples == 30
