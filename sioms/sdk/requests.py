@@ -63,12 +63,12 @@ def write(
     size = WRITE_STRUCT[node_class].size
     if not data or len(data) % size:
         raise _refuse(errno.EINVAL, f"{what}: {len(data)} bytes; want whole records of {size} bytes")
+    if runtime.stopped:
+        raise _refuse(errno.EPERM, f"{what}: stopped by emergency stop ({runtime.latch.source}); reset first")
     records = np.frombuffer(data, _DTYPE[node_class])
     if isinstance(handle.block, AxisBlock):
         return _write_axes(runtime, handle, number, flags, timeout_s, records, what)
     channels, values = _output_values(runtime, handle, records, what)
-    if runtime.stopped:
-        raise _refuse(errno.EPERM, f"{what}: stopped by emergency stop ({runtime.latch.source}); reset first")
     return runtime.engine.write_outputs(handle, number, handle.block, channels, values)
 
 

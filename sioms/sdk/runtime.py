@@ -463,12 +463,12 @@ class Runtime:
         self.engine.stop(self.blocks)
         for block in self.blocks:
             self._make_safe(block, range(block.n))
-        self._take_events()
-        self.waits.end_where(
+        self.waits.end_where(  # before the events of the banks would: these know who stopped
             lambda w: isinstance(w.handle.block, AxisBlock),
             errno.ECANCELED,
             f"emergency stop by {self.latch.source}",
         )
+        self._take_events()
 
     def _make_safe(self, block: AnyBlock, channels: Any) -> None:
         """Give output channels their safe values; those without one keep the last."""
