@@ -144,7 +144,7 @@ class RtuLine:
 
     def _from_line(self, data: bytes) -> None:
         loop = asyncio.get_running_loop()
-        self._frame += data
+        self._frame = (self._frame + data)[-256:]  # no frame is longer
         if self._gap is not None:
             self._gap.cancel()
         if crc_is_right(self._frame):
