@@ -8,6 +8,7 @@ import shutil
 import signal
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -33,7 +34,7 @@ motor = {{ mass = 1.0, viscous = 2.0, coulomb = 0.5, stiction = 0.6, encoder_ste
 
 def axes(device: str, *names: str, extra: str = "") -> str:
     """Return the table of a simulated device with axes between -1 m and 1 m, 1 m/s, 10 m/s^2."""
-    head = f'\n[device.{device}]\ndriver = "sim-axes"\nhistory = 512\ncapacity = 16384\n{extra}\n'
+    head = f'\n[device.{device}]\ndriver = "sim-axes"\nhistory = 4096\ncapacity = 16384\n{extra}\n'
     return head + "".join(AXIS.format(device=device, axis=name) for name in names)
 
 
@@ -251,3 +252,24 @@ def at_rest(node: Any, timeout_s: float = 5.0) -> float:
     began = time.monotonic()
     wait_for(lambda: not any(node.read().in_motion), f"{node.name} at rest", timeout_s)
     return time.monotonic() - began
+
+
+class Waiting:
+    """A call in a thread, and how it ended."""
+
+    def __init__(self, call: Callable[[], object]) -> None:
+        self.error: OSError | None = None
+        self.value: object = None
+        self.thread = threading.Thread(target=self._run, args=(call,))
+        self.thread.start()
+
+    def _run(self, call: Callable[[], object]) -> None:
+        try:
+            self.value = call()
+        except OSError as error:
+            self.error = error
+
+    def errno(self) -> int | None:
+        self.thread.join(10.0)
+        assert not self.thread.is_alive()
+        return self.error.errno if self.error else None

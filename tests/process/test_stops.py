@@ -1,0 +1,244 @@
+"""Emergency stop: it overtakes everything, needs no ownership, latches until reset, and does not need the daemon."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import time
+from collections.abc import Callable
+
+import pytest
+from daemon_rig import WORKCELL, Client, Daemon, Waiting, at_rest, jog, raises, wait_for
+
+import sioms
+import sioms.aio
+from sioms.protocol.flags import AxisStatus, Request
+
+
+def _fill(axis: sioms.AxisNode) -> None:
+    """Fill the command buffer with slow moves."""
+    capacity = axis.info.buffer_capacity
+    axis.write([sioms.command(0, position=0.5 if i % 2 else -0.5, time=2.0) for i in range(capacity)])
+    wait_for(lambda: axis.read().in_motion[0], "the first has left the buffer")
+    axis.move(0.0, time=2.0)
+
+
+def test_stop_of_the_workcell_overtakes_full_buffers_and_ends_waits(daemon: Daemon, cell: sioms.Workcell) -> None:
+    with cell.open("mod0.xaxis", "rw") as first, cell.open("mod1", "rw") as second, cell.open("io0", "rw") as io:
+        io.set(0b11)
+        for axis in (first, second):
+            _fill(axis)
+            with raises(errno.EAGAIN, axis.name, f"room for 0 of {axis.info.buffer_capacity}"):
+                axis.move(0.0)
+        idle = [Waiting(axis.wait_until_idle) for axis in (first, second)]
+        room = Waiting(lambda: first.move(0.0, timeout=30.0))
+        wait_for(lambda: first.read().velocity[0] != 0 and second.read().velocity[0] != 0, "both move")
+        with daemon.cell("stopper") as other:
+            began = time.monotonic()
+            other.emergency_stop(why="test")
+            took = max(at_rest(first, 2.0), at_rest(second, 2.0))
+            print(f"stop to rest of two processes: {took * 1e3:.1f} ms")
+            assert time.monotonic() - began < 1.0
+        assert [wait.errno() for wait in (*idle, room)] == [errno.ECANCELED] * 3
+        assert "emergency stop" in str(idle[0].error) and "stopper: test" in str(idle[0].error)
+        for axis in (first, second):
+            reading = axis.read()
+            assert reading.buffered[0] == 0 and reading.status[0] & AxisStatus.EMERGENCY_STOP
+            for attempt in (lambda: axis.move(0.0), lambda: axis.command(velocity=0.1)):  # noqa: B023
+                with raises(errno.EPERM, axis.name, "emergency stop"):
+                    attempt()
+        wait_for(lambda: io.read().data[0] == 0, "outputs safe")
+        with raises(errno.EPERM, "io0", "stopper"):
+            io.set(1)
+        with raises(errno.EPERM, "whole workcell is stopped"):
+            first.reset()
+        status = cell.status()
+        assert status["stopped_ns"] > 0 and "stopper: test" in status["stop_source"]
+        where = first.read().position[0]
+        cell.reset()
+        wait_for(lambda: not first.read().status[0] & AxisStatus.EMERGENCY_STOP, "latch cleared")
+        number = first.read().number
+        first.wait_new(number + 200, 3.0)
+        assert not first.read().in_motion[0], "nothing resumes"
+        assert abs(first.read().position[0] - where) < 5e-3
+        assert io.read().data[0] == 0, "outputs do not come back by themselves"
+        first.move(0.0)
+        second.move(0.0)
+        first.wait_until_idle(5.0)
+        second.wait_until_idle(5.0)
+
+
+def test_stop_of_a_node_leaves_the_others_moving(cell: sioms.Workcell, daemon: Daemon) -> None:
+    with cell.open("mod0.xaxis", "rw") as mine, cell.open("mod0.yaxis", "rw") as other:
+        mine.command(velocity=0.1)
+        other.command(velocity=0.1)
+        waiting = Waiting(mine.wait_until_idle)
+        with daemon.cell("by") as stopper, stopper.open("mod0.xaxis.readonly") as seen:
+            wait_for(lambda: seen.read().in_motion[0], "moving")
+            seen.emergency_stop()
+        at_rest(mine, 2.0)
+        assert waiting.errno() == errno.ECANCELED
+        with raises(errno.EPERM, "mod0.xaxis"):
+            mine.move(0.0)
+        number = other.read().number
+        other.wait_new(number + 100, 3.0)
+        assert other.read().in_motion[0]
+        mine.reset()
+        mine.move(0.0)
+        mine.wait_until_idle(5.0)
+        cell.emergency_stop("mod0.yaxis")  # through the daemon, without a handle
+        at_rest(other, 2.0)
+        with raises(errno.EPERM):
+            other.move(0.0)
+        cell.reset("mod0.yaxis")
+        other.move(0.0, timeout=0.5)
+        other.wait_until_idle(5.0)
+
+
+def test_stop_through_the_request_page_while_the_daemon_hangs(daemon: Daemon, cell: sioms.Workcell) -> None:
+    axes = [cell.open("mod0.xaxis", "rw"), cell.open("mod1", "rw")]
+    for axis in axes:
+        axis.command(velocity=0.2)
+        wait_for(lambda axis=axis: axis.read().velocity[0] > 0.1, "moving")
+    with daemon.frozen(daemon.pid):
+        stopping = Waiting(lambda: cell.emergency_stop(why="the daemon hangs"))
+        began = time.monotonic()
+        for axis in axes:
+            wait_for(lambda axis=axis: axis.read().status[0] & AxisStatus.EMERGENCY_STOP, "latched", 1.0)
+        # well before the lease of the hung daemon would have stopped them
+        print(f"request page to all latched: {(time.monotonic() - began) * 1e3:.1f} ms")
+        for axis in axes:
+            at_rest(axis, 1.0)
+    assert stopping.errno() in (None, errno.ETIMEDOUT)
+    assert wait_for(lambda: cell.status()["stopped_ns"], "the daemon knows")
+    for axis in axes:
+        axis.close()
+    cell.reset()
+
+
+def test_a_client_cannot_clear_a_stop_through_the_page(daemon: Daemon, cell: sioms.Workcell) -> None:
+    cell.emergency_stop()
+    page = cell._request
+    assert page is not None
+    for value in (0, 1, 1 << 63):
+        page._words[0] = value
+        time.sleep(0.01)
+        assert cell.status()["stopped_ns"]
+
+
+def test_a_read_only_page_is_sealed(cell: sioms.Workcell) -> None:
+    """A client gets the page of readings, and can neither write nor resize nor remap it."""
+    import fcntl
+    import mmap
+    import os
+
+    from sioms.client.workcell import open_call
+
+    answer = cell._channel.call(open_call("mod0.readonly", "r", 0.0, 0.0))
+    page = answer.fds[0]
+    try:
+        with pytest.raises(PermissionError):
+            mmap.mmap(page, 4096)
+        with pytest.raises(PermissionError):
+            os.pwrite(page, b"x", 0)
+        with pytest.raises(PermissionError):
+            os.ftruncate(page, 0)
+        with pytest.raises(PermissionError):
+            fcntl.fcntl(page, fcntl.F_ADD_SEALS, 0x2)
+    finally:
+        for fd in answer.fds:
+            os.close(fd)
+
+
+def test_input_configured_as_stop_source(start_daemon: Callable[..., Daemon]) -> None:
+    source = '\n[[emergency_stop]]\nnode = "io0.in.bit0"\nactive = 1\n'
+    daemon = start_daemon(WORKCELL + source)
+    with daemon.cell() as cell, cell.open("mod0.xaxis", "rw") as axis, cell.open("io0", "rw") as io:
+        axis.command(velocity=0.1)
+        io.set(0b10)
+        assert axis.read().in_motion[0]
+        io.set(0b01)  # wired to input 0
+        at_rest(axis, 2.0)
+        assert "input io0 in in bit 0 reads 1" in wait_for(lambda: cell.status()["stop_source"], "latched")
+        wait_for(lambda: io.read().data[0] == 0, "outputs safe, and with them the source")
+        cell.reset()
+        axis.move(0.0, timeout=0.5)
+        axis.wait_until_idle(5.0)
+
+
+def test_stop_source_that_is_still_active_stops_again_after_a_reset(start_daemon: Callable[..., Daemon]) -> None:
+    daemon = start_daemon(WORKCELL + '\n[[emergency_stop]]\nnode = "io0.in.bit0"\n')  # active 0: a broken wire stops
+    with daemon.cell() as cell:
+        for _ in range(3):
+            wait_for(lambda: cell.status()["stopped_ns"], "stopped, since the input reads 0")
+            cell.reset()
+        with cell.open("mod0.xaxis", "rw") as axis:
+            wait_for(lambda: axis.read().status[0] & AxisStatus.EMERGENCY_STOP, "latched")
+            with raises(errno.EPERM):
+                axis.move(0.1)
+
+
+def test_started_stopped_where_configured(start_daemon: Callable[..., Daemon]) -> None:
+    daemon = start_daemon(WORKCELL.replace('name = "test"', 'name = "test"\nstart_stopped = true'))
+    with daemon.cell() as cell, cell.open("mod0.xaxis", "rw") as axis:
+        with raises(errno.EPERM, "started stopped, as configured"):
+            axis.move(0.1)
+        cell.reset()
+        axis.move(0.01, timeout=0.5)
+        axis.wait_until_idle(5.0)
+
+
+def test_a_driver_that_restarts_during_a_stop_is_stopped(daemon: Daemon, cell: sioms.Workcell) -> None:
+    import os
+    import signal
+
+    cell.emergency_stop()
+    before = daemon.device("mod0")
+    os.kill(before["pid"], signal.SIGKILL)
+    daemon.wait_up("mod0", before["generation"] + 1)
+    with cell.open("mod0.xaxis", "rw", timeout=2.0) as axis, raises(errno.EPERM, "emergency stop"):
+        axis.move(0.1)
+
+
+def test_controlled_stop_is_not_latched(cell: sioms.Workcell) -> None:
+    with cell.open("mod0.xaxis", "rw") as axis:
+        _fill(axis)
+        waiting = Waiting(axis.wait_until_idle)
+        wait_for(lambda: axis.read().in_motion[0], "moving")
+        axis.stop()
+        at_rest(axis, 2.0)
+        assert axis.read().buffered[0] == 0
+        assert waiting.errno() == errno.ECANCELED
+        axis.move(0.0)
+        axis.wait_until_idle(5.0)
+
+
+def test_waits_are_cancelled_by_another_session(daemon: Daemon, cell: sioms.Workcell) -> None:
+    with cell.open("mod0.xaxis", "rw") as axis:
+        axis.command(velocity=0.01)
+        waiting = Waiting(axis.wait_until_idle)
+        with daemon.cell("other") as other, other.open("mod0.xaxis.readonly") as seen:
+            assert wait_for(seen.cancel_waits, "something to cancel") == 1
+        assert waiting.errno() == errno.ECANCELED and "cancelled by" in str(waiting.error)
+        assert axis.read().in_motion[0], "only the wait ended"
+
+
+def test_stop_from_asyncio(daemon: Daemon, cell: sioms.Workcell) -> None:
+    async def story() -> None:
+        async with await sioms.aio.connect(daemon.socket) as mine, await mine.open("mod0.xaxis", "rw") as axis:
+            await axis.command(velocity=0.1)
+            waiting = asyncio.create_task(axis.wait_until_idle())
+            await asyncio.sleep(0.05)
+            await mine.emergency_stop(why="asyncio")
+            with raises(errno.ECANCELED, "asyncio"):
+                await waiting
+            await mine.reset()
+
+    asyncio.run(story())
+
+
+def test_stop_needs_no_ownership(daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client]) -> None:
+    client(daemon, jog("mod0.xaxis", 0.1) + "hold()")
+    with cell.open("mod0.xaxis.readonly") as seen:
+        seen.ioctl(Request.STOP)
+        at_rest(seen, 2.0)
