@@ -9,8 +9,8 @@ A pure object: frames and their time stamps go in, a `StrainFrame` comes out, no
 
 While untouched the baseline follows the readings with the finger's drift time (temperature moves it by per
 cents an hour); while touched, and until creep has faded after a release, it rests.  A touch is what rises
-above the noise in sum over all elements; it ends at half that level.  A touch from the first frame on cannot
-be told from an offset: call `zero` untouched.
+above the noise in sum over all elements, what all have in common left out; it ends at half that level.  A
+touch from the first frame on cannot be told from an offset: call `zero` untouched.
 """
 
 from __future__ import annotations
@@ -168,7 +168,10 @@ class SignalChain:
         count = int(np.count_nonzero(usable))
         if count == 0:
             return 0.0, 0
-        return float(np.sum(change[usable] ** 2 / self._noise[usable])) / count, count
+        # a touch is somewhere; what moves all elements alike is temperature, which a fast change would else
+        # turn into a touch
+        local = change[usable] - np.median(change[usable])
+        return float(np.sum(local**2 / self._noise[usable])) / count, count
 
     def _touch(self, strength: float, count: int, stamp_ns: int) -> None:
         level = 1.0 + _TOUCH_SIGMA * math.sqrt(2.0 / max(count, 1))

@@ -231,7 +231,16 @@ def _solver(fit: Fit) -> Solve:
         if score[best] <= 0.0:
             return 2, 0.0, 0.0, blank, 0, 0.0
         t, b, at, steps = fit(
-            nodes, first, step, width_step, weights, y, load, load_weight, places[best, 0], places[best, 1]
+            nodes,
+            first,
+            step,
+            width_step,
+            weights,
+            y,
+            load,
+            load_weight,
+            float(places[best, 0]),
+            float(places[best, 1]),
         )
         return 0, t, b, at, steps, weights.sum()
 

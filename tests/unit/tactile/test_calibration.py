@@ -1,0 +1,155 @@
+"""Calibration finds the truth of a moulded finger, and says what the touches cannot tell."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from sioms.tactile.calibration import Calibration, calibrate
+from sioms.tactile.closedform import equivalent_radius
+from sioms.tactile.estimator import Estimator, Quality
+from sioms.tactile.finger import Finger, from_toml, to_toml
+from sioms.tactile.identify import corrected, truncated
+from sioms.tactile.linearity import find_quadratic, linearise
+from sioms.tactile.touches import Recording, Touches, average, join
+
+
+@pytest.fixture(scope="module")
+def start(nominal: Finger) -> Finger:
+    return msgspec.structs.replace(
+        nominal, elements=msgspec.structs.replace(nominal.elements, gain=(3.0,) * 16)
+    )
+
+
+@pytest.fixture(scope="module")
+def result(start: Finger, made) -> Calibration:  # type: ignore[no-untyped-def]
+    told: list[str] = []
+    found = calibrate(start, made.touches(), tick=told.append)
+    assert len(told) > 20
+    return found
+
+
+def test_elements_are_found(result: Calibration, made) -> None:  # type: ignore[no-untyped-def]
+    fits = [fit for fit in result.elements if fit is not None]
+    assert len(fits) == 16
+    assert np.degrees([fit.angle_rad for fit in fits]) == pytest.approx(np.degrees(made.angles), abs=0.1)
+    # depth, gain and Poisson's ratio trade against each other: the product is what strain feels
+    assert np.array([fit.radius_m for fit in fits]) == pytest.approx(made.radii, abs=1.5e-4)
+    assert np.corrcoef([fit.radius_m for fit in fits], made.radii)[0, 1] > 0.95
+    assert np.array([fit.gain for fit in fits]) == pytest.approx(made.gain, rel=0.12)
+    assert result.finger.geometry.poisson == pytest.approx(0.46, abs=0.01)
+
+
+def test_quadratic_is_kept_apart_from_the_contacts_growth(result: Calibration, made) -> None:  # type: ignore[no-untyped-def]
+    assert result.quadratic is not None
+    assert result.quadratic.common == pytest.approx(made.quadratic, abs=0.5)
+    assert np.array(result.finger.elements.quadratic) == pytest.approx(np.full(16, made.quadratic), abs=1.5)
+
+
+def test_frictionless_contact_is_chosen(result: Calibration) -> None:
+    assert result.finger.contact.model == "frictionless"
+    assert result.contacts["hertz"] > 1.5 * result.contacts["frictionless"]
+    assert result.contacts["adhesion 1"] > 1.2 * result.contacts["frictionless"]
+
+
+def test_calibrated_finger_measures(result: Calibration, made) -> None:  # type: ignore[no-untyped-def]
+    finger = from_toml(to_toml(result.finger))
+    estimator, gain = Estimator(finger), np.array(finger.elements.gain)
+    for place, load, rc in ((40.3, 200.0, 6e-3), (77.7, 150.0, 12e-3), (101.2, 220.0, math.inf)):
+        output = made.output(math.radians(place), load, rc)
+        shape = estimator.frame(-gain * linearise(output, np.array(finger.elements.quadratic)))
+        assert not shape.quality & Quality.POOR_FIT
+        assert math.degrees(shape.angle_rad) == pytest.approx(place, abs=0.12)
+        assert shape.load_n_per_m == pytest.approx(load, rel=0.04)
+        assert shape.equivalent_radius_m == pytest.approx(equivalent_radius(finger.cylinder, rc), abs=0.7e-3)
+
+
+def test_residuals_are_those_of_left_out_touches(result: Calibration, made) -> None:  # type: ignore[no-untyped-def]
+    noise = made.noise * math.sqrt(0.1) * made.gain.mean() / result.peak
+    for name in ("elements", "corrected"):
+        assert noise * 0.7 < np.mean(result.residuals[name]) < 0.012
+    assert np.mean(result.residuals["elements"]) < np.mean(result.residuals["uniform"])
+
+
+def test_half_a_finger_is_left_out_and_said(start: Finger, made) -> None:  # type: ignore[no-untyped-def]
+    touches = made.touches()
+    half = touches.pick(touches.angle_rad < math.radians(70.0))
+    found = calibrate(start, half)
+    used = np.array(found.finger.elements.used)
+    assert not used[:5].any()
+    assert used[9:].all()
+    assert any("element 0: too few touches" in warning for warning in found.warnings)
+
+
+def test_what_is_not_supported_is_said(start: Finger, made) -> None:  # type: ignore[no-untyped-def]
+    touches = made.touches()
+    edges = touches.pick(touches.radius_m == 0.0)
+    scaled = Touches(edges.output, edges.angle_rad, edges.load, edges.radius_m, 0.9 * edges.load, edges.noise)
+    found = calibrate(start, scaled)
+    assert found.quadratic is None
+    assert any("quadratic not fitted" in warning for warning in found.warnings)
+    assert any("load cell reads -10.0 %" in warning for warning in found.warnings)
+
+
+def test_nonsense_is_refused(start: Finger, made) -> None:  # type: ignore[no-untyped-def]
+    touches = made.touches()
+    with pytest.raises(ValueError, match="10 touches; need at least 30"):
+        calibrate(start, touches.pick(np.arange(10)))
+    with pytest.raises(ValueError, match="compression must be positive"):
+        calibrate(start, touches.with_output(-touches.output))
+    with pytest.raises(ValueError, match="touches have 12 elements; the finger has 16"):
+        calibrate(start, touches.with_output(touches.output[:, :12]))
+    pulled = np.where(np.arange(len(touches)) == 0, -200.0, touches.load)
+    bad = Touches(touches.output, touches.angle_rad, pulled, touches.radius_m, touches.force, touches.noise)
+    with pytest.raises(ValueError, match=r"load -200\.0 N/m; pressing loads are positive"):
+        calibrate(start, bad)
+
+
+def test_linearise_undoes_the_quadratic() -> None:
+    linear = np.linspace(-0.05, 0.1, 31)
+    for q in (0.0, 4.0, -2.0):
+        assert linearise(linear + q * linear**2, q) == pytest.approx(linear, abs=1e-15)
+    assert linearise(-0.2, 4.0) == pytest.approx(-0.125)  # beyond the vertex: saturated
+
+
+def test_quadratic_needs_load_series(made) -> None:  # type: ignore[no-untyped-def]
+    touches = made.touches()
+    edges = touches.pick(touches.radius_m == 0.0)
+    assert find_quadratic(edges, -np.abs(edges.output)) is None
+
+
+def test_identified_maps_recover_a_known_one() -> None:
+    random = np.random.default_rng(8)
+    known, pressure = random.normal(size=(4, 21)), random.normal(size=(60, 21))
+    strain = pressure @ known.T
+    assert truncated(pressure, strain).rows == pytest.approx(known, abs=1e-9)
+    assert corrected(pressure, strain, known).rows == pytest.approx(known, abs=1e-9)
+    model = known + 0.1 * random.normal(size=known.shape)
+    found = corrected(pressure, strain, model)
+    assert np.abs(found.rows - known).max() < 0.1 * np.abs(model - known).max()
+    # where no touch speaks, the model stays and the source's way says nothing
+    silent = pressure.copy()
+    silent[:, 20] = 0.0
+    assert corrected(silent, silent @ known.T, model).rows[:, 20] == pytest.approx(model[:, 20])
+    assert truncated(silent, silent @ known.T).rows[:, 20] == pytest.approx(np.zeros(4), abs=1e-12)
+    with pytest.raises(ValueError, match="60 pressures for 59 touches"):
+        truncated(pressure, strain[:59])
+
+
+def test_average_subtracts_each_touchs_baseline() -> None:
+    raw = np.repeat(np.array([[1.0, 2.0], [3.0, 2.5], [10.0, 20.0], [11.0, 20.0]]), 5, axis=0)
+    touch, phase = np.repeat([0, 0, 1, 1], 5), np.repeat([0, 1, 0, 1], 5)
+    column = np.zeros(20)
+    recording = Recording(raw, np.arange(20.0), touch, phase, 10.0 * phase, column, 33.0)
+    found = average(recording, np.zeros(2), np.full(2, 10.0), np.zeros(2), 0.01)
+    assert found.output == pytest.approx(np.array([[0.02, 0.005], [0.01, 0.0]]))
+    assert found.force == pytest.approx([10.0, 10.0])
+    assert len(join([found, found])) == 4
+    with pytest.raises(ValueError, match="average touch 2 of 3: 0 baseline and 0 loaded frames"):
+        average(recording, np.zeros(3), np.full(3, 10.0), np.zeros(3), 0.01)
+    raw[7, 1] = np.nan
+    with pytest.raises(ValueError, match="touch 0: element 1 holds a reading that is not finite"):
+        average(recording, np.zeros(2), np.full(2, 10.0), np.zeros(2), 0.01)

@@ -1,0 +1,130 @@
+"""The signal chain follows drift, keeps touches, undoes the quadratic and drops bad elements."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from sioms.tactile.chain import DEAD_FRAMES, SETTLE_FRAMES, SignalChain
+from sioms.tactile.finger import Finger
+
+PERIOD_NS = 8_333_333
+
+
+@pytest.fixture
+def finger(nominal: Finger) -> Finger:
+    elements = msgspec.structs.replace(
+        nominal.elements, gain=(3.0,) * 16, quadratic=(4.0,) * 16, noise=(5e-4,) * 16
+    )
+    return msgspec.structs.replace(nominal, elements=elements)
+
+
+class Bench:
+    """Feed a chain with noisy frames at 120 Hz; raw units are per cent."""
+
+    def __init__(self, finger: Finger) -> None:
+        self.chain, self.stamp_ns = SignalChain(finger), 0
+        self.random = np.random.default_rng(11)
+        self.offset = np.linspace(-2.0, 3.0, 16)
+
+    def feed(self, frames: int, output: float = 0.0, element: int = 8, drift_per_s: float = 0.0):  # type: ignore[no-untyped-def]
+        out = None
+        for _ in range(frames):
+            self.stamp_ns += PERIOD_NS
+            self.offset = self.offset + drift_per_s * PERIOD_NS * 1e-9
+            raw = self.offset + 0.05 * self.random.normal(size=16)
+            raw[element] += output
+            out = self.chain.frame(raw, self.stamp_ns)
+        return out
+
+
+def test_strain_of_a_touch(finger: Finger) -> None:
+    bench = Bench(finger)
+    assert not bench.feed(1).settled
+    bench.feed(SETTLE_FRAMES)
+    free = bench.feed(200)
+    assert free.settled
+    assert not free.touched
+    assert free.strength == pytest.approx(1.0, abs=1.0)
+    linear = 0.05
+    touched = [bench.feed(1, 100 * (linear + 4.0 * linear**2)) for _ in range(100)]
+    assert all(frame.touched for frame in touched)
+    assert np.mean([frame.strains[8] for frame in touched]) == pytest.approx(-3.0 * linear, rel=0.02)
+    assert np.mean([frame.strains[2] for frame in touched]) == pytest.approx(0.0, abs=1e-3)
+    assert not bench.feed(5).touched
+
+
+def test_drift_is_followed_untouched_and_kept_out_of_touches(finger: Finger) -> None:
+    bench = Bench(finger)
+    bench.feed(200)
+    frame = bench.feed(1200, drift_per_s=0.05)
+    assert not frame.touched
+    lag = bench.offset.mean() - bench.chain.baseline.mean()
+    assert lag == pytest.approx(0.05 * finger.signal.drift_time_s, rel=0.3)  # first-order follower
+    before = bench.chain.baseline
+    bench.feed(600, output=5.0, drift_per_s=0.01)
+    assert bench.chain.baseline == pytest.approx(before)
+    bench.feed(60)  # resting after the release
+    assert bench.chain.baseline == pytest.approx(before)
+    bench.feed(1200)
+    assert bench.chain.baseline == pytest.approx(bench.offset, abs=0.02)
+
+
+def test_zero_takes_a_new_baseline(finger: Finger) -> None:
+    bench = Bench(finger)
+    bench.feed(100)
+    bench.offset[3] += 4.0
+    assert bench.feed(5).touched
+    bench.chain.zero()
+    assert not bench.feed(SETTLE_FRAMES).settled
+    frame = bench.feed(1)
+    assert frame.settled
+    assert not frame.touched
+    assert bench.chain.baseline == pytest.approx(bench.offset, abs=0.06)
+
+
+def test_what_moves_all_elements_alike_is_no_touch(finger: Finger) -> None:
+    bench = Bench(finger)
+    bench.feed(200)
+    bench.offset += 1.0  # a gust of warm air
+    assert not bench.feed(1).touched
+    bench.feed(1200)
+    assert bench.chain.baseline == pytest.approx(bench.offset, abs=0.02)
+
+
+def test_bad_elements_are_marked(finger: Finger) -> None:
+    bench = Bench(finger)
+    bench.feed(100)
+    for _ in range(DEAD_FRAMES + 1):
+        bench.stamp_ns += PERIOD_NS
+        raw = bench.offset + 0.05 * bench.random.normal(size=16)
+        raw[4], raw[5], raw[6] = 1.0, np.nan, 100.0
+        frame = bench.chain.frame(raw, bench.stamp_ns)
+    assert frame.dead.tolist() == [n in (4, 6) for n in range(16)]
+    assert frame.saturated.tolist() == [n == 6 for n in range(16)]
+    assert frame.usable.tolist() == [n not in (4, 5, 6) for n in range(16)]
+    assert np.isnan(frame.strains[[4, 5, 6]]).all()
+    assert not frame.touched
+    assert bench.feed(1).usable.all()  # it moves again
+
+
+def test_gains_are_replaced(finger: Finger) -> None:
+    bench = Bench(finger)
+    bench.feed(100)
+    bench.chain.set_gain(np.full(16, 6.0))
+    assert np.mean([bench.feed(1, 1.0).strains[8] for _ in range(50)]) == pytest.approx(
+        -6.0 * 0.00963, rel=0.05
+    )
+    for bad in (np.ones(3), np.zeros(16), np.full(16, np.nan)):
+        with pytest.raises(ValueError, match="set gain"):
+            bench.chain.set_gain(bad)
+
+
+def test_bad_frames_are_refused(finger: Finger) -> None:
+    chain = SignalChain(finger)
+    with pytest.raises(ValueError, match=r"17 readings in shape \(17,\); the finger has 16 elements"):
+        chain.frame(np.zeros(17), 0)
+    chain.frame(np.zeros(16), 10)
+    with pytest.raises(ValueError, match="stamp 9 ns is before the last one, 10 ns"):
+        chain.frame(np.zeros(16), 9)
