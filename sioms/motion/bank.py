@@ -20,8 +20,10 @@ from sioms.protocol.records import AXIS_READ_FIELDS
 from .guard import LimitGuard
 from .homing import HomingRuns
 from .law import ControlLaw
+from .plain import MOST, Taken
 from .queue import AxesLike, CommandQueue, LimitValue
 from .sequencer import FORCE, HOLD, STOP, Sequencer
+from .store import NEVER_NS
 from .types import SWITCH_MINUS, SWITCH_PLUS, AxisSettings, CommandError, Event, EventKind, MarkerPort
 
 Axes = NDArray[np.int64]
@@ -86,6 +88,7 @@ class AxisBank:
         self._late_ns = int(late_max_s * 1e9)
         self._last_ns = 0
         self._seen = False
+        self._inbox: list[Taken] = []
 
     # -- writing ------------------------------------------------------------------------------
 
@@ -103,8 +106,15 @@ class AxisBank:
             CommandError: EINVAL, ERANGE (outside limits, or known to be infeasible), EAGAIN (no
                 room), EPERM (emergency stop, home required), EIO (fault), EBUSY (homing).
         """
+        # A short write is acknowledged first and worked in by the next tick or verb, at its own instant: see _take().
         if not self._seen:
             raise CommandError(errno.EIO, "write: no position has been measured yet; wait for the first tick")
+        waiting = sum([len(write.commands) for write in self._inbox])
+        plain = self._queue.admit_plain(records, axes, waiting, replace=replace)
+        if plain is not None:
+            self._take(Taken(plain, frozenset([c.axis for c in plain]), replace, now_ns))
+            return
+        self._work_in()
         sequencer = self._sequencer
         sequencer.advance(now_ns)
         commands = self._queue.admit(records, axes, sequencer.rest_positions(), replace=replace)
@@ -116,13 +126,53 @@ class AxisBank:
         else:
             sequencer.appended(self._queue.append(commands), now_ns)
 
+    def _take(self, write: Taken) -> None:
+        """Keep a plain write for the next tick or verb, which carries it out at its own instant.
+
+        The writer has its acknowledgement sooner, and set-points that are replaced before any tick
+        has seen them are never planned.
+        """
+        if write.replace:
+            self._inbox = [older for older in self._inbox if not older.axes <= write.axes]
+        self._inbox.append(write)
+        if len(self._inbox) > MOST:
+            self._work_in()
+
+    def _work_in(self, latest_ns: int = NEVER_NS) -> None:
+        """Carry out the plain writes since the last tick, each at its own instant, or at latest_ns."""
+        if not self._inbox:
+            return
+        writes, self._inbox = self._inbox, []
+        for write in writes:
+            at_ns = min(write.now_ns, latest_ns)
+            self._sequencer.advance(at_ns)
+            # Working in an earlier one may have ended in a fault.
+            commands = [c for c in write.commands if not self._queue.is_barred(c.axis)]
+            if not commands:
+                continue
+            if write.replace:
+                self._sequencer.drop(np.unique([c.axis for c in commands]).astype(np.int64))
+                self._sequencer.replaced(self._queue.append_plain(commands), at_ns)
+            else:
+                self._sequencer.appended(self._queue.append_plain(commands), at_ns)
+
+    def _forget(self, axes: Axes) -> None:
+        """Drop the plain writes of these axes that are not worked in yet."""
+        if not self._inbox:
+            return
+        dropped = frozenset(axes.tolist())
+        left = [(write, [c for c in write.commands if c.axis not in dropped]) for write in self._inbox]
+        self._inbox = [write._replace(commands=cs, axes=write.axes - dropped) for write, cs in left if cs]
+
     def room(self, axes: AxesLike) -> int:
         """Return how many further commands fit into the fullest buffer of these axes."""
+        self._work_in()
         return int(self._queue.room_of_all()[np.asarray(axes)].min())
 
     def flush(self, axes: AxesLike) -> None:
         """Empty the buffers; the running command goes on to its end."""
         chosen = np.asarray(axes, dtype=np.int64)
+        self._forget(chosen)
         waited = chosen[~self._sequencer.is_idle(chosen)]
         self._sequencer.drop(chosen)
         self._queue.emit(EventKind.IDLE, waited[self._sequencer.is_idle(waited)], self._last_ns)
@@ -138,6 +188,7 @@ class AxisBank:
         Returns:
             the axes released.
         """
+        self._work_in()
         self._sequencer.advance(now_ns)
         chosen = np.asarray(axes, dtype=np.int64)
         chosen = chosen[self._queue.gated_synch[chosen] & self._sequencer.is_open_ended(chosen)]
@@ -163,6 +214,7 @@ class AxisBank:
     def stop(self, axes: AxesLike, now_ns: int) -> None:
         """Empty the buffers and stop at maximum deceleration; force mode goes over to holding."""
         chosen = np.asarray(axes, dtype=np.int64)
+        self._forget(chosen)
         self._sequencer.advance(now_ns)
         self._homing.cancel(chosen)
         self._sequencer.halt(chosen, now_ns)
@@ -207,6 +259,7 @@ class AxisBank:
 
     def _abandon(self, axes: Axes, now_ns: int, errno_: int, text: str) -> None:
         """Stop axes for a reason that is not their writer's, and tell those who wait for them."""
+        self._forget(axes)
         self._queue.emit(EventKind.DROPPED, axes[~self._sequencer.is_idle(axes)], now_ns, errno_, text)
         self._homing.cancel(axes)
         self._sequencer.halt(axes, now_ns)
@@ -226,6 +279,7 @@ class AxisBank:
             CommandError: EBUSY while an axis moves, ERANGE outside its soft limits, EINVAL when not finite.
         """
         chosen, wanted = np.asarray(axes, dtype=np.int64), np.asarray(positions, dtype=np.float64)
+        self._work_in()
         self._queue.check_calibration(chosen, wanted, self._sequencer.is_idle(chosen))
         for axis, position in zip(chosen.tolist(), wanted.tolist(), strict=True):
             self.shift(axis, position - float(self._position[axis]))
@@ -256,6 +310,7 @@ class AxisBank:
             CommandError: EINVAL without homing, EBUSY while moving, EPERM or EIO when latched.
         """
         chosen = np.asarray(axes, dtype=np.int64)
+        self._work_in()
         self._sequencer.advance(now_ns)
         self._homing.begin(chosen, self._sequencer.is_idle(chosen), now_ns)
         self._sequencer.refresh(chosen)
@@ -313,6 +368,7 @@ class AxisBank:
         if now_ns - last_ns > self._late_ns:
             self._stop_late(last_ns, now_ns)
         self._measure(position, dt, now_ns)
+        self._work_in(now_ns)
         if self._queue.waits_for_markers:
             self._poll_markers(now_ns)
         sequencer = self._sequencer
@@ -446,8 +502,10 @@ class AxisBank:
 
     def is_idle(self, axes: AxesLike) -> bool:
         """Tell whether these axes hold still, have no commands and are not homing."""
+        self._work_in()
         return bool(self._sequencer.is_idle(np.asarray(axes, dtype=np.int64)).all())
 
     def take_events(self) -> list[Event]:
         """Return what happened since the last call, oldest first."""
+        self._work_in()
         return self._queue.take_events()

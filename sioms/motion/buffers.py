@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ class CommandBuffers:
     def __init__(self, n: int, capacity: int) -> None:
         self.capacity = capacity
         self.count = np.zeros(n, dtype=np.int64)
-        self._chunks: list[deque[NDArray[Any]]] = [deque() for _ in range(n)]
+        self._chunks: list[deque[NDArray[Any] | tuple[Command]]] = [deque() for _ in range(n)]
         self._position = [0] * n
 
     def append(self, commands: NDArray[Any]) -> NDArray[np.int64]:
@@ -38,6 +39,12 @@ class CommandBuffers:
         self.count[touched] += np.diff(bounds)
         return touched
 
+    def append_commands(self, commands: Sequence[Command]) -> None:
+        """Append a few commands that are Python objects already."""
+        for command in commands:
+            self._chunks[command.axis].append((command,))
+            self.count[command.axis] += 1
+
     def pop(self, axis: int) -> Command | None:
         """Take the oldest command of an axis, None when it has none."""
         chunks = self._chunks[axis]
@@ -45,7 +52,8 @@ class CommandBuffers:
             return None
         i = self._position[axis]
         chunk = chunks[0]
-        command = Command._make(chunk[i].item())
+        record = chunk[i]
+        command = record if isinstance(record, Command) else Command._make(record.item())
         if i + 1 < len(chunk):
             self._position[axis] = i + 1
         else:

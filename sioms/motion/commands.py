@@ -127,6 +127,11 @@ class Validator:
         stepper = np.array([s.kind is AxisKind.STEPPER for s in settings])
         self._modes[stepper] &= np.uint32(KNOWN & ~FORCE_FLAGS)
 
+    @property
+    def offered(self) -> list[int]:
+        """Control-mode flags that each axis can do."""
+        return [int(mode) for mode in self._modes]
+
     def check(self, records: NDArray[Any], axes: NDArray[np.int64]) -> NDArray[Any]:
         """Return the records as COMMAND_DTYPE, with bank axes and captured markers.
 

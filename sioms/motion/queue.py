@@ -19,10 +19,12 @@ from . import modes
 from .buffers import CommandBuffers
 from .commands import WIRE_DTYPE, Command, Limits, Validator
 from .feasibility import Feasibility, Tail
+from .plain import MOST, PlainCheck
 from .types import AxisSettings, CommandError, Event, EventKind, MarkerPort
 
 AxesLike = Sequence[int] | NDArray[np.int64]
 LimitValue = float | None | Sequence[float | None]
+BARRED, HOMED = int(AxisStatus.EMERGENCY_STOP | AxisStatus.FAULT | AxisStatus.HOMING), int(AxisStatus.HOMED)
 LIMIT_NAMES = ("position_min", "position_max", "velocity_max", "acceleration_max", "jerk_max", "force_max")
 
 
@@ -52,6 +54,7 @@ class CommandQueue:
         self.tail = Tail(np.full((self.n, 3), np.nan), self.in_force[0].copy(), self.in_force[1].copy())
         self._next_tail: tuple[NDArray[np.int64], Tail] | None = None
         self._feasibility = Feasibility(self.limits, self._validator)
+        self._plain = PlainCheck(self._validator.offered, self.limits)
         self._waiting: dict[tuple[int, int], set[int]] = {}
         self._fault_text: dict[int, str] = {}
         self._events: list[tuple[EventKind, Any, int, int, str]] = []
@@ -88,6 +91,50 @@ class CommandQueue:
         self._check_feasible(commands, at_rest, replace)
         return commands
 
+    def admit_plain(
+        self, records: NDArray[Any], axes: AxesLike, waiting: int, *, replace: bool
+    ) -> list[Command] | None:
+        """Check a short write one by one; None when the general way has to judge it.
+
+        Args:
+            records: as written.
+            axes: bank axis of each node-local index.
+            waiting: how many commands have been admitted but not appended.
+            replace: the buffers of these axes will be emptied first.
+        """
+        count = len(records)
+        if not 0 < count <= min(MOST, self.capacity) or records.dtype != WIRE_DTYPE:
+            return None
+        commands = []
+        for record in records.tolist():
+            if not 0 <= record[0] < len(axes):
+                return None
+            axis = int(axes[record[0]])
+            full = not replace and int(self._buffers.count[axis]) + 1 + waiting + count > self.capacity
+            command = None if full or self.is_barred(axis) else self._plain.command(record, axis)
+            if command is None:
+                return None
+            commands.append(command)
+        return commands
+
+    def is_barred(self, axis: int) -> bool:
+        """Tell whether an axis takes no commands now; see _check_latches()."""
+        latched = int(self.latched[axis])
+        return bool(latched & BARRED) or bool(self.home_required[axis] and not latched & HOMED)
+
+    def append_plain(self, commands: Sequence[Command]) -> NDArray[np.int64]:
+        """Take plain commands; return the axes touched, each of which now has a head."""
+        tail = self.tail
+        for command in commands:
+            axis, mode = command.axis, command.control_mode
+            tail.state[axis] = (command.position, 0.0, 0.0) if mode & modes.POSITION else np.nan
+            if mode & modes.MAX_VEL_ACC:
+                tail.velocity[axis], tail.acceleration[axis] = command.max_velocity, command.max_acceleration
+        self._buffers.append_commands(commands)
+        touched = np.unique([command.axis for command in commands]).astype(np.int64)
+        self.load_heads(touched)
+        return touched
+
     def _check_feasible(self, commands: NDArray[Any], at_rest: NDArray[np.float64], replace: bool) -> None:
         known = self.tail.state
         resting = np.isfinite(at_rest)
@@ -104,8 +151,8 @@ class CommandQueue:
 
     def _check_latches(self, axes: NDArray[np.int64]) -> None:
         latched = self.latched[axes]
-        homed = (latched & int(AxisStatus.HOMED)) != 0
-        barred = (latched & int(AxisStatus.EMERGENCY_STOP | AxisStatus.FAULT | AxisStatus.HOMING)) != 0
+        homed = (latched & HOMED) != 0
+        barred = (latched & BARRED) != 0
         barred |= self.home_required[axes] & ~homed
         if not barred.any():
             return

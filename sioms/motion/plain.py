@@ -1,0 +1,86 @@
+"""The short way of a write: few records, each of which can be judged by its own fields alone.
+
+A stream of set-points is many small writes, and the arrays of the general way cost the same for one
+record as for a thousand. A plain record commands one quantity, and at most limits beside it: its
+beginning and its duration cannot make it infeasible at the write. What is not plain, or is bad, goes
+the general way, which is also the only one that refuses: every message has one home.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import modes
+from .commands import RULES, WIRE_DTYPE, Command, Limits
+
+MOST = 16
+"""Records up to which one by one is quicker than as arrays."""
+GREATEST = float(np.finfo(np.float64).max)
+_QUANTITIES = (
+    modes.POSITION, modes.VELOCITY, modes.ACCELERATION, modes.JERK, modes.FORCE, modes.FORCE_VELOCITY,
+)  # fmt: skip
+_BESIDE = (modes.MAX_VEL_ACC, modes.MAX_FORCE, modes.FORCE_OFFSET, modes.SYNCH)
+_COLUMN = {name: i for i, name in enumerate(WIRE_DTYPE.names or ())}
+
+Check = tuple[int, NDArray[np.float64] | None, bool]
+"""Column of a value, the array (n,) of its bound or None, and whether it must be above zero."""
+
+
+class Taken(NamedTuple):
+    """A plain write that has been acknowledged and waits to be worked in.
+
+    Args:
+        commands: in order.
+        axes: the bank axes they are for.
+        replace: whether they replace what the axes do.
+        now_ns: instant of the write.
+    """
+
+    commands: list[Command]
+    axes: frozenset[int]
+    replace: bool
+    now_ns: int
+
+
+class PlainCheck:
+    """Tells which records are plain and good. Pure; concurrency: that of the bank.
+
+    Args:
+        offered: control-mode flags that each axis can do.
+        limits: of the axes, kept up to date by their owner.
+    """
+
+    def __init__(self, offered: Sequence[int], limits: Limits) -> None:
+        self._offered = list(offered)
+        self._minimum, self._maximum = limits.minimum, limits.maximum
+        self._checks: dict[int, tuple[Check, ...]] = {}
+        for quantity in _QUANTITIES:
+            for beside in range(1 << len(_BESIDE)):
+                mode = quantity | sum(flag for i, flag in enumerate(_BESIDE) if beside >> i & 1)
+                self._checks[mode] = tuple(
+                    (_COLUMN[rule.field], getattr(limits, rule.bound) if rule.bound else None, rule.positive)
+                    for rule in RULES
+                    if mode & rule.flag
+                )
+
+    def command(self, record: tuple[Any, ...], axis: int) -> Command | None:
+        """Return a record of the wire as a command of a bank axis; None when it is not plain, or bad."""
+        mode = record[1]
+        checks = self._checks.get(mode)
+        if checks is None or mode & ~self._offered[axis]:
+            return None
+        for column, bound, positive in checks:
+            value = record[column]
+            most = GREATEST if bound is None else min(bound[axis], GREATEST)
+            if not -most <= value <= most or (positive and value <= 0):
+                return None
+        if mode & modes.POSITION:
+            position = record[4]
+            low, high = max(self._minimum[axis], -GREATEST), min(self._maximum[axis], GREATEST)
+            if not low <= position <= high:
+                return None
+        return Command._make((axis, mode, 0, 0, *record[4:], 0, 0))
