@@ -74,7 +74,6 @@ class Clients:
         self._opens: list[tuple[Wait, Callable[[], bool]]] = []
         self._numbers = itertools.count(1)
         listener.setblocking(False)
-        server.loop.watch(listener.fileno(), self._accept)
 
     @property
     def bounds(self) -> WorkcellTable:
@@ -82,6 +81,10 @@ class Clients:
         return self._server.config.workcell if self._server.config else WorkcellTable()
 
     # --- connections -----------------------------------------------------------------------------
+
+    def welcome(self) -> None:
+        """Begin to accept clients; those that came while the configuration was loading have waited."""
+        self._server.loop.watch(self._listener.fileno(), self._accept)
 
     def _accept(self) -> None:
         try:

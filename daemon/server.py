@@ -185,6 +185,8 @@ class Server:
                 self._retire(device)
         for name in plan.config.devices:
             self._start(name)
+        if first:
+            self.clients.welcome()
         if old is not None:
             old.close()
         self._maybe_ready()

@@ -148,7 +148,8 @@ class SimIo(TickDriver):
             for table in settings.gripper
         ]
         self._waves: dict[int, SquareWave] = {}
-        self._seen_ns: int | None = None
+        self._positions: dict[int, float] = {}
+        self._seen_ns = 0
         self._last_ns = 0
 
     @property
@@ -203,16 +204,23 @@ class SimIo(TickDriver):
         return edges
 
     def _beam_edges(self, now_ns: int) -> list[tuple[Edge, int]]:
-        """Sample the beams at the nodes' own time, once for each of their snapshots."""
+        """Sample the beams at every snapshot of the nodes, at the nodes' own time: a late tick misses none."""
         if not self._beams:
             return []
-        readings = [self.kit.inputs[node].read(now_ns) for node in self._nodes]
-        stamp_ns = max(self.kit.inputs[node].stamp_ns for node in self._nodes)
-        positions = [float(reading[0, 0]) for reading in readings if reading is not None]
-        if len(positions) < len(readings) or stamp_ns == self._seen_ns:
-            return []
-        self._seen_ns = stamp_ns
-        return [(edge, bit) for bit, beam in self._beams for edge in beam.sample(positions, stamp_ns)]
+        news: dict[int, dict[int, float]] = {}
+        for index, node in enumerate(self._nodes):
+            for stamp_ns, reading in self.kit.inputs[node].fresh(now_ns):
+                news.setdefault(stamp_ns, {})[index] = float(reading[0, 0])
+        edges = []
+        for stamp_ns in sorted(news):
+            self._positions.update(news[stamp_ns])
+            if len(self._positions) == len(self._nodes) and stamp_ns > self._seen_ns:
+                self._seen_ns = stamp_ns
+                positions = [self._positions[index] for index in range(len(self._nodes))]
+                edges += [
+                    (edge, bit) for bit, beam in self._beams for edge in beam.sample(positions, stamp_ns)
+                ]
+        return edges
 
     def _gripper_edges(self, now_ns: int) -> list[tuple[Edge, int]]:
         edges: list[tuple[Edge, int]] = []

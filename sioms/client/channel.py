@@ -25,7 +25,7 @@ from array import array
 from struct import pack
 from time import monotonic
 
-from sioms.protocol.messages import MAX_PACKET, MalformedMessage, decode, encode
+from sioms.protocol.messages import MAX_PACKET, HandleVerb, MalformedMessage, decode, encode
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ _CMSG_CLOEXEC = 0x40000000
 _DONTWAIT = 0x40
 _ANCILLARY = CMSG_SPACE(8 * 4)
 _FOREVER = pack("ll", 0, 0)
+KEEPALIVE = encode(HandleVerb.KEEPALIVE, 0)
 GRACE_S = 2.0
 """How much longer than its own time-out an answer may take before the other side counts as hung."""
 
@@ -95,6 +96,10 @@ class Channel:
     Args:
         sock: the socket, owned by the channel from now on.
         name: whose it is, for messages: the daemon, or a node.
+
+    Attributes:
+        keepalive_s: while a thread waits for an answer, it tells the other side this often [s] that it
+            lives; 0 = never. The waiting thread itself does, so that a program that hangs is silent.
     """
 
     def __init__(self, sock: socket, name: str) -> None:
@@ -106,6 +111,7 @@ class Channel:
         self._answers: dict[int, tuple[list, list[int]]] = {}  # type: ignore[type-arg]
         self._waiting: dict[int, object] = {}
         self._timeout = 0.0
+        self.keepalive_s = 0.0
         self._ended: tuple[int, str] | None = None
 
     @property
@@ -220,15 +226,19 @@ class Channel:
         """Read packets until the one with this number has come; None when it is late."""
         while True:
             if deadline is None:
-                timeout = 0.0
+                timeout = self.keepalive_s
             else:
                 timeout = deadline - monotonic()
                 if timeout <= 0:
                     return None
+                if self.keepalive_s:
+                    timeout = min(timeout, self.keepalive_s)
             self._set_timeout(timeout)
             try:
                 message, fds = self._packet(0)
             except BlockingIOError:
+                if self.keepalive_s:
+                    self.notice(KEEPALIVE)
                 continue
             if message[1] == number:
                 return message, fds
@@ -265,7 +275,7 @@ class Channel:
 
     def _set_timeout(self, timeout: float) -> None:
         # In steps, because setting it is a system call: an answer is seldom late.
-        coarse = 0.0 if not timeout else max(0.05, timeout if timeout < 1.0 else float(int(timeout) + 1))
+        coarse = 0.0 if not timeout else max(0.001, timeout if timeout < 1.0 else float(int(timeout) + 1))
         if coarse != self._timeout:
             self._timeout = coarse
             seconds = int(coarse)

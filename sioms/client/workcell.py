@@ -141,7 +141,8 @@ class Workcell:
                 ``.readonly`` companion opens any number of times.
             timeout: how long to wait for it to be free [s]; 0: not; None: for ever.
             lease: longest silence of this client [s] before its axes are halted, for programs that may
-                hang; 0: none. Any request, or ``keepalive``, renews it.
+                hang; 0: none. Any request of the node renews it, ``keepalive`` does, and a call that
+                waits on the node keeps renewing it.
 
         Returns:
             An AxisNode, AnalogNode or BinaryNode.
@@ -152,7 +153,7 @@ class Workcell:
         """
         answer = self._channel.call(open_call(name, mode, timeout, lease))
         core = node_parts(answer.value, answer.fds)
-        return NODE[core[0].node_class](core, self._close_handle)
+        return NODE[core[0].node_class](core, self._close_handle, lease)
 
     def _close_handle(self, handle: int) -> None:
         try:

@@ -47,9 +47,12 @@ class InputNode(Protocol):
         Integer fields (status, binary data) are int64 in the same memory: ``.view(np.int64)``.
         """
 
+    def fresh(self, now_ns: int) -> list[tuple[int, NDArray[np.float64]]]:
+        """Return all snapshots since the last look, oldest first, as (stamp_ns, readings)."""
+
     @property
     def stamp_ns(self) -> int:
-        """Time stamp of what ``read`` returned last [ns]."""
+        """Time stamp of what was returned last [ns]."""
 
 
 class Kit(Protocol):

@@ -22,6 +22,7 @@ class Input:
     def __init__(self, name: str) -> None:
         self.name = name
         self.stamp_ns = 0
+        self._number = 0
         self._reader: PageReader | None = None
         self._map: mmap.mmap | None = None
 
@@ -36,6 +37,7 @@ class Input:
         self._channels = np.array(channels, dtype=np.intp)
         self._all = list(channels) == list(range(self._reader.channels))
         self._bit = bit
+        self._number = 0
 
     def detach(self) -> None:
         """Let the page go."""
@@ -52,7 +54,32 @@ class Input:
             raw = self._reader.latest(now_ns)
         except NotReadable:
             return None
-        self.stamp_ns = slot_header(raw)[1]
+        self._number, self.stamp_ns, _ = slot_header(raw)
+        return self._values(raw)
+
+    def fresh(self, now_ns: int) -> list[tuple[int, NDArray[np.float64]]]:
+        """Return all snapshots since the last look, oldest first, as (stamp_ns, readings as of ``read``).
+
+        None is lost as long as the looks are no further apart than what the page keeps; nothing comes
+        while the device is not there.
+        """
+        if self._reader is None:
+            return []
+        try:
+            self._reader.check(now_ns)
+        except NotReadable:
+            return []
+        reader, head = self._reader, self._reader.head
+        first = max(self._number + 1, head - reader.slots + 2, 1) if self._number else max(head, 1)
+        found = []
+        for number in range(first, head + 1):
+            raw = reader.numbered(number)
+            if raw is not None:
+                self._number, self.stamp_ns, _ = slot_header(raw)
+                found.append((self.stamp_ns, self._values(raw)))
+        return found
+
+    def _values(self, raw: bytes) -> NDArray[np.float64]:
         values = np.frombuffer(raw, np.float64, offset=SLOT_HEADER).reshape(self._fields, -1)
         if not self._all:
             values = values[:, self._channels]

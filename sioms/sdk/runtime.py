@@ -390,14 +390,11 @@ class Runtime:
         os.ftruncate(fd, size)
         self._page_fds = [*getattr(self, "_page_fds", []), fd]
         lease_ns = int(self._description.lease_s * 1e9)
-        return PageWriter(
-            memoryview(mmap.mmap(fd, size)),
-            spec.node_class,
-            block.n,
-            spec.history,
-            lease_ns,
-            self._generation,
+        writer = PageWriter(
+            memoryview(mmap.mmap(fd, size)), spec.node_class, block.n, spec.history, lease_ns, self._generation
         )
+        writer.alive(time.monotonic_ns())
+        return writer
 
     def _make_engine(self) -> Engine:
         if isinstance(self.driver, TickDriver):
