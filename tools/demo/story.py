@@ -18,7 +18,7 @@ from .rig import Process, daemon, tool
 def tell(out: str, quick: bool, wire: bool) -> int:
     """Run the demo; return the exit status."""
     os.makedirs(out, exist_ok=True)
-    config = str(files("sioms").joinpath("etc/demo.toml"))
+    config = str(files("sioms.tools.demo").joinpath("demo.toml"))
     with tempfile.TemporaryDirectory(prefix="sioms-demo-") as folder:
         _chapter("Start the daemon", f"siomsd --config {os.path.relpath(config)}")
         began = time.monotonic()

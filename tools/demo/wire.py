@@ -22,7 +22,7 @@ def bench(folder: str, stack: ExitStack) -> str:
     stack.callback(io.end)
     stack.callback(Process([f"{base}.leadshine", "--link", drives, "--units", "1"], "ready").end)
     stack.callback(Process([f"{base}.adc", "--link", finger, "--channels", "16"], "ready").end)
-    text = files("sioms").joinpath("etc/bench-modbus.toml").read_text()
+    text = files("sioms.tools.demo").joinpath("bench-modbus.toml").read_text()
     names = {"drives": drives, "finger": finger, "io": io.ready_line.split()[-1]}
     for port, counterpart in PORTS.items():
         text = text.replace(port, names[counterpart])
