@@ -25,12 +25,22 @@ def run(tool: str, work: Callable[[Sequence[str]], None], words: Sequence[str] |
     Returns:
         0; 1 after a failure; 2 when the command line was wrong.
     """
+    as_program = words is None
     if words is None:
         # The interpreter's own handlers would turn both into tracebacks. A killed client's axes are halted
         # by their driver, so there is nothing to clean up that is not cleaned up by the end itself.
         _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
         _signal.signal(_signal.SIGPIPE, _signal.SIG_DFL)
         words = sys.argv[1:]
+    status = _status(tool, work, words)
+    if as_program:
+        # Leave without taking the interpreter apart: everything is written, and the kernel closes the rest.
+        sys.stdout.flush()
+        os._exit(status)
+    return status
+
+
+def _status(tool: str, work: Callable[[Sequence[str]], None], words: Sequence[str]) -> int:
     try:
         work(words)
     except HelpWanted as wanted:

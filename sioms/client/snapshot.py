@@ -6,7 +6,6 @@ one time stamp.
 
 from __future__ import annotations
 
-from collections import namedtuple
 from struct import Struct, unpack_from
 
 from sioms.protocol.flags import NodeClass
@@ -20,16 +19,6 @@ if TYPE_CHECKING:
 
     import numpy as np
     from numpy.typing import NDArray
-
-AxisReading = namedtuple("AxisReading", [name for name, _ in READ_FIELDS[NodeClass.AXIS]])  # type: ignore[misc]
-"""One axis: the fields of table F.3 and beyond it; units of the channel."""
-AnalogReading = namedtuple("AnalogReading", ["data", "flags"])
-BinaryReading = namedtuple("BinaryReading", ["data", "changed_ns", "edges"])
-_READING: dict[NodeClass, Callable[..., Any]] = {
-    NodeClass.AXIS: AxisReading,
-    NodeClass.ANALOG: AnalogReading,
-    NodeClass.BINARY: BinaryReading,
-}
 
 
 class Layout:
@@ -102,7 +91,10 @@ class Snapshot:
         count = self._layout.count
         if not -count <= channel < count:
             raise IndexError(f"channel {channel} of a node of {count}; want {-count} to {count - 1}")
-        return _READING[self._layout.node_class](
+        # Loaded when first used: named tuples are a tenth of the start time of a shell tool.
+        from .reading import READING
+
+        return READING[self._layout.node_class](
             *[self._row(row)[channel] for row in range(len(self._layout.fields))]
         )
 

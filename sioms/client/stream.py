@@ -7,7 +7,6 @@ its source; a refusal ends it, and nothing that was written after the refused on
 from __future__ import annotations
 
 import os
-from collections import deque
 from select import POLLIN, poll
 
 TYPE_CHECKING = False
@@ -33,7 +32,7 @@ class Stream:
         self.node = node
         self._channel = node._channel
         self._ahead = ahead
-        self._pending: deque[tuple[int, Call]] = deque()
+        self._pending: list[tuple[int, Call]] = []
         self._poll = poll()
         self._poll.register(self.fileno(), POLLIN)
 
@@ -79,5 +78,5 @@ class Stream:
             self._oldest()
 
     def _oldest(self) -> None:
-        number, call = self._pending.popleft()
+        number, call = self._pending.pop(0)
         self._channel.wait(number, call)

@@ -1,6 +1,10 @@
 """Enumerations of the protocol. The numbers are wire facts: never renumber, only append."""
 
-from enum import IntEnum, IntFlag
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from enum import IntEnum, IntFlag
+else:
+    from .enumeration import IntEnum, IntFlag
 
 PROTOCOL_VERSION = 1
 

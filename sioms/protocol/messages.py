@@ -8,9 +8,31 @@ Packets are bounded by MAX_PACKET; a larger write carries its records in a seale
 descriptor goes along. Whoever receives something else ends that connection, and nothing else.
 """
 
-from enum import IntEnum
+from __future__ import annotations
 
-import msgpack
+import sys
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from enum import IntEnum
+    from typing import Any
+else:
+    from .enumeration import IntEnum
+
+if "site" in sys.modules:
+    from msgpack import packb, unpackb
+
+    def _pack(value: object) -> bytes:
+        packed: bytes = packb(value, use_bin_type=True)
+        return packed
+
+    def _unpack(data: bytes) -> Any:
+        return unpackb(data, raw=False, use_list=True, strict_map_key=True)
+
+else:
+    # A shell tool, started with -S to be quick (docs/decisions/0002-start-of-pipe-tools.md).
+    from .wire import pack as _pack
+    from .wire import unpack as _unpack
 
 MAX_PACKET = 65536
 MAX_INLINE = 49152
@@ -96,8 +118,7 @@ class MalformedMessage(Exception):
 
 def encode(*parts: object) -> bytes:
     """Pack a message."""
-    packed: bytes = msgpack.packb(parts, use_bin_type=True)
-    return packed
+    return _pack(parts)
 
 
 def decode(packet: bytes) -> list[object]:
@@ -110,9 +131,7 @@ def decode(packet: bytes) -> list[object]:
         MalformedMessage: anything else.
     """
     try:
-        message = msgpack.unpackb(
-            packet, raw=False, use_list=True, strict_map_key=True
-        )
+        message = _unpack(packet)
     except Exception as error:  # msgpack raises a wide family for bad input, all of them meaning just this
         raise MalformedMessage(
             f"decode packet of {len(packet)} bytes: {type(error).__name__}: {error}"

@@ -154,7 +154,7 @@ def devout(daemon: Daemon) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
             subprocess.Popen(
                 [BIN / "devout", *arguments], env=environment(socket), stdin=subprocess.PIPE,
                 stderr=subprocess.PIPE, bufsize=0,
-            )  # fmt: skip
+            )
         )
         return running[-1]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -59,7 +60,7 @@ def test_any_cut_of_a_stream_gives_the_same_numbers(text, cuts, skip):
     whole.feed(b"")
     pieces = Tokens(skip)
     edges = sorted({0, len(data), *[c for c in cuts if c < len(data)]})
-    for low, high in zip(edges, edges[1:], strict=False):
+    for low, high in itertools.pairwise(edges):
         pieces.feed(data[low:high])
     pieces.feed(b"")
     assert (pieces.numbers, pieces.bad, pieces.skipped) == (whole.numbers, whole.bad, whole.skipped)
