@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
+from msgspec import Meta
 
 from sioms.wording import did_you_mean, explain, field_names
 
 Table = TypeVar("Table", bound=msgspec.Struct)
 RightName = Literal["read", "write", "stop", "administer"]
+Count = Annotated[int, Meta(ge=1, le=65536)]
+Seconds = Annotated[float, Meta(ge=0.05, le=3600.0)]
 
 
 class WorkcellTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -23,14 +26,14 @@ class WorkcellTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: str = "workcell"
     socket: str = ""
-    socket_mode: str = "0660"
+    socket_mode: Annotated[str, Meta(pattern="^0?[0-7]{3}$")] = "0660"
     socket_group: str = ""
     start_stopped: bool = False
-    daemon_lease_s: float = 0.5
-    max_sessions: int = 256
-    max_handles: int = 256
-    max_markers: int = 128
-    max_waits: int = 64
+    daemon_lease_s: Seconds = 0.5
+    max_sessions: Count = 256
+    max_handles: Count = 256
+    max_markers: Annotated[int, Meta(ge=0, le=1023)] = 128
+    max_waits: Count = 64
 
 
 class GrantTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -48,8 +51,8 @@ class DeviceTable(msgspec.Struct, frozen=True):
     driver: str
     description: str = ""
     on_loss: Literal["none", "stop"] = "none"
-    realtime_priority: int = 50
-    hang_s: float = 1.0
+    realtime_priority: Annotated[int, Meta(ge=0, le=99)] = 50
+    hang_s: Seconds = 1.0
     user: str = ""
 
 
@@ -121,16 +124,8 @@ def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
             nodes[name] = node
         if name in devices:
             errors.append(f"[node.{name}]: a device has this name already; choose another")
-    grants = [
-        grant
-        for i, table in enumerate(root.get("grant", []), 1)
-        if (grant := _convert(table, GrantTable, f"[[grant]] number {i}", errors)) is not None
-    ]
-    sources = [
-        source
-        for i, table in enumerate(root.get("emergency_stop", []), 1)
-        if (source := _convert(table, StopSourceTable, f"[[emergency_stop]] number {i}", errors)) is not None
-    ]
+    grants = _list(root, "grant", GrantTable, errors)
+    sources = _list(root, "emergency_stop", StopSourceTable, errors)
     if not devices and not errors:
         errors.append("read configuration: no [device.NAME] in it; want at least one")
     return Config(workcell, devices, nodes, grants, sources, folder), errors
@@ -154,6 +149,15 @@ def _tables(root: Mapping[str, Any], section: str, errors: list[str]) -> list[tu
         else:
             good.append((name, table))
     return good
+
+
+def _list(root: Mapping[str, Any], section: str, kind: type[Table], errors: list[str]) -> list[Table]:
+    found = root.get(section, [])
+    if not isinstance(found, list):
+        errors.append(f"{section}: want tables [[{section}]]")
+        return []
+    each = [_convert(table, kind, f"[[{section}]] number {i}", errors) for i, table in enumerate(found, 1)]
+    return [table for table in each if table is not None]
 
 
 def _is_name(name: str) -> bool:

@@ -6,6 +6,7 @@ Everything is checked before anything is touched, and all errors of all devices 
 from __future__ import annotations
 
 import os
+import pwd
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -108,6 +109,7 @@ class Loader:
         names = NameTable(
             {n: self._infos[n] for n in self._config.devices if n in self._infos}, self._config.nodes
         )
+        self._errors += _unknown_users(self._config)
         sources = self._stop_sources(names)
         if not self._errors:
             self._errors += names.errors
@@ -130,3 +132,14 @@ class Loader:
                 [node.block, node.channels[0], max(node.bit, 0), int(source.active)]
             )
         return found
+
+
+def _unknown_users(config: Config) -> list[str]:
+    """Return an error for each device whose driver shall run as somebody who does not exist."""
+    errors = []
+    for name, device in config.devices.items():
+        try:
+            pwd.getpwnam(device.common.user or "root")
+        except KeyError:
+            errors.append(f"[device.{name}]: user = {device.common.user}: no such user; create it or name another")
+    return errors
