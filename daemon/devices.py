@@ -196,31 +196,38 @@ class DriverProcess:
         self._timer = self._loop.after(_SHUTDOWN_S, lambda: self.kill("it did not end when asked to"))
 
     def _receive(self) -> None:
+        if self._sock is not None and self._take() is False:
+            self._exited()
+
+    def _take(self) -> bool | None:
+        """Take one packet; False at the end of file, None when there is none."""
         if self._sock is None:
-            return
+            return None
         try:
             packet, fds, _, _ = socket.recv_fds(self._sock, MAX_PACKET, 250)
         except BlockingIOError:
-            return
+            return None
+        except ConnectionResetError:
+            return self._take()  # a reset is reported once, ahead of what is still there to read
         except OSError:
-            packet, fds = b"", []
+            return False
         if not packet:
-            self._exited()
-            return
+            return False
         try:
             message: list[Any] = decode(packet)
             verb = DriverVerb(message[0])
         except (MalformedMessage, ValueError) as error:
             self.kill(f"its driver sent a malformed message: {error}")
-            return
+            return None
         if verb is DriverVerb.READY:
             self._ready(fds)
-            return
+            return True
         for fd in fds:
             os.close(fd)
         if verb is DriverVerb.LINK:
             self.link = (PageState(message[2]), message[3])
         self._owner.device_message(self, verb, message[2:])
+        return True
 
     def _ready(self, fds: list[int]) -> None:
         self._maps = [mmap.mmap(fd, 4096) for fd in fds]
@@ -243,6 +250,8 @@ class DriverProcess:
                 return
 
     def _exited(self) -> None:
+        while self._take():
+            pass  # its last words: why it failed, which handles it has ended
         if self._sock is None:
             return
         self._kill_process()  # a driver that closed its control socket has no business living on
