@@ -21,7 +21,6 @@ from _socket import (
     socket,
 )
 from _thread import allocate_lock
-from array import array
 from struct import pack
 from time import monotonic
 
@@ -90,21 +89,33 @@ def connect(path: str) -> socket:
     return sock
 
 
+def _fds_of(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
+    # Without the module array: it drags a third of the start time of a shell tool behind it.
+    fds: list[int] = []
+    for level, kind, data in ancillary:
+        if level == SOL_SOCKET and kind == SCM_RIGHTS:
+            fds += memoryview(data[: len(data) - len(data) % 4]).cast("i")
+    return fds
+
+
 class Channel:
     """Requests and answers on a connected socket.
 
     Args:
         sock: the socket, owned by the channel from now on.
         name: whose it is, for messages: the daemon, or a node.
+        passed: whether answers may bring descriptors along; those of drivers never do, and looking for
+            them takes time.
 
     Attributes:
         keepalive_s: while a thread waits for an answer, it tells the other side this often [s] that it
             lives; 0 = never. The waiting thread itself does, so that a program that hangs is silent.
     """
 
-    def __init__(self, sock: socket, name: str) -> None:
+    def __init__(self, sock: socket, name: str, passed: bool = True) -> None:
         self.name = name
         self._sock = sock
+        self._passed = passed
         self._number = 0
         self._mutex = allocate_lock()
         self._reading = False
@@ -146,7 +157,7 @@ class Channel:
                 )
             try:
                 if call.fds:
-                    self._sock.sendmsg([packet], [(SOL_SOCKET, SCM_RIGHTS, array("i", call.fds))])
+                    self._sock.sendmsg([packet], [(SOL_SOCKET, SCM_RIGHTS, pack(f"{len(call.fds)}i", *call.fds))])
                 else:
                     self._sock.send(packet)
             except OSError as error:
@@ -249,18 +260,17 @@ class Channel:
                 turn.release()  # type: ignore[attr-defined]
 
     def _packet(self, flags: int) -> tuple[list, list[int]]:  # type: ignore[type-arg]
+        fds: list[int] = []
         try:
-            packet, ancillary, _, _ = self._sock.recvmsg(MAX_PACKET, _ANCILLARY, flags | _CMSG_CLOEXEC)
+            if self._passed:
+                packet, ancillary, _, _ = self._sock.recvmsg(MAX_PACKET, _ANCILLARY, flags | _CMSG_CLOEXEC)
+                fds = _fds_of(ancillary)
+            else:
+                packet = self._sock.recv(MAX_PACKET, flags)
         except BlockingIOError:
             raise
         except OSError as error:
             raise self._gone(error, "receive") from None
-        fds: list[int] = []
-        for level, kind, data in ancillary:
-            if level == SOL_SOCKET and kind == SCM_RIGHTS:
-                received = array("i")
-                received.frombytes(data[: len(data) - len(data) % 4])
-                fds += received
         if not packet:
             raise self._gone(None, "receive")
         try:

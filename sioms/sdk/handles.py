@@ -43,6 +43,7 @@ class Handle:
         lease_ns: longest silence allowed to the client, 0 = any.
         every: eventfd is written on every n-th publication; 0 = not; -1 = when a binary edge came.
         waits: unanswered requests by message number; each has a way to be ended.
+        writes: whether it may write.
     """
 
     number: int
@@ -63,11 +64,10 @@ class Handle:
     countdown: int = 0
     waits: dict[int, Wait] = field(default_factory=dict)
     full: Callable[[], tuple[Any] | None] | None = None
+    writes: bool = field(init=False)
 
-    @property
-    def writes(self) -> bool:
-        """Whether it may write."""
-        return self.exclusive and bool(self.access & Access.WRITE)
+    def __post_init__(self) -> None:
+        self.writes = self.exclusive and bool(self.access & Access.WRITE)
 
     def answer(self, number: int, value: object = None) -> None:
         """Reply to a request; a client that does not read is found dead later, by its socket or its lease."""

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .runtime import Runtime
 
 _DTYPE = {cls: np.dtype(numpy_dtype(cls)) for cls in NodeClass}
+_REPLACE = int(WriteFlag.REPLACE)
 LATER = object()
 """Returned instead of a value when the answer comes later."""
 
@@ -77,7 +78,7 @@ def _write_axes(
     records: NDArray[Any], what: str,
 ) -> Any:  # fmt: skip
     bank = handle.block.bank  # type: ignore[union-attr]
-    replace = bool(flags & WriteFlag.REPLACE)
+    replace = bool(flags & _REPLACE)
 
     def attempt() -> None:
         try:
@@ -162,7 +163,7 @@ def _output_values(
 # --- ioctl ---------------------------------------------------------------------------------------
 
 _NEEDS_OWNER = {
-    Request.CALIBRATE_DEVICE, Request.HOME, Request.SET_LIMITS, Request.FLUSH,
+    Request.CALIBRATE_DEVICE, Request.HOME, Request.SET_LIMITS, Request.FLUSH, Request.ZERO_DEVICE, Request.SET_GAINS,
 }  # fmt: skip
 _NEEDS_RIGHT = {
     Request.EMERGENCY_STOP: Right.STOP,
@@ -192,9 +193,7 @@ def ioctl(
         raise _refuse(errno.ENOTTY, f"ioctl {request_number} on {handle.node}: no such request") from None
     what = f"{request.name} on {handle.node}"
     owns = handle.exclusive or not _writable(handle)
-    if request in _NEEDS_OWNER and not (owns and handle.exclusive):
-        raise _refuse(errno.EBADF, f"{what}: needs the output node itself, not its read-only companion")
-    if request in (Request.ZERO_DEVICE, Request.SET_GAINS) and not owns:
+    if request in _NEEDS_OWNER and not owns:
         raise _refuse(errno.EBADF, f"{what}: needs the output node itself, not its read-only companion")
     right = _NEEDS_RIGHT.get(request, Right.READ)
     if not handle.rights & right:

@@ -15,6 +15,7 @@ import select
 import socket
 import time
 import traceback
+from array import array
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -49,6 +50,7 @@ STOP_GRACE_NS = 2_000_000_000
 """How long axes may take to stop before the process ends all the same."""
 PACKETS_A_TURN = 8
 PAGE = 4096
+_TWO_FDS = socket.CMSG_LEN(2 * 4)
 
 
 def run(
@@ -66,7 +68,7 @@ def run(
         device: device name.
         settings: its validated settings.
         generation: number of this process among the device's.
-        options: stop_sources, daemon_lease_s, realtime_priority, user.
+        options: stop_sources, daemon_lease_s, realtime_priority, user, phase of the tick [period].
         fds: control socket, latch page, stop-request page, marker table.
     """
     name_process(f"sioms:{device}")
@@ -110,6 +112,7 @@ class Runtime:
         self._leased: list[Handle] = []
         self._links: dict[int, tuple[PageState, str]] = {}
         self._stop_sources = [tuple(source) for source in options["stop_sources"]]
+        self._phase = float(options["phase"])
         self._daemon_lease_ns = int(float(options["daemon_lease_s"]) * 1e9)
         self._daemon_late = False
         self._ending_ns = 0
@@ -274,7 +277,8 @@ class Runtime:
         self.watch(self._line_timer.fd, self._on_line_timer)
         self._tell_ready()
         self._look_at_latch()
-        self._scheduled_ns = time.monotonic_ns() // self.period_ns * self.period_ns + self.period_ns
+        phase_ns = int(self._phase * self.period_ns)
+        self._scheduled_ns = (time.monotonic_ns() // self.period_ns + 2) * self.period_ns + phase_ns
         self._timer.set(self._scheduled_ns, self.period_ns)
         self._scheduled_ns -= self.period_ns
         status = 0
@@ -574,11 +578,12 @@ class Runtime:
             if handle.number not in self._handles:
                 return
             try:
-                packet, fds, flags, _ = socket.recv_fds(handle.sock, MAX_PACKET, 2)
+                packet, ancillary, flags, _ = handle.sock.recvmsg(MAX_PACKET, _TWO_FDS)
             except BlockingIOError:
                 return
             except OSError:
-                packet, fds, flags = b"", [], 0
+                packet, ancillary, flags = b"", [], 0
+            fds = _fds_of(ancillary) if ancillary else []
             handle.heard_ns = time.monotonic_ns()
             try:
                 if not packet:
@@ -675,6 +680,15 @@ class Runtime:
             self.engine.write_outputs(None, 0, block, [channel], [value])
         except OSError as error:
             self.log("error", f"safe output of {handle.node} could not be set: {error.strerror}")
+
+
+def _fds_of(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
+    """Return the descriptors that came along with a packet."""
+    fds = array("i")
+    for level, kind, data in ancillary:
+        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
+            fds.frombytes(data[: len(data) - len(data) % fds.itemsize])
+    return fds.tolist()
 
 
 def _records_of(fds: list[int]) -> bytes:
