@@ -53,7 +53,7 @@ def test_axes_move_as_they_do_by_the_general_way(commands):
     rigs = [Rig([axis(), axis()]) for _ in range(2)]
     general(rigs[1])
     for mode, value, index, replace, ticks in commands:
-        fields = {name: value for name in FIELDS[:6]}
+        fields = dict.fromkeys(FIELDS[:6], value)
         for rig in rigs:
             outcome(rig, records(mode=mode, axis=index, **fields), replace)
             rig.tick(ticks)
