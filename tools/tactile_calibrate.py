@@ -21,7 +21,7 @@ from sioms.tactile.estimator import Estimator, Load, ShapeEstimate
 from sioms.tactile.finger import Finger, from_toml, to_toml
 from sioms.tactile.identify import series_of
 from sioms.tactile.linearity import linearise
-from sioms.tactile.touches import Recording, Touches, join
+from sioms.tactile.touches import Recording, Touches, join, ramps_of
 from sioms.tools.report_page import Page
 from sioms.tools.tactile import Progress
 from sioms.tools.tactile_data import Data, read_folder
@@ -35,7 +35,9 @@ def calibrate(args: argparse.Namespace) -> int:
     data = read_folder(args.data)
     progress(f"read {len(data.recordings)} recordings, {sum(map(len, data.touches.values()))} touches")
     options = Options(math.radians(args.edge_deg), not args.no_map, args.contact)
-    result = fit(data.nominal, join(list(data.touches.values())), options, progress)
+    ramp = data.recordings.get("ramp")
+    ramps = [] if ramp is None else ramps_of(ramp, data.nominal.signal.scale)
+    result = fit(data.nominal, join(list(data.touches.values())), options, progress, ramps)
     args.output.write_text(to_toml(result.finger), encoding="utf-8")
     from_toml(args.output.read_text(encoding="utf-8"))  # what was written can be read
     report = args.report or args.output.with_suffix(".html")
@@ -101,7 +103,7 @@ def _elements(page: Page, result: Calibration) -> None:
 
 
 def _deviation(value: float) -> str:
-    return f"{value / 100:.4f}" if math.isfinite(value) else "common value"
+    return f"{value / 100:.4f}" if math.isfinite(value) else "no load series"
 
 
 def _grid(count: int, height: float = 2.0) -> tuple[Figure, list[Axes]]:

@@ -30,8 +30,8 @@ from sioms.tactile.emap import e_map
 from sioms.tactile.finger import ContactKind, ContactModel, Elements, Finger, Geometry, IdentifiedMap
 from sioms.tactile.identify import Identified, corrected, series_of, truncated
 from sioms.tactile.indenter import Wedge
-from sioms.tactile.linearity import Quadratic, find_quadratic, linearise
-from sioms.tactile.touches import Touches, TouchLoads, touch_loads
+from sioms.tactile.linearity import Quadratic, find_quadratic, linearise, ramp_quadratic, with_ramps
+from sioms.tactile.touches import Ramp, Touches, TouchLoads, touch_loads
 from sioms.tactile.width import WidthTable, hertz_table, rigid_core_table
 
 Floats = NDArray[np.float64]
@@ -97,6 +97,7 @@ def calibrate(
     touches: Touches,
     options: Options = Options(),
     tick: Callable[[str], None] = lambda what: None,
+    ramps: list[Ramp] | None = None,
 ) -> Calibration:
     """Calibrate a finger.
 
@@ -105,6 +106,7 @@ def calibrate(
         touches: averaged touches with raw outputs.
         options: what is allowed.
         tick: called with a few words at every step of progress.
+        ramps: load ramps over elements, for the differences of their quadratics.
 
     Raises:
         ValueError: too few touches, wrong number of elements, or outputs of the wrong sign.
@@ -117,7 +119,8 @@ def calibrate(
     loads = touch_loads(body, widths, touches, HIGHEST, options.edge_half_angle_rad)
     recorded = touches
     begin = starts(body, np.array(nominal.angles_rad), np.array(nominal.elements.radius_m), touches)
-    quadratic = _quadratic(body, begin, recorded, loads)
+    ramped = _Ramps(body, ramps or [], options)
+    quadratic = ramped.join(begin, _quadratic(body, begin, recorded, loads))
     if quadratic is None:
         warnings.append(
             "no place was touched with three loads or more over a factor of two: quadratic not fitted"
@@ -127,10 +130,12 @@ def calibrate(
         # look
         touches = recorded.with_output(linearise(recorded.output, quadratic.value))
         deep = fit_elements(body, begin, touches, loads, 0.0, Freedom(True, True), lambda: tick("first fit"))
-        quadratic = _quadratic(body, deep, recorded, loads) or quadratic
+        quadratic = ramped.join(deep, _quadratic(body, deep, recorded, loads)) or quadratic
         touches = recorded.with_output(linearise(recorded.output, quadratic.value))
         few = int(np.count_nonzero(~np.isfinite(quadratic.deviation)))
-        if few:
+        if not quadratic.groups.any():
+            warnings.append("the quadratic comes from load ramps alone: creep during the ramp is in it")
+        elif few and not ramps:
             warnings.append(
                 f"{few} of {quadratic.value.size} elements have too few load series for a quadratic of their own: "
                 f"theirs is the common {quadratic.common:.3g}"
@@ -217,6 +222,38 @@ def _quadratic(body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads) 
         for fit in fits
     ]
     return find_quadratic(touches, np.stack(model, axis=1))
+
+
+class _Ramps:
+    """Hold the tractions of an edge over the range of the ramps' loads, to ask the model again with other depths."""
+
+    _LOADS = 9
+
+    def __init__(self, body: Cylinder, ramps: list[Ramp], options: Options) -> None:
+        self._body, self._ramps = body, ramps
+        if not ramps:
+            return
+        top = max(float(ramp.load.max()) for ramp in ramps)
+        self._load = np.linspace(0.02 * top, top, self._LOADS)
+        none = np.zeros(self._LOADS)
+        self._touches = Touches(none[:, None], none, self._load, none, self._load, np.zeros(1))
+        widths = rigid_core_table(body)
+        self._loads = touch_loads(body, widths, self._touches, HIGHEST, options.edge_half_angle_rad)
+
+    def join(self, fits: Fits, series: Quadratic | None) -> Quadratic | None:
+        """Return the quadratic of load series and ramps together."""
+        found = np.full(len(fits), np.nan)
+        for ramp in self._ramps:
+            fit = fits[ramp.element]
+            if fit is not None:
+                strain = strain_of(
+                    self._body, 0.0, fit.radius_m, fit.poisson, self._touches, self._loads, 0.0
+                )
+                # strain per load is nearly constant: interpolate that
+                found[ramp.element] = ramp_quadratic(
+                    ramp.output, ramp.load * np.interp(ramp.load, self._load, strain / self._load)
+                )
+        return with_ramps(found, series) if np.isfinite(found).any() else series
 
 
 def _contact(

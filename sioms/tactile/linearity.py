@@ -96,6 +96,36 @@ def _jackknife(pairs: list[Pair]) -> float:
     return float(np.sqrt((len(pairs) - 1) * np.mean((without - without.mean()) ** 2)))
 
 
+def ramp_quadratic(output: Floats, model: Floats) -> float:
+    """Return q of one element from a load ramp over it, creep included.
+
+    Args:
+        output: of the element, shape (frames,).
+        model: its strain by the model at the same frames, negative; only the shape matters.
+    """
+    return _fit([(output, -model)])
+
+
+def with_ramps(ramps: Floats, series: Quadratic | None) -> Quadratic:
+    """Join ramps (nan where an element has none) and load series.
+
+    Elements that have both give the level; without any, the ramps' own level stands, with creep's bias in it.
+    """
+    if series is None:
+        common = float(np.nanmedian(ramps))
+        nothing = np.zeros(ramps.size, dtype=np.int64)
+        return Quadratic(
+            np.where(np.isfinite(ramps), ramps, common), np.full(ramps.size, np.inf), nothing, common
+        )
+    both = np.isfinite(ramps) & (series.groups > 0)
+    if not both.any():
+        return series
+    weight = series.groups[both].astype(np.float64)
+    level = series.common - float(weight @ ramps[both] / weight.sum())
+    value = np.where(np.isfinite(ramps), ramps + level, series.value)
+    return Quadratic(value, series.deviation, series.groups, series.common)
+
+
 def _groups(touches: Touches) -> list[NDArray[np.intp]]:
     keys = np.stack(
         [np.round(touches.angle_rad, 5), np.where(np.isinf(touches.radius_m), 1e9, touches.radius_m)], axis=1

@@ -139,6 +139,40 @@ def average(recording: Recording, angle_rad: Floats, load: Floats, radius_m: Flo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Ramp:
+    """Hold a load ramp of an edge over one element; immutable.
+
+    Args:
+        element: number of the element.
+        output: of that element, shape (frames,).
+        load: smoothed [N/m], > 0, shape (frames,).
+    """
+
+    element: int
+    output: Floats
+    load: Floats
+
+
+def ramps_of(recording: Recording, scale: float) -> list[Ramp]:
+    """Read load ramps: touch n lies over element n; the load is the straight line through the load cell's readings."""
+    out = []
+    for number in np.unique(recording.touch[recording.touch >= 0]):
+        mine = recording.touch == number
+        before, under = mine & (recording.phase == BASELINE), mine & (recording.phase == LOADED)
+        if under.sum() < 20 or not before.any() or number >= recording.raw.shape[1]:
+            continue
+        clock = recording.time_s[under] - recording.time_s[under][0]
+        load = np.polyval(
+            np.polyfit(clock, recording.force[under] - recording.force[before].mean(), 1), clock
+        )
+        output = scale * (recording.raw[under, number] - recording.raw[before, number].mean())
+        pressed = load > 0.02 * load.max()
+        if np.isfinite(output).all() and np.isfinite(load).all() and load.max() > 0.0:
+            out.append(Ramp(int(number), output[pressed], load[pressed]))
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class TouchLoads:
     """Hold cosine coefficients of p and sine coefficients of q [Pa] about each touch, shape (nt, nc + 1)."""
 
