@@ -43,7 +43,8 @@ MANUALS: dict[str, Manual] = {
             "With -r, -t or -L the output is timed: a stream of numbers, each followed by a blank, flushed with every "
             "sample. Samples are taken on an absolute schedule. One whose time has passed when its turn comes is left "
             "out and does not count. With -N anywhere, each sample is a line that begins with the time since the "
-            "first sample in seconds and the number of the sample on the schedule.",
+            "first sample in seconds and the number of the sample on the schedule. On a busy machine a steady period wants "
+            "real-time priority, for those who may: chrt -f 1 devin ...",
             "Reading disturbs nobody: an output node is read through its read-only companion, also while another "
             "program owns it. A device that is lost, hung or in fault ends devin with an error; old data are never "
             "printed as new.",
