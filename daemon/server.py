@@ -199,6 +199,8 @@ class Server:
             "stop_sources": self._stop_sources.get(name, []),
             "daemon_lease_s": self.config.workcell.daemon_lease_s,
             "folder": self.config.folder,
+            # Golden-ratio steps: however many drivers there are, their ticks do not fall together.
+            "phase": (list(self.config.devices).index(name) * 0.6180339887) % 1.0,
         }
         device = DriverProcess(
             self.loop, self._current_nursery, self.config.devices[name], self.names.devices[name],

@@ -31,7 +31,9 @@ class ControlLaw:
         gains: arrays k, kz, kp, kb (n,) to use, rows of the published fields.
     """
 
-    def __init__(self, settings: Sequence[AxisSettings], tick_s: float, gains: Sequence[Vector] | Vector) -> None:
+    def __init__(
+        self, settings: Sequence[AxisSettings], tick_s: float, gains: Sequence[Vector] | Vector
+    ) -> None:
         n = len(settings)
         self.stepper = np.array([s.kind is AxisKind.STEPPER for s in settings], dtype=bool)
         self.k: Vector = gains[0]
@@ -40,7 +42,9 @@ class ControlLaw:
         self.kb: Vector = gains[3]
         for given in settings:
             if given.kind is AxisKind.SERVO and given.k is None:
-                raise ValueError(f"axis {given.name}: a servo needs the gain k; without it nothing holds its position")
+                raise ValueError(
+                    f"axis {given.name}: a servo needs the gain k; without it nothing holds its position"
+                )
         default = [1.0 / tick_s if s.kind is AxisKind.STEPPER else 0.0 for s in settings]
         self.k[:] = [d if s.k is None else s.k for s, d in zip(settings, default, strict=True)]
         self.kz[:] = [s.kz for s in settings]
@@ -65,6 +69,7 @@ class ControlLaw:
         self._u = np.zeros(n)
         self._term = np.zeros(n)
         self._low = np.zeros(n)
+        self._last_velocity = np.zeros(n)
 
     def step(
         self,
@@ -120,25 +125,40 @@ class ControlLaw:
         self, desired: Vector, desired_velocity: Vector, w_last: Vector, e_last: Vector, dt: float
     ) -> None:
         s = self.stepper_rows
+        dv, limit = desired_velocity[s], self.acceleration_limit[s]
         e = desired[s] - self.slewed[s]
-        free = self.k[s] * (e + self.kz[s] * e_last) - self.kp[s] * w_last + self.kb[s] * desired_velocity[s]
-        wish = self._brakable(free, e, desired_velocity[s], self.acceleration_limit[s], dt)
+        free = self.k[s] * (e + self.kz[s] * e_last) - self.kp[s] * w_last + self.kb[s] * dv
+        wish = self._brakable(free, e, dv, self._spare(limit, dv, s, dt), dt)
         # Rounding must not count as saturation: a profile at full acceleration is within the limits.
-        v, a = self.velocity_limit[s] * (1 + 1e-6), self.acceleration_limit[s] * dt * (1 + 1e-6)
+        v, a = self.velocity_limit[s] * (1 + 1e-6), limit * dt * (1 + 1e-6)
         w = np.clip(np.clip(wish, w_last - a, w_last + a), -v, v)
-        self.slewed[s] += w * dt
+        # Dead beat on a set-point that the limits allow to reach in this tick, however long it is.
+        locked = (self.k[s] * dt >= 0.999) & (self.kz[s] == 0.0) & (self.kp[s] == 0.0) & (self.kb[s] == 0.0)
+        locked &= (np.abs(dv - w_last) <= a) & (np.abs(dv) <= v)
+        locked &= np.abs(e - w_last * dt) <= 0.5 * a * dt + 1e-12
+        self.slewed[s] = np.where(locked, desired[s], self.slewed[s] + w * dt)
+        w = np.where(locked, dv, w)
         self.output[s] = w
         self.error[s] = e
-        self.saturated[s] = np.abs(w - free) > 1e-3 * v
+        self.saturated[s] = ~locked & (np.abs(w - free) > 1e-3 * v)
+
+    def _spare(
+        self, limit: Vector, desired_velocity: Vector, s: slice | NDArray[np.int64], dt: float
+    ) -> Vector:
+        """Return the acceleration that is left to catch up with a set-point that accelerates itself."""
+        own = np.abs(desired_velocity - self._last_velocity[s]) / dt
+        self._last_velocity[s] = desired_velocity
+        return np.maximum(limit - own, 0.05 * limit)
 
     @staticmethod
     def _brakable(free: Vector, e: Vector, desired_velocity: Vector, a: Vector, dt: float) -> Vector:
         """Bound the output velocity to what can still be braked on the way to the set-point.
 
         The lag that is not the set-point's own travel in this tick is closed at most within the
-        tick, and at most as fast as a deceleration a can stop there; else an output that was
-        clipped, or a tick that came late, would swing about the set-point for ever.
+        tick, and at most as fast as half of the spare deceleration a can stop there; else an output
+        that was clipped, or a tick that came late, would swing about the set-point for ever.
         """
+        a = 0.5 * a
         lag = np.abs(e - desired_velocity * dt)
         half = 0.5 * a * dt
         most = np.minimum(lag / dt, np.sqrt(2 * a * lag + half * half) - half)

@@ -65,6 +65,8 @@ class Planner:
         self._otg = ruckig.Ruckig(1)
         self._input = ruckig.InputParameter(1)
         self._trajectory = ruckig.Trajectory(1)
+        # The first plan of a process takes milliseconds (page faults); not in a tick, then.
+        self._optimal((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), Bounds(1.0, 1.0, 1.0, -math.inf, math.inf), None)
 
     def plan(self, command: Command, state: State, bounds: Bounds) -> Plan:
         """Return the plan of a position, velocity, acceleration or jerk command from a state.
