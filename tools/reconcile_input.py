@@ -237,4 +237,4 @@ def with_resolution(model: AxisModel, session: Session) -> AxisModel:
     moved = steps[steps > 1e-9 * max(top, 1e-12)]
     if not len(moved):
         raise BadInputError("read records: position is constant; needs motion")
-    return replace(model, resolution=float(np.quantile(moved, 0.01)))
+    return replace(model, resolution=float(np.min(moved)))

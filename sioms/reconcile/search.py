@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sioms.reconcile.blocks import better, block_ids, heldout
 from sioms.reconcile.effect import Array, Slot
-from sioms.reconcile.effects import known
+from sioms.reconcile.effects import known, library
 from sioms.reconcile.fit import Fit, Problem, refit
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.screen import Start, screen
@@ -207,14 +207,17 @@ def unspecific(name: str, gains: dict[str, float]) -> bool:
 
 
 def simplest(good: dict[str, tuple[Fit, Array, float, float]]) -> str:
-    """Of the candidates within one standard error and ``GAIN`` of the best, the one with the fewest parameters."""
+    """Of the candidates within one standard error and ``GAIN`` of the best, the one with the fewest parameters.
+
+    A named effect goes before a nameless term that does no better.
+    """
     best = max(good, key=lambda n: good[n][2])
     near = []
     for n, (_, loss, _, _) in good.items():
         lost, sure = better(good[best][1], loss)
         if lost < GAIN or sure < 1.0:
             near.append(n)
-    return min(near, key=lambda n: (size(n), -good[n][2]))
+    return min(near, key=lambda n: (n not in library(), size(n), -good[n][2]))
 
 
 def physical(fit: Fit, name: str) -> bool:
