@@ -101,8 +101,11 @@ class Server:
 
     def stop_workcell(self, source: str) -> None:
         """Latch the emergency stop and wake every driver."""
-        if self.shared.latch.stop(time.monotonic_ns(), source):
+        latch = self.shared.latch
+        if latch.stop(time.monotonic_ns(), source):
             self.log("warning", "emergency stop", source=source)
+        elif latch.source == self.shared.request.source:
+            latch.name_source(source)  # the drivers were faster than the message that tells the reason
         for device in self.devices.values():
             device.tell(DriverVerb.STOP_CHANGED)
 
@@ -266,7 +269,7 @@ class Server:
         if self.shared.request.word != self._request_seen:
             # A client that could not reach us has asked the drivers directly; they have acted already.
             self._request_seen = self.shared.request.word
-            self.stop_workcell("a client, through the stop-request page")
+            self.stop_workcell(self.shared.request.source)
         for device in list(self.devices.values()):
             device.check(now)
         self.loop.after(ALIVE_S, self._alive)

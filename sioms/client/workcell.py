@@ -246,7 +246,7 @@ class Workcell:
             why: for the log and for who asks why nothing moves.
         """
         if not node and self._request is not None:
-            self._request.request(monotonic_ns())
+            self._request.request(monotonic_ns(), os.getpid())
         self._call("emergency stop", ClientVerb.EMERGENCY_STOP, node, why)
 
     def reset(self, node: str = "") -> None:

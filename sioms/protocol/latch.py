@@ -54,9 +54,13 @@ class Latch:
         """Latch the stop; return whether it was not latched before."""
         if self._words[_STOPPED]:
             return False
-        self._bytes[_TEXT : _TEXT + _TEXT_SIZE] = source.encode()[: _TEXT_SIZE - 1].ljust(_TEXT_SIZE, b"\0")
+        self.name_source(source)
         self._words[_STOPPED] = now_ns
         return True
+
+    def name_source(self, source: str) -> None:
+        """Say better who stopped, of a stop that is latched already."""
+        self._bytes[_TEXT : _TEXT + _TEXT_SIZE] = source.encode()[: _TEXT_SIZE - 1].ljust(_TEXT_SIZE, b"\0")
 
     def reset(self) -> None:
         """Clear the latch (the daemon's, on behalf of somebody entitled)."""
@@ -81,15 +85,21 @@ class StopRequest:
     """
 
     def __init__(self, buffer: memoryview) -> None:
-        self._words = buffer[:8].cast("Q")
+        self._words = buffer[:16].cast("Q")
+
+    @property
+    def source(self) -> str:
+        """Who requested last, as far as it said."""
+        return f"pid {self._words[1]}, through the stop-request page"
 
     @property
     def word(self) -> int:
         """The present word; a change is a request."""
         return self._words[0]
 
-    def request(self, now_ns: int) -> None:
+    def request(self, now_ns: int, pid: int) -> None:
         """Request a stop of the workcell."""
+        self._words[1] = pid
         self._words[0] = now_ns if now_ns != self._words[0] else now_ns + 1
 
     def release(self) -> None:

@@ -395,7 +395,12 @@ class Runtime:
         self._page_fds = [*getattr(self, "_page_fds", []), fd]
         lease_ns = int(self._description.lease_s * 1e9)
         writer = PageWriter(
-            memoryview(mmap.mmap(fd, size)), spec.node_class, block.n, spec.history, lease_ns, self._generation
+            memoryview(mmap.mmap(fd, size)),
+            spec.node_class,
+            block.n,
+            spec.history,
+            lease_ns,
+            self._generation,
         )
         writer.alive(time.monotonic_ns())
         return writer
@@ -441,9 +446,7 @@ class Runtime:
     def _look_at_latch(self) -> None:
         latch, (seen_stop, seen_resets, seen_request) = self.latch, self._seen_stop
         word = self._request.word
-        if word != seen_request and latch.stop(
-            time.monotonic_ns(), "a client, through the stop-request page"
-        ):
+        if word != seen_request and latch.stop(time.monotonic_ns(), self._request.source):
             self._tell(DriverVerb.STOPPED, latch.source)
         stopped_ns, resets = latch.stopped_ns, latch.resets
         self._seen_stop = (stopped_ns, resets, word)

@@ -84,8 +84,9 @@ def daemon(config: str, socket_path: str) -> Process:
 
 def tool(name: str, *arguments: str, input_text: str | None = None) -> str:
     """Run a pipe tool and return what it prints."""
+    beside = os.path.join(os.path.dirname(sys.executable), name)
     done = subprocess.run(
-        [sys.executable, "-m", f"sioms.tools.{name}", *arguments],
+        [beside if os.path.exists(beside) else name, *arguments],
         input=input_text, text=True, capture_output=True, timeout=60, check=False,
     )  # fmt: skip
     if done.returncode:
