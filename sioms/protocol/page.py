@@ -233,7 +233,7 @@ class PageReader:
             offset = HEADER_SIZE + (number & self._mask) * self._size
             raw: bytes = self._buffer[offset : offset + self._size]
             # The writer may have lapped us between reading the head and copying.
-            if words[offset >> 3] == number and raw[:8] == number.to_bytes(8, "little"):
+            if words[offset >> 3] == number and raw[:8] == number.to_bytes(8, "little") and number:
                 return raw
             if number == 0:
                 raise NotReadable(PageState.STARTING, "nothing published yet")
