@@ -1,0 +1,83 @@
+"""Reading the configuration: every error is a sentence with its place, all of them at once."""
+
+from __future__ import annotations
+
+import pytest
+
+from sioms.daemon.config import parse
+
+GOOD = """
+[workcell]
+name = "w"
+[device.mod0]
+driver = "sim-axes"
+tick_hz = 500
+on_loss = "stop"
+[node."mod0.xy"]
+of = "mod0"
+channels = ["x", "y"]
+[[grant]]
+rights = ["read"]
+users = ["eva"]
+[[emergency_stop]]
+node = "io0.bit1"
+active = 1
+"""
+
+
+def errors(text: str) -> list[str]:
+    return parse(text, "/etc")[1]
+
+
+def test_a_good_configuration() -> None:
+    config, found = parse(GOOD, "/etc")
+    assert found == [] and config is not None
+    device = config.devices["mod0"]
+    assert device.common.driver == "sim-axes" and device.common.on_loss == "stop"
+    assert device.settings == {"tick_hz": 500}, "what the daemon does not read belongs to the driver"
+    assert config.nodes["mod0.xy"].channels == ["x", "y"]
+    assert config.grants[0].nodes == ["*"] and config.stop_sources[0].active == 1
+    assert config.folder == "/etc"
+
+
+def test_all_errors_at_once_in_the_order_of_the_sections() -> None:
+    found = errors(
+        '[workcel]\n[workcell]\nnam = "x"\n[device.a]\n[device.b]\ndriver = 3\n[node.n]\n[[grant]]\nrights = []\nuser = ["x"]\n'
+    )
+    assert [line.split(":")[0].split(";")[0] for line in found] == [
+        "unknown section [workcel]", "[workcell]", "[device.a]", "[device.b].driver", "[node.n]", "[[grant]] number 1",
+    ]  # fmt: skip
+    assert "did you mean workcell?" in found[0] and "did you mean name?" in found[1]
+    assert "key driver is missing" in found[2] and "did you mean users?" in found[5]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[device.x]\ndriver = 'd'\non_loss = 'halt'", "on_loss"),
+        ("[device.x]\ndriver = 'd'\nrealtime_priority = 100", "realtime_priority"),
+        ("[device.x]\ndriver = 'd'\nhang_s = 0", "hang_s"),
+        ("[device.readonly]\ndriver = 'd'", "a device name is"),
+        ("[device.'ä']\ndriver = 'd'", "a device name is"),
+        ("[device.'a.b']\ndriver = 'd'", "a device name is"),
+        ("[device.a]\ndriver = 'd'\n[node.a]\nof = 'b'", "a device has this name already"),
+        ("[node.'a..b']\nof = 'c'", "a node name is"),
+        ("[device]\nx = 1", "want a table [device.x]"),
+        ("[[device]]\nx = 1", "want tables [device.NAME]"),
+        ("[grant]\nrights = ['read']", "want tables [[grant]]"),
+        ("[workcell]\ndaemon_lease_s = nan", "daemon_lease_s"),
+        ("[workcell]\nsocket_mode = '777 '", "socket_mode"),
+        ("[workcell]\nsocket_mode = 432", "socket_mode"),
+        ("[workcell]\nmax_markers = 1024", "max_markers"),
+        ("[[emergency_stop]]\nnode = 'x'\nactive = 2", "active"),
+        ("x = [", "read configuration: "),
+        ("", "want at least one"),
+    ],
+)
+def test_errors(text: str, words: str) -> None:
+    assert any(words in line for line in errors(text)), errors(text)
+
+
+def test_values_at_their_ends_are_taken() -> None:
+    text = "[workcell]\nmax_markers = 1023\nmax_sessions = 1\nsocket_mode = '660'\n[device.a-b_1]\ndriver = 'd'\nrealtime_priority = 0\n"
+    assert errors(text) == []

@@ -1,0 +1,120 @@
+"""Latch, stop requests, marker table, records, node information, socket path."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sioms.protocol.flags import NodeClass
+from sioms.protocol.latch import LATCH_SIZE, REQUEST_SIZE, Latch, StopRequest
+from sioms.protocol.markers import MARKERS, TABLE_SIZE, MarkerTable, split_token, token_of
+from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.protocol.records import READ_SIZE, WRITE_STRUCT, numpy_dtype
+from sioms.protocol.socketpath import socket_path
+
+
+def test_the_latch_holds_its_first_stop_until_reset() -> None:
+    memory = bytearray(LATCH_SIZE)
+    latch, other = Latch(memoryview(memory)), Latch(memoryview(memory))
+    assert latch.stopped_ns == 0 and latch.source == ""
+    assert latch.stop(5, "eva") and not other.stop(6, "tom")
+    assert (other.stopped_ns, other.source, other.resets) == (5, "eva", 0)
+    latch.reset()
+    assert (other.stopped_ns, other.resets) == (0, 1)
+    assert other.stop(7, "ö" * 300) and 100 < len(latch.source) <= 128
+    latch.daemon_alive(9)
+    assert other.daemon_alive_ns == 9 and other.stopped_ns == 7
+
+
+def test_a_stop_and_reset_between_two_looks_shows() -> None:
+    latch = Latch(memoryview(bytearray(LATCH_SIZE)))
+    before = (latch.stopped_ns, latch.resets)
+    latch.stop(5, "x")
+    latch.reset()
+    assert (latch.stopped_ns, latch.resets) != before
+
+
+def test_every_request_changes_the_word() -> None:
+    request = StopRequest(memoryview(bytearray(REQUEST_SIZE)))
+    words = [request.word]
+    for now in (5, 5, 5, 6, 0):
+        request.request(now, 42)
+        assert request.word != words[-1]
+        words.append(request.word)
+    assert "pid 42" in request.source
+
+
+@pytest.fixture
+def table() -> MarkerTable:
+    return MarkerTable(memoryview(bytearray(TABLE_SIZE)))
+
+
+def test_a_marker_is_signalled_once(table: MarkerTable) -> None:
+    generation = table.reserve(5, 77)
+    assert table.is_reserved(5) and table.is_key(5, 77) and not table.is_key(5, 78) and not table.is_key(5, 0)
+    assert not table.is_signalled(5, generation)
+    assert table.signal(5, generation, 100) and not table.signal(5, generation, 200)
+    assert table.is_signalled(5, generation) and table.stamp_ns(5) == 100
+
+
+def test_generations_never_come_back(table: MarkerTable) -> None:
+    seen = set()
+    for key in range(1, 20):
+        generation = table.reserve(5, key)
+        assert generation == table.generation(5) and generation not in seen
+        seen |= {generation}
+        table.signal(5, generation, key)
+        table.free(5)
+        assert not table.is_reserved(5) and table.generation(5) not in seen
+        seen |= {table.generation(5)}
+        assert not table.is_key(5, key)
+    late = min(seen)
+    newest = table.reserve(5, 99)
+    table.signal(5, late, 1)
+    assert not table.is_signalled(5, newest)
+    assert table.signal(5, newest, 2), "a late signal of an old generation must not swallow the new one's"
+
+
+@pytest.mark.parametrize("number", [0, -1, MARKERS, 1 << 40])
+def test_numbers_beyond_the_table_are_not_reserved(table: MarkerTable, number: int) -> None:
+    assert not table.is_reserved(number) and not table.is_key(number, 1)
+
+
+@pytest.mark.parametrize(("number", "key"), [(1, 1), (1023, 1), (1, (1 << 40) - 1), (512, 123456789)])
+def test_a_token_survives_a_double(number: int, key: int) -> None:
+    token = token_of(number, key)
+    assert split_token(token) == (number, key) and int(float(token)) == token and 0 < token < 1 << 50
+    assert split_token(number) == (number, 0)
+
+
+def test_records_are_as_numpy_sees_them() -> None:
+    for node_class in NodeClass:
+        assert np.dtype(numpy_dtype(node_class)).itemsize == WRITE_STRUCT[node_class].size
+    assert (WRITE_STRUCT[NodeClass.AXIS].size, READ_SIZE[NodeClass.AXIS]) == (144, 104)
+    record = np.zeros(1, np.dtype(numpy_dtype(NodeClass.AXIS)))
+    record["axis"], record["max_force"], record["signal_marker_number"] = 3, 2.5, 1 << 49
+    fields = WRITE_STRUCT[NodeClass.AXIS].unpack(record.tobytes())
+    assert (fields[0], fields[2], fields[-1]) == (3, 1 << 49, 2.5)
+
+
+def test_channel_information_packs_and_unpacks() -> None:
+    info = ChannelInfo("x", "m", -1.0, None, 0, 15, {"velocity": 2.0}, "text")
+    again = ChannelInfo(*info.pack())
+    assert again.pack() == info.pack() and again.maximum is None and again.limits == {"velocity": 2.0}
+
+
+def test_socket_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("SIOMS_SOCKET", "/x/y")
+    assert socket_path() == "/x/y"
+    monkeypatch.delenv("SIOMS_SOCKET")
+    monkeypatch.setattr("sioms.protocol.socketpath.SYSTEM_PATH", str(tmp_path / "none"))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/5")
+    assert socket_path() == "/run/user/5/sioms/siomsd.sock"
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    assert socket_path() == f"/tmp/sioms-{os.getuid()}/sioms/siomsd.sock"
+    (tmp_path / "s").touch()
+    monkeypatch.setattr("sioms.protocol.socketpath.SYSTEM_PATH", str(tmp_path / "s"))
+    assert socket_path() == str(tmp_path / "s")
