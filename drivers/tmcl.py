@@ -1,0 +1,342 @@
+"""Trinamic modules and evaluation boards on TMCL, up to six motors a module.
+
+The module makes its own ramps. Its serial heartbeat (global parameter 68) is the dead-man: without a request for that long
+the motors stop.
+
+    [device.mod0]
+    driver = "tmcl"
+    line = { serial = "/dev/ttyUSB0", baud = 9600 }
+    module = 1140
+    [[device.mod0.axis]]
+    name = "xaxis"
+    motor = 0
+    travel_per_turn = 0.01
+    microsteps_per_turn = 51200
+    velocity_max = 0.1
+    acceleration_max = 1.0
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from sioms.motion import DriveAction
+from sioms.protocol.flags import ControlMode
+from sioms.sdk import drive_axes
+from sioms.sdk.blocks import BlockSpec, Description
+from sioms.sdk.codec.tmcl import SERIAL_HEARTBEAT, SIZE, Axis, Module, Op
+from sioms.sdk.drive_axes import POSITION_MODES, AxesUnit, drive_table
+from sioms.sdk.driver import Kit, LineDriver, LineUnit
+from sioms.sdk.exchange import DeviceError, Steps
+from sioms.sdk.settings import LineSettings
+
+MODES = POSITION_MODES | ControlMode.VELOCITY
+HIGHEST_INTERNAL = 2047
+DRIVER_FAULTS = {
+    1: "stall", 2: "overtemperature", 8: "short to ground, coil A", 16: "short to ground, coil B",
+}  # fmt: skip
+"""Bits of axis parameter 208 on the TMC26x and TMC5130 drivers; 4 (warning), 32, 64 (open load) and 128 are no faults."""
+EXTENDED_FAULTS = {1: "motor stalled", 2: "deviation from the encoder too large"}
+"""Bits of axis parameter 207."""
+FAULT_BITS = {Axis.DRIVER_ERRORS: DRIVER_FAULTS, Axis.EXTENDED_ERRORS: EXTENDED_FAULTS}
+SELDOM_NS = 500_000_000
+
+AxisTable: Any = drive_table(
+    {
+        "motor": (int, 0),
+        "travel_per_turn": (float, 2 * math.pi),
+        "microsteps_per_turn": (float, 51200.0),
+        "pulse_divisor": (int, 3),
+        "ramp_divisor": (int, 7),
+        "homing": (bool, False),
+        "home_required": (bool, False),
+    }
+)
+"""Keys of an axis: those of AxisSettings that a drive of its own loop leaves, and
+
+motor: number in the module; travel_per_turn: m or rad in one turn, negative to reverse the axis; microsteps_per_turn: full steps
+times microstep resolution; pulse_divisor, ramp_divisor: of the motor, for speed_unit = "internal" alone; homing: the
+module's reference search (parameters 193 to 195) may be used.
+"""
+
+
+class TmclSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Keys of the device.
+
+    Attributes:
+        line: to the module.
+        axis: its motors in use.
+        address: of the module.
+        host_address: that it answers to (global parameter 76).
+        module: number that it must tell, e.g. 1140; 0 takes any.
+        speed_unit: what the module counts speeds in: microsteps/s, or the internal units of TMC428/429.
+        clock_hz: of a TMC428/429.
+        heartbeat_s: time without a request after which the module stops its motors [s]; 0 = none.
+        turnaround_s: longest time that the module needs to answer [s].
+        recovery_s: silence after a bad or missing reply [s]; 0 takes 50 ms below 19200 baud, else 10 ms.
+        poll_hz: rate at which the module is read.
+        capacity: commands that each axis buffers.
+        history: snapshots kept for readers.
+    """
+
+    line: LineSettings
+    axis: list[AxisTable]
+    address: int = 1
+    host_address: int = 2
+    module: int = 0
+    speed_unit: Literal["microsteps/s", "internal"] = "microsteps/s"
+    clock_hz: float = 16e6
+    heartbeat_s: float = 0.5
+    turnaround_s: float = 0.05
+    recovery_s: float = 0.0
+    poll_hz: float = 20.0
+    capacity: int = 4096
+    history: int = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """From the unit of an axis to what its motor counts in.
+
+    Args:
+        per_unit: microsteps in one m or rad, negative when the axis is reversed.
+        per_speed: counts of a speed in one microstep/s.
+        per_acceleration: counts of an acceleration in one microstep/s^2.
+        highest: highest count of a speed or acceleration.
+    """
+
+    per_unit: float
+    per_speed: float
+    per_acceleration: float
+    highest: int
+
+    @staticmethod
+    def of(axis: Any, settings: TmclSettings) -> Scale:
+        """Return the scale of an axis.
+
+        For TMC428/429: speed = clock v / (2^pulse_divisor 2048 32), acceleration = clock^2 a / 2^(pulse_divisor +
+        ramp_divisor + 29), in microsteps/s and /s^2 (TMC429 datasheet, section 7.1).
+
+        Raises:
+            ValueError: zero gearing.
+        """
+        if not (axis.travel_per_turn and axis.microsteps_per_turn > 0):
+            raise ValueError(
+                f"axis {axis.name}: travel_per_turn = {axis.travel_per_turn:g}, microsteps_per_turn = "
+                f"{axis.microsteps_per_turn:g}; want a travel other than 0 and a positive number"
+            )
+        per_unit = axis.microsteps_per_turn / axis.travel_per_turn
+        if settings.speed_unit == "microsteps/s":
+            return Scale(per_unit, 1.0, 1.0, 2**31 - 1)
+        per_speed = 2**axis.pulse_divisor * 2048 * 32 / settings.clock_hz
+        per_acceleration = 2 ** (axis.pulse_divisor + axis.ramp_divisor + 29) / settings.clock_hz**2
+        return Scale(per_unit, per_speed, per_acceleration, HIGHEST_INTERNAL)
+
+    def position(self, si: float) -> int:
+        """Return a position in microsteps."""
+        return round(si * self.per_unit)
+
+    def speed(self, si: float) -> int:
+        """Return the size of a speed as the module counts it, at least 1 for what is not 0."""
+        return max(1, math.floor(abs(si * self.per_unit) * self.per_speed + 1e-9)) if si else 0
+
+    def acceleration(self, si: float) -> int:
+        """Return an acceleration as the module counts it, at least 1."""
+        return max(1, math.floor(abs(si * self.per_unit) * self.per_acceleration + 1e-9))
+
+    def check(self, axis: Any) -> None:
+        """Raise ValueError when a limit of the axis does not fit what the module counts in."""
+        for name, count in (
+            ("velocity_max", self.speed(axis.velocity_max)),
+            ("acceleration_max", self.acceleration(axis.acceleration_max)),
+        ):
+            if count > self.highest:
+                raise ValueError(
+                    f"axis {axis.name}: {name} is {count} in the module, which counts to {self.highest}; "
+                    f"want {getattr(axis, name) * self.highest / count:.4g} or other divisors"
+                )
+        for name in ("position_min", "position_max"):
+            value = getattr(axis, name)
+            if value is not None and abs(self.position(value)) >= 2**31:
+                raise ValueError(f"axis {axis.name}: {name} = {value:g} is beyond 2^31 microsteps")
+
+
+class TmclUnit(AxesUnit):
+    """One module."""
+
+    def __init__(self, name: str, settings: TmclSettings, spec: BlockSpec, kit: Kit, **given: Any) -> None:
+        super().__init__(name, _axes(settings), spec, kit, **given)
+        self._settings = settings
+        line = settings.line
+        on_line_s = SIZE * line.bits_per_character / line.baud if line.serial else 0.0
+        self._module = Module(settings.address, settings.host_address, settings.turnaround_s + on_line_s)
+        self._motors = [axis.motor for axis in settings.axis]
+        self._scales = [Scale.of(axis, settings) for axis in settings.axis]
+        self._ramps: dict[tuple[int, int], int] = {}
+        self._homes = [False] * len(self._motors)
+        self._faults = [""] * len(self._motors)
+        self._without: set[int] = set()
+        self._seldom_ns = 0
+
+    def open(self) -> Steps:
+        """Identify the module, stop its motors, and set its heartbeat."""
+        self._ramps.clear()
+        self._homes = [False] * len(self._motors)
+        settings, module = self._settings, self._module
+        version = yield module.exchange(Op.VERSION, 1)
+        number, firmware = version >> 16 & 0xFFFF, version & 0xFFFF
+        if settings.module and number != settings.module:
+            text = (
+                f"identify {self.name}: module {number}, firmware {firmware >> 8}.{firmware & 0xFF:02d}; the "
+            )
+            raise DeviceError(
+                errno.ENODEV, f"{text}configuration says {settings.module}; check address and wiring"
+            )
+        yield from self.stop()
+        wanted = round(settings.heartbeat_s * 1000)
+        try:
+            present = yield module.exchange(Op.GGP, SERIAL_HEARTBEAT)
+            if present != wanted:  # never written without need: some modules keep it in their EEPROM
+                yield module.exchange(Op.SGP, SERIAL_HEARTBEAT, 0, wanted)
+        except DeviceError as error:
+            if wanted:
+                text = f"{error}; the module has no heartbeat, heartbeat_s = 0 accepts that its motors go on"
+                raise DeviceError(error.errno, f"{text} when the host dies") from None
+
+    def poll(self) -> Steps:
+        """Read positions, speeds and ends of all motors, and now and then their errors."""
+        n = len(self._motors)
+        position, velocity = np.zeros(n), np.zeros(n)
+        moving, done = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        for axis, (motor, scale) in enumerate(zip(self._motors, self._scales, strict=True)):
+            steps = yield self._module.get(Axis.ACTUAL_POSITION, motor)
+            speed = yield self._module.get(Axis.ACTUAL_SPEED, motor)
+            reached = yield self._module.get(Axis.POSITION_REACHED, motor)
+            position[axis] = steps / scale.per_unit
+            velocity[axis] = speed / (scale.per_speed * scale.per_unit)
+            moving[axis], done[axis] = speed != 0, bool(reached)
+            if self._homes[axis]:
+                searching = yield self._module.exchange(Op.RFS, 2, motor)
+                moving[axis], done[axis] = searching != 0, searching == 0
+                self._homes[axis] = searching != 0
+        if self.clock() >= self._seldom_ns:
+            self._seldom_ns = self.clock() + SELDOM_NS
+            yield from self._read_faults()
+        self.report(position, velocity, moving, done, self._faults)
+
+    def start_position(self, axis: int, position: float, speed: float, action: DriveAction) -> Steps:
+        """Set the ramp where it differs, and move."""
+        motor, scale = self._motors[axis], self._scales[axis]
+        yield from self._ramp(axis, Axis.MAX_ACCELERATION, scale.acceleration(action.acceleration_max))
+        yield from self._ramp(axis, Axis.MAX_SPEED, scale.speed(speed))
+        yield self._module.exchange(Op.MVP, 0, motor, scale.position(position))
+
+    def start_velocity(self, axis: int, velocity: float, action: DriveAction) -> Steps:
+        """Turn right or left."""
+        scale = self._scales[axis]
+        yield from self._ramp(axis, Axis.MAX_ACCELERATION, scale.acceleration(action.acceleration_max))
+        op = Op.ROR if velocity * scale.per_unit >= 0 else Op.ROL
+        yield self._module.exchange(op, 0, self._motors[axis], scale.speed(velocity))
+
+    def halt(self, axis: int, *, fastest: bool) -> Steps:
+        """Stop a motor: MST brakes with the ramp's acceleration, and there is nothing faster; a search ends first."""
+        motor = self._motors[axis]
+        if self._homes[axis]:
+            self._homes[axis] = False
+            yield self._module.exchange(Op.RFS, 1, motor)
+        yield self._module.exchange(Op.MST, 0, motor)
+
+    def home(self, axis: int) -> Steps:
+        """Begin the module's reference search."""
+        yield self._module.exchange(Op.RFS, 0, self._motors[axis])
+        self._homes[axis] = True
+
+    def reset(self, axis: int) -> Steps:
+        """Read the errors again: reading the extended flags clears what has passed."""
+        yield from self._read_faults()
+        yield from self._read_faults()
+        if self._faults[axis]:
+            raise DeviceError(errno.EIO, self._faults[axis])
+
+    def _ramp(self, axis: int, parameter: Axis, value: int) -> Steps:
+        """Set a parameter of the ramp unless the module has it."""
+        key = (axis, int(parameter))
+        if self._ramps.get(key) != value:
+            self._ramps.pop(key, None)
+            yield self._module.set(parameter, self._motors[axis], value)
+            self._ramps[key] = value
+
+    def _read_faults(self) -> Steps:
+        """Read the error flags of all motors; a module without them has none."""
+        for axis, motor in enumerate(self._motors):
+            texts = []
+            for parameter, bits in FAULT_BITS.items():
+                if parameter in self._without:
+                    continue
+                try:
+                    flags = yield self._module.get(parameter, motor)
+                except DeviceError:
+                    self._without.add(parameter)
+                    continue
+                texts += [text for bit, text in bits.items() if flags & bit]
+            self._faults[axis] = ", ".join(dict.fromkeys(texts))
+
+
+class Tmcl(LineDriver):
+    """One module on its line.
+
+    Concurrency: the one thread of the driver process.
+    """
+
+    Settings = TmclSettings
+
+    @classmethod
+    def describe(cls, name: str, settings: TmclSettings) -> Description:
+        """Tell the axes; raises ValueError for what the module could not carry out."""
+        if not settings.axis:
+            raise ValueError("axis: none given; want a table [[...axis]] for each motor")
+        drive_axes.check_rate(settings.poll_hz, 1000)
+        drive_axes.check_once("motor", [axis.motor for axis in settings.axis], 0, 5)
+        for axis in settings.axis:
+            Scale.of(axis, settings).check(axis)
+        _check_heartbeat(settings)
+        spec = drive_axes.axis_spec(
+            "", _axes(settings), f"TMCL module {settings.address}", settings.capacity, settings.history
+        )
+        return Description((spec,), settings.poll_hz, lease_s=max(0.5, 5 / settings.poll_hz))
+
+    def __init__(self, name: str, settings: TmclSettings, kit: Kit) -> None:
+        super().__init__(name, settings, kit)
+        self.line = settings.line
+        self.recovery_s = settings.recovery_s or (0.05 if settings.line.baud < 19200 else 0.01)
+        self._units = (TmclUnit(name, settings, self.describe(name, settings).blocks[0], kit),)
+
+    @property
+    def units(self) -> Sequence[LineUnit]:
+        """The module."""
+        return self._units
+
+
+def _axes(settings: TmclSettings) -> list[Any]:
+    return [
+        drive_axes.axis_settings(axis, MODES, homing=axis.homing, required=axis.home_required)
+        for axis in settings.axis
+    ]
+
+
+def _check_heartbeat(settings: TmclSettings) -> None:
+    """Raise when the module would stop its motors between two polls."""
+    if not 0 <= settings.heartbeat_s <= 60:
+        raise ValueError(f"heartbeat_s = {settings.heartbeat_s:g}; want 0 (none) to 60")
+    if settings.heartbeat_s and settings.heartbeat_s < 3 / settings.poll_hz:
+        raise ValueError(
+            f"heartbeat_s = {settings.heartbeat_s:g}: the module is polled every {1 / settings.poll_hz:g} s; want at "
+            f"least {3 / settings.poll_hz:.3g} s or a higher poll_hz"
+        )

@@ -1,0 +1,167 @@
+"""Trinamic TMCL: the driver under the real daemon against a simulated module, and the vendor's client against both."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from daemon_rig import at_rest, raises, wait_for
+from wire_rig import Wire
+
+from sioms.protocol.flags import AxisStatus
+
+CONFIG = """
+[device.mod0]
+driver = "tmcl"
+line = { serial = "{port}", baud = 115200 }
+module = 1140
+heartbeat_s = 0.2
+poll_hz = 50.0
+[[device.mod0.axis]]
+name = "x"
+motor = 0
+travel_per_turn = 0.01
+microsteps_per_turn = 51200
+velocity_max = 0.1
+acceleration_max = 1.0
+homing = true
+[[device.mod0.axis]]
+name = "y"
+motor = 1
+travel_per_turn = -0.01
+microsteps_per_turn = 51200
+position_max = 0.02
+velocity_max = 0.1
+acceleration_max = 1.0
+"""
+PER_M = 51200 / 0.01
+
+
+def test_moves_homes_and_faults(start: Callable[..., Any], short_folder: Path) -> None:
+    wire = Wire(start, short_folder, "tmcl", "--motors", "2", "--baud", "115200")
+    cell = wire.serve(CONFIG)
+    wire.wait_up("mod0.x")
+    assert wire.state("heartbeat_ms") == 200
+    with cell.open("mod0", "rw") as both:
+        # two motors at once, the second reversed
+        both.command(position=0.02, axis=0)
+        both.command(position=0.01, axis=1)
+        both.wait_until_idle(5.0)
+        assert both.read().position == pytest.approx([0.02, 0.01], abs=1e-6)
+        assert wire.state("position", 0) == pytest.approx(0.02 * PER_M, abs=1)
+        assert wire.state("position", 1) == pytest.approx(-0.01 * PER_M, abs=1)
+    with cell.open("mod0.y", "rw") as y:
+        # a velocity ends before the soft limit
+        y.command(velocity=0.05)
+        wait_for(lambda: y.read().position[0] > 0.012, "motion")
+        at_rest(y)
+        assert 0.014 < y.read().position[0] <= 0.02
+        with raises(22, "cannot do FORCE"):
+            y.command(force=1.0)
+    with cell.open("mod0.x", "rw") as x:
+        # the module's own homing, to the left switch
+        wire.tell("ends -20000 2000000")
+        x.home()
+        x.wait_until_idle(10.0)
+        status = x.read().status[0]
+        assert status & AxisStatus.HOMED and x.read().position[0] == 0
+        # emergency stop in motion
+        x.command(velocity=0.05)
+        wait_for(lambda: wire.state("velocity") > 0.04 * PER_M, "motion")
+        x.stop_all()
+        wait_for(lambda: wire.state("velocity") == 0, "rest", 1.0)
+        with raises(1, "RESET"):
+            x.move(0.0)
+        x.reset()
+        # a fault of the motor's driver: named, latched, reset only when it is gone
+        wire.tell("flags 2")
+        wait_for(lambda: x.read().status[0] & AxisStatus.FAULT, "the fault")
+        with raises(5, "overtemperature"):
+            x.move(0.0)
+        wire.tell("flags 0")
+        x.reset()
+        wait_for(lambda: not x.read().status[0] & AxisStatus.FAULT, "the reset")
+        # a move that a limit switch cuts short is no success
+        wire.tell("ends -20000 40000")
+        with raises(5, "before its target"):
+            x.move(0.05)
+            x.wait_until_idle(8.0)
+        assert wire.tell("store") == [68]
+
+
+def counted(node: Any, counter: str, before: int) -> bool:
+    return bool(node.statistics()["link"][counter] > before)
+
+
+def test_line_faults_and_deaths(start: Callable[..., Any], short_folder: Path) -> None:
+    wire = Wire(start, short_folder, "tmcl", "--motors", "2")
+    cell = wire.serve(CONFIG)
+    wire.wait_up("mod0.x")
+    with cell.open("mod0.x", "rw") as x:
+        for fault, counter in (("noise 3", "garbled"), ("deaf 1", "timeouts")):
+            before = x.statistics()["link"][counter]
+            wire.tell(fault)
+            wait_for(partial(counted, x, counter, before), f"{fault} counted")
+        assert wire.reads("mod0.x")
+        wire.tell("unplug 0.3")
+        wait_for(lambda: not wire.reads("mod0.x"), "the loss")
+        wire.wait_up("mod0.x")
+        x.reset()
+        # the replies to a move are lost: it is not sent again, and the motor stops
+        wire.tell("mute")
+        with raises(5, "mod0"):
+            x.move(0.05)
+            x.wait_until_idle(8.0)
+        wait_for(lambda: wire.state("velocity") == 0, "rest by heartbeat or stop", 2.0)
+        wire.tell("clear")
+        wire.wait_up("mod0.x")
+        x.reset()
+        # frozen for longer than the heartbeat: the module stops by itself
+        x.command(velocity=0.02)
+        wait_for(lambda: wire.state("velocity") > 0, "motion")
+        began = time.monotonic()
+        wire.tell("deaf")
+        wait_for(lambda: wire.state("velocity") == 0, "rest by heartbeat", 1.5)
+        assert time.monotonic() - began < 1.0
+        wire.tell("clear")
+        wire.wait_up("mod0.x")
+        x.reset()
+    wire.check_deaths("mod0.x", 0.05, lambda: float(wire.state("velocity")), 0.02 * PER_M, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--module", "1276"), "module 1276"),
+        (("--no-heartbeat",), "heartbeat_s = 0 accepts"),
+        (("--address", "3"), "no reply"),
+    ],
+)
+def test_wrong_devices(
+    start: Callable[..., Any], short_folder: Path, options: tuple[str, ...], words: str
+) -> None:
+    wire = Wire(start, short_folder, "tmcl", "--motors", "2", *options)
+    wire.serve(CONFIG)
+    wait_for(lambda: words in wire.reason("mod0"), f"the sentence; {wire.reason('mod0')}")
+    assert not wire.reads("mod0.x")
+
+
+def test_the_vendors_client_agrees_with_the_counterpart(
+    start: Callable[..., Any], short_folder: Path
+) -> None:
+    pytrinamic = pytest.importorskip("pytrinamic.connections")
+    wire = Wire(start, short_folder, "tmcl", "--motors", "2")
+    manager = pytrinamic.ConnectionManager(f"--interface serial_tmcl --port {wire.port} --data-rate 115200")
+    with manager.connect() as master:
+        master.move_to(0, 20000, 1)
+        wait_for(lambda: master.get_axis_parameter(8, 0, 1), "the position reached")
+        assert master.get_axis_parameter(1, 0, 1, signed=True) == 20000
+        master.rotate(1, -30000, 1)
+        wait_for(lambda: master.get_axis_parameter(3, 1, 1, signed=True) == -30000, "the velocity")
+        master.stop(1, 1)
+        wait_for(lambda: master.get_axis_parameter(3, 1, 1, signed=True) == 0, "rest")
+        assert master.get_global_parameter(68, 0, 1) == 0

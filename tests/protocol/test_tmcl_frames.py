@@ -1,0 +1,90 @@
+"""TMCL telegrams: the golden ones, and what is wrong with bad ones."""
+
+from pathlib import Path
+
+import pytest
+
+from sioms.sdk.codec.tmcl import Axis, Module, Op, checksum
+from sioms.sdk.exchange import DeviceError, Exchange, LinkError
+from sioms.tools.counterparts import tmcl as counterpart
+
+GOLDEN = [
+    line.split("|")[2]
+    for line in (Path(__file__).parent / "golden_frames.txt").read_text().splitlines()
+    if line.startswith("tmcl|")
+]
+M = Module(1, 2, 0.05)
+REQUESTS = [
+    (M.exchange(Op.ROR, 0, 0, 1000), "01 01 00 00 00 00 03 e8 ed"),
+    (M.exchange(Op.MST), "01 03 00 00 00 00 00 00 04"),
+    (M.exchange(Op.MVP, 0, 0, 10000), "01 04 00 00 00 00 27 10 3c"),
+    (M.exchange(Op.MVP, 1, 0, -500), "01 04 01 00 ff ff fe 0c 0e"),
+    (M.get(Axis.ACTUAL_POSITION, 0), "01 06 01 00 00 00 00 00 08"),
+    (M.set(Axis.MAX_SPEED, 0, 20000), "01 05 04 00 00 00 4e 20 78"),
+]
+REPLIES = [
+    (M.exchange(Op.MVP, 0, 0, 10000), "02 01 64 04 00 00 27 10 a2", 10000),
+    (M.get(Axis.ACTUAL_POSITION, 0), "02 01 64 06 00 00 27 10 a4", 10000),
+]
+
+
+def test_the_golden_frames_are_all_used() -> None:
+    assert {text for _, text in REQUESTS} | {text for _, text, _ in REPLIES} == set(GOLDEN)
+    for text in GOLDEN:
+        data = bytes.fromhex(text)
+        assert checksum(data[:-1]) == data[-1]
+
+
+@pytest.mark.parametrize(("exchange", "text"), REQUESTS)
+def test_request(exchange: Exchange, text: str) -> None:
+    assert exchange.data.hex(" ") == text
+    assert exchange.repeatable == (exchange.data[1] in (3, 6))
+
+
+@pytest.mark.parametrize(("exchange", "text", "value"), REPLIES)
+def test_reply(exchange: Exchange, text: str, value: int) -> None:
+    data = bytes.fromhex(text) + b"\x02\x01"
+    for cut in range(9):
+        assert exchange.want(data[:cut]) == 9
+    assert exchange.decode(data[:9]) == value
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "words"),
+    [
+        ("02 01 64 06 00 00 27 10 a5", LinkError, "checksum of the reply"),
+        ("02 02 64 06 00 00 27 10 a5", LinkError, "goes from 2"),
+        ("03 01 64 06 00 00 27 10 a5", LinkError, "to 3"),
+        ("02 01 64 05 00 00 27 10 a3", LinkError, "answers command 5"),
+        ("02 01 01 04 00 00 00 00 08", LinkError, "received a wrong checksum"),
+        ("02 01 03 06 00 00 00 00 0c", DeviceError, "status 3, wrong type"),
+        ("02 01 05 06 00 00 00 00 0e", DeviceError, "EEPROM is locked"),
+    ],
+)
+def test_bad_replies(text: str, error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        M.get(Axis.ACTUAL_POSITION, 0).decode(bytes.fromhex(text))
+
+
+def test_values_that_do_not_fit() -> None:
+    with pytest.raises(ValueError, match="is right"):
+        M.exchange(Op.MVP, 0, 0, 2**31)
+
+
+def test_the_simulated_module_answers_as_the_manual_says() -> None:
+    now = 5.0
+    module = counterpart.Module(clock=lambda: now)
+    module.motors[0].mover.position = 10000.0
+    assert (
+        module.take(bytes.fromhex("01 06 01 00 00 00 00 00 08"))[0].hex(" ") == "02 01 64 06 00 00 27 10 a4"
+    )
+    assert (
+        module.take(bytes.fromhex("01 04 00 00 00 00 27 10 3c"))[0].hex(" ") == "02 01 64 04 00 00 27 10 a2"
+    )
+    # cut anywhere, another address, a wrong checksum with the stale command byte, an unknown axis
+    assert module.take(bytes.fromhex("01 06 01")) == []
+    assert module.take(bytes.fromhex("00 00 00 00 00 08"))[0][2] == 100
+    assert module.take(bytes.fromhex("07 06 01 00 00 00 00 00 0e")) == []
+    assert module.take(bytes.fromhex("01 03 00 00 00 00 00 00 05"))[0].hex(" ")[:11] == "02 01 01 06"
+    assert module.take(bytes.fromhex("01 06 01 05 00 00 00 00 0d"))[0][2] == 3
+    assert module.take(bytes.fromhex("01 88 00 00 00 00 00 00 89"))[0] == b"\x021140V140"

@@ -1,0 +1,133 @@
+"""Rig for drivers of own-loop drives under the real daemon: a simulated device as a process, a daemon, a client."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from daemon_rig import wait_for
+
+import sioms
+
+RUNNER = """
+import sys, time, sioms
+node = sioms.Workcell(sys.argv[1]).open(sys.argv[2], "rw")
+node.command(velocity=float(sys.argv[3]))
+print("moving", flush=True)
+time.sleep(60)
+"""
+
+
+class Wire:
+    """A counterpart behind a link in a folder, and what a test does with it.
+
+    Args:
+        start: starts processes that end with the test.
+        folder: a short path.
+        name: of the counterpart's module.
+        options: of the counterpart; without ``--tcp`` it serves the link ``folder/port``.
+    """
+
+    def __init__(self, start: Callable[..., Any], folder: Path, name: str, *options: object) -> None:
+        self._start, self.folder = start, folder
+        port = () if "--tcp" in options else ("--link", folder / "port")
+        command = [sys.executable, "-m", f"sioms.tools.counterparts.{name}", *port, *options]
+        self.device = start([str(part) for part in command])
+        self.port: str = self.device.wait_line(r"^ready (\S+)$").group(1)
+        self.socket = str(folder / "s")
+
+    def tell(self, line: str) -> Any:
+        """Send a command to the counterpart and return its answer's value."""
+        before = len(self.device.lines)
+        self.device.process.stdin.write(line + "\n")
+        self.device.process.stdin.flush()
+        wait_for(lambda: len(self.device.lines) > before, f"an answer to {line}", 5.0)
+        answer = self.device.lines[before]
+        assert answer.startswith("ok"), answer
+        return json.loads(answer[3:]) if answer[3:] else None
+
+    def state(self, key: str, axis: object = "") -> Any:
+        """Return one number of what a bystander sees."""
+        return self.tell(f"state {axis}".rstrip())[key]
+
+    def serve(self, config: str) -> sioms.Workcell:
+        """Start the daemon with the tables of devices; ``{port}`` is the counterpart's port."""
+        path = self.folder / "cell.toml"
+        path.write_text('[workcell]\nname = "wire"\n' + config.replace("{port}", self.port))
+        command = [sys.executable, "-m", "sioms.daemon.main", "--config", path, "--socket", self.socket]
+        self.daemon = self._start([str(part) for part in command])
+        self.daemon.wait_line("event=ready", 40.0)
+        self.client = sioms.Workcell(self.socket)
+        return self.client
+
+    def reads(self, node: str) -> bool:
+        """Tell whether a node can be read."""
+        try:
+            with self.client.open(f"{node}.readonly") as opened:
+                opened.read()
+        except OSError:
+            return False
+        return True
+
+    def wait_up(self, node: str) -> None:
+        """Wait until a node can be read."""
+        wait_for(lambda: self.reads(node), f"{node} readable; the daemon said {self.daemon.lines[-5:]}")
+
+    def reason(self, device: str) -> str:
+        """Return what the daemon says of a device's link."""
+        found = next(each for each in self.client.status()["devices"] if each["name"] == device)
+        return str(found)
+
+    def pid(self, device: str) -> int:
+        """Return the process of a driver."""
+        return int(
+            next(each for each in self.client.status()["devices"] if each["name"] == device)["pid"] or 0
+        )
+
+    def run_client(self, node: str, velocity: float, moving: Callable[[], bool]) -> Any:
+        """Let a client of its own run an axis."""
+        client = self._start([sys.executable, "-c", RUNNER, self.socket, node, str(velocity)])
+        client.wait_line("moving")
+        wait_for(moving, f"{node} moving")
+        return client
+
+    def check_deaths(
+        self, node: str, velocity: float, speed: Callable[[], float], fast: float, rest_s: float
+    ) -> None:
+        """Kill client, driver and daemon in motion: the device is at rest in time, and nothing resumes.
+
+        Args:
+            node: to run.
+            velocity: to run it at.
+            speed: what the device really does.
+            fast: speed above which it counts as running.
+            rest_s: longest time from each death to rest.
+        """
+        device = node.partition(".")[0]
+
+        def rests(after: str) -> None:
+            began = time.monotonic()
+            wait_for(lambda: speed() == 0, f"rest after the death of the {after}", rest_s)
+            print(f"{node}: at rest {time.monotonic() - began:.3f} s after the death of the {after}")
+
+        client = self.run_client(node, velocity, lambda: abs(speed()) > fast)
+        client.process.kill()
+        rests("client")
+        wait_for(lambda: self.reads(node), "the axis after its client's death")
+        client = self.run_client(node, velocity, lambda: abs(speed()) > fast)
+        driver = self.pid(device)
+        os.kill(driver, signal.SIGKILL)
+        rests("driver")
+        client.process.kill()
+        wait_for(lambda: self.pid(device) not in (0, driver), "a new driver")
+        self.wait_up(node)
+        assert speed() == 0, "motion must not resume"
+        self.run_client(node, velocity, lambda: abs(speed()) > fast)
+        self.daemon.process.kill()
+        rests("daemon")
