@@ -24,8 +24,10 @@ from .snapshot import SNAPSHOT, AnalogSnapshot, AxisSnapshot, BinarySnapshot, La
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Iterable, Sequence
     from typing import Any, Self, TypeAlias
+
+    from .workcell import Workcell
 
     Records: TypeAlias = bytes | bytearray | memoryview | Iterable[bytes]
 
@@ -215,9 +217,9 @@ class NodeCore:
 class Node(NodeCore):
     """An open node, with calls that wait. Use it in a ``with`` block: closing halts its axes."""
 
-    def __init__(self, core: tuple[Any, ...], close: Callable[[int], None], lease: float = 0.0) -> None:
+    def __init__(self, core: tuple[Any, ...], cell: Workcell, lease: float = 0.0) -> None:
         super().__init__(*core)
-        self._close = close
+        self._cell = cell
         self._channel.keepalive_s = lease / 3
 
     def __enter__(self) -> Self:
@@ -230,7 +232,7 @@ class Node(NodeCore):
         """Close the node: axes halt, buffers empty, outputs become safe. Returns when the node is free."""
         if self._map is not None:
             self._release()
-            self._close(self.handle)
+            self._cell.close_handle(self.handle)
 
     def subscribe(self, every: int) -> None:
         """Have ``fileno`` become readable with every n-th publication, -1: with edges only, 0: not at all."""
@@ -241,14 +243,31 @@ class Node(NodeCore):
     def ioctl(self, request: Request, argument: object = None, timeout: float | None = 0.0) -> Any:
         """Send a request to the driver and return its answer.
 
+        Those of tables F.2 and F.5 that are not the driver's to answer are answered here:
+        GET_IO_STRUCT_INFO out of what the open told, markers by the daemon, WAIT_UNTIL_EVENT out of
+        the page.
+
         Args:
             request: one of Request.
-            argument: what the request takes.
+            argument: what the request takes: a marker's token or number, an event mask, positions ...
             timeout: how long a request that waits may wait [s]; None = for ever.
 
         Raises:
-            OSError: with the errno and the sentence of the driver.
+            OSError: with the errno and the sentence of who refuses.
         """
+        match request:
+            case Request.GET_IO_STRUCT_INFO:
+                return self.info
+            case Request.RESERVE_MARKER:
+                return self._cell.reserve_marker().token
+            case Request.FREE_MARKER:
+                return self._cell.free_marker(argument)  # type: ignore[arg-type, func-returns-value]
+            case Request.SIGNAL_MARKER:
+                return self._cell.signal_marker(argument)  # type: ignore[arg-type, func-returns-value]
+            case Request.WAIT_MARKER:
+                return self._cell.wait_marker(argument, timeout)  # type: ignore[arg-type]
+            case Request.WAIT_UNTIL_EVENT if isinstance(self, BinaryNode):
+                return self.wait_event(-1 if argument is None else argument, timeout=timeout)  # type: ignore[arg-type]
         return self._channel.call(self._ioctl(request, argument, timeout)).value
 
     def write(self, records: Records, timeout: float | None = 0.0, *, replace: bool = False) -> int:

@@ -153,9 +153,10 @@ class Workcell:
         """
         answer = self._channel.call(open_call(name, mode, timeout, lease))
         core = node_parts(answer.value, answer.fds)
-        return NODE[core[0].node_class](core, self._close_handle, lease)
+        return NODE[core[0].node_class](core, self, lease)
 
-    def _close_handle(self, handle: int) -> None:
+    def close_handle(self, handle: int) -> None:
+        """Tell the daemon that a node was closed, and wait until its channels are free (nodes call this)."""
         try:
             self._channel.call(Call("close", ClientVerb.CLOSE, handle))
         except OSError as error:
