@@ -316,9 +316,9 @@ class Channel:
         for _ in range(2):  # a reset is reported once, ahead of what is still there to read
             try:
                 while packet := self._sock.recv(MAX_PACKET, _DONTWAIT):
-                    message = decode(packet)
+                    message: list[Any] = decode(packet)
                     if message[1] == 0:
-                        return int(message[2]), str(message[3])  # type: ignore[call-overload]
+                        return int(message[2]), str(message[3])
                     self._answers[message[1]] = (message, [])
             except (OSError, MalformedMessage):
                 continue

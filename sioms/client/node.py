@@ -261,9 +261,9 @@ class Node(NodeCore):
             case Request.RESERVE_MARKER:
                 return self._cell.reserve_marker().token
             case Request.FREE_MARKER:
-                return self._cell.free_marker(argument)  # type: ignore[arg-type, func-returns-value]
+                return self._cell.free_marker(argument)  # type: ignore[arg-type]
             case Request.SIGNAL_MARKER:
-                return self._cell.signal_marker(argument)  # type: ignore[arg-type, func-returns-value]
+                return self._cell.signal_marker(argument)  # type: ignore[arg-type]
             case Request.WAIT_MARKER:
                 return self._cell.wait_marker(argument, timeout)  # type: ignore[arg-type]
             case Request.WAIT_UNTIL_EVENT if isinstance(self, BinaryNode):

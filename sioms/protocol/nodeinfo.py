@@ -77,6 +77,15 @@ class NodeInfo:
         "read_only", "tick_hz",
     )  # fmt: skip
 
+    name: str
+    read_only: bool
+    bit: int
+    tick_hz: float
+    buffer_capacity: int
+    device: str
+    driver: str
+    protocol_version: int
+
     def __init__(self, packed: list) -> None:  # type: ignore[type-arg]
         (self.name, cls, self.read_only, channels, self.bit, self.tick_hz, self.buffer_capacity, self.device,
          self.driver, self.protocol_version) = packed  # fmt: skip
