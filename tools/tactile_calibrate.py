@@ -211,8 +211,8 @@ def _fit_all(finger: Finger, touches: Touches, with_load: bool) -> list[ShapeEst
     estimator = Estimator(finger)
     strains = -np.array(finger.elements.gain) * touches.output
     return [
-        estimator.frame(y, Load(float(p), 4.0) if with_load and p > 0.0 else None)
-        for y, p in zip(strains, touches.force, strict=True)
+        estimator.frame(y, Load(float(p), 4.0) if with_load else None)
+        for y, p in zip(strains, touches.load, strict=True)
     ]
 
 
@@ -228,6 +228,12 @@ def _indenters(page: Page, data: Data, result: Calibration) -> None:
     touches = touches.pick(np.abs(touches.load / 200.0 - 1.0) < 0.25)
     if len(touches) == 0:
         return
+    if np.isfinite(touches.force).all() and np.all(touches.force > 0.0):
+        # what was applied: the cell's variation at the commanded level
+        applied = touches.force * float(np.median(touches.load / touches.force))
+        touches = Touches(
+            touches.output, touches.angle_rad, applied, touches.radius_m, touches.force, touches.noise
+        )
     free = _fit_all(finger, touches, False)
     loaded = _fit_all(finger, touches, True) if np.isfinite(touches.force).all() else None
     rows, radii = [], np.unique(touches.radius_m)
@@ -235,8 +241,8 @@ def _indenters(page: Page, data: Data, result: Calibration) -> None:
         mine = np.flatnonzero(touches.radius_m == rc)
         rows.append(_row(finger, float(rc), touches, mine, free, loaded))
     page.table(
-        ("rc, mm", "R, mm", "mean R", "deviation of R", "rc from mean R", "place: mean, deg", "deviation, deg",
-         "load: mean, N/m", "deviation, N/m", "mean R with load cell", "deviation"), rows)  # fmt: skip
+        ("rc, mm", "R, mm", "mean R", "deviation of R", "rc from mean R", "place: mean error, deg", "deviation, deg",
+         "load: mean error, N/m", "deviation, N/m", "mean R with load cell", "deviation"), rows)  # fmt: skip
     page.text("The touches took part in the calibration; deviations are over places. The published finger: place 0.043 deg, "
               "load 6.4 N/m, R 0.60 mm by place.")  # fmt: skip
     figure = Figure(figsize=(11, 4), layout="constrained")
@@ -261,12 +267,12 @@ def _row(
 ) -> tuple[str, ...]:  # fmt: skip
     radius = np.array([1e3 * free[m].equivalent_radius_m for m in mine])
     place = np.degrees([free[m].angle_rad for m in mine]) - np.degrees(touches.angle_rad[mine])
-    load = np.array([free[m].load_n_per_m for m in mine])
+    load = np.array([free[m].load_n_per_m for m in mine]) - touches.load[mine]
     cells = [
         "flat" if math.isinf(rc) else f"{1e3 * rc:.2f}", f"{1e3 * equivalent_radius(finger.cylinder, rc):.2f}",
         f"{np.nanmean(radius):.2f}", f"{np.nanstd(radius):.2f}",
         f"{1e3 * indenter_radius(finger.cylinder, 1e-3 * float(np.nanmean(radius))):.2f}",
-        f"{np.nanmean(place):+.3f}", f"{np.nanstd(place):.3f}", f"{np.nanmean(load):.1f}", f"{np.nanstd(load):.1f}",
+        f"{np.nanmean(place):+.3f}", f"{np.nanstd(place):.3f}", f"{np.nanmean(load):+.1f}", f"{np.nanstd(load):.1f}",
     ]  # fmt: skip
     if loaded is not None:
         other = np.array([1e3 * loaded[m].equivalent_radius_m for m in mine])

@@ -42,6 +42,7 @@ FEWEST_TOUCHES = 30
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of full adhesion, tried in turn
 _BETTER = 0.97  # a richer model must bring the left-out residual below this share of the simpler one's
 _POISSON_DEVIATION = 0.03
+_FOLLOWS = 0.3  # correlation of touches and load cell above which the cell is believed
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +118,12 @@ def calibrate(
     widths = rigid_core_table(body)
     tick("loads of the touches")
     loads = touch_loads(body, widths, touches, HIGHEST, options.edge_half_angle_rad)
+    if _cell_is_better(nominal, touches, loads):
+        touches = _cell_loads(touches)
+        loads = touch_loads(body, widths, touches, HIGHEST, options.edge_half_angle_rad)
+        warnings.append(
+            "the outputs follow the load cell from touch to touch: its variation was used at the commanded level"
+        )
     recorded = touches
     begin = starts(body, np.array(nominal.angles_rad), np.array(nominal.elements.radius_m), touches)
     ramped = _Ramps(body, ramps or [], options)
@@ -211,6 +218,38 @@ def _check(nominal: Finger, touches: Touches, warnings: list[str]) -> None:
             f"the load cell reads {100 * (ratio - 1):+.1f} % of the commanded load: one of them is out of scale; "
             "the commanded load was used"
         )
+
+
+def _cell_is_better(nominal: Finger, touches: Touches, loads: TouchLoads) -> bool:
+    """Return whether the strength of the touches goes with the load cell's reading beyond the commanded load."""
+    if not np.isfinite(touches.force).all() or np.any(touches.force <= 0.0):
+        return False
+    body, e = nominal.cylinder, nominal.elements
+    model = np.stack(
+        [
+            strain_of(body, t, r, body.poisson, touches, loads, 0.0)
+            for t, r in zip(e.angle_rad, e.radius_m, strict=True)
+        ],
+        1,
+    )
+    strength = np.einsum("ji,ji->j", touches.output, -model) / np.einsum("ji,ji->j", model, model)
+    inside = (touches.angle_rad > min(e.angle_rad)) & (touches.angle_rad < max(e.angle_rad))
+    told, heard = [], []
+    for load, radius in {(p, r) for p, r in zip(touches.load[inside], touches.radius_m[inside], strict=True)}:
+        mine = inside & (touches.load == load) & (touches.radius_m == radius)
+        if mine.sum() >= 10:
+            heard.append(strength[mine] / strength[mine].mean() - 1.0)
+            told.append(touches.force[mine] / touches.force[mine].mean() - 1.0)
+    if not told:
+        return False
+    x, y = np.concatenate(told), np.concatenate(heard)
+    return bool(x @ y > _FOLLOWS * np.sqrt((x @ x) * (y @ y)))
+
+
+def _cell_loads(touches: Touches) -> Touches:
+    """Return the touches with the cell's loads, scaled to the commanded level."""
+    load = touches.force * float(np.median(touches.load / touches.force))
+    return Touches(touches.output, touches.angle_rad, load, touches.radius_m, touches.force, touches.noise)
 
 
 def _quadratic(body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads) -> Quadratic | None:
