@@ -1,0 +1,123 @@
+"""Messages on the sockets: golden bytes, so that an old client and a new daemon go on understanding each other."""
+
+from __future__ import annotations
+
+import math
+
+import msgpack
+import pytest
+
+from sioms.protocol.flags import (
+    Access, AnalogStatus, AxisStatus, ControlMode, NodeClass, PageState, Request, Right, WriteFlag,
+)  # fmt: skip
+from sioms.protocol.messages import (
+    MAX_TEXT, ClientVerb, DriverVerb, HandleVerb, MalformedMessage, NurseryVerb, decode, encode, refusal, reply,
+)  # fmt: skip
+from sioms.protocol.records import ANALOG_WRITE, AXIS_WRITE, BINARY_WRITE
+
+GOLDEN = [
+    (encode(ClientVerb.HELLO, 1, 1, "eva"), "94010101a3657661"),
+    (encode(ClientVerb.OPEN, 2, "mod0", 3, 0.5, 0.0), "960202a46d6f643003cb3fe0000000000000cb0000000000000000"),
+    (encode(ClientVerb.OPEN, 2, "mod0", 1, None, 0.0), "960202a46d6f643001c0cb0000000000000000"),
+    (encode(ClientVerb.CLOSE, 3, 300), "930303cd012c"),
+    (encode(ClientVerb.RESERVE_MARKER, 4, 2, False), "940a0402c2"),
+    (encode(ClientVerb.SIGNAL_MARKER, 5, 1 << 49), "930c05cf0002000000000000"),
+    (encode(ClientVerb.EMERGENCY_STOP, 6, "", "why"), "941406a0a3776879"),
+    (encode(HandleVerb.WRITE, 1, 0, 0.0, b"\x01\x02"), "95010100cb0000000000000000c4020102"),
+    (encode(HandleVerb.WRITE, 1, 1, None, None), "95010101c0c0"),
+    (encode(HandleVerb.IOCTL, 2, 23, {"position_max": 0.2}, 0.0),
+     "9502021781ac706f736974696f6e5f6d6178cb3fc999999999999acb0000000000000000"),
+    (encode(HandleVerb.SUBSCRIBE, 3, -1), "930303ff"),
+    (encode(HandleVerb.KEEPALIVE, 0), "920400"),
+    (encode(DriverVerb.DETACHED, 0, 7), "93150007"),
+    (reply(9), "940009" + "00c0"),
+    (reply(9, [1, 2]), "94000900920102"),
+    (refusal(9, 16, "held"), "94000910a468656c64"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("packet", "golden"), GOLDEN, ids=[g for _, g in GOLDEN])
+def test_golden_bytes(packet: bytes, golden: str) -> None:
+    assert packet.hex() == golden
+    assert decode(packet) == msgpack.unpackb(packet)
+
+
+@pytest.mark.parametrize(("packet", "golden"), GOLDEN, ids=[g for _, g in GOLDEN])
+def test_cut_anywhere_or_followed_by_more_is_no_message(packet: bytes, golden: str) -> None:
+    for cut in range(len(packet)):
+        with pytest.raises(MalformedMessage):
+            decode(packet[:cut])
+    for more in (b"\0", b"\xc0", packet):
+        with pytest.raises(MalformedMessage):
+            decode(packet + more)
+
+
+@pytest.mark.parametrize(
+    "packet",
+    [
+        b"", b"\x90", b"\x91\x01", b"\xc1", b"\x80", b"\x82\x01\x02\x03\x04", b"\xa3abc", b"\xc0", b"\x92\xc0\x01",
+        encode(1.0, 1), encode(True, 1), encode(1, True), encode(-1, 1), encode(256, 1), encode(1, -1), encode(1, 1 << 53),
+        b"\x93\x01\x02\xa2\xff\xfe", b"\x92\x01\xcf\xff\xff\xff\xff\xff\xff\xff\xff", b"\xdc\xff\xff", b"\x91" * 5000,
+        b"\x93\x01\x01\x81\x91\x01\x01", b"\x93\x01\x01\x82\xc4\x01a\x01\xc4",
+    ],
+    ids=lambda p: p[:10].hex() or "empty",
+)  # fmt: skip
+def test_what_is_no_message(packet: bytes) -> None:
+    with pytest.raises(MalformedMessage):
+        decode(packet)
+
+
+def test_numbers_keep_all_their_bits() -> None:
+    values = [0.1, -0.0, 1e308, 5e-324, math.inf, -math.inf, 1 << 52, -(1 << 62), (1 << 63) - 1]
+    again = decode(encode(1, 1, *values))[2:]
+    assert [repr(v) for v in again] == [repr(v) for v in values]
+    assert math.isnan(decode(encode(1, 1, math.nan))[2])
+
+
+def test_a_refusal_is_bounded() -> None:
+    assert len(decode(refusal(1, 22, "x" * 100_000))[3]) == MAX_TEXT
+
+
+NUMBERS = {
+    ClientVerb: "HELLO=1 OPEN=2 CLOSE=3 LIST=4 INFO=5 STATUS=6 RESERVE_MARKER=10 FREE_MARKER=11 SIGNAL_MARKER=12 "
+    "WAIT_MARKER=13 EMERGENCY_STOP=20 RESET=21 RELOAD=22 CANCEL=30",
+    HandleVerb: "WRITE=1 IOCTL=2 SUBSCRIBE=3 KEEPALIVE=4 CANCEL=5",
+    DriverVerb: "ATTACH=1 DETACH=2 STOP_CHANGED=3 SHUTDOWN=4 INPUT=5 NODE_STOP=6 NODE_RESET=7 READY=20 DETACHED=21 "
+    "MARKER_SIGNALLED=22 STOPPED=23 LINK=24 LOG=25",
+    NurseryVerb: "DESCRIBE=1 SPAWN=2",
+    NodeClass: "BINARY=1 ANALOG=2 AXIS=3",
+    Access: "READ=1 WRITE=2",
+    Right: "READ=1 WRITE=2 STOP=4 ADMINISTER=8 ALL=15",
+    PageState: "STARTING=0 GOOD=1 LINK_LOST=2 FAULT=3 STALE=4 CLOSED=5",
+    WriteFlag: "APPEND=0 REPLACE=1 LATEST=2",
+    AnalogStatus: "SATURATED=1 INVALID=2 OVERRUN=4",
+    ControlMode: "JERK=1 ACCELERATION=2 VELOCITY=4 POSITION=8 FORCE=16 FORCE_VELOCITY=32 SPECIFIED_TIME=64 "
+    "WAIT_FOR_EXTERNAL_SYNCH=128 SPECIFIED_GAINS=256 SPECIFIED_FORCE_OFFSET=512 SPECIFIED_MAX_VEL_ACC=1024 "
+    "SPECIFIED_MAX_FORCE=2048 SPECIFIED_WAIT_MARKER=4096 SPECIFIED_SIGNAL_MARKER=8192 RELATIVE=16384",
+    AxisStatus: "MOVING=1 FORCE_MODE=2 LIMIT_MINUS=4 LIMIT_PLUS=8 HOMED=16 FOLLOWING_ERROR=32 FAULT=64 "
+    "EMERGENCY_STOP=128 WAITING_MARKER=256 WAITING_SYNCH=512 SATURATED=1024 HOMING=2048 STOPPING=4096 "
+    "SWITCH_MINUS=8192 SWITCH_PLUS=16384 STALLED=32768",
+    Request: "GET_IO_STRUCT_INFO=1 CALIBRATE_DEVICE=2 ZERO_DEVICE=3 WAIT_UNTIL_IDLE=4 SEND_EXTERNAL_SYNCH=5 "
+    "EMERGENCY_STOP=6 SIGNAL_MARKER=7 WAIT_MARKER=8 RESERVE_MARKER=9 FREE_MARKER=10 WAIT_UNTIL_EVENT=11 SET_GAINS=12 "
+    "GET_GAINS=13 STOP=20 RESET=21 HOME=22 SET_LIMITS=23 GET_LIMITS=24 FLUSH=25 CANCEL_WAITS=26 GET_STATISTICS=27",
+}
+
+
+@pytest.mark.parametrize("kind", NUMBERS, ids=lambda k: k.__name__)
+def test_numbers_are_never_changed(kind: type) -> None:
+    """Names may be added at the end; those that are there are facts of the wire."""
+    fixed = {name: int(value) for name, value in (pair.split("=") for pair in NUMBERS[kind].split())}
+    present = {name: int(getattr(kind, name)) for name in fixed}
+    assert present == fixed
+
+
+def test_golden_records() -> None:
+    axis = AXIS_WRITE.pack(1, 0x2048, 7, 8, *[float(i) for i in range(15)])
+    assert axis.hex() == (
+        "01000000" "48200000" "0700000000000000" "0800000000000000" "0000000000000000" "000000000000f03f"
+        "0000000000000040" "0000000000000840" "0000000000001040" "0000000000001440" "0000000000001840" "0000000000001c40"
+        "0000000000002040" "0000000000002240" "0000000000002440" "0000000000002640" "0000000000002840" "0000000000002a40"
+        "0000000000002c40"
+    )  # fmt: skip
+    assert BINARY_WRITE.pack(2, 0, 5, 7).hex() == "02000000" "00000000" "0500000000000000" "0700000000000000"  # fmt: skip
+    assert ANALOG_WRITE.pack(3, 0, 0.5).hex() == "03000000" "00000000" "000000000000e03f"  # fmt: skip
