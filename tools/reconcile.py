@@ -34,12 +34,18 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     test.add_argument("--axes", type=int, default=20, help="number of axes")
     test.add_argument("--seed", type=int, default=1, help="of the generator")
     test.add_argument("--out", type=Path, default=None, metavar="DIR", help="keep axes and answers here")
+    kinds.add_parser("effects", help="print the library of effects")
     parser.set_defaults(run=run)
     return parser
 
 
 def run(args: argparse.Namespace) -> int:
     """Do what the command line asks; return the exit status."""
+    if args.subject == "effects":
+        from sioms.tools.reconcile_effects import page
+
+        print(page(), end="")
+        return 0
     if args.subject == "selftest":
         from sioms.tools.reconcile_selftest import selftest
 

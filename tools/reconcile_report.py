@@ -33,6 +33,13 @@ code{background:#eef2f5;padding:0 .3em} img{max-width:100%} .small{font-size:.85
 """
 
 
+def headline(v: Verdict) -> str:
+    """One sentence."""
+    if v.outcome is Outcome.UNEXPLAINED and v.effects:
+        return "Found part of what the model lacks; something remains that no effect of the library explains."
+    return HEAD[v.outcome]
+
+
 def number(value: float) -> str:
     """Four significant digits."""
     return f"{value:.4g}"
@@ -40,7 +47,7 @@ def number(value: float) -> str:
 
 def summary(v: Verdict, out: str) -> list[str]:
     """Say the verdict in at most ten lines."""
-    lines = [f"verdict: {v.outcome.value} - {HEAD[v.outcome]}"]
+    lines = [f"verdict: {v.outcome.value} - {headline(v)}"]
     for e in v.effects[:3]:
         lines.append("  " + _line(e))
     lines += [f"  unexplained part looks like {_line(e)}" for e in v.symbolic[:2]]
@@ -82,9 +89,10 @@ def as_json(v: Verdict, seconds: float) -> str:
         "separating_experiment": v.experiment.text if v.experiment else "",
         "separation_in_noise": v.experiment.separation if v.experiment else None,
         "details": [effect(e) for e in v.effects], "symbolic": [effect(e) for e in v.symbolic],
-        "gaps": [{"channel": g.channel, "unit": g.unit, "before": g.before, "after": g.after, "floor": g.floor,
+        "gaps": [{"channel": g.channel, "unit": g.unit, "before": g.before, "after": g.after, "floor": g.floor, "session": g.session,
                   "closed": g.closed} for g in v.gaps],
-        "ladder": [{"action": s.action, "effect": s.effect, "ratio": s.ratio, "saved": s.saved, "rivals": s.rivals} for s in v.ladder],
+        "ladder": [{"action": s.action, "effect": s.effect, "ratio": s.ratio, "saved": s.saved, "rivals": s.rivals,
+                    "untouched_force_error": e} for s, e in zip(v.ladder, v.rungs, strict=True)],
         "not_excited": v.gate.missing, "same_in_these_records": [list(p) for p in v.gate.pairs],
         "located": [{"variable": p.variable, "explained": p.explained, "p": p.p} for p in v.places],
         "residual_over_floor": v.ratio, "smoother_share": v.smoother_share, "burst_share": v.burst_share,
@@ -98,7 +106,7 @@ def page(v: Verdict, seconds: float) -> str:
     pictures = _pictures(v)
     parts = [f"<!doctype html><html lang=en><meta charset=utf-8><title>{html.escape(v.nominal.name)}: reconcile</title>"
              f"<style>{STYLE}</style><h1>{html.escape(v.nominal.name)}: simulation against measurement</h1>",
-             f"<p class='verdict {v.outcome.value}'><b>{v.outcome.value}</b> - {HEAD[v.outcome]}</p>"]
+             f"<p class='verdict {v.outcome.value}'><b>{v.outcome.value}</b> - {headline(v)}</p>"]
     parts.append(_what(v))
     parts.append("<h2>How far the gap shrank</h2><p>Root mean square on samples that took no part in any choice.</p>" + _gaps(v.gaps))
     parts.append(pictures.get("gap", ""))
@@ -129,9 +137,11 @@ def _what(v: Verdict) -> str:
 
 
 def _gaps(gaps: Sequence[Gap]) -> str:
-    rows = "".join(f"<tr><td>{g.channel}<td class=n>{number(g.before)}<td class=n>{number(g.after)}<td class=n>{number(g.floor)}"
+    rows = "".join(f"<tr><td>{g.channel}<td class=n>{number(g.before)}<td class=n>{number(g.after)}<td class=n>"
+                   f"{'-' if g.session is None else number(g.session)}<td class=n>{number(g.floor)}"
                    f"<td>{g.unit}<td class=n>{100 * g.closed:.1f} %" for g in gaps)
-    return f"<table><tr><th>channel<th>before<th>after<th>noise floor<th>unit<th>closed{rows}</table>"
+    return ("<table><tr><th>channel<th>before<th>after<th>after, session offset re-estimated<th>noise floor<th>unit<th>closed"
+            f"{rows}</table>")
 
 
 def _where(v: Verdict) -> str:
@@ -165,11 +175,12 @@ def _next(v: Verdict) -> str:
 
 
 def _ladder(v: Verdict) -> str:
-    rows = [f"<tr><td>channel<td>{f.effect}<td colspan=2>{html.escape(f.evidence)}" for f in v.findings]
-    rows += [f"<tr><td>{s.action}<td>{s.effect}<td class=n>{s.ratio:.2f}<td>"
-             + ", ".join(f"{n} {100 * g:.0f} %" for n, g in sorted(s.rivals.items(), key=lambda q: -q[1])) for s in v.ladder]
-    return ("<table><tr><th>step<th>effect<th>residual over expected<th>what its rivals saved on held-out blocks" + "".join(rows)
-            + "</table>")
+    rows = [f"<tr><td>channel<td>{f.effect}<td colspan=3>{html.escape(f.evidence)}" for f in v.findings]
+    rows += [f"<tr><td>{s.action}<td>{s.effect}<td class=n>{s.ratio:.2f}<td class=n>{number(e)}<td>"
+             + ", ".join(f"{n} {100 * g:.0f} %" for n, g in sorted(s.rivals.items(), key=lambda q: -q[1]))
+             for s, e in zip(v.ladder, v.rungs, strict=True)]
+    return (f"<table><tr><th>step<th>effect<th>residual over expected<th>force error, untouched, {v.nominal.force_unit}"
+            "<th>what its rivals saved on held-out blocks" + "".join(rows) + "</table>")
 
 
 def _pictures(v: Verdict) -> dict[str, str]:

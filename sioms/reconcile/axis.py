@@ -21,7 +21,7 @@ from sioms.reconcile.effects.terms import TERM_PREFIX, TERMS
 from sioms.reconcile.excitation import Gate, gate
 from sioms.reconcile.experiment import Experiment, separate
 from sioms.reconcile.fit import BASE, Fit, Problem, refit
-from sioms.reconcile.gaps import lap, measure
+from sioms.reconcile.gaps import lap, measure, rungs
 from sioms.reconcile.locate import Place, Spectrum, force_residual, locate, spectra
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, effective_samples, observer, sensor_noise
@@ -197,7 +197,7 @@ def _conclude(ready: Prepared, nominal: AxisModel, o: Options, excited: Gate, fo
         spectrum = spectra(whole, nominal)
         traces = _traces(whole, nominal, fit.model)
     return Verdict(outcome, nominal, fit.model, tuple(named), alternatives, tuple(terms), gaps,
-                   found.ladder, ready.findings, excited, places, spectrum, plan, found.fit.ratio, share, burst,
+                   found.ladder, rungs(ready.final, [s.model for s in found.ladder]), ready.findings, excited, places, spectrum, plan, found.fit.ratio, share, burst,
                    effective_samples(found.fit.residual), len(found.fit.residual), tuple(notes), traces, rejected)
 
 

@@ -6,6 +6,8 @@ else from sensor and drive noise propagated through the linear loop.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sioms.reconcile.effect import Array
@@ -79,6 +81,13 @@ def measure(problem: Problem, nominal: AxisModel, model: AxisModel) -> tuple[Gap
     out.append(Gap("force, closed loop", unit, errors[0][0], errors[1][0], force))
     out.append(Gap("position, closed loop", nominal.position_unit, errors[0][1], errors[1][1], place))
     return tuple(out)
+
+
+def rungs(problem: Problem, models: Sequence[AxisModel]) -> tuple[float, ...]:
+    """Force error of each model on the samples of ``problem``: in closed loop where it can be, [{F}]."""
+    closed = all(r.command is not None for r in problem.session.records)
+    return tuple(closed_errors(problem, m)[0] if closed and m.controller is not None
+                 else _rms(problem.residual(m)) * problem.noise.drive for m in models)
 
 
 def closed_errors(problem: Problem, model: AxisModel) -> tuple[float, float]:

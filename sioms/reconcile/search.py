@@ -39,6 +39,7 @@ class Step:
     effect: str
     ratio: float
     saved: float
+    model: AxisModel
     rivals: dict[str, float] = field(default_factory=dict)
 
 
@@ -90,7 +91,7 @@ class Searcher:
         """Search from a model."""
         fit = self.fit(start)
         losses = self.loss(fit)
-        ladder = [Step("start", "", fit.ratio, 0.0)]
+        ladder = [Step("start", "", fit.ratio, 0.0, fit.model)]
         for _ in range(STEPS):
             if fit.ratio <= FLOOR:
                 break
@@ -145,7 +146,7 @@ class Searcher:
         if gain < SPECIFIC and unspecific(name, {n: t[2] for n, t in tried.items()}):
             return None
         rivals = {n: t[2] for n, t in tried.items() if n != name}
-        return new, loss, Step("add", name, new.ratio, gain, rivals)
+        return new, loss, Step("add", name, new.ratio, gain, new.model, rivals)
 
     def _sure(self, name: str) -> float:
         return PERIODIC_SURE if any(p.fixed for p in known()[name].parameters) else SURE
@@ -160,7 +161,7 @@ class Searcher:
             gain, sure = better(losses, loss)
             if gain < GAIN or sure < 1.0:
                 fit, losses = without, loss
-                ladder.append(Step("leave", name, fit.ratio, -gain))
+                ladder.append(Step("leave", name, fit.ratio, -gain, fit.model))
         return fit, losses
 
     def _simplify(self, fit: Fit, losses: Array, ladder: list[Step]) -> tuple[Fit, Array]:
@@ -177,7 +178,7 @@ class Searcher:
                 lost, sure = better(losses, loss)
                 if lost < GAIN or sure < 1.0:
                     fit, losses = new, loss
-                    ladder.append(Step("simplify", f"{name} to {other}", fit.ratio, -lost))
+                    ladder.append(Step("simplify", f"{name} to {other}", fit.ratio, -lost, fit.model))
                     break
         return fit, losses
 

@@ -106,7 +106,11 @@ class Trace:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Everything the workflow found out about one axis."""
+    """Everything the workflow found out about one axis.
+
+    Attributes:
+        rungs: force error on the untouched samples after each step of the ladder, in closed loop where it can be.
+    """
 
     outcome: Outcome
     nominal: AxisModel
@@ -116,6 +120,7 @@ class Verdict:
     symbolic: tuple[NamedEffect, ...]
     gaps: tuple[Gap, ...]
     ladder: tuple[Step, ...]
+    rungs: tuple[float, ...]
     findings: tuple[Finding, ...]
     gate: Gate
     places: tuple[Place, ...]

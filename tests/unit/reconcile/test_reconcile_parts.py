@@ -1,0 +1,178 @@
+"""Channels, screening, blocks, location and ambiguity on small made records."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sioms.reconcile.blocks import better, block_ids, bootstrap, heldout
+from sioms.reconcile.channels import drive, drive_output, index_fit, lattice
+from sioms.reconcile.excitation import common, gate
+from sioms.reconcile.experiment import catalogue, separate
+from sioms.reconcile.fit import Problem, refit
+from sioms.reconcile.locate import locate
+from sioms.reconcile.model import AxisModel, Controller
+from sioms.reconcile.noise import drive_noise, observer, sensor_noise
+from sioms.reconcile.records import Record, Session
+from sioms.reconcile.screen import screen
+from sioms.reconcile.search import Searcher, unspecific
+from sioms.reconcile.simulate import simulate
+
+AXIS = AxisModel(True, 1e-3, 2e-3, 1e-3, 2e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0))
+T = np.arange(4000) * 1e-3
+COMMAND = 3.5 * np.sin(2 * np.pi * 0.5 * T) + 0.4 * np.sin(2 * np.pi * 3.1 * T)
+
+
+def session(model: AxisModel = AXIS, command: np.ndarray = COMMAND) -> Session:
+    """Record ``model`` with the small noises of a good axis."""
+    rng = np.random.default_rng(4)
+    run = simulate(model, command)
+    marks = np.floor(run.x / model.pitch)
+    index = np.concatenate([np.diff(marks) != 0, [False]])
+    measured = run.applied + 2e-3 * rng.standard_normal(len(command))
+    return Session((Record("made", run.position, run.force, command, measured, index),))
+
+
+def problem(s: Session) -> Problem:
+    return Problem(s, observer(AXIS, sensor_noise(s, AXIS.resolution), drive_noise(s, AXIS.rated_force)))
+
+
+def test_the_lattice_of_a_coarse_encoder_is_seen() -> None:
+    found = lattice(session(replace(AXIS, resolution=8 * AXIS.resolution)), AXIS)
+    assert found is not None
+    assert found.values["factor"] == 8.0
+    assert lattice(session(), AXIS) is None
+
+
+@pytest.mark.parametrize("gain", [0.97, 1.0, 1.02])
+def test_index_marks_give_the_scale(gain: float) -> None:
+    fit = index_fit(session(AXIS.with_effect("encoder_scale", {"gain": gain}), 3.0 * COMMAND), AXIS)
+    assert fit is not None
+    value, error, _ = fit
+    assert abs(value - gain) < 4.0 * error
+    assert error < 2e-3
+
+
+@pytest.mark.parametrize(("effect", "symbol", "value", "within"), [
+    ("delay", "delay", 2.7e-3, 2e-5), ("lag", "tau", 3e-3, 1e-4), ("saturation", "limit", 0.35, 2e-3)])
+def test_the_drive_is_judged_by_its_current(effect: str, symbol: str, value: float, within: float) -> None:
+    found = drive(session(AXIS.with_effect(effect, {symbol: value}), 2.0 * COMMAND), AXIS)
+    assert [f.effect for f in found] == [effect]
+    assert found[0].values[symbol] == pytest.approx(value, abs=within)
+
+
+def test_a_good_drive_shows_nothing() -> None:
+    assert drive(session(), AXIS) == []
+
+
+def test_the_drive_model_is_that_of_the_simulation() -> None:
+    model = AXIS.with_effect("delay", {"delay": 2.7e-3}).with_effect("lag", {"tau": 2e-3})
+    run = simulate(model, COMMAND)
+    np.testing.assert_allclose(drive_output(run.force, 2.7e-3, 2e-3, np.inf, 1e-3)[5:], run.applied[5:], atol=4e-3)
+
+
+def test_screening_puts_the_hidden_effect_first_and_starts_near_it() -> None:
+    hidden = AXIS.with_effect("gravity", {"amp": 0.15, "phase": 0.8})
+    p = problem(session(hidden))
+    best = screen(p, refit(p, AXIS), ["viscous", "coulomb", "gravity", "payload", "offset", "delay"])[0]
+    assert best.effect == "gravity"
+    assert best.values["amp"] == pytest.approx(0.15, rel=0.1)
+    assert best.values["phase"] == pytest.approx(0.8, abs=0.1)
+
+
+def test_a_refit_finds_the_parameters() -> None:
+    hidden = AXIS.with_effect("coulomb", {"Fc": 0.06}).with_effect("payload", {"J_extra": 4e-4})
+    p = problem(session(hidden))
+    fit = refit(p, AXIS.with_effect("coulomb", {"Fc": 0.03}).with_effect("payload", {"J_extra": 1e-4}))
+    assert fit.model.effects["coulomb"]["Fc"] == pytest.approx(0.06, rel=0.02)
+    assert fit.model.effects["payload"]["J_extra"] == pytest.approx(4e-4, rel=0.02)
+
+
+def test_a_search_adds_what_is_missing_and_nothing_else() -> None:
+    hidden = AXIS.with_effect("offset", {"off": 0.06})
+    s = Searcher(problem(session(hidden)), names=("viscous", "coulomb", "offset", "payload", "spring", "viscous_direction"))
+    assert set(s.run(AXIS).fit.model.effects) == {"offset"}
+    assert set(s.run(hidden).fit.model.effects) == {"offset"}
+
+
+def test_an_effect_that_is_not_needed_leaves() -> None:
+    hidden = AXIS.with_effect("viscous", {"b_extra": 8e-3})
+    s = Searcher(problem(session(hidden)), names=("viscous", "coulomb", "offset"))
+    start = AXIS.with_effect("offset", {"off": 0.05})
+    assert set(s.run(start).fit.model.effects) == {"viscous"}
+
+
+def test_a_residual_that_suits_everything_has_no_name() -> None:
+    assert unspecific("saturation", {"saturation": 0.15, "cogging": 0.13})
+    assert not unspecific("coulomb", {"coulomb": 0.15, "stribeck": 0.16, "offset": 0.02})
+
+
+def test_blocks_agree_with_refitting() -> None:
+    """Leaving a tenth out by one Gauss-Newton step is what a refit without it would do, for a linear effect."""
+    p = problem(session(AXIS.with_effect("viscous", {"b_extra": 5e-3})))
+    fit = refit(p, AXIS.with_effect("viscous", {"b_extra": 1e-3}))
+    ids = block_ids(p, AXIS.sample_time_s)
+    loss = heldout(fit, ids)
+    assert len(loss) == ids.max() + 1
+    assert loss.sum() == pytest.approx(fit.cost, rel=0.02)
+    spread = np.std(bootstrap(fit, ids, 300, np.random.default_rng(1))[:, 0]) * fit.free[0].scale
+    assert abs(fit.model.effects["viscous"]["b_extra"] - 5e-3) < 5.0 * spread + 5e-5
+
+
+def test_a_lucky_fit_to_loud_blocks_is_not_sure() -> None:
+    quiet, loud = np.ones(40), np.ones(40)
+    loud[:3] = 500.0
+    lucky = 1.3 * quiet
+    lucky[:3] = 100.0
+    gain, errors = better(lucky, loud)
+    assert gain > 0.5
+    assert errors < 0.0
+
+
+def test_the_gate_sees_look_alikes_and_what_is_not_excited() -> None:
+    one_way = session(AXIS.with_effect("coulomb", {"Fc": 0.05}), 2.0 * T + 0.1 * np.sin(9 * T))
+    pairs = {frozenset(p[:2]) for p in gate(problem(one_way), AXIS, ("coulomb", "offset", "viscous")).pairs}
+    assert frozenset(("coulomb", "offset")) in pairs
+    both = {frozenset(p[:2]) for p in gate(problem(session()), AXIS, ("coulomb", "offset", "viscous")).pairs}
+    assert frozenset(("coulomb", "offset")) not in both
+
+
+def test_common_energy_of_equal_and_of_orthogonal_traces() -> None:
+    a = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
+    assert common(a, a @ np.array([[2.0], [1.0]])) == pytest.approx(1.0)
+    assert common(a, np.array([[0.0], [0.0], [1.0]])) == pytest.approx(0.0)
+
+
+def test_the_residual_is_located_where_it_lives() -> None:
+    p = problem(session(AXIS.with_effect("gravity", {"amp": 0.15, "phase": 0.8})))
+    places = locate(p, AXIS, np.random.default_rng(1), 39)
+    assert places[0].variable.startswith("position")
+    assert places[0].p <= 0.05
+
+
+def test_the_experiment_that_separates_is_the_one_that_excites() -> None:
+    rivals = [AXIS.with_effect("coulomb", {"Fc": 0.06}), AXIS.with_effect("offset", {"off": -0.06})]
+    plan = separate(rivals, 6.0, 2e-3)
+    assert plan is not None
+    assert plan.separation > 20.0
+    for _, _, command in catalogue(AXIS, 6.0):
+        assert np.max(np.abs(command)) <= 2.05 * 6.0
+        assert np.max(np.abs(np.diff(command))) / 1e-3 <= AXIS.max_speed
+
+
+def test_the_plain_path_gives_the_same_numbers() -> None:
+    code = ("import numpy as np; from sioms.reconcile.jit import COMPILED; from sioms.reconcile.model import *; "
+            "from sioms.reconcile.simulate import simulate; "
+            "m = AxisModel(True, 1e-3, 2e-3, 1e-3, 2e-4, 6.28, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)); "
+            "m = m.with_effect('stribeck', {'Fc': 0.05, 'Fs': 0.1, 'vs': 0.3}).with_effect('offset', {'off': 0.01}); "
+            "r = simulate(m, np.sin(np.arange(300) * 0.01)); print(COMPILED, repr(float(r.force.sum())), repr(float(r.position[-1])))")
+    out = [subprocess.run([sys.executable, "-W", "ignore", "-c", code], env={**os.environ, **extra}, capture_output=True, text=True,
+                          check=True).stdout.split() for extra in ({}, {"SIOMS_PLAIN": "1"})]
+    assert [o[0] for o in out] == ["True", "False"]
+    assert float(out[0][1]) == pytest.approx(float(out[1][1]), rel=1e-9)
+    assert out[0][2] == out[1][2]
