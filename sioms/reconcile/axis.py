@@ -15,14 +15,13 @@ from sioms.reconcile.ambiguity import Rival, rivals
 from sioms.reconcile.blocks import better, block_ids, bootstrap
 from sioms.reconcile.channels import Finding, drive, index_fit, index_scale, lattice
 from sioms.reconcile.checks import check, check_scale
-from sioms.reconcile.effect import Array
 from sioms.reconcile.effects import known, library
 from sioms.reconcile.effects.terms import TERM_PREFIX, TERMS
 from sioms.reconcile.excitation import Gate, gate
 from sioms.reconcile.experiment import Experiment, separate
 from sioms.reconcile.fit import BASE, Fit, Problem, refit
 from sioms.reconcile.gaps import lap, measure, rungs
-from sioms.reconcile.locate import Place, Spectrum, force_residual, locate, spectra
+from sioms.reconcile.locate import Place, Spectrum, locate, spectra
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, effective_samples, observer, sensor_noise
 from sioms.reconcile.records import Session
@@ -37,7 +36,8 @@ UNTOUCHED = 0.2
 UNEXPLAINED = 0.2
 #: Loudest tenth of the time holds this share of the residual's energy: bursts.
 BURSTS = 0.8
-#: Below this multiple of the expected innovation nothing is called unexplained or a burst.
+#: Below these multiples of the expected innovation nothing is called unexplained, or a burst.
+LEAST_ODD = 1.25
 QUIET = 1.6
 #: Bandwidth of the observer where no force was measured: with the colour of the drive noise unknown, what
 #: happens above it would drown the mechanics below.
@@ -95,7 +95,7 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
     share = smoother_share(ready.problem, found.fit)
     burst, _ = bursts(ready.problem, found.fit)
     rejected: tuple[str, ...] = ()
-    odd = found.fit.ratio > QUIET and share > UNEXPLAINED
+    odd = found.fit.ratio > LEAST_ODD and share > UNEXPLAINED
     if odd:
         o.progress(f"a smoother explains {100 * share:.0f} % of what remains: searching for a term")
         before = found
@@ -180,7 +180,7 @@ def _conclude(ready: Prepared, nominal: AxisModel, o: Options, excited: Gate, fo
     open_rivals = [r for r in others if r.open]
     disturbance = found.fit.ratio > QUIET and burst > BURSTS and share < UNEXPLAINED and not any(
         n == "backlash" for n in found.fit.model.effects)
-    outcome = _outcome(bool(named), bool(terms) or disturbance or (found.fit.ratio > QUIET and share > UNEXPLAINED),
+    outcome = _outcome(bool(named), bool(terms) or disturbance or (found.fit.ratio > LEAST_ODD and share > UNEXPLAINED),
                        bool(open_rivals))
     alternatives = tuple(_set(r, fit.model) for r in open_rivals) if outcome is Outcome.AMBIGUOUS else ()
     plan = _plan(ready, nominal, fit.model, open_rivals) if outcome is Outcome.AMBIGUOUS else None
@@ -278,29 +278,19 @@ def _plan(ready: Prepared, nominal: AxisModel, model: AxisModel, open_rivals: Se
 
 
 def _traces(problem: Problem, nominal: AxisModel, model: AxisModel) -> tuple[Trace, ...]:
-    """Keep curves for the pictures: force residual and, in closed loop, the force a user sees."""
-    _, before = force_residual(problem, nominal)
-    out, temperature = [], {"n": 0.0, "m": 0.0}
-    after = _remaining(problem, model, before)
+    """Keep force curves for the pictures: in closed loop where it can be, else what short windows leave."""
+    out, heat = [], [0.0, 0.0]
+    unit = problem.noise.drive / problem.noise.innovation
+    tracked = [problem.runs(m) for m in (nominal, model)]
     for i, r in enumerate(problem.session.records):
-        if nominal.controller is not None and r.command is not None:
-            n = simulate(nominal, r.command, temperature["n"])
-            m = simulate(model, r.command, temperature["m"])
-            temperature = {"n": n.end_temperature, "m": m.end_temperature}
-            fb, fa = n.force, m.force
-        else:
-            fb, fa = r.force + before[i], r.force + after[i]
-        t = np.arange(len(r), dtype=np.float64) * nominal.sample_time_s
-        out.append(Trace(r.name, t, r.force, fb, fa, before[i], after[i]))
+        curves = []
+        for j, m in enumerate((nominal, model)):
+            if m.controller is None or r.command is None:
+                curves.append(r.force + tracked[j][i].innovation * unit)
+                continue
+            run = simulate(m, r.command, heat[j])
+            heat[j] = run.end_temperature
+            curves.append(run.force)
+        time = np.arange(len(r), dtype=np.float64) * nominal.sample_time_s
+        out.append(Trace(r.name, time, r.force, curves[0], curves[1]))
     return tuple(out)
-
-
-def _remaining(problem: Problem, model: AxisModel, like: Sequence[Array]) -> list[Array]:
-    """Force residual that the corrected model leaves, from its innovations through a low-pass observer."""
-    out = []
-    gain = problem.noise.gain[1] / model.sample_time_s
-    for run, b in zip(problem.runs(model), like, strict=True):
-        smooth = np.convolve(run.innovation, np.full(20, 1.0 / 20.0), mode="same")
-        out.append(np.clip(model.inertia * gain * smooth, -10 * np.ptp(b) - 1e-30, 10 * np.ptp(b) + 1e-30))
-    return out
-

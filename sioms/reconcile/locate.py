@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt, welch
 
-from sioms.reconcile.effect import Array
+from sioms.reconcile.effect import Array, Slot
+from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.refuse import since_reversal
@@ -51,10 +52,12 @@ class Spectrum:
 def force_residual(problem: Problem, model: AxisModel) -> tuple[list[Motion], list[Array]]:
     """Return smoothed motion and force residual of every record; positive where the model lacks driving force.
 
+    The forces of state effects that the model already has are taken off.
+
     Returns:
         Motions, and J a + b v - u per record, zero-phase low-passed like the motion, [{F}].
     """
-    motions = smoothed_motion(problem, model)
+    motions, dead = smoothed_motion(problem, model), dead_band(problem, model)
     dt = model.sample_time_s
     cutoff = float(np.clip(3.0 * np.sqrt(problem.noise.gain[1] / dt) / (2.0 * np.pi), 10.0, 150.0))
     sos = butter(3, min(2.0 * cutoff * dt, 0.8), output="sos")
@@ -63,8 +66,25 @@ def force_residual(problem: Problem, model: AxisModel) -> tuple[list[Motion], li
         u = sosfiltfilt(sos, m.u, padtype="odd", padlen=min(300, len(m.u) - 1))
         # the force of sample n acts from n to n + 1: half a sample late against the speed at n
         u = 0.5 * (u + np.concatenate([u[:1], u[:-1]]))
-        out.append(sosfiltfilt(sos, model.inertia * m.a + model.viscous * m.v - u, padlen=min(300, len(u) - 1)))
+        lacking = model.inertia * m.a + model.viscous * m.v - u - _known_force(model, m, dead)
+        out.append(sosfiltfilt(sos, lacking, padlen=min(300, len(u) - 1)))
     return motions, out
+
+
+def _known_force(model: AxisModel, m: Motion, dead: float) -> Array:
+    """Sum the forces of the model's state effects on a measured motion."""
+    total = np.zeros_like(m.x)
+    for name, given in model.effects.items():
+        effect = known()[name]
+        if effect.function is None:
+            continue
+        f = effect.evaluate(m.x, m.v, m.u, m.temperature, effect.row(effect.values(given), model.pitch))
+        if effect.slot is Slot.FRICTION:
+            f = -f * direction(m.v, dead)
+        elif effect.slot is Slot.GAIN:
+            f = m.u * (f - 1.0)
+        total += f
+    return total
 
 
 def variables(motions: list[Motion], model: AxisModel, dead: float) -> dict[str, tuple[str, list[Array]]]:

@@ -100,8 +100,6 @@ class Trace:
     measured: Array
     before: Array
     after: Array
-    residual_before: Array
-    residual_after: Array
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,100 @@
+"""The whole workflow on four axes of an independent continuous-time generator, and a small blind self-test.
+
+The truth stands here, not beside the data; the solver is a process of its own in the self-test.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from sioms.reconcile_selftest.draw import draw_axis
+from sioms.reconcile_selftest.score import score
+from sioms.tools import reconcile
+from sioms.tools.reconcile_input import read_model
+from sioms.tools.reconcile_selftest import generate, record_all, solve, write_public
+
+AXES = Path(__file__).parent / "reconcile_axes"
+
+
+def answer(name: str, out: Path) -> tuple[int, dict[str, object]]:
+    status = reconcile.main(["axis", str(AXES / name), "--out", str(out), "--quiet"])
+    return status, json.loads((out / "verdict.json").read_text())
+
+
+def test_nothing_hidden_is_silent(tmp_path: Path) -> None:
+    status, found = answer("s05", tmp_path)
+    assert status == 0
+    assert found["verdict"] == "none"
+    assert found["effects"] == []
+
+
+def test_stribeck_friction_is_named_with_its_parameters_and_the_gap_closes(tmp_path: Path) -> None:
+    status, found = answer("s18", tmp_path)
+    assert status == 0
+    assert found["effects"] == ["stribeck"]
+    values = found["parameters"]["stribeck"]  # type: ignore[index]
+    assert values["Fc"] == pytest.approx(6.473, rel=0.02)
+    assert values["Fs"] == pytest.approx(12.344, rel=0.02)
+    assert values["vs"] == pytest.approx(0.009992, rel=0.05)
+    assert all(g["closed"] > 0.95 for g in found["gaps"])  # type: ignore[attr-defined]
+    page = (tmp_path / "report.html").read_text()
+    assert "Stribeck" in page
+    assert "data:image/png" in page
+    assert "src='http" not in page
+    corrected = read_model(tmp_path / "model.toml")
+    assert corrected.effects["stribeck"]["Fc"] == values["Fc"]
+
+
+def test_one_cruising_speed_leaves_coulomb_and_viscous_friction_open(tmp_path: Path) -> None:
+    status, found = answer("s16", tmp_path)
+    assert status == 4
+    sets = [set(found["effects"]), *map(set, found["alternatives"])]  # type: ignore[arg-type, call-overload]
+    assert {"coulomb"} in sets
+    assert {"viscous"} in sets
+    assert found["separation_in_noise"] > 10.0  # type: ignore[operator]
+    assert (tmp_path / "experiment.csv").exists()
+
+
+def test_a_drag_outside_the_library_is_refused_and_described(tmp_path: Path) -> None:
+    status, found = answer("s35", tmp_path)
+    assert status == 3
+    assert found["effects"] == []
+    (term,) = found["symbolic"]  # type: ignore[misc]
+    assert term["name"] == "term_falling_drag"
+    assert term["parameters"]["c"]["value"] == pytest.approx(0.0349, rel=0.05)
+    assert term["parameters"]["v0"]["value"] == pytest.approx(4.329, rel=0.05)
+
+
+def test_the_same_seed_gives_the_same_verdict(tmp_path: Path) -> None:
+    first, second = (answer("s05", tmp_path / n)[1] for n in "ab")
+    first.pop("seconds"), second.pop("seconds")
+    assert first == second
+
+
+def test_bad_input_is_an_error_and_no_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert reconcile.main(["axis", str(tmp_path / "none"), "--out", str(tmp_path / "r")]) == 2
+    assert "bad input" in capsys.readouterr().err
+    assert not (tmp_path / "r").exists()
+
+
+def test_a_small_blind_test(tmp_path: Path) -> None:
+    """Two generated axes, solved by processes that see the public part only."""
+    import numpy as np
+
+    rng = np.random.default_rng(11)
+    axes = [draw_axis("quiet", "null", rng), draw_axis("dragging", "single", rng, "viscous")]
+    for axis, records in zip(axes, record_all(axes, 11, 1.5), strict=True):
+        folder = tmp_path / axis.name
+        write_public(axis, records, folder)
+        assert not any("b_extra" in p.read_text() for p in folder.glob("*.toml"))
+        assert score(axis, solve(folder)).right
+
+
+def test_the_draw_is_reproducible_and_mixed() -> None:
+    assert generate(20, 5) == generate(20, 5)
+    assert {a.kind for a in generate(20, 5)} == {"null", "single", "multi", "unknown", "confounded"}
+    hidden = {n for a in generate(60, 5) for n in a.named if a.kind == "single"}
+    assert len(hidden) >= 14
