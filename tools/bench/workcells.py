@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 def axes(
     name: str, count: int = 4, *, tick_hz: float = 1000.0, history: int = 64, capacity: int = 16384,
-    velocity: float = 1.0, acceleration: float = 10.0, limits: bool = True, axis_keys: str = "",
+    velocity: float = 1.0, acceleration: float = 10.0, jerk: float | None = 1000.0, limits: bool = True,
+    axis_keys: str = "",
 ) -> str:  # fmt: skip
     """Return a device of simulated servo axes, named a0, a1 ...
 
@@ -15,13 +16,14 @@ def axes(
         name: of the device.
         count: of axes.
         tick_hz, history, capacity: keys of the device.
-        velocity, acceleration: limits of each axis [m/s, m/s^2].
+        velocity, acceleration, jerk: limits of each axis [m/s, m/s^2, m/s^3], jerk None for no limit.
         limits: whether the axes have soft limits, at -0.4 and 0.4 m.
         axis_keys: further lines of each axis.
     """
     soft = "position_min = -0.4\nposition_max = 0.4\n" if limits else ""
+    soft += f"jerk_max = {jerk}\n" if jerk is not None else ""
     one = (
-        f"velocity_max = {velocity}\nacceleration_max = {acceleration}\njerk_max = 1000.0\nforce_max = 60.0\n{soft}"
+        f"velocity_max = {velocity}\nacceleration_max = {acceleration}\nforce_max = 60.0\n{soft}"
         f"motor = {{ mass = 1.0, viscous = 2.0, encoder_step = 1e-6 }}\n{axis_keys}\n"
     )
     head = f'[device.{name}]\ndriver = "sim-axes"\ntick_hz = {tick_hz}\nhistory = {history}\ncapacity = {capacity}\n'
