@@ -50,6 +50,9 @@ class Engine(Protocol):
     def stop(self, blocks: Sequence[AnyBlock]) -> None:
         """Stop the motion of blocks as fast as the device can (the banks have been told already)."""
 
+    def recover(self, reason: str) -> None:
+        """Give up what is under way, so that stops can go out: a hook has raised what it should not have."""
+
     def is_quiet(self) -> bool:
         """Whether everything that was asked of the device has been done."""
 
@@ -119,6 +122,9 @@ class TickEngine:
 
     def stop(self, blocks: Sequence[AnyBlock]) -> None:
         """Nothing: the banks command the device in the next tick."""
+
+    def recover(self, reason: str) -> None:
+        """Nothing is under way between two ticks."""
 
     def is_quiet(self) -> bool:
         """A tick is all there is."""
@@ -224,6 +230,11 @@ class _Connected:
     def _arm(self) -> None:
         self._runtime.set_line_timer(self.line.deadline_ns if self.line is not None else None)
 
+    def recover(self, reason: str) -> None:
+        """Give up the jobs of the line."""
+        if self.line is not None:
+            self.line.abandon(reason)
+
     def close_line(self) -> None:
         """Release the line for good."""
         if self.line is not None:
@@ -255,6 +266,10 @@ class LineEngine(_Connected):
         self._units = [_UnitState(unit) for unit in driver.units]
         self._by_block = {id(block): state for state in self._units for block in state.unit.blocks}
         self.publishes = False
+
+    def unsolicited(self) -> Any:
+        """Return the driver's ear, if it has one."""
+        return self._driver.overheard
 
     def connected(self, now_ns: int) -> None:
         """Open all units."""

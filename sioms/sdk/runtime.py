@@ -15,42 +15,38 @@ import select
 import socket
 import time
 import traceback
-from array import array
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from sioms.motion import CommandError, EventKind
-from sioms.protocol.flags import Access, PageState, Right
+from sioms.protocol.flags import PageState
 from sioms.protocol.latch import LATCH_SIZE, REQUEST_SIZE, Latch, StopRequest
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
 from sioms.protocol.messages import (
     MAX_PACKET,
-    MAX_WRITE,
     DriverVerb,
-    HandleVerb,
-    MalformedMessage,
     decode,
     encode,
 )
-from sioms.protocol.page import PageWriter, page_size
 
+from .attachments import Attachments
 from .blocks import AnyBlock, AxisBlock, BinaryBlock
 from .driver import Driver, LineDriver, StreamDriver, TickDriver
 from .engines import Engine, LineEngine, StreamEngine, TickEngine
-from .handles import Handle, Waits
+from .handles import Waits
 from .inputs import Input
 from .markers import Markers
-from .requests import LATER, ioctl, write
+from .pages import Pages
 from .rt import TimerFd, become_realtime, name_process
 from .statistics import TickStatistics
 
 STOP_GRACE_NS = 2_000_000_000
 """How long axes may take to stop before the process ends all the same."""
+FAIL_GRACE_NS = 500_000_000
+"""How long a failed driver's line may take to send the stops."""
 PACKETS_A_TURN = 8
-PAGE = 4096
-_TWO_FDS = socket.CMSG_LEN(2 * 4)
 
 
 def run(
@@ -99,18 +95,14 @@ class Runtime:
         self.latch = Latch(memoryview(mmap.mmap(fds[1], LATCH_SIZE)))
         self._request = StopRequest(memoryview(mmap.mmap(fds[2], REQUEST_SIZE)))
         table = MarkerTable(memoryview(mmap.mmap(fds[3], TABLE_SIZE)))
-        self.markers = Markers(table, lambda number: self._tell(DriverVerb.MARKER_SIGNALLED, number))
+        self.markers = Markers(table, lambda number: self.tell(DriverVerb.MARKER_SIGNALLED, number))
         description = driver.describe(device, settings)
         self.inputs: dict[str, Input] = {name: Input(name) for name in description.inputs}
         self._description = description
-        self._generation = generation
         self._epoll = select.epoll()
         self._callbacks: dict[int, Callable[[], None]] = {}
         self._timer = TimerFd()
         self._line_timer = TimerFd()
-        self._handles: dict[int, Handle] = {}
-        self._leased: list[Handle] = []
-        self._links: dict[int, tuple[PageState, str]] = {}
         self._stop_sources = [tuple(source) for source in options["stop_sources"]]
         self._phase = float(options["phase"])
         self._daemon_lease_ns = int(float(options["daemon_lease_s"]) * 1e9)
@@ -118,12 +110,9 @@ class Runtime:
         self._ending_ns = 0
         self.driver = driver(device, settings, self)
         self.blocks = list(self.driver.blocks)
-        self._writers = [self._make_page(block) for block in self.blocks]
-        self._writer_of = {
-            id(block): writer for block, writer in zip(self.blocks, self._writers, strict=True)
-        }
-        self._subscribers: dict[int, list[Handle]] = {id(block): [] for block in self.blocks}
-        self._edges: dict[int, int] = {}
+        lease_ns = int(description.lease_s * 1e9)
+        self.pages = Pages(device, self.blocks, lease_ns, generation)
+        self.clients = Attachments(self)
         self.engine = self._make_engine()
         self.period_ns = int(1e9 / self.engine.tick_hz)
         self._seen_stop = (0, self.latch.resets, self._request.word)
@@ -132,20 +121,17 @@ class Runtime:
 
     def log(self, level: str, text: str) -> None:
         """Write a line to the daemon's log."""
-        self._tell(DriverVerb.LOG, level, text[:1000])
+        self.tell(DriverVerb.LOG, level, text[:1000])
 
     def emergency_stop(self, source: str) -> None:
         """Stop the whole workcell."""
         if self.latch.stop(time.monotonic_ns(), source):
-            self._tell(DriverVerb.STOPPED, source)
+            self.tell(DriverVerb.STOPPED, source)
         self._look_at_latch()
 
     def publish(self, block: AnyBlock, stamp_ns: int) -> None:
         """Publish a block and wake who subscribed to it."""
-        self._writer_of[id(block)].publish(block.payload(), stamp_ns, self.tick)
-        subscribers = self._subscribers[id(block)]
-        if subscribers:
-            self._wake(block, subscribers)
+        self.pages.publish(block, stamp_ns, self.tick)
 
     # --- services to engine and requests ---------------------------------------------------------
 
@@ -159,7 +145,7 @@ class Runtime:
 
     def published(self, block: AnyBlock) -> int:
         """Return the number of a block's newest snapshot."""
-        return self._writer_of[id(block)].number
+        return self.pages.number(block)
 
     def watch(self, fd: int, callback: Callable[[], None]) -> None:
         """Call back when a descriptor is readable or hung up."""
@@ -177,18 +163,12 @@ class Runtime:
 
     def set_link(self, blocks: Sequence[AnyBlock], state: PageState, reason: str) -> None:
         """Say how the device behind some blocks is: in their pages, and to the daemon once a change."""
-        changed = False
-        for block in blocks:
-            if self._links.get(id(block)) != (state, reason):
-                self._links[id(block)] = (state, reason)
-                self._writer_of[id(block)].set_state(state, reason)
-                changed = True
-        if changed:
-            self._tell(DriverVerb.LINK, int(state), reason)
+        if self.pages.set_link(blocks, state, reason):
+            self.tell(DriverVerb.LINK, int(state), reason)
 
     def is_good(self, blocks: Sequence[AnyBlock]) -> bool:
         """Whether all these blocks have a good link."""
-        return all(self._links.get(id(block), (None,))[0] is PageState.GOOD for block in blocks)
+        return self.pages.is_good(blocks)
 
     def lose(self, blocks: Sequence[AnyBlock], reason: str) -> None:
         """The device behind some blocks is lost: nothing queued will run, waits end, readers are told."""
@@ -236,7 +216,7 @@ class Runtime:
             self.engine.stop([block])
             self.end_axis_waits(block, channels, errno.ECANCELED, f"emergency stop by {source}")
         else:
-            self._make_safe(block, channels)
+            self.make_safe(block, channels)
 
     def reset_node(self, block: AnyBlock, channels: Any, what: str) -> None:
         """Clear the latched stop and faults of some channels."""
@@ -255,7 +235,7 @@ class Runtime:
         """Return what GET_STATISTICS tells: times of the last ticks, link counters, handles."""
         report = self.statistics.summary(last)
         report["tick_hz"] = self.engine.tick_hz
-        report["handles"] = len(self._handles)
+        report["handles"] = len(self.clients.handles)
         counters = getattr(self.engine, "counters", None)
         if counters is not None:
             report["link"] = {name: getattr(counters, name) for name in counters.__slots__}
@@ -313,19 +293,11 @@ class Runtime:
             self._miss_daemon()
         elif self._daemon_late:
             self._daemon_late = False
-        for handle in self._leased:
-            if began_ns - handle.heard_ns > handle.lease_ns:
-                self._end_handle(
-                    handle,
-                    errno.ETIMEDOUT,
-                    f"{handle.node}: its client was silent for longer than its lease of {handle.lease_ns / 1e9:g} s",
-                )
-                break  # the list has changed; the others have their turn next tick
+        self.clients.check_leases(began_ns)
         engine = self.engine
         engine.tick(scheduled_ns)
         ticked_ns = time.monotonic_ns()
-        for writer in self._writers:
-            writer.alive(ticked_ns)
+        self.pages.alive(ticked_ns)
         if isinstance(engine, TickEngine) and engine.publishes:
             for block in self.blocks:
                 self.publish(block, block.stamp_ns or scheduled_ns)
@@ -342,31 +314,48 @@ class Runtime:
         self.line_due()
 
     def _fail(self, error: Exception) -> None:
+        """Stop first, report second: the driver has raised what it should not have."""
         trace = "".join(traceback.format_exception(error)[-3:])
         try:
+            self.engine.recover(f"the driver failed: {error!r}")
             now_ns = time.monotonic_ns()
             for block in self.blocks:
                 if isinstance(block, AxisBlock):
                     block.bank.emergency_stop(np.arange(block.n), now_ns)
             self.engine.stop(self.blocks)
+            for block in self.blocks:
+                self.make_safe(block, range(block.n))
             self.engine.close()
-        except Exception as second:
+            self._run_line(now_ns + FAIL_GRACE_NS)
+        except Exception as second:  # nothing may keep the failure from being reported
             trace += f" (and while stopping: {second!r})"
         self.log("error", f"driver failed: {error!r}: {trace}")
+
+    def _run_line(self, until_ns: int) -> None:
+        """Let the line send what is left to send; nothing else runs any more."""
+        others = {
+            self._control.fileno(),
+            self._timer.fd,
+            *(h.sock.fileno() for h in self.clients.handles.values()),
+        }
+        while not self.engine.is_quiet() and time.monotonic_ns() < until_ns:
+            for fd, _ in self._epoll.poll(0.005):
+                callback = self._callbacks.get(fd)
+                if callback is not None and fd not in others:
+                    callback()
 
     def end(self, reason: str) -> None:
         """Stop everything, make outputs safe, and let the process end when all is quiet."""
         if self._ending_ns:
             return
         self._ending_ns = time.monotonic_ns()
-        for handle in list(self._handles.values()):
-            self._end_handle(handle, errno.EIO, f"{handle.node}: {reason}")
+        self.clients.end_all(errno.EIO, reason)
         for block in self.blocks:
             if isinstance(block, AxisBlock):
                 block.bank.stop(np.arange(block.n), self._ending_ns)
                 self.engine.commands_written(block)
         for block in self.blocks:
-            self._make_safe(block, range(block.n))
+            self.make_safe(block, range(block.n))
         self._end_reason = reason
         self._closing = False
 
@@ -381,29 +370,10 @@ class Runtime:
             self.engine.close()
             self._closing = True
         if self.engine.is_quiet() or late:
-            for writer in self._writers:
-                writer.set_state(PageState.CLOSED, self._end_reason)
+            self.pages.close(self._end_reason)
             self.running = False
 
     # --- pages and links -------------------------------------------------------------------------
-
-    def _make_page(self, block: AnyBlock) -> PageWriter:
-        spec = block.spec
-        size = -(-page_size(spec.node_class, block.n, spec.history) // PAGE) * PAGE
-        fd = os.memfd_create(f"sioms:{self.device}.{spec.name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-        os.ftruncate(fd, size)
-        self._page_fds = [*getattr(self, "_page_fds", []), fd]
-        lease_ns = int(self._description.lease_s * 1e9)
-        writer = PageWriter(
-            memoryview(mmap.mmap(fd, size)),
-            spec.node_class,
-            block.n,
-            spec.history,
-            lease_ns,
-            self._generation,
-        )
-        writer.alive(time.monotonic_ns())
-        return writer
 
     def _make_engine(self) -> Engine:
         if isinstance(self.driver, TickDriver):
@@ -413,22 +383,6 @@ class Runtime:
         if isinstance(self.driver, StreamDriver):
             return StreamEngine(self, self.driver)
         raise TypeError(f"{type(self.driver).__name__} is no TickDriver, LineDriver or StreamDriver")
-
-    def _wake(self, block: AnyBlock, subscribers: list[Handle]) -> None:
-        edge = False
-        if isinstance(block, BinaryBlock):
-            edges = int(block.words[2].sum())
-            edge = edges != self._edges.get(id(block))
-            self._edges[id(block)] = edges
-        for handle in subscribers:
-            if handle.every < 0:
-                if edge:
-                    handle.wake()
-                continue
-            handle.countdown -= 1
-            if handle.countdown <= 0:
-                handle.countdown = handle.every
-                handle.wake()
 
     def _take_events(self) -> None:
         for block in self.blocks:
@@ -447,7 +401,7 @@ class Runtime:
         latch, (seen_stop, seen_resets, seen_request) = self.latch, self._seen_stop
         word = self._request.word
         if word != seen_request and latch.stop(time.monotonic_ns(), self._request.source):
-            self._tell(DriverVerb.STOPPED, latch.source)
+            self.tell(DriverVerb.STOPPED, latch.source)
         stopped_ns, resets = latch.stopped_ns, latch.resets
         self._seen_stop = (stopped_ns, resets, word)
         if (stopped_ns and stopped_ns != seen_stop) or resets != seen_resets:
@@ -466,7 +420,7 @@ class Runtime:
                 block.bank.emergency_stop(np.arange(block.n), now_ns)
         self.engine.stop(self.blocks)
         for block in self.blocks:
-            self._make_safe(block, range(block.n))
+            self.make_safe(block, range(block.n))
         self.waits.end_where(  # before the events of the banks would: these know who stopped
             lambda w: isinstance(w.handle.block, AxisBlock),
             errno.ECANCELED,
@@ -474,7 +428,7 @@ class Runtime:
         )
         self._take_events()
 
-    def _make_safe(self, block: AnyBlock, channels: Any) -> None:
+    def make_safe(self, block: AnyBlock, channels: Any) -> None:
         """Give output channels their safe values; those without one keep the last."""
         if isinstance(block, AxisBlock) or not block.spec.writable or not block.spec.safe:
             return
@@ -492,25 +446,20 @@ class Runtime:
         if self._daemon_late or self._ending_ns:
             return
         self._daemon_late = True
-        for handle in list(self._handles.values()):
-            if handle.exclusive:
-                self._end_handle(
-                    handle,
-                    errno.ETIMEDOUT,
-                    f"{handle.node}: the daemon has been silent for more than {self._daemon_lease_ns / 1e9:g} s",
-                )
+        silent = f"the daemon has been silent for more than {self._daemon_lease_ns / 1e9:g} s"
+        self.clients.end_all(errno.ETIMEDOUT, silent, exclusive_only=True)
 
     # --- the daemon ------------------------------------------------------------------------------
 
-    def _tell(self, verb: DriverVerb, *arguments: object) -> None:
+    def tell(self, verb: DriverVerb, *arguments: object) -> None:
         try:
             self._control.send(encode(verb, 0, *arguments))
         except OSError:
             return  # a daemon that is gone is noticed by its end of file, a hung one by its lease
 
     def _tell_ready(self) -> None:
-        socket.send_fds(self._control, [encode(DriverVerb.READY, 0, len(self.blocks))], self._page_fds)
-        for fd in self._page_fds:
+        socket.send_fds(self._control, [encode(DriverVerb.READY, 0, len(self.blocks))], self.pages.fds)
+        for fd in self.pages.fds:
             os.close(fd)
 
     def _control_readable(self) -> None:
@@ -531,13 +480,9 @@ class Runtime:
     def _obey(self, verb: DriverVerb, arguments: list[Any], fds: list[int]) -> None:
         match verb:
             case DriverVerb.ATTACH:
-                self._attach(fds, *arguments)
+                self.clients.attach(fds, *arguments)
             case DriverVerb.DETACH:
-                handle = self._handles.get(arguments[0])
-                if handle is not None:
-                    self._drop_handle(handle)
-                else:
-                    self._tell(DriverVerb.DETACHED, arguments[0])
+                self.clients.detach(arguments[0])
             case DriverVerb.STOP_CHANGED:
                 self._look_at_latch()
             case DriverVerb.SHUTDOWN:
@@ -554,162 +499,6 @@ class Runtime:
                     self.log("warning", str(error))
             case _:
                 self.log("error", f"daemon sent {verb.name}, which is not for it to send")
-
-    # --- clients ---------------------------------------------------------------------------------
-
-    def _attach(
-        self, fds: list[int], number: int, block: int, channels: list[int], bit: int, access: int,
-        exclusive: bool, rights: int, lease_ns: int, who: str, node: str,
-    ) -> None:  # fmt: skip
-        sock = socket.socket(fileno=fds[0])
-        sock.setblocking(False)
-        handle = Handle(
-            number, node, who, sock, fds[1], fds[2] if len(fds) > 2 else -1, self.blocks[block],
-            np.array(channels, dtype=np.intp), bit, Access(access), exclusive, Right(rights), lease_ns,
-            time.monotonic_ns(),
-        )  # fmt: skip
-        self._handles[number] = handle
-        if lease_ns:
-            self._leased.append(handle)
-        self.watch(sock.fileno(), lambda: self._handle_readable(handle))
-        if exclusive and handle.pidfd >= 0:
-            # A child of the client may hold the socket open after the client's death.
-            self.watch(handle.pidfd, lambda: self._drop_handle(handle))
-
-    def _handle_readable(self, handle: Handle) -> None:
-        for _ in range(PACKETS_A_TURN):
-            if handle.number not in self._handles:
-                return
-            try:
-                packet, ancillary, flags, _ = handle.sock.recvmsg(MAX_PACKET, _TWO_FDS)
-            except BlockingIOError:
-                return
-            except OSError:
-                packet, ancillary, flags = b"", [], 0
-            fds = _fds_of(ancillary) if ancillary else []
-            handle.heard_ns = time.monotonic_ns()
-            try:
-                if not packet:
-                    self._drop_handle(handle)
-                    return
-                if flags & socket.MSG_TRUNC:
-                    raise MalformedMessage(f"packet longer than {MAX_PACKET} bytes")
-                self._serve(handle, decode(packet), fds)
-            except (MalformedMessage, ValueError, TypeError, LookupError, OverflowError) as error:
-                self.log(
-                    "warning", f"{handle.node}: connection of {handle.who} ended: malformed message: {error}"
-                )
-                self._end_handle(handle, errno.EPROTO, f"{handle.node}: malformed message: {error}")
-                return
-            finally:
-                for fd in fds:
-                    os.close(fd)
-
-    def _serve(self, handle: Handle, message: list[Any], fds: list[int]) -> None:
-        verb, number, arguments = HandleVerb(message[0]), message[1], message[2:]
-        if verb is not HandleVerb.KEEPALIVE and (number == 0 or number in handle.waits):
-            raise MalformedMessage(f"message number {number} is zero or in use")
-        try:
-            match verb:
-                case HandleVerb.WRITE:
-                    flags, timeout_s, data = arguments
-                    if data is None:
-                        data = _records_of(fds)
-                    value = write(self, handle, number, int(flags), _seconds(timeout_s), data)
-                case HandleVerb.IOCTL:
-                    request, argument, timeout_s = arguments
-                    value = ioctl(self, handle, number, int(request), argument, _seconds(timeout_s))
-                case HandleVerb.SUBSCRIBE:
-                    self._subscribe(handle, int(arguments[0]))
-                    value = None
-                case HandleVerb.CANCEL:
-                    wait = handle.waits.get(int(arguments[0]))
-                    value = wait is not None
-                    if wait is not None:
-                        self.waits.end(wait, errno.ECANCELED, f"{wait.what}: cancelled")
-                case HandleVerb.KEEPALIVE:
-                    return
-        except OSError as error:
-            handle.refuse(number, error.errno or errno.EIO, error.strerror or str(error))
-        else:
-            if value is not LATER:
-                handle.answer(number, value)
-
-    def _subscribe(self, handle: Handle, every: int) -> None:
-        if not -1 <= every <= 1_000_000:
-            raise OSError(errno.EINVAL, f"subscribe to {handle.node}: every {every}; want -1 to 1000000")
-        subscribers = self._subscribers[id(handle.block)]
-        if handle in subscribers:
-            subscribers.remove(handle)
-        handle.every, handle.countdown = every, 0
-        if every:
-            subscribers.append(handle)
-
-    def _end_handle(self, handle: Handle, errno_: int, text: str) -> None:
-        handle.tell_end(errno_, text)
-        self._drop_handle(handle)
-
-    def _drop_handle(self, handle: Handle) -> None:
-        """End a handle: halt what it owns, then tell the daemon that the channels are free."""
-        if self._handles.pop(handle.number, None) is None:
-            return
-        self.unwatch(handle.sock.fileno())
-        if handle.pidfd >= 0:
-            self.unwatch(handle.pidfd)
-        if handle in self._leased:
-            self._leased.remove(handle)
-        if handle.every:
-            self._subscribers[id(handle.block)].remove(handle)
-        self.waits.forget(handle)
-        if handle.exclusive:
-            if isinstance(handle.block, AxisBlock):
-                handle.block.bank.stop(handle.channels, time.monotonic_ns())
-                self.engine.commands_written(handle.block)
-            else:
-                self._make_safe_handle(handle)
-        handle.close()
-        self._tell(DriverVerb.DETACHED, handle.number)
-
-    def _make_safe_handle(self, handle: Handle) -> None:
-        block = handle.block
-        if handle.bit < 0 or not block.spec.safe or block.spec.safe[int(handle.channels[0])] is None:
-            self._make_safe(block, handle.channels)
-            return
-        channel = int(handle.channels[0])
-        mask = 1 << handle.bit
-        present = int(self.outputs.get((id(block), channel), 0))
-        value = (present & ~mask) | (int(block.spec.safe[channel] or 0) & mask)
-        try:
-            self.engine.write_outputs(None, 0, block, [channel], [value])
-        except OSError as error:
-            self.log("error", f"safe output of {handle.node} could not be set: {error.strerror}")
-
-
-def _fds_of(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
-    """Return the descriptors that came along with a packet."""
-    fds = array("i")
-    for level, kind, data in ancillary:
-        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
-            fds.frombytes(data[: len(data) - len(data) % fds.itemsize])
-    return fds.tolist()
-
-
-def _records_of(fds: list[int]) -> bytes:
-    """Copy the records of a large write out of the memory file that came with it."""
-    if not fds:
-        raise MalformedMessage("a write without records and without a descriptor")
-    size = os.fstat(fds[0]).st_size
-    if size > MAX_WRITE:
-        raise OSError(errno.EMSGSIZE, f"write of {size} bytes; want at most {MAX_WRITE}")
-    return os.pread(fds[0], size, 0)
-
-
-def _seconds(value: Any) -> float | None:
-    if value is None:
-        return None
-    if not isinstance(value, int | float) or value != value:
-        raise MalformedMessage(f"time-out {value!r}; want a number of seconds or nil")
-    return float(value)
 
 
 def _become_user(user: str) -> None:

@@ -1,0 +1,222 @@
+"""Attachments: the handles of a driver process, from the daemon's ATTACH to their end, however it comes.
+
+Concurrency: the one thread of the driver process.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import time
+from array import array
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sioms.protocol.flags import Access, Right
+from sioms.protocol.messages import MAX_PACKET, MAX_WRITE, DriverVerb, HandleVerb, MalformedMessage, decode
+
+from .blocks import AxisBlock
+from .handles import Handle
+from .requests import LATER, ioctl, write
+
+if TYPE_CHECKING:
+    from .runtime import Runtime
+
+PACKETS_A_TURN = 8
+_TWO_FDS = socket.CMSG_LEN(2 * 4)
+
+
+class Attachments:
+    """The handles of a driver process.
+
+    Attributes:
+        handles: by the daemon's number.
+    """
+
+    def __init__(self, runtime: Runtime) -> None:
+        self.handles: dict[int, Handle] = {}
+        self._runtime = runtime
+        self._leased: list[Handle] = []
+
+    def check_leases(self, now_ns: int) -> None:
+        """End the handles whose clients have been silent for longer than their leases."""
+        for handle in self._leased:
+            if now_ns - handle.heard_ns > handle.lease_ns:
+                self.end(
+                    handle, errno.ETIMEDOUT,
+                    f"{handle.node}: its client was silent for longer than its lease of {handle.lease_ns / 1e9:g} s",
+                )  # fmt: skip
+                return  # the list has changed; the others have their turn next tick
+
+    def end_all(self, errno_: int, text: str, exclusive_only: bool = False) -> None:
+        """End all handles, or those that own outputs."""
+        for handle in list(self.handles.values()):
+            if handle.exclusive or not exclusive_only:
+                self.end(handle, errno_, f"{handle.node}: {text}")
+
+    def detach(self, number: int) -> None:
+        """End a handle because the daemon says so; one that has ended already is confirmed again."""
+        handle = self.handles.get(number)
+        if handle is not None:
+            self.drop(handle)
+        else:
+            self._runtime.tell(DriverVerb.DETACHED, number)
+
+    def attach(
+        self, fds: list[int], number: int, block: int, channels: list[int], bit: int, access: int,
+        exclusive: bool, rights: int, lease_ns: int, who: str, node: str,
+    ) -> None:  # fmt: skip
+        """Take a handle from the daemon: descriptors of socket, eventfd and, if known, the client's process."""
+        sock = socket.socket(fileno=fds[0])
+        sock.setblocking(False)
+        handle = Handle(
+            number, node, who, sock, fds[1], fds[2] if len(fds) > 2 else -1, self._runtime.blocks[block],
+            np.array(channels, dtype=np.intp), bit, Access(access), exclusive, Right(rights), lease_ns,
+            time.monotonic_ns(),
+        )  # fmt: skip
+        self.handles[number] = handle
+        if lease_ns:
+            self._leased.append(handle)
+        self._runtime.watch(sock.fileno(), lambda: self._readable(handle))
+        if exclusive and handle.pidfd >= 0:
+            # A child of the client may hold the socket open after the client's death.
+            self._runtime.watch(handle.pidfd, lambda: self.drop(handle))
+
+    def _readable(self, handle: Handle) -> None:
+        for _ in range(PACKETS_A_TURN):
+            if handle.number not in self.handles:
+                return
+            try:
+                packet, ancillary, flags, _ = handle.sock.recvmsg(MAX_PACKET, _TWO_FDS)
+            except BlockingIOError:
+                return
+            except OSError:
+                packet, ancillary, flags = b"", [], 0
+            fds = _fds_of(ancillary) if ancillary else []
+            handle.heard_ns = time.monotonic_ns()
+            try:
+                if not packet:
+                    self.drop(handle)
+                    return
+                if flags & socket.MSG_TRUNC:
+                    raise MalformedMessage(f"packet longer than {MAX_PACKET} bytes")
+                self._serve(handle, decode(packet), fds)
+            except (MalformedMessage, ValueError, TypeError, LookupError, OverflowError) as error:
+                self._runtime.log(
+                    "warning", f"{handle.node}: connection of {handle.who} ended: malformed message: {error}"
+                )
+                self.end(handle, errno.EPROTO, f"{handle.node}: malformed message: {error}")
+                return
+            finally:
+                for fd in fds:
+                    os.close(fd)
+
+    def _serve(self, handle: Handle, message: list[Any], fds: list[int]) -> None:
+        verb, number, arguments = HandleVerb(message[0]), message[1], message[2:]
+        if verb is not HandleVerb.KEEPALIVE and (number == 0 or number in handle.waits):
+            raise MalformedMessage(f"message number {number} is zero or in use")
+        try:
+            match verb:
+                case HandleVerb.WRITE:
+                    flags, timeout_s, data = arguments
+                    if data is None:
+                        data = _records_of(fds)
+                    value = write(self._runtime, handle, number, int(flags), _seconds(timeout_s), data)
+                case HandleVerb.IOCTL:
+                    request, argument, timeout_s = arguments
+                    value = ioctl(self._runtime, handle, number, int(request), argument, _seconds(timeout_s))
+                case HandleVerb.SUBSCRIBE:
+                    self._subscribe(handle, int(arguments[0]))
+                    value = None
+                case HandleVerb.CANCEL:
+                    wait = handle.waits.get(int(arguments[0]))
+                    value = wait is not None
+                    if wait is not None:
+                        self._runtime.waits.end(wait, errno.ECANCELED, f"{wait.what}: cancelled")
+                case HandleVerb.KEEPALIVE:
+                    return
+        except OSError as error:
+            handle.refuse(number, error.errno or errno.EIO, error.strerror or str(error))
+        else:
+            if value is not LATER:
+                handle.answer(number, value)
+
+    def _subscribe(self, handle: Handle, every: int) -> None:
+        if not -1 <= every <= 1_000_000:
+            raise OSError(errno.EINVAL, f"subscribe to {handle.node}: every {every}; want -1 to 1000000")
+        subscribers = self._runtime.pages.subscribers(handle.block)
+        if handle in subscribers:
+            subscribers.remove(handle)
+        handle.every, handle.countdown = every, 0
+        if every:
+            subscribers.append(handle)
+
+    def end(self, handle: Handle, errno_: int, text: str) -> None:
+        """End a handle and tell its client why."""
+        handle.tell_end(errno_, text)
+        self.drop(handle)
+
+    def drop(self, handle: Handle) -> None:
+        """End a handle: halt what it owns, then tell the daemon that the channels are free."""
+        if self.handles.pop(handle.number, None) is None:
+            return
+        self._runtime.unwatch(handle.sock.fileno())
+        if handle.pidfd >= 0:
+            self._runtime.unwatch(handle.pidfd)
+        if handle in self._leased:
+            self._leased.remove(handle)
+        if handle.every:
+            self._runtime.pages.subscribers(handle.block).remove(handle)
+        self._runtime.waits.forget(handle)
+        if handle.exclusive:
+            if isinstance(handle.block, AxisBlock):
+                handle.block.bank.stop(handle.channels, time.monotonic_ns())
+                self._runtime.engine.commands_written(handle.block)
+            else:
+                self._make_safe(handle)
+        handle.close()
+        self._runtime.tell(DriverVerb.DETACHED, handle.number)
+
+    def _make_safe(self, handle: Handle) -> None:
+        """Give the outputs of a handle their safe values; of a bit only that bit."""
+        block = handle.block
+        if handle.bit < 0 or not block.spec.safe or block.spec.safe[int(handle.channels[0])] is None:
+            self._runtime.make_safe(block, handle.channels)
+            return
+        channel = int(handle.channels[0])
+        mask = 1 << handle.bit
+        present = int(self._runtime.outputs.get((id(block), channel), 0))
+        value = (present & ~mask) | (int(block.spec.safe[channel] or 0) & mask)
+        try:
+            self._runtime.engine.write_outputs(None, 0, block, [channel], [value])
+        except OSError as error:
+            self._runtime.log("error", f"safe output of {handle.node} could not be set: {error.strerror}")
+
+
+def _fds_of(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
+    """Return the descriptors that came along with a packet."""
+    fds = array("i")
+    for level, kind, data in ancillary:
+        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
+            fds.frombytes(data[: len(data) - len(data) % fds.itemsize])
+    return fds.tolist()
+
+
+def _records_of(fds: list[int]) -> bytes:
+    """Copy the records of a large write out of the memory file that came with it."""
+    if not fds:
+        raise MalformedMessage("a write without records and without a descriptor")
+    size = os.fstat(fds[0]).st_size
+    if size > MAX_WRITE:
+        raise OSError(errno.EMSGSIZE, f"write of {size} bytes; want at most {MAX_WRITE}")
+    return os.pread(fds[0], size, 0)
+
+
+def _seconds(value: Any) -> float | None:
+    if value is None:
+        return None
+    if not isinstance(value, int | float) or value != value:
+        raise MalformedMessage(f"time-out {value!r}; want a number of seconds or nil")
+    return float(value)

@@ -1,0 +1,106 @@
+"""Pages of a driver process: made, published, and told who waits for them.
+
+Concurrency: the one thread of the driver process.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import time
+from collections.abc import Sequence
+
+from sioms.protocol.flags import PageState
+from sioms.protocol.page import PageWriter, page_size
+
+from .blocks import AnyBlock, BinaryBlock
+from .handles import Handle
+
+PAGE = 4096
+
+
+class Pages:
+    """One shared page a block.
+
+    Args:
+        device: device name, for the names of the memory files.
+        blocks: the blocks.
+        lease_ns: how old the stamp of life may get.
+        generation: of the driver process.
+
+    Attributes:
+        fds: descriptors of the pages in the order of the blocks, until they have been handed over.
+    """
+
+    def __init__(self, device: str, blocks: Sequence[AnyBlock], lease_ns: int, generation: int) -> None:
+        self.fds: list[int] = []
+        self._writers: dict[int, PageWriter] = {}
+        self._subscribers: dict[int, list[Handle]] = {id(block): [] for block in blocks}
+        self._edges: dict[int, int] = {}
+        self._links: dict[int, tuple[PageState, str]] = {}
+        for block in blocks:
+            spec = block.spec
+            size = -(-page_size(spec.node_class, block.n, spec.history) // PAGE) * PAGE
+            fd = os.memfd_create(f"sioms:{device}.{spec.name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+            os.ftruncate(fd, size)
+            self.fds.append(fd)
+            memory = memoryview(mmap.mmap(fd, size))
+            writer = PageWriter(memory, spec.node_class, block.n, spec.history, lease_ns, generation)
+            writer.alive(time.monotonic_ns())
+            self._writers[id(block)] = writer
+
+    def alive(self, now_ns: int) -> None:
+        """Stamp all pages as alive [ns, CLOCK_MONOTONIC]."""
+        for writer in self._writers.values():
+            writer.alive(now_ns)
+
+    def publish(self, block: AnyBlock, stamp_ns: int, tick: int) -> None:
+        """Publish a block and wake who subscribed to it."""
+        key = id(block)
+        self._writers[key].publish(block.payload(), stamp_ns, tick)
+        subscribers = self._subscribers[key]
+        if subscribers:
+            self._wake(block, subscribers)
+
+    def number(self, block: AnyBlock) -> int:
+        """Return the number of a block's newest snapshot."""
+        return self._writers[id(block)].number
+
+    def subscribers(self, block: AnyBlock) -> list[Handle]:
+        """Return who is woken by a block's publications; the list itself, to be changed."""
+        return self._subscribers[id(block)]
+
+    def set_link(self, blocks: Sequence[AnyBlock], state: PageState, reason: str) -> bool:
+        """Say how the device behind some blocks is; return whether that is news."""
+        changed = False
+        for block in blocks:
+            if self._links.get(id(block)) != (state, reason):
+                self._links[id(block)] = (state, reason)
+                self._writers[id(block)].set_state(state, reason)
+                changed = True
+        return changed
+
+    def is_good(self, blocks: Sequence[AnyBlock]) -> bool:
+        """Whether all these blocks have a good link."""
+        return all(self._links.get(id(block), (None,))[0] is PageState.GOOD for block in blocks)
+
+    def close(self, reason: str) -> None:
+        """Mark all pages as closed for good."""
+        for writer in self._writers.values():
+            writer.set_state(PageState.CLOSED, reason)
+
+    def _wake(self, block: AnyBlock, subscribers: list[Handle]) -> None:
+        edge = False
+        if isinstance(block, BinaryBlock):
+            edges = int(block.words[2].sum())
+            edge = edges != self._edges.get(id(block))
+            self._edges[id(block)] = edges
+        for handle in subscribers:
+            if handle.every < 0:
+                if edge:
+                    handle.wake()
+                continue
+            handle.countdown -= 1
+            if handle.countdown <= 0:
+                handle.countdown = handle.every
+                handle.wake()
