@@ -1,0 +1,63 @@
+"""A driver that raises in mid-motion: the stop is sent before the process ends, also on a line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from daemon_rig import wait_for
+from wire_rig import Wire
+
+DRIVER = '''
+import os
+from sioms.drivers.modbus_axis import ModbusAxis
+
+
+class Failing(ModbusAxis):
+    """Raises in a poll once a file is there."""
+
+    def __init__(self, name, settings, kit):
+        super().__init__(name, settings, kit)
+        for unit in self.units:
+            poll = unit.poll
+
+            def failing(poll=poll):
+                if os.path.exists("{folder}/fail"):
+                    os.unlink("{folder}/fail")
+                    raise ZeroDivisionError("as planned")
+                return poll()
+
+            unit.poll = failing
+
+
+DRIVER = Failing
+'''
+CONFIG = """
+[device.slide0]
+driver = "./failing.py"
+map = "leadshine"
+line = { serial = "{port}", baud = 115200 }
+[[device.slide0.axis]]
+name = "x"
+unit = "m"
+velocity_by = "path"
+travel_per_turn = 0.01
+velocity_max = 0.1
+acceleration_max = 2.0
+"""
+
+
+def test_a_driver_that_raises_sends_the_stop_first(start: Any, short_folder: Path) -> None:
+    wire = Wire(start, short_folder, "leadshine")
+    (short_folder / "failing.py").write_text(DRIVER.replace("{folder}", str(short_folder)))
+    wire.serve(CONFIG)
+    wire.wait_up("slide0")
+    # A path goes on to its end by itself: only a stop that is sent can end it early.
+    axis = wire.client.open("slide0", "rw")
+    axis.move(1.0, max_velocity=0.05, max_acceleration=1.0)
+    wait_for(lambda: wire.state("moving") == 1, "the drive moving")
+    (short_folder / "fail").touch()
+    wire.daemon.wait_line("driver failed", 10.0)
+    wait_for(lambda: wire.state("moving") == 0, "the drive at rest", 2.0)
+    assert wire.state("feedback") < 0.5 / 0.01 * 10000
+    assert any("ZeroDivisionError" in line for line in wire.daemon.lines)
