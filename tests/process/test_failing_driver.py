@@ -11,6 +11,7 @@ from wire_rig import Wire
 DRIVER = '''
 import os
 from sioms.drivers.modbus_axis import ModbusAxis
+from sioms.sdk.exchange import LinkError
 
 
 class Failing(ModbusAxis):
@@ -19,15 +20,21 @@ class Failing(ModbusAxis):
     def __init__(self, name, settings, kit):
         super().__init__(name, settings, kit)
         for unit in self.units:
-            poll = unit.poll
+            poll, open_ = unit.poll, unit.open
 
             def failing(poll=poll):
                 if os.path.exists("{folder}/fail"):
-                    os.unlink("{folder}/fail")
+                    os.rename("{folder}/fail", "{folder}/failed")
                     raise ZeroDivisionError("as planned")
                 return poll()
 
-            unit.poll = failing
+            def opening(open_=open_):
+                # The next process must not be the one that stops the drive.
+                if os.path.exists("{folder}/failed"):
+                    raise LinkError("out of order")
+                return open_()
+
+            unit.poll, unit.open = failing, opening
 
 
 DRIVER = Failing
