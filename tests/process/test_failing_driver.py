@@ -23,10 +23,10 @@ class Failing(ModbusAxis):
             poll, open_ = unit.poll, unit.open
 
             def failing(poll=poll):
+                yield from poll()
                 if os.path.exists("{folder}/fail"):
                     os.rename("{folder}/fail", "{folder}/failed")
                     raise ZeroDivisionError("as planned")
-                return poll()
 
             def opening(open_=open_):
                 # The next process must not be the one that stops the drive.
