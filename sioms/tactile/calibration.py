@@ -31,6 +31,7 @@ from sioms.tactile.finger import ContactKind, ContactModel, Elements, Finger, Ge
 from sioms.tactile.identify import Identified, corrected, series_of, truncated
 from sioms.tactile.indenter import Wedge
 from sioms.tactile.linearity import Quadratic, find_quadratic, linearise, ramp_quadratic, with_ramps
+from sioms.tactile.proximity import Proximity, find_proximity
 from sioms.tactile.touches import Ramp, Touches, TouchLoads, touch_loads
 from sioms.tactile.width import WidthTable, hertz_table, rigid_core_table
 
@@ -124,6 +125,15 @@ def calibrate(
         warnings.append(
             "the outputs follow the load cell from touch to touch: its variation was used at the commanded level"
         )
+    proximity = _proximity(nominal, touches, loads)
+    if proximity is not None:
+        reach = np.degrees(proximity.range_rad)
+        warnings.append(
+            f"the indenter draws {100 * proximity.amplitude:+.2f} % of output without strain, over {reach:.0f} deg: shield the "
+            "elements; the finger's file undoes it for conductors"
+        )
+        distance = np.array(nominal.angles_rad) - touches.angle_rad[:, None]
+        touches = touches.with_output(touches.output - proximity.output(distance))
     recorded = touches
     begin = starts(body, np.array(nominal.angles_rad), np.array(nominal.elements.radius_m), touches)
     ramped = _Ramps(body, ramps or [], options)
@@ -187,7 +197,9 @@ def calibrate(
         if found is not None:
             residuals[name] = np.full(known.size, np.nan)
             residuals[name][known] = found.left_out / peak
-    finger = _finger(nominal, body, best, kind, adhesion, widths, quadratic, touches, residuals, direct, peak)
+    finger = _finger(
+        nominal, body, best, kind, adhesion, widths, quadratic, touches, residuals, direct, peak, proximity
+    )
     return Calibration(
         finger, touches, loads, quadratic, uniform, own, peak, contacts, cut, direct, residuals, warnings
     )
@@ -207,32 +219,43 @@ def _check(nominal: Finger, touches: Touches, warnings: list[str]) -> None:
         raise ValueError(
             f"calibrate finger: a touch has load {touches.load.min()} N/m; pressing loads are positive"
         )
-    strongest = touches.output[np.arange(len(touches)), np.abs(touches.output).argmax(axis=1)]
-    if np.median(strongest) < 0.0:
+    # about each touch's own mean: a conductor lowers all outputs, but the pressed ones stand out
+    own = touches.output - touches.output.mean(axis=1, keepdims=True)
+    nearest = np.abs(np.array(nominal.angles_rad) - touches.angle_rad[:, None]).argmin(axis=1)
+    if np.median(own[np.arange(len(touches)), nearest]) < 0.0:
         raise ValueError(
             "calibrate finger: pressing lowers the output; compression must be positive: change its sign"
         )
-    ratio = np.nanmedian(touches.force / touches.load)
-    if np.isfinite(ratio) and abs(ratio - 1.0) > 0.02:
+    ratio = float(np.median(touches.force / touches.load)) if np.isfinite(touches.force).all() else 1.0
+    if abs(ratio - 1.0) > 0.02:
         warnings.append(
             f"the load cell reads {100 * (ratio - 1):+.1f} % of the commanded load: one of them is out of scale; "
             "the commanded load was used"
         )
 
 
+def _nominal_strain(nominal: Finger, touches: Touches, loads: TouchLoads) -> Floats:
+    body, e = nominal.cylinder, nominal.elements
+    columns = [
+        strain_of(body, t, r, body.poisson, touches, loads, 0.0)
+        for t, r in zip(e.angle_rad, e.radius_m, strict=True)
+    ]
+    return np.stack(columns, axis=1)
+
+
+def _proximity(nominal: Finger, touches: Touches, loads: TouchLoads) -> Proximity | None:
+    distance = np.array(nominal.angles_rad) - touches.angle_rad[:, None]
+    return find_proximity(touches.output, _nominal_strain(nominal, touches, loads), distance)
+
+
 def _cell_is_better(nominal: Finger, touches: Touches, loads: TouchLoads) -> bool:
     """Return whether the strength of the touches goes with the load cell's reading beyond the commanded load."""
     if not np.isfinite(touches.force).all() or np.any(touches.force <= 0.0):
         return False
-    body, e = nominal.cylinder, nominal.elements
-    model = np.stack(
-        [
-            strain_of(body, t, r, body.poisson, touches, loads, 0.0)
-            for t, r in zip(e.angle_rad, e.radius_m, strict=True)
-        ],
-        1,
-    )
-    strength = np.einsum("ji,ji->j", touches.output, -model) / np.einsum("ji,ji->j", model, model)
+    e, model = nominal.elements, _nominal_strain(nominal, touches, loads)
+    # each element at its own gain first, or the gains' scatter hides the loads'
+    model = -model * (np.sum(touches.output * -model, axis=0) / np.sum(model**2, axis=0))
+    strength = np.einsum("ji,ji->j", touches.output, model) / np.einsum("ji,ji->j", model, model)
     inside = (touches.angle_rad > min(e.angle_rad)) & (touches.angle_rad < max(e.angle_rad))
     told, heard = [], []
     for load, radius in {(p, r) for p, r in zip(touches.load[inside], touches.radius_m[inside], strict=True)}:
@@ -409,7 +432,7 @@ def _identify(
 def _finger(
     nominal: Finger, body: Cylinder, fits: Fits, kind: ContactKind, adhesion: float, widths: WidthTable,
     quadratic: Quadratic | None, touches: Touches, residuals: dict[str, Floats], direct: Identified | None,
-    peak: float,
+    peak: float, proximity: Proximity | None,
 ) -> Finger:  # fmt: skip
     count = len(fits)
     base = nominal.elements
@@ -448,6 +471,9 @@ def _finger(
         contact=ContactModel(
             kind, adhesion, tuple(table.half_widths.tolist()), tuple(table.ratio.tolist()),
             nominal.contact.most_load_n_per_m,
+        ),
+        signal=nominal.signal if proximity is None else msgspec.structs.replace(
+            nominal.signal, proximity=proximity.amplitude, proximity_range_rad=proximity.range_rad
         ),
         identified=None if rows is None else IdentifiedMap(tuple(tuple(row) for row in rows.tolist())),
         notes={**nominal.notes, "map": method},

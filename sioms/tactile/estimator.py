@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sioms.tactile.finger import Finger
 from sioms.tactile.kernel import MOST_STEPS, Products, Solve, Status, compiled, plain
+from sioms.tactile.proximity import Proximity
 
 Floats = NDArray[np.float64]
 
@@ -46,6 +47,7 @@ class Quality(Flag):
 
 
 _HUGE = 1e30  # variance of an element that must not count
+_PROXIMITY_PASSES = 3
 _NOTHING = Quality.NO_CONTACT | Quality.TOO_FEW_ELEMENTS | Quality.WRONG_SIGN
 
 
@@ -119,7 +121,12 @@ class Estimator:
     """
 
     def __init__(
-        self, finger: Finger, compiled: bool | None = False, poor_fit: float = 4.0, contact_sigma: float = 6.0
+        self,
+        finger: Finger,
+        compiled: bool | None = False,
+        poor_fit: float = 4.0,
+        contact_sigma: float = 6.0,
+        conductor: bool = True,
     ) -> None:
         self.finger = finger
         self._table = finger.strain_table()
@@ -130,7 +137,10 @@ class Estimator:
         self._used = np.isfinite(noise)
         self._noise = np.where(self._used, noise, _HUGE)
         self._share = np.asarray(finger.misfit, dtype=np.float64) ** 2
-        angles = np.asarray(finger.angles_rad, dtype=np.float64)
+        angles = self._angles = np.asarray(finger.angles_rad, dtype=np.float64)
+        self._gain = np.asarray(finger.elements.gain, dtype=np.float64)
+        near = Proximity(finger.signal.proximity, finger.signal.proximity_range_rad)
+        self._drawn = near if conductor and near.amplitude != 0.0 else None
         pitch = float(np.ptp(angles)) / max(angles.size - 1, 1)
         self._arc = float(angles.min()) - 0.5 * pitch, float(angles.max()) + 0.5 * pitch
         self._radius = finger.cylinder.outer_m

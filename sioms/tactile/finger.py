@@ -71,6 +71,8 @@ class Signal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         highest: raw readings at or above are saturated.
         drift_time_s: time constant of the baseline while untouched.
         release_hold_s: how long after a touch the baseline rests, for creep to fade.
+        proximity: output that a conducting indenter draws without strain, at its own place.
+        proximity_range_rad: angle over which that falls to 1/e.
     """
 
     scale: float = 0.01
@@ -78,6 +80,8 @@ class Signal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     highest: float = 100.0
     drift_time_s: float = 2.0
     release_hold_s: float = 1.0
+    proximity: float = 0.0
+    proximity_range_rad: float = 0.25
 
 
 class ContactModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
