@@ -6,7 +6,6 @@ Decisions where the text leaves a choice are in docs/pipe-tools.md.
 from __future__ import annotations
 
 import errno
-import os
 from select import POLLIN, poll
 
 from sioms.client.stream import Stream
@@ -14,7 +13,7 @@ from sioms.client.workcell import Workcell
 
 from .columns import Columns
 from .options import Line, UsageError, fold
-from .pipe import complain, open_node, run
+from .pipe import complain, open_node, read_input, run
 from .tokens import Tokens
 
 TYPE_CHECKING = False
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 DEFAULT_COUNT = 100
-_CHUNK = 65536
 
 
 class BadInput(Exception):
@@ -46,7 +44,7 @@ def _work(words: Sequence[str]) -> None:
     if tokens.bad:
         raise UsageError(tokens.bad.partition(": ")[2])
     cell = Workcell(name="devout")
-    nodes = [open_node(cell, target.name, "rw") for target in line.targets]
+    nodes = [open_node(cell, t.name, "rw", lease_s=line.common.get("lease", 0.0)) for t in line.targets]
     columns = [Columns(t, n.info) for t, n in zip(line.targets, nodes, strict=True)]
     writer = Writer(cell, [Stream(node) for node in nodes], columns, tokens)
     try:
@@ -156,7 +154,7 @@ class Writer:
     def _await_input(self) -> None:
         for fd, _ in self._poller.poll():
             if fd == 0:
-                data = os.read(0, _CHUNK)
+                data = read_input()
                 self._ended = not data
                 self._tokens.feed(data)
                 for text in self._tokens.skipped:

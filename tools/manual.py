@@ -74,6 +74,8 @@ MANUALS: dict[str, Manual] = {
             "At the end of the input devout waits until the axes stand still, except for motion that has no end (a "
             "velocity, acceleration, jerk or force without a time), and then closes the devices. Closing halts the "
             "axes; so does the end of devout for whatever reason, SIGKILL included.",
+            "With --lease=# the drivers halt the axes when no row has come for that time, be it that the program before "
+            "devout in the pipe hangs or devout itself.",
             "A word that is no finite number stops devout with an error that names line and word, because in a stream "
             "without lines nobody can tell which number is meant for what after it. With --skip-bad-lines the line "
             "that holds it is left out instead. Input that ends within an iteration is an error. A refused command, "

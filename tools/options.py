@@ -89,6 +89,7 @@ TOOLS: dict[str, list[Option]] = {
         Option("L", "count", COUNT, ALL, "repeat COUNT times; -1: to the end of the input"),
         Option("w", "wait", "", ALL, "wait for the axes after each iteration"),
         Option("W", "no-wait", "", ALL, "do not wait for the axes at the end of the input"),
+        Option("", "lease", SECONDS, ALL, "halt the axes and end when no row has come for SECONDS, also when devout hangs"),
         Option("", "skip-bad-lines", "", ALL, "leave out a line that holds anything but numbers, instead of stopping there"),
     ],
     "sdev": [

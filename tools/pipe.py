@@ -32,12 +32,26 @@ def run(tool: str, work: Callable[[Sequence[str]], None], words: Sequence[str] |
         _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
         _signal.signal(_signal.SIGPIPE, _signal.SIG_DFL)
         words = sys.argv[1:]
+        _occupy_standard_descriptors()
     status = _status(tool, work, words)
     if as_program:
         # Leave without taking the interpreter apart: everything is written, and the kernel closes the rest.
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
         os._exit(status)
     return status
+
+
+def _occupy_standard_descriptors() -> None:
+    """See to it that no socket becomes standard input or output where the caller has closed them (``<&-``).
+
+    Reading or writing there fails as it should.
+    """
+    for fd, mode in enumerate((os.O_WRONLY, os.O_RDONLY, os.O_RDWR)):
+        try:
+            os.fstat(fd)
+        except OSError:
+            os.open(os.devnull, mode)  # takes the lowest that is free
 
 
 def _status(tool: str, work: Callable[[Sequence[str]], None], words: Sequence[str]) -> int:
@@ -75,6 +89,16 @@ def write_all(data: bytes) -> None:
             poller = poll()
             poller.register(1, POLLOUT)
             poller.poll()
+        except OSError as error:
+            raise OSError(error.errno, f"write standard output: {os.strerror(error.errno or 0).lower()}") from None
+
+
+def read_input() -> bytes:
+    """Return what standard input has, waiting for it; b'' at its end."""
+    try:
+        return os.read(0, 65536)
+    except OSError as error:
+        raise OSError(error.errno, f"read standard input: {os.strerror(error.errno or 0).lower()}") from None
 
 
 def base_name(word: str) -> str:
@@ -95,7 +119,7 @@ def names_of(word: str) -> list[str]:
     return [name]
 
 
-def open_node(cell: Workcell, word: str, mode: str, *, companion: bool = False) -> Any:
+def open_node(cell: Workcell, word: str, mode: str, *, companion: bool = False, lease_s: float = 0.0) -> Any:
     """Open the node that a word names.
 
     Args:
@@ -103,6 +127,7 @@ def open_node(cell: Workcell, word: str, mode: str, *, companion: bool = False) 
         word: node name, or a path or soft link that ends in one.
         mode: 'r' or 'rw'.
         companion: open its read-only companion where it has one, so that nobody is disturbed.
+        lease_s: longest silence before its axes are halted [s]; 0: none.
 
     Raises:
         OSError: it cannot be opened; of several names tried the error of the first.
@@ -113,7 +138,7 @@ def open_node(cell: Workcell, word: str, mode: str, *, companion: bool = False) 
         tries = [name + READONLY, name] if companion and not name.endswith(READONLY) else [name]
         for attempt in tries:
             try:
-                return cell.open(attempt, mode)
+                return cell.open(attempt, mode, lease=lease_s)
             except OSError as error:
                 if error.errno != errno.ENOENT:
                     raise

@@ -6,13 +6,12 @@ Decisions where the text leaves a choice are in docs/pipe-tools.md.
 from __future__ import annotations
 
 import errno
-import os
 
 from sioms.client.workcell import Workcell
 from sioms.protocol.flags import NodeClass
 
 from .options import Line, Target, UsageError, fold
-from .pipe import READONLY, open_node, run
+from .pipe import READONLY, open_node, read_input, run
 from .tokens import Tokens
 
 TYPE_CHECKING = False
@@ -117,7 +116,7 @@ class Setter:
         need = {"c": count, "g": count * count}.get(key, 0)
         tokens = self._numbers
         while len(tokens.numbers) < need and not tokens.bad:
-            data = os.read(0, 65536)
+            data = read_input()
             tokens.feed(data)
             if not data:
                 break

@@ -4,7 +4,7 @@ _sioms_tool() {
     local word=${COMP_WORDS[COMP_CWORD]} options=""
     case $1 in
     devin) options='-p -v -f -m -N -V -l -h -n -r -t -L --position --velocity --force --moving --lines --verbose --from= --to= --only= --repeat --period= --count= --digits= --help --version' ;;
-    devout) options='-p -v -a -j -f -F -o -t -m -s -l -h -n -r -L -w -W --position --velocity --acceleration --jerk --force --force-velocity --force-offset --time --wait-marker --signal-marker --from= --to= --only= --repeat --count= --wait --no-wait --skip-bad-lines --help --version' ;;
+    devout) options='-p -v -a -j -f -F -o -t -m -s -l -h -n -r -L -w -W --position --velocity --acceleration --jerk --force --force-velocity --force-offset --time --wait-marker --signal-marker --from= --to= --only= --repeat --count= --wait --no-wait --lease= --skip-bad-lines --help --version' ;;
     sdev) options='-z -s -e -w -c -g --zero --synch --emergency-stop --wait --calibrate --gains --help --version' ;;
     smarkers) options='-r -f -s -w --reserve --free --signal --wait --help --version' ;;
     esac

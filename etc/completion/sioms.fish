@@ -33,6 +33,7 @@ complete -c devout -s r -l repeat -d 'repeat, 100 times unless -L says otherwise
 complete -c devout -s L -l count -x -d 'repeat COUNT times; -1; to the end of the input'
 complete -c devout -s w -l wait -d 'wait for the axes after each iteration'
 complete -c devout -s W -l no-wait -d 'do not wait for the axes at the end of the input'
+complete -c devout -l lease -x -d 'halt the axes and end when no row has come for SECONDS, also when devout hangs'
 complete -c devout -l skip-bad-lines -d 'leave out a line that holds anything but numbers, instead of stopping there'
 complete -c devout -l help -d 'print this help'
 complete -c devout -l version -d 'print the version'

@@ -145,6 +145,27 @@ def test_each_sample_is_flushed(daemon: Daemon) -> None:
     process.communicate()
 
 
+def test_closed_and_full_standard_streams(shell: Shell) -> None:
+    refused(shell("devin -p lord1 > /dev/full"), "write standard output: no space left")
+    refused(shell("devin -p lord1 >&-"), "write standard output: bad file descriptor")
+    refused(shell("devout gripper0 <&-"), "read standard input: bad file descriptor")
+    assert shell("devin -p mod9 2>&-").returncode == 1
+
+
+def test_a_drivers_death_ends_devin(daemon: Daemon, cell: sioms.Workcell) -> None:
+    process = subprocess.Popen(
+        [BIN / "devin", "-t0.01", "-L-1", "tactile0"], env=environment(daemon.socket),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stdout is not None
+    process.stdout.read(10)
+    os.kill(daemon.device("tactile0")["pid"], signal.SIGKILL)
+    _, said = process.communicate(timeout=10)
+    assert process.returncode == 1
+    assert said.startswith(b"devin: read tactile0: its driver is gone")
+    daemon.wait_up("tactile0", generation=2)
+
+
 @pytest.fixture
 def devout(daemon: Daemon) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
     running: list[subprocess.Popen[bytes]] = []
@@ -210,6 +231,22 @@ def test_a_bad_number_halts_and_is_named(devout: Callable[..., subprocess.Popen[
 def test_bad_lines_are_left_out_when_asked(shell: Shell, cell: sioms.Workcell) -> None:
     result = shell("devout --skip-bad-lines -r -L-1 gripper0", "1\nx\n3\n")
     assert (result.returncode, result.stderr) == (0, "devout: line 2: 'x' is no finite number; line left out\n")
+
+
+@pytest.mark.parametrize("hung", [False, True])
+def test_a_lease_halts_when_the_rows_stay_away(
+    devout: Callable[..., subprocess.Popen[bytes]], cell: sioms.Workcell, hung: bool
+) -> None:
+    process = devout("-rv", "-L-1", "--lease=0.4", "mod0.xaxis")
+    feed(process, b"0.1 ")
+    moving(cell, 0.1)
+    if hung:
+        process.send_signal(signal.SIGSTOP)
+    halted(cell)
+    process.send_signal(signal.SIGCONT)
+    assert process.wait(10) == 1
+    assert process.stderr is not None
+    assert process.stderr.read().count(b"\n") == 1
 
 
 def test_positions_are_waited_for(shell: Shell, cell: sioms.Workcell) -> None:

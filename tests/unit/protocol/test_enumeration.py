@@ -53,9 +53,12 @@ def test_codes_are_as_the_original(members, value):
 @given(BITS, WORD, WORD)
 def test_flags_are_as_the_original(members, a, b):
     theirs, ours = pair("IntFlag", members)
+    assert int(ours(a)) == int(theirs(a)) == a  # bits without a name are kept
+    mask = sum(members.values())
+    a, b = a & mask, b & mask  # what such bits are called, and how they invert, differs between versions of Python
     for act in (
         lambda c: c(a), lambda c: c(a) | c(b), lambda c: c(a) & c(b), lambda c: c(a) ^ c(b), lambda c: c(a) | b,
-        lambda c: a & c(b), lambda c: a | c(b), lambda c: c(a) & ~c(b & a), lambda c: c(a) in c(b), lambda c: len(c(a)),
+        lambda c: a & c(b), lambda c: a | c(b), lambda c: c(a) & ~c(b), lambda c: c(a) in c(b), lambda c: len(c(a)),
         lambda c: [shown(m) for m in c(a)], lambda c: [shown(m) for m in c], lambda c: c(a) + 1, lambda c: c(a) == a,
         lambda c: {c(a): 1}[a], lambda c: c(a) >> 1,
     ):  # fmt: skip
