@@ -203,8 +203,9 @@ class Channel:
             finally:
                 with self._mutex:
                     self._reading = False
-                    if self._waiting:  # pass the reading on
-                        self._waiting.pop(next(iter(self._waiting))).release()  # type: ignore[attr-defined]
+                    # Pass the reading on; when there is nothing to read any more, tell all.
+                    for waiting in list(self._waiting)[: None if self._ended else 1]:
+                        self._waiting.pop(waiting).release()  # type: ignore[attr-defined]
             if found is None:
                 raise self._late(call)
             return self.result(found)
