@@ -11,6 +11,7 @@ import itertools
 import os
 import socket
 import time
+import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -121,6 +122,12 @@ class Clients:
                 self._dispatch(session, decode(packet) if len(packet) <= MAX_PACKET else None)
             except (MalformedMessage, _Malformed) as error:
                 self._end_session(session, str(error))
+                return
+            except Exception as error:  # our own mistake costs one session, not the workcell
+                trace = "".join(traceback.format_exception(error)[-3:])
+                self._server.log("error", "internal error", peer=session, trace=trace)
+                if session in self._sessions:
+                    self._end_session(session, f"internal error: {error!r}")
                 return
 
     def _dispatch(self, session: Session, message: list[Any] | None) -> None:
@@ -300,7 +307,9 @@ class Clients:
         if timeout_s is not None and float(timeout_s) <= 0:
             raise obstacle
         wait = self._wait(session, number, timeout_s, f"open {name}")
-        wait.why = lambda: str(self._obstacle(node) or "it has just become free").removeprefix(f"open {name}: ")
+        wait.why = lambda: str(self._obstacle(node) or "it has just become free").removeprefix(
+            f"open {name}: "
+        )
 
         def retry() -> bool:
             if self._obstacle(node) is not None:

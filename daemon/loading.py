@@ -88,13 +88,21 @@ class Loader:
         if errno_:
             self._errors.append(f"[device.{name}]: {text}")
         else:
-            errors, packed = msgpack.unpackb(zlib.decompress(value))
-            self._errors += [f"[device.{name}]{error}" for error in errors]
-            if packed is not None:
-                driver = self._config.devices[name].common.driver
-                self._infos[name] = DeviceInfo.unpack(name, driver, packed)
+            try:
+                self._take(name, *msgpack.unpackb(zlib.decompress(value)))
+            except (ValueError, TypeError, zlib.error) as error:
+                # A nursery of another version: the software was changed under the running daemon.
+                self._errors.append(
+                    f"[device.{name}]: its description is not understood ({error}); restart the daemon"
+                )
         if not self._waiting:
             self._finish()
+
+    def _take(self, name: str, errors: list[str], packed: list[Any] | None) -> None:
+        self._errors += [f"[device.{name}]{error}" for error in errors]
+        if packed is not None:
+            driver = self._config.devices[name].common.driver
+            self._infos[name] = DeviceInfo.unpack(name, driver, packed)
 
     def _late(self) -> None:
         self._errors += [
@@ -141,5 +149,7 @@ def _unknown_users(config: Config) -> list[str]:
         try:
             pwd.getpwnam(device.common.user or "root")
         except KeyError:
-            errors.append(f"[device.{name}]: user = {device.common.user}: no such user; create it or name another")
+            errors.append(
+                f"[device.{name}]: user = {device.common.user}: no such user; create it or name another"
+            )
     return errors

@@ -308,7 +308,7 @@ class Channel:
             elif self._sock.fileno() < 0:
                 self._ended = (errno.EBADF, f"{self.name} is closed")
             else:
-                gone = (errno.EIO, f"{self.name}: the process behind it has gone; open it again")
+                gone = (errno.EIO, f"{self.name}: the process behind it has gone; connect or open again")
                 self._ended = self._last_word() or gone
         return OSError(*self._ended)
 
