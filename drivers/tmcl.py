@@ -32,12 +32,12 @@ from sioms.protocol.flags import ControlMode
 from sioms.sdk import drive_axes
 from sioms.sdk.blocks import BlockSpec, Description
 from sioms.sdk.codec.tmcl import SERIAL_HEARTBEAT, SIZE, Axis, Module, Op
-from sioms.sdk.drive_axes import POSITION_MODES, AxesUnit, drive_table
+from sioms.sdk.drive_axes import BANK_MODES, POSITION_MODES, AxesUnit, drive_table
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
 from sioms.sdk.exchange import DeviceError, Steps
 from sioms.sdk.settings import LineSettings
 
-MODES = POSITION_MODES | ControlMode.VELOCITY
+MODES = BANK_MODES | POSITION_MODES | ControlMode.VELOCITY
 HIGHEST_INTERNAL = 2047
 DRIVER_FAULTS = {
     1: "stall", 2: "overtemperature", 8: "short to ground, coil A", 16: "short to ground, coil B",

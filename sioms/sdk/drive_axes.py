@@ -59,7 +59,7 @@ def axis_settings(
 ) -> AxisSettings:
     """Return an axis as the bank knows it; a drive homes by its own parameters, so only "required" matters."""
     own = Homing(axis.velocity_max, axis.velocity_max, required=required) if homing else None
-    return from_table(AxisSettings, axis, {"modes": modes | BANK_MODES, "homing": own})
+    return from_table(AxisSettings, axis, {"modes": modes, "homing": own})
 
 
 def axis_spec(

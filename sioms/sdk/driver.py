@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import errno
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import msgspec
@@ -220,12 +220,15 @@ class LineDriver(Driver):
 
     Attributes:
         line: the line's settings.
+        overheard: takes bytes that no exchange waits for, and the time [ns]: for devices that also speak unasked
+            (alarms); None counts them as noise.
         gap_s: silence on the line before each request [s].
         recovery_s: silence after a time-out before the input is discarded and the next request is
             sent: the longest turn-around of a device, so that a late reply is never taken for the next.
     """
 
     line: LineSettings
+    overheard: Callable[[bytes, int], None] | None = None
     gap_s: float = 0.0
     recovery_s: float = 0.05
 

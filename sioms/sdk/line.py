@@ -258,8 +258,11 @@ class Line:
         if running is None or not isinstance(running.step, Exchange | Send):
             return
         step = running.step
-        if self._unsolicited is None:
-            self.counters.noise_bytes += len(self.connection.read())
+        stale = self.connection.read()
+        if stale and self._unsolicited is not None:
+            self._unsolicited(stale, now_ns)
+        else:
+            self.counters.noise_bytes += len(stale)
         self.connection.write(step.data)
         self.counters.requests += 1
         self.counters.sent_bytes += len(step.data)

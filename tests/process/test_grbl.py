@@ -1,0 +1,202 @@
+"""Grbl: the driver under the real daemon against a simulated controller, on a serial line and on TCP."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from daemon_rig import at_rest, raises, wait_for
+from wire_rig import Wire
+
+from sioms.protocol.flags import AxisStatus
+
+CONFIG = """
+[device.mod0]
+driver = "grbl"
+line = { serial = "{port}" }
+version = "1.1"
+poll_hz = 25.0
+homing = true
+[[device.mod0.axis]]
+name = "x"
+letter = "X"
+position_min = -0.2
+position_max = 0.2
+velocity_max = 0.1
+acceleration_max = 0.5
+[[device.mod0.axis]]
+name = "z"
+letter = "Z"
+velocity_max = 0.1
+acceleration_max = 0.5
+"""
+
+
+def unlock(node: Any) -> None:
+    """Reset until the controller's alarm is gone."""
+
+    def good() -> bool:
+        node.reset()
+        time.sleep(0.1)
+        return not any(s & (AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP) for s in node.read().status)
+
+    wait_for(good, "unlocked")
+
+
+def test_moves_stops_homes_and_alarms(start: Callable[..., Any], short_folder: Path) -> None:
+    wire = Wire(start, short_folder, "grbl")
+    cell = wire.serve(CONFIG)
+    wire.wait_up("mod0.x")
+    with cell.open("mod0", "rw") as both:
+        # locked after power-up: homing is the way out, of all axes, and the line stays served meanwhile
+        both.home()
+        wait_for(lambda: wire.state("state") == "Home", "homing")
+        number = both.read().number
+        both.wait_until_idle(20.0)
+        assert both.read().number > number + 3
+        assert all(s & AxisStatus.HOMED for s in both.read().status)
+        assert both.read().position == pytest.approx([-0.001, -0.001])
+        # two axes released together go on one straight line
+        both.command(position=0.03, synch=True)
+        both.command(1, position=-0.06, synch=True)
+        both.synch()
+        wait_for(lambda: wire.state("velocity") > 0, "motion")
+        x, _, z = wire.state("position")
+        assert (z + 1) / (x + 1) == pytest.approx(-59 / 31, rel=0.01)
+        both.wait_until_idle(10.0)
+        assert both.read().position == pytest.approx([0.03, -0.06], abs=2e-6)
+        with raises(22, "cannot do FORCE"):
+            both.command(force=1.0)
+        with raises(22, "cannot do"):
+            both.command(position=0.0, max_velocity=0.01, max_acceleration=0.1)
+    with cell.open("mod0.x", "rw") as x:
+        # a velocity is a chain of jogs without gaps, and ends at the soft limit by itself
+        x.move(-0.1)
+        x.wait_until_idle(10.0)
+        x.command(velocity=0.08)
+        wait_for(lambda: x.read().position[0] > -0.07, "motion")
+        speeds = []
+        while x.read().position[0] < 0.05:
+            speeds.append(wire.state("velocity"))
+        assert min(speeds) > 79 and max(speeds) < 81, (min(speeds), max(speeds))
+        began = wire.state("position")[0]
+        x.stop()
+        rested = at_rest(x)
+        assert wire.state("state") == "Idle" and rested < 1.0
+        assert 0 < wire.state("position")[0] - began < 25
+        x.command(velocity=0.1)
+        wait_for(lambda: x.read().position[0] > 0.1, "motion")
+        at_rest(x)
+        assert 0.19 < x.read().position[0] <= 0.2
+        # a command replaces the one that runs
+        x.move(0.0)
+        wait_for(lambda: x.read().position[0] < 0.17, "motion")
+        x.move(0.19, replace=True)
+        x.wait_until_idle(10.0)
+        assert x.read().position[0] == pytest.approx(0.19, abs=2e-6)
+        # emergency stop: at once, and the position is lost, which is said
+        x.command(velocity=-0.1)
+        wait_for(lambda: wire.state("velocity") > 90, "motion")
+        x.stop_all()
+        wait_for(lambda: wire.state("velocity") == 0, "rest", 1.0)
+        wait_for(lambda: x.read().status[0] & AxisStatus.FAULT, "the alarm")
+        assert wire.state("position") != wire.state("real")
+        assert not x.read().status[0] & AxisStatus.HOMED
+        with raises(1, "RESET"):
+            x.move(0.0)
+        unlock(x)
+        # an alarm that comes unasked is named
+        x.command(velocity=-0.05)
+        wait_for(lambda: wire.state("velocity") > 40, "motion")
+        wire.tell("alarm 1")
+        wait_for(lambda: x.read().status[0] & AxisStatus.FAULT, "the alarm")
+        with raises(5, "hard limit switch; the position is lost"):
+            x.move(0.0)
+        unlock(x)
+        with cell.open("mod0.z", "rw") as z:
+            unlock(z)
+        # a homing that is stopped
+        x.home()
+        wait_for(lambda: wire.state("state") == "Home", "homing")
+        x.stop_all()
+        wait_for(lambda: wire.state("state") == "Alarm", "the end of homing", 1.0)
+        unlock(x)
+        # a door
+        wire.tell("door")
+        wait_for(lambda: x.read().status[0] & AxisStatus.FAULT, "the door")
+        with raises(5, "safety door"):
+            x.move(0.0)
+
+
+def test_line_faults_and_deaths_on_tcp(start: Callable[..., Any], short_folder: Path) -> None:
+    wire = Wire(start, short_folder, "grbl", "--tcp", "0", "--no-homing", "--hal")
+    cell = wire.serve(CONFIG.replace('serial = "{port}"', 'tcp = "{port}"').replace("homing = true", ""))
+    wire.wait_up("mod0.x")
+    with cell.open("mod0.x", "rw") as x:
+        wire.tell("noise 2")
+        wire.tell("late 0.3 2")
+        time.sleep(1.0)
+        wire.wait_up("mod0.x")
+        x.reset()
+        x.move(0.01)
+        x.wait_until_idle(8.0)
+        # the host falls silent: the chain of jogs ends by itself
+        x.command(velocity=0.05)
+        wait_for(lambda: wire.state("velocity") > 40, "motion")
+        wire.tell("deaf")
+        began = time.monotonic()
+        wait_for(lambda: wire.state("velocity") == 0, "the end of the chain", 1.5)
+        assert time.monotonic() - began < 1.0
+        wire.tell("clear")
+        wire.wait_up("mod0.x")
+        x.reset()
+        # unplugged and back; somebody else's program is ended with its position kept
+        wire.tell("unplug")
+        wait_for(lambda: not wire.reads("mod0.x"), "the loss")
+        wire.tell("program 100 600")
+        wire.tell("plug")
+        wire.wait_up("mod0.x")
+        wait_for(lambda: wire.state("state") == "Idle", "the program's end")
+        assert wire.state("position") == wire.state("real")
+        x.reset()
+        x.move(0.0)
+        x.wait_until_idle(10.0)
+        # rebooted in motion
+        x.command(velocity=0.05)
+        wait_for(lambda: wire.state("velocity") > 40, "motion")
+        wire.tell("reboot")
+        time.sleep(0.3)
+        x.stop()
+        at_rest(x)
+    wire.check_deaths("mod0.x", 0.02, lambda: float(wire.state("velocity")), 15, 1.5)
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("set 110 3000", "velocity_max = 0.1, but $110 of the controller is 0.05"),
+        ("set 122 100", "acceleration_max = 0.5, but $122 of the controller is 0.1"),
+    ],
+)
+def test_limits_that_differ(start: Callable[..., Any], short_folder: Path, setting: str, words: str) -> None:
+    wire = Wire(start, short_folder, "grbl")
+    wire.tell(setting)
+    wire.serve(CONFIG)
+    wait_for(lambda: words in wire.reason("mod0"), f"the sentence; {wire.reason('mod0')}")
+    assert not wire.reads("mod0.x")
+
+
+def test_inches_and_work_positions(start: Callable[..., Any], short_folder: Path) -> None:
+    wire = Wire(start, short_folder, "grbl", "--no-homing")
+    wire.tell("set 13 1")
+    wire.tell("set 10 0")
+    cell = wire.serve(CONFIG)
+    wire.wait_up("mod0.x")
+    with cell.open("mod0.x", "rw") as x:
+        x.move(0.0254)
+        x.wait_until_idle(8.0)
+        assert wire.state("position")[0] == pytest.approx(25.4)
+        assert x.read().position[0] == pytest.approx(0.0254, abs=3e-5)

@@ -1,0 +1,452 @@
+"""A Grbl controller on a pty or TCP port: ``python -m sioms.tools.counterparts.grbl --link PATH``.
+
+Behaves as the documents of Grbl 1.1h say: one ``ok`` or ``error:N`` a line, real-time bytes, a planner that looks ahead over
+15 blocks, jogs that can be cancelled, holds, alarms, homing during which ``?`` is ignored, a position that is wrong after a reset in
+motion. Commands on standard input, beside those of the line: ``state``, ``alarm N`` (motion ends, position lost), ``door``,
+``program DISTANCE FEED`` (somebody else's move in X).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from . import wire
+from .drive import Stepper
+
+WORDS = re.compile(r"([A-Z])(-?\d+(?:\.\d*)?|-?\.\d+)")
+BLOCKS = 15
+RX_BYTES = 128
+SLIP_S = 0.03
+"""How long a rotor goes on after its pulses end at once."""
+REALTIME = set(b"?!~\x18\x84\x85") | set(range(0x90, 0xA2))
+
+
+@dataclass
+class Block:
+    """A straight line."""
+
+    target: list[float]
+    feed: float
+    is_jog: bool
+
+
+@dataclass
+class Modal:
+    """Modal state of the G-code parser."""
+
+    absolute: bool = True
+    scale: float = 1.0
+    motion: int = 0
+    feed: float = 0.0
+    offset: list[float] = field(default_factory=list)
+
+
+class Controller:
+    """The controller; times in seconds of the given clock, lengths in mm."""
+
+    def __init__(
+        self,
+        axes: int = 3,
+        hal: bool = False,
+        homing: bool = True,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.letters = "XYZABCUVW"[:axes]
+        self.hal = hal
+        self.settings: dict[int, float] = {
+            0: 10, 1: 25, 2: 0, 3: 0, 4: 0, 5: 0, 6: 0, 10: 3, 11: 0.01, 12: 0.002, 13: 0, 20: 0, 21: 0, 22: int(homing),
+            23: 0, 24: 100, 25: 1500, 26: 25, 27: 1, 30: 1000, 31: 0, 32: 0,
+        }  # fmt: skip
+        for i in range(axes):
+            self.settings |= {100 + i: 250, 110 + i: 6000, 120 + i: 500, 130 + i: 200}
+        self.position = [0.0] * axes
+        self.slip = [0.0] * axes
+        self.blocks: deque[Block] = deque()
+        self.speed = 0.0
+        self.state = "Alarm" if homing else "Idle"
+        self.holding = self.cancelling = False
+        self.modal = Modal(offset=[0.0] * axes)
+        self.reports = 0
+        self._line = bytearray()
+        self._lines: deque[str] = deque()
+        self._pending: list[bytes] = []
+        self._homing_s = 0.0
+        self._clock = clock
+        self.time = Stepper(self._step, lambda: not self.blocks and not self._homing_s, clock)
+
+    # -- motion ----------------------------------------------------------------------------------
+
+    def _way(self, block: Block) -> list[float]:
+        return [t - p for t, p in zip(block.target, self.position, strict=True)]
+
+    def _limits_along(self, way: list[float], length: float) -> tuple[float, float]:
+        """Return greatest speed and acceleration along a line, so that no axis passes its own."""
+        shares = [abs(w) / length for w in way]
+        speed = min(self.settings[110 + i] / 60 / s for i, s in enumerate(shares) if s > 1e-9)
+        rate = min(self.settings[120 + i] / s for i, s in enumerate(shares) if s > 1e-9)
+        return speed, rate
+
+    def _straight_ahead(self, way: list[float], length: float) -> float:
+        """Return how far it goes straight on, over this block and those behind it."""
+        total, unit, at = length, [w / length for w in way], self.blocks[0].target
+        for block in list(self.blocks)[1:]:
+            step = [t - a for t, a in zip(block.target, at, strict=True)]
+            size = math.hypot(*step)
+            if size < 1e-9:
+                continue
+            if sum(u * s for u, s in zip(unit, step, strict=True)) / size < 0.9999:
+                break
+            total, at = total + size, block.target
+        return total
+
+    def _step(self, now_s: float, dt: float) -> None:
+        if self._homing_s:
+            if now_s >= self._homing_s:
+                self._end_homing()
+            return
+        if not self.blocks or self.state in ("Alarm", "Sleep"):
+            return
+        block = self.blocks[0]
+        way = self._way(block)
+        length = math.hypot(*way)
+        if length < 1e-7:
+            self._finish()
+            return
+        top, rate = self._limits_along(way, length)
+        if self.holding or self.cancelling:
+            wanted = 0.0
+        else:
+            half = rate * dt / 2
+            ahead = math.sqrt(half * half + 2 * rate * self._straight_ahead(way, length)) - half
+            wanted = min(block.feed / 60, top, max(ahead, rate * dt))
+        self.speed += max(-rate * dt, min(rate * dt, wanted - self.speed))
+        if self.speed <= 0.0:
+            self._rest()
+            return
+        share = min(1.0, self.speed * dt / length)
+        self.position = [p + w * share for p, w in zip(self.position, way, strict=True)]
+        if share == 1.0:
+            self.position = list(block.target)
+            self._finish()
+
+    def _finish(self) -> None:
+        self.blocks.popleft()
+        self._admit()
+        if not self.blocks:
+            self.speed = 0.0
+            if self.state in ("Run", "Jog"):
+                self.state = "Idle"
+
+    def _rest(self) -> None:
+        self.speed = 0.0
+        if self.cancelling:
+            self.cancelling = False
+            self.blocks.clear()
+            self.state = "Idle"
+
+    def _end_homing(self) -> None:
+        self._homing_s = 0.0
+        self.position = [-self.settings[27]] * len(self.position)
+        self.slip = [0.0] * len(self.slip)
+        self.state = "Idle"
+        self._say("ok")
+        self._admit()
+
+    def crash(self, number: int) -> None:
+        """End all motion at once: the rotors go on for a little, and nobody counts it."""
+        if self.blocks and self.speed:
+            way = self._way(self.blocks[0])
+            length = math.hypot(*way) or 1.0
+            self.slip = [s + w / length * self.speed * SLIP_S for s, w in zip(self.slip, way, strict=True)]
+        self.blocks.clear()
+        self._lines.clear()
+        self.speed, self._homing_s = 0.0, 0.0
+        self.holding = self.cancelling = False
+        self.state = "Alarm"
+        self._say(f"ALARM:{number}")
+
+    # -- line ------------------------------------------------------------------------------------
+
+    def _say(self, text: str) -> None:
+        self._pending.append(f"{text}\r\n".encode())
+
+    def _spoken(self) -> list[bytes]:
+        said, self._pending = self._pending, []
+        return said
+
+    def connected(self) -> list[bytes]:
+        """Greet."""
+        self._greet()
+        return self._spoken()
+
+    def due(self) -> list[bytes]:
+        """Let time pass."""
+        self.time.catch_up()
+        self._admit()
+        return self._spoken()
+
+    def take(self, data: bytes) -> list[bytes]:
+        """Take bytes: real-time ones at once, the rest by lines that end in LF or CR."""
+        self.time.catch_up()
+        for byte in data:
+            if byte in REALTIME or (self.hal and byte in (0x80, 0x81, 0x82, 0x83, 0x87, 0x19)):
+                self._realtime(byte)
+            elif byte in b"\r\n":
+                self._lines.append(self._line.decode("latin-1"))
+                self._line.clear()
+            else:
+                self._line.append(byte)
+        self._admit()
+        return self._spoken()
+
+    def _admit(self) -> None:
+        """Take lines while the planner has room; a full one lets the line wait for its ok."""
+        while self._lines and len(self.blocks) < BLOCKS and not self._homing_s:
+            line = self._lines.popleft()
+            error = self._obey(line.replace(" ", "").upper()) if len(line) < 80 else 11
+            if not self._homing_s or error:
+                self._say(f"error:{error}" if error else "ok")
+
+    def _greet(self) -> None:
+        name = "GrblHAL 1.1f ['$' or '$HELP' for help]" if self.hal else "Grbl 1.1h ['$' for help]"
+        self._pending.append(f"\r\n{name}\r\n".encode())
+        if self.state == "Alarm":
+            self._say("[MSG:'$H'|'$X' to unlock]")
+
+    def _realtime(self, byte: int) -> None:
+        match byte:
+            case 0x3F | 0x80 if not self._homing_s:
+                self._say(self.report())
+            case 0x18:
+                self._reset()
+            case 0x85 if self.state == "Jog":
+                self.cancelling = True
+            case 0x21 if self.state in ("Run", "Jog"):
+                if self.state == "Jog":
+                    self.cancelling = True
+                else:
+                    self.state, self.holding = "Hold", True
+            case 0x7E if self.state in ("Hold", "Door"):
+                self.holding = False
+                self.state = "Run" if self.blocks else "Idle"
+            case 0x84 if self.state in ("Idle", "Run", "Jog"):
+                self.holding, self.state = True, "Door"
+
+    def _reset(self) -> None:
+        if self._homing_s:
+            self.crash(6)
+        elif self.speed > 0:
+            self.crash(3)
+        elif self.state not in ("Alarm", "Sleep"):
+            self.state = "Idle"
+        self.blocks.clear()
+        self._lines.clear()
+        self._line.clear()
+        self.holding = self.cancelling = False
+        self.modal = Modal(offset=self.modal.offset)
+        self._greet()
+
+    def report(self) -> str:
+        """Return a status report."""
+        state = self.state
+        if state in ("Hold", "Door"):
+            state += ":1" if self.speed and state == "Hold" else ":0"
+        scale = 25.4 if self.settings[13] else 1.0
+        work = not int(self.settings[10]) & 1
+        offset = self.modal.offset
+        shown = [(p - (o if work else 0.0)) / scale for p, o in zip(self.position, offset, strict=True)]
+        fields = [state, f"{'WPos' if work else 'MPos'}:" + ",".join(f"{v:.3f}" for v in shown)]
+        if int(self.settings[10]) & 2:
+            fields.append(f"Bf:{BLOCKS - len(self.blocks)},{RX_BYTES}")
+        fields.append(f"FS:{self.speed * 60:.0f},0")
+        if self.reports % 10 == 0:
+            fields.append("WCO:" + ",".join(f"{o / scale:.3f}" for o in offset))
+        elif self.reports % 10 == 1:
+            fields.append("Ov:100,100,100")
+        if self.hal and self.reports % 7 == 0:
+            fields.append("FW:grblHAL|H:0,0")
+        self.reports += 1
+        return "<" + "|".join(fields) + ">"
+
+    # -- lines -----------------------------------------------------------------------------------
+
+    def _obey(self, line: str) -> int:
+        """Obey a line and return the error, 0 for none."""
+        if not line:
+            return 0
+        if line.startswith("$J="):
+            return self._jog(line[3:]) if self.state in ("Idle", "Jog") else 9
+        if line.startswith("$"):
+            return self._system(line)
+        if self.state in ("Alarm", "Jog", "Sleep"):
+            return 9
+        return self._gcode(line)
+
+    def _system(self, line: str) -> int:
+        moving = self.state not in ("Idle", "Alarm", "Check")
+        match line:
+            case "$":
+                self._say("[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]")
+            case _ if moving:
+                return 8
+            case "$I":
+                self._say("[VER:1.1f.20260801:]" if self.hal else "[VER:1.1h.20190830:]")
+                self._say("[OPT:VNML+,100,1024,3,0]" if self.hal else f"[OPT:V,{BLOCKS},{RX_BYTES}]")
+            case "$$":
+                for key, value in sorted(self.settings.items()):
+                    self._say(f"${key}={value:.3f}" if key >= 100 or value % 1 else f"${key}={int(value)}")
+            case "$G":
+                self._say("[GC:G0 G54 G17 G21 G90 G94 M5 M9 T0 F0 S0]")
+            case "$X":
+                if self.state == "Alarm":
+                    self.state = "Idle"
+                    self._say("[MSG:Caution: Unlocked]")
+            case "$C":
+                self.state = "Idle" if self.state == "Check" else "Check"
+            case "$H":
+                if not self.settings[22]:
+                    return 5
+                self.state = "Home"
+                way = max(abs(p) for p in self.position) + 10
+                self._homing_s = self._clock() + way / (self.settings[25] / 60) + 0.3
+            case "$SLP":
+                self.state = "Sleep"
+            case _:
+                return self._set(line)
+        return 0
+
+    def _set(self, line: str) -> int:
+        match = re.fullmatch(r"\$(\d+)=(-?[\d.]+)", line)
+        if match is None or int(match[1]) not in self.settings:
+            return 3
+        if float(match[2]) < 0:
+            return 4
+        self.settings[int(match[1])] = float(match[2])
+        return 0
+
+    def _words(self, text: str) -> list[tuple[str, float]] | int:
+        found = WORDS.findall(text)
+        if "".join(letter + value for letter, value in found) != text:
+            return 1 if not text[:1].isalpha() else 2
+        values = [letter for letter, _ in found if letter not in "G"]
+        return 25 if len(set(values)) < len(values) else [(letter, float(value)) for letter, value in found]
+
+    def _jog(self, text: str) -> int:
+        words = self._words(text)
+        if isinstance(words, int):
+            return words
+        absolute, scale, machine, feed = self.modal.absolute, self.modal.scale, False, 0.0
+        axes = {letter: value for letter, value in words if letter in self.letters}
+        for letter, value in words:
+            if letter == "G":
+                if value not in (20, 21, 53, 90, 91):
+                    return 16
+                absolute = value == 90 if value in (90, 91) else absolute
+                scale = {20: 25.4, 21: 1.0}.get(int(value), scale)
+                machine = machine or value == 53
+            elif letter == "F":
+                feed = value * scale
+            elif letter not in self.letters:
+                return 16
+        if not axes:
+            return 26
+        if feed <= 0:
+            return 22
+        target = self._target(axes, scale, absolute, machine)
+        if self.settings[20] and any(not -self.settings[130 + i] <= t <= 0 for i, t in enumerate(target)):
+            return 15
+        self.cancelling = False if not self.blocks else self.cancelling
+        self.blocks.append(Block(target, feed, True))
+        self.state = "Jog"
+        return 0
+
+    def _target(self, axes: dict[str, float], scale: float, absolute: bool, machine: bool) -> list[float]:
+        start = self.blocks[-1].target if self.blocks else self.position
+        target = list(start)
+        for i, letter in enumerate(self.letters):
+            if letter in axes:
+                value = axes[letter] * scale
+                offset = 0.0 if machine else self.modal.offset[i]
+                target[i] = value + offset if absolute or machine else start[i] + value
+        return target
+
+    def _gcode(self, line: str) -> int:
+        words = self._words(line)
+        if isinstance(words, int):
+            return words
+        machine, modal = False, self.modal
+        axes = {letter: value for letter, value in words if letter in self.letters}
+        for letter, value in words:
+            if letter == "G":
+                if value in (0, 1):
+                    modal.motion = int(value)
+                elif value in (20, 21):
+                    modal.scale = 25.4 if value == 20 else 1.0
+                elif value in (90, 91):
+                    modal.absolute = value == 90
+                elif value == 53:
+                    machine = True
+                elif value not in (4, 17, 54, 94):
+                    return 20
+            elif letter == "F":
+                modal.feed = value * modal.scale
+            elif letter not in self.letters and letter not in "PMST":
+                return 20
+        if axes:
+            if modal.motion == 1 and modal.feed <= 0:
+                return 22
+            feed = modal.feed if modal.motion == 1 else 1e9
+            self.blocks.append(Block(self._target(axes, modal.scale, modal.absolute, machine), feed, False))
+            self.state = "Run" if self.state == "Idle" else self.state
+        return 0
+
+    def handlers(self) -> dict[str, Callable[..., object]]:
+        """Return the commands on standard input."""
+
+        def state() -> dict[str, object]:
+            self.time.catch_up()
+            real = [p + s for p, s in zip(self.position, self.slip, strict=True)]
+            return {
+                "state": self.state, "position": self.position, "real": real, "velocity": self.speed,
+                "blocks": len(self.blocks),
+            }  # fmt: skip
+
+        def alarm(number: str) -> None:
+            self.crash(int(number))
+
+        def program(distance: str, feed: str) -> int:
+            return self._obey(f"G91G1X{distance}F{feed}")
+
+        def setting(key: str, value: str) -> None:
+            self.settings[int(key)] = float(value)
+
+        def reboot() -> None:
+            self.blocks.clear()
+            self.speed, self.state = 0.0, "Alarm" if self.settings[22] else "Idle"
+            self._greet()
+
+        return {
+            "state": state, "alarm": alarm, "program": program, "set": setting, "reboot": reboot,
+            "door": lambda: self._realtime(0x84), "hold": lambda: self._realtime(0x21),
+        }  # fmt: skip
+
+
+async def main() -> None:
+    """Serve until told to end."""
+    parser = wire.parser("simulated Grbl controller", tcp=True)
+    parser.add_argument("--axes", type=int, default=3)
+    parser.add_argument("--hal", action="store_true", help="grblHAL")
+    parser.add_argument("--no-homing", action="store_true", help="$22=0: starts unlocked")
+    options = parser.parse_args()
+    controller = Controller(options.axes, options.hal, not options.no_homing)
+    await wire.run(controller, options, controller.handlers())
+
+
+if __name__ == "__main__":
+    asyncio.run(main())
