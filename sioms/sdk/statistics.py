@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-PHASES = ("late_ns", "input_ns", "control_ns", "publish_ns", "total_ns")
-"""Scheduled to begun; to the readings being there; to the outputs being set; to all being published; all of it."""
+PHASES = ("late_ns", "input_ns", "control_ns", "publish_ns", "busy_ns", "total_ns")
+"""Scheduled to begun; to the readings being there; to the outputs being set; to all being published; all from begun;
+all from scheduled."""
 _SIZE = 8192
 
 
@@ -35,7 +36,8 @@ class TickStatistics:
         ring[1][i] = inputs_ns - began_ns
         ring[2][i] = ticked_ns - inputs_ns
         ring[3][i] = ended_ns - ticked_ns
-        ring[4][i] = total_ns
+        ring[4][i] = ended_ns - began_ns
+        ring[5][i] = total_ns
         self.ticks += 1
         if total_ns > self.longest_ns:
             self.longest_ns = total_ns

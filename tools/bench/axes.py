@@ -27,6 +27,8 @@ MOST = 10_000
 GROUP = 20
 MOVES = 40
 SKIPPED = 0.001
+PRIORITY = 90
+"""Above other drivers on the machine: what one core carries is asked, not what is left of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +48,13 @@ class Load:
     skipped: float
     share: float
 
-    def p99_us(self, phase: str = "total_ns") -> float:
+    def p99_us(self, phase: str = "busy_ns") -> float:
         """Return the 99th percentile of a phase [us]."""
         return float(self.phases[phase]["99.0"]) * 1e-3
 
     @property
     def carried(self) -> bool:
-        """Whether the ticks kept to the period."""
+        """Whether the ticks fit into the period; a late start alone does not make the next one late."""
         return self.p99_us() < 1e6 / self.rate and self.skipped <= SKIPPED
 
 
@@ -99,7 +101,7 @@ def _search(rate: int, seconds: float, report: Report) -> Load | None:
 def _tell(load: Load, report: Report) -> None:
     word = "carried" if load.carried else "too many"
     report.note(
-        f"{load.axes:6} axes at {load.rate} Hz: p50 {load.phases['total_ns']['50.0'] * 1e-3:7.0f} us, p99 {load.p99_us():7.0f} us, "
+        f"{load.axes:6} axes at {load.rate} Hz: p50 {load.phases['busy_ns']['50.0'] * 1e-3:7.0f} us, p99 {load.p99_us():7.0f} us, "
         f"{load.skipped:.2%} of ticks left out, core {load.share:.0%}: {word}"
     )
 
@@ -133,7 +135,7 @@ def _groups(axes: int) -> int:
 
 def _config(axes: int, rate: int) -> str:
     device = (
-        f'[device.many]\ndriver = "sim-axes"\ntick_hz = {rate}\nhistory = 4\ncapacity = 64\n'
+        f'[device.many]\ndriver = "sim-axes"\nrealtime_priority = {PRIORITY}\ntick_hz = {rate}\nhistory = 4\ncapacity = 64\n'
         f'[[device.many.axis]]\nname = "a"\ncount = {axes}\nposition_min = -0.4\nposition_max = 0.4\nvelocity_max = 1.0\n'
         "acceleration_max = 10.0\njerk_max = 1000.0\nforce_max = 60.0\nfollowing_error_max = 0.1\n"
         "motor = { mass = 1.0, viscous = 2.0, coulomb = 1.0, stiction = 1.5, encoder_step = 1e-6 }\n"
@@ -158,7 +160,8 @@ def _break_down(load: Load, report: Report) -> None:
     """Say where the time of a tick goes, as table F.7 does."""
     names = {
         "late_ns": "scheduling", "input_ns": "stops, leases, simulated mechanics, measurement",
-        "control_ns": "plans, limits, law, watching", "publish_ns": "publication, waits, events", "total_ns": "whole tick",
+        "control_ns": "plans, limits, law, watching", "publish_ns": "publication, waits, events", "busy_ns": "whole tick",
+        "total_ns": "from schedule to end",
     }  # fmt: skip
     for phase, text in names.items():
         p = load.phases[phase]
