@@ -195,6 +195,8 @@ class Channel:
                 with self._mutex:
                     self._waiting.pop(number, None)
                     late = number not in self._answers and deadline is not None and monotonic() >= deadline
+                    if late and not self._reading:  # the reading may just have been passed to us
+                        self._pass_on()
                 if late:
                     raise self._late(call)
                 continue
@@ -203,12 +205,15 @@ class Channel:
             finally:
                 with self._mutex:
                     self._reading = False
-                    # Pass the reading on; when there is nothing to read any more, tell all.
-                    for waiting in list(self._waiting)[: None if self._ended else 1]:
-                        self._waiting.pop(waiting).release()  # type: ignore[attr-defined]
+                    self._pass_on()
             if found is None:
                 raise self._late(call)
             return self.result(found)
+
+    def _pass_on(self) -> None:
+        """Let another thread read; when there is nothing to read any more, tell all."""
+        for waiting in list(self._waiting)[: None if self._ended else 1]:
+            self._waiting.pop(waiting).release()  # type: ignore[attr-defined]
 
     def take(self) -> tuple[list, list[int]] | None:  # type: ignore[type-arg]
         """Read one packet without waiting, for event loops; None when there is none.
