@@ -255,13 +255,22 @@ def at_rest(node: Any, timeout_s: float = 5.0) -> float:
 
 
 class Waiting:
-    """A call in a thread, and how it ended."""
+    """A call in a thread, and how it ended.
 
-    def __init__(self, call: Callable[[], object]) -> None:
+    Args:
+        call: it waits.
+        of: the node or session that it waits on; the request has then been taken when this returns.
+    """
+
+    def __init__(self, call: Callable[[], object], of: Any = None) -> None:
         self.error: OSError | None = None
         self.value: object = None
         self.thread = threading.Thread(target=self._run, args=(call,))
+        before = of._channel._number if of is not None else 0
         self.thread.start()
+        if of is not None:
+            wait_for(lambda: of._channel._number > before, "the request is sent")
+            of.status() if isinstance(of, sioms.Workcell) else of.statistics(1)  # is answered after it
 
     def _run(self, call: Callable[[], object]) -> None:
         try:

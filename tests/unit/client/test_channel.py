@@ -1,0 +1,151 @@
+"""A channel used by many threads: each gets its own answer, and none waits for ever."""
+
+from __future__ import annotations
+
+import _socket
+import errno
+import socket
+import threading
+from _thread import allocate_lock
+from collections.abc import Iterator
+
+import pytest
+
+from sioms.client.channel import GRACE_S, Call, Channel
+from sioms.protocol.messages import decode, encode, refusal, reply
+
+
+class Peer:
+    """The other end of a channel."""
+
+    def __init__(self) -> None:
+        ours, self.sock = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.sock.settimeout(10.0)
+        self.channel = Channel(_socket.socket(fileno=ours.detach()), "peer")
+        self.results: dict[object, object] = {}
+        self.threads: list[threading.Thread] = []
+
+    def ask(self, word: object, limit_s: float | None = None) -> int:
+        """Let a thread ask; return the number of its request when it has come."""
+
+        def run() -> None:
+            try:
+                self.results[word] = self.channel.call(Call("ask", 1, word, limit_s=limit_s)).value
+            except OSError as error:
+                self.results[word] = error
+
+        self.threads.append(threading.Thread(target=run, daemon=True))
+        self.threads[-1].start()
+        return int(decode(self.sock.recv(65536))[1])
+
+    def join(self) -> dict[object, object]:
+        for thread in self.threads:
+            thread.join(10.0)
+            assert not thread.is_alive(), "a thread waits for ever"
+        return self.results
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    one = Peer()
+    yield one
+    one.channel.close()
+    one.sock.close()
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 2, 1, 0), (2, 0, 3, 1)])
+def test_answers_in_any_order_find_their_threads(peer: Peer, order: tuple[int, ...]) -> None:
+    numbers = [peer.ask(word) for word in range(4)]
+    for i in order:
+        peer.sock.send(reply(numbers[i], i * 10))
+    assert peer.join() == {i: i * 10 for i in range(4)}
+
+
+@pytest.mark.parametrize("end", ["close", "peer", "reason"])
+def test_the_end_wakes_all_threads(peer: Peer, end: str) -> None:
+    for word in range(5):
+        peer.ask(word)
+    if end == "close":
+        peer.channel.close()
+    elif end == "peer":
+        peer.sock.close()
+    else:
+        peer.sock.send(encode(0, 0, errno.ETIMEDOUT, "the lease"))
+    expected = {"close": errno.EBADF, "peer": errno.EIO, "reason": errno.ETIMEDOUT}[end]
+    assert [error.errno for error in peer.join().values()] == [expected] * 5  # type: ignore[attr-defined]
+
+
+def test_a_late_one_passes_the_reading_on(peer: Peer) -> None:
+    """The first reads, the second would be next and is late, the third waits without limit."""
+    first = peer.ask("first")
+    peer.ask("second", 0.05 - GRACE_S)
+    third = peer.ask("third")
+    peer.sock.send(reply(first, 1))
+    peer.threads[1].join(10.0)
+    peer.sock.send(reply(third, 3))
+    results = peer.join()
+    assert (results["first"], results["third"]) == (1, 3)
+    assert isinstance(results["second"], OSError) and results["second"].errno == errno.ETIMEDOUT
+
+
+def test_a_thread_whose_turn_comes_too_late_lets_the_next_one_read(peer: Peer) -> None:
+    """The reading is passed to a thread in the very moment in which its time is over."""
+    channel = peer.channel
+    channel._reading = True  # by a thread that is not there
+    late = peer.ask("late", 0.2 - GRACE_S)
+    last = peer.ask("last")
+    while len(channel._waiting) < 2:
+        threading.Event().wait(0.001)
+    with channel._mutex:  # nobody can go on ...
+        threading.Event().wait(0.3)  # ... when the time of the first is over ...
+        channel._waiting.pop(late, allocate_lock()).release()  # type: ignore[attr-defined]
+        channel._reading = False  # ... and it is told to read
+    peer.sock.send(reply(last, "in time"))
+    results = peer.join()
+    assert results["last"] == "in time" and isinstance(results["late"], OSError)
+
+
+def test_the_reason_of_the_end_is_told_to_who_sends_next(peer: Peer) -> None:
+    peer.sock.send(encode(0, 0, errno.ECANCELED, "stopped by eva"))
+    peer.sock.close()
+    for _ in range(2):
+        with pytest.raises(OSError, match="stopped by eva") as refused:
+            peer.channel.call(Call("ask", 1))
+        assert refused.value.errno == errno.ECANCELED
+
+
+def test_answers_before_the_end_are_kept(peer: Peer) -> None:
+    call = Call("ask", 1)
+    first, second = peer.channel.send(call), peer.channel.send(call)
+    peer.sock.send(reply(first, "taken"))
+    peer.sock.send(refusal(second, errno.EAGAIN, "no room"))
+    peer.sock.close()  # with requests unread: a reset comes first
+    with pytest.raises(OSError, match="peer"):
+        peer.channel.send(call)
+    assert peer.channel.wait(first, call).value == "taken"
+    with pytest.raises(OSError, match="no room"):
+        peer.channel.wait(second, call)
+
+
+def test_a_message_too_long_is_refused_before_it_is_sent(peer: Peer) -> None:
+    with pytest.raises(OSError, match="at most 65536") as refused:
+        peer.channel.call(Call("ask", 1, b"x" * 70000))
+    assert refused.value.errno == errno.EMSGSIZE
+    number = peer.ask("still works")
+    peer.sock.send(reply(number, 1))
+    assert peer.join() == {"still works": 1}
+
+
+def test_a_peer_that_talks_nonsense_ends_the_channel(peer: Peer) -> None:
+    peer.ask("x")
+    peer.sock.send(b"\xc1nonsense")
+    error = peer.join()["x"]
+    assert isinstance(error, OSError) and error.errno == errno.EPROTO
+
+
+def test_take_does_not_wait(peer: Peer) -> None:
+    assert peer.channel.take() is None
+    number = peer.channel.send(Call("ask", 1))
+    peer.sock.send(reply(number, 5))
+    packet = peer.channel.take()
+    assert packet is not None and peer.channel.result(packet).value == 5
