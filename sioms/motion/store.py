@@ -7,6 +7,8 @@ is carried from command to command, so that a trajectory of many pieces does not
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,8 @@ from .profile import MAX_SEGMENTS, Plan
 
 NEVER_NS = 2**62
 UNCUT_NS = 2**63 - 1
+FEW = 4
+"""Axes up to which one by one is quicker than as arrays: segments of different axes seldom end together."""
 Axes = NDArray[np.int64]
 
 
@@ -106,6 +110,8 @@ class PlanStore:
 
     def advance(self, axes: Axes) -> Axes:
         """Go to the next segment of axes whose segment ended; return those whose plan ended."""
+        if axes.size <= FEW:
+            return np.array([axis for axis in axes.tolist() if not self._advance_one(axis)], dtype=np.int64)
         cut = self.end_ns[axes] >= self.cut_ns[axes]
         if cut.any():
             self._end_here(axes[cut])
@@ -117,6 +123,19 @@ class PlanStore:
             self._load(going)
         return axes[~more]
 
+    def _advance_one(self, axis: int) -> bool:
+        """Go to the next segment of an axis; tell whether there is one."""
+        end_ns = self.end_ns[axis]
+        if end_ns >= self.cut_ns[axis]:
+            self._end_here(np.array([axis]))
+            return False
+        if self._segment[axis] + 1 >= self._count[self.row[axis]]:
+            return False
+        self.segment_ns[axis] = end_ns
+        self._segment[axis] += 1
+        self._load_one(axis)
+        return True
+
     def _end_here(self, axes: Axes) -> None:
         rows, cut_ns = self.row[axes], self.cut_ns[axes]
         self.final[rows] = self.state(axes, cut_ns)
@@ -124,7 +143,24 @@ class PlanStore:
         self.start_fraction[axes] = 0.0
         self.duration[rows] = 0.0
 
+    def _load_one(self, axis: int) -> None:
+        """Do what _load() does for one axis."""
+        row, segment = self.row[axis], self._segment[axis]
+        present = self._coefficients[row, segment]
+        self._present[:, axis] = present
+        if self._order == 3 and (present[4] or present[5]):
+            self._order = 5
+        end = float(self._ends[row, segment]) * 1e9 + float(self.start_fraction[axis])
+        end_ns = NEVER_NS if end >= NEVER_NS else min(int(self.start_ns[axis]) + math.ceil(end), NEVER_NS)
+        end_ns = min(end_ns, int(self.cut_ns[axis]))
+        self.end_ns[axis] = end_ns
+        self.next_ns = min(self.next_ns, end_ns)
+
     def _load(self, axes: Axes) -> None:
+        if axes.size <= FEW:
+            for axis in axes.tolist():
+                self._load_one(axis)
+            return
         rows, segment = self.row[axes], self._segment[axes]
         present = self._coefficients[rows, segment]
         self._present[:, axes] = present.T
