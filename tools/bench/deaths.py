@@ -71,7 +71,7 @@ def bench_client(options: Options, report: Report) -> None:
         report.samples("client SIGKILL to its 4 axes halting", halts, "ms", bars=[BAR], notes="none missed")
         report.samples("client SIGKILL to its node open again", frees, "ms", bars=[Bar("max", 50.0)])
         hangs = []
-        trials = options.kills(5, 100)
+        trials = options.slow(5, 100)
         for trial in range(trials):
             victim = daemon.fork(cruise(daemon, "mod0", LEASE_S))
             wait_cruising(node)
@@ -91,7 +91,7 @@ def bench_daemon(options: Options, report: Report) -> None:
     hangs: list[int] = []
     for how, trials, found in (
         (signal.SIGKILL, options.kills(8, 1000), kills),
-        (signal.SIGSTOP, options.kills(4, 100), hangs),
+        (signal.SIGSTOP, options.slow(4, 100), hangs),
     ):
         while len(found) < trials:
             found += _daemon_trial(how)

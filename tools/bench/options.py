@@ -26,5 +26,9 @@ class Options:
         return quick if self.quick else full
 
     def kills(self, quick: int, full: int) -> int:
-        """Return how many kills, hangs or stops to try."""
+        """Return how many kills or stops to try."""
         return self.trials if self.trials is not None else self.count(quick, full)
+
+    def slow(self, quick: int, full: int) -> int:
+        """Return how often to try what takes a good part of a second: never more than the full number."""
+        return min(self.kills(quick, full), full)

@@ -62,7 +62,7 @@ def bench_restart(options: Options, report: Report) -> None:
     back: list[int] = []
     gaps: list[int] = []
     with Daemon(TYPICAL) as daemon, daemon.cell() as cell, cell.open("mod1.readonly") as neighbour:
-        for trial in range(options.kills(1, 20)):
+        for trial in range(options.slow(1, 20)):
             if trial:
                 time.sleep(QUIET_S)
             before = neighbour.read().number

@@ -106,7 +106,7 @@ def _shell(options: Options, report: Report, daemon: Daemon, cell: Any, nodes: l
     acted: list[int] = []
     rested: list[int] = []
     calls: list[int] = []
-    for _ in range(options.kills(10, 100)):
+    for _ in range(options.slow(10, 100)):
         bare.append(interpreter_ns())
         found = _trials(1, cell, nodes, report, lambda: run_ns([str(tool), "-e"], environment))
         for samples, more in zip((acted, rested, calls), found, strict=True):
