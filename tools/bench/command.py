@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import signal
 import sys
 from typing import Any
 
@@ -62,6 +63,9 @@ def run(args: argparse.Namespace) -> int:
     if wrong:
         print(f"sioms bench: no sub-bench {wrong[0]}; there are: {', '.join(BENCHES)}", file=sys.stderr)
         return 2
+    # However we are ended, our daemons end with us.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     options = Options(args.quick, args.trials, args.soak, args.frames, args.seed)
     report = Report()
     try:

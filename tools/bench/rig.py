@@ -110,6 +110,7 @@ class Daemon:
             status = 1
             try:
                 signal.signal(signal.SIGINT, signal.SIG_DFL)
+                signal.signal(signal.SIGTERM, signal.SIG_DFL)
                 work()
                 status = 0
             except KeyboardInterrupt:
