@@ -99,6 +99,7 @@ class SimAxesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         effects: effects beyond the motors' parameters, a table per axis name or "*".
         effects_file: the same from a TOML file, to be hidden from who looks at the configuration.
         history: snapshots kept for readers.
+        late_max_s: a tick later than this stops all motion with a fault.
     """
 
     axis: list[AxisTable]
@@ -108,6 +109,7 @@ class SimAxesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     effects: dict[str, dict[str, Any]] = {}
     effects_file: str = ""
     history: int = 64
+    late_max_s: float = 0.05
 
 
 class SimAxes(TickDriver):
@@ -144,7 +146,11 @@ class SimAxes(TickDriver):
         self._servos, self._steppers, configured = _build(settings)
         self._tick_ns = round(1e9 / settings.tick_hz)
         self.bank = AxisBank(
-            configured, tick_s=1 / settings.tick_hz, markers=kit.markers, capacity=settings.capacity
+            configured,
+            tick_s=1 / settings.tick_hz,
+            markers=kit.markers,
+            capacity=settings.capacity,
+            late_max_s=settings.late_max_s,
         )
         self._axes, self._plant = AxisBlock(axes, self.bank), AnalogBlock(plant)
         self._port = BinaryBlock(port[0]) if port else None

@@ -34,7 +34,7 @@ motor = {{ mass = 1.0, viscous = 2.0, coulomb = 0.5, stiction = 0.6, encoder_ste
 
 def axes(device: str, *names: str, extra: str = "") -> str:
     """Return the table of a simulated device with axes between -1 m and 1 m, 1 m/s, 10 m/s^2."""
-    head = f'\n[device.{device}]\ndriver = "sim-axes"\nhistory = 4096\ncapacity = 16384\n{extra}\n'
+    head = f'\n[device.{device}]\ndriver = "sim-axes"\nlate_max_s = 0.5\nhistory = 4096\ncapacity = 16384\n{extra}\n'
     return head + "".join(AXIS.format(device=device, axis=name) for name in names)
 
 

@@ -85,7 +85,7 @@ DRIVE = "travel_per_turn = 0.01\nvelocity_max = 0.2\nacceleration_max = 2.0\n" +
 RIGS = (
     Rig(
         "sim-axes",
-        '[device.sim_axes]\ndriver = "sim-axes"\nhistory = 1024\n'
+        '[device.sim_axes]\ndriver = "sim-axes"\nlate_max_s = 0.5\nhistory = 1024\n'
         f'[[device.sim_axes.axis]]\nname = "servo"\n{LIMITS}{SERVO}motor = {{ mass = 1.0, viscous = 2.0, encoder_step = 1e-6 }}\n'
         '[[device.sim_axes.axis]]\nname = "stepper"\nvelocity_max = 0.25\nacceleration_max = 1.0\n' + LIMITS
         + "stepper = { mass = 0.5, step = 2.0e-4, microsteps = 16, hold_force = 40.0, damping_ratio = 0.3 }\n",

@@ -327,7 +327,7 @@ class Node(NodeCore):
         """Return the driver's tick times and link counters.
 
         Args:
-            last: over so many of the last ticks; None for all that are kept.
+            last: over so many of the last ticks, at most 8192, None for 1000; each costs the driver a microsecond.
         """
         value: dict[str, Any] = self.ioctl(Request.GET_STATISTICS, last)
         return value

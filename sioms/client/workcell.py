@@ -246,9 +246,13 @@ class Workcell:
             node: a node, '' for the whole workcell.
             why: for the log and for who asks why nothing moves.
         """
-        if not node and self._request is not None:
-            self._request.request(monotonic_ns(), os.getpid())
-        self._call("emergency stop", ClientVerb.EMERGENCY_STOP, node, why)
+        call = Call("emergency stop", ClientVerb.EMERGENCY_STOP, node, why)
+        try:
+            number = self._channel.send(call)  # first, because the daemon knows who and why
+        finally:
+            if not node and self._request is not None:
+                self._request.request(monotonic_ns(), os.getpid())
+        self._channel.wait(number, call)
 
     def reset(self, node: str = "") -> None:
         """Clear the latched stop of the workcell or of a node. Nothing resumes by itself."""

@@ -24,7 +24,6 @@ from .requests import LATER, ioctl, write
 if TYPE_CHECKING:
     from .runtime import Runtime
 
-PACKETS_A_TURN = 8
 _TWO_FDS = socket.CMSG_LEN(2 * 4)
 
 
@@ -85,33 +84,33 @@ class Attachments:
             self._runtime.watch(handle.pidfd, lambda: self.drop(handle))
 
     def _readable(self, handle: Handle) -> None:
-        for _ in range(PACKETS_A_TURN):
-            if handle.number not in self.handles:
+        """Serve one packet; the tick and the other clients have their turn before the next."""
+        if handle.number not in self.handles:
+            return
+        try:
+            packet, ancillary, flags, _ = handle.sock.recvmsg(MAX_PACKET, _TWO_FDS)
+        except BlockingIOError:
+            return
+        except OSError:
+            packet, ancillary, flags = b"", [], 0
+        fds = _fds_of(ancillary) if ancillary else []
+        handle.heard_ns = time.monotonic_ns()
+        try:
+            if not packet:
+                self.drop(handle)
                 return
-            try:
-                packet, ancillary, flags, _ = handle.sock.recvmsg(MAX_PACKET, _TWO_FDS)
-            except BlockingIOError:
-                return
-            except OSError:
-                packet, ancillary, flags = b"", [], 0
-            fds = _fds_of(ancillary) if ancillary else []
-            handle.heard_ns = time.monotonic_ns()
-            try:
-                if not packet:
-                    self.drop(handle)
-                    return
-                if flags & socket.MSG_TRUNC:
-                    raise MalformedMessage(f"packet longer than {MAX_PACKET} bytes")
-                self._serve(handle, decode(packet), fds)
-            except (MalformedMessage, ValueError, TypeError, LookupError, OverflowError) as error:
-                self._runtime.log(
-                    "warning", f"{handle.node}: connection of {handle.who} ended: malformed message: {error}"
-                )
-                self.end(handle, errno.EPROTO, f"{handle.node}: malformed message: {error}")
-                return
-            finally:
-                for fd in fds:
-                    os.close(fd)
+            if flags & socket.MSG_TRUNC:
+                raise MalformedMessage(f"packet longer than {MAX_PACKET} bytes")
+            self._serve(handle, decode(packet), fds)
+        except (MalformedMessage, ValueError, TypeError, LookupError, OverflowError) as error:
+            self._runtime.log(
+                "warning", f"{handle.node}: connection of {handle.who} ended: malformed message: {error}"
+            )
+            self.end(handle, errno.EPROTO, f"{handle.node}: malformed message: {error}")
+            return
+        finally:
+            for fd in fds:
+                os.close(fd)
 
     def _serve(self, handle: Handle, message: list[Any], fds: list[int]) -> None:
         verb, number, arguments = HandleVerb(message[0]), message[1], message[2:]

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 _DTYPE = {cls: np.dtype(numpy_dtype(cls)) for cls in NodeClass}
 _REPLACE = int(WriteFlag.REPLACE)
+FEW_TICKS = 1000
+"""Ticks that statistics are told of when nobody asks for more: sorting thousands would delay the next tick."""
 LATER = object()
 """Returned instead of a value when the answer comes later."""
 
@@ -217,7 +219,7 @@ def ioctl(
         case Request.GET_STATISTICS:
             if argument is not None and (type(argument) is not int or argument < 1):
                 raise _refuse(errno.EINVAL, f"{what}: {argument!r} ticks; want a number from 1, or none")
-            return runtime.statistics_report(argument or 1 << 30)
+            return runtime.statistics_report(argument or FEW_TICKS)
         case Request.WAIT_UNTIL_EVENT:
             raise _refuse(errno.ENOTTY, f"{what}: is answered by the client library, out of the page")
         case Request.ZERO_DEVICE if isinstance(handle.block, AnalogBlock):
