@@ -118,46 +118,9 @@ def calibrate(
     body = nominal.cylinder
     widths = rigid_core_table(body)
     tick("loads of the touches")
-    loads = touch_loads(body, widths, touches, HIGHEST, options.edge_half_angle_rad)
-    if _cell_is_better(nominal, touches, loads):
-        touches = _cell_loads(touches)
-        loads = touch_loads(body, widths, touches, HIGHEST, options.edge_half_angle_rad)
-        warnings.append(
-            "the outputs follow the load cell from touch to touch: its variation was used at the commanded level"
-        )
-    proximity = _proximity(nominal, touches, loads)
-    if proximity is not None:
-        reach = np.degrees(proximity.range_rad)
-        warnings.append(
-            f"the indenter draws {100 * proximity.amplitude:+.2f} % of output without strain, over {reach:.0f} deg: shield the "
-            "elements; the finger's file undoes it for conductors"
-        )
-        distance = np.array(nominal.angles_rad) - touches.angle_rad[:, None]
-        touches = touches.with_output(touches.output - proximity.output(distance))
-    recorded = touches
+    touches, loads, clean = _clean(nominal, touches, widths, ramps or [], options, warnings, tick)
+    quadratic, proximity = clean
     begin = starts(body, np.array(nominal.angles_rad), np.array(nominal.elements.radius_m), touches)
-    ramped = _Ramps(body, ramps or [], options)
-    quadratic = ramped.join(begin, _quadratic(body, begin, recorded, loads))
-    if quadratic is None:
-        warnings.append(
-            "no place was touched with three loads or more over a factor of two: quadratic not fitted"
-        )
-    else:
-        # how much the contact's growth costs depends on the depth, so the depths are fitted before the second
-        # look
-        touches = recorded.with_output(linearise(recorded.output, quadratic.value))
-        deep = fit_elements(body, begin, touches, loads, 0.0, Freedom(True, True), lambda: tick("first fit"))
-        quadratic = ramped.join(deep, _quadratic(body, deep, recorded, loads)) or quadratic
-        touches = recorded.with_output(linearise(recorded.output, quadratic.value))
-        few = int(np.count_nonzero(~np.isfinite(quadratic.deviation)))
-        if not quadratic.groups.any():
-            warnings.append("the quadratic comes from load ramps alone: creep during the ramp is in it")
-        elif few and not ramps:
-            warnings.append(
-                f"{few} of {quadratic.value.size} elements have too few load series for a quadratic of their own: "
-                f"theirs is the common {quadratic.common:.3g}"
-            )
-    tick("quadratic")
     for element, fit in enumerate(begin):
         if fit is None:
             warnings.append(f"element {element}: too few touches within 25 degrees; left out of the finger")
@@ -234,28 +197,99 @@ def _check(nominal: Finger, touches: Touches, warnings: list[str]) -> None:
         )
 
 
-def _nominal_strain(nominal: Finger, touches: Touches, loads: TouchLoads) -> Floats:
-    body, e = nominal.cylinder, nominal.elements
+def _clean(
+    nominal: Finger, touches: Touches, widths: WidthTable, ramps: list[Ramp], options: Options, warnings: list[str],
+    tick: Callable[[str], None],
+) -> tuple[Touches, TouchLoads, tuple[Quadratic | None, Proximity | None]]:  # fmt: skip
+    """Take proximity and quadratic off the outputs; all the model needs for that is each element's depth.
+
+    Twice: how strain grows with load and falls with distance depends on the depth, which the first round
+        finds.
+    """
+    body, recorded = nominal.cylinder, touches
+    loads = touch_loads(body, widths, touches, HIGHEST, options.edge_half_angle_rad)
+    fits = starts(body, np.array(nominal.angles_rad), np.array(nominal.elements.radius_m), touches)
+    distance = np.array(nominal.angles_rad) - touches.angle_rad[:, None]
+    ramped, quadratic, proximity = _Ramps(body, ramps, options), None, None
+    for last in (False, True):
+        proximity = find_proximity(
+            recorded.output, _expected(body, fits, recorded, loads, quadratic), distance
+        )
+        pull = 0.0 if proximity is None else proximity.output(distance)
+        touches = recorded.with_output(recorded.output - pull)
+        if not last and _cell_is_better(nominal, touches, loads):
+            recorded = _cell_loads(recorded)
+            touches = recorded.with_output(touches.output)
+            loads = touch_loads(body, widths, recorded, HIGHEST, options.edge_half_angle_rad)
+            warnings.append(
+                "the outputs follow the load cell from touch to touch: its variation was used, at the commanded level"
+            )
+        quadratic = ramped.join(fits, _quadratic(body, fits, touches, loads))
+        if quadratic is not None:
+            touches = touches.with_output(linearise(touches.output, quadratic.value))
+        if not last:
+            fits = fit_elements(
+                body, fits, touches, loads, 0.0, Freedom(True, True), lambda: tick("first fit")
+            )
+    _tell(quadratic, proximity, bool(ramps), warnings)
+    return touches, loads, (quadratic, proximity)
+
+
+def _tell(quadratic: Quadratic | None, proximity: Proximity | None, ramps: bool, warnings: list[str]) -> None:
+    if proximity is not None:
+        warnings.append(
+            f"the indenter draws {100 * proximity.amplitude:+.2f} % of output without strain, over "
+            f"{np.degrees(proximity.range_rad):.0f} deg: shield the elements; the finger's file undoes it for conductors"
+        )
+    if quadratic is None:
+        warnings.append(
+            "no place was touched with three loads or more over a factor of two: quadratic not fitted"
+        )
+    elif not quadratic.groups.any():
+        warnings.append("the quadratic comes from load ramps alone: creep during the ramp is in it")
+    elif not ramps and not np.isfinite(quadratic.deviation).all():
+        few = int(np.count_nonzero(~np.isfinite(quadratic.deviation)))
+        warnings.append(
+            f"{few} of {quadratic.value.size} elements have too few load series for a quadratic of their own: theirs is the "
+            f"common {quadratic.common:.3g}"
+        )
+
+
+def _model(body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads) -> Floats:
+    """Return the strain of every touch and element [1], zero for elements without touches."""
+    silent = np.zeros(len(touches))
     columns = [
-        strain_of(body, t, r, body.poisson, touches, loads, 0.0)
-        for t, r in zip(e.angle_rad, e.radius_m, strict=True)
+        silent
+        if fit is None
+        else strain_of(body, fit.angle_rad, fit.radius_m, fit.poisson, touches, loads, 0.0)
+        for fit in fits
     ]
     return np.stack(columns, axis=1)
 
 
-def _proximity(nominal: Finger, touches: Touches, loads: TouchLoads) -> Proximity | None:
-    distance = np.array(nominal.angles_rad) - touches.angle_rad[:, None]
-    return find_proximity(touches.output, _nominal_strain(nominal, touches, loads), distance)
+def _expected(
+    body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, quadratic: Quadratic | None
+) -> Floats:
+    """Return the outputs that strain alone gives, up to each element's scale."""
+    strain = _model(body, fits, touches, loads)
+    if quadratic is None:
+        return strain
+    gain = np.array([np.inf if fit is None else fit.gain for fit in fits])
+    linear = -strain / gain
+    output: Floats = linear + quadratic.value * linear**2
+    return output
 
 
 def _cell_is_better(nominal: Finger, touches: Touches, loads: TouchLoads) -> bool:
     """Return whether the strength of the touches goes with the load cell's reading beyond the commanded load."""
     if not np.isfinite(touches.force).all() or np.any(touches.force <= 0.0):
         return False
-    e, model = nominal.elements, _nominal_strain(nominal, touches, loads)
+    e = nominal.elements
+    begin = starts(nominal.cylinder, np.array(e.angle_rad), np.array(e.radius_m), touches)
+    model = _model(nominal.cylinder, begin, touches, loads)
     # each element at its own gain first, or the gains' scatter hides the loads'
-    model = -model * (np.sum(touches.output * -model, axis=0) / np.sum(model**2, axis=0))
-    strength = np.einsum("ji,ji->j", touches.output, model) / np.einsum("ji,ji->j", model, model)
+    model = -model * (np.sum(touches.output * -model, axis=0) / (np.sum(model**2, axis=0) + 1e-30))
+    strength = np.einsum("ji,ji->j", touches.output, model) / (np.einsum("ji,ji->j", model, model) + 1e-30)
     inside = (touches.angle_rad > min(e.angle_rad)) & (touches.angle_rad < max(e.angle_rad))
     told, heard = [], []
     for load, radius in {(p, r) for p, r in zip(touches.load[inside], touches.radius_m[inside], strict=True)}:
@@ -276,14 +310,7 @@ def _cell_loads(touches: Touches) -> Touches:
 
 
 def _quadratic(body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads) -> Quadratic | None:
-    silent = np.zeros(len(touches))
-    model = [
-        silent
-        if fit is None
-        else strain_of(body, fit.angle_rad, fit.radius_m, fit.poisson, touches, loads, 0.0)
-        for fit in fits
-    ]
-    return find_quadratic(touches, np.stack(model, axis=1))
+    return find_quadratic(touches, _model(body, fits, touches, loads))
 
 
 class _Ramps:

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sioms.tactile.finger import Finger
 from sioms.tactile.kernel import MOST_STEPS, Products, Solve, Status, compiled, plain
+from sioms.tactile.linearity import linearise
 from sioms.tactile.proximity import Proximity
 
 Floats = NDArray[np.float64]
@@ -118,6 +119,7 @@ class Estimator:
         poor_fit: misfit above which POOR_FIT is set.
         contact_sigma: how far above the noise the strains must be to count as a touch, in standard deviations
             of their chi square.
+        conductor: what touches is a conductor; a finger calibrated with the proximity effect then undoes it.
     """
 
     def __init__(
@@ -139,6 +141,7 @@ class Estimator:
         self._share = np.asarray(finger.misfit, dtype=np.float64) ** 2
         angles = self._angles = np.asarray(finger.angles_rad, dtype=np.float64)
         self._gain = np.asarray(finger.elements.gain, dtype=np.float64)
+        self._quadratic = np.asarray(finger.elements.quadratic, dtype=np.float64)
         near = Proximity(finger.signal.proximity, finger.signal.proximity_range_rad)
         self._drawn = near if conductor and near.amplitude != 0.0 else None
         pitch = float(np.ptp(angles)) / max(angles.size - 1, 1)
@@ -214,6 +217,8 @@ class Estimator:
         if load is not None:
             value, weight = load.value, 1.0 / max(load.deviation, 1e-6 * load.value) ** 2
         least = count + self._contact_sigma * math.sqrt(2.0 * count)
+        if self._drawn is not None:
+            y = self._undrawn(self._drawn, y, noise, least, value, weight)
         status, t, b, at, steps, total = self._solve(
             *self._fixed, noise, self._share, least, y, value, weight
         )
@@ -222,6 +227,33 @@ class Estimator:
         if status == Status.WRONG_SIGN:
             return _nothing(quality | Quality.WRONG_SIGN)
         return self._describe(t, b, at, steps, value, weight, count, total, quality)
+
+    def _undrawn(
+        self, drawn: Proximity, y: Floats, noise: Floats, least: float, load: float, load_weight: float
+    ) -> Floats:
+        """Return the strains without the pull of a conductor at the place that then fits best; y if untouched."""
+        if float(np.sum(y * y / noise)) < least:
+            return y
+        # the pull is an output: back before the quadratic, which acts on the sum
+        linear = -y / self._gain
+        output = linear + self._quadratic * linear**2
+
+        def without(t: Floats | float) -> Floats:
+            strain = -self._gain * linearise(output - drawn.output(self._angles - t), self._quadratic)
+            return np.where(noise < _HUGE, strain, 0.0)
+
+        bank, places = self._fixed[4], self._fixed[6]
+        clean = without(places[:, :1])
+        score = np.maximum(np.sum(bank * clean / noise, axis=1), 0.0) ** 2 / np.sum(bank**2 / noise, axis=1)
+        t = float(places[int(np.argmin(np.sum(clean**2 / noise, axis=1) - score)), 0])
+        for _ in range(_PROXIMITY_PASSES):
+            status, found, *_ = self._solve(
+                *self._fixed, noise, self._share, 0.0, without(t), load, load_weight
+            )
+            if status != Status.FITTED:
+                break
+            t = found
+        return without(t)
 
     def _describe(
         self, t: float, b: float, at: Products, steps: int, load: float, load_weight: float, count: int, total: float,

@@ -39,10 +39,10 @@ def find_proximity(output: Floats, strain: Floats, distance: Floats) -> Proximit
 
     Args:
         output: of every touch and element, shape (nt, ns).
-        strain: by the model, same shape.
+        strain: by the model, or the output it gives, in any unit per element, same shape.
         distance: angle of the element less that of the touch [rad], same shape.
     """
-    square = np.sum(strain**2, axis=0)
+    square = np.sum(strain**2, axis=0) + 1e-30
     alone = output - strain * (np.sum(output * strain, axis=0) / square)
     best, least = Proximity(0.0, 1.0), float(np.sum(alone**2))
     for reach in _RANGES:

@@ -8,12 +8,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from sioms.tactile.calibration import Calibration, calibrate
+from sioms.tactile.calibration import Calibration, Options, calibrate
 from sioms.tactile.closedform import equivalent_radius
 from sioms.tactile.estimator import Estimator, Quality
 from sioms.tactile.finger import Finger, from_toml, to_toml
 from sioms.tactile.identify import corrected, truncated
-from sioms.tactile.linearity import find_quadratic, linearise
+from sioms.tactile.linearity import Quadratic, find_quadratic, linearise, with_ramps
+from sioms.tactile.proximity import Proximity
 from sioms.tactile.touches import Recording, Touches, average, join
 
 
@@ -153,3 +154,54 @@ def test_average_subtracts_each_touchs_baseline() -> None:
     raw[7, 1] = np.nan
     with pytest.raises(ValueError, match="touch 0: element 1 holds a reading that is not finite"):
         average(recording, np.zeros(2), np.full(2, 10.0), np.zeros(2), 0.01)
+
+
+def test_ramps_give_the_differences_and_series_the_level() -> None:
+    own = np.array([0.03, 0.05, 0.04, 0.06])
+    creep = 0.01
+    ramps = own + creep
+    series = Quadratic(np.full(4, 0.045), np.full(4, np.inf), np.array([0, 5, 5, 0]), 0.045)
+    assert with_ramps(ramps, series).value == pytest.approx(own)
+    assert with_ramps(np.array([0.04, np.nan, 0.05, 0.07]), series).value[1] == 0.045
+    assert with_ramps(ramps, None).value == pytest.approx(ramps)
+
+
+def test_load_cell_is_believed_where_touches_follow_it(start: Finger, made) -> None:  # type: ignore[no-untyped-def]
+    touches = made.touches()
+    random = np.random.default_rng(2)
+    share = 1.0 + 0.03 * random.normal(size=len(touches))
+    real = Touches(
+        touches.output * share[:, None],
+        touches.angle_rad,
+        touches.load,
+        touches.radius_m,
+        touches.load * share,
+        touches.noise,
+    )
+    blind = Touches(
+        real.output, real.angle_rad, real.load, real.radius_m, np.full(len(real), np.nan), real.noise
+    )
+    edges = [t.pick(t.radius_m == 0.0) for t in (real, blind)]
+    with_cell, without = (calibrate(start, t, Options(identify=False, contact="frictionless")) for t in edges)
+    assert any("follow the load cell" in warning for warning in with_cell.warnings)
+    assert not any("follow the load cell" in warning for warning in without.warnings)
+    assert np.mean(with_cell.residuals["elements"]) < 0.5 * np.mean(without.residuals["elements"])
+
+
+def test_pull_of_a_conductor_is_found_and_undone(start: Finger, made) -> None:  # type: ignore[no-untyped-def]
+    touches = made.touches()
+    touches = touches.pick((touches.radius_m == 0.0) | (touches.load != 200.0))
+    pull = Proximity(-0.03, math.radians(14.0))
+    distance = made.angles - touches.angle_rad[:, None]
+    drawn = touches.with_output(touches.output + pull.output(distance))
+    found = calibrate(start, drawn, Options(identify=False, contact="frictionless"))
+    assert found.finger.signal.proximity == pytest.approx(pull.amplitude, rel=0.15)
+    assert found.finger.signal.proximity_range_rad == pytest.approx(pull.range_rad, rel=0.15)
+    assert any("without strain" in warning for warning in found.warnings)
+    quadratic, gain = np.array(found.finger.elements.quadratic), np.array(found.finger.elements.gain)
+    place = math.radians(77.0)
+    frame = -gain * linearise(made.output(place, 200.0, 6e-3) + pull.output(made.angles - place), quadratic)
+    undone, left = (Estimator(found.finger, conductor=conductor).frame(frame) for conductor in (True, False))
+    assert undone.load_n_per_m == pytest.approx(200.0, rel=0.05)
+    assert math.degrees(undone.angle_rad) == pytest.approx(77.0, abs=0.3)
+    assert abs(left.load_n_per_m - 200.0) > 4.0 * abs(undone.load_n_per_m - 200.0)

@@ -1,0 +1,114 @@
+"""The tactile commands work on a folder, write what can be read, and name what is wrong."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sioms.tactile.cylinder import FINGER_B
+from sioms.tactile.emap import e_map
+from sioms.tactile.estimator import Estimator
+from sioms.tactile.finger import from_toml
+from sioms.tactile.series import line_load
+from sioms.tools import tactile
+from sioms.tools.report_page import Page
+
+ANGLES = 143.0 - 9.22 * np.arange(16)
+
+
+def command(*words: str) -> int:
+    parser = argparse.ArgumentParser()
+    tactile.add_parser(parser.add_subparsers(dest="command", required=True))
+    return tactile.run(parser.parse_args(["tactile", *words]))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Write edges every third degree as frames of 33 Hz, noise, a thermal cycle, and the finger as built."""
+    random = np.random.default_rng(6)
+    places = np.arange(0.0, 151.0, 3.0)
+    matrix = e_map(FINGER_B, np.radians(ANGLES), 10.3e-3, 60)[:, :121]
+    raw, touch, phase = [], [], []
+    for number, place in enumerate(places):
+        strain = matrix @ line_load(FINGER_B, -200.0, np.radians(place), 60)
+        for part, output in ((0, 0.0 * strain), (1, -100.0 * strain / 3.0)):
+            raw.append(output + 0.05 * random.normal(size=(10, 16)))
+            touch += [number] * 10
+            phase += [part] * 10
+    frames = np.concatenate(raw)
+    np.savez(
+        tmp_path / "edges.npz", raw=frames, time=np.arange(len(frames)) / 33.0, touch=touch, phase=phase, fs=33.0,
+        force=200.0 * np.array(phase), cmd_theta=places, cmd_P=np.full(places.size, 200.0), cmd_rc=np.zeros(places.size),
+    )  # fmt: skip
+    quiet = (
+        0.05 * random.normal(size=(4096, 16))
+        + 0.1 * np.sin(2 * np.pi * 60.0 * np.arange(4096) / 432.0)[:, None]
+    )
+    np.savez(tmp_path / "noise.npz", raw=quiet, time=np.arange(4096) / 432.0, fs=432.0)
+    warm = 21.0 + np.sin(np.arange(100) / 8.0)
+    drift = -0.8 * warm[:, None] + 0.02 * random.normal(size=(100, 16))
+    np.savez(tmp_path / "thermal.npz", raw=drift, time=300.0 * np.arange(100), temperature=warm, fs=33.0)
+    nominal = {
+        "ra_mm": 9.6, "rb_mm": 12.7, "poisson": 0.46, "shear_modulus_pa": 8.3e4, "element_angle_deg": ANGLES.tolist(),
+        "element_radius_mm": [10.3] * 16, "gain_percent_strain_per_percent_output": [3.2] * 16,
+    }  # fmt: skip
+    (tmp_path / "nominal.json").write_text(json.dumps(nominal))
+    return tmp_path
+
+
+def test_calibrate_writes_a_finger_and_a_report(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = folder / "finger.toml"
+    assert command("calibrate", str(folder), "-o", str(out)) == 0
+    finger = from_toml(out.read_text())
+    # the touches were line loads and an edge of 45 degrees is a little wider: the fit goes a little less deep
+    assert np.array(finger.elements.gain) == pytest.approx(np.full(16, 3.0), rel=0.15)
+    Estimator(finger)
+    page = out.with_suffix(".html").read_text()
+    assert page.count("data:image/png;base64,") >= 5
+    assert "temperature slope" in page
+    assert "-0.800" in page or "-0.79" in page or "-0.80" in page
+    assert "at 59.9" in page or "at 60" in page or "at 60.3" in page  # the line in the spectrum
+    told = capsys.readouterr()
+    assert "quadratic not fitted" in told.out
+    assert "contact model frictionless" in told.err
+
+
+def test_calibrate_names_what_is_wrong(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert command("calibrate", str(empty)) == 1
+    assert "neither nominal.toml nor nominal.json" in capsys.readouterr().err
+    (empty / "nominal.json").write_text((folder / "nominal.json").read_text())
+    assert command("calibrate", str(empty)) == 1
+    assert "no *.npz with touches" in capsys.readouterr().err
+    np.savez(empty / "bad.npz", raw=np.zeros((3, 16)), time=np.zeros(2), fs=33.0)
+    assert command("calibrate", str(empty)) == 1
+    assert "bad.npz: read recording: time_s has shape (2,); need (3,)" in capsys.readouterr().err
+
+
+def test_design_refuses_what_cannot_be_built(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command("design", "--core-mm", "13", "-o", str(tmp_path / "d.html")) == 1
+    assert "need 0 < core < outer" in capsys.readouterr().err
+    assert command("design", "--depth-mm", "4", "-o", str(tmp_path / "d.html")) == 1
+    assert (
+        "elements 4.0 mm deep are at radius 8.7 mm; need between 9.6 and 12.7 mm" in capsys.readouterr().err
+    )
+    assert not (tmp_path / "d.html").exists()
+
+
+def test_page_escapes_and_colours(tmp_path: Path) -> None:
+    page = Page("a < b")
+    page.text("<script>")
+    page.table(("x",), [("ok: yes",), ("no: <no>",)])
+    page.write(tmp_path / "p.html")
+    text = (tmp_path / "p.html").read_text()
+    assert "<script>" not in text
+    assert "<h1>a &lt; b</h1>" in text
+    assert '<td class="good">yes</td>' in text
+    assert '<td class="bad">&lt;no&gt;</td>' in text
