@@ -28,6 +28,10 @@ STEPS = 6
 #: A saving below ``SPECIFIC`` counts only where no unrelated effect saves ``NEARLY`` as much.
 SPECIFIC = 0.3
 NEARLY = 0.5
+#: A larger loss than this is one, however unevenly it falls on the blocks.
+DOUBTFUL = 0.2
+#: A step that saves this much needs no second look at the friction law.
+CLEAR = 0.5
 PERIODIC_SURE = 3.0  # for effects whose order is searched over tens of values
 
 
@@ -129,15 +133,17 @@ class Searcher:
         return out
 
     def _add(self, fit: Fit, losses: Array) -> tuple[Fit, Array, Step] | None:
-        """Refit the best candidates and take the simplest of those that save most."""
+        """Refit the best candidates and take the simplest of those that save most.
+
+        A rich friction law may have bent itself to stand in for the next effect; so the best candidates are tried
+        with it started afresh too.
+        """
         tried: dict[str, tuple[Fit, Array, float, float]] = {}
-        for s in self._candidates(fit):
-            model = without(fit.model, known()[s.effect].replaces)
-            new = self.fit(model.with_effect(s.effect, s.values), 8 if not tried else 5)
-            loss = self.loss(new)
-            gain, sure = better(loss, losses)
-            if s.effect not in tried or gain > tried[s.effect][2]:
-                tried[s.effect] = (new, loss, gain, sure)
+        for i, s in enumerate(self._candidates(fit)):
+            self._try(tried, s.effect, self._with(fit, s, 8 if i == 0 else 5), losses)
+        if max((t[2] for t in tried.values()), default=0.0) < CLEAR:
+            for effect, new in self._afresh(fit):
+                self._try(tried, effect, new, losses)
         good = {n: t for n, t in tried.items() if t[2] >= GAIN and t[3] >= self._sure(n) and physical(t[0], n)}
         if not good:
             return None
@@ -147,6 +153,30 @@ class Searcher:
             return None
         rivals = {n: t[2] for n, t in tried.items() if n != name}
         return new, loss, Step("add", name, new.ratio, gain, new.model, rivals)
+
+    def _with(self, fit: Fit, start: Start, iterations: int) -> Fit:
+        """Switch a candidate on, what it replaces off, and refit."""
+        model = without(fit.model, known()[start.effect].replaces)
+        return self.fit(model.with_effect(start.effect, start.values), iterations)
+
+    def _try(self, tried: dict[str, tuple[Fit, Array, float, float]], effect: str, new: Fit, losses: Array) -> None:
+        """Score a refitted candidate; keep the better of two ways to the same effect."""
+        loss = self.loss(new)
+        gain, sure = better(loss, losses)
+        if effect not in tried or gain > tried[effect][2]:
+            tried[effect] = (new, loss, gain, sure)
+
+    def _afresh(self, fit: Fit) -> list[tuple[str, Fit]]:
+        """Add the best candidates to the plain form of each rich friction law, then enrich it afresh."""
+        out = []
+        for name in [n for n in fit.model.effects if n not in self.frozen]:
+            for other in [o for o in plainer(name, self.names) if o in known()[name].replaces]:
+                base = self.fit(swapped(fit.model, name, other), 5)
+                starts = [s for s in self._candidates(base) if name not in (s.effect, *known()[s.effect].replaces)]
+                for s in starts[:2]:
+                    middle = self._with(base, s, 5)
+                    out += [(s.effect, self._with(middle, again, 6)) for again in self._upgrades(middle, [name])[:1]]
+        return out
 
     def _sure(self, name: str) -> float:
         return PERIODIC_SURE if any(p.fixed for p in known()[name].parameters) else SURE
@@ -159,28 +189,37 @@ class Searcher:
             without = self.fit(fit.model.without_effect(name), 6)
             loss = self.loss(without)
             gain, sure = better(losses, loss)
-            if gain < GAIN or sure < 1.0:
+            if negligible(gain, sure):
                 fit, losses = without, loss
                 ladder.append(Step("leave", name, fit.ratio, -gain, fit.model))
         return fit, losses
 
     def _simplify(self, fit: Fit, losses: Array, ladder: list[Step]) -> tuple[Fit, Array]:
         """Put a simpler look-alike in the place of a richer effect where it does as well."""
-        lib = known()
         for name in [n for n in fit.model.effects if n not in self.frozen]:
-            for other in lib[name].lookalikes:
-                if other not in self.names or other in fit.model.effects or size(other) >= size(name):
+            for other in plainer(name, self.names):
+                if other in fit.model.effects:
                     continue
-                plain = {p.symbol: p.start * fit.model.scale(p) for p in lib[other].parameters}
-                shared = {k: v for k, v in fit.model.effects[name].items() if k in plain}
-                new = self.fit(fit.model.without_effect(name).with_effect(other, {**plain, **shared}), 6)
+                new = self.fit(swapped(fit.model, name, other), 6)
                 loss = self.loss(new)
                 lost, sure = better(losses, loss)
-                if lost < GAIN or sure < 1.0:
+                if negligible(lost, sure):
                     fit, losses = new, loss
                     ladder.append(Step("simplify", f"{name} to {other}", fit.ratio, -lost, fit.model))
                     break
         return fit, losses
+
+
+def plainer(name: str, names: Sequence[str]) -> list[str]:
+    """List the look-alikes with fewer parameters."""
+    return [o for o in known()[name].lookalikes if o in names and size(o) < size(name)]
+
+
+def swapped(model: AxisModel, name: str, other: str) -> AxisModel:
+    """Put another effect in the place of one, keeping the values of parameters that both have."""
+    plain = {p.symbol: p.start * model.scale(p) for p in known()[other].parameters}
+    shared = {k: v for k, v in model.effects[name].items() if k in plain}
+    return model.without_effect(name).with_effect(other, {**plain, **shared})
 
 
 def without(model: AxisModel, names: Sequence[str]) -> AxisModel:
@@ -207,6 +246,11 @@ def unspecific(name: str, gains: dict[str, float]) -> bool:
     return any(g > NEARLY * gains[name] for n, g in gains.items() if n not in family)
 
 
+def negligible(lost: float, errors: float) -> bool:
+    """Say whether a loss counts for nothing: small, or not large and within one standard error."""
+    return lost < GAIN or (errors < 1.0 and lost < DOUBTFUL)
+
+
 def simplest(good: dict[str, tuple[Fit, Array, float, float]]) -> str:
     """Of the candidates within one standard error and ``GAIN`` of the best, the one with the fewest parameters.
 
@@ -216,7 +260,7 @@ def simplest(good: dict[str, tuple[Fit, Array, float, float]]) -> str:
     near = []
     for n, (_, loss, _, _) in good.items():
         lost, sure = better(good[best][1], loss)
-        if lost < GAIN or sure < 1.0:
+        if negligible(lost, sure):
             near.append(n)
     return min(near, key=lambda n: (n not in library(), size(n), -good[n][2]))
 
