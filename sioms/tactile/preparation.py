@@ -1,0 +1,170 @@
+"""Prepare recorded touches for calibration: loads from the load cell, proximity and quadratic off the outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.tactile.calibrate import ElementFit, Freedom, fit_elements, starts, strain_of
+from sioms.tactile.cylinder import Cylinder
+from sioms.tactile.finger import Finger
+from sioms.tactile.linearity import Quadratic, find_quadratic, linearise, ramp_quadratic, with_ramps
+from sioms.tactile.proximity import Proximity, find_proximity
+from sioms.tactile.touches import Ramp, Touches, TouchLoads, touch_loads
+from sioms.tactile.width import WidthTable, rigid_core_table
+
+Floats = NDArray[np.float64]
+Fits = list[ElementFit | None]
+
+HIGHEST = 60  # wave numbers of calibration
+_FOLLOWS = 0.3  # correlation of touches and load cell above which the cell is believed
+
+
+def clean_outputs(
+    nominal: Finger, touches: Touches, widths: WidthTable, ramps: list[Ramp], edge_half_angle: float, warnings: list[str],
+    tick: Callable[[str], None],
+) -> tuple[Touches, TouchLoads, tuple[Quadratic | None, Proximity | None]]:  # fmt: skip
+    """Take proximity and quadratic off the outputs; all the model needs for that is each element's depth.
+
+    Twice: how strain grows with load and falls with distance depends on the depth, which the first round
+        finds.
+    """
+    body, recorded = nominal.cylinder, touches
+    loads = touch_loads(body, widths, touches, HIGHEST, edge_half_angle)
+    fits = starts(body, np.array(nominal.angles_rad), np.array(nominal.elements.radius_m), touches)
+    distance = np.array(nominal.angles_rad) - touches.angle_rad[:, None]
+    ramped, quadratic, proximity = _Ramps(body, ramps, edge_half_angle), None, None
+    for last in (False, True):
+        proximity = find_proximity(
+            recorded.output, _expected(body, fits, recorded, loads, quadratic), distance
+        )
+        pull = 0.0 if proximity is None else proximity.output(distance)
+        touches = recorded.with_output(recorded.output - pull)
+        if not last and _cell_is_better(nominal, touches, loads):
+            recorded = _cell_loads(recorded)
+            touches = recorded.with_output(touches.output)
+            loads = touch_loads(body, widths, recorded, HIGHEST, edge_half_angle)
+            warnings.append(
+                "the outputs follow the load cell from touch to touch: its variation was used, at the commanded level"
+            )
+        quadratic = ramped.join(fits, _quadratic(body, fits, touches, loads))
+        if quadratic is not None:
+            touches = touches.with_output(linearise(touches.output, quadratic.value))
+        if not last:
+            fits = fit_elements(
+                body, fits, touches, loads, 0.0, Freedom(True, True), lambda: tick("first fit")
+            )
+    _tell(quadratic, proximity, bool(ramps), warnings)
+    return touches, loads, (quadratic, proximity)
+
+
+def _tell(quadratic: Quadratic | None, proximity: Proximity | None, ramps: bool, warnings: list[str]) -> None:
+    if proximity is not None:
+        warnings.append(
+            f"the indenter draws {100 * proximity.amplitude:+.2f} % of output without strain, over "
+            f"{np.degrees(proximity.range_rad):.0f} deg: shield the elements; the finger's file undoes it for conductors"
+        )
+    if quadratic is None:
+        warnings.append(
+            "no place was touched with three loads or more over a factor of two: quadratic not fitted"
+        )
+    elif not quadratic.groups.any():
+        warnings.append("the quadratic comes from load ramps alone: creep during the ramp is in it")
+    elif not ramps and not np.isfinite(quadratic.deviation).all():
+        few = int(np.count_nonzero(~np.isfinite(quadratic.deviation)))
+        warnings.append(
+            f"{few} of {quadratic.value.size} elements have too few load series for a quadratic of their own: theirs is the "
+            f"common {quadratic.common:.3g}"
+        )
+
+
+def _model(body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads) -> Floats:
+    """Return the strain of every touch and element [1], zero for elements without touches."""
+    silent = np.zeros(len(touches))
+    columns = [
+        silent
+        if fit is None
+        else strain_of(body, fit.angle_rad, fit.radius_m, fit.poisson, touches, loads, 0.0)
+        for fit in fits
+    ]
+    return np.stack(columns, axis=1)
+
+
+def _expected(
+    body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, quadratic: Quadratic | None
+) -> Floats:
+    """Return the outputs that strain alone gives, up to each element's scale."""
+    strain = _model(body, fits, touches, loads)
+    if quadratic is None:
+        return strain
+    gain = np.array([np.inf if fit is None else fit.gain for fit in fits])
+    linear = -strain / gain
+    output: Floats = linear + quadratic.value * linear**2
+    return output
+
+
+def _cell_is_better(nominal: Finger, touches: Touches, loads: TouchLoads) -> bool:
+    """Return whether the strength of the touches goes with the load cell's reading beyond the commanded load."""
+    if not np.isfinite(touches.force).all() or np.any(touches.force <= 0.0):
+        return False
+    e = nominal.elements
+    begin = starts(nominal.cylinder, np.array(e.angle_rad), np.array(e.radius_m), touches)
+    model = _model(nominal.cylinder, begin, touches, loads)
+    # each element at its own gain first, or the gains' scatter hides the loads'
+    model = -model * (np.sum(touches.output * -model, axis=0) / (np.sum(model**2, axis=0) + 1e-30))
+    strength = np.einsum("ji,ji->j", touches.output, model) / (np.einsum("ji,ji->j", model, model) + 1e-30)
+    inside = (touches.angle_rad > min(e.angle_rad)) & (touches.angle_rad < max(e.angle_rad))
+    told, heard = [], []
+    for load, radius in {(p, r) for p, r in zip(touches.load[inside], touches.radius_m[inside], strict=True)}:
+        mine = inside & (touches.load == load) & (touches.radius_m == radius)
+        if mine.sum() >= 10:
+            heard.append(strength[mine] / strength[mine].mean() - 1.0)
+            told.append(touches.force[mine] / touches.force[mine].mean() - 1.0)
+    if not told:
+        return False
+    x, y = np.concatenate(told), np.concatenate(heard)
+    return bool(x @ y > _FOLLOWS * np.sqrt((x @ x) * (y @ y)))
+
+
+def _cell_loads(touches: Touches) -> Touches:
+    """Return the touches with the cell's loads, scaled to the commanded level."""
+    load = touches.force * float(np.median(touches.load / touches.force))
+    return Touches(touches.output, touches.angle_rad, load, touches.radius_m, touches.force, touches.noise)
+
+
+def _quadratic(body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads) -> Quadratic | None:
+    return find_quadratic(touches, _model(body, fits, touches, loads))
+
+
+class _Ramps:
+    """Hold the tractions of an edge over the range of the ramps' loads, to ask the model again with other depths."""
+
+    _LOADS = 9
+
+    def __init__(self, body: Cylinder, ramps: list[Ramp], edge_half_angle: float) -> None:
+        self._body, self._ramps = body, ramps
+        if not ramps:
+            return
+        top = max(float(ramp.load.max()) for ramp in ramps)
+        self._load = np.linspace(0.02 * top, top, self._LOADS)
+        none = np.zeros(self._LOADS)
+        self._touches = Touches(none[:, None], none, self._load, none, self._load, np.zeros(1))
+        widths = rigid_core_table(body)
+        self._loads = touch_loads(body, widths, self._touches, HIGHEST, edge_half_angle)
+
+    def join(self, fits: Fits, series: Quadratic | None) -> Quadratic | None:
+        """Return the quadratic of load series and ramps together."""
+        found = np.full(len(fits), np.nan)
+        for ramp in self._ramps:
+            fit = fits[ramp.element]
+            if fit is not None:
+                strain = strain_of(
+                    self._body, 0.0, fit.radius_m, fit.poisson, self._touches, self._loads, 0.0
+                )
+                # strain per load is nearly constant: interpolate that
+                found[ramp.element] = ramp_quadratic(
+                    ramp.output, ramp.load * np.interp(ramp.load, self._load, strain / self._load)
+                )
+        return with_ramps(found, series) if np.isfinite(found).any() else series
