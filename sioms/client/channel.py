@@ -24,7 +24,7 @@ from _thread import allocate_lock
 from struct import pack
 from time import monotonic
 
-from sioms.protocol.messages import MAX_PACKET, HandleVerb, MalformedMessage, decode, encode
+from sioms.protocol.messages import MAX_PACKET, HandleVerb, MalformedMessage, decode, encode, value_of
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -304,7 +304,10 @@ class Channel:
             for fd in fds:
                 os.close(fd)
             raise OSError(message[2], message[3])
-        return Answer(message[3], fds)
+        try:
+            return Answer(value_of(message), fds)
+        except MalformedMessage as error:
+            raise OSError(errno.EPROTO, f"receive on {self.name}: {error}") from None
 
     def _gone(self, error: OSError | None, what: str) -> OSError:
         if self._ended is None:

@@ -2,6 +2,7 @@
 
 Request  [verb, id, arguments...]        id > 0, unique among the sender's unanswered requests
 Reply    [0, id, errno, value or text]   errno 0: value; else text, one sentence without full stop
+Reply    [0, id, 0, bytes, true]         a long value: its msgpack, compressed by zlib
 Notice   [verb, 0, arguments...]         draws no reply
 
 Packets are bounded by MAX_PACKET; a larger write carries its records in a sealed memory file whose
@@ -40,6 +41,7 @@ MAX_INLINE = 49152
 MAX_WRITE = 1 << 24
 """Bytes of records in one write at most."""
 MAX_TEXT = 1024
+EMSGSIZE = 90
 
 
 class ClientVerb(IntEnum):
@@ -145,8 +147,32 @@ def decode(packet: bytes) -> list[object]:
 
 
 def reply(number: int, value: object = None) -> bytes:
-    """Pack a successful reply."""
-    return encode(0, number, 0, value)
+    """Pack a successful reply; a long one is compressed, one that is still too long becomes a refusal."""
+    packet = encode(0, number, 0, value)
+    if len(packet) <= MAX_PACKET:
+        return packet
+    from zlib import compress  # thousands of nodes or channels, much alike
+
+    packet = encode(0, number, 0, compress(_pack(value)), True)
+    if len(packet) <= MAX_PACKET:
+        return packet
+    return refusal(number, EMSGSIZE, f"the answer takes {len(packet)} bytes; at most {MAX_PACKET} fit")
+
+
+def value_of(message: list[Any]) -> Any:
+    """Return the value of a successful reply.
+
+    Raises:
+        MalformedMessage: it says that it is compressed, and is not.
+    """
+    if len(message) < 5:
+        return message[3]
+    from zlib import decompress
+
+    try:
+        return _unpack(decompress(message[3]))
+    except Exception as error:
+        raise MalformedMessage(f"decompress answer: {type(error).__name__}: {error}") from None
 
 
 def refusal(number: int, errno_: int, text: str) -> bytes:

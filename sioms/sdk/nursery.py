@@ -18,7 +18,7 @@ from typing import Any
 
 import msgpack
 
-from sioms.protocol.messages import NurseryVerb, decode, refusal, reply
+from sioms.protocol.messages import NurseryVerb, decode, encode, refusal, reply
 
 from .finding import DriverNotFound, describe, find_driver, read_settings
 
@@ -40,7 +40,8 @@ def main(fd: int) -> None:
             match NurseryVerb(message[0]):
                 case NurseryVerb.DESCRIBE:
                     # Thousands of alike channels would not fit into a packet.
-                    sock.send(reply(number, zlib.compress(msgpack.packb(_describe(*message[2:])), 1)))
+                    described = zlib.compress(msgpack.packb(_describe(*message[2:])), 1)
+                    sock.send(encode(0, number, 0, described))
                 case NurseryVerb.SPAWN:
                     _spawn(sock, number, fds, *message[2:])
         except Exception as error:  # a driver's describe may raise anything; the daemon must hear of it
