@@ -342,3 +342,18 @@ def test_many_threads_wait_for_one_node(cell: sioms.Workcell) -> None:
         for thread in threads:
             thread.join(10.0)
         assert woken == [1] * 5
+
+
+def test_a_node_of_many_axes_and_a_workcell_of_many_nodes(start_daemon: Callable[..., Daemon]) -> None:
+    daemon = start_daemon(
+        '[device.big]\ndriver = "sim-axes"\ntick_hz = 100\n[[device.big.axis]]\nname = "a"\ncount = 800\n'
+        "velocity_max = 1.0\nacceleration_max = 10.0\nforce_max = 100.0\nbandwidth_hz = 5\nmotor = { mass = 1.0 }\n"
+    )
+    with daemon.cell() as cell:
+        assert len(cell.info("big").channels) == 800
+        assert len(cell.nodes()) == 2 + 2 * 800 + 1 + 2 * 800
+        with cell.open("big", "rw") as big:
+            assert len(big.read()) == 800 and len(big.limits()["velocity_max"]) == 800
+            big.write([sioms.command(i, position=0.001) for i in range(800)])
+            big.wait_until_idle(20.0)
+            wait_for(lambda: big.read().position == pytest.approx([0.001] * 800, abs=5e-4), "settled, at 5 Hz")

@@ -164,7 +164,7 @@ class MarkerLife(RuleBasedStateMachine):
         if not token:
             return
         state = self.driver.state(number, generation)
-        assert state is (self.live[token] if token in self.live else None)
+        assert state is self.live.get(token)
 
     @rule(wait=waits)
     def signal_late(self, wait: tuple[int, int, int]) -> None:

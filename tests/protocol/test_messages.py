@@ -2,16 +2,37 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import random
 
 import msgpack
 import pytest
 
 from sioms.protocol.flags import (
-    Access, AnalogStatus, AxisStatus, ControlMode, NodeClass, PageState, Request, Right, WriteFlag,
+    Access,
+    AnalogStatus,
+    AxisStatus,
+    ControlMode,
+    NodeClass,
+    PageState,
+    Request,
+    Right,
+    WriteFlag,
 )  # fmt: skip
 from sioms.protocol.messages import (
-    MAX_TEXT, ClientVerb, DriverVerb, HandleVerb, MalformedMessage, NurseryVerb, decode, encode, refusal, reply,
+    MAX_PACKET,
+    MAX_TEXT,
+    ClientVerb,
+    DriverVerb,
+    HandleVerb,
+    MalformedMessage,
+    NurseryVerb,
+    decode,
+    encode,
+    refusal,
+    reply,
+    value_of,
 )  # fmt: skip
 from sioms.protocol.records import ANALOG_WRITE, AXIS_WRITE, BINARY_WRITE
 
@@ -76,6 +97,21 @@ def test_numbers_keep_all_their_bits() -> None:
 
 def test_a_refusal_is_bounded() -> None:
     assert len(decode(refusal(1, 22, "x" * 100_000))[3]) == MAX_TEXT
+
+
+def test_a_long_reply_is_compressed_and_one_too_long_is_a_refusal() -> None:
+    value = [["mod0.xaxis", 1.5, None, {"velocity": float(i)}] for i in range(5000)]
+    packet = reply(7, value)
+    assert len(encode(0, 7, 0, value)) > MAX_PACKET >= len(packet)
+    message = decode(packet)
+    assert message[:3] == [0, 7, 0] and message[4] is True and value_of(message) == value
+    assert value_of(decode(reply(7, [1]))) == [1]
+    noise = random.Random(1).randbytes(2 * MAX_PACKET)
+    refused = decode(reply(7, noise))
+    assert refused[2] == errno.EMSGSIZE and str(MAX_PACKET) in refused[3]
+    for odd in (b"", b"nonsense", None, packet):
+        with pytest.raises(MalformedMessage):
+            value_of([0, 7, 0, odd, True])
 
 
 NUMBERS = {

@@ -10,7 +10,16 @@ import pytest
 
 from sioms.protocol.flags import NodeClass, PageState
 from sioms.protocol.page import (
-    HEADER_SIZE, SLOT_HEADER, NotReadable, PageError, PageReader, PageWriter, page_size, set_daemon_state, slot_header, slot_size,
+    HEADER_SIZE,
+    SLOT_HEADER,
+    NotReadable,
+    PageError,
+    PageReader,
+    PageWriter,
+    page_size,
+    set_daemon_state,
+    slot_header,
+    slot_size,
 )  # fmt: skip
 
 LEASE_NS = 100
