@@ -34,6 +34,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     test.add_argument("--axes", type=int, default=20, help="number of axes")
     test.add_argument("--seed", type=int, default=1, help="of the generator")
     test.add_argument("--out", type=Path, default=None, metavar="DIR", help="keep axes and answers here")
+    test.add_argument("--jobs", type=int, default=0, help="solvers at a time (default: one for each core)")
     kinds.add_parser("effects", help="print the library of effects")
     parser.set_defaults(run=run)
     return parser
@@ -49,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     if args.subject == "selftest":
         from sioms.tools.reconcile_selftest import selftest
 
-        return selftest(args.axes, args.seed, args.out)
+        return selftest(args.axes, args.seed, args.out, args.jobs)
     return run_axis(args)
 
 
