@@ -163,6 +163,7 @@ def test_killed_daemon_stops_all_drivers(
             node.command(velocity=0.1)
     wait_for(lambda: not any(_alive(pid) for pid in pids), "drivers ended", 5.0)
     print(f"daemon SIGKILL to all drivers gone: {(time.monotonic() - killed) * 1e3:.0f} ms")
+    wait_for(lambda: not daemon.running._reader.is_alive(), "nobody holds its pipes open", 5.0)
     with raises(errno.EIO):
         cell.status()
 

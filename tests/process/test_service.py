@@ -109,6 +109,8 @@ def test_errors_of_names_come_at_once(tmp_path: Path) -> None:
         (IO + "hang_s = inf", "hang_s"),
         (IO + "realtime_priority = 100", "realtime_priority"),
         (IO + 'user = "nobody-of-that-name"', "user"),
+        (axes("m", "x").replace("-1.0", "0.0").replace("_max = 1.0", "_max = 0.0"), "position_min 0 is not below"),
+        (axes("m", "x").replace("acceleration_max = 10.0", "acceleration_max = nan"), "acceleration_max"),
     ],
 )
 def test_odd_configurations_are_refused_in_a_sentence(tmp_path: Path, text: str, words: str) -> None:
