@@ -97,17 +97,7 @@ def test_errors_of_names_come_at_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[device", "read configuration: "),
-        ("", "no [device.NAME] in it"),
-        ("device = 3", "[device]: want tables"),
         ("grant = 3\n" + IO, "grant"),
-        ("emergency_stop = 3\n" + IO, "emergency_stop"),
-        ('[workcell]\nsocket_mode = "rw"\n' + IO, "socket_mode"),
-        ("[workcell]\ndaemon_lease_s = -1\n" + IO, "daemon_lease_s"),
-        ("[workcell]\ndaemon_lease_s = nan\n" + IO, "daemon_lease_s"),
-        ("[workcell]\nmax_sessions = 0\n" + IO, "max_sessions"),
-        (IO + "hang_s = inf", "hang_s"),
-        (IO + "realtime_priority = 100", "realtime_priority"),
         (IO + 'user = "nobody-of-that-name"', "user"),
         (axes("m", "x").replace("-1.0", "0.0").replace("_max = 1.0", "_max = 0.0"), "position_min 0 is not below"),
         (axes("m", "x").replace("acceleration_max = 10.0", "acceleration_max = nan"), "acceleration_max"),
