@@ -20,6 +20,9 @@ from .loop import Loop
 from .nursery import Nursery
 from .server import Server
 
+PRIORITY = 10
+"""SCHED_FIFO priority of the daemon; that of a driver is 50 unless configured otherwise."""
+
 
 def main(argv: list[str] | None = None) -> int:
     """Run the daemon, or check a configuration; return the exit status."""
@@ -45,6 +48,7 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         print(f"siomsd: listen: {error.strerror or error}", file=sys.stderr)
         return 1
+    _become_prompt(log)
     server = Server(loop, listener, options.config, log)
     _take_signals(loop, server)
 
@@ -60,6 +64,18 @@ def main(argv: list[str] | None = None) -> int:
         if os.path.exists(path):
             os.unlink(path)
     return server.exit_status
+
+
+def _become_prompt(log: Log) -> None:
+    """Run before all ordinary processes, where allowed, and behind the drivers; what we start does not inherit it.
+
+    Not for work but for the end: a killed process closes its sockets only when it gets a processor, and by
+    that the drivers see that we are gone. Also an emergency stop through us then waits for nobody.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
+    except OSError as error:
+        log("debug", "runs without SCHED_FIFO", why=error.strerror)
 
 
 def _check(loop: Loop, path: str) -> int:
