@@ -112,8 +112,8 @@ class Searcher:
     def _candidates(self, fit: Fit) -> list[Start]:
         names = [n for n in self.names if n not in fit.model.effects and n not in self.frozen
                  and not any(f in known()[n].replaces for f in self.frozen)]
-        starts = [s for s in screen(self.problem, fit, [n for n in names if not replaced(fit.model, n)])
-                  if s.gain > 0.5 * GAIN]
+        fresh = [n for n in names if not replaced(fit.model, n) and not self._enrichment(n)]
+        starts = [s for s in screen(self.problem, fit, fresh) if s.gain > 0.5 * GAIN]
         starts += self._upgrades(fit, [n for n in names if replaced(fit.model, n)])
         starts.sort(key=lambda s: -s.gain)
         chosen = starts[:TRIES]
@@ -121,6 +121,11 @@ class Searcher:
             alike = known()[chosen[0].effect].lookalikes
             chosen += [s for s in starts[TRIES:] if s.effect in alike and s.gain > 0.3 * chosen[0].gain]
         return chosen
+
+    def _enrichment(self, name: str) -> bool:
+        """Say whether an effect with a searched order only enriches a plainer one, which goes first."""
+        effect = known()[name]
+        return any(p.fixed for p in effect.parameters) and any(o in effect.replaces for o in plainer(name, self.names))
 
     def _upgrades(self, fit: Fit, names: list[str]) -> list[Start]:
         """Screen richer forms of an effect in the model, on top of the level it has."""
