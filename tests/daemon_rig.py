@@ -77,12 +77,21 @@ class Daemon:
         text: the configuration.
         env: further variables of its environment.
         ready: whether to wait until it says that it is ready.
+        files: to be put beside the configuration, by name.
     """
 
     def __init__(
-        self, folder: Path, text: str, env: Mapping[str, str] | None = None, *, ready: bool = True
+        self,
+        folder: Path,
+        text: str,
+        env: Mapping[str, str] | None = None,
+        *,
+        ready: bool = True,
+        files: Mapping[str, str] | None = None,
     ) -> None:
         self.folder = folder
+        for name, content in (files or {}).items():
+            (folder / name).write_text(content)
         self.config = folder / "cell.toml"
         self.config.write_text(text)
         self.socket = str(folder / "d.sock")
@@ -157,10 +166,10 @@ def daemons() -> Iterator[Callable[..., Daemon]]:
     started: list[Daemon] = []
     folder = Path(tempfile.mkdtemp(prefix="sioms-", dir="/tmp"))
 
-    def start(text: str = WORKCELL, env: Mapping[str, str] | None = None, *, ready: bool = True) -> Daemon:
+    def start(text: str = WORKCELL, env: Mapping[str, str] | None = None, **options: Any) -> Daemon:
         mine = folder / str(len(started))
         mine.mkdir()
-        started.append(Daemon(mine, text, env, ready=ready))
+        started.append(Daemon(mine, text, env, **options))
         return started[-1]
 
     try:
