@@ -116,6 +116,8 @@ class Attachments:
         verb, number, arguments = HandleVerb(message[0]), message[1], message[2:]
         if verb is not HandleVerb.KEEPALIVE and (number == 0 or number in handle.waits):
             raise MalformedMessage(f"message number {number} is zero or in use")
+        # Nothing is taken after a stop, or refused after its reset, because no tick has come in between.
+        self._runtime.heed_latch()
         try:
             match verb:
                 case HandleVerb.WRITE:

@@ -286,10 +286,8 @@ class Runtime:
         self.statistics.skipped += expired - 1
         scheduled_ns = self._scheduled_ns
         self.tick += 1
-        latch = self.latch
-        if (latch.stopped_ns, latch.resets, self._request.word) != self._seen_stop:
-            self._look_at_latch()
-        if began_ns - latch.daemon_alive_ns > self._daemon_lease_ns:
+        self.heed_latch()
+        if began_ns - self.latch.daemon_alive_ns > self._daemon_lease_ns:
             self._miss_daemon()
         elif self._daemon_late:
             self._daemon_late = False
@@ -396,6 +394,12 @@ class Runtime:
                         self.log("error", f"fault of {names}: {event.text}")
 
     # --- stops -----------------------------------------------------------------------------------
+
+    def heed_latch(self) -> None:
+        """Look whether the emergency stop, or its reset, has come since the last look; cheap."""
+        latch = self.latch
+        if (latch.stopped_ns, latch.resets, self._request.word) != self._seen_stop:
+            self._look_at_latch()
 
     def _look_at_latch(self) -> None:
         latch, (seen_stop, seen_resets, seen_request) = self.latch, self._seen_stop
