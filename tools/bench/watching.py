@@ -46,8 +46,15 @@ class Watch:
             time.sleep(0.002)
 
 
-def halting_ns(watch: Watch, since_ns: int, timeout_s: float = 3.0) -> int:
+def halting_ns(watch: Watch, since_ns: int, deceleration: float | None = None, timeout_s: float = 3.0) -> int:
     """Return the stamp of the first snapshot in which every axis was commanded slower than at ``since_ns``.
+
+    Args:
+        watch: of the axes.
+        since_ns: when it was that they should halt [ns].
+        deceleration: known constant deceleration of all axes [m/s^2]: then the instant at which the last
+            of them began to brake is returned, instead of the tick that showed it first.
+        timeout_s: how long to wait for it [s].
 
     Raises:
         TimeoutError: an axis went on.
@@ -58,7 +65,11 @@ def halting_ns(watch: Watch, since_ns: int, timeout_s: float = 3.0) -> int:
         pairs = zip(snapshot.commanded_velocity, before, strict=True)
         return all(abs(now) < abs(was) - SLOWER for now, was in pairs)
 
-    return int(watch.first(slower, since_ns, timeout_s, "axes halting").stamp_ns)
+    found = watch.first(slower, since_ns, timeout_s, "axes halting")
+    if deceleration is None:
+        return int(found.stamp_ns)
+    lost = min(abs(was) - abs(now) for now, was in zip(found.commanded_velocity, before, strict=True))
+    return int(found.stamp_ns) - round(lost / deceleration * 1e9)
 
 
 def standing_ns(watch: Watch, since_ns: int, timeout_s: float = 3.0) -> int:
