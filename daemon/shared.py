@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import mmap
 import os
 
 from sioms.protocol.latch import LATCH_SIZE, REQUEST_SIZE, Latch, StopRequest
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
+
+_SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
+"""Clients hold the stop-request page too: a page that shrinks kills everybody who has mapped it (SIGBUS)."""
 
 
 class Shared:
@@ -25,8 +29,9 @@ class Shared:
         self.fds = []
         views = []
         for name, size in sizes:
-            fd = os.memfd_create(name, os.MFD_CLOEXEC)
+            fd = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
             os.ftruncate(fd, size)
+            fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _SEALS)
             self.fds.append(fd)
             views.append(memoryview(mmap.mmap(fd, size)))
         self.latch = Latch(views[0])
