@@ -69,7 +69,7 @@ def halting_ns(watch: Watch, since_ns: int, deceleration: float | None = None, t
     if deceleration is None:
         return int(found.stamp_ns)
     lost = min(abs(was) - abs(now) for now, was in zip(found.commanded_velocity, before, strict=True))
-    return int(found.stamp_ns) - round(lost / deceleration * 1e9)
+    return int(found.stamp_ns) - int(lost / deceleration * 1e9)
 
 
 def standing_ns(watch: Watch, since_ns: int, timeout_s: float = 3.0) -> int:
