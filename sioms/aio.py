@@ -17,9 +17,12 @@ import asyncio
 import errno
 import os
 from collections.abc import AsyncIterator
+from mmap import mmap
+from time import monotonic_ns
 from typing import TYPE_CHECKING, Any, Self
 
 from sioms.protocol.flags import PROTOCOL_VERSION, Request
+from sioms.protocol.latch import REQUEST_SIZE, StopRequest
 from sioms.protocol.messages import ClientVerb, HandleVerb
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.socketpath import socket_path
@@ -195,8 +198,9 @@ class AsyncNode(NodeCore):
 class AsyncWorkcell:
     """A session with the daemon in an event loop; made by ``connect``."""
 
-    def __init__(self, requests: _Requests) -> None:
+    def __init__(self, requests: _Requests, page: StopRequest | None) -> None:
         self._requests = requests
+        self._page = page
 
     async def __aenter__(self) -> Self:
         return self
@@ -235,8 +239,14 @@ class AsyncWorkcell:
         return stamp_ns
 
     async def emergency_stop(self, node: str = "", why: str = "") -> None:
-        """Stop the workcell or a node, latched until reset."""
-        await self._call("emergency stop", ClientVerb.EMERGENCY_STOP, node, why)
+        """Stop the workcell or a node, latched until reset; the workcell also while the daemon hangs."""
+        stopping = asyncio.ensure_future(self._call("emergency stop", ClientVerb.EMERGENCY_STOP, node, why))
+        try:
+            await asyncio.sleep(0)  # sent first, because the daemon knows who and why
+        finally:
+            if not node and self._page is not None:
+                self._page.request(monotonic_ns(), os.getpid())
+        await stopping
 
     async def reset(self, node: str = "") -> None:
         """Clear the latched stop of the workcell or of a node."""
@@ -264,6 +274,8 @@ async def connect(path: str | None = None, name: str = "") -> AsyncWorkcell:
     channel = Channel(connect_socket(path or socket_path()), "the daemon")
     requests = _Requests(channel, ClientVerb.CANCEL)
     answer = await requests.call(Call("hello", ClientVerb.HELLO, PROTOCOL_VERSION, name))
-    for fd in answer.fds:
-        os.close(fd)  # the stop-request page: a hung daemon is for blocking clients to overcome
-    return AsyncWorkcell(requests)
+    page = None
+    if answer.fds:
+        page = StopRequest(memoryview(mmap(answer.fds[0], REQUEST_SIZE)))
+        os.close(answer.fds[0])
+    return AsyncWorkcell(requests, page)
