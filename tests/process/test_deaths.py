@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 
 import pytest
-from daemon_rig import WORKCELL, Client, Daemon, at_rest, jog, raises, wait_for
+from daemon_rig import WORKCELL, Client, Daemon, at_rest, axes, jog, raises, wait_for
 
 import sioms
 
@@ -44,6 +44,22 @@ def test_killed_client_with_a_child_that_holds_the_sockets_open(
         at_rest(axis, 1.0)
     with raises(errno.EINVAL, "not reserved"):  # its marker went with it
         cell.wait_marker(token & 1023, 0.0)
+
+
+@pytest.mark.parametrize("child", [False, True])
+def test_killed_client_halts_its_axes_while_the_daemon_hangs(
+    start_daemon: Callable[..., Daemon], client: Callable[..., Client], child: bool
+) -> None:
+    """The driver sees the death itself: by the end of file, or by the process when a child holds the socket open."""
+    daemon = start_daemon("[workcell]\ndaemon_lease_s = 60\n" + axes("mod0", "xaxis"))
+    with daemon.cell() as cell, cell.open("mod0.readonly") as seen:
+        fork = "if os.fork() == 0: hold()\nsay('forked')\nhold()\n" if child else "hold()\n"
+        victim = client(daemon, jog("mod0", 0.2) + fork)
+        if child:
+            victim.wait_line("forked")
+        with daemon.frozen(daemon.pid):
+            victim.kill()
+            assert at_rest(seen, 3.0) < 1.0
 
 
 def test_killed_client_drops_outputs_to_safe(

@@ -230,11 +230,29 @@ def test_stop_from_asyncio(daemon: Daemon, cell: sioms.Workcell) -> None:
             waiting = asyncio.create_task(axis.wait_until_idle())
             await asyncio.sleep(0.05)
             await mine.emergency_stop(why="asyncio")
-            with raises(errno.ECANCELED, "asyncio"):
+            with raises(errno.ECANCELED, "emergency stop by"):
                 await waiting
+            assert "asyncio" in (await mine.status())["stop_source"]
             await mine.reset()
 
     asyncio.run(story())
+
+
+def test_stop_from_asyncio_while_the_daemon_hangs(daemon: Daemon, cell: sioms.Workcell) -> None:
+    async def story(axis: sioms.AxisNode) -> None:
+        async with await sioms.aio.connect(daemon.socket) as mine:
+            with daemon.frozen(daemon.pid):
+                stopping = asyncio.create_task(mine.emergency_stop())
+                deadline = time.monotonic() + 2.0
+                while not axis.read().status[0] & AxisStatus.EMERGENCY_STOP:
+                    assert time.monotonic() < deadline
+                    await asyncio.sleep(0.001)
+            await stopping
+
+    with cell.open("mod0.xaxis", "rw") as axis:
+        axis.command(velocity=0.1)
+        asyncio.run(story(axis))
+        at_rest(axis, 2.0)
 
 
 def test_stop_needs_no_ownership(daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client]) -> None:
