@@ -112,7 +112,7 @@ class Server:
     def reset_workcell(self, who: str) -> None:
         """Clear the latch and give devices in fault another try; nothing moves by itself."""
         self._request_seen = self.shared.request.word
-        self.shared.latch.reset()
+        self.shared.latch.reset(self._request_seen)
         self.log("info", "reset", by=who)
         for device in self.devices.values():
             device.tell(DriverVerb.STOP_CHANGED)

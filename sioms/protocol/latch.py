@@ -13,7 +13,7 @@ This is a software stop (category 1 or 2 of IEC 60204-1 at best), not a safety-r
 
 LATCH_SIZE = 4096
 REQUEST_SIZE = 4096
-_STOPPED, _RESETS, _ALIVE = 0, 1, 2
+_STOPPED, _RESETS, _ALIVE, _ANSWERED = 0, 1, 2, 3
 _TEXT, _TEXT_SIZE = 64, 256
 
 
@@ -62,8 +62,18 @@ class Latch:
         """Say better who stopped, of a stop that is latched already."""
         self._bytes[_TEXT : _TEXT + _TEXT_SIZE] = source.encode()[: _TEXT_SIZE - 1].ljust(_TEXT_SIZE, b"\0")
 
-    def reset(self) -> None:
-        """Clear the latch (the daemon's, on behalf of somebody entitled)."""
+    @property
+    def answered_request(self) -> int:
+        """Word of the stop-request page that the last reset answered: no new request to who sees it only now."""
+        return self._words[_ANSWERED]
+
+    def reset(self, request: int = 0) -> None:
+        """Clear the latch (the daemon's, on behalf of somebody entitled).
+
+        Args:
+            request: word of the stop-request page that is thereby answered.
+        """
+        self._words[_ANSWERED] = request
         self._words[_RESETS] += 1
         self._words[_STOPPED] = 0
 

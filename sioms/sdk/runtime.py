@@ -404,7 +404,8 @@ class Runtime:
     def _look_at_latch(self) -> None:
         latch, (seen_stop, seen_resets, seen_request) = self.latch, self._seen_stop
         word = self._request.word
-        if word != seen_request and latch.stop(time.monotonic_ns(), self._request.source):
+        fresh = word not in (seen_request, latch.answered_request)
+        if fresh and latch.stop(time.monotonic_ns(), self._request.source):
             self.tell(DriverVerb.STOPPED, latch.source)
         stopped_ns, resets = latch.stopped_ns, latch.resets
         self._seen_stop = (stopped_ns, resets, word)

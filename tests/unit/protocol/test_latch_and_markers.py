@@ -118,3 +118,14 @@ def test_socket_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "s").touch()
     monkeypatch.setattr("sioms.protocol.socketpath.SYSTEM_PATH", str(tmp_path / "s"))
     assert socket_path() == str(tmp_path / "s")
+
+
+def test_a_reset_tells_which_request_it_has_answered() -> None:
+    latch = Latch(memoryview(bytearray(LATCH_SIZE)))
+    request = StopRequest(memoryview(bytearray(REQUEST_SIZE)))
+    request.request(1000)
+    latch.stop(1000, "a client")
+    latch.reset(request.word)
+    assert latch.stopped_ns == 0 and latch.answered_request == request.word
+    request.request(2000)
+    assert latch.answered_request != request.word
