@@ -8,12 +8,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from sioms.reconcile.axis import Options, analyse
+from sioms.reconcile.records import Session
 from sioms.reconcile_selftest.draw import draw_axis
 from sioms.reconcile_selftest.score import score
 from sioms.tools import reconcile
-from sioms.tools.reconcile_input import read_model
+from sioms.tools.reconcile_input import read_data, read_model
 from sioms.tools.reconcile_selftest import generate, record_all, solve, write_public
 
 AXES = Path(__file__).parent / "reconcile_axes"
@@ -58,6 +61,7 @@ def test_one_cruising_speed_leaves_coulomb_and_viscous_friction_open(tmp_path: P
     assert (tmp_path / "experiment.csv").exists()
 
 
+@pytest.mark.timeout(400)
 def test_a_drag_outside_the_library_is_refused_and_described(tmp_path: Path) -> None:
     status, found = answer("s35", tmp_path)
     assert status == 3
@@ -68,10 +72,14 @@ def test_a_drag_outside_the_library_is_refused_and_described(tmp_path: Path) -> 
     assert term["parameters"]["v0"]["value"] == pytest.approx(4.329, rel=0.05)
 
 
-def test_the_same_seed_gives_the_same_verdict(tmp_path: Path) -> None:
-    first, second = (answer("s05", tmp_path / n)[1] for n in "ab")
-    first.pop("seconds"), second.pop("seconds")
-    assert first == second
+def test_the_same_seed_gives_the_same_verdict() -> None:
+    model = read_model(AXES / "s05" / "nominal.json")
+    session = read_data(AXES / "s05", model)
+    short = Session(tuple(r.cut(0, 1500) for r in session.records[:2]))
+    first, second = (analyse(short, model, Options(seed=3, replicates=20)) for _ in "ab")
+    assert [p.p for p in first.places] == [p.p for p in second.places]
+    assert first.gaps == second.gaps
+    assert first.ratio == second.ratio
 
 
 def test_bad_input_is_an_error_and_no_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -80,13 +88,12 @@ def test_bad_input_is_an_error_and_no_verdict(tmp_path: Path, capsys: pytest.Cap
     assert not (tmp_path / "r").exists()
 
 
+@pytest.mark.timeout(400)
 def test_a_small_blind_test(tmp_path: Path) -> None:
     """Two generated axes, solved by processes that see the public part only."""
-    import numpy as np
-
     rng = np.random.default_rng(11)
     axes = [draw_axis("quiet", "null", rng), draw_axis("dragging", "single", rng, "viscous")]
-    for axis, records in zip(axes, record_all(axes, 11, 1.5), strict=True):
+    for axis, records in zip(axes, record_all(axes, 11, 1.2), strict=True):
         folder = tmp_path / axis.name
         write_public(axis, records, folder)
         assert not any("b_extra" in p.read_text() for p in folder.glob("*.toml"))
