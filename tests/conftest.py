@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import itertools
 import os
 import re
@@ -40,6 +41,15 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         pytest.skip("needs the rights of root")
 
 
+_libc = ctypes.CDLL(None)
+_PR_SET_PDEATHSIG = 1
+
+
+def _end_with_us() -> None:
+    """In the new process: get SIGTERM when the test run dies, however it dies (prctl(2))."""
+    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
 class Running:
     """A process of our own session whose output is collected line by line while it runs.
 
@@ -63,6 +73,7 @@ class Running:
             stderr=subprocess.STDOUT,
             text=True,
             start_new_session=True,
+            preexec_fn=_end_with_us,
         )
         self.lines: list[str] = []
         self._news = threading.Condition()
