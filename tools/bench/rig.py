@@ -59,7 +59,7 @@ class Daemon:
         self.pid = self.process.pid
         try:
             self._wait_ready(notify)
-        except RuntimeError:
+        except BaseException:  # also when we are interrupted: nothing is left behind
             self.close()
             raise
         finally:
