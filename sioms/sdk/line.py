@@ -21,6 +21,8 @@ from .exchange import DeviceError, Exchange, LinkError, Pause, Send, Step, Steps
 
 ATTEMPTS = 2
 """Times a repeatable request is sent before its exchange counts as failed."""
+BABBLE_NS = 500_000_000
+"""How much longer than the silence it owes a line may go on after a bad reply; then the exchange has failed."""
 
 
 class Priority(IntEnum):
@@ -105,6 +107,7 @@ class Line:
         self._suspended: list[tuple[_Running, Any]] = []
         self._state = _State.IDLE
         self._until_ns = 0
+        self._babble_ns = 0
         self._quiet_since_ns = 0
 
     @property
@@ -196,8 +199,9 @@ class Line:
                 got = f"{len(running.reply)} bytes of a reply" if running.reply else "no reply"
                 self._recover(f"{what}: {got} within its time-out", now_ns)
             case _State.RECOVERING:
-                if now_ns - self._quiet_since_ns < self._recovery_ns:
-                    self._until_ns = self._quiet_since_ns + self._recovery_ns
+                quiet_ns = self._quiet_since_ns + self._recovery_ns
+                if now_ns < quiet_ns and now_ns < self._babble_ns:
+                    self._until_ns = min(quiet_ns, self._babble_ns)
                     return
                 self._after_recovery(now_ns)
 
@@ -284,6 +288,7 @@ class Line:
         self._state = _State.RECOVERING
         self._reason = reason
         self._until_ns = max(now_ns, self._quiet_since_ns) + self._recovery_ns
+        self._babble_ns = self._until_ns + BABBLE_NS
 
     def _after_recovery(self, now_ns: int) -> None:
         running = self._running
