@@ -291,8 +291,8 @@ class AxesUnit(LineUnit):
             limits = self.bank.get_limits([axis])
             low, high = limits["position_min"][0], limits["position_max"][0]
             position, velocity = float(self.bank.fields[0, axis]), float(self.bank.fields[1, axis])
-            # one more poll and the stop's way over the line pass before the drive brakes
-            ahead = velocity * (between_s + LATENCY_S) + velocity * abs(velocity) / (
+            # up to two polls and the stop's way over the line pass before the drive brakes
+            ahead = velocity * (2 * between_s + LATENCY_S) + velocity * abs(velocity) / (
                 2 * settings.acceleration_max
             )
             passed_low = low is not None and velocity < 0 and position + ahead < low

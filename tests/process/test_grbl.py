@@ -150,6 +150,7 @@ def test_line_faults_and_deaths_on_tcp(start: Callable[..., Any], short_folder: 
         began = time.monotonic()
         wait_for(lambda: wire.state("velocity") == 0, "the end of the chain", 1.5)
         assert time.monotonic() - began < 1.0
+        wait_for(lambda: not wire.reads("mod0.x"), "the loss")
         wire.tell("clear")
         wire.wait_up("mod0.x")
         x.reset()

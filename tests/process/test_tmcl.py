@@ -117,6 +117,7 @@ def test_line_faults_and_deaths(start: Callable[..., Any], short_folder: Path) -
             x.move(0.05)
             x.wait_until_idle(8.0)
         wait_for(lambda: wire.state("velocity") == 0, "rest by heartbeat or stop", 2.0)
+        wait_for(lambda: not wire.reads("mod0.x"), "the loss")
         wire.tell("clear")
         wire.wait_up("mod0.x")
         x.reset()
@@ -127,6 +128,7 @@ def test_line_faults_and_deaths(start: Callable[..., Any], short_folder: Path) -
         wire.tell("deaf")
         wait_for(lambda: wire.state("velocity") == 0, "rest by heartbeat", 1.5)
         assert time.monotonic() - began < 1.0
+        wait_for(lambda: not wire.reads("mod0.x"), "the loss")
         wire.tell("clear")
         wire.wait_up("mod0.x")
         x.reset()

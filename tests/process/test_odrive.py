@@ -1,0 +1,152 @@
+"""ODrive: the driver under the real daemon against a simulated board."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from daemon_rig import at_rest, raises, wait_for
+from wire_rig import Wire
+
+from sioms.protocol.flags import AxisStatus
+
+CONFIG = """
+[device.mod0]
+driver = "odrive"
+line = { serial = "{port}" }
+watchdog_s = 1.0
+[[device.mod0.axis]]
+name = "x"
+number = 0
+travel_per_turn = 0.01
+position_max = 0.1
+velocity_max = 0.1
+acceleration_max = 0.5
+force_max = 400.0
+homing = true
+[[device.mod0.axis]]
+name = "j"
+number = 1
+unit = "rad"
+travel_per_turn = -6.283185307179586
+velocity_max = 60.0
+acceleration_max = 200.0
+force_max = 2.0
+"""
+
+
+def test_moves_torques_homes_and_faults(start: Callable[..., Any], short_folder: Path) -> None:
+    wire = Wire(start, short_folder, "odrive", "--baud", "115200")
+    cell = wire.serve(CONFIG)
+    wire.wait_up("mod0.x")
+    wait_for(lambda: wire.state("state", 0) == 8, "closed loop")
+    with cell.open("mod0", "rw") as both:
+        both.command(position=0.03)
+        both.command(1, position=6.283)
+        both.wait_until_idle(8.0)
+        assert both.read().position == pytest.approx([0.03, 6.283], abs=0.02)
+        assert wire.state("position", 0) == pytest.approx(3.0, abs=0.01)
+        assert wire.state("position", 1) == pytest.approx(-1.0, abs=0.01)
+    with cell.open("mod0.j", "rw") as j:
+        # a torque of 0.2 Nm turns the reversed axis; friction settles it near 3 turns/s
+        j.command(force=0.2)
+        wait_for(lambda: j.read().velocity[0] > 5.0, "the torque to act")
+        assert wire.state("torque", 1) == pytest.approx(-0.2)
+        j.stop()
+        at_rest(j)
+        with raises(34, "force"):
+            j.command(force=5.0)
+    with cell.open("mod0.x", "rw") as x:
+        # a velocity ends before the soft limit, along the ramp
+        x.command(velocity=0.08)
+        wait_for(lambda: x.read().position[0] > 0.07, "motion")
+        at_rest(x)
+        assert 0.08 < x.read().position[0] <= 0.1
+        # the board's own homing, and its loop is closed afterwards
+        wire.tell("switch -1")
+        x.home()
+        x.wait_until_idle(20.0)
+        assert x.read().status[0] & AxisStatus.HOMED
+        assert x.read().position[0] == pytest.approx(0.0, abs=1e-3)
+        x.move(0.02)
+        x.wait_until_idle(8.0)
+        # emergency stop lets go; after a reset it moves again
+        x.command(velocity=0.08)
+        wait_for(lambda: wire.state("velocity") > 6, "motion")
+        x.stop_all()
+        wait_for(lambda: wire.state("state") == 1, "idle", 1.0)
+        with raises(1, "RESET"):
+            x.move(0.0)
+        at_rest(x)
+        x.reset()
+        x.move(0.0)
+        x.wait_until_idle(8.0)
+        assert wire.state("state") == 8
+        # an error of the board: named with its details, latched, cleared by reset
+        wire.tell("error 0x40")
+        wait_for(lambda: x.read().status[0] & AxisStatus.FAULT, "the fault")
+        with raises(5, "motor failed; motor.error 0x10"):
+            x.move(0.01)
+        x.reset()
+        wait_for(lambda: not x.read().status[0] & AxisStatus.FAULT, "the reset")
+        wait_for(lambda: wire.state("state") == 8, "closed loop")
+        x.move(0.01)
+        x.wait_until_idle(8.0)
+
+
+def test_line_faults_watchdog_and_deaths(start: Callable[..., Any], short_folder: Path) -> None:
+    wire = Wire(start, short_folder, "odrive")
+    cell = wire.serve(CONFIG)
+    wire.wait_up("mod0.x")
+    with cell.open("mod0.x", "rw") as x:
+        for fault in ("noise 2", "double 1", "cut 1 3", "deaf 1"):
+            wire.tell(fault)
+            time.sleep(0.2)
+            x.reset()
+            wire.wait_up("mod0.x")
+        x.reset()
+        x.move(0.01)
+        x.wait_until_idle(8.0)
+        assert wire.state("position") == pytest.approx(1.0, abs=0.01)
+        # nothing is fed: the board lets go by itself
+        x.command(velocity=0.05)
+        wait_for(lambda: wire.state("velocity") > 4, "motion")
+        wire.tell("deaf")
+        wait_for(lambda: wire.state("state") == 1, "idle by the watchdog", 3.0)
+        assert int(wire.state("error")) == 1 << 11
+        wait_for(lambda: not wire.reads("mod0.x"), "the loss")
+        wire.tell("clear")
+        wire.wait_up("mod0.x")
+        x.reset()
+        x.move(0.0)
+        x.wait_until_idle(8.0)
+    wire.check_deaths("mod0.x", 0.05, lambda: float(abs(wire.state("velocity")) > 0.02), 0.5, 1.5)
+
+
+@pytest.mark.parametrize(
+    ("option", "change", "words"),
+    [
+        ("0.4.12", "", "counts positions in encoder counts"),
+        ("0.5.6", "set axis1.controller.config.vel_limit 2", "vel_limit is 2"),
+        ("0.5.6", "error 0x100 1", "encoder failed"),
+    ],
+)
+def test_boards_that_do_not_fit(
+    start: Callable[..., Any], short_folder: Path, option: str, change: str, words: str
+) -> None:
+    wire = Wire(start, short_folder, "odrive", "--version", option)
+    if change:
+        wire.tell(change)
+    cell = wire.serve(CONFIG)
+    if words != "encoder failed":
+        wait_for(lambda: words in wire.reason("mod0"), f"the sentence; {wire.reason('mod0')}")
+        assert not wire.reads("mod0.x")
+        return
+    wire.wait_up("mod0.j")
+    with cell.open("mod0.j", "rw") as j, raises(5, words):
+        wait_for(lambda: j.read().status[0] & AxisStatus.FAULT, "the fault")
+        j.move(math.pi)
