@@ -12,8 +12,6 @@ from sioms.tactile.cylinder import Cylinder, respond
 
 Floats = NDArray[np.float64]
 
-_NODES = 64  # for the smooth difference between the circle's and the line's Hilbert kernel
-
 
 @lru_cache(maxsize=32)
 def _remainders(cylinder: Cylinder, count: int) -> Floats:
@@ -40,16 +38,23 @@ def _gap(t: Floats) -> Floats:
     return difference
 
 
+def _nodes(order: int) -> int:
+    """Return how many nodes keep the functions up to `order` apart and integrate the smooth kernel to rounding."""
+    return max(64, 2 * order)
+
+
 def _first_kind(order: int) -> tuple[Floats, Floats]:
     """Return nodes and weights, shape (order + 1, nodes), of (2/pi) int T_m f/sqrt(1 - x^2) dx."""
-    angle = np.pi * (np.arange(_NODES) + 0.5) / _NODES
-    return np.cos(angle), 2.0 / _NODES * np.cos(np.arange(order + 1)[:, None] * angle)
+    nodes = _nodes(order)
+    angle = np.pi * (np.arange(nodes) + 0.5) / nodes
+    return np.cos(angle), 2.0 / nodes * np.cos(np.arange(order + 1)[:, None] * angle)
 
 
 def _second_kind(order: int) -> tuple[Floats, Floats]:
     """Return nodes and weights, shape (order, nodes), of (2/pi) int U_m f sqrt(1 - x^2) dx."""
-    angle = np.pi * np.arange(1, _NODES + 1) / (_NODES + 1)
-    return np.cos(angle), 2.0 / (_NODES + 1) * np.sin((np.arange(order)[:, None] + 1) * angle) * np.sin(angle)
+    nodes = _nodes(order)
+    angle = np.pi * np.arange(1, nodes + 1) / (nodes + 1)
+    return np.cos(angle), 2.0 / (nodes + 1) * np.sin((np.arange(order)[:, None] + 1) * angle) * np.sin(angle)
 
 
 class StripTables:
