@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
@@ -13,7 +14,7 @@ from sioms.protocol.flags import PageState
 from .blocks import AnyBlock, AxisBlock
 from .connection import Connection
 from .driver import LineDriver, LineUnit, Refusal, StreamDriver, TickDriver
-from .exchange import DeviceError, LinkError
+from .exchange import DeviceError, LinkError, Steps
 from .handles import Handle
 from .line import Counters, Done, Line, Priority
 from .requests import LATER
@@ -265,6 +266,7 @@ class LineEngine(_Connected):
         self._period_ns = int(1e9 / poll_hz)
         self._units = [_UnitState(unit) for unit in driver.units]
         self._by_block = {id(block): state for state in self._units for block in state.unit.blocks}
+        self._voids: Counter[tuple[int, int]] = Counter()
         self.publishes = False
 
     def unsolicited(self) -> Any:
@@ -328,6 +330,8 @@ class LineEngine(_Connected):
         if state.fresh:
             state.fresh = False
             self._runtime.set_link(state.unit.blocks, PageState.GOOD, "")
+            for block in state.unit.blocks:
+                self._runtime.make_safe(block, self._unowned(block))  # who wrote them may have gone meanwhile
         for block in state.unit.blocks:
             self._runtime.publish(block, block.stamp_ns or now_ns)
             if isinstance(block, AxisBlock):
@@ -383,12 +387,18 @@ class LineEngine(_Connected):
         state, line, now_ns = self._by_block[id(block)], self.line, self._runtime.now_ns()
         if line is None or not state.is_up:
             raise OSError(errno.EIO, f"write {block.spec.name}: {state.unit.name} does not answer")
+        outputs, wanted = self._runtime.outputs, {(id(block), c): v for c, v in zip(channels, values, strict=True)}
         steps = state.unit.write_outputs(block.spec, channels, values)
+        if handle is None:
+            self._voids.update(wanted.keys())
+        else:
+            steps = self._unless_void(steps, {key: self._voids[key] for key in wanted})
+        outputs.update(wanted)  # at once: writes of single bits begin from what is on its way already
 
         def done(_: Any, error: Exception | None) -> None:
-            if error is None:
-                for channel, value in zip(channels, values, strict=True):
-                    self._runtime.outputs[(id(block), channel)] = value
+            if error is not None:
+                for key in [k for k, v in wanted.items() if outputs.get(k) == v]:
+                    del outputs[key]  # what it is now, the device tells
             if handle is None:
                 if error is not None:
                     self._runtime.log("error", f"{state.unit.name}: safe outputs could not be set: {error}")
@@ -409,9 +419,32 @@ class LineEngine(_Connected):
             block.bank.advance(now_ns)
             self._take_actions(state, block, now_ns)
 
+    def _unless_void(self, steps: Steps, marks: dict[tuple[int, int], int]) -> Steps:
+        """Carry out a write of outputs, and no further once a stop or a safe value has overtaken it."""
+        value: Any = None
+        failure: Exception | None = None
+        while all(self._voids[key] == mark for key, mark in marks.items()):
+            try:
+                step = steps.throw(failure) if failure else steps.send(value)
+            except StopIteration:
+                return
+            value, failure = None, None
+            try:
+                value = yield step
+            except (LinkError, DeviceError) as error:
+                failure = error
+        raise DeviceError(errno.ECANCELED, "overtaken by a stop or a safe value")
+
+    def _unowned(self, block: AnyBlock) -> list[int]:
+        """Return the channels whose outputs no client holds; a stopped workcell holds none."""
+        holders = [] if self._runtime.stopped else self._runtime.clients.handles.values()
+        held = {int(c) for h in holders if h.exclusive and h.block is block for c in h.channels}
+        return [c for c in range(block.n) if c not in held]
+
     def stop(self, blocks: Sequence[AnyBlock]) -> None:
         """Send what the banks have been told: their stops overtake everything else on the line."""
         for block in blocks:
+            self._voids.update((id(block), c) for c in range(block.n))
             self.commands_written(block)
 
     def is_quiet(self) -> bool:

@@ -5,15 +5,20 @@ from __future__ import annotations
 import errno
 import mmap
 import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
 
 import pytest
-from daemon_rig import Daemon
+from daemon_rig import Daemon, wait_for
 
 import sioms
 from sioms.client.channel import Call, Channel, connect
 from sioms.protocol.flags import PROTOCOL_VERSION
 from sioms.protocol.latch import REQUEST_SIZE
-from sioms.protocol.messages import ClientVerb
+from sioms.protocol.messages import ClientVerb, HandleVerb
+from sioms.protocol.records import BINARY_WRITE
 
 
 def test_the_stop_request_page_cannot_be_taken_away(daemon: Daemon, cell: sioms.Workcell) -> None:
@@ -29,3 +34,172 @@ def test_the_stop_request_page_cannot_be_taken_away(daemon: Daemon, cell: sioms.
         os.close(fd)
         channel.close()
     assert cell.status()["pid"] == daemon.pid
+
+
+UDP = '''
+import struct
+from sioms.sdk.blocks import BinaryBlock, BlockSpec, Description
+from sioms.sdk.driver import LineDriver, LineUnit
+from sioms.sdk.exchange import Exchange, LinkError
+from sioms.sdk.settings import LineSettings
+from sioms.protocol.flags import NodeClass
+from sioms.protocol.nodeinfo import ChannelInfo
+import msgspec, time
+
+
+class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    line: LineSettings
+
+
+def ask(kind, value=0):
+    def decode(reply):
+        if reply[:1] != kind:
+            raise LinkError("reply to another request")
+        return reply[1]
+    return Exchange(kind + bytes([value]), lambda data: 2, decode, 0.3, False, kind.decode())
+
+
+class Unit(LineUnit):
+    name = "port"
+    misses = 2
+
+    def __init__(self, spec):
+        self.block = BinaryBlock(spec)
+        self.blocks_ = [self.block]
+
+    blocks = property(lambda self: self.blocks_)
+
+    def open(self):
+        yield ask(b"O")
+
+    def poll(self):
+        value = yield ask(b"P")
+        self.block.set(0, value, time.monotonic_ns())
+
+    def write_outputs(self, spec, channels, values):
+        yield ask(b"W", int(values[-1]))
+
+
+class Port(LineDriver):
+    Settings = Settings
+    recovery_s = 0.02
+
+    @classmethod
+    def describe(cls, name, settings):
+        channels = (ChannelInfo("port", width=8, minimum=0, maximum=255),)
+        spec = BlockSpec("", NodeClass.BINARY, channels, writable=True, safe=(0,))
+        return Description((spec,), 20.0, lease_s=1.0)
+
+    def __init__(self, name, settings, kit):
+        super().__init__(name, settings, kit)
+        self.line = settings.line
+        self._units = [Unit(self.describe(name, settings).blocks[0])]
+
+    units = property(lambda self: self._units)
+
+
+DRIVER = Port
+'''
+
+
+class Device:
+    """Eight outputs behind a datagram socket, each request answered after a delay; keeps what was written."""
+
+    def __init__(self) -> None:
+        self.sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.sock.bind(("127.0.0.1", 0))
+        self.port = self.sock.getsockname()[1]
+        self.value, self.written, self.delay_s, self.mute = 0, list[int](), 0.0, False
+        self.asked = threading.Event()
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def _serve(self) -> None:
+        while True:
+            request, where = self.sock.recvfrom(16)
+            if request == b"end":
+                return
+            if self.mute:
+                continue
+            if request[:1] == b"W":
+                self.asked.set()
+                time.sleep(self.delay_s)
+                self.value = request[1]
+                self.written.append(request[1])
+            self.sock.sendto(request[:1] + bytes([self.value]), where)
+
+    def close(self) -> None:
+        self.sock.sendto(b"end", self.sock.getsockname())
+
+
+@pytest.fixture
+def port(start_daemon: Callable[..., Daemon]) -> Iterator[tuple[Daemon, Device]]:
+    """A daemon with one port, and the device behind it."""
+    device = Device()
+    text = f'[workcell]\nname = "test"\n[device.port0]\ndriver = "./port.py"\nline = {{ udp = "127.0.0.1:{device.port}" }}\n'
+    daemon = start_daemon(text, files={"port.py": UDP})
+    daemon.wait_up("port0")
+    yield daemon, device
+    device.close()
+
+
+def _send(node: sioms.BinaryNode, value: int) -> None:
+    """Send a write and do not wait for its answer."""
+    node._channel.send(Call("write", HandleVerb.WRITE, 0, 0.0, BINARY_WRITE.pack(0, 0, value, 0)))
+
+
+def test_writes_on_their_way_do_not_come_after_the_safe_value(port: tuple[Daemon, Device]) -> None:
+    daemon, device = port
+    with daemon.cell("writer") as cell:
+        node = cell.open("port0", "rw")
+        node.set(1)
+        device.delay_s = 0.05
+        device.asked.clear()
+        for value in (3, 5, 7, 9):
+            _send(node, value)
+        assert device.asked.wait(5.0)
+        node.close()
+    wait_for(lambda: device.value == 0, "the safe value")
+    time.sleep(0.3)
+    assert device.value == 0, f"written: {device.written}"
+
+
+def test_writes_on_their_way_do_not_come_after_an_emergency_stop(port: tuple[Daemon, Device]) -> None:
+    daemon, device = port
+    with daemon.cell("writer") as cell, cell.open("port0", "rw") as node:
+        device.delay_s = 0.05
+        device.asked.clear()
+        for value in (3, 5, 7, 9):
+            _send(node, value)
+        assert device.asked.wait(5.0)
+        cell.emergency_stop()
+        wait_for(lambda: device.written[-1:] == [0], "the safe value")
+        cell.reset()
+        time.sleep(0.3)
+        assert device.value == 0, f"written: {device.written}"
+        node.set(1)
+        assert device.value == 1
+
+
+def test_outputs_whose_writer_went_during_a_loss_are_made_safe_after_it(port: tuple[Daemon, Device]) -> None:
+    daemon, device = port
+    with daemon.cell("writer") as cell:
+        node = cell.open("port0", "rw")
+        node.set(5)
+        device.mute = True
+        wait_for(lambda: daemon.device("port0")["link"] != "good", "lost")
+        node.close()
+    assert device.value == 5
+    device.mute = False
+    daemon.wait_up("port0")
+    wait_for(lambda: device.value == 0, "the safe value")
+
+
+def test_two_writers_of_one_port_keep_each_others_bits(port: tuple[Daemon, Device]) -> None:
+    daemon, device = port
+    with daemon.cell("writer") as cell, cell.open("port0.bit0", "rw") as first, cell.open("port0.bit1", "rw") as other:
+        device.delay_s = 0.05
+        device.asked.clear()
+        _send(first, 1)
+        assert device.asked.wait(5.0)
+        other.set(1)
+        assert device.value == 3, f"written: {device.written}"
