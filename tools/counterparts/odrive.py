@@ -36,7 +36,7 @@ class Axis:
             "config.watchdog_timeout": 0, "motor.config.torque_lim": 5.0,
         }  # fmt: skip
         self.position = self.velocity = self.setpoint = 0.0
-        self.inertia, self.friction = 0.02, 0.05
+        self.inertia, self.friction = 0.02, 0.1
         self.switch: float | None = None
         self.trajectory: float | None = None
         self._clock = clock
