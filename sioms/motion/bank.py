@@ -115,7 +115,7 @@ class AxisBank:
             self._take(Taken(plain, frozenset([c.axis for c in plain]), replace, now_ns))
             return
         self._work_in()
-        sequencer = self._sequencer
+        sequencer, now_ns = self._sequencer, self._instant(now_ns)
         sequencer.advance(now_ns)
         commands = self._queue.admit(records, axes, sequencer.rest_positions(), replace=replace)
         if not len(commands):
@@ -144,7 +144,7 @@ class AxisBank:
             return
         writes, self._inbox = self._inbox, []
         for write in writes:
-            at_ns = min(write.now_ns, latest_ns)
+            at_ns = self._instant(min(write.now_ns, latest_ns))
             self._sequencer.advance(at_ns)
             # Working in an earlier one may have ended in a fault.
             commands = [c for c in write.commands if not self._queue.is_barred(c.axis)]
@@ -189,7 +189,7 @@ class AxisBank:
             the axes released.
         """
         self._work_in()
-        self._sequencer.advance(now_ns)
+        self._sequencer.advance(self._instant(now_ns))
         chosen = np.asarray(axes, dtype=np.int64)
         chosen = chosen[self._queue.gated_synch[chosen] & self._sequencer.is_open_ended(chosen)]
         if chosen.size and now_ns - start_ns > self._tick_s * 1e9:
@@ -215,6 +215,7 @@ class AxisBank:
         """Empty the buffers and stop at maximum deceleration; force mode goes over to holding."""
         chosen = np.asarray(axes, dtype=np.int64)
         self._forget(chosen)
+        now_ns = self._instant(now_ns)
         self._sequencer.advance(now_ns)
         self._homing.cancel(chosen)
         self._sequencer.halt(chosen, now_ns)
@@ -229,7 +230,7 @@ class AxisBank:
         if not fresh.size:
             return
         self._queue.latched[fresh] |= EMERGENCY_STOP
-        self._sequencer.advance(now_ns)
+        self._sequencer.advance(self._instant(now_ns))
         in_force = fresh[self._sequencer.kind[fresh] == FORCE]
         self._abandon(fresh, now_ns, errno.ECANCELED, "emergency stop")
         self._set_limp(in_force)
@@ -262,7 +263,15 @@ class AxisBank:
         self._forget(axes)
         self._queue.emit(EventKind.DROPPED, axes[~self._sequencer.is_idle(axes)], now_ns, errno_, text)
         self._homing.cancel(axes)
-        self._sequencer.halt(axes, now_ns)
+        self._sequencer.halt(axes, self._instant(now_ns))
+
+    def _instant(self, now_ns: int) -> int:
+        """Return the instant at which a verb acts: now, or that of the last tick when the next is late already.
+
+        A late tick stops what moves where it was last put out; a verb that comes before it must not let
+        the set-points run on to now.
+        """
+        return self._last_ns if self._seen and now_ns - self._last_ns > self._late_ns else now_ns
 
     def _set_limp(self, axes: Axes) -> None:
         self._limp[axes] = True
@@ -311,6 +320,7 @@ class AxisBank:
         """
         chosen = np.asarray(axes, dtype=np.int64)
         self._work_in()
+        now_ns = self._instant(now_ns)
         self._sequencer.advance(now_ns)
         self._homing.begin(chosen, self._sequencer.is_idle(chosen), now_ns)
         self._sequencer.refresh(chosen)

@@ -1,13 +1,17 @@
-"""The line when the device never falls silent."""
+"""The line when the device never falls silent; verbs that come before a late tick."""
 
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 
+from sioms.motion import AxisBank, AxisSettings
+from sioms.protocol.flags import ControlMode, NodeClass
+from sioms.protocol.records import numpy_dtype
 from sioms.sdk.connection import Connection
 from sioms.sdk.exchange import Exchange, LinkError, Steps
 from sioms.sdk.line import BABBLE_NS, Counters, Line, Priority
@@ -59,3 +63,57 @@ def _received(device: socket.socket) -> bytes:
         return device.recv(64, socket.MSG_DONTWAIT)
     except BlockingIOError:
         return b""
+
+
+class _NoMarkers:
+    """Nobody has reserved a marker."""
+
+    def capture(self, token_or_number: int, *, signal: bool) -> tuple[int, int]:
+        raise AssertionError("no command here names a marker")
+
+    def state(self, number: int, generation: int) -> bool | None:
+        return None
+
+    def signal(self, number: int, generation: int, now_ns: int) -> None:
+        raise AssertionError("no command here names a marker")
+
+
+VERBS: dict[str, Callable[[AxisBank, int], None]] = {
+    "stop": lambda bank, now: bank.stop([0], now),
+    "stop of another axis": lambda bank, now: bank.stop([1], now),
+    "emergency stop": lambda bank, now: bank.emergency_stop([0, 1], now),
+    "fault": lambda bank, now: bank.fault([0], "as planned", now),
+    "synch": lambda bank, now: bank.synch([1], now, now) and None,
+    "write": lambda bank, now: bank.append(_to(0.0), [1], now),
+    "replacing write": lambda bank, now: bank.append(_to(0.0), [0], now, replace=True),
+    "question": lambda bank, now: bank.is_idle([1]) and None,
+}
+
+
+def _to(position: float) -> np.ndarray[Any, Any]:
+    record = np.zeros(1, numpy_dtype(NodeClass.AXIS))
+    record["control_mode"], record["position"] = int(ControlMode.POSITION), position
+    return record
+
+
+@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("gap_ms", [60, 400])
+def test_no_verb_lets_the_set_point_run_on_before_a_late_tick(verb: str, gap_ms: int) -> None:
+    settings = [
+        AxisSettings(name, "m", velocity_max=1.0, acceleration_max=10.0, position_min=-1.0, position_max=1.0, k=100.0)
+        for name in "xy"
+    ]
+    bank = AxisBank(settings, tick_s=1e-3, markers=_NoMarkers())
+    position, now = np.zeros(2), 1000 * MS
+    bank.tick(now, position)
+    bank.append(_to(0.3), [0, 1], now)
+    for _ in range(100):
+        now += MS
+        bank.tick(now, position)
+        position = bank.fields[7].copy()
+    velocity = bank.fields[8][0]
+    assert 0.04 < position[0] < 0.06 and velocity > 0.5
+    now += gap_ms * MS
+    VERBS[verb](bank, now)
+    bank.tick(now + 1000, position)
+    assert bank.fields[7][0] == pytest.approx(position[0], abs=1e-4), "it brakes from where it was last put out"
