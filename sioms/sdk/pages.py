@@ -84,6 +84,11 @@ class Pages:
         """Whether all these blocks have a good link."""
         return all(self._links.get(id(block), (None,))[0] is PageState.GOOD for block in blocks)
 
+    def why_not(self, block: AnyBlock) -> str:
+        """Return why the device behind a block cannot be reached, empty when it can."""
+        state, reason = self._links.get(id(block), (PageState.STARTING, "it is starting"))
+        return "" if state is PageState.GOOD else reason or state.name.lower()
+
     def close(self, reason: str) -> None:
         """Mark all pages as closed for good."""
         for writer in self._writers.values():

@@ -68,11 +68,19 @@ def write(
         raise _refuse(errno.EINVAL, f"{what}: {len(data)} bytes; want whole records of {size} bytes")
     if runtime.stopped:
         raise _refuse(errno.EPERM, f"{what}: stopped by emergency stop ({runtime.latch.source}); reset first")
+    _check_link(runtime, handle, what)
     records = np.frombuffer(data, _DTYPE[node_class])
     if isinstance(handle.block, AxisBlock):
         return _write_axes(runtime, handle, number, flags, timeout_s, records, what)
     channels, values = _output_values(runtime, handle, records, what)
     return runtime.engine.write_outputs(handle, number, handle.block, channels, values)
+
+
+def _check_link(runtime: Runtime, handle: Handle, what: str) -> None:
+    """Refuse what would wait for a lost device and begin by itself when that is back."""
+    reason = runtime.pages.why_not(handle.block)
+    if reason:
+        raise _refuse(errno.EIO, f"{what}: its device does not answer ({reason}); write again when it is back")
 
 
 def _write_axes(
@@ -282,6 +290,7 @@ def _axis_request(
         case Request.FLUSH:
             bank.flush(axes)
         case Request.HOME:
+            _check_link(runtime, handle, what)
             bank.home(axes, now_ns)
         case Request.SET_LIMITS:
             if not isinstance(argument, dict) or not all(isinstance(k, str) for k in argument):

@@ -5,13 +5,17 @@ from __future__ import annotations
 import errno
 import mmap
 import os
+import signal
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
-from daemon_rig import Daemon, wait_for
+from daemon_rig import Daemon, raises, wait_for
+from wire_rig import Wire
 
 import sioms
 from sioms.client.channel import Call, Channel, connect
@@ -203,3 +207,42 @@ def test_two_writers_of_one_port_keep_each_others_bits(port: tuple[Daemon, Devic
         assert device.asked.wait(5.0)
         other.set(1)
         assert device.value == 3, f"written: {device.written}"
+
+
+SLIDE = """
+[device.slide0]
+driver = "modbus-axis"
+map = "leadshine"
+line = { serial = "{port}", baud = 115200 }
+[[device.slide0.axis]]
+name = "x"
+unit = "m"
+velocity_by = "path"
+travel_per_turn = 0.01
+velocity_max = 0.1
+acceleration_max = 2.0
+"""
+
+
+def test_nothing_that_is_asked_of_a_lost_drive_begins_when_it_is_back(start: Any, short_folder: Path) -> None:
+    wire = Wire(start, short_folder, "leadshine")
+    cell = wire.serve(SLIDE)
+    wire.wait_up("slide0")
+    with cell.open("slide0", "rw") as node:
+        node.move(0.01)
+        node.wait_until_idle(10.0)
+        os.kill(wire.device.process.pid, signal.SIGSTOP)
+        wait_for(lambda: not wire.reads("slide0"), "lost")
+        node.reset()
+        with raises(errno.EIO, "slide0", "does not answer"):
+            node.move(0.05)
+        with raises(errno.EIO, "slide0", "does not answer"):
+            node.move(0.05, timeout=5.0, replace=True)
+        os.kill(wire.device.process.pid, signal.SIGCONT)
+        wire.wait_up("slide0")
+        time.sleep(0.5)
+        assert node.read().position[0] == pytest.approx(0.01, abs=1e-3) and not node.read().in_motion[0]
+        node.reset()
+        node.move(0.02)
+        node.wait_until_idle(10.0)
+        assert node.read().position[0] == pytest.approx(0.02, abs=1e-3)
