@@ -396,14 +396,13 @@ class Clients:
             Whether there is a driver to wait for.
         """
         device = self._server.devices.get(handle.node.device)
-        if (
-            device is not None
-            and device.generation == handle.generation
-            and device.state is State.UP
-            and handle.claims
-        ):
+        there = (
+            device is not None and device.generation == handle.generation and device.state is State.UP
+        )
+        if device is not None and there:
             device.tell(DriverVerb.DETACH, handle.number)
-            return True
+            if handle.claims:
+                return True
         self._forget(handle)
         return False
 

@@ -115,7 +115,7 @@ class AsyncNode(NodeCore):
         """Close the node: axes halt, buffers empty, outputs become safe. Returns when the node is free."""
         if not self.closed:
             self._requests.close()
-            self._release()
+            self.release()
             await self._cell.forget(self.handle)
 
     async def ioctl(self, request: Request, argument: object = None, timeout: float | None = 0.0) -> Any:

@@ -204,7 +204,8 @@ class NodeCore:
             return OSError(errno.EIO, f"read {self.name}: {what}: {why}")
         raise error
 
-    def _release(self) -> None:
+    def release(self) -> None:
+        """Let go of memory and descriptors; the driver ends the handle at the end of file."""
         if self._map is None:
             return
         self._channel.close()
@@ -231,7 +232,7 @@ class Node(NodeCore):
     def close(self) -> None:
         """Close the node: axes halt, buffers empty, outputs become safe. Returns when the node is free."""
         if self._map is not None:
-            self._release()
+            self.release()
             self._cell.close_handle(self.handle)
 
     def subscribe(self, every: int) -> None:

@@ -16,7 +16,7 @@ from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.socketpath import socket_path
 
 from .channel import Call, Channel, connect
-from .node import NODE, SYNCH_LEAD_S, AxisNode
+from .node import NODE, SYNCH_LEAD_S, AxisNode, Node
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -112,6 +112,7 @@ class Workcell:
         answer = self._channel.call(Call("hello", ClientVerb.HELLO, PROTOCOL_VERSION, title))
         _, self.name, self.rights = answer.value
         self._request: StopRequest | None = None
+        self._nodes: dict[int, Node] = {}
         if answer.fds:
             self._request = StopRequest(memoryview(mmap(answer.fds[0], REQUEST_SIZE)))
             os.close(answer.fds[0])
@@ -124,6 +125,9 @@ class Workcell:
 
     def close(self) -> None:
         """End the session: its nodes are closed and its markers freed."""
+        nodes, self._nodes = self._nodes, {}
+        for node in nodes.values():
+            node.release()
         self._channel.close()
 
     def fileno(self) -> int:
@@ -153,10 +157,13 @@ class Workcell:
         """
         answer = self._channel.call(open_call(name, mode, timeout, lease))
         core = node_parts(answer.value, answer.fds)
-        return NODE[core[0].node_class](core, self, lease)
+        node = NODE[core[0].node_class](core, self, lease)
+        self._nodes[node.handle] = node
+        return node
 
     def close_handle(self, handle: int) -> None:
         """Tell the daemon that a node was closed, and wait until its channels are free (nodes call this)."""
+        self._nodes.pop(handle, None)
         try:
             self._channel.call(Call("close", ClientVerb.CLOSE, handle))
         except OSError as error:

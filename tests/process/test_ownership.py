@@ -327,3 +327,16 @@ def _quiet(call: Callable[[], object]) -> None:
         call()
     except OSError:
         return
+
+
+def test_the_end_of_a_session_closes_its_read_only_nodes_too(daemon: Daemon, cell: sioms.Workcell) -> None:
+    with cell.open("mod0.readonly") as watch:
+        before = watch.statistics(1)["handles"]
+        session = sioms.Workcell(daemon.socket)
+        nodes = [session.open("mod0.readonly") for _ in range(3)]
+        assert watch.statistics(1)["handles"] == before + 3
+        session.close()
+        wait_for(lambda: watch.statistics(1)["handles"] == before, "handles of the closed session gone")
+        for node in nodes:
+            with raises(errno.EBADF, "closed"):
+                node.read()
