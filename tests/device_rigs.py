@@ -117,6 +117,21 @@ RIGS = (
         axes=(Axis("tmcl", velocity=0.02, tolerance=1e-5),),
     ),
     Rig(
+        "grbl",
+        '[device.grbl]\ndriver = "grbl"\nquick_stop = "cancel"\npoll_hz = 25.0\nline = { serial = "{port}" }\n'
+        '[[device.grbl.axis]]\nname = "x"\nletter = "X"\nvelocity_max = 0.1\nacceleration_max = 0.5\n' + LIMITS,
+        ("grbl", "--no-homing"),
+        axes=(Axis("grbl", velocity=0.02, tolerance=1e-5),),
+    ),
+    Rig(
+        "odrive",
+        '[device.odrive]\ndriver = "odrive"\nquick_stop = "hold"\nline = { serial = "{port}" }\n'
+        '[[device.odrive.axis]]\nname = "x"\nnumber = 0\ntravel_per_turn = 0.01\nvelocity_max = 0.1\n'
+        "acceleration_max = 0.3\n" + LIMITS,
+        ("odrive",),
+        axes=(Axis("odrive", velocity=0.02, tolerance=3e-4),),
+    ),
+    Rig(
         "framed-adc",
         '[device.framed_adc]\ndriver = "framed-adc"\nchannels = 4\nrate_hz = 200\nscale = 0.0005\nunit = "N"\n'
         'line = { serial = "{port}", baud = 921600 }\n',
