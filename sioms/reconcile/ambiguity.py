@@ -14,10 +14,9 @@ from sioms.reconcile.blocks import better
 from sioms.reconcile.effects import library
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.screen import screen
-from sioms.reconcile.search import Found, Searcher, physical, size, without
+from sioms.reconcile.search import DOUBTFUL, Found, Searcher, physical, size, without
 
 AMBIGUOUS = 0.05
-FEEBLE = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,18 +26,20 @@ class Rival:
     Attributes:
         missed: share of the contribution of ``effect`` that it cannot reproduce.
         errors: by how many standard errors it is worse on held-out blocks.
+        excess: by how much more than the named model it leaves, as a share of what that leaves.
     """
 
     effect: str
     rival: str
     missed: float
     errors: float
+    excess: float
     fit: Fit
 
     @property
     def open(self) -> bool:
         """True where the data do not rule the rival out."""
-        return self.missed < AMBIGUOUS or (self.errors < 1.0 and self.missed < 4.0 * AMBIGUOUS)
+        return self.missed < AMBIGUOUS or (self.errors < 1.0 and self.excess < DOUBTFUL)
 
 
 def rivals(searcher: Searcher, found: Found) -> list[Rival]:
@@ -61,7 +62,8 @@ def rivals(searcher: Searcher, found: Found) -> list[Rival]:
             if not physical(fit, start.effect):
                 continue
             _, errors = better(found.losses, searcher.loss(fit))
-            out.append(Rival(name, start.effect, (fit.cost - found.fit.cost) / contribution, errors, fit))
+            out.append(Rival(name, start.effect, (fit.cost - found.fit.cost) / contribution, errors,
+                             fit.cost / found.fit.cost - 1.0, fit))
     best: dict[tuple[str, str], Rival] = {}
     for r in out:
         if (r.effect, r.rival) not in best or r.missed < best[r.effect, r.rival].missed:

@@ -92,11 +92,11 @@ def test_bad_input_is_an_error_and_no_verdict(tmp_path: Path, capsys: pytest.Cap
 def test_a_small_blind_test(tmp_path: Path) -> None:
     """Two generated axes, solved by processes that see the public part only."""
     rng = np.random.default_rng(11)
-    axes = [draw_axis("quiet", "null", rng), draw_axis("dragging", "single", rng, "viscous")]
+    axes = [draw_axis("quiet", "null", rng), draw_axis("late", "single", rng, "delay")]
     for axis, records in zip(axes, record_all(axes, 11, 1.2), strict=True):
         folder = tmp_path / axis.name
         write_public(axis, records, folder)
-        assert not any("b_extra" in p.read_text() for p in folder.glob("*.toml"))
+        assert not any("delay" in p.read_text() for p in folder.glob("*.toml"))
         assert score(axis, solve(folder)).right
 
 
