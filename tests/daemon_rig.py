@@ -95,7 +95,15 @@ class Daemon:
         self.config = folder / "cell.toml"
         self.config.write_text(text)
         self.socket = str(folder / "d.sock")
-        command = [sys.executable, "-m", "sioms.daemon.main", "--config", self.config, "--socket", self.socket]
+        command = [
+            sys.executable,
+            "-m",
+            "sioms.daemon.main",
+            "--config",
+            self.config,
+            "--socket",
+            self.socket,
+        ]
         self.running = Running(command, dict(env or {}), None)
         self._frozen: set[int] = set()
         if ready:
@@ -274,7 +282,7 @@ class Waiting:
     def __init__(self, call: Callable[[], object], of: Any = None) -> None:
         self.error: OSError | None = None
         self.value: object = None
-        self.thread = threading.Thread(target=self._run, args=(call,))
+        self.thread = threading.Thread(target=self._run, args=(call,), daemon=True)
         before = of._channel._number if of is not None else 0
         self.thread.start()
         if of is not None:

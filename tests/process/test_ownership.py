@@ -88,7 +88,7 @@ def test_waiting_open_gets_the_node_when_it_is_freed(
         with daemon.cell() as mine, mine.open("mod0", "rw", timeout=10.0):
             got.append(time.monotonic())
 
-    threads = [threading.Thread(target=wait) for _ in range(5)]
+    threads = [threading.Thread(target=wait, daemon=True) for _ in range(5)]
     for thread in threads:
         thread.start()
     wait_for(lambda: sum(s[2] for s in cell.status()["sessions"]) == 5, "five wait")
@@ -137,7 +137,7 @@ def test_race_of_second_writers_has_one_winner(daemon: Daemon) -> None:
                 barrier.wait(20.0)
                 node.close()
 
-    threads = [threading.Thread(target=run) for _ in range(threads_n)]
+    threads = [threading.Thread(target=run, daemon=True) for _ in range(threads_n)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -196,7 +196,10 @@ def test_bounds_of_a_session(start_daemon: Callable[..., Daemon]) -> None:
         markers = cell.reserve_markers(4)
         with raises(errno.EBUSY, "this session has 4"):
             cell.reserve_markers(2)
-        waiters = [threading.Thread(target=lambda: _quiet(lambda: markers[0].wait(20.0))) for _ in range(2)]
+        waiters = [
+            threading.Thread(target=lambda: _quiet(lambda: markers[0].wait(20.0)), daemon=True)
+            for _ in range(2)
+        ]
         for waiter in waiters:
             waiter.start()
         wait_for(lambda: cell.status()["sessions"][0][2] == 2, "two wait")
@@ -302,7 +305,9 @@ def test_foreign_user_may_what_is_granted(
     allowed = {name for name, (number, _) in said.items() if number == 0}
     assert allowed == {"list", "nodes", "read mod0", "write io0", "page"}
     assert said["page"][1] is False, "who may not stop gets no stop-request page"
-    assert said["write mod0"][0] == errno.EACCES and "nobody has no right to write it" in str(said["write mod0"][1])
+    assert said["write mod0"][0] == errno.EACCES and "nobody has no right to write it" in str(
+        said["write mod0"][1]
+    )
     assert said["read force0"][0] == errno.EACCES
     for name in ("stop", "stop mod0", "reset", "reload", "ioctl stop mod0"):
         assert said[name][0] == errno.EPERM, (name, said[name])

@@ -146,6 +146,7 @@ def test_asyncio_face(daemon: Daemon, cell: sioms.Workcell) -> None:
     async def story() -> None:
         async with await sioms.aio.connect(daemon.socket, "async") as mine:
             async with await mine.open("mod0.xaxis", "rw") as axis, await mine.open("force0") as force:
+
                 async def watch() -> int:
                     count = 0
                     async for snapshot in force.snapshots(10):
@@ -225,7 +226,11 @@ def test_wait_event_watches_its_mask_only(cell: sioms.Workcell) -> None:
 
 def test_a_bit_node_shows_and_waits_for_its_own_bit(cell: sioms.Workcell) -> None:
     """An edge of the neighbour is none of it."""
-    with cell.open("io0.bit0", "rw") as zero, cell.open("io0.bit1", "rw") as one, cell.open("io0.in.bit0") as seen:
+    with (
+        cell.open("io0.bit0", "rw") as zero,
+        cell.open("io0.bit1", "rw") as one,
+        cell.open("io0.in.bit0") as seen,
+    ):
         before = seen.read()
         one.set(1)
         with pytest.raises(TimeoutError):
@@ -235,7 +240,9 @@ def test_a_bit_node_shows_and_waits_for_its_own_bit(cell: sioms.Workcell) -> Non
         assert (event.initial, event.final) == (0, 1)
 
 
-def test_edges_wake_a_waiting_client(daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client]) -> None:
+def test_edges_wake_a_waiting_client(
+    daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client]
+) -> None:
     waiter = client(
         daemon,
         "node = cell.open('io0.in.bit0')\nsay('ready')\n"
@@ -334,7 +341,7 @@ def test_many_threads_wait_for_one_node(cell: sioms.Workcell) -> None:
         start = inputs.read()
         woken: list[int] = []
         threads = [
-            threading.Thread(target=lambda: woken.append(inputs.wait_event(last=start, timeout=10.0).final)) for _ in range(5)
+            threading.Thread(target=lambda: woken.append(inputs.wait_event(last=start, timeout=10.0).final), daemon=True) for _ in range(5)
         ]  # fmt: skip
         for thread in threads:
             thread.start()
@@ -356,4 +363,6 @@ def test_a_node_of_many_axes_and_a_workcell_of_many_nodes(start_daemon: Callable
             assert len(big.read()) == 800 and len(big.limits()["velocity_max"]) == 800
             big.write([sioms.command(i, position=0.001) for i in range(800)])
             big.wait_until_idle(20.0)
-            wait_for(lambda: big.read().position == pytest.approx([0.001] * 800, abs=5e-4), "settled, at 5 Hz")
+            wait_for(
+                lambda: big.read().position == pytest.approx([0.001] * 800, abs=5e-4), "settled, at 5 Hz"
+            )

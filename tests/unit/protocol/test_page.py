@@ -226,7 +226,7 @@ def test_a_reader_in_another_process_sees_only_whole_snapshots() -> None:
             number += 1
             writer.publish(memoryview(number.to_bytes(8, "little") * (13 * 50)), 0, 0)
 
-    thread = threading.Thread(target=write)
+    thread = threading.Thread(target=write, daemon=True)
     thread.start()
     _, status = os.waitpid(child, 0)
     done.set()
