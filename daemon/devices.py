@@ -11,6 +11,7 @@ import socket
 import time
 from collections.abc import Callable, Sequence
 from enum import Enum
+from functools import partial
 from typing import Any, Protocol
 
 from sioms.protocol.flags import PageState
@@ -119,20 +120,21 @@ class DriverProcess:
             realtime_priority=self.device.common.realtime_priority,
             user=self.device.common.user,
         )
+        self._loop.watch(ours.fileno(), self._receive)  # first, because a spawn may be refused at once
         self._nursery().spawn(
             self.name, self.device.common.driver, self.device.settings, self.generation, options,
-            [theirs.fileno(), *self._shared], self._spawned,
+            [theirs.fileno(), *self._shared], partial(self._spawned, self.generation),
         )  # fmt: skip
         theirs.close()
-        self._loop.watch(ours.fileno(), self._receive)
 
-    def _spawned(self, pid: Any, errno_: int, text: str, fds: list[int]) -> None:
-        if errno_:
-            self._end(f"its process could not be started: {text}")
-        elif self._sock is None:  # ended while the nursery was forking
+    def _spawned(self, generation: int, pid: Any, errno_: int, text: str, fds: list[int]) -> None:
+        if self._sock is None or generation != self.generation:  # ended while the nursery was forking
+            if not errno_:
+                os.kill(pid, signal.SIGKILL)
             for fd in fds:
                 os.close(fd)
-            os.kill(pid, signal.SIGKILL)
+        elif errno_:
+            self._end(f"its process could not be started: {text}")
         else:
             self.pid, self._pidfd = pid, fds[0]
             self._loop.watch(self._pidfd, self._exited)
