@@ -132,6 +132,14 @@ RIGS = (
         axes=(Axis("odrive", velocity=0.02, tolerance=3e-4),),
     ),
     Rig(
+        "dynamixel",
+        '[device.dynamixel]\ndriver = "dynamixel"\nquick_stop = "hold"\nline = { serial = "{port}", baud = 1000000 }\n'
+        '[[device.dynamixel.axis]]\nname = "x"\nid = 1\nzero = 2048\ntravel_per_turn = 0.05\n'
+        "velocity_max = 0.07\nacceleration_max = 0.5\n" + LIMITS,
+        ("dynamixel", "--ids", "1"),
+        axes=(Axis("dynamixel", velocity=0.02, tolerance=5e-5),),
+    ),
+    Rig(
         "framed-adc",
         '[device.framed_adc]\ndriver = "framed-adc"\nchannels = 4\nrate_hz = 200\nscale = 0.0005\nunit = "N"\n'
         'line = { serial = "{port}", baud = 921600 }\n',
