@@ -105,8 +105,8 @@ def trapezoid_speed(distance: float, duration_s: float, top: float, rate: float)
         rate: acceleration and deceleration [unit/s^2].
 
     Example:
-        >>> trapezoid_speed(1.0, 2.0, 10.0, 4.0)
-        0.585786437626905
+        >>> round(trapezoid_speed(1.0, 2.0, 10.0, 4.0), 6)
+        0.535898
     """
     under = (rate * duration_s) ** 2 - 4 * rate * abs(distance)
     if duration_s <= 0 or under < 0 or distance == 0:
