@@ -170,10 +170,11 @@ class AsyncNode(NodeCore):
             await self.subscribed(-1)
         async with asyncio.timeout(timeout):
             while True:
+                head = self._page.head  # what comes while we look is for the next look
                 event = self._find_event(mask, state, number)
                 if event is not None:
                     return event
-                number = max(number, self._page.head)
+                number = max(number, head)
                 await self._wake()
 
     async def _wake(self) -> None:

@@ -168,7 +168,13 @@ class NodeCore:
 
     def _find_event(self, mask: int, state: int, after: int) -> Event | None:
         """Look through the snapshots after a number for a change of the masked bits."""
-        for snapshot in self.history(after):
+        self.read()
+        page = self._page
+        for number in range(max(after + 1, page.head - page.slots + 2, 1), page.head + 1):
+            raw = page.numbered(number)  # one by one: who is far behind pays for one edge at a time
+            if raw is None:
+                continue
+            snapshot: Any = self._snapshot(raw, self._layout)
             final = snapshot.data[0]
             if (final ^ state) & mask:
                 return Event(state, final, snapshot.changed_ns[0], snapshot.number)
@@ -484,10 +490,11 @@ class BinaryNode(Node):
             self.subscribe(-1)
         deadline = None if timeout is None else monotonic() + timeout
         while True:
+            head = self._page.head  # what comes while we look is for the next look
             event = self._find_event(mask, state, number)
             if event is not None:
                 return event
-            number = max(number, self._page.head)
+            number = max(number, head)
             self._poll(deadline, f"wait for an event on {self.name}")
 
 
