@@ -44,7 +44,7 @@ driver = "sim-io"
 outputs = 8
 inputs = 8
 safe = 0
-history = 1024
+history = 8192
 loop = [{ bit = 0, output_bit = 0 }, { bit = 1, output_bit = 1 }]
 wave = [{ bit = 7, period_s = 0.002, high_s = 0.0005, count = 200, trigger_bit = 7 }]
 """
