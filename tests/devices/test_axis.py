@@ -6,6 +6,7 @@ import errno
 import math
 import threading
 import time
+from typing import Any
 
 import pytest
 from daemon_rig import Daemon, Waiting, at_rest, raises, wait_for
@@ -60,7 +61,7 @@ def test_what_it_cannot_do_is_refused_and_moves_nothing(cell: sioms.Workcell, ax
         if axis.beyond is not None:
             with raises(errno.ERANGE, f"{axis.beyond:g}"):
                 node.move(axis.beyond)
-        fast = (
+        fast: dict[str, Any] = (
             {"velocity": 1e6}
             if has_velocity(node)
             else {"position": 0.0, "max_velocity": 1e6, "max_acceleration": 0.1}
