@@ -41,6 +41,14 @@ class DeviceInfo:
     inputs: tuple[str, ...]
     lease_s: float
 
+    def facts(self) -> list[object]:
+        """Return all it tells as plain values, to be compared."""
+        blocks = [
+            [b.name, b.node_class, [channel.pack() for channel in b.channels], b.writable, b.history, b.capacity]
+            for b in self.blocks
+        ]
+        return [self.driver, blocks, self.tick_hz, self.inputs, self.lease_s]
+
     @classmethod
     def unpack(cls, name: str, driver: str, packed: list) -> DeviceInfo:  # type: ignore[type-arg]
         """Make it from the nursery's reply."""

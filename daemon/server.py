@@ -183,7 +183,8 @@ class Server:
             self.shared.latch.stop(time.monotonic_ns(), "started stopped, as configured")
         for name, device in list(self.devices.items()):
             wanted = plan.config.devices.get(name)
-            if wanted != device.device or name in changed_sources:
+            same = wanted == device.device and plan.names.devices[name].facts() == device.info.facts()
+            if not same or name in changed_sources:
                 self.log("info", "device ends", device=name, why="removed" if wanted is None else "changed")
                 self._retire(device)
         for name in plan.config.devices:

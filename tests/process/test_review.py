@@ -246,3 +246,18 @@ def test_nothing_that_is_asked_of_a_lost_drive_begins_when_it_is_back(start: Any
         node.move(0.02)
         node.wait_until_idle(10.0)
         assert node.read().position[0] == pytest.approx(0.02, abs=1e-3)
+
+
+def test_a_reload_restarts_a_device_whose_driver_describes_it_otherwise(port: tuple[Daemon, Device]) -> None:
+    daemon, _ = port
+    file = daemon.folder / "port.py"
+    with daemon.cell("admin") as cell:
+        before = daemon.device("port0")["pid"]
+        cell.reload()
+        assert daemon.device("port0")["pid"] == before, "nothing has changed"
+        file.write_text(UDP.replace("width=8, minimum=0, maximum=255", "width=4, minimum=0, maximum=15"))
+        cell.reload()
+        wait_for(lambda: any(d["pid"] not in (0, before) for d in cell.status()["devices"]), "a new process")
+        daemon.wait_up("port0")
+        with cell.open("port0", "rw") as node, raises(errno.EINVAL, "want 0 to 15"):
+            node.set(16)
