@@ -312,6 +312,10 @@ class Clients:
         )
 
         def retry() -> bool:
+            if self._server.names.nodes.get(node.name) != node:  # a reload came in between
+                why = f"open {name}: it has been removed or changed meanwhile; open it again"
+                self._answer(wait, refusal(wait.number, errno.EIO, why))
+                return True
             if self._obstacle(node) is not None:
                 return False
             if self._drop_wait(wait):

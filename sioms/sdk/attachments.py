@@ -6,6 +6,7 @@ Concurrency: the one thread of the driver process.
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import socket
 import time
@@ -68,6 +69,12 @@ class Attachments:
         exclusive: bool, rights: int, lease_ns: int, who: str, node: str,
     ) -> None:  # fmt: skip
         """Take a handle from the daemon: descriptors of socket, eventfd and, if known, the client's process."""
+        if len(fds) < 2:  # the kernel drops what goes beyond the limit of open descriptors
+            for fd in fds:
+                os.close(fd)
+            self._runtime.log("error", f"{node}: {who} could not be served: too many open descriptors")
+            self._runtime.tell(DriverVerb.DETACHED, number)
+            return
         sock = socket.socket(fileno=fds[0])
         sock.setblocking(False)
         handle = Handle(
@@ -209,6 +216,10 @@ def _records_of(fds: list[int]) -> bytes:
     """Copy the records of a large write out of the memory file that came with it."""
     if not fds:
         raise MalformedMessage("a write without records and without a descriptor")
+    try:
+        fcntl.fcntl(fds[0], fcntl.F_GET_SEALS)  # only memory files have seals; any other file may block for ever
+    except OSError:
+        raise MalformedMessage("the descriptor of a write is no memory file") from None
     size = os.fstat(fds[0]).st_size
     if size > MAX_WRITE:
         raise OSError(errno.EMSGSIZE, f"write of {size} bytes; want at most {MAX_WRITE}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import mmap
 import os
+import resource
 import signal
 import socket
 import threading
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from daemon_rig import Daemon, raises, wait_for
+from daemon_rig import Daemon, Waiting, raises, wait_for
 from wire_rig import Wire
 
 import sioms
@@ -261,3 +262,47 @@ def test_a_reload_restarts_a_device_whose_driver_describes_it_otherwise(port: tu
         daemon.wait_up("port0")
         with cell.open("port0", "rw") as node, raises(errno.EINVAL, "want 0 to 15"):
             node.set(16)
+
+
+def test_an_open_that_waits_ends_when_a_reload_changes_its_node(port: tuple[Daemon, Device]) -> None:
+    daemon, _ = port
+    with daemon.cell("holder") as cell, daemon.cell("waiting") as other, cell.open("port0", "rw"):
+        waiting = Waiting(lambda: other.open("port0.bit7", "rw", timeout=20.0), other)
+        (daemon.folder / "port.py").write_text(UDP.replace("width=8, minimum=0, maximum=255", "width=4, minimum=0, maximum=15"))
+        cell.reload()
+        assert waiting.errno() == errno.EIO and "changed meanwhile" in str(waiting.error)
+
+
+def test_records_come_out_of_memory_files_only(port: tuple[Daemon, Device], tmp_path: Path) -> None:
+    daemon, device = port
+    record = BINARY_WRITE.pack(0, 0, 7, 0)
+    (tmp_path / "records").write_bytes(record)
+    with daemon.cell("writer") as cell, (tmp_path / "records").open("rb") as file:
+        node = cell.open("port0", "rw")
+        with raises(errno.EPROTO, "no memory file"):
+            node._channel.call(Call("write", HandleVerb.WRITE, 0, 1.0, None, fds=(file.fileno(),)))
+        node.close()
+        assert device.written.count(7) == 0
+        memory = os.memfd_create("records")
+        os.write(memory, record)
+        with cell.open("port0", "rw", timeout=5.0) as node:
+            node._channel.call(Call("write", HandleVerb.WRITE, 0, 1.0, None, fds=(memory,)))
+        os.close(memory)
+        assert device.written.count(7) == 1
+
+
+def test_a_driver_without_descriptors_left_lives_on(port: tuple[Daemon, Device]) -> None:
+    daemon, _ = port
+    with daemon.cell("reader") as cell:
+        first = cell.open("port0.readonly")
+        pid = daemon.device("port0")["pid"]
+        used = max(int(fd) for fd in os.listdir(f"/proc/{pid}/fd")) + 1
+        before = resource.prlimit(pid, resource.RLIMIT_NOFILE)
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, (used, before[1]))
+        more = [cell.open("port0.readonly") for _ in range(4)]
+        daemon.said("too many open descriptors")
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, before)
+        assert daemon.device("port0")["pid"] == pid
+        assert first.read().data[0] == 0
+        for node in more:
+            node.close()
