@@ -189,6 +189,7 @@ class Runtime:
             port = self.blocks[block]
             if (
                 isinstance(port, BinaryBlock)
+                and self.pages.number(port)  # before the first reading there is nothing to judge
                 and (int(port.data[channel]) >> bit & 1) == active
                 and not self.stopped
             ):

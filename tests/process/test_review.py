@@ -306,3 +306,19 @@ def test_a_driver_without_descriptors_left_lives_on(port: tuple[Daemon, Device])
         assert first.read().data[0] == 0
         for node in more:
             node.close()
+
+
+def test_a_closed_contact_stops_nothing_before_it_has_been_read(start_daemon: Callable[..., Daemon]) -> None:
+    device = Device()
+    device.value = 1
+    text = f'[workcell]\nname = "test"\n[device.port0]\ndriver = "./port.py"\nline = {{ udp = "127.0.0.1:{device.port}" }}\n'
+    text += '[[emergency_stop]]\nnode = "port0.bit0"\nactive = 0\n'
+    daemon = start_daemon(text, files={"port.py": UDP})
+    daemon.wait_up("port0")
+    with daemon.cell("watcher") as cell, cell.open("port0.bit0.readonly") as contact:
+        contact.read()
+        assert cell.status()["stopped_ns"] == 0, cell.status()["stop_source"]
+        device.value = 0
+        wait_for(lambda: cell.status()["stopped_ns"], "the stop")
+        assert "port0" in cell.status()["stop_source"]
+    device.close()
