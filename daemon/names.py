@@ -154,7 +154,8 @@ class NameTable:
     def _parts(self, node: Node) -> Iterator[Node]:
         yield node
         block = self.block(node)
-        if len(node.channels) > 1:
+        ports = block.node_class is NodeClass.BINARY
+        if len(node.channels) > 1 or (len(block.channels) == 1 and not ports):
             for channel in node.channels:
                 part = replace(node, name=f"{node.name}.{block.channels[channel].name}", channels=(channel,))
                 yield part

@@ -109,7 +109,7 @@ def frictionless(cylinder: Cylinder, indenter: Indenter, half_width: float, orde
         >>> from sioms.tactile.indenter import FLAT
         >>> contact = frictionless(FINGER_B, FLAT, 0.20)
         >>> print(f"P R = {contact.load * FINGER_B.outer_m:.4f} N")
-        P R = 2.2435 N
+        P R = 2.2432 N
     """
     return slide(cylinder, indenter, half_width, 0.0, order)
 

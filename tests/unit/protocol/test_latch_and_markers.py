@@ -123,9 +123,9 @@ def test_socket_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def test_a_reset_tells_which_request_it_has_answered() -> None:
     latch = Latch(memoryview(bytearray(LATCH_SIZE)))
     request = StopRequest(memoryview(bytearray(REQUEST_SIZE)))
-    request.request(1000)
+    request.request(1000, 4711)
     latch.stop(1000, "a client")
     latch.reset(request.word)
     assert latch.stopped_ns == 0 and latch.answered_request == request.word
-    request.request(2000)
+    request.request(2000, 4711)
     assert latch.answered_request != request.word
