@@ -13,6 +13,7 @@ import socket
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.flags import PROTOCOL_VERSION, Access, Right
@@ -48,6 +49,13 @@ class Refused(Exception):
     def __init__(self, errno_: int, text: str) -> None:
         super().__init__(text)
         self.errno = errno_
+
+
+@dataclass(frozen=True, slots=True)
+class _Persisting:
+    """Owner of markers that outlive their sessions: a user."""
+
+    uid: int
 
 
 class _Malformed(Exception):
@@ -90,7 +98,12 @@ class Clients:
     def _accept(self) -> None:
         try:
             sock, _ = self._listener.accept()
-        except OSError:
+        except OSError as error:
+            if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOMEM):
+                # The listener stays readable: look away for a while instead of spinning.
+                self._server.log("error", "session refused", why=error.strerror)
+                self._server.loop.unwatch(self._listener.fileno())
+                self._server.loop.after(0.2, self.welcome)
             return
         sock.setblocking(False)
         peer = peer_of(sock)
@@ -400,9 +413,7 @@ class Clients:
             Whether there is a driver to wait for.
         """
         device = self._server.devices.get(handle.node.device)
-        there = (
-            device is not None and device.generation == handle.generation and device.state is State.UP
-        )
+        there = device is not None and device.generation == handle.generation and device.state is State.UP
         if device is not None and there:
             device.tell(DriverVerb.DETACH, handle.number)
             if handle.claims:
@@ -481,10 +492,17 @@ class Clients:
                 errno.EBUSY,
                 f"reserve markers: this session has {session.markers}; at most {self.bounds.max_markers}, free some",
             )
+        owner: object = _Persisting(session.peer.uid) if persist else session
+        if persist and len(self._markers.owned_by(owner)) + count > self.bounds.max_markers:
+            raise Refused(
+                errno.EBUSY,
+                f"reserve markers: {session.peer.user} has {len(self._markers.owned_by(owner))} that persist; "
+                f"at most {self.bounds.max_markers}, free some",
+            )
         tokens: list[int] = []
         try:
             for _ in range(count):
-                tokens.append(self._markers.reserve(None if persist else session))
+                tokens.append(self._markers.reserve(owner))
         except MarkerError:
             for token in tokens:  # all or nothing
                 self._markers.free(self._markers.entitled(token, "free"))
@@ -565,6 +583,11 @@ class Clients:
         if device is not None and device.state is State.FAULT:
             device.reset()
             return
+        latch = self._server.shared.latch
+        if latch.stopped_ns:
+            raise Refused(
+                errno.EPERM, f"reset {name}: the whole workcell is stopped ({latch.source}); reset that"
+            )
         self._to_device(node, DriverVerb.NODE_RESET, str(session))
 
     def _to_device(self, node: Node, verb: DriverVerb, text: str) -> None:

@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+TIDY = 1024
+"""Pending calls from which on cancelled ones are looked for."""
 Callback = Callable[[], Any]
 
 
@@ -38,6 +40,7 @@ class Loop:
         self._selector = selectors.DefaultSelector()
         self._timers: list[tuple[int, int, Timer]] = []
         self._order = itertools.count()
+        self._tidy_at = TIDY
         self.running = True
 
     def watch(self, fd: int, callback: Callback) -> None:
@@ -50,6 +53,11 @@ class Loop:
 
     def at(self, when_ns: int, callback: Callback) -> Timer:
         """Call back once at a time [ns, CLOCK_MONOTONIC]."""
+        if len(self._timers) > self._tidy_at:
+            # Cancelled calls lie here until they are due, and that may be next week.
+            self._timers = [entry for entry in self._timers if entry[2].callback is not None]
+            heapq.heapify(self._timers)
+            self._tidy_at = max(TIDY, 2 * len(self._timers))
         timer = Timer(callback)
         heapq.heappush(self._timers, (when_ns, next(self._order), timer))
         return timer

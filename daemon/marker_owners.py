@@ -25,7 +25,7 @@ class MarkerError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Reservation:
-    """A reserved number: its key, generation, and the session that owns it (None: it persists)."""
+    """A reserved number: its key, generation, and its owner: a session, or whoever it persists for."""
 
     number: int
     key: int
@@ -98,7 +98,7 @@ class MarkerOwners:
 
     def owned_by(self, owner: object) -> list[Reservation]:
         """Return the reservations of a session."""
-        return [r for r in self._reserved.values() if r.owner is owner]
+        return [r for r in self._reserved.values() if r.owner == owner]
 
     def is_signalled(self, reservation: Reservation) -> bool:
         """Tell whether a reserved marker has been signalled."""

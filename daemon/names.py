@@ -44,7 +44,14 @@ class DeviceInfo:
     def facts(self) -> list[object]:
         """Return all it tells as plain values, to be compared."""
         blocks = [
-            [b.name, b.node_class, [channel.pack() for channel in b.channels], b.writable, b.history, b.capacity]
+            [
+                b.name,
+                b.node_class,
+                [channel.pack() for channel in b.channels],
+                b.writable,
+                b.history,
+                b.capacity,
+            ]
             for b in self.blocks
         ]
         return [self.driver, blocks, self.tick_hz, self.inputs, self.lease_s]

@@ -33,6 +33,7 @@ class Nursery:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._loop = loop
         self._died = died
+        ours.setblocking(False)  # a nursery that is stuck in a driver's import must not hold up the daemon
         self._sock = ours
         self._answers: dict[int, Answer] = {}
         self._number = 0
@@ -78,6 +79,8 @@ class Nursery:
     def _receive(self) -> None:
         try:
             packet, fds, _, _ = socket.recv_fds(self._sock, 1 << 20, 8)
+        except BlockingIOError:
+            return
         except OSError:
             packet, fds = b"", []
         if not packet:

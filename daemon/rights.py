@@ -57,9 +57,14 @@ class Rights:
 
     def on_workcell(self, peer: Peer) -> Right:
         """Return what the peer may do with the workcell: stop with any grant of stop, the rest with one for ``*``."""
-        rights = self.on_node(peer, "*")
-        if any("stop" in grant.rights and self._concerns(grant, peer) for grant in self._grants):
-            rights |= Right.STOP
+        if peer.uid in (0, self._owner) or not self._grants:
+            return self.on_node(peer, "*")
+        rights = Right(0)
+        for grant in self._grants:
+            if self._concerns(grant, peer):
+                for name in grant.rights:
+                    if "*" in grant.nodes or name == "stop":
+                        rights |= _RIGHT[name]
         return rights
 
     @staticmethod

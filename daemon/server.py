@@ -177,6 +177,7 @@ class Server:
         old, self._nursery = self._nursery, plan.nursery
         changed_sources = {n for n in {*plan.stop_sources, *self._stop_sources}
                            if plan.stop_sources.get(n) != self._stop_sources.get(n)}  # fmt: skip
+        names = self.names
         self.config, self.names, self._stop_sources = plan.config, plan.names, plan.stop_sources
         self.clients.rights = Rights(plan.config.grants, os.getuid())
         if first and plan.config.workcell.start_stopped:
@@ -189,6 +190,10 @@ class Server:
                 self._retire(device)
         for name in plan.config.devices:
             self._start(name)
+        for device in self.devices.values():
+            for name in device.info.inputs:
+                if names.nodes.get(name) != self.names.nodes[name]:
+                    self._send_input(device, name)  # the name shows something else now
         if first:
             self.clients.welcome()
         if old is not None:

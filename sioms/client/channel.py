@@ -24,7 +24,15 @@ from _thread import allocate_lock
 from struct import pack
 from time import monotonic
 
-from sioms.protocol.messages import MAX_PACKET, HandleVerb, MalformedMessage, decode, encode, value_of
+from sioms.protocol.messages import (
+    MAX_PACKET,
+    ClientVerb,
+    HandleVerb,
+    MalformedMessage,
+    decode,
+    encode,
+    value_of,
+)
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -119,6 +127,7 @@ class Channel:
         self._number = 0
         self._mutex = allocate_lock()
         self._reading = False
+        self._abandoned: set[int] = set()
         self._answers: dict[int, tuple[list, list[int]]] = {}  # type: ignore[type-arg]
         self._waiting: dict[int, object] = {}
         self._timeout = 0.0
@@ -141,7 +150,25 @@ class Channel:
             OSError: the refusal, with its errno and sentence; EIO when the other side is gone,
                 ETIMEDOUT when it does not answer within the time-out and a grace.
         """
-        return self.wait(self.send(call), call)
+        number = self.send(call)
+        try:
+            return self.wait(number, call)
+        except KeyboardInterrupt:
+            self._abandon(number)
+            raise
+
+    def _abandon(self, number: int) -> None:
+        """Nobody waits for this answer any more: cancel the request, and let go of what it may bring."""
+        verb = ClientVerb.CANCEL if self._passed else HandleVerb.CANCEL
+        try:
+            cancelled = self.send(Call("cancel", verb, number))
+        except OSError:
+            return  # the other side has gone, and the request with it
+        with self._mutex:
+            self._abandoned |= {number, cancelled}
+            found = self._answers.pop(number, None)
+        for fd in found[1] if found else ():
+            os.close(fd)
 
     def send(self, call: Call) -> int:
         """Send a request; return its number."""
@@ -157,7 +184,9 @@ class Channel:
                 )
             try:
                 if call.fds:
-                    self._sock.sendmsg([packet], [(SOL_SOCKET, SCM_RIGHTS, pack(f"{len(call.fds)}i", *call.fds))])
+                    self._sock.sendmsg(
+                        [packet], [(SOL_SOCKET, SCM_RIGHTS, pack(f"{len(call.fds)}i", *call.fds))]
+                    )
                 else:
                     self._sock.send(packet)
             except OSError as error:
@@ -259,6 +288,11 @@ class Channel:
                 continue
             if message[1] == number:
                 return message, fds
+            if message[1] in self._abandoned:
+                self._abandoned.discard(message[1])
+                for fd in fds:  # of a node that was opened all the same: its driver sees the end of file
+                    os.close(fd)
+                continue
             with self._mutex:
                 self._answers[message[1]] = (message, fds)
                 turn = self._waiting.pop(message[1], None)

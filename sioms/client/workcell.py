@@ -90,7 +90,14 @@ def node_parts(value: Any, fds: list[int]) -> tuple[Any, ...]:
     """Turn the answer to an open into the arguments of a node."""
     handle, packed, channels, bit = value
     info = NodeInfo(packed)
-    return info, handle, fds[:2], list(channels), bit, Channel(socket(fileno=fds[2]), f"node {info.name}", False)
+    return (
+        info,
+        handle,
+        fds[:2],
+        list(channels),
+        bit,
+        Channel(socket(fileno=fds[2]), f"node {info.name}", False),
+    )
 
 
 class Workcell:

@@ -92,7 +92,11 @@ class DriveBank:
         self.fields = np.zeros((len(AXIS_READ_FIELDS), n))
         integers = self.fields.view(np.int64)
         self._position, self._velocity = self.fields[0], self.fields[1]
-        self._desired, self._desired_velocity, self._following = self.fields[7], self.fields[8], self.fields[9]
+        self._desired, self._desired_velocity, self._following = (
+            self.fields[7],
+            self.fields[8],
+            self.fields[9],
+        )
         self._in_motion, self._status_word, self._buffered = integers[10], integers[11], integers[12]
         self._queue = CommandQueue(settings, markers, capacity)
         self._limits = self._queue.limits
@@ -139,13 +143,21 @@ class DriveBank:
         return int(self._queue.room_of_all()[np.asarray(axes)].min())
 
     def flush(self, axes: AxesLike) -> None:
-        """Empty the buffers; the running command goes on."""
-        self._queue.clear(np.asarray(axes, dtype=np.int64))
+        """Empty the buffers; the running command goes on, one that was to be replaced is stopped."""
+        chosen = np.asarray(axes, dtype=np.int64)
+        self._queue.clear(chosen)
+        replaced = [a for a in chosen.tolist() if self._running[a] is None]
+        orphans = np.array(replaced, dtype=np.int64)
+        orphans = orphans[self._active[orphans] & ~self._stopping[orphans] & ~self._homing[orphans]]
+        if orphans.size:
+            self._halt(orphans, fastest=False)
 
     def synch(self, axes: AxesLike, start_ns: int, now_ns: int) -> tuple[int, ...]:
         """Release the commands that wait for the external synch; they go out at start_ns (see due_ns)."""
         chosen = np.asarray(axes, dtype=np.int64)
-        chosen = chosen[self._queue.gated_synch[chosen] & (~self._active[chosen] | self._is_open_ended(chosen))]
+        chosen = chosen[
+            self._queue.gated_synch[chosen] & (~self._active[chosen] | self._is_open_ended(chosen))
+        ]
         self._queue.gated_synch[chosen] = False
         self._release_ns[chosen] = start_ns
         return tuple(chosen.tolist())
@@ -200,7 +212,9 @@ class DriveBank:
         """Narrow the limits of axes; see CommandQueue.set_limits()."""
         chosen = np.asarray(axes, dtype=np.int64)
         if not self.is_idle(chosen):
-            raise CommandError(errno.EBUSY, "set limits: an axis moves or has commands; wait until it is idle")
+            raise CommandError(
+                errno.EBUSY, "set limits: an axis moves or has commands; wait until it is idle"
+            )
         self._queue.set_limits(chosen, limits, self._position)
 
     def get_limits(self, axes: AxesLike) -> dict[str, list[float | None]]:
@@ -367,7 +381,9 @@ class DriveBank:
 
     def _is_open_ended(self, axes: Axes) -> NDArray[np.bool_]:
         """Tell which running commands last until the next one arrives."""
-        return np.array([c is not None and _is_open_ended(c) for c in (self._running[a] for a in axes)], dtype=bool)
+        return np.array(
+            [c is not None and _is_open_ended(c) for c in (self._running[a] for a in axes)], dtype=bool
+        )
 
     def _end(self, axis: int, now_ns: int) -> None:
         command, one = self._running[axis], np.array([axis])
@@ -413,7 +429,10 @@ class DriveBank:
             self._target[axis] = target
             command = command._replace(position=float(target - self._offset[axis]))
         if mode & modes.MAX_VEL_ACC:
-            self._velocity_limit[axis], self._acceleration_limit[axis] = command.max_velocity, command.max_acceleration
+            self._velocity_limit[axis], self._acceleration_limit[axis] = (
+                command.max_velocity,
+                command.max_acceleration,
+            )
         timed = bool(mode & modes.TIME) and command.time > 0
         due_ns, fraction = (int(self._end_ns[axis]), float(self._end_fraction[axis]))
         if not 0 <= now_ns - due_ns < self._settle_ns:
@@ -441,7 +460,9 @@ class DriveBank:
 
     def _publish(self) -> None:
         running = np.array([c is not None for c in self._running])
-        position_mode = np.array([c is not None and bool(c.control_mode & modes.POSITION) for c in self._running])
+        position_mode = np.array(
+            [c is not None and bool(c.control_mode & modes.POSITION) for c in self._running]
+        )
         self._target[~self._active] = self._position[~self._active]
         np.copyto(self._desired, np.where(position_mode, self._target, self._position))
         np.copyto(self._desired_velocity, self._velocity)

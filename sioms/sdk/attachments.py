@@ -217,7 +217,9 @@ def _records_of(fds: list[int]) -> bytes:
     if not fds:
         raise MalformedMessage("a write without records and without a descriptor")
     try:
-        fcntl.fcntl(fds[0], fcntl.F_GET_SEALS)  # only memory files have seals; any other file may block for ever
+        fcntl.fcntl(
+            fds[0], fcntl.F_GET_SEALS
+        )  # only memory files have seals; any other file may block for ever
     except OSError:
         raise MalformedMessage("the descriptor of a write is no memory file") from None
     size = os.fstat(fds[0]).st_size

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 HOUSEKEEPING_HZ = 200.0
 FIRST_PAUSE_NS = 250_000_000
+MAX_WRITES = 16
+"""Writes of outputs that one handle may have waiting for the line."""
 LONGEST_PAUSE_NS = 4_000_000_000
 
 
@@ -347,10 +349,11 @@ class LineEngine(_Connected):
 
     def _take_actions(self, state: _UnitState, block: AxisBlock, now_ns: int) -> None:
         """Send what the bank wants sent, stops ahead of everything."""
-        bank, line = block.bank, self.line
+        bank = block.bank
         if not isinstance(bank, DriveBank):
             return
         for action in bank.take_actions():
+            line = self.line  # an action before this one may have lost it
             if line is None:
                 bank.action_failed(action, "the line is down", now_ns)
                 continue
@@ -387,15 +390,27 @@ class LineEngine(_Connected):
         state, line, now_ns = self._by_block[id(block)], self.line, self._runtime.now_ns()
         if line is None or not state.is_up:
             raise OSError(errno.EIO, f"write {block.spec.name}: {state.unit.name} does not answer")
-        outputs, wanted = self._runtime.outputs, {(id(block), c): v for c, v in zip(channels, values, strict=True)}
+        if handle is not None and handle.writes_under_way >= MAX_WRITES:
+            raise OSError(
+                errno.EAGAIN,
+                f"write {handle.node}: {MAX_WRITES} writes wait for the line already; wait for their answers",
+            )
+        outputs, wanted = (
+            self._runtime.outputs,
+            {(id(block), c): v for c, v in zip(channels, values, strict=True)},
+        )
         steps = state.unit.write_outputs(block.spec, channels, values)
         if handle is None:
             self._voids.update(wanted.keys())
         else:
             steps = self._unless_void(steps, {key: self._voids[key] for key in wanted})
+        if handle is not None:
+            handle.writes_under_way += 1
         outputs.update(wanted)  # at once: writes of single bits begin from what is on its way already
 
         def done(_: Any, error: Exception | None) -> None:
+            if handle is not None:
+                handle.writes_under_way -= 1
             if error is not None:
                 for key in [k for k, v in wanted.items() if outputs.get(k) == v]:
                     del outputs[key]  # what it is now, the device tells
@@ -502,7 +517,7 @@ class StreamEngine(_Connected):
             self._runtime.lose(
                 self._driver.blocks, f"no good frame for {(now_ns - self._good_ns) / 1e9:.3f} s"
             )
-        elif self._driver.heartbeat_s and now_ns >= self._heartbeat_ns:
+        elif self._driver.heartbeat_s and now_ns >= self._heartbeat_ns and line.is_free:
             self._heartbeat_ns = now_ns + int(self._driver.heartbeat_s * 1e9)
             self.guarded(
                 lambda: line.submit(self._driver.heartbeat(), Priority.POLL, lambda v, e: None, now_ns),

@@ -62,6 +62,7 @@ class Handle:
     heard_ns: int
     every: int = 0
     countdown: int = 0
+    writes_under_way: int = 0
     waits: dict[int, Wait] = field(default_factory=dict)
     full: Callable[[], tuple[Any] | None] | None = None
     writes: bool = field(init=False)
@@ -98,6 +99,9 @@ class Handle:
     def _send(self, packet: bytes) -> None:
         try:
             self.sock.send(packet)
+        except BlockingIOError:
+            # A client that does not read its answers is as good as dead: what follows is its end of file.
+            self.sock.shutdown(socket.SHUT_RDWR)
         except OSError:
             return
 
@@ -146,6 +150,8 @@ class Waits:
         if not self._waits:
             return
         for wait in list(self._waits):
+            if wait.handle.waits.get(wait.number) is not wait:
+                continue  # ended by what another has just brought about
             try:
                 done = wait.ready()
             except OSError as error:

@@ -30,8 +30,9 @@ class Priority(IntEnum):
 
     STOP = 0
     ACT = 1
+    POLL = 2
     OUTPUT = 2
-    POLL = 3
+    """In turn with polls: a client that writes without pause must not keep the state from being read."""
 
 
 Done = Callable[[Any, Exception | None], None]

@@ -27,7 +27,11 @@ def main(fd: int) -> None:
     """Serve the daemon until it closes the socket."""
     sock = socket.socket(fileno=fd)
     os.set_inheritable(fd, False)
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # what these mean is for the daemon to decide
+    for number in (
+        signal.SIGINT,
+        signal.SIGTERM,
+        signal.SIGHUP,
+    ):  # what these mean is for the daemon to decide
         signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel reaps; the daemon watches by pidfd
     while True:

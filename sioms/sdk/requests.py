@@ -73,6 +73,10 @@ def write(
     if isinstance(handle.block, AxisBlock):
         return _write_axes(runtime, handle, number, flags, timeout_s, records, what)
     channels, values = _output_values(runtime, handle, records, what)
+    for channel in channels:
+        source = runtime.latched_outputs.get((id(handle.block), channel))
+        if source is not None:
+            raise _refuse(errno.EPERM, f"{what}: stopped by emergency stop ({source}); reset the node first")
     return runtime.engine.write_outputs(handle, number, handle.block, channels, values)
 
 
@@ -80,7 +84,9 @@ def _check_link(runtime: Runtime, handle: Handle, what: str) -> None:
     """Refuse what would wait for a lost device and begin by itself when that is back."""
     reason = runtime.pages.why_not(handle.block)
     if reason:
-        raise _refuse(errno.EIO, f"{what}: its device does not answer ({reason}); write again when it is back")
+        raise _refuse(
+            errno.EIO, f"{what}: its device does not answer ({reason}); write again when it is back"
+        )
 
 
 def _write_axes(
@@ -97,7 +103,17 @@ def _write_axes(
             raise _refuse(error.errno, f"{what}: {error}") from None
         runtime.engine.commands_written(handle.block)
 
-    if timeout_s is not None and timeout_s <= 0 and not handle.full:
+    if replace:
+        attempt()  # what replaces the buffer also replaces what waits to get into it
+        runtime.waits.end_where(
+            lambda w: w.handle is handle and w.cancelled is not None,
+            errno.ECANCELED,
+            "replaced by a later write",
+        )
+        return runtime.tick
+    if timeout_s is not None and timeout_s <= 0:
+        if handle.full is not None:
+            raise _refuse(errno.EAGAIN, f"{what}: an earlier write still waits for room")
         attempt()
         return runtime.tick
 

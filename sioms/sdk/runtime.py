@@ -88,6 +88,8 @@ class Runtime:
         self.stopped = False
         self.waits = Waits()
         self.outputs: dict[tuple[int, int], float] = {}
+        self.latched_outputs: dict[tuple[int, int], str] = {}
+        """Output channels (block, channel) under an emergency stop of their node, and by whom."""
         self.statistics = TickStatistics()
         self.line_due: Callable[[], None] = lambda: None
         self._control = socket.socket(fileno=fds[0])
@@ -217,6 +219,7 @@ class Runtime:
             self.engine.stop([block])
             self.end_axis_waits(block, channels, errno.ECANCELED, f"emergency stop by {source}")
         else:
+            self.latched_outputs.update({(id(block), int(channel)): source for channel in channels})
             self.make_safe(block, channels)
 
     def reset_node(self, block: AnyBlock, channels: Any, what: str) -> None:
@@ -227,6 +230,9 @@ class Runtime:
             )
         if isinstance(block, AxisBlock):
             self._reset_axes(block, channels)
+        else:
+            for channel in channels:
+                self.latched_outputs.pop((id(block), int(channel)), None)
 
     def _reset_axes(self, block: AxisBlock, channels: Any) -> None:
         block.bank.reset(np.array(channels, dtype=np.intp))
@@ -414,6 +420,7 @@ class Runtime:
             self._stop_all()
         if not stopped_ns and self.stopped:
             self.stopped = False
+            self.latched_outputs.clear()
             for block in self.blocks:
                 if isinstance(block, AxisBlock):
                     self._reset_axes(block, range(block.n))
