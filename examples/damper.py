@@ -1,7 +1,7 @@
 """Damper control as a script: an axis gives way to the force on a sensor.
 
 The same as damper.sh, at the sensor's own rate and with a lease: should this program hang, the axis
-halts after 100 ms.
+halts after 250 ms.
 """
 
 import sys
@@ -15,7 +15,7 @@ def main(seconds: float) -> None:
     with (
         sioms.Workcell() as cell,
         cell.open("lord1") as sensor,
-        cell.open("mod0.xaxis", "rw", lease=0.1) as axis,
+        cell.open("mod0.xaxis", "rw", lease=0.25) as axis,
     ):
         sensor.zero(samples=50)
         snapshot = sensor.read()
