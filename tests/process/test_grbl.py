@@ -90,7 +90,7 @@ def test_moves_stops_homes_and_alarms(start: Callable[..., Any], short_folder: P
         x.command(velocity=0.1)
         wait_for(lambda: x.read().position[0] > 0.1, "motion")
         at_rest(x)
-        assert 0.19 < x.read().position[0] <= 0.2
+        assert 0.17 < x.read().position[0] <= 0.2  # inside the limit, short by a poll of way and the braking
         # a command replaces the one that runs
         x.move(0.0)
         wait_for(lambda: x.read().position[0] < 0.17, "motion")
