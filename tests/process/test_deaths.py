@@ -192,6 +192,7 @@ def test_hung_daemon_costs_the_writers_their_axes_only(
         seen = cell.open("mod0.readonly")
         axis = cell.open("mod0.xaxis", "rw")
         axis.command(velocity=0.2)
+        wait_for(lambda: seen.read().velocity[0] > 0.1, "motion")
         with daemon.frozen(daemon.pid):
             assert at_rest(seen, 3.0) < 2.0
             with raises(errno.ETIMEDOUT, "the daemon has been silent for more than 0.3 s"):
