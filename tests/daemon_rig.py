@@ -121,7 +121,13 @@ class Daemon:
     def device(self, name: str) -> dict[str, Any]:
         """Return the status of a device."""
         with self.cell() as cell:
-            return next(d for d in cell.status()["devices"] if d["name"] == name)
+            absent = {
+                "name": name,
+                "state": "leaving",
+                "generation": 0,
+                "pid": 0,
+            }  # between two processes of a reload
+            return next((d for d in cell.status()["devices"] if d["name"] == name), absent)
 
     def wait_up(self, name: str, generation: int = 1, timeout_s: float = 20.0) -> dict[str, Any]:
         """Wait until a device is up in at least this generation with a good link."""
