@@ -351,6 +351,14 @@ def test_many_threads_wait_for_one_node(cell: sioms.Workcell) -> None:
         assert woken == [1] * 5
 
 
+def _readable(node: sioms.Node) -> bool:
+    try:
+        node.read()
+    except OSError:
+        return False
+    return True
+
+
 def test_a_node_of_many_axes_and_a_workcell_of_many_nodes(start_daemon: Callable[..., Daemon]) -> None:
     daemon = start_daemon(
         '[device.big]\ndriver = "sim-axes"\ntick_hz = 100\n[[device.big.axis]]\nname = "a"\ncount = 800\n'
@@ -359,7 +367,9 @@ def test_a_node_of_many_axes_and_a_workcell_of_many_nodes(start_daemon: Callable
     with daemon.cell() as cell:
         assert len(cell.info("big").channels) == 800
         assert len(cell.nodes()) == 2 + 2 * 800 + 1 + 2 * 800
+        daemon.wait_up("big")
         with cell.open("big", "rw") as big:
+            wait_for(lambda: _readable(big), "the first publication")
             assert len(big.read()) == 800 and len(big.limits()["velocity_max"]) == 800
             big.write([sioms.command(i, position=0.001) for i in range(800)])
             big.wait_until_idle(20.0)
