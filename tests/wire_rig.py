@@ -23,6 +23,21 @@ print("moving", flush=True)
 time.sleep(60)
 """
 
+SLIDE = """
+[device.slide0]
+driver = "modbus-axis"
+map = "leadshine"
+line = { serial = "{port}", baud = 115200 }
+[[device.slide0.axis]]
+name = "x"
+unit = "m"
+velocity_by = "path"
+travel_per_turn = 0.01
+velocity_max = 0.1
+acceleration_max = 2.0
+"""
+"""One Leadshine drive that goes on to the end of its path by itself: only a stop that is sent can end it early."""
+
 
 class Wire:
     """A counterpart behind a link in a folder, and what a test does with it.

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from daemon_rig import wait_for
-from wire_rig import Wire
+from wire_rig import SLIDE, Wire
 
 DRIVER = '''
 import os
@@ -39,25 +39,12 @@ class Failing(ModbusAxis):
 
 DRIVER = Failing
 '''
-CONFIG = """
-[device.slide0]
-driver = "./failing.py"
-map = "leadshine"
-line = { serial = "{port}", baud = 115200 }
-[[device.slide0.axis]]
-name = "x"
-unit = "m"
-velocity_by = "path"
-travel_per_turn = 0.01
-velocity_max = 0.1
-acceleration_max = 2.0
-"""
 
 
 def test_a_driver_that_raises_sends_the_stop_first(start: Any, short_folder: Path) -> None:
     wire = Wire(start, short_folder, "leadshine")
     (short_folder / "failing.py").write_text(DRIVER.replace("{folder}", str(short_folder)))
-    wire.serve(CONFIG)
+    wire.serve(SLIDE.replace('"modbus-axis"', '"./failing.py"'))
     wire.wait_up("slide0")
     # A path goes on to its end by itself: only a stop that is sent can end it early.
     axis = wire.client.open("slide0", "rw")

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 from daemon_rig import Daemon, Waiting, raises, wait_for
-from wire_rig import Wire
+from wire_rig import SLIDE, Wire
 
 import sioms
 from sioms.client.channel import Call, Channel, connect
@@ -41,7 +41,7 @@ def test_the_stop_request_page_cannot_be_taken_away(daemon: Daemon, cell: sioms.
     assert cell.status()["pid"] == daemon.pid
 
 
-UDP = '''
+UDP = """
 import struct
 from sioms.sdk.blocks import BinaryBlock, BlockSpec, Description
 from sioms.sdk.driver import LineDriver, LineUnit
@@ -104,7 +104,7 @@ class Port(LineDriver):
 
 
 DRIVER = Port
-'''
+"""
 
 
 class Device:
@@ -201,28 +201,17 @@ def test_outputs_whose_writer_went_during_a_loss_are_made_safe_after_it(port: tu
 
 def test_two_writers_of_one_port_keep_each_others_bits(port: tuple[Daemon, Device]) -> None:
     daemon, device = port
-    with daemon.cell("writer") as cell, cell.open("port0.bit0", "rw") as first, cell.open("port0.bit1", "rw") as other:
+    with (
+        daemon.cell("writer") as cell,
+        cell.open("port0.bit0", "rw") as first,
+        cell.open("port0.bit1", "rw") as other,
+    ):
         device.delay_s = 0.05
         device.asked.clear()
         _send(first, 1)
         assert device.asked.wait(5.0)
         other.set(1)
         assert device.value == 3, f"written: {device.written}"
-
-
-SLIDE = """
-[device.slide0]
-driver = "modbus-axis"
-map = "leadshine"
-line = { serial = "{port}", baud = 115200 }
-[[device.slide0.axis]]
-name = "x"
-unit = "m"
-velocity_by = "path"
-travel_per_turn = 0.01
-velocity_max = 0.1
-acceleration_max = 2.0
-"""
 
 
 def test_nothing_that_is_asked_of_a_lost_drive_begins_when_it_is_back(start: Any, short_folder: Path) -> None:
@@ -268,7 +257,9 @@ def test_an_open_that_waits_ends_when_a_reload_changes_its_node(port: tuple[Daem
     daemon, _ = port
     with daemon.cell("holder") as cell, daemon.cell("waiting") as other, cell.open("port0", "rw"):
         waiting = Waiting(lambda: other.open("port0.bit7", "rw", timeout=20.0), other)
-        (daemon.folder / "port.py").write_text(UDP.replace("width=8, minimum=0, maximum=255", "width=4, minimum=0, maximum=15"))
+        (daemon.folder / "port.py").write_text(
+            UDP.replace("width=8, minimum=0, maximum=255", "width=4, minimum=0, maximum=15")
+        )
         cell.reload()
         assert waiting.errno() == errno.EIO and "changed meanwhile" in str(waiting.error)
 
