@@ -13,7 +13,6 @@ import socket
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.flags import PROTOCOL_VERSION, Access, Right
@@ -31,31 +30,17 @@ from sioms.wording import did_you_mean
 from .claims import Claims
 from .config import WorkcellTable
 from .devices import DriverProcess, State
-from .marker_owners import MarkerError, MarkerOwners, Reservation
+from .marker_owners import MarkerError
+from .marker_verbs import MarkerVerbs
 from .names import READONLY, Node
 from .rights import Rights
-from .sessions import Handle, Session, Wait, peer_of, pidfd_of
+from .sessions import LATER, Handle, Refused, Session, Wait, peer_of, pidfd_of
 
 if TYPE_CHECKING:
     from .server import Server
 
 LONGEST_WAIT_S = 7 * 24 * 3600.0
 _SEND_BUFFER = 1 << 18
-
-
-class Refused(Exception):
-    """A request is refused: errno and one sentence."""
-
-    def __init__(self, errno_: int, text: str) -> None:
-        super().__init__(text)
-        self.errno = errno_
-
-
-@dataclass(frozen=True, slots=True)
-class _Persisting:
-    """Owner of markers that outlive their sessions: a user."""
-
-    uid: int
 
 
 class _Malformed(Exception):
@@ -78,8 +63,7 @@ class Clients:
         self._sessions: set[Session] = set()
         self._handles: dict[int, Handle] = {}
         self._claims: Claims[Handle] = Claims()
-        self._markers = MarkerOwners(server.shared.markers)
-        self._marker_waits: list[tuple[Reservation, Wait]] = []
+        self.markers = MarkerVerbs(server.shared.markers, self)
         self._opens: list[tuple[Wait, Callable[[], bool]]] = []
         self._numbers = itertools.count(1)
         listener.setblocking(False)
@@ -162,7 +146,7 @@ class Clients:
         except (ValueError, TypeError, LookupError, OverflowError) as error:
             raise _Malformed(f"{verb.name} with arguments {arguments!r:.80}: {error}") from None
         else:
-            if value is not _LATER:
+            if value is not LATER:
                 self._send(session, reply(number, value))
 
     def _verb(self, session: Session, verb: ClientVerb, number: int, arguments: list[Any]) -> Any:
@@ -180,13 +164,13 @@ class Clients:
             case ClientVerb.STATUS:
                 return self._status()
             case ClientVerb.RESERVE_MARKER:
-                return self._reserve(session, *arguments)
+                return self.markers.reserve(session, *arguments)
             case ClientVerb.FREE_MARKER:
-                return self._free(*arguments)
+                return self.markers.free(*arguments)
             case ClientVerb.SIGNAL_MARKER:
-                return self._signal(*arguments)
+                return self.markers.signal(*arguments)
             case ClientVerb.WAIT_MARKER:
-                return self._wait_marker(session, number, *arguments)
+                return self.markers.wait(session, number, *arguments)
             case ClientVerb.EMERGENCY_STOP:
                 return self._emergency_stop(session, *arguments)
             case ClientVerb.RESET:
@@ -215,8 +199,7 @@ class Clients:
         session.sock.close()
         for wait in list(session.waits.values()):
             self._drop_wait(wait)
-        for reservation in self._markers.owned_by(session):
-            self._release_marker(reservation)
+        self.markers.end_session(session)
         for handle in list(session.handles.values()):
             self._detach(handle)
         if session.pidfd >= 0:
@@ -225,7 +208,8 @@ class Clients:
 
     # --- waiting requests ------------------------------------------------------------------------
 
-    def _wait(self, session: Session, number: int, timeout_s: float | None, what: str) -> Wait:
+    def wait(self, session: Session, number: int, timeout_s: float | None, what: str) -> Wait:
+        """Keep a request to be answered later, or refused when its time is over [s; None = never]."""
         if len(session.waits) >= self.bounds.max_waits:
             raise Refused(
                 errno.EAGAIN,
@@ -238,7 +222,8 @@ class Clients:
         session.waits[number] = wait
         return wait
 
-    def _answer(self, wait: Wait, packet: bytes, fds: list[int] | None = None) -> None:
+    def answer(self, wait: Wait, packet: bytes, fds: list[int] | None = None) -> None:
+        """Answer a request that was kept, unless it has ended in another way."""
         if self._drop_wait(wait):
             self._send(wait.session, packet, fds)
 
@@ -246,12 +231,12 @@ class Clients:
         if wait.timer is not None:
             wait.timer.cancel()
         self._opens = [entry for entry in self._opens if entry[0] is not wait]
-        self._marker_waits = [entry for entry in self._marker_waits if entry[1] is not wait]
+        self.markers.forget(wait)
         return wait.session.waits.pop(wait.number, None) is not None
 
     def _timed_out(self, wait: Wait, limit_s: float) -> None:
         why = f": {wait.why()}" if wait.why is not None else ""
-        self._answer(
+        self.answer(
             wait, refusal(wait.number, errno.ETIMEDOUT, f"{wait.what}: not within {limit_s:g} s{why}")
         )
 
@@ -259,7 +244,7 @@ class Clients:
         wait = session.waits.get(int(number))
         if wait is None:
             return False
-        self._answer(wait, refusal(wait.number, errno.ECANCELED, f"{wait.what}: cancelled"))
+        self.answer(wait, refusal(wait.number, errno.ECANCELED, f"{wait.what}: cancelled"))
         return True
 
     # --- names, opens, closes --------------------------------------------------------------------
@@ -274,7 +259,7 @@ class Clients:
         value = [PROTOCOL_VERSION, self.bounds.name, int(rights)]
         fds = [self._server.shared.request_fd] if rights & Right.STOP else []
         self._send(session, reply(number, value), fds)
-        return _LATER
+        return LATER
 
     def _node(self, session: Session, what: str, name: str) -> Node:
         node = self._server.names.nodes.get(str(name))
@@ -316,10 +301,10 @@ class Clients:
         obstacle = self._obstacle(node)
         if obstacle is None:
             self._grant(session, number, node, access, float(lease_s))
-            return _LATER
+            return LATER
         if timeout_s is not None and float(timeout_s) <= 0:
             raise obstacle
-        wait = self._wait(session, number, timeout_s, f"open {name}")
+        wait = self.wait(session, number, timeout_s, f"open {name}")
         wait.why = lambda: str(self._obstacle(node) or "it has just become free").removeprefix(
             f"open {name}: "
         )
@@ -327,7 +312,7 @@ class Clients:
         def retry() -> bool:
             if self._server.names.nodes.get(node.name) != node:  # a reload came in between
                 why = f"open {name}: it has been removed or changed meanwhile; open it again"
-                self._answer(wait, refusal(wait.number, errno.EIO, why))
+                self.answer(wait, refusal(wait.number, errno.EIO, why))
                 return True
             if self._obstacle(node) is not None:
                 return False
@@ -339,7 +324,7 @@ class Clients:
             return True
 
         self._opens.append((wait, retry))
-        return _LATER
+        return LATER
 
     def _obstacle(self, node: Node) -> Refused | None:
         """Return why a node cannot be opened now, or None."""
@@ -402,7 +387,7 @@ class Clients:
         if handle.claims and self._detach(handle):
             handle.closing = number
             session.waits[number] = Wait(number, session, None, f"close {handle.node.name}")
-            return _LATER
+            return LATER
         self._forget(handle)
         return None
 
@@ -434,7 +419,7 @@ class Clients:
         self._claims.release(handle.claims)
         wait = handle.session.waits.get(handle.closing)
         if wait is not None:
-            self._answer(wait, reply(handle.closing))
+            self.answer(wait, reply(handle.closing))
         if self._opens:
             self.retry_opens()
 
@@ -475,78 +460,9 @@ class Clients:
                 }
                 for d in server.devices.values()
             ],
-            "sessions": [[str(s), len(s.handles), len(s.waits), s.markers] for s in self._sessions],
+            "sessions": [[str(s), len(s.handles), len(s.waits), self.markers.count(s)] for s in self._sessions],
             "holders": [[h.node.name, str(h.session), (now - h.since_ns) / 1e9] for h in self._handles.values() if h.claims],
         }  # fmt: skip
-
-    # --- markers ---------------------------------------------------------------------------------
-
-    def _reserve(self, session: Session, count: int, persist: bool) -> list[int]:
-        count = int(count)
-        if not 1 <= count <= self.bounds.max_markers:
-            raise Refused(
-                errno.EINVAL, f"reserve markers: {count} asked for; want 1 to {self.bounds.max_markers}"
-            )
-        if not persist and session.markers + count > self.bounds.max_markers:
-            raise Refused(
-                errno.EBUSY,
-                f"reserve markers: this session has {session.markers}; at most {self.bounds.max_markers}, free some",
-            )
-        owner: object = _Persisting(session.peer.uid) if persist else session
-        if persist and len(self._markers.owned_by(owner)) + count > self.bounds.max_markers:
-            raise Refused(
-                errno.EBUSY,
-                f"reserve markers: {session.peer.user} has {len(self._markers.owned_by(owner))} that persist; "
-                f"at most {self.bounds.max_markers}, free some",
-            )
-        tokens: list[int] = []
-        try:
-            for _ in range(count):
-                tokens.append(self._markers.reserve(owner))
-        except MarkerError:
-            for token in tokens:  # all or nothing
-                self._markers.free(self._markers.entitled(token, "free"))
-            raise
-        session.markers += 0 if persist else count
-        return tokens
-
-    def _free(self, token: int) -> None:
-        self._release_marker(self._markers.entitled(int(token), "free"))
-
-    def _release_marker(self, reservation: Reservation) -> None:
-        self._markers.free(reservation)
-        if isinstance(reservation.owner, Session):
-            reservation.owner.markers -= 1
-        for reserved, wait in list(self._marker_waits):
-            if reserved == reservation:
-                self._answer(
-                    wait,
-                    refusal(
-                        wait.number,
-                        errno.EPIPE,
-                        f"wait for marker {reserved.number}: it was freed, or its owner has gone",
-                    ),
-                )
-
-    def _signal(self, token: int) -> None:
-        self._markers.signal(self._markers.entitled(int(token), "signal"), time.monotonic_ns())
-        self.marker_signalled()
-
-    def _wait_marker(self, session: Session, number: int, token: int, timeout_s: float | None) -> Any:
-        reservation = self._markers.find(int(token), "wait for")
-        if self._markers.is_signalled(reservation):
-            return self._server.shared.markers.stamp_ns(reservation.number)
-        wait = self._wait(session, number, timeout_s, f"wait for marker {reservation.number}")
-        self._marker_waits.append((reservation, wait))
-        return _LATER
-
-    def marker_signalled(self) -> None:
-        """Answer the waits of markers that have been signalled."""
-        for reservation, wait in list(self._marker_waits):
-            if self._markers.is_signalled(reservation):
-                self._answer(
-                    wait, reply(wait.number, self._server.shared.markers.stamp_ns(reservation.number))
-                )
 
     # --- stops -----------------------------------------------------------------------------------
 
@@ -602,18 +518,15 @@ class Clients:
     def _reload(self, session: Session, number: int) -> Any:
         if not self.rights.on_workcell(session.peer) & Right.ADMINISTER:
             raise Refused(errno.EPERM, f"reload: {session.peer.user} has no right to administer every node")
-        wait = self._wait(session, number, None, "reload")
+        wait = self.wait(session, number, None, "reload")
 
         def done(errors: list[str]) -> None:
             if errors:
-                self._answer(
+                self.answer(
                     wait, refusal(number, errno.EINVAL, "reload: nothing taken up: " + "; ".join(errors))
                 )
             else:
-                self._answer(wait, reply(number))
+                self.answer(wait, reply(number))
 
         self._server.load(done)
-        return _LATER
-
-
-_LATER = object()
+        return LATER

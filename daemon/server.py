@@ -148,7 +148,7 @@ class Server:
             case DriverVerb.DETACHED:
                 self.clients.detached(device, arguments[0])
             case DriverVerb.MARKER_SIGNALLED:
-                self.clients.marker_signalled()
+                self.clients.markers.signalled()
             case DriverVerb.STOPPED:
                 self.log("warning", "emergency stop", source=arguments[0], device=device.name)
                 for other in self.devices.values():

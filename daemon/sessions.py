@@ -20,6 +20,18 @@ from .rights import Peer
 _SO_PEERPIDFD = 77  # Linux 6.5; not in the socket module of Python 3.11
 
 
+LATER = object()
+"""Returned by a verb whose answer comes later."""
+
+
+class Refused(Exception):
+    """A request is refused: errno and one sentence."""
+
+    def __init__(self, errno_: int, text: str) -> None:
+        super().__init__(text)
+        self.errno = errno_
+
+
 @dataclass(slots=True)
 class Handle:
     """An open node.
@@ -75,7 +87,6 @@ class Session:
         name: what it calls itself.
         handles: by number.
         waits: unanswered requests by message number.
-        markers: numbers reserved, persisting ones not counted.
     """
 
     sock: socket.socket
@@ -84,7 +95,6 @@ class Session:
     name: str = ""
     handles: dict[int, Handle] = field(default_factory=dict)
     waits: dict[int, Wait] = field(default_factory=dict)
-    markers: int = 0
 
     def __str__(self) -> str:
         return f"{self.peer}" + (f" {self.name}" if self.name else "")

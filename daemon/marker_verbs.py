@@ -1,0 +1,110 @@
+"""Marker requests of clients: reserve, free, signal, wait.
+
+Concurrency: everything runs in the daemon's loop.
+"""
+
+from __future__ import annotations
+
+import errno
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from sioms.protocol.markers import MarkerTable
+from sioms.protocol.messages import refusal, reply
+
+from .marker_owners import MarkerError, MarkerOwners, Reservation
+from .sessions import LATER, Refused, Session, Wait
+
+if TYPE_CHECKING:
+    from .clients import Clients
+
+
+@dataclass(frozen=True, slots=True)
+class Persisting:
+    """Owner of markers that outlive their sessions: a user."""
+
+    uid: int
+    user: str
+
+    def __str__(self) -> str:
+        return f"{self.user} (markers that persist)"
+
+
+class MarkerVerbs:
+    """Markers on behalf of clients.
+
+    Args:
+        table: the shared marker table.
+        clients: who waits and is answered, and the bounds.
+    """
+
+    def __init__(self, table: MarkerTable, clients: Clients) -> None:
+        self._table = table
+        self._owners = MarkerOwners(table)
+        self._clients = clients
+        self._waits: list[tuple[Reservation, Wait]] = []
+
+    def count(self, owner: object) -> int:
+        """Return how many markers an owner has."""
+        return len(self._owners.owned_by(owner))
+
+    def reserve(self, session: Session, count: int, persist: bool) -> list[int]:
+        """Reserve markers, all or none; return their tokens."""
+        count, most = int(count), self._clients.bounds.max_markers
+        if not 1 <= count <= most:
+            raise Refused(errno.EINVAL, f"reserve markers: {count} asked for; want 1 to {most}")
+        owner = Persisting(session.peer.uid, session.peer.user) if persist else session
+        has = self.count(owner)
+        if has + count > most:
+            who = owner if persist else "this session"
+            raise Refused(errno.EBUSY, f"reserve markers: {who} has {has}; at most {most}, free some")
+        tokens: list[int] = []
+        try:
+            for _ in range(count):
+                tokens.append(self._owners.reserve(owner))
+        except MarkerError:
+            for token in tokens:
+                self._owners.free(self._owners.entitled(token, "free"))
+            raise
+        return tokens
+
+    def free(self, token: int) -> None:
+        """Free a marker; who waits for it gets EPIPE."""
+        self._release(self._owners.entitled(int(token), "free"))
+
+    def signal(self, token: int) -> None:
+        """Signal a marker."""
+        self._owners.signal(self._owners.entitled(int(token), "signal"), time.monotonic_ns())
+        self.signalled()
+
+    def wait(self, session: Session, number: int, token: int, timeout_s: float | None) -> Any:
+        """Answer with the time of the signal, at once or when it comes."""
+        reservation = self._owners.find(int(token), "wait for")
+        if self._owners.is_signalled(reservation):
+            return self._table.stamp_ns(reservation.number)
+        wait = self._clients.wait(session, number, timeout_s, f"wait for marker {reservation.number}")
+        self._waits.append((reservation, wait))
+        return LATER
+
+    def signalled(self) -> None:
+        """Answer the waits of markers that have been signalled, by clients or by drivers."""
+        for reservation, wait in list(self._waits):
+            if self._owners.is_signalled(reservation):
+                self._clients.answer(wait, reply(wait.number, self._table.stamp_ns(reservation.number)))
+
+    def end_session(self, session: Session) -> None:
+        """Free what a session owns."""
+        for reservation in self._owners.owned_by(session):
+            self._release(reservation)
+
+    def forget(self, wait: Wait) -> None:
+        """Drop a wait that has ended in another way."""
+        self._waits = [entry for entry in self._waits if entry[1] is not wait]
+
+    def _release(self, reservation: Reservation) -> None:
+        self._owners.free(reservation)
+        gone = f"wait for marker {reservation.number}: it was freed, or its owner has gone"
+        for reserved, wait in list(self._waits):
+            if reserved == reservation:
+                self._clients.answer(wait, refusal(wait.number, errno.EPIPE, gone))
