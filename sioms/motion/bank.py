@@ -21,7 +21,7 @@ from .guard import LimitGuard
 from .homing import HomingRuns
 from .law import ControlLaw
 from .plain import MOST, Taken
-from .queue import AxesLike, CommandQueue, LimitValue
+from .queue import AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
 from .sequencer import FORCE, HOLD, STOP, Sequencer
 from .store import NEVER_NS
 from .types import SWITCH_MINUS, SWITCH_PLUS, AxisSettings, CommandError, Event, EventKind, MarkerPort
@@ -114,17 +114,39 @@ class AxisBank:
         if plain is not None:
             self._take(Taken(plain, frozenset([c.axis for c in plain]), replace, now_ns))
             return
+        self.take(verdict(self.judge(records, axes, now_ns, replace=replace)), now_ns)
+
+    def judge(
+        self, records: NDArray[Any], axes: AxesLike, now_ns: int, *, replace: bool = False
+    ) -> Judgement:
+        """Judge a long write piece by piece, between ticks; what append() would refuse is refused here.
+
+        Args, Raises: as append(). Returns, at its end: what take() takes.
+        """
+        if not self._seen:
+            raise CommandError(errno.EIO, "write: no position has been measured yet; wait for the first tick")
+        return (yield from self._queue.judge(records, axes, self._rest_positions(now_ns), replace=replace))
+
+    def take(self, judged: Judged, now_ns: int) -> bool:
+        """Append a judged write whole, at now; False when its axes have changed since: judge it again.
+
+        Raises:
+            CommandError: the axes take no commands any more, or have no room.
+        """
+        now_ns = self._instant(now_ns)
+        if not self._queue.still_holds(judged, self._rest_positions(now_ns)):
+            return False
+        if judged.replace:
+            self._sequencer.drop(judged.axes)
+            self._sequencer.replaced(self._queue.append(judged), now_ns)
+        elif judged.axes.size:
+            self._sequencer.appended(self._queue.append(judged), now_ns)
+        return True
+
+    def _rest_positions(self, now_ns: int) -> NDArray[np.float64]:
         self._work_in()
-        sequencer, now_ns = self._sequencer, self._instant(now_ns)
-        sequencer.advance(now_ns)
-        commands = self._queue.admit(records, axes, sequencer.rest_positions(), replace=replace)
-        if not len(commands):
-            return
-        if replace:
-            sequencer.drop(np.unique(commands["axis"]).astype(np.int64))
-            sequencer.replaced(self._queue.append(commands), now_ns)
-        else:
-            sequencer.appended(self._queue.append(commands), now_ns)
+        self._sequencer.advance(self._instant(now_ns))
+        return self._sequencer.rest_positions()
 
     def _take(self, write: Taken) -> None:
         """Keep a plain write for the next tick or verb, which carries it out at its own instant.

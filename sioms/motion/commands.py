@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import QUANTITIES, ControlMode, NodeClass
 from sioms.protocol.records import numpy_dtype
 
-from .types import AxisKind, AxisSettings, CommandError, MarkerPort
+from .types import AxisKind, AxisSettings, CommandError, MarkerPort, RecordError
 
 WIRE_DTYPE = np.dtype(numpy_dtype(NodeClass.AXIS))
 COMMAND_DTYPE = np.dtype([*numpy_dtype(NodeClass.AXIS), ("signal_generation", "<i8"), ("wait_generation", "<i8")])
@@ -132,38 +132,50 @@ class Validator:
         """Control-mode flags that each axis can do."""
         return [int(mode) for mode in self._modes]
 
-    def check(self, records: NDArray[Any], axes: NDArray[np.int64]) -> NDArray[Any]:
-        """Return the records as COMMAND_DTYPE, with bank axes and captured markers.
+    @staticmethod
+    def place(records: NDArray[Any], axes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the bank axis of each record.
 
         Args:
             records: structured array of WIRE_DTYPE.
             axes: bank axis of each node-local index.
 
         Raises:
-            CommandError: EINVAL for what no axis like this could do, ERANGE for a value outside
-                its limits, and what the marker port raises.
+            RecordError: EINVAL, an axis that the node does not have.
         """
         local = records["axis"]
         bad = (local < 0) | (local >= len(axes))
         if bad.any():
             i = int(bad.argmax())
-            raise CommandError(
-                errno.EINVAL, f"write, record {i}: axis {local[i]} does not exist; 0 to {len(axes) - 1}"
-            )
+            raise RecordError(errno.EINVAL, "", i, f"axis {local[i]} does not exist; 0 to {len(axes) - 1}")
+        placed: NDArray[np.int64] = axes[local]
+        return placed
+
+    def check(self, records: NDArray[Any], placed: NDArray[np.int64]) -> NDArray[Any]:
+        """Return the records as COMMAND_DTYPE, with bank axes and captured markers.
+
+        Args:
+            records: structured array of WIRE_DTYPE.
+            placed: bank axis of each record.
+
+        Raises:
+            RecordError: EINVAL for what no axis like this could do, ERANGE for a value outside
+                its limits, and what the marker port raises.
+        """
         commands = np.zeros(len(records), dtype=COMMAND_DTYPE)
         for name in WIRE_DTYPE.names or ():
             commands[name] = records[name]
-        commands["axis"] = axes[local]
+        commands["axis"] = placed
         self._check_modes(commands)
         self._check_values(commands)
         self._check_position(commands)
         self._capture(commands)
         return commands
 
-    def refuse(self, errno_: int, commands: NDArray[Any], i: int, what: str) -> CommandError:
+    def refuse(self, errno_: int, commands: NDArray[Any], i: int, what: str) -> RecordError:
         """Build the error for record i."""
         axis = int(commands["axis"][i])
-        return CommandError(errno_, f"write axis {axis} ({self._settings[axis].name}), record {i}: {what}")
+        return RecordError(errno_, f"{axis} ({self._settings[axis].name})", i, what)
 
     def _check_modes(self, commands: NDArray[Any]) -> None:
         mode = commands["control_mode"]
@@ -214,7 +226,7 @@ class Validator:
 
     def _out_of_range(
         self, commands: NDArray[Any], i: int, rule: Rule, bound: NDArray[np.float64]
-    ) -> CommandError:
+    ) -> RecordError:
         settings = self._settings[int(commands["axis"][i])]
         unit = rule.unit.format(u=settings.unit, f=settings.force_unit)
         low = "above 0" if rule.positive else f"{-bound[i]:g}"

@@ -21,7 +21,7 @@ from sioms.protocol.records import AXIS_READ_FIELDS
 
 from . import modes
 from .commands import Command
-from .queue import AxesLike, CommandQueue, LimitValue
+from .queue import AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
 from .types import AxisSettings, CommandError, Event, EventKind, MarkerPort
 
 NEVER_NS = 2**62
@@ -125,18 +125,30 @@ class DriveBank:
 
     def append(self, records: NDArray[Any], axes: AxesLike, now_ns: int, *, replace: bool = False) -> None:
         """Append written records, all or none; see AxisBank.append()."""
-        commands = self._queue.admit(records, axes, np.full(self.n, np.nan), replace=replace)
+        self.take(verdict(self.judge(records, axes, now_ns, replace=replace)), now_ns)
+
+    def judge(
+        self, records: NDArray[Any], axes: AxesLike, now_ns: int, *, replace: bool = False
+    ) -> Judgement:
+        """Judge a long write piece by piece; see AxisBank.judge()."""
         if not self._seen:
             raise CommandError(errno.EIO, "write: the drive has not reported its position yet; wait for it")
-        if replace:
-            touched = np.unique(commands["axis"]).astype(np.int64)
+        return (yield from self._queue.judge(records, axes, np.full(self.n, np.nan), replace=replace))
+
+    def take(self, judged: Judged, now_ns: int) -> bool:
+        """Append a judged write whole; see AxisBank.take()."""
+        if not self._queue.still_holds(judged, np.full(self.n, np.nan)):
+            return False
+        if judged.replace:
+            touched = judged.axes
             self._queue.clear(touched)
             self._end_ns[touched] = now_ns
             self._end_fraction[touched] = 0.0
             for axis in touched.tolist():
                 self._running[axis] = None
-        self._queue.append(commands)
+        self._queue.append(judged)
         self.advance(now_ns)
+        return True
 
     def room(self, axes: AxesLike) -> int:
         """Return how many further commands fit into the fullest buffer of these axes."""

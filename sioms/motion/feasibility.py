@@ -9,6 +9,7 @@ the command is next; then an infeasible one is a latched fault.
 from __future__ import annotations
 
 import errno
+from collections.abc import Generator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,11 +18,15 @@ from numpy.typing import NDArray
 from . import modes
 from .commands import Command, Limits, Validator
 from .profile import Bounds, InfeasibleError, Planner, State, enclosures, pass_acceleration, quintic
-from .types import CommandError
+from .types import RecordError
 
 Floats = NDArray[np.float64]
 SUFFICIENT = 1.06
 """d/v + v/a + a/j is at least 3/3.175 of the shortest rest-to-rest time, so 1.06 of it suffices."""
+
+
+TRIALS = 8
+"""Profiles tried in one go, at 10 to 20 us each."""
 
 
 class Tail(NamedTuple):
@@ -30,6 +35,19 @@ class Tail(NamedTuple):
     state: Floats
     velocity: Floats
     acceleration: Floats
+
+    def rows(self, axes: NDArray[np.int64]) -> Tail:
+        """Return a copy of the rows of some axes."""
+        return Tail(self.state[axes], self.velocity[axes], self.acceleration[axes])
+
+    def set_rows(self, axes: NDArray[np.int64], rows: Tail) -> None:
+        """Overwrite the rows of some axes."""
+        for held, new in zip(self, rows, strict=True):
+            held[axes] = new
+
+    def equals(self, other: Tail) -> bool:
+        """Tell whether both know the same."""
+        return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(self, other, strict=True))
 
 
 class Feasibility:
@@ -40,11 +58,11 @@ class Feasibility:
         self._validator = validator
         self._planner = Planner()
 
-    def check(self, commands: NDArray[Any], tail: Tail) -> tuple[NDArray[np.int64], Tail]:
-        """Refuse what is known to be infeasible; return the axes written and their new tail (rows of them).
+    def check(self, commands: NDArray[Any], tail: Tail) -> Generator[None, None, None]:
+        """Refuse what is known to be infeasible, and bring the tail up to date; yields between trials.
 
         Raises:
-            CommandError: ERANGE, naming the record.
+            RecordError: ERANGE.
         """
         order = np.argsort(commands["axis"], kind="stable")
         c = commands[order]
@@ -58,10 +76,12 @@ class Feasibility:
             (velocity, acceleration, self._limits.jerk[axis], self._limits.minimum[axis], self._limits.maximum[axis]), 1
         )
         doubtful = self._doubtful(c, begin, end, bounds)
-        for i in np.flatnonzero(doubtful).tolist():
+        for tried, i in enumerate(np.flatnonzero(doubtful).tolist(), 1):
             self._try(commands, int(order[i]), c[i], begin[i], bounds[i])
+            if tried % TRIALS == 0:
+                yield
         last = np.flatnonzero(np.concatenate((first[1:], [True])))
-        return axis[last], Tail(end[last], velocity[last], acceleration[last])
+        tail.set_rows(axis[last], Tail(end[last], velocity[last], acceleration[last]))
 
     def _states(
         self, c: NDArray[Any], first: NDArray[np.bool_], tail: Tail, limit: Floats
@@ -135,7 +155,7 @@ class Feasibility:
         except InfeasibleError as e:
             raise self._refusal(commands, i, str(e)) from None
 
-    def _refusal(self, commands: NDArray[Any], i: int, what: str) -> CommandError:
+    def _refusal(self, commands: NDArray[Any], i: int, what: str) -> RecordError:
         return self._validator.refuse(errno.ERANGE, commands, i, what)
 
 

@@ -7,7 +7,8 @@ buffer, marker and latch semantics are the same for both. What runs, and when, i
 from __future__ import annotations
 
 import errno
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,15 +18,52 @@ from sioms.protocol.flags import AxisStatus
 
 from . import modes
 from .buffers import CommandBuffers
-from .commands import WIRE_DTYPE, Command, Limits, Validator
+from .commands import COMMAND_DTYPE, WIRE_DTYPE, Command, Limits, Validator
 from .feasibility import Feasibility, Tail
 from .plain import MOST, PlainCheck
-from .types import AxisSettings, CommandError, Event, EventKind, MarkerPort
+from .types import AxisSettings, CommandError, Event, EventKind, MarkerPort, RecordError
 
 AxesLike = Sequence[int] | NDArray[np.int64]
 LimitValue = float | None | Sequence[float | None]
 BARRED, HOMED = int(AxisStatus.EMERGENCY_STOP | AxisStatus.FAULT | AxisStatus.HOMING), int(AxisStatus.HOMED)
 LIMIT_NAMES = ("position_min", "position_max", "velocity_max", "acceleration_max", "jerk_max", "force_max")
+
+PIECE = 512
+"""Records that are judged in one go: some 0.3 ms."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """A written array that was found good, and on what that rests.
+
+    Attributes:
+        commands: the array as commands.
+        axes: the axes it touches, ascending.
+        replace: whether the buffers of these axes are to be emptied first.
+        begin, end: what is known of these axes' buffers before and after it.
+        limits_set: how often limits had been changed.
+    """
+
+    commands: NDArray[Any]
+    axes: NDArray[np.int64]
+    replace: bool
+    begin: Tail
+    end: Tail
+    limits_set: int
+
+
+Judgement = Generator[None, None, Judged]
+"""Judging a written array: goes on with every ``next``, returns Judged or raises CommandError."""
+
+
+def verdict(judgement: Judgement) -> Judged:
+    """Judge to the end in one go."""
+    while True:
+        try:
+            next(judgement)
+        except StopIteration as end:
+            judged: Judged = end.value
+            return judged
 
 
 class CommandQueue:
@@ -52,7 +90,7 @@ class CommandQueue:
         self.in_force = (self.limits.velocity.copy(), self.limits.acceleration.copy())
         """Velocity and acceleration limits that commands have specified, (n,) each."""
         self.tail = Tail(np.full((self.n, 3), np.nan), self.in_force[0].copy(), self.in_force[1].copy())
-        self._next_tail: tuple[NDArray[np.int64], Tail] | None = None
+        self._limits_set = 0
         self._feasibility = Feasibility(self.limits, self._validator)
         self._plain = PlainCheck(self._validator.offered, self.limits)
         self._waiting: dict[tuple[int, int], set[int]] = {}
@@ -61,10 +99,10 @@ class CommandQueue:
 
     # -- writing ------------------------------------------------------------------------------
 
-    def admit(
+    def judge(
         self, records: NDArray[Any], axes: AxesLike, at_rest: NDArray[np.float64], *, replace: bool
-    ) -> NDArray[Any]:
-        """Check a written array and the state of its axes; return it as commands, nothing taken yet.
+    ) -> Judgement:
+        """Check a written array and the state of its axes, piece by piece; nothing is taken yet.
 
         Args:
             records: as written.
@@ -74,10 +112,38 @@ class CommandQueue:
         """
         if records.dtype != WIRE_DTYPE:
             raise CommandError(errno.EINVAL, "write: the records are no axis write records; table F.3")
-        commands = self._validator.check(records, np.asarray(axes, dtype=np.int64))
-        if not len(commands):
-            return commands
-        touched = np.bincount(commands["axis"], minlength=self.n)
+        placed = self._validator.place(records, np.asarray(axes, dtype=np.int64))
+        touched = np.unique(placed)
+        self._check_state(placed, replace)
+        begin, limits_set = self._known(touched, at_rest, replace), self._limits_set
+        tail = Tail(np.full((self.n, 3), np.nan), np.zeros(self.n), np.zeros(self.n))
+        tail.set_rows(touched, begin)
+        pieces = [np.zeros(0, dtype=COMMAND_DTYPE)]
+        for first in range(0, len(records), PIECE):
+            piece = slice(first, first + PIECE)
+            try:
+                commands = self._validator.check(records[piece], placed[piece])
+                yield from self._feasibility.check(commands, tail)
+            except RecordError as error:
+                raise error.later(first) from None
+            pieces.append(commands)
+            if first + PIECE < len(records):
+                yield
+        return Judged(np.concatenate(pieces), touched, replace, begin, tail.rows(touched), limits_set)
+
+    def still_holds(self, judged: Judged, at_rest: NDArray[np.float64]) -> bool:
+        """Tell whether what a judgement rests on has not changed since; else it must be judged again.
+
+        Raises:
+            CommandError: the axes take no commands any more, or have no room.
+        """
+        self._check_state(judged.commands["axis"], judged.replace)
+        known = self._known(judged.axes, at_rest, judged.replace)
+        return judged.limits_set == self._limits_set and judged.begin.equals(known)
+
+    def _check_state(self, placed: NDArray[np.int64], replace: bool) -> None:
+        """Raise when an axis written to takes no commands now, or has no room for these."""
+        touched = np.bincount(placed, minlength=self.n)
         self._check_latches(np.flatnonzero(touched))
         full = touched > (self.capacity if replace else self.room_of_all())
         if full.any():
@@ -88,8 +154,16 @@ class CommandQueue:
                 f"write axis {axis} ({self.settings[axis].name}): {touched[axis]} commands do not fit; "
                 f"room for {room} of {self.capacity}",
             )
-        self._check_feasible(commands, at_rest, replace)
-        return commands
+
+    def _known(self, axes: NDArray[np.int64], at_rest: NDArray[np.float64], replace: bool) -> Tail:
+        """Return what is known of the state in which the next command of these axes begins."""
+        known = self.tail.rows(axes)
+        resting = np.isfinite(at_rest[axes])
+        if replace:
+            known.state[~resting] = np.nan
+        known.state[resting] = 0.0
+        known.state[resting, 0] = at_rest[axes][resting]
+        return known
 
     def admit_plain(
         self, records: NDArray[Any], axes: AxesLike, waiting: int, *, replace: bool
@@ -135,14 +209,6 @@ class CommandQueue:
         self.load_heads(touched)
         return touched
 
-    def _check_feasible(self, commands: NDArray[Any], at_rest: NDArray[np.float64], replace: bool) -> None:
-        known = self.tail.state
-        resting = np.isfinite(at_rest)
-        known[resting, 0] = at_rest[resting]
-        known[resting, 1:] = 0.0
-        tail = self.tail._replace(state=np.where(resting[:, None], known, np.nan)) if replace else self.tail
-        self._next_tail = self._feasibility.check(commands, tail)
-
     def forget_tail(self, axes: NDArray[np.int64]) -> None:
         """The buffers of these axes were emptied: what follows begins in a state not known here."""
         self.tail.state[axes] = np.nan
@@ -166,18 +232,12 @@ class CommandQueue:
             raise CommandError(errno.EBUSY, what + "homing; wait until it is idle")
         raise CommandError(errno.EPERM, what + "home required; HOME first")
 
-    def append(self, commands: NDArray[Any]) -> NDArray[np.int64]:
-        """Take admitted commands; return the axes touched, each of which now has a head."""
-        if not len(commands):
-            return np.zeros(0, dtype=np.int64)
-        touched = self._buffers.append(commands)
-        if self._next_tail is not None:
-            axes, end = self._next_tail
-            for held, new in zip(self.tail, end, strict=True):
-                held[axes] = new
-            self._next_tail = None
-        self.load_heads(touched)
-        return touched
+    def append(self, judged: Judged) -> NDArray[np.int64]:
+        """Take what still holds; return the axes touched, each of which now has a head."""
+        self._buffers.append(judged.commands)
+        self.tail.set_rows(judged.axes, judged.end)
+        self.load_heads(judged.axes)
+        return judged.axes
 
     def room_of_all(self) -> NDArray[np.int64]:
         """Return how many commands each axis has room for."""
@@ -321,6 +381,7 @@ class CommandQueue:
                 changes.append((array, axis, self._checked_limit(axis, name, value, position)))
         for array, axis, value in changes:
             array[axis] = value
+        self._limits_set += 1
         self.in_force[0][axes] = self.limits.velocity[axes]
         self.in_force[1][axes] = self.limits.acceleration[axes]
         self.forget_tail(axes)

@@ -25,6 +25,26 @@ class CommandError(Exception):
         self.errno = errno_
 
 
+class RecordError(CommandError):
+    """A record of a written array is bad.
+
+    Args:
+        errno_: POSIX errno.
+        axis: bank axis and name, for the sentence; empty when the record names none.
+        record: its index in the written array.
+        what: what is wrong with it, and what would be accepted.
+    """
+
+    def __init__(self, errno_: int, axis: str, record: int, what: str) -> None:
+        super().__init__(errno_, f"write{' axis ' + axis if axis else ''}, record {record}: {what}")
+        self._parts = (axis, record, what)
+
+    def later(self, records: int) -> "RecordError":
+        """Return the same of a record so many further on: the array was looked at in pieces."""
+        axis, record, what = self._parts
+        return RecordError(self.errno, axis, record + records, what)
+
+
 class MarkerPort(Protocol):
     """The marker table as the motion core needs it; the kit binds it to shared memory."""
 
