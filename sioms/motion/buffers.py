@@ -11,6 +11,20 @@ from numpy.typing import NDArray
 
 from .commands import Command
 
+Chunk = tuple[int, NDArray[Any]]
+"""Commands of one axis (COMMAND_DTYPE), in order."""
+
+
+def cut(commands: NDArray[Any]) -> list[Chunk]:
+    """Cut validated commands (COMMAND_DTYPE) by axis; the order within an axis is kept."""
+    axis = commands["axis"]
+    if len(commands) > 1 and (axis[1:] < axis[:-1]).any():
+        order = np.argsort(axis, kind="stable")
+        commands, axis = commands[order], axis[order]
+    starts = np.flatnonzero(np.concatenate(([True], axis[1:] != axis[:-1]))).tolist()
+    ends = [*starts[1:], len(commands)]
+    return [(int(axis[i]), commands[i:j]) for i, j in zip(starts, ends, strict=True)]
+
 
 class CommandBuffers:
     """One first-in first-out buffer per axis. ``count`` (n,) is how many records each holds.
@@ -25,19 +39,11 @@ class CommandBuffers:
         self._chunks: list[deque[NDArray[Any] | tuple[Command]]] = [deque() for _ in range(n)]
         self._position = [0] * n
 
-    def append(self, commands: NDArray[Any]) -> NDArray[np.int64]:
-        """Append validated commands (COMMAND_DTYPE, order kept per axis); return the axes touched."""
-        axis = commands["axis"]
-        if len(commands) > 1 and (axis[1:] < axis[:-1]).any():
-            order = np.argsort(axis, kind="stable")
-            commands, axis = commands[order], axis[order]
-        first = np.flatnonzero(np.concatenate(([True], axis[1:] != axis[:-1])))
-        touched = axis[first].astype(np.int64)
-        bounds = [*first.tolist(), len(commands)]
-        for i, a in enumerate(touched.tolist()):
-            self._chunks[a].append(commands[bounds[i] : bounds[i + 1]])
-        self.count[touched] += np.diff(bounds)
-        return touched
+    def append(self, chunks: Sequence[Chunk]) -> None:
+        """Append validated commands, cut by axis."""
+        for axis, commands in chunks:
+            self._chunks[axis].append(commands)
+            self.count[axis] += len(commands)
 
     def append_commands(self, commands: Sequence[Command]) -> None:
         """Append a few commands that are Python objects already."""

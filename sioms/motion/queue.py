@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import AxisStatus
 
 from . import modes
-from .buffers import CommandBuffers
-from .commands import COMMAND_DTYPE, WIRE_DTYPE, Command, Limits, Validator
+from .buffers import Chunk, CommandBuffers, cut
+from .commands import WIRE_DTYPE, Command, Limits, Validator
 from .feasibility import Feasibility, Tail
 from .plain import MOST, PlainCheck
 from .types import AxisSettings, CommandError, Event, EventKind, MarkerPort, RecordError
@@ -37,15 +37,16 @@ class Judged:
     """A written array that was found good, and on what that rests.
 
     Attributes:
-        commands: the array as commands.
-        axes: the axes it touches, ascending.
+        chunks: the array as commands, cut by axis, in order.
+        axes, counts: the axes it touches, ascending, and how many commands each gets.
         replace: whether the buffers of these axes are to be emptied first.
         begin, end: what is known of these axes' buffers before and after it.
         limits_set: how often limits had been changed.
     """
 
-    commands: NDArray[Any]
+    chunks: list[Chunk]
     axes: NDArray[np.int64]
+    counts: NDArray[np.int64]
     replace: bool
     begin: Tail
     end: Tail
@@ -113,12 +114,14 @@ class CommandQueue:
         if records.dtype != WIRE_DTYPE:
             raise CommandError(errno.EINVAL, "write: the records are no axis write records; table F.3")
         placed = self._validator.place(records, np.asarray(axes, dtype=np.int64))
-        touched = np.unique(placed)
-        self._check_state(placed, replace)
+        counts = np.bincount(placed, minlength=self.n)
+        touched = np.flatnonzero(counts)
+        counts = counts[touched]
+        self._check_state(touched, counts, replace)
         begin, limits_set = self._known(touched, at_rest, replace), self._limits_set
         tail = Tail(np.full((self.n, 3), np.nan), np.zeros(self.n), np.zeros(self.n))
         tail.set_rows(touched, begin)
-        pieces = [np.zeros(0, dtype=COMMAND_DTYPE)]
+        chunks: list[Chunk] = []
         for first in range(0, len(records), PIECE):
             piece = slice(first, first + PIECE)
             try:
@@ -126,10 +129,10 @@ class CommandQueue:
                 yield from self._feasibility.check(commands, tail)
             except RecordError as error:
                 raise error.later(first) from None
-            pieces.append(commands)
+            chunks += cut(commands)
             if first + PIECE < len(records):
                 yield
-        return Judged(np.concatenate(pieces), touched, replace, begin, tail.rows(touched), limits_set)
+        return Judged(chunks, touched, counts, replace, begin, tail.rows(touched), limits_set)
 
     def still_holds(self, judged: Judged, at_rest: NDArray[np.float64]) -> bool:
         """Tell whether what a judgement rests on has not changed since; else it must be judged again.
@@ -137,22 +140,22 @@ class CommandQueue:
         Raises:
             CommandError: the axes take no commands any more, or have no room.
         """
-        self._check_state(judged.commands["axis"], judged.replace)
+        self._check_state(judged.axes, judged.counts, judged.replace)
         known = self._known(judged.axes, at_rest, judged.replace)
         return judged.limits_set == self._limits_set and judged.begin.equals(known)
 
-    def _check_state(self, placed: NDArray[np.int64], replace: bool) -> None:
-        """Raise when an axis written to takes no commands now, or has no room for these."""
-        touched = np.bincount(placed, minlength=self.n)
-        self._check_latches(np.flatnonzero(touched))
-        full = touched > (self.capacity if replace else self.room_of_all())
+    def _check_state(self, axes: NDArray[np.int64], counts: NDArray[np.int64], replace: bool) -> None:
+        """Raise when an axis written to takes no commands now, or has no room for so many."""
+        self._check_latches(axes)
+        room = np.full(len(axes), self.capacity) if replace else self.room_of_all()[axes]
+        full = counts > room
         if full.any():
-            axis = int(full.argmax())
-            room = self.capacity if replace else int(self.room_of_all()[axis])
+            i = int(full.argmax())
+            axis, count = int(axes[i]), int(counts[i])
             raise CommandError(
-                errno.EAGAIN if touched[axis] <= self.capacity else errno.EINVAL,
-                f"write axis {axis} ({self.settings[axis].name}): {touched[axis]} commands do not fit; "
-                f"room for {room} of {self.capacity}",
+                errno.EAGAIN if count <= self.capacity else errno.EINVAL,
+                f"write axis {axis} ({self.settings[axis].name}): {count} commands do not fit; "
+                f"room for {room[i]} of {self.capacity}",
             )
 
     def _known(self, axes: NDArray[np.int64], at_rest: NDArray[np.float64], replace: bool) -> Tail:
@@ -234,7 +237,7 @@ class CommandQueue:
 
     def append(self, judged: Judged) -> NDArray[np.int64]:
         """Take what still holds; return the axes touched, each of which now has a head."""
-        self._buffers.append(judged.commands)
+        self._buffers.append(judged.chunks)
         self.tail.set_rows(judged.axes, judged.end)
         self.load_heads(judged.axes)
         return judged.axes
