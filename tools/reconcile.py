@@ -91,7 +91,7 @@ def reconcile_axis(data: Path, model: Path | None, columns: Path | None = None, 
 
 def write(verdict: Verdict, seconds: float, out: Path) -> None:
     """Write report.html, verdict.json, model.toml and, where one is proposed, the experiment; print the summary."""
-    from sioms.tools.reconcile_input import write_model
+    from sioms.reconcile.model_file import write_model
     from sioms.tools.reconcile_report import as_json, page, summary
 
     out.mkdir(parents=True, exist_ok=True)

@@ -28,10 +28,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.reconcile.effects import known
+from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.model import AxisModel, Controller
+from sioms.reconcile.model_file import only, parse_model
 from sioms.reconcile.records import Record, Session
-from sioms.reconcile.verdict import BadInputError
 
 Array = NDArray[np.float64]
 UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "rad": 1.0, "deg": np.pi / 180.0, "turn": 2.0 * np.pi, "s": 1.0, "ms": 1e-3,
@@ -63,7 +63,7 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
             table = tomllib.load(f)
         except tomllib.TOMLDecodeError as e:
             raise BadInputError(f"read {description}: {e}") from e
-    _only(table, ("sample_time_s", "files", "continuous", "columns"), str(description))
+    only(table, ("sample_time_s", "files", "continuous", "columns"), str(description))
     files = [folder / n for n in table["files"]] if "files" in table else _files(data)
     if not files:
         raise BadInputError(f"read {data}: no data files; expects one of {', '.join(SUFFIXES)}")
@@ -73,12 +73,6 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
 
 def _files(data: Path) -> list[Path]:
     return [data] if data.is_file() else sorted(p for p in data.iterdir() if p.suffix in SUFFIXES)
-
-
-def _only(table: Mapping[str, Any], allowed: tuple[str, ...], where: str) -> None:
-    odd = sorted(set(table) - set(allowed))
-    if odd:
-        raise BadInputError(f"read {where}: nobody reads {', '.join(odd)}; known are {', '.join(allowed)}")
 
 
 def _load(path: Path) -> dict[str, Array]:
@@ -109,10 +103,10 @@ def _load(path: Path) -> dict[str, Array]:
 
 def _record(path: Path, columns: Mapping[str, Any], model: AxisModel) -> Record:
     raw = _load(path)
-    _only(columns, QUANTITIES, "the column description")
+    only(columns, QUANTITIES, "the column description")
     found: dict[str, Array] = {}
     for quantity, spec in columns.items():
-        _only(spec, ("name", "unit", "scale", "offset"), f"column {quantity}")
+        only(spec, ("name", "unit", "scale", "offset"), f"column {quantity}")
         if spec.get("name") not in raw:
             raise BadInputError(f"read {path.name}: no column {spec.get('name')!r} for {quantity}; has {', '.join(sorted(raw))}")
         found[quantity] = _convert(quantity, raw[spec["name"]], spec, model)
@@ -158,14 +152,13 @@ def read_model(path: Path) -> AxisModel:
     """
     if not path.exists():
         raise BadInputError(f"read model {path}: no such file")
+    if path.suffix != ".json":
+        return parse_model(path.read_text(), str(path))
     try:
-        if path.suffix == ".json":
-            return _layout_model(json.loads(path.read_text()))
-        with path.open("rb") as f:
-            return model_from(tomllib.load(f))
+        return _layout_model(json.loads(path.read_text()))
     except (KeyError, TypeError) as e:
         raise BadInputError(f"read model {path}: missing or wrong key {e}") from e
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError, ValueError) as e:
+    except ValueError as e:
         raise BadInputError(f"read model {path}: {e}") from e
 
 
@@ -176,56 +169,6 @@ def _layout_model(n: Mapping[str, Any]) -> AxisModel:
         resolution=n["encoder_resolution"], pitch=n["index_pitch"], rated_force=n["inertia"] * n["max_acceleration"],
         max_speed=n["position_max_speed"], start_position=n.get("start_position", 0.0), name=n.get("scenario", "axis"),
         controller=Controller(c["k"], c["kz"], c["kp"], c["kb"], c["tau_o"], c["tau_m"], c["vel_filter_hz"]))
-
-
-AXIS_KEYS = ("name", "kind", "sample_time_s", "inertia", "viscous", "resolution", "pitch", "rated_force", "max_speed",
-             "start_position", "refine")
-CONTROLLER_KEYS = ("k", "kz", "kp", "kb", "offset", "limit", "velocity_filter_hz", "velocity_mean")
-
-
-def model_from(table: Mapping[str, Any]) -> AxisModel:
-    """Build a model from the tables [axis], [controller] and [effects.*]; effects with ``on = false`` are left out."""
-    _only(table, ("axis", "controller", "effects", "symbolic"), "model")
-    a = dict(table["axis"])
-    _only(a, AXIS_KEYS, "model, [axis]")
-    kind = a.pop("kind")
-    if kind not in ("rotary", "linear"):
-        raise ValueError(f"kind is {kind!r}; rotary or linear")
-    a["refine"] = tuple(a.get("refine", ()))
-    controller = None
-    if "controller" in table:
-        _only(table["controller"], CONTROLLER_KEYS, "model, [controller]")
-        controller = Controller(**table["controller"])
-    model = AxisModel(rotary=kind == "rotary", controller=controller, **a)
-    for name, given in table.get("effects", {}).items():
-        if name not in known():
-            raise ValueError(f"effect {name!r} is not known; known are {', '.join(sorted(known()))}")
-        if given.get("on", True):
-            model = model.with_effect(name, {k: float(v) for k, v in given.items() if k != "on"})
-    return model
-
-
-def write_model(model: AxisModel, comments: Mapping[str, str] | None = None) -> str:
-    """Write a model as TOML, every effect switchable by ``on``."""
-    lines = ["[axis]", f'name = "{model.name}"', f'kind = "{"rotary" if model.rotary else "linear"}"']
-    for key in AXIS_KEYS[2:-1]:
-        lines.append(f"{key} = {getattr(model, key)!r}")
-    lines.append(f"refine = {json.dumps(list(model.refine))}")
-    if model.controller is not None:
-        lines += ["", "[controller]"]
-        lines += [f"{key} = {_toml(getattr(model.controller, key))}" for key in CONTROLLER_KEYS]
-    for name, values in model.effects.items():
-        effect = known()[name]
-        lines += ["", f"# {effect.title}: {effect.equation}"]
-        lines += [f"# {comments[name]}"] if comments and name in comments else []
-        lines += [f"[effects.{name}]", "on = true"]
-        units = {p.symbol: f"{model.unit(p)}, {p.text}" for p in effect.parameters}
-        lines += [f"{k} = {float(v)!r}  # {units[k]}" for k, v in values.items()]
-    return "\n".join(lines) + "\n"
-
-
-def _toml(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else repr(value)
 
 
 def with_resolution(model: AxisModel, session: Session) -> AxisModel:

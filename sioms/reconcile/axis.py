@@ -27,7 +27,7 @@ from sioms.reconcile.noise import drive_noise, effective_samples, observer, sens
 from sioms.reconcile.records import Session
 from sioms.reconcile.refuse import bursts, smoother_share
 from sioms.reconcile.search import GAIN, Found, Searcher
-from sioms.reconcile.simulate import simulate
+from sioms.reconcile.simulate import replay
 from sioms.reconcile.verdict import Estimate, NamedEffect, Outcome, Trace, Verdict
 
 #: Share at the end of every record that takes no part in any choice.
@@ -288,7 +288,7 @@ def _traces(problem: Problem, nominal: AxisModel, model: AxisModel) -> tuple[Tra
             if m.controller is None or r.command is None:
                 curves.append(r.force + tracked[j][i].innovation * unit)
                 continue
-            run = simulate(m, r.command, heat[j])
+            run = replay(m, r, heat[j])
             heat[j] = run.end_temperature
             curves.append(run.force)
         time = np.arange(len(r), dtype=np.float64) * nominal.sample_time_s

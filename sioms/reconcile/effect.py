@@ -17,8 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.reconcile.jit import plain
-
 #: Width of a parameter row handed to a state function; the last place holds 2 pi / pitch.
 ROW = 8
 TURN = ROW - 1
@@ -165,5 +163,5 @@ class Effect:
         """
         if self.function is None:
             raise TypeError(f"evaluate effect {self.name}: slot {self.slot.value} is no function of the state")
-        out = plain(self.function)(x, v, u, temperature, p)
+        out = self.function(x, v, u, temperature, p)
         return np.broadcast_to(np.asarray(out, dtype=np.float64), np.shape(x)).copy()

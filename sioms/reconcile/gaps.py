@@ -15,7 +15,7 @@ from sioms.reconcile.fit import Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import Noise, response, rigid
 from sioms.reconcile.records import Record
-from sioms.reconcile.simulate import simulate
+from sioms.reconcile.simulate import replay
 from sioms.reconcile.verdict import Gap
 
 #: A lap repeats the command to this share of its range.
@@ -94,7 +94,7 @@ def closed_errors(problem: Problem, model: AxisModel) -> tuple[float, float]:
     """Root mean square error of the simulated closed loop in force and position."""
     force, place, temperature = [], [], 0.0
     for r in problem.session.records:
-        run = simulate(model, r.command if r.command is not None else r.position, temperature)
+        run = replay(model, r, temperature)
         temperature = run.end_temperature if problem.session.continuous else 0.0
         force.append(np.nan_to_num(run.force - r.force, nan=1e9))
         place.append(np.nan_to_num(run.position - r.position, nan=1e9))

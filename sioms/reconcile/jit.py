@@ -1,12 +1,15 @@
 """Compile the scalar kernels with numba where it is installed, else run them as they are.
 
-The plain path gives the same numbers some sixty times slower (docs/reconcile.md, "Time").
+numba is loaded when the first kernel is compiled, not before: a simulated device that only evaluates effects
+never pays for it. The plain path gives the same numbers some sixty times slower (docs/reconcile.md, "Time").
 """
 
 from __future__ import annotations
 
+import inspect
 import os
 from collections.abc import Callable
+from functools import cache
 from importlib import import_module
 from typing import Any, TypeVar
 
@@ -14,49 +17,47 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 #: Signature of every state function of an effect: (x, v, u, temperature, parameters) -> value.
 STATE_SIGNATURE = "float64(float64, float64, float64, float64, float64[::1])"
+STATE_ARGUMENTS = 5
 
-numba: Any = None
-TypedList: Any = list
-try:
-    if os.environ.get("SIOMS_PLAIN") is None:  # set it to run without compiling
-        numba = import_module("numba")
-        TypedList = import_module("numba.typed").List
-except ImportError:
-    pass
 
-COMPILED = numba is not None
+@cache
+def numba() -> Any:
+    """Return the module numba, None where it is not installed or SIOMS_PLAIN is set."""
+    if os.environ.get("SIOMS_PLAIN") is not None:
+        return None
+    try:
+        return import_module("numba")
+    except ImportError:
+        return None
+
+
+def typed_list() -> Any:
+    """Return the list type that compiled code takes."""
+    return list if numba() is None else import_module("numba.typed").List
 
 
 def kernel(function: F) -> F:
     """Compile a loop over samples (cached on disk)."""
-    if numba is None:
+    if numba() is None:
         return function
-    compiled: F = numba.njit(cache=True)(function)
-    return compiled
+    done: F = numba().njit(cache=True)(function)
+    return done
 
 
-def state_function(function: F, *, cache: bool = True) -> F:
-    """Compile one state function with the common signature, so that all of them have one type."""
-    if numba is None:
-        return function
-    compiled: F = numba.njit(STATE_SIGNATURE, cache=cache)(function)
-    return compiled
+def state_function(function: F) -> F:
+    """Mark a state function of an effect.
+
+    Raises:
+        TypeError: it does not take (x, v, u, temperature, p).
+    """
+    taken = len(inspect.signature(function).parameters)
+    if taken != STATE_ARGUMENTS:
+        raise TypeError(f"define state function {function.__name__}: it takes {taken} arguments; "
+                        "needs (x, v, u, temperature, p)")
+    return function
 
 
-@kernel
-def _listed(functions: Any) -> Any:
-    out = TypedList()
-    for f in functions:
-        out.append(f)
-    return out
-
-
-def function_list(functions: tuple[Any, ...]) -> Any:
-    """Return state functions in the container that a compiled kernel takes at no cost per call."""
-    return functions if numba is None else _listed(functions)
-
-
-def plain(function: F) -> F:
-    """Return the uncompiled form, which takes arrays of axes elementwise (a simulated plant uses it)."""
-    uncompiled: F = getattr(function, "py_func", function)
-    return uncompiled
+@cache
+def compiled(function: Callable[..., Any]) -> Any:
+    """Return the compiled form of a state function; all of them have one type."""
+    return function if numba() is None else numba().njit(STATE_SIGNATURE, cache=True)(function)

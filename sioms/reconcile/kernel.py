@@ -17,7 +17,9 @@ from typing import Any
 import numpy as np
 
 from sioms.reconcile.effect import Array
-from sioms.reconcile.jit import kernel
+from sioms.reconcile.jit import kernel, typed_list
+
+TypedList = typed_list()
 
 # Places in the plant row.
 (
@@ -31,6 +33,15 @@ OUT_Y, OUT_FORCE, OUT_INNOVATION, OUT_X, OUT_V, OUT_APPLIED, OUT_T, OUT_SIZE = r
 TINY_SPEED = 1e-12
 #: A hot drive keeps at least this share of its force constant; keeps a wild trial value harmless.
 LEAST_GAIN = 0.05
+
+
+@kernel
+def listed(functions: Any) -> Any:
+    """Put state functions into the container that a compiled kernel takes at no cost per call."""
+    out = TypedList()
+    for f in functions:
+        out.append(f)
+    return out
 
 
 @kernel
@@ -110,7 +121,7 @@ def march(closed: bool, command: Array, measured: Array, force_in: Array, ctl: A
 
     Args:
         command, measured, force_in: shape (n,); ``command`` is read when closed, the others when tracking.
-        start: x [.], v, temperature at the first sample.
+        start: x, v, temperature, and error and force of the controller at the sample before the first.
         out: shape (n, OUT_SIZE), filled.
     """
     # Local tuples: picking a function out of a list costs ten times as much, handing tuples in a millisecond.
@@ -128,7 +139,7 @@ def march(closed: bool, command: Array, measured: Array, force_in: Array, ctl: A
     xl, vl = x, v
     lagged = 0.0
     hyst = 0.0
-    e_old, u_old, y_old, y_older, v_f = 0.0, 0.0, 0.0, 0.0, 0.0
+    e_old, u_old, y_old, y_older, v_f = start[3], start[4], 0.0, 0.0, 0.0
     u_all = np.zeros(n)
     for i in range(n):
         y = plant[GAIN_Y] * x + plant[ECC_AMP] * np.sin(plant[TURN_X] * x + plant[ECC_PHASE])

@@ -20,7 +20,7 @@ from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import response
-from sioms.reconcile.simulate import simulate
+from sioms.reconcile.simulate import replay
 
 #: Trial values, as multiples of a parameter's scale, of effects that are not forces of the state.
 GRID_DELAY = (0.5e-3, 2e-3, 5e-3)
@@ -170,12 +170,12 @@ def instrument_motion(problem: Problem, model: AxisModel) -> list[Motion]:
 
     Falls back to the smoothed measurement where there is no controller or command to simulate.
     """
-    commands = [r.command for r in problem.session.records]
-    if model.controller is None or any(c is None for c in commands):
+    records = problem.session.records
+    if model.controller is None or any(r.command is None for r in records):
         return smoothed_motion(problem, model)
     out, temperature = [], 0.0
-    for c in commands:
-        run = simulate(model, c if c is not None else np.empty(0), temperature)
+    for r in records:
+        run = replay(model, r, temperature)
         temperature = run.end_temperature if problem.session.continuous else 0.0
         out.append(Motion(run.x, run.v, np.gradient(run.v, model.sample_time_s), run.applied, run.temperature))
     return out

@@ -15,8 +15,9 @@ import numpy as np
 from sioms.reconcile import kernel as k
 from sioms.reconcile.effect import ROW, Array, Number, Slot
 from sioms.reconcile.effects import known
-from sioms.reconcile.jit import function_list, state_function
+from sioms.reconcile.jit import compiled, numba, state_function
 from sioms.reconcile.model import AxisModel, controller_row
+from sioms.reconcile.records import Record
 
 #: Places for effects of one kind; the kernel unpacks as many.
 SLOTS = 6
@@ -105,7 +106,8 @@ def pack(model: AxisModel, substeps: int = 0) -> Packed:
 @lru_cache(maxsize=1024)
 def _container(functions: tuple[Any, ...]) -> Any:
     """Keep one container per set of functions."""
-    return function_list(functions)
+    ready = tuple(compiled(f) for f in functions)
+    return ready if numba() is None else k.listed(ready)
 
 
 def _steps(transmission: tuple[Slot, Array] | None) -> int:
@@ -173,8 +175,25 @@ def simulate(model: AxisModel, command: Array, temperature: float = 0.0, substep
         The run; ``position`` lies on the count lattice.
     """
     command = np.ascontiguousarray(command, dtype=np.float64)
-    start = np.array([model.start_position, 0.0, temperature])
+    start = np.array([model.start_position, 0.0, temperature, 0.0, 0.0])
     return _march(pack(model, substeps), True, command, command, command, controller_row(model), (0.0, 0.0), start)
+
+
+def replay(model: AxisModel, record: Record, temperature: float = 0.0) -> Run:
+    """Simulate the closed loop over a record: its command, from rest where it began, under the force that held it.
+
+    Raises:
+        ValueError: the record has no command, or the model no controller.
+    """
+    if record.command is None:
+        raise ValueError(f"simulate record {record.name}: it has no command; a closed loop needs one")
+    command = np.ascontiguousarray(record.command, dtype=np.float64)
+    p = pack(model)
+    y = record.position[0]
+    turned = y / p.plant[k.GAIN_Y] * p.plant[k.TURN_X] + p.plant[k.ECC_PHASE]
+    x = (y - p.plant[k.ECC_AMP] * np.sin(turned)) / p.plant[k.GAIN_Y]
+    start = np.array([x, 0.0, temperature, command[0] - y, record.force[0]])
+    return _march(p, True, command, command, command, controller_row(model), (0.0, 0.0), start)
 
 
 def track(model: AxisModel, position: Array, force: Array, gain: tuple[float, float],
@@ -192,5 +211,5 @@ def track(model: AxisModel, position: Array, force: Array, gain: tuple[float, fl
     y = np.ascontiguousarray(position, dtype=np.float64)
     u = np.ascontiguousarray(force, dtype=np.float64)
     p = packed or pack(model)
-    start = np.array([y[0] / p.plant[k.GAIN_Y], 0.0, temperature])
+    start = np.array([y[0] / p.plant[k.GAIN_Y], 0.0, temperature, 0.0, 0.0])
     return _march(p, False, y, y, u, np.zeros(k.CTL_SIZE), gain, start)

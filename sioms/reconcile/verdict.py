@@ -7,11 +7,16 @@ from enum import Enum
 
 from sioms.reconcile.channels import Finding
 from sioms.reconcile.effect import Array
+from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.excitation import Gate
 from sioms.reconcile.experiment import Experiment
 from sioms.reconcile.locate import Place, Spectrum
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.search import Step
+
+__all__ = [
+    "EXIT", "EXIT_BAD_INPUT", "BadInputError", "Estimate", "Gap", "NamedEffect", "Outcome", "Trace", "Verdict",
+]  # fmt: skip
 
 
 class Outcome(Enum):
@@ -26,10 +31,6 @@ class Outcome(Enum):
 #: Exit status per verdict.
 EXIT = {Outcome.NONE: 0, Outcome.NAMED: 0, Outcome.UNEXPLAINED: 3, Outcome.AMBIGUOUS: 4}
 EXIT_BAD_INPUT = 2
-
-
-class BadInputError(ValueError):
-    """The data or the model cannot be used; the message says what is wrong and what would be right."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -166,11 +166,11 @@ def test_the_experiment_that_separates_is_the_one_that_excites() -> None:
 
 
 def test_the_plain_path_gives_the_same_numbers() -> None:
-    code = ("import numpy as np; from sioms.reconcile.jit import COMPILED; from sioms.reconcile.model import *; "
+    code = ("import numpy as np; from sioms.reconcile.jit import numba; from sioms.reconcile.model import *; "
             "from sioms.reconcile.simulate import simulate; "
             "m = AxisModel(True, 1e-3, 2e-3, 1e-3, 2e-4, 6.28, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)); "
             "m = m.with_effect('stribeck', {'Fc': 0.05, 'Fs': 0.1, 'vs': 0.3}).with_effect('offset', {'off': 0.01}); "
-            "r = simulate(m, np.sin(np.arange(300) * 0.01)); print(COMPILED, repr(float(r.force.sum())), repr(float(r.position[-1])))")
+            "r = simulate(m, np.sin(np.arange(300) * 0.01)); print(numba() is not None, repr(float(r.force.sum())), repr(float(r.position[-1])))")
     out = [subprocess.run([sys.executable, "-W", "ignore", "-c", code], env={**os.environ, **extra}, capture_output=True, text=True,
                           check=True).stdout.split() for extra in ({}, {"SIOMS_PLAIN": "1"})]
     assert [o[0] for o in out] == ["True", "False"]
