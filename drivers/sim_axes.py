@@ -16,12 +16,17 @@ the axes a tick earlier than those of another process.
     [[device.mod0.beam]]
     name = "beam0"
     boxes = [{ xaxis = [0.10, 0.14] }]
+
+An axis with a ``model_file`` (as ``sioms reconcile`` writes it) is the twin of the axis that the model was found
+for: mass, friction, encoder and all effects come from the file, stops and switches from ``motor``. The name and a
+check sum of the model show in the plant's description, so that a reload takes up a changed file.
 """
 
 from __future__ import annotations
 
 import errno
 import time
+import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Any
@@ -34,6 +39,7 @@ from numpy.typing import NDArray
 from sioms.motion import SWITCH_HOME, SWITCH_MINUS, SWITCH_PLUS, AxisBank, AxisKind, AxisSettings
 from sioms.plant.binary import Beam, Box, port_values
 from sioms.plant.effects import Effect, build_effects, parse_effects
+from sioms.plant.foreign import Laws
 from sioms.plant.motor import MotorBank
 from sioms.plant.parameters import Motor
 from sioms.plant.stepper import Stepper, StepperBank
@@ -67,9 +73,10 @@ AxisTable: Any = table_type(
         "count": (Annotated[int, Meta(ge=1, le=10_000)], 1),
         "motor": (table_type(Motor) | None, None),
         "stepper": (table_type(Stepper) | None, None),
+        "model_file": (str, ""),
     },
 )
-"""Keys of an axis: those of AxisSettings, and ``motor`` or ``stepper``.
+"""Keys of an axis: those of AxisSettings, ``motor`` or ``stepper``, and the ``model_file`` of a twin.
 
 ``bandwidth_hz`` sets the gains of a servo that gives none; ``count`` above 1 makes so many of it, with
 the numbers from 0 behind their name.
@@ -251,8 +258,10 @@ def _build(settings: SimAxesSettings) -> tuple[MotorBank | None, StepperBank | N
     for axis in axes:
         if (axis.motor is None) == (axis.stepper is None):
             raise ValueError(f"axis {axis.name}: has neither or both of motor and stepper; want one of them")
-    effects = _effects(settings, [axis.name for axis in servos])
-    motors = MotorBank([from_table(Motor, a.motor) for a in servos], tick_s, effects) if servos else None
+    names = [axis.name for axis in servos]
+    plants, effects, laws = _twins(servos, [from_table(Motor, a.motor) for a in servos], tick_s)
+    effects += _effects(settings, names)
+    motors = MotorBank(plants, tick_s, effects, laws=laws) if servos else None
     rotors = StepperBank([from_table(Stepper, a.stepper) for a in steppers], tick_s) if steppers else None
     return motors, rotors, [_axis_settings(axis, tick_s) for axis in axes]
 
@@ -284,13 +293,47 @@ def _effects(settings: SimAxesSettings, servos: Sequence[str]) -> tuple[Effect, 
     effects = build_effects(settings.effects, servos, "effects")
     if not settings.effects_file:
         return effects
+    return effects + parse_effects(
+        _text("effects_file", settings.effects_file), servos, settings.effects_file
+    )
+
+
+def _text(key: str, path: str) -> str:
+    """Return the content of a file that the configuration names."""
     try:
-        with open(settings.effects_file, encoding="utf-8") as file:
-            text = file.read()
+        with open(path, encoding="utf-8") as file:
+            return file.read()
     except OSError as error:
         reason = error.strerror or errno.errorcode.get(error.errno or 0, "?")
-        raise ValueError(f"effects_file {settings.effects_file}: {reason}; want a TOML file") from error
-    return effects + parse_effects(text, servos, settings.effects_file)
+        raise ValueError(f"{key} {path}: {reason}; want a TOML file") from error
+
+
+def _twins(
+    servos: Sequence[Any], motors: Sequence[Motor], tick_s: float
+) -> tuple[Sequence[Motor], tuple[Effect, ...], Laws]:
+    """Let the axes with a model file be what it says."""
+    files = {i: axis.model_file for i, axis in enumerate(servos) if axis.model_file}
+    if not files:
+        return motors, (), Laws()
+    # The library of effects is loaded only by who has a twin.
+    from sioms.reconcile.model_file import parse_model
+    from sioms.reconcile.twin import twins
+
+    models = {i: parse_model(_text("model_file", path), path) for i, path in files.items()}
+    for i, model in models.items():
+        if model.rotary != (servos[i].unit == "rad"):
+            kind = "rotary" if model.rotary else "linear"
+            raise ValueError(
+                f"model_file {files[i]}: of a {kind} axis; {servos[i].name} is in {servos[i].unit}"
+            )
+    return twins(models, motors, [axis.name for axis in servos], tick_s)
+
+
+def _model_sum(axis: Any) -> str:
+    """Say which model an axis is the twin of."""
+    if not axis.model_file:
+        return ""
+    return f", model {zlib.crc32(_text('model_file', axis.model_file).encode()):08x}"
 
 
 def _axis_settings(axis: Any, tick_s: float) -> AxisSettings:
@@ -336,7 +379,11 @@ def _plant_channels(axes: Sequence[Any]) -> list[ChannelInfo]:
         channel
         for axis in axes
         for channel in (
-            ChannelInfo(f"{axis.name}_position", axis.unit, description="true position of the load"),
+            ChannelInfo(
+                f"{axis.name}_position",
+                axis.unit,
+                description=f"true position of the load{_model_sum(axis)}",
+            ),
             ChannelInfo(
                 f"{axis.name}_contact", force_unit.get(axis.unit, "N"), description="force on the wall"
             ),

@@ -16,6 +16,7 @@ from .drive import build_drive
 from .effects import Effect, Place
 from .encoder import Encoder
 from .forces import FORCES, RESISTANCES, Motion, middle_velocity
+from .foreign import Laws
 from .friction import FrictionStep
 from .parameters import Motor, Supply, build_walls, check_motors, choose_substeps, column, mechanics
 from .transmission import Transmission
@@ -31,6 +32,7 @@ class MotorBank:
         tick_s: duration of a tick [s].
         effects: what they have beyond these parameters.
         substeps: substeps of a tick where any are needed; raised where stiffness demands it.
+        laws: of motion, from elsewhere.
 
     Raises:
         ValueError: a parameter out of its range, or a stiffness that cannot be followed.
@@ -45,10 +47,15 @@ class MotorBank:
     """
 
     def __init__(
-        self, motors: Sequence[Motor], tick_s: float, effects: Sequence[Effect] = (), substeps: int = 4
+        self,
+        motors: Sequence[Motor],
+        tick_s: float,
+        effects: Sequence[Effect] = (),
+        substeps: int = 4,
+        laws: Laws = Laws(),  # noqa: B008 (frozen)
     ) -> None:
         check_motors(motors, tick_s)
-        self._tick_s = tick_s
+        self._tick_s, self._laws = tick_s, laws
         self._by_place = {place: tuple(e for e in effects if e.place is place) for place in Place}
         self._build_state(motors)
         body = mechanics(motors, self._by_place[Place.PARAMETER])
@@ -107,18 +114,20 @@ class MotorBank:
         """Return 1 where the exact step covers everything, else what the fastest motion needs."""
         places = (Place.MOTOR, Place.LOAD, Place.RESISTANCE, Place.TRANSMISSION)
         effects = [effect for place in places for effect in self._by_place[place]]
-        self._nonlinear = bool(effects)
+        self._nonlinear = bool(effects or self._laws.motor or self._laws.resistance)
         self._bounded = self._walls is not None or self._supply.limits
         if not self._nonlinear and not self._bounded:
             return 1
         return choose_substeps(wanted, tick_s, mass, self._supply, self._walls, self._transmission, effects)
 
     def _build_forces(self, tick_s: float) -> None:
-        self._drive = build_drive(self._by_place[Place.DRIVE], tick_s)
+        self._drive = [*build_drive(self._by_place[Place.DRIVE], tick_s), *self._laws.drive]
         h = self._substep_s
         self._motor_forces = [FORCES[e.name](e, h) for e in self._by_place[Place.MOTOR]]
+        self._motor_forces += self._laws.motor
         self._load_forces = [FORCES[e.name](e, h) for e in self._by_place[Place.LOAD]]
         self._resistances = [RESISTANCES[e.name](e, h) for e in self._by_place[Place.RESISTANCE]]
+        self._resistances += self._laws.resistance
         rigid, n = self._transmission is None, self.position.size
         middle, rate = np.zeros(n), np.zeros(n)
         self._motion = Motion(

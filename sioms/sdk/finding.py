@@ -96,12 +96,7 @@ def read_settings(driver: type[Driver], table: Mapping[str, Any], folder: str) -
         The settings (None with errors) and the errors, each beginning with ``.key`` or ``: ``.
     """
     kind = driver.Settings
-    table = {
-        key: os.path.join(folder, value)
-        if key.endswith("_file") and isinstance(value, str) and value
-        else value
-        for key, value in table.items()
-    }
+    table = dict(_anchored(table, folder))
     known = field_names(kind)
     errors = []
     # One error at a time is what the validator gives; unknown keys are collected beside it.
@@ -114,6 +109,15 @@ def read_settings(driver: type[Driver], table: Mapping[str, Any], folder: str) -
     except msgspec.ValidationError as error:
         errors.append(explain("", error, known))
         return None, errors
+
+
+def _anchored(value: Any, folder: str, key: str = "") -> Any:
+    """Take the relative paths of keys ``..._file`` from a folder, in nested tables too."""
+    if isinstance(value, Mapping):
+        return {k: _anchored(v, folder, k) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_anchored(v, folder) for v in value]
+    return os.path.join(folder, value) if key.endswith("_file") and isinstance(value, str) and value else value
 
 
 def describe(driver: type[Driver], name: str, settings: Any) -> tuple[list[object] | None, list[str]]:

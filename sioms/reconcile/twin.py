@@ -1,0 +1,161 @@
+"""The simulated twin of an axis: a model with its effects, as a plant that a simulated device steps.
+
+The equations are those of the library, evaluated on arrays of axes; nothing is written twice. Effects with a state
+function act as they stand, a user's own among them; those that are a slot of the time step (delay, two masses,
+sensor errors) become the plant's effect of the same meaning. The plant has its own integration and its own servo,
+so a twin that agrees with a recording says more than the simulation that was fitted to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sioms.plant.effects import Effect as PlantEffect
+from sioms.plant.effects import build_effects
+from sioms.plant.forces import Motion
+from sioms.plant.foreign import Laws
+from sioms.plant.parameters import Motor
+from sioms.reconcile.effect import Array, Effect, Slot
+from sioms.reconcile.effects import known
+from sioms.reconcile.model import AxisModel
+
+#: A hot drive keeps at least this share of its force constant, as in the time step of the workflow.
+LEAST_GAIN = 0.05
+
+
+class Heat:
+    """Heat state of each axis and what it takes from the force: gain 1 - loss T, T' = ((u/rated)^2 - T)/tau.
+
+    Axes without the effect stay cold. ``before`` is the force of the drive as commanded, which effects may depend on.
+    """
+
+    def __init__(self, loss: Array, tau_s: Array, rated_force: Array, tick_s: float) -> None:
+        self._loss, self._rated = loss, rated_force
+        self._keep = np.exp(-tick_s / tau_s)
+        self.temperature, self.before = np.zeros((2, loss.size))
+
+    def apply(self, force: Array) -> None:
+        """Warm up by this tick's force, then weaken it."""
+        np.copyto(self.before, force)
+        heat = (force / self._rated) ** 2
+        self.temperature = np.where(self._loss > 0.0, heat + (self.temperature - heat) * self._keep, 0.0)
+        force *= np.maximum(1.0 - self._loss * self.temperature, LEAST_GAIN)
+
+
+class Acting:
+    """One effect of the library on those axes of a bank whose models have it.
+
+    Args:
+        axes: which, shape (k,).
+        rows: their parameters as a state function reads them, shape (ROW, k).
+    """
+
+    def __init__(self, effect: Effect, axes: Sequence[int], rows: Sequence[Array], heat: Heat) -> None:
+        self._effect, self._heat = effect, heat
+        self._axes = np.array(axes)
+        self._rows = np.stack(rows, axis=1)
+
+    def add(self, motion: Motion, total: Array) -> None:
+        """Add the force, or the level of friction, or what the gain adds to the force of the drive."""
+        at, heat = self._axes, self._heat
+        state = motion.position[at], motion.velocity[at], heat.before[at], heat.temperature[at]
+        value = self._effect.evaluate(*state, self._rows)
+        match self._effect.slot:
+            case Slot.GAIN:
+                value = motion.drive[at] * (value - 1.0)
+            case Slot.FRICTION:
+                value = np.maximum(value, 0.0)
+            case _:
+                pass
+        total[at] += value
+
+
+def twins(
+    models: Mapping[int, AxisModel], motors: Sequence[Motor], names: Sequence[str], tick_s: float
+) -> tuple[list[Motor], tuple[PlantEffect, ...], Laws]:
+    """Turn the models of some axes of a bank into what the plant is built of.
+
+    Args:
+        models: by the number of the motor in the bank.
+        motors: as configured; stops, switches, wall, start and the limit of the drive stay theirs.
+        names: of the axes, for messages.
+
+    Returns:
+        The motors, the plant's effects, and the laws from the library.
+
+    Raises:
+        ValueError: an effect that no plant can carry out, or a number out of the plant's range.
+    """
+    made = [_motor(models[i], m) if i in models else m for i, m in enumerate(motors)]
+    table: dict[str, dict[str, object]] = {}
+    acting: dict[str, list[tuple[int, Array]]] = {}
+    for i, model in models.items():
+        for name, values in model.effects.items():
+            effect = known()[name]
+            if effect.function is not None:
+                acting.setdefault(name, []).append((i, effect.row(effect.values(values), model.pitch)))
+            elif effect.slot is not Slot.THERMAL:
+                table.setdefault(names[i], {}).update(_slot(effect, values, model))
+    heat = _heat(models, len(motors), tick_s)
+    forces = {n: Acting(known()[n], [i for i, _ in a], [r for _, r in a], heat) for n, a in acting.items()}
+    levels = tuple(f for n, f in forces.items() if known()[n].slot is Slot.FRICTION)
+    others = tuple(f for n, f in forces.items() if known()[n].slot is not Slot.FRICTION)
+    return made, build_effects(table, names, "the model"), Laws((heat,), others, levels)
+
+
+def _motor(model: AxisModel, motor: Motor) -> Motor:
+    """Give a motor the body of the model; its friction is the model's effects and nothing else."""
+    return replace(
+        motor,
+        mass=model.inertia,
+        viscous=model.viscous,
+        coulomb=0.0,
+        stiction=None,
+        load_force=0.0,
+        encoder_step=model.resolution,
+        index_pitch=model.pitch,
+    )
+
+
+def _heat(models: Mapping[int, AxisModel], count: int, tick_s: float) -> Heat:
+    loss, tau, rated = np.zeros(count), np.ones(count), np.ones(count)
+    for i, model in models.items():
+        for name, values in model.effects.items():
+            if known()[name].slot is Slot.THERMAL:
+                loss[i], tau[i] = known()[name].values(values)
+        rated[i] = model.rated_force
+    return Heat(loss, tau, rated, tick_s)
+
+
+def _slot(effect: Effect, values: Mapping[str, float], model: AxisModel) -> dict[str, dict[str, float]]:
+    """Say an effect that fills a slot of the time step in the words of the plant."""
+    p = effect.values(values)
+    match effect.slot:
+        case Slot.INERTIA:
+            return {"payload": {"mass": p[0]}}
+        case Slot.DELAY:
+            return {"delay": {"delay_s": p[0]}}
+        case Slot.LAG:
+            return {"lag": {"tau_s": p[0]}}
+        case Slot.LIMIT:
+            return {"saturation": {"limit": p[0]}}
+        case Slot.HYSTERESIS:
+            return {"presliding": {"level": p[0], "stiffness": p[0] / p[1]}}
+        case Slot.ELASTIC:
+            return {"elastic": {"frequency_hz": p[0], "load_fraction": p[1], "damping": p[2]}}
+        case Slot.BACKLASH:
+            return {"backlash": {"gap": p[0], "load_fraction": p[1], "frequency_hz": p[2], "damping": p[3]}}
+        case Slot.SCALE:
+            return {"encoder_scale": {"gain": p[0]}}
+        case Slot.ECCENTRICITY:
+            return {"encoder_eccentricity": {"amplitude": p[0], "pitch": model.pitch, "phase": p[1]}}
+        case Slot.LATTICE:
+            return {"encoder_quantisation": {"factor": p[0]}}
+        case _:
+            raise ValueError(
+                f"simulate {effect.name} of {model.name}: a plant cannot carry out slot {effect.slot.value}; "
+                "switch the effect off in the model file"
+            )
