@@ -7,9 +7,11 @@ import os
 import select
 import socket
 import termios
+from collections.abc import Callable
 
 import serial
 
+from .datagram import Datagrams, split_address
 from .settings import LineSettings
 
 
@@ -18,29 +20,33 @@ class Connection:
 
     Args:
         settings: which line.
+        stranger: called for each datagram that came from another host and was dropped.
 
     Raises:
         OSError: it cannot be opened; the text says what to look at.
     """
 
-    def __init__(self, settings: LineSettings) -> None:
+    def __init__(self, settings: LineSettings, stranger: Callable[[], None] = lambda: None) -> None:
         self.settings = settings
         self._serial: serial.Serial | None = None
         self._sock: socket.socket | None = None
+        self._datagrams: Datagrams | None = None
         if settings.serial is not None:
             self._open_serial(settings)
+        elif settings.udp is not None:
+            self._datagrams = Datagrams(settings.udp, settings.local, stranger)
         else:
-            self._open_socket(settings)
+            self._open_tcp(settings)
 
     @property
     def fd(self) -> int:
         """The descriptor, for epoll."""
-        owner = self._serial if self._serial is not None else self._sock
+        owner = self._serial or self._sock or self._datagrams
         return owner.fileno() if owner is not None else -1
 
     def is_connected(self) -> bool:
         """Tell whether a TCP connection has come about; raises OSError when it was refused."""
-        if self._sock is None or self.settings.tcp is None:
+        if self._sock is None:
             return True
         if not select.select([], [self._sock], [], 0)[1]:
             return False
@@ -50,17 +56,22 @@ class Connection:
         return True
 
     def write(self, data: bytes) -> None:
-        """Send bytes at once, or fail: requests are far smaller than any buffer."""
+        """Send bytes at once, or fail: requests are far smaller than any buffer. On UDP this is one datagram."""
+        if self._datagrams is not None:
+            self._datagrams.write(data)
+            return
         sent = os.write(self.fd, data)
         if sent != len(data):
             raise OSError(errno.EIO, f"send on {self.settings}: took {sent} of {len(data)} bytes")
 
     def read(self) -> bytes:
-        """Return what has come, b'' when nothing has.
+        """Return what has come, b'' when nothing has; on UDP the next datagram.
 
         Raises:
-            OSError: the line is gone: unplugged, or closed by the device.
+            OSError: the line is gone: unplugged, closed by the device, or refused by its host.
         """
+        if self._datagrams is not None:
+            return self._datagrams.read()
         try:
             data = os.read(self.fd, 65536)
         except BlockingIOError:
@@ -79,6 +90,8 @@ class Connection:
             self._serial.close()
         if self._sock is not None:
             self._sock.close()
+        if self._datagrams is not None:
+            self._datagrams.close()
 
     def _open_serial(self, settings: LineSettings) -> None:
         try:
@@ -104,18 +117,15 @@ class Connection:
         attributes[6][termios.VMIN] = 1
         termios.tcsetattr(fd, termios.TCSANOW, attributes)
 
-    def _open_socket(self, settings: LineSettings) -> None:
-        kind = socket.SOCK_STREAM if settings.tcp else socket.SOCK_DGRAM
-        host, _, port = (settings.tcp or settings.udp or "").rpartition(":")
-        sock = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, kind)
+    def _open_tcp(self, settings: LineSettings) -> None:
+        host, port = split_address(settings.tcp or "")
+        sock = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
         try:
             sock.setblocking(False)
-            if settings.tcp:
-                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if settings.local:
-                local_host, _, local_port = settings.local.rpartition(":")
-                sock.bind((local_host, int(local_port)))
-            result = sock.connect_ex((host.strip("[]"), int(port)))
+                sock.bind(split_address(settings.local))
+            result = sock.connect_ex((host, port))
         except OSError as error:
             sock.close()
             raise OSError(error.errno, f"connect to {settings}: {error.strerror}") from None

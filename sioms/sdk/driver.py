@@ -111,6 +111,11 @@ class Driver(ABC):
         self.kit = kit
 
     @classmethod
+    def variant(cls, settings: Any) -> type[Driver]:
+        """Return the class that serves these settings: for a device that either pushes or is asked."""
+        return cls
+
+    @classmethod
     @abstractmethod
     def describe(cls, name: str, settings: Any) -> Description:
         """Tell the blocks, rate and inputs; pure; raises ValueError with a sentence for bad settings."""
@@ -121,9 +126,10 @@ class Driver(ABC):
         """The blocks in the order of the description, made in __init__."""
 
     def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
-        """Answer a request that the kit does not answer itself (ZERO_DEVICE, SET_GAINS, GET_GAINS ...).
+        """Answer a request that the kit does not answer itself: CALIBRATE_DEVICE of a sensor with a tare of its own ...
 
-        The kit answers all axis requests through the bank. Return a msgpack-able value.
+        The kit answers all axis requests through the bank, and zero and gains of analog blocks. Return a
+        msgpack-able value, or in a driver with a line the steps that end in one.
 
         Raises:
             Refusal: not supported or not now.
@@ -220,6 +226,7 @@ class LineDriver(Driver):
 
     Attributes:
         line: the line's settings.
+        aside: as of StreamDriver.
         overheard: takes bytes that no exchange waits for, and the time [ns]: for devices that also speak unasked
             (alarms); None counts them as noise.
         gap_s: silence on the line before each request [s].
@@ -228,6 +235,7 @@ class LineDriver(Driver):
     """
 
     line: LineSettings
+    aside: LineSettings | None = None
     overheard: Callable[[bytes, int], None] | None = None
     gap_s: float = 0.0
     recovery_s: float = 0.05
@@ -247,14 +255,21 @@ class StreamDriver(Driver):
     """A driver of a device that pushes samples.
 
     Attributes:
-        line: the line's settings.
+        line: the line's settings; the samples come on it.
+        aside: a TCP connection beside it, for steps that are :class:`~sioms.sdk.exchange.Aside`.
         heartbeat_s: period of ``heartbeat`` [s], 0 = never.
         silence_s: without a good frame for this long the link is lost [s].
+        advice: what to look at when a stream was started and nothing comes.
+        gap_s, recovery_s: as of LineDriver.
     """
 
     line: LineSettings
+    aside: LineSettings | None = None
     heartbeat_s: float = 0.0
     silence_s: float = 0.5
+    advice: str = ""
+    gap_s: float = 0.0
+    recovery_s: float = 0.1
 
     @abstractmethod
     def open(self) -> Steps:
@@ -276,8 +291,8 @@ class StreamDriver(Driver):
         """Keep the stream alive."""
         yield from ()
 
-    def counters(self) -> Mapping[str, int]:
-        """Return the link counters that the codec keeps: bad checksums, lost blocks ..."""
+    def counters(self) -> Mapping[str, int | str]:
+        """Return the link counters that the codec keeps, and the device's status in words."""
         return {}
 
     def close(self) -> Steps:

@@ -18,6 +18,7 @@ from .exchange import DeviceError, LinkError, Steps
 from .handles import Handle
 from .line import Counters, Done, Line, Priority
 from .requests import LATER
+from .side_connection import SideConnection
 
 if TYPE_CHECKING:
     from .runtime import Runtime
@@ -166,7 +167,7 @@ class _Connected:
             if self._connecting is None:
                 if now_ns < self._retry_ns:
                     return False
-                self._connecting = Connection(self._base.line)
+                self._connecting = Connection(self._base.line, self._count_stranger)
                 self._limit_ns = now_ns + int(self._base.line.connect_timeout_s * 1e9)
             if not self._connecting.is_connected():
                 if now_ns > self._limit_ns:
@@ -184,11 +185,17 @@ class _Connected:
             self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
             return False
         connection, self._connecting = self._connecting, None
-        self.line = Line(connection, self._gap_s, self._recovery_s, self.counters, self.unsolicited())
+        aside = self._base.aside
+        self.line = Line(
+            connection, self._gap_s, self._recovery_s, self.counters, self.unsolicited(),
+            None if aside is None else SideConnection(aside),
+        )  # fmt: skip
         self._runtime.watch(connection.fd, self._readable)
-        self._pause_ns = FIRST_PAUSE_NS
         self.connected(now_ns)
         return True
+
+    def _count_stranger(self) -> None:
+        self.counters.strangers += 1
 
     def unsolicited(self) -> Any:
         """Return what takes bytes that no exchange waits for."""
@@ -205,8 +212,9 @@ class _Connected:
             return
         self.counters.reconnects += 1
         self._runtime.unwatch(line.connection.fd)
-        line.connection.close()
+        line.close()
         self._retry_ns = now_ns + self._pause_ns
+        self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
         self._runtime.lose(self._base.blocks, reason)
         line.abandon(reason)
 
@@ -217,6 +225,21 @@ class _Connected:
         except OSError as error:
             self.line_lost(error.strerror or str(error), now_ns)
         self._arm()
+
+    def carry_out(self, handle: Handle, number: int, steps: Steps, what: str) -> None:
+        """Run the steps that a client's request takes; its answer comes when they end."""
+        line, now_ns = self.line, self._runtime.now_ns()
+        if line is None:
+            raise OSError(errno.EIO, f"{what}: there is no connection to {self._base.line}")
+
+        def done(value: Any, error: Exception | None) -> None:
+            if error is None:
+                handle.answer(number, value)
+            else:
+                errno_ = error.errno if isinstance(error, DeviceError) else errno.EIO
+                handle.refuse(number, errno_, f"{what}: {error}")
+
+        self.guarded(lambda: line.submit(steps, Priority.ACT, done, now_ns), now_ns)
 
     def _readable(self) -> None:
         now_ns = self._runtime.now_ns()
@@ -242,7 +265,7 @@ class _Connected:
         """Release the line for good."""
         if self.line is not None:
             self._runtime.unwatch(self.line.connection.fd)
-            self.line.connection.close()
+            self.line.close()
             self.line = None
 
 
@@ -277,6 +300,7 @@ class LineEngine(_Connected):
 
     def connected(self, now_ns: int) -> None:
         """Open all units."""
+        self._pause_ns = FIRST_PAUSE_NS
         for state in self._units:
             state.is_up = state.busy = False
             state.due_ns = now_ns
@@ -483,12 +507,13 @@ class StreamEngine(_Connected):
     publishes = False
 
     def __init__(self, runtime: Runtime, driver: StreamDriver) -> None:
-        super().__init__(runtime, driver, 0.0, 0.1)
+        super().__init__(runtime, driver, driver.gap_s, driver.recovery_s)
         self._driver = driver
         self._is_up = False
         self._busy = False
         self._due_ns = 0
         self._good_ns = 0
+        self._heard = False
         self._heartbeat_ns = 0
 
     def unsolicited(self) -> Any:
@@ -512,11 +537,7 @@ class StreamEngine(_Connected):
                     lambda: line.submit(self._driver.open(), Priority.POLL, self._opened, now_ns), now_ns
                 )
         elif now_ns - self._good_ns > self._driver.silence_s * 1e9:
-            self._is_up = False
-            self._due_ns = now_ns
-            self._runtime.lose(
-                self._driver.blocks, f"no good frame for {(now_ns - self._good_ns) / 1e9:.3f} s"
-            )
+            self._stalled(now_ns)
         elif self._driver.heartbeat_s and now_ns >= self._heartbeat_ns and line.is_free:
             self._heartbeat_ns = now_ns + int(self._driver.heartbeat_s * 1e9)
             self.guarded(
@@ -524,11 +545,23 @@ class StreamEngine(_Connected):
                 now_ns,
             )
 
+    def _stalled(self, now_ns: int) -> None:
+        """Begin anew: at once when the stream ran, else after a pause that grows."""
+        self._is_up = False
+        reason = f"no good frame for {(now_ns - self._good_ns) / 1e9:.3f} s"
+        if not self._heard:
+            reason += f" after the start of the stream{self._driver.advice and '; ' + self._driver.advice}"
+            self._due_ns = now_ns + self._pause_ns
+            self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
+        else:
+            self._due_ns = now_ns
+        self._runtime.lose(self._driver.blocks, reason)
+
     def _opened(self, _: Any, error: Exception | None) -> None:
         self._busy = False
         now_ns = self._runtime.now_ns()
         if error is None:
-            self._is_up, self._good_ns = True, now_ns
+            self._is_up, self._good_ns, self._heard = True, now_ns, False
             self._heartbeat_ns = now_ns + int(self._driver.heartbeat_s * 1e9)
             return
         kind = PageState.FAULT if isinstance(error, DeviceError) else PageState.LINK_LOST
@@ -543,7 +576,7 @@ class StreamEngine(_Connected):
             if self._good_ns == 0 or not self._runtime.is_good(self._driver.blocks):
                 self._runtime.set_link(self._driver.blocks, PageState.GOOD, "")
                 self._pause_ns = FIRST_PAUSE_NS
-            self._good_ns = now_ns
+            self._good_ns, self._heard = now_ns, True
             self._runtime.after_publication(now_ns)
 
     def write_outputs(

@@ -1,7 +1,7 @@
 """What a driver says to its line: exchanges, as values. Pure; the kit does the I/O.
 
-A driver's hooks are generators: they yield an :class:`Exchange` (or a :class:`Send`, or a
-:class:`Pause`) and are resumed with the decoded reply. The kit owns time-outs, silence, draining,
+A driver's hooks are generators: they yield an :class:`Exchange` (or a :class:`Send`, a :class:`Pause`, an
+:class:`Aside`) and are resumed with the decoded reply. The kit owns time-outs, silence, draining,
 repetition, reconnection and the serving of clients in between, so a driver has no sleeps, no
 retries and no threads, and its tests need no line: they resume the generator themselves.
 
@@ -76,6 +76,16 @@ class Pause:
     duration_s: float
 
 
-Step = Exchange | Send | Pause
+@dataclass(frozen=True, slots=True)
+class Aside:
+    """An exchange on the driver's connection beside its line (``StreamDriver.aside``): a web page, a command port.
+
+    The reply may end with the connection: ``decode`` then gets what has come.
+    """
+
+    exchange: Exchange
+
+
+Step = Exchange | Send | Pause | Aside
 Steps = Generator[Step, Any, None]
 """What a hook returns: a generator of steps."""

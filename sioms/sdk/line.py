@@ -17,10 +17,13 @@ from itertools import count
 from typing import Any
 
 from .connection import Connection
-from .exchange import DeviceError, Exchange, LinkError, Pause, Send, Step, Steps
+from .exchange import Aside, DeviceError, Exchange, LinkError, Pause, Send, Step, Steps
+from .side_connection import SideConnection
 
 ATTEMPTS = 2
 """Times a repeatable request is sent before its exchange counts as failed."""
+LOOK_ASIDE_NS = 1_000_000
+"""How often the connection beside the line is looked at while something is asked there, which is at opening."""
 BABBLE_NS = 500_000_000
 """How much longer than the silence it owes a line may go on after a bad reply; then the exchange has failed."""
 
@@ -59,6 +62,7 @@ class Counters:
     garbled: int = 0
     refused: int = 0
     noise_bytes: int = 0
+    strangers: int = 0
     reconnects: int = 0
     sent_bytes: int = 0
     received_bytes: int = 0
@@ -70,6 +74,7 @@ class _State(Enum):
     """Waiting until ``_until_ns``: silence before a request, or a Pause."""
     EXPECTING = auto()
     RECOVERING = auto()
+    ASIDE = auto()
 
 
 @dataclass(slots=True)
@@ -87,13 +92,14 @@ class Line:
         connection: the open connection.
         gap_s: silence before each request [s].
         recovery_s: silence after a bad or missing reply [s].
-        unsolicited: takes bytes that no exchange waits for; None counts them as noise.
         counters: kept over reconnections.
+        unsolicited: takes bytes that no exchange waits for; None counts them as noise.
+        aside: the connection beside the line, for a driver that has one.
     """
 
     def __init__(
         self, connection: Connection, gap_s: float, recovery_s: float, counters: Counters,
-        unsolicited: Callable[[bytes, int], None] | None = None,
+        unsolicited: Callable[[bytes, int], None] | None = None, aside: SideConnection | None = None,
     ) -> None:  # fmt: skip
         self.connection = connection
         self.counters = counters
@@ -102,6 +108,7 @@ class Line:
         self._gap_ns = int(gap_s * 1e9)
         self._recovery_ns = int(recovery_s * 1e9)
         self._unsolicited = unsolicited
+        self._aside = aside
         self._queue: list[tuple[int, int, Job]] = []
         self._order = count()
         self._running: _Running | None = None
@@ -126,6 +133,12 @@ class Line:
         heappush(self._queue, (priority, next(self._order), Job(steps, priority, done)))
         if self._running is None:
             self._next_job(now_ns)
+
+    def close(self) -> None:
+        """Release the connections."""
+        self.connection.close()
+        if self._aside is not None:
+            self._aside.close()
 
     def abandon(self, reason: str) -> None:
         """End all jobs with a LinkError; the connection is gone."""
@@ -205,6 +218,8 @@ class Line:
                     self._until_ns = min(quiet_ns, self._babble_ns)
                     return
                 self._after_recovery(now_ns)
+            case _State.ASIDE:
+                self._look_aside(now_ns)
 
     # --- inside ----------------------------------------------------------------------------------
 
@@ -250,6 +265,8 @@ class Line:
     def _begin(self, step: Step, now_ns: int) -> None:
         if isinstance(step, Pause):
             self._rest_until(now_ns + int(step.duration_s * 1e9))
+        elif isinstance(step, Aside):
+            self._ask_aside(step.exchange, now_ns)
         elif now_ns < self._quiet_since_ns + self._gap_ns:
             self._rest_until(self._quiet_since_ns + self._gap_ns)
         else:
@@ -284,6 +301,28 @@ class Line:
         running.reply.clear()
         self._state = _State.EXPECTING
         self._until_ns = now_ns + on_line_ns + int(step.timeout_s * 1e9)
+
+    def _ask_aside(self, exchange: Exchange, now_ns: int) -> None:
+        if self._aside is None:
+            raise RuntimeError(f"{exchange.what}: the driver names no connection aside")
+        self.counters.requests += 1
+        self._aside.begin(exchange, now_ns)
+        self._state, self._until_ns = _State.ASIDE, now_ns
+
+    def _look_aside(self, now_ns: int) -> None:
+        if self._aside is None:
+            return
+        try:
+            found = self._aside.advance(now_ns)
+        except (LinkError, DeviceError) as error:
+            self.counters.refused += isinstance(error, DeviceError)
+            self._resume(error, now_ns)
+            return
+        if found is None:
+            self._until_ns = now_ns + LOOK_ASIDE_NS
+        else:
+            self.counters.replies += 1
+            self._resume(found[0], now_ns)
 
     def _recover(self, reason: str, now_ns: int) -> None:
         self._state = _State.RECOVERING

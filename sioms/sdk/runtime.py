@@ -110,7 +110,7 @@ class Runtime:
         self._daemon_lease_ns = int(float(options["daemon_lease_s"]) * 1e9)
         self._daemon_late = False
         self._ending_ns = 0
-        self.driver = driver(device, settings, self)
+        self.driver = driver.variant(settings)(device, settings, self)
         self.blocks = list(self.driver.blocks)
         lease_ns = int(description.lease_s * 1e9)
         self.pages = Pages(device, self.blocks, lease_ns, generation)

@@ -15,7 +15,8 @@ class LineSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     ``line = { serial = "/dev/ttyUSB0", baud = 115200, parity = "N" }``,
     ``line = { tcp = "192.168.0.20:502" }`` or
-    ``line = { udp = "192.168.1.1:49152", local = "0.0.0.0:49152" }``.
+    ``line = { udp = "192.168.1.1:49152" }``. ``local`` is the address on this side, where it matters; with it the port
+    of ``udp`` may be 0, which listens to any port of that host.
     """
 
     serial: str | None = None
@@ -35,12 +36,12 @@ class LineSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             )
         if not 300 <= self.baud <= 12_000_000:
             raise ValueError(f"baud = {self.baud}; want 300 to 12000000")
-        for key in ("tcp", "udp"):
-            value = getattr(self, key)
-            if value is not None:
-                _, _, port = value.rpartition(":")
-                if not port.isdigit() or not 0 < int(port) < 65536:
-                    raise ValueError(f'{key} = "{value}"; want "host:port" with a port from 1 to 65535')
+        if self.local:
+            _check_address("local", self.local, lowest=0)
+        if self.tcp is not None:
+            _check_address("tcp", self.tcp)
+        if self.udp is not None:
+            _check_address("udp", self.udp, lowest=0 if self.local else 1)
 
     @property
     def bits_per_character(self) -> int:
@@ -49,3 +50,10 @@ class LineSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __str__(self) -> str:
         return self.serial or self.tcp or self.udp or "?"
+
+
+def _check_address(key: str, value: str, lowest: int = 1) -> None:
+    """Raise ValueError when a key does not name a host and a port from ``lowest`` on."""
+    host, _, port = value.rpartition(":")
+    if not host or not port.isdigit() or not lowest <= int(port) < 65536:
+        raise ValueError(f'{key} = "{value}"; want "host:port" with a port from {lowest} to 65535')
