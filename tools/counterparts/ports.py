@@ -41,9 +41,7 @@ class PtyPort:
         self.name = os.ttyname(self._slave)
         asyncio.get_running_loop().add_reader(self._master, self._read)
         if self._link is not None:
-            fresh = self._link.with_name(f"{self._link.name}.{os.getpid()}")
-            fresh.symlink_to(self.name)
-            fresh.replace(self._link)
+            make_link(self._link, self.name)
 
     def unplug(self) -> None:
         """Make the port vanish; a master that has it open gets an error and a hang-up."""
@@ -71,16 +69,24 @@ class PtyPort:
         except OSError:
             return
         if data:
-            self._allow_parity()
+            allow_parity(self._slave)
             self._received(data)
 
-    def _allow_parity(self) -> None:
-        """Let the next master ask for parity, which a pty does not have.
 
-        Linux refuses (EINVAL) settings of which it takes nothing over. A flag without effect (ECHOCTL while nothing
-        is echoed), which every master clears, leaves something to take.
-        """
-        settings = termios.tcgetattr(self._slave)
-        if not settings[3] & termios.ECHOCTL:
-            settings[3] |= termios.ECHOCTL
-            termios.tcsetattr(self._slave, termios.TCSANOW, settings)
+def allow_parity(slave: int) -> None:
+    """Let the next master ask for parity, which a pty does not have.
+
+    Linux refuses (EINVAL) settings of which it takes nothing over. A flag without effect (ECHOCTL while nothing
+    is echoed), which every master clears, leaves something to take.
+    """
+    settings = termios.tcgetattr(slave)
+    if not settings[3] & termios.ECHOCTL:
+        settings[3] |= termios.ECHOCTL
+        termios.tcsetattr(slave, termios.TCSANOW, settings)
+
+
+def make_link(link: Path, name: str) -> None:
+    """Let a fixed path lead to a port."""
+    fresh = link.with_name(f"{link.name}.{os.getpid()}")
+    fresh.symlink_to(name)
+    fresh.replace(link)

@@ -1,0 +1,363 @@
+"""A station: a driver at work under a daemon of its own, its counterpart, the wire between them, and a client.
+
+Concurrency: one thread; the processes are the station's own and end with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+from sioms.client.workcell import Workcell
+from sioms.protocol.flags import ControlMode, NodeClass
+
+from ..bench.rig import Daemon
+from ..cell import READONLY, is_part
+from ..counterparts.rigs import Axis, Output, Rig
+
+ANSWER_S = 5.0
+START_S = 30.0
+UP_S = 15.0
+
+
+class Unanswered(RuntimeError):
+    """A process of the station did not answer; the text says which and what."""
+
+
+class Peer:
+    """A process that says ``ready PORT`` and obeys lines: a counterpart or a wire.
+
+    Attributes:
+        port: that it told.
+    """
+
+    def __init__(self, command: Sequence[str], what: str, folder: Path | None = None) -> None:
+        self.what = what
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=folder,
+            env={**os.environ, "PYTHONUNBUFFERED": "1"}, bufsize=0,
+        )  # fmt: skip
+        self._rest = b""
+        try:
+            line = self._line(START_S)
+            while not line.startswith("ready "):
+                line = self._line(START_S)
+        except Unanswered as error:
+            self.close()
+            said = self._process.stderr.read().decode("utf-8", "replace")[-600:] if self._process.stderr else ""
+            raise Unanswered(f"start {what}: no line 'ready PORT' ({error}); it said: {said.strip()}") from None
+        self.port = line.split(maxsplit=1)[1]
+
+    def tell(self, line: str) -> Any:
+        """Send a command; return its answer's value.
+
+        Raises:
+            Unanswered: no answer, or an error.
+        """
+        if self._process.stdin is None:
+            raise Unanswered(f"{self.what}: it takes no commands")
+        try:
+            self._process.stdin.write(line.encode() + b"\n")
+        except OSError as error:
+            raise Unanswered(f"{self.what}: {line}: it has ended ({error.strerror})") from None
+        answer = self._line(ANSWER_S)
+        if not answer.startswith("ok"):
+            raise Unanswered(f"{self.what}: {line}: {answer}")
+        return json.loads(answer[3:]) if answer[3:] else None
+
+    def _line(self, timeout_s: float) -> str:
+        deadline = time.monotonic() + timeout_s
+        out = self._process.stdout
+        while b"\n" not in self._rest:
+            left = deadline - time.monotonic()
+            if out is None or left <= 0 or not select.select([out], [], [], left)[0]:
+                raise Unanswered(f"{self.what}: no answer within {timeout_s:g} s")
+            data = os.read(out.fileno(), 65536)
+            if not data:
+                raise Unanswered(f"{self.what}: it has ended")
+            self._rest += data
+        line, _, self._rest = self._rest.partition(b"\n")
+        return line.decode("utf-8", "replace").strip()
+
+    def close(self) -> None:
+        """End the process."""
+        if self._process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+        try:
+            self._process.wait(2.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A node of the device under test."""
+
+    name: str
+    node_class: NodeClass
+    read_only: bool
+
+    @property
+    def reader(self) -> str:
+        """Name under which it is read without owning it."""
+        return self.name if self.read_only else self.name + READONLY
+
+
+class Station:
+    """A driver at work. Use it in a ``with`` block.
+
+    Args:
+        rig: of the driver.
+        paced: characters take the time of the configured line.
+        folder: where relative paths of the rig start: that of the driver's file.
+
+    Attributes:
+        rig: of the driver, its axes and outputs found out where it names none.
+        wire, counterpart: of the device; None for a driver that needs none.
+        nodes: of the device, one a block.
+        cell: the session.
+    """
+
+    def __init__(self, rig: Rig, *, paced: bool = True, folder: Path | None = None) -> None:
+        self.rig = rig
+        self._base = folder or Path.cwd()
+        self._folder = Path(tempfile.mkdtemp(prefix="sioms-check-"))
+        self.counterpart: Peer | None = None
+        self.wire: Peer | None = None
+        self.daemon: Daemon | None = None
+        self.cell: Workcell
+        self.port = ""
+        try:
+            if rig.counterpart:
+                self._connect(paced)
+            self.start_daemon()
+            self.wait_good()
+            self._look()
+        except BaseException:
+            self.close()
+            raise
+
+    def _connect(self, paced: bool) -> None:
+        rig = self.rig
+        name, *options = rig.counterpart
+        program = ["-m", name if "." in name else f"sioms.tools.counterparts.{name}"]
+        if name.endswith(".py"):
+            program = [str((self._base / name).resolve())]
+        link = [] if rig.tcp else ["--link", str(self._folder / "device")]
+        command = [sys.executable, *program, *link, *options]
+        self.counterpart = Peer(command, f"counterpart {name}", self._base)
+        speed = ["--baud", str(self.baud), "--bits", str(rig.bits_per_character)] if paced and self.baud else []
+        self.wire = Peer(
+            [sys.executable, "-m", "sioms.tools.author.wire", "--kind", rig.line or "serial", "--device",
+             self.counterpart.port, "--link", str(self._folder / "port"), *speed],
+            "wire",
+        )  # fmt: skip
+        self.port = self.wire.port
+
+    @property
+    def baud(self) -> float:
+        """Speed of the serial line [baud], 0 where there is none."""
+        return self.rig.setting("baud", 115200) if self.rig.line == "serial" else 0.0
+
+    @property
+    def character_s(self) -> float:
+        """Time that a character takes on the line [s], 0 where it takes none."""
+        return self.rig.bits_per_character / self.baud if self.baud else 0.0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def start_daemon(self) -> None:
+        """Start a daemon with the device, and a session."""
+        text = self.rig.tables.replace("{port}", self.port)
+        driver = self.rig.driver
+        if driver.endswith(".py"):
+            text = text.replace("{driver}", str((self._base / driver).resolve()))
+        self.daemon = Daemon('[workcell]\nname = "check"\n' + text)
+        self.cell = self.daemon.cell("check")
+
+    def end_daemon(self, *, kill: bool = False) -> None:
+        """End or kill the daemon."""
+        daemon, self.daemon = self.daemon, None
+        if daemon is None:
+            return
+        if kill:
+            daemon.process.kill()
+        with contextlib.suppress(OSError):
+            self.cell.close()
+        daemon.close()
+
+    def close(self) -> None:
+        """End everything."""
+        self.end_daemon()
+        for peer in (self.wire, self.counterpart):
+            if peer is not None:
+                peer.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    # --- the device ------------------------------------------------------------------------------
+
+    def _look(self) -> None:
+        """Find out the nodes of the device, and its axes and outputs unless the rig tells them."""
+        entries = [e for e in self.cell.nodes() if e.device == self.rig.device]
+        whole = [e for e in entries if not is_part(e, entries)]
+        self.nodes = [Node(e.name, e.node_class, e.read_only) for e in whole]
+        rig = self.rig
+        if not rig.axes:
+            names = [e.name for e in entries if e.node_class is NodeClass.AXIS and e.channels == 1]
+            rig = replace(rig, axes=tuple(self._axis(name) for name in names if not name.endswith(READONLY)))
+        if not rig.outputs:
+            names = [e.name for e in whole if e.node_class is NodeClass.BINARY and not e.read_only]
+            rig = replace(rig, outputs=tuple(Output(n, self.cell.info(n).channels[0].width, None) for n in names))
+        self.rig = rig
+
+    def _axis(self, name: str) -> Axis:
+        channel = self.cell.info(name).channels[0]
+        velocity = 0.2 * channel.limits["velocity"]
+        low = -velocity if channel.minimum is None else channel.minimum
+        high = velocity if channel.maximum is None else channel.maximum
+        reach = min(velocity, 0.4 * (high - low))
+        return Axis(name, reach, velocity, max(1e-3 * reach, 1e-6))
+
+    def status(self) -> dict[str, Any]:
+        """Return what the daemon says of the device."""
+        found = [d for d in self.cell.status()["devices"] if d["name"] == self.rig.device]
+        absent = {"state": "leaving", "link": "", "pid": 0, "generation": 0, "deaths": 0, "reason": "", "link_reason": ""}
+        return dict(found[0]) if found else absent
+
+    def is_good(self) -> bool:
+        """Whether the driver is up and its link good."""
+        status = self.status()
+        return (status["state"], status["link"]) == ("up", "good")
+
+    def wait_good(self, timeout_s: float = UP_S) -> float:
+        """Wait until the driver is up and its link good; return how long that took [s].
+
+        Raises:
+            TimeoutError: it is not; the text holds what the daemon says.
+        """
+        began = time.monotonic()
+        while not self.is_good():
+            if time.monotonic() - began > timeout_s:
+                status = self.status()
+                why = status["reason"] or status["link_reason"] or "no reason given"
+                said = self.daemon.log()[-1500:] if self.daemon is not None else ""
+                text = f"device {self.rig.device}: {status['state']}, link {status['link']}: {why}"
+                raise TimeoutError(f"{text}; not good within {timeout_s:g} s; the daemon said: {said}")
+            time.sleep(0.005)
+        return time.monotonic() - began
+
+    def has(self, mode: ControlMode) -> bool:
+        """Whether the first axis has a control mode."""
+        return bool(self.rig.axes and self.cell.info(self.rig.axes[0].node).channels[0].modes & mode)
+
+    def speed(self) -> float | None:
+        """Return how fast the device really moves, as its counterpart says; None when that does not say."""
+        if self.counterpart is None:
+            return None
+        try:
+            velocity = self.counterpart.tell("state").get("velocity")
+        except (Unanswered, AttributeError):
+            return None
+        return float(velocity) if isinstance(velocity, int | float) else None
+
+    # --- the wire --------------------------------------------------------------------------------
+
+    def tell_wire(self, line: str) -> Any:
+        """Send a command to the wire."""
+        if self.wire is None:
+            raise Unanswered("this driver has no wire")
+        return self.wire.tell(line)
+
+    def fault(self, **keys: object) -> None:
+        """Let the wire bend messages; none without keys."""
+        self.tell_wire("fault " + json.dumps(keys, separators=(",", ":")))
+
+    def totals(self) -> Mapping[str, int]:
+        """Return what the wire has carried."""
+        found: dict[str, int] = self.tell_wire("totals")
+        return found
+
+    def exchanges(self, count: int = 8) -> list[str]:
+        """Return the last messages as lines to print."""
+        if self.wire is None:
+            return []
+        entries = self.tell_wire(f"log {count}")
+        now_ns = time.monotonic_ns()
+        return [
+            f"{(t_ns - now_ns) / 1e6:9.2f} ms {way} {' '.join(text[i : i + 2] for i in range(0, len(text), 2))}"
+            + (f"   ({note})" if note else "")
+            for t_ns, way, text, note in entries
+        ]
+
+    def settle(self) -> None:
+        """Bring all back to calm: no faults, no stop, link good, axes at rest."""
+        if self.wire is not None:
+            self.fault()
+            self.tell_wire("plug")
+        if self.daemon is None or self.daemon.process.poll() is not None:
+            self.end_daemon()
+            self.start_daemon()
+        self.wait_good()
+        self.cell.reset()
+        for axis in self.rig.axes[:1]:
+            with contextlib.suppress(OSError), self.cell.open(axis.node, "rw", timeout=2.0) as node:
+                node.reset()
+
+    def start_client(self, script: str, *words: str) -> Client:
+        """Start a client in a process of its own; it must print a line when it is ready."""
+        if self.daemon is None:
+            raise Unanswered("no daemon runs")
+        return Client(script, self.daemon.socket, *words)
+
+
+PROLOGUE = "import sys, time, sioms\ncell = sioms.Workcell(sys.argv[1], 'victim')\n"
+
+
+class Client:
+    """A client process that can be killed."""
+
+    def __init__(self, script: str, *words: str) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", PROLOGUE + script, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            text=True,
+        )  # fmt: skip
+        line = self._process.stdout.readline() if self._process.stdout else ""
+        if not line:
+            said = self._process.stderr.read()[-400:] if self._process.stderr else ""
+            self.kill()
+            raise OSError(5, f"the client of the trial failed: {said.strip()}")
+
+    def kill(self) -> None:
+        """SIGKILL."""
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        for stream in (self._process.stdout, self._process.stderr):
+            if stream is not None:
+                stream.close()
+
+
+def wait_for(condition: Callable[[], Any], timeout_s: float, period_s: float = 0.003) -> Any:
+    """Look until something is true; return it, or what it was last when the time is over."""
+    deadline = time.monotonic() + timeout_s
+    while not (found := condition()) and time.monotonic() < deadline:
+        time.sleep(period_s)
+    return found
