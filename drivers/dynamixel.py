@@ -34,6 +34,7 @@ from sioms.sdk.codec.dynamixel import Bus, Status, signed
 from sioms.sdk.drive_axes import BANK_MODES, POSITION_MODES, AxesUnit, drive_table
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
 from sioms.sdk.exchange import DeviceError, Pause, Send, Steps
+from sioms.sdk.golden import Golden
 from sioms.sdk.settings import LineSettings
 
 MODES = {
@@ -322,6 +323,33 @@ class Dynamixel(LineDriver):
             for axis in settings.axis
         )
         return Description(specs, settings.poll_hz, lease_s=max(0.5, 5 / settings.poll_hz))
+
+    @classmethod
+    def golden(cls, settings: Any) -> Sequence[Golden]:
+        """Return packets of the e-Manual."""
+        bus, one = Bus(1e-5, 0.02), Status
+        return (
+            Golden(
+                "ping", bus.ping(1), "ff ff fd 00 01 03 00 01 19 4e", "ff ff fd 00 01 07 00 55 00 06 04 26 65 5d",
+                one(1, b"\x06\x04\x26", False),
+            ),
+            Golden(
+                "read the position", bus.read(1, 132, 4), "ff ff fd 00 01 07 00 02 84 00 04 00 1d 15",
+                "ff ff fd 00 01 08 00 55 00 a6 00 00 00 8c c0", one(1, b"\xa6\0\0\0", False),
+            ),
+            Golden(
+                "write a goal", bus.write(1, 116, 512, 4), "ff ff fd 00 01 09 00 03 74 00 00 02 00 00 ca 89",
+                "ff ff fd 00 01 04 00 55 00 a1 0c", one(1, b"", False),
+            ),
+            Golden(
+                "sync read", dynamixel.sync_read([1, 2], 132, 4), "ff ff fd 00 fe 09 00 82 84 00 04 00 01 02 ce fa"
+            ),
+            Golden(
+                "sync write", dynamixel.sync_write({1: 150, 2: 170}, 116, 4),
+                "ff ff fd 00 fe 11 00 83 74 00 04 00 01 96 00 00 00 02 aa 00 00 00 82 87",
+            ),
+            Golden("reboot", bus.reboot(1), "ff ff fd 00 01 03 00 08 2f 4e"),
+        )  # fmt: skip
 
     def __init__(self, name: str, settings: DynamixelSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)

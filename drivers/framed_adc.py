@@ -17,6 +17,7 @@ from __future__ import annotations
 import errno
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -29,6 +30,7 @@ from sioms.sdk.codec.clock_fit import ClockFit
 from sioms.sdk.codec.cobs import FrameReceiver, frame
 from sioms.sdk.driver import Kit, StreamDriver
 from sioms.sdk.exchange import DeviceError, Send, Steps
+from sioms.sdk.golden import Golden, Incomplete
 from sioms.sdk.settings import LineSettings
 
 _BYTES = {"i16": 2, "i32": 4, "f32": 4}
@@ -89,6 +91,30 @@ class FramedAdc(StreamDriver):
         )
         block = BlockSpec("", NodeClass.ANALOG, channels, history=settings.history)
         return Description((block,), settings.rate_hz, lease_s=max(0.5, 10 / settings.rate_hz))
+
+    @classmethod
+    def golden(cls, settings: Any) -> Sequence[Golden]:
+        """Return the frames of the protocol's description."""
+        block = stream.SampleBlock(1, 7, 123456, 0, (100, -200, 0, 32767))
+        about = stream.Hello(1, 4, stream.Format.I16, 1000, "TAC4")
+
+        def first(data: bytes) -> stream.SampleBlock:
+            payloads = FrameReceiver().feed(data)
+            if not payloads:
+                raise Incomplete("no good frame")
+            return stream.parse_samples(payloads[0]) or block
+
+        return (
+            Golden(
+                "samples", reply="04 01 01 07 04 40 e2 01 02 04 02 64 03 38 ff 01 05 ff 7f f5 76 00", value=block, read=first
+            ),
+            Golden(
+                "hello", stream.hello(), "04 10 c1 f3 00",
+                "04 11 01 04 03 e8 03 01 07 54 41 43 34 de c8 00", about,
+            ),
+            Golden("start", stream.start(1, 1000), "05 12 01 e8 03 01 03 fc 6d 00", "03 1f 12 03 df c6 00"),
+            Golden("stop", stream.stop(1), "05 13 01 0e 5b 00"),
+        )  # fmt: skip
 
     def __init__(self, name: str, settings: FramedAdcSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)

@@ -33,6 +33,7 @@ from sioms.sdk.codec.grbl import Answer, Report
 from sioms.sdk.drive_axes import BANK_MODES, POSITION_MODES, AxesUnit, drive_table
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
 from sioms.sdk.exchange import DeviceError, LinkError, Pause, Send, Steps
+from sioms.sdk.golden import Golden
 from sioms.sdk.settings import LineSettings
 
 MODES = (POSITION_MODES | ControlMode.VELOCITY | BANK_MODES) & ~ControlMode.SPECIFIED_MAX_VEL_ACC
@@ -451,6 +452,17 @@ class Grbl(LineDriver):
             raise ValueError("line = udp: Grbl speaks on serial and tcp")
         spec = drive_axes.axis_spec("", _axes(settings), "Grbl axis", settings.capacity, settings.history)
         return Description((spec,), settings.poll_hz, lease_s=max(0.5, 5 / settings.poll_hz))
+
+    @classmethod
+    def golden(cls, settings: Any) -> Sequence[Golden]:
+        """Return lines of the interface description; they carry no checksum."""
+        text = b"<Idle|MPos:0.000,0.000,0.000|FS:0,0|WCO:0.000,0.000,0.000>\r\n"
+        report = Report("Idle", -1, (0.0, 0.0, 0.0), None, (0.0, 0.0, 0.0))
+        return (
+            Golden("status report", grbl.status(0.1), b"?".hex(), text.hex(), (report, ())),
+            Golden("unlock", grbl.command("$X", 0.5), b"$X\n".hex()),
+            Golden("stored settings", grbl.command("$$", 0.5), b"$$\n".hex()),
+        )
 
     def __init__(self, name: str, settings: GrblSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)

@@ -33,7 +33,8 @@ from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import BlockSpec, Description
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
-from sioms.sdk.mapped import MappedUnit, unit_on
+from sioms.sdk.golden import Golden
+from sioms.sdk.mapped import MappedUnit, golden_of, unit_on
 from sioms.sdk.mapped_drive import DriveUnit
 from sioms.sdk.registers import Gearing
 from sioms.sdk.regmap import RegisterMap, load_map
@@ -130,6 +131,11 @@ class ModbusAxis(LineDriver):
             settings.poll_hz,
             lease_s=max(0.5, 5 / settings.poll_hz),
         )  # fmt: skip
+
+    @classmethod
+    def golden(cls, settings: Any) -> Sequence[Golden]:
+        """Return the golden frames of the register map."""
+        return golden_of(load_map(_map_path(settings.map))) if settings is not None else ()
 
     def __init__(self, name: str, settings: ModbusAxisSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)

@@ -28,7 +28,8 @@ from sioms.sdk.blocks import AnalogBlock, AnyBlock, BinaryBlock, BlockSpec, Desc
 from sioms.sdk.codec import modbus_pdu
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
 from sioms.sdk.exchange import DeviceError, Steps
-from sioms.sdk.mapped import MappedUnit, unit_on
+from sioms.sdk.golden import Golden
+from sioms.sdk.mapped import MappedUnit, golden_of, unit_on
 from sioms.sdk.registers import UNITS, to_words, width
 from sioms.sdk.regmap import Port, RegisterMap, Signal, load_map
 from sioms.sdk.settings import LineSettings
@@ -95,6 +96,11 @@ class ModbusIo(LineDriver):
         return Description(
             tuple(plan.spec for plan in plans), settings.poll_hz, lease_s=max(0.5, 5 / settings.poll_hz)
         )
+
+    @classmethod
+    def golden(cls, settings: Any) -> Sequence[Golden]:
+        """Return the golden frames of the register map."""
+        return golden_of(_load(settings)) if settings is not None else ()
 
     def __init__(self, name: str, settings: ModbusIoSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)

@@ -34,6 +34,7 @@ from sioms.sdk.codec.odrive import CLOSED_LOOP, HOMING, IDLE, confirmed
 from sioms.sdk.drive_axes import BANK_MODES, POSITION_MODES, AxesUnit, drive_table
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
 from sioms.sdk.exchange import DeviceError, Pause, Steps
+from sioms.sdk.golden import Golden
 from sioms.sdk.settings import LineSettings
 
 MODES = BANK_MODES | POSITION_MODES | ControlMode.VELOCITY | ControlMode.FORCE
@@ -331,6 +332,17 @@ class Odrive(LineDriver):
             )
         spec = drive_axes.axis_spec("", _axes(settings), "ODrive axis", settings.capacity, settings.history)
         return Description((spec,), settings.poll_hz, lease_s=max(0.5, 5 / settings.poll_hz))
+
+    @classmethod
+    def golden(cls, settings: Any) -> Sequence[Golden]:
+        """Return lines of the documentation, with their checksums."""
+        texts = ("v 0 1 0*103", "f 0*118", "c 0 0.1*124", "p 0 -2 0 0*95")
+        lines = [
+            Golden(text, odrive.line(text.partition("*")[0]), (text + "\n").encode().hex()) for text in texts
+        ]
+        reply = b"24.087744*32\r\n" + odrive.line("0.0 0.0").replace(b"\n", b"\r\n")
+        read = Golden("read a property", odrive.read(["vbus_voltage"], 0.1), "", reply.hex(), [[24.087744]])
+        return (*lines, read)
 
     def __init__(self, name: str, settings: OdriveSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)

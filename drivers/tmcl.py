@@ -35,6 +35,7 @@ from sioms.sdk.codec.tmcl import SERIAL_HEARTBEAT, SIZE, Axis, Module, Op
 from sioms.sdk.drive_axes import BANK_MODES, POSITION_MODES, AxesUnit, drive_table
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
 from sioms.sdk.exchange import DeviceError, Steps
+from sioms.sdk.golden import Golden
 from sioms.sdk.settings import LineSettings
 
 MODES = BANK_MODES | POSITION_MODES | ControlMode.VELOCITY
@@ -311,6 +312,25 @@ class Tmcl(LineDriver):
             "", _axes(settings), f"TMCL module {settings.address}", settings.capacity, settings.history
         )
         return Description((spec,), settings.poll_hz, lease_s=max(0.5, 5 / settings.poll_hz))
+
+    @classmethod
+    def golden(cls, settings: Any) -> Sequence[Golden]:
+        """Return telegrams of the firmware manuals."""
+        one = Module(1, 2, 0.05)
+        return (
+            Golden("rotate right", one.exchange(Op.ROR, 0, 0, 1000), "01 01 00 00 00 00 03 e8 ed"),
+            Golden("stop", one.exchange(Op.MST), "01 03 00 00 00 00 00 00 04"),
+            Golden(
+                "move to 10000", one.exchange(Op.MVP, 0, 0, 10000), "01 04 00 00 00 00 27 10 3c",
+                "02 01 64 04 00 00 27 10 a2", 10000,
+            ),
+            Golden("move by -500", one.exchange(Op.MVP, 1, 0, -500), "01 04 01 00 ff ff fe 0c 0e"),
+            Golden(
+                "read the position", one.get(Axis.ACTUAL_POSITION, 0), "01 06 01 00 00 00 00 00 08",
+                "02 01 64 06 00 00 27 10 a4", 10000,
+            ),
+            Golden("set the speed", one.set(Axis.MAX_SPEED, 0, 20000), "01 05 04 00 00 00 4e 20 78"),
+        )  # fmt: skip
 
     def __init__(self, name: str, settings: TmclSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)

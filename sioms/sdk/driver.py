@@ -29,6 +29,7 @@ from sioms.protocol.flags import Request
 
 from .blocks import AnyBlock, BlockSpec, Description
 from .exchange import Steps
+from .golden import Golden
 from .settings import LineSettings
 
 if TYPE_CHECKING:
@@ -100,9 +101,12 @@ class Driver(ABC):
     Attributes:
         inputs_ns: a driver that sets it in each tick to the time at which its readings were there
             [ns, CLOCK_MONOTONIC] splits the tick's time in two in the statistics.
+        rig: what ``sioms driver check`` runs a driver with that is not shipped: a mapping with the keys of ``Rig``
+            of ``sioms.tools.counterparts.rigs``.
     """
 
     Settings: ClassVar[type[msgspec.Struct]]
+    rig: ClassVar[Mapping[str, Any]] = {}
     inputs_ns = 0
 
     def __init__(self, name: str, settings: Any, kit: Kit) -> None:
@@ -119,6 +123,11 @@ class Driver(ABC):
     @abstractmethod
     def describe(cls, name: str, settings: Any) -> Description:
         """Tell the blocks, rate and inputs; pure; raises ValueError with a sentence for bad settings."""
+
+    @classmethod
+    def golden(cls, settings: Any) -> Sequence[Golden]:
+        """Return messages of the vendor's manual and what the driver makes of them; ``settings`` may be None."""
+        return ()
 
     @property
     @abstractmethod

@@ -19,8 +19,9 @@ from .codec import modbus_pdu as pdus
 from .codec.modbus import RtuUnit, SerialLine, TcpUnit, Unit
 from .codec.modbus_pdu import MAX_READ_BITS, MAX_READ_REGISTERS, Pdu
 from .exchange import DeviceError, Exchange, Pause, Steps
+from .golden import Golden, Incomplete
 from .registers import RANGES, UNITS, Gearing, rounded, to_raw, to_words, width
-from .regmap import Command, Identify, Item, RegisterMap, Signal, Write
+from .regmap import Command, GoldenFrame, Identify, Item, RegisterMap, Signal, Write
 from .settings import LineSettings
 
 Values = dict[str, Any]
@@ -224,6 +225,43 @@ def unit_on(line: LineSettings, address: int, turnaround_s: float) -> Unit:
     if line.tcp is not None:
         return TcpUnit(address, turnaround_s)
     raise ValueError("line = udp: Modbus runs on serial and tcp")
+
+
+def golden_of(rmap: RegisterMap) -> list[Golden]:
+    """Return the golden frames of a map, on a serial line of 115200 baud."""
+    return [golden for frame in rmap.golden for golden in _golden(rmap, frame)]
+
+
+def _golden(rmap: RegisterMap, frame: GoldenFrame) -> list[Golden]:
+    address = bytes.fromhex(frame.requests[0])[0]
+    unit = RtuUnit(address, SerialLine(115200), rmap.turnaround_s)
+    mapped = MappedUnit(rmap, unit, Gearing(1.0, frame.pulses_per_turn))
+    if frame.signals:
+        plan = mapped.plan(frame.signals)
+        exchanges = [unit.exchange(read.pdu) for read in plan]
+        what = "read " + ", ".join(frame.signals)
+        wanted = {name: frame.values[name] for name in frame.values}
+
+        def read(data: bytes) -> Values:
+            length = exchanges[0].want(data)
+            if length is None or len(data) < length:
+                raise Incomplete("the reply is not complete")
+            reply = exchanges[0].decode(data[:length])
+            return {
+                name: mapped._value(signal, at, reply) for name, signal, at in plan[0].parts if name in wanted
+            }
+
+        first = Golden(what, exchanges[0], frame.requests[0], frame.reply, wanted, read)
+        return [
+            first,
+            *(Golden(what, e, text) for e, text in zip(exchanges[1:], frame.requests[1:], strict=True)),
+        ]
+    steps = [step for step in mapped.command(frame.command, **frame.quantities) if isinstance(step, Exchange)]
+    texts = [*frame.requests, *[""] * (len(steps) - len(frame.requests))]
+    return [
+        Golden(frame.command, step, text, frame.reply if i == 0 else "", None)
+        for i, (step, text) in enumerate(zip(steps, texts, strict=True))
+    ]
 
 
 def _order(item: tuple[Signal, str]) -> tuple[str, int]:

@@ -196,6 +196,28 @@ class Port(Schema, frozen=True):
     maximum: float | None = None
 
 
+class GoldenFrame(Schema, frozen=True):
+    """Messages of the vendor's manual as Modbus RTU, which the map must make or read.
+
+    Args:
+        requests: what is sent, in hex, one a message.
+        command: that sends them, with its ``quantities``; lengths in turns of the motor, else in SI.
+        quantities: by name.
+        signals: or what is read by them.
+        reply: to the first request, in hex.
+        values: that the reply gives, by signal.
+        pulses_per_turn: of the motor.
+    """
+
+    requests: tuple[str, ...]
+    command: str = ""
+    quantities: dict[str, float] = {}
+    signals: tuple[str, ...] = ()
+    reply: str = ""
+    values: dict[str, float] = {}
+    pulses_per_turn: float = 10000.0
+
+
 class RegisterMap(Schema, frozen=True, kw_only=True):
     """A device family."""
 
@@ -219,6 +241,7 @@ class RegisterMap(Schema, frozen=True, kw_only=True):
     """Model name to the number of channels of each port."""
     dead_man: DeadMan = DeadMan()
     alarms: Alarms | None = None
+    golden: tuple[GoldenFrame, ...] = ()
 
 
 class RegisterMapError(ValueError):

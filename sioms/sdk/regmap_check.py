@@ -75,7 +75,7 @@ def _struct_problems(value: Mapping[str, Any], expected: type[msgspec.Struct], p
 
 def meaning_problems(m: RegisterMap) -> list[str]:
     """Return one sentence for each contradiction in a map that follows the schema."""
-    parts = (_signals, _overlaps, _references, _commands, _axis, _dead_man, _ports, _alarms)
+    parts = (_signals, _overlaps, _references, _commands, _axis, _dead_man, _ports, _alarms, _golden)
     return [problem for part in parts for problem in part(m)]
 
 
@@ -283,3 +283,19 @@ def _alarms(m: RegisterMap) -> Iterator[str]:
             int(code, 0)
         except ValueError:
             yield f"alarms.codes: {code!r} is no number; decimal or 0x… is right"
+
+
+def _golden(m: RegisterMap) -> Iterator[str]:
+    for i, frame in enumerate(m.golden):
+        place = f"golden[{i}]"
+        if bool(frame.command) == bool(frame.signals):
+            yield f"{place}: names {'both' if frame.command else 'neither'} a command and signals; one is right"
+        if frame.command and frame.command not in m.commands:
+            yield f"{place}: unknown command {frame.command}{did_you_mean(frame.command, m.commands)}"
+        for name in {*frame.signals, *frame.values} - set(m.signals):
+            yield f"{place}: unknown signal {name}{did_you_mean(name, m.signals)}"
+        for text in (*frame.requests, frame.reply):
+            try:
+                bytes.fromhex(text)
+            except ValueError:
+                yield f"{place}: {text!r} is no hex; e.g. '01 06 60 02 00 40 37 fa' is right"
