@@ -51,6 +51,12 @@ class Faults:
             data += data
         return delay_s, data
 
+    def datagrams(self, data: bytes) -> list[tuple[float, bytes]]:
+        """Return what leaves instead of one datagram, each with its extra delay [s]; doubled, it leaves twice."""
+        copies = 2 if self.double > 0 else 1
+        delay_s, bent = self.outgoing(data)
+        return [(delay_s, bent[: len(bent) // copies])] * copies if bent else []
+
     def handlers(self) -> dict[str, Callable[..., None]]:
         """Return the commands that set faults: ``noise 3``, ``late 0.2 1``, ``cut 2 4``, ``mute`` ..., ``clear``."""
 

@@ -1,0 +1,206 @@
+"""SCHUNK FTS force/torque sensors with the Ethernet interface box (IFB-EN): commands on TCP, 1000 records/s on UDP.
+
+[device.force0]
+driver = "schunk-ft"
+line = { tcp = "192.168.0.100:82" }
+full_scale = [400, 400, 1000, 15, 15, 15]
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import msgspec
+
+from sioms.protocol.flags import AnalogStatus, Request
+from sioms.sdk.blocks import AnyBlock, BlockSpec, Description
+from sioms.sdk.codec import schunk_ifb as ifb
+from sioms.sdk.codec.clock_fit import ClockFit
+from sioms.sdk.codec.schunk_ifb import Command, Status
+from sioms.sdk.codec.sequence import SequenceWatch
+from sioms.sdk.datagram import split_address
+from sioms.sdk.driver import Kit, Refusal, StreamDriver
+from sioms.sdk.exchange import Aside, DeviceError, Exchange, LinkError, Steps
+from sioms.sdk.force_torque import ForceBlock, Six, force_spec
+from sioms.sdk.settings import LineSettings
+
+SILENCE_S = 3 / ifb.RATE_HZ + 0.1
+_BAD = Status.INVALID | Status.HARDWARE
+_OVERLOAD = Status.MECHANICAL_RANGE | Status.USER_RANGE
+
+
+class SchunkFtSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Keys of the device.
+
+    Attributes:
+        line: the box's TCP port, ``host:82``.
+        data: where the records come: ``address:port`` of this host. The firmware knows port 54843 alone.
+        product: what the sensor must call itself; anything without.
+        tool: tool setting 0 to 3 to select; left alone without.
+        noise_filter: 0 to 4, means of 1, 2, 4, 8, 16 samples; left alone without.
+        full_scale: greatest forces [N] and torques [N m] of the sensor.
+        history: snapshots kept for readers.
+    """
+
+    line: LineSettings
+    data: str = f"0.0.0.0:{ifb.DATA_PORT}"
+    product: str = ""
+    tool: int | None = None
+    noise_filter: int | None = None
+    full_scale: Six | None = None
+    history: int = 256
+
+
+class SchunkFt(StreamDriver):
+    """One sensor.
+
+    Concurrency: the one thread of the driver process.
+    """
+
+    Settings = SchunkFtSettings
+    silence_s = SILENCE_S
+
+    @classmethod
+    def describe(cls, name: str, settings: SchunkFtSettings) -> Description:
+        """Tell the channels; raises ValueError for what the box could not do."""
+        _check(settings)
+        spec = force_spec(settings.full_scale, settings.history, "SCHUNK FTS force/torque sensor")
+        return Description((spec,), ifb.RATE_HZ, lease_s=0.5)
+
+    def __init__(self, name: str, settings: SchunkFtSettings, kit: Kit) -> None:
+        super().__init__(name, settings, kit)
+        self.aside = settings.line
+        host = (settings.line.tcp or "").rpartition(":")[0]
+        self.line = LineSettings(udp=f"{host}:0", local=settings.data)
+        self.advice = f"look whether a firewall keeps UDP from {host} to {settings.data} away"
+        self._block = ForceBlock(self.describe(name, settings).blocks[0], name, kit)
+        self._commands = ifb.Commands()
+        self._sequence = SequenceWatch(ifb.SEQUENCE_MODULUS)
+        self._clock = ClockFit(int(1e9 / ifb.RATE_HZ), ifb.SEQUENCE_MODULUS)
+        self._status: int | None = None
+        self._packet: int | None = None
+        self._records = self._malformed = 0
+        self._known = ""
+
+    @property
+    def blocks(self) -> Sequence[AnyBlock]:
+        """The six components."""
+        return (self._block,)
+
+    def open(self) -> Steps:
+        """Stop a stream that may still run, identify the sensor, set it up, and start the stream."""
+        commands, settings = self._commands, self.settings
+        try:
+            yield from self._tolerated(commands.act(Command.STOP))
+            yield from self._identify()
+            if settings.tool is not None:
+                yield Aside(commands.act(Command.TOOL, settings.tool))
+            if settings.noise_filter is not None:
+                yield Aside(commands.act(Command.NOISE_FILTER, settings.noise_filter))
+            self._sequence.expect_anew()
+            self._packet = None
+            yield Aside(commands.act(Command.START))
+        except LinkError as error:
+            raise LinkError(f"open {self.name}: {error}") from None
+        except DeviceError as error:
+            raise DeviceError(error.errno, f"open {self.name} at {settings.line}: {error}") from None
+
+    def feed(self, data: bytes, now_ns: int) -> int:
+        """Publish the record of a datagram, if it is fresh."""
+        record = ifb.parse(data)
+        if record is None or self._packet not in (None, record.packet):
+            self._malformed += 1
+            return 0
+        self._packet = record.packet
+        lost = self._sequence.accept(record.counter)
+        if lost is None:
+            return 0
+        flags = int(AnalogStatus.OVERRUN) if lost else 0
+        if record.status != self._status or record.status != Status.READY:
+            flags |= self._judge(record.status, now_ns)
+        self._block.show(record.values, self._clock.to_host(record.counter, now_ns), flags)
+        self._records += 1
+        return 1
+
+    def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
+        """Let the sensor tare itself on CALIBRATE_DEVICE; with the argument 0 it takes its tare back."""
+        if request is not Request.CALIBRATE_DEVICE:
+            return super().ioctl(block, request, channels, argument)
+        number = argument[0] if isinstance(argument, list) and len(argument) == 1 else argument
+        if number not in (None, 0):
+            raise Refusal(errno.EINVAL, f"{argument!r}; want nothing for a tare, or 0 to take it back")
+        return self._tare(Command.TARE if number is None else Command.RESET_TARE)
+
+    def counters(self) -> Mapping[str, int | str]:
+        """Return what came, and the status of the last record."""
+        seen, block = self._sequence, self._block
+        return {
+            "records": self._records, "malformed": self._malformed, "lost": seen.lost, "late": seen.late,
+            "doubled": seen.doubled, "sequence_restarts": seen.restarts, "clock_restarts": self._clock.restarts,
+            "saturated": block.saturated, "invalid": block.invalid, "status": block.status,
+        }  # fmt: skip
+
+    def close(self) -> Steps:
+        """Stop the stream."""
+        yield from self._tolerated(self._commands.act(Command.STOP))
+
+    # --- inside ----------------------------------------------------------------------------------
+
+    def _tolerated(self, exchange: Exchange) -> Steps:
+        """Do what the sensor may refuse: a stop when nothing streams."""
+        try:
+            yield Aside(exchange)
+        except DeviceError:
+            return
+
+    def _tare(self, command: Command) -> Steps:
+        yield Aside(self._commands.act(command))
+        self._block.offset[:] = 0.0
+
+    def _identify(self) -> Steps:
+        product: str = (yield Aside(self._commands.get(ifb.PRODUCT))).rstrip(b"\0").decode("ascii", "replace")
+        unit: bytes = yield Aside(self._commands.get(ifb.UNIT))
+        firmware: str = (
+            (yield Aside(self._commands.get(ifb.FIRMWARE))).rstrip(b"\0").decode("ascii", "replace")
+        )
+        if self.settings.product and product != self.settings.product:
+            raise _not_this(f"calls itself {product!r}; the configuration says {self.settings.product!r}")
+        if unit.strip(b"\0"):
+            number = int.from_bytes(unit, "little")
+            raise _not_this(
+                f"has unit selection {number}; N and N*m, 0, are right: set them on the sensor's page"
+            )
+        known = f"{product}, firmware {firmware}"
+        if known != self._known:
+            self._known = known
+            self.kit.log("info", f"identified {self.name} at {self.settings.line}: {known}")
+
+    def _judge(self, status: int, now_ns: int) -> int:
+        """Return the flags of a status, and tell of its change."""
+        if status != self._status:
+            self._status = status
+            self._block.say(ifb.status_text(status), now_ns)
+        good = status & Status.READY and not status & _BAD
+        flags = 0 if good else int(AnalogStatus.INVALID)
+        return flags | (int(AnalogStatus.SATURATED) if status & _OVERLOAD else 0)
+
+
+def _not_this(what: str) -> DeviceError:
+    return DeviceError(errno.ENODEV, f"the sensor {what}")
+
+
+def _check(settings: SchunkFtSettings) -> None:
+    if settings.line.tcp is None:
+        raise ValueError('line: the box takes commands on TCP; want line = { tcp = "host:82" }')
+    try:
+        if split_address(settings.data)[1] == 0:
+            raise ValueError(settings.data)
+        LineSettings(udp="localhost:0", local=settings.data)
+    except ValueError:
+        raise ValueError(f'data = "{settings.data}"; want "0.0.0.0:{ifb.DATA_PORT}"') from None
+    for key, most in (("tool", 3), ("noise_filter", 4)):
+        value = getattr(settings, key)
+        if value is not None and not 0 <= value <= most:
+            raise ValueError(f"{key} = {value}; want 0 to {most}")

@@ -1,0 +1,98 @@
+"""Six-component force/torque sensors: their channels, and how a reading gets its flags and into its page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from sioms.protocol.flags import AnalogStatus, NodeClass
+from sioms.protocol.nodeinfo import ChannelInfo
+
+from .blocks import AnalogBlock, BlockSpec
+from .driver import Kit
+
+COMPONENTS = ("fx", "fy", "fz", "tx", "ty", "tz")
+UNITS = ("N", "N", "N", "N*m", "N*m", "N*m")
+Six = tuple[float, float, float, float, float, float]
+SAY_AGAIN_NS = 1_000_000_000
+"""A status that changes all the time is told of once in this time [ns]."""
+
+
+def force_spec(full_scale: Six | None, history: int, description: str) -> BlockSpec:
+    """Return the block of a sensor.
+
+    Args:
+        full_scale: greatest forces [N] and torques [N m] that the sensor measures; None leaves the ranges open.
+        history: snapshots kept for readers.
+        description: of the channels.
+
+    Raises:
+        ValueError: a full scale is not positive.
+    """
+    if full_scale is not None and not all(0 < value < math.inf for value in full_scale):
+        raise ValueError(f"full_scale = {list(full_scale)}; want six positive numbers, N and N*m")
+    limits = full_scale or (None,) * 6
+    channels = tuple(
+        ChannelInfo(name, unit, None if limit is None else -limit, limit, description=description)
+        for name, unit, limit in zip(COMPONENTS, UNITS, limits, strict=True)
+    )
+    return BlockSpec("", NodeClass.ANALOG, channels, history=history)
+
+
+class ForceBlock(AnalogBlock):
+    """Forces and torques of one sensor; values at or beyond full scale are flagged as saturated.
+
+    Attributes:
+        saturated, invalid: readings so far that were flagged as such.
+        status: the sensor's status in words.
+    """
+
+    def __init__(self, spec: BlockSpec, device: str, kit: Kit) -> None:
+        super().__init__(spec)
+        self._device, self._kit = device, kit
+        self._limit = np.array([math.inf if c.maximum is None else c.maximum for c in spec.channels])
+        self._scale = np.ones(self.n)
+        self._size = np.empty(self.n)
+        self.saturated = self.invalid = 0
+        self.status = "ok"
+        self._told, self._told_ns = "ok", -SAY_AGAIN_NS
+
+    def set_scale(self, force_n: float, torque_nm: float) -> None:
+        """Tell what one of the sensor's numbers is [N], [N m]."""
+        self._scale[:3], self._scale[3:] = force_n, torque_nm
+
+    def show(self, values: Sequence[float], stamp_ns: int, flags: int = 0) -> None:
+        """Take a reading and publish it; the arguments are those of ``fill``."""
+        self.fill(values, stamp_ns, flags)
+        self._kit.publish(self, stamp_ns)
+
+    def fill(self, values: Sequence[float], stamp_ns: int, flags: int = 0) -> None:
+        """Take a reading.
+
+        Args:
+            values: six numbers as the sensor sends them.
+            stamp_ns: when they were measured [ns, CLOCK_MONOTONIC].
+            flags: of AnalogStatus, what the sensor says of the whole reading.
+        """
+        data = self.data
+        np.multiply(values, self._scale, out=data)
+        np.abs(data, out=self._size)
+        self.flags[:] = flags
+        # one comparison for the ordinary case: not-a-number is not smaller either
+        if not (self._size < self._limit).all():
+            self.flags[self._size >= self._limit] |= int(AnalogStatus.SATURATED)
+            self.flags[~np.isfinite(data)] |= int(AnalogStatus.INVALID)
+            flags = int(np.bitwise_or.reduce(self.flags))
+        if flags:
+            self.saturated += bool(flags & AnalogStatus.SATURATED)
+            self.invalid += bool(flags & AnalogStatus.INVALID)
+        self.stamp_ns = stamp_ns
+
+    def say(self, status: str, now_ns: int) -> None:
+        """Note the sensor's status, and log a change of it."""
+        self.status = status
+        if status != self._told and now_ns - self._told_ns >= SAY_AGAIN_NS:
+            self._told, self._told_ns = status, now_ns
+            self._kit.log("info" if status == "ok" else "warning", f"{self._device}: status: {status}")

@@ -1,0 +1,168 @@
+"""A Robotiq FT 300 on a pty: ``python -m sioms.tools.counterparts.ft300 --link PATH``.
+
+Modbus RTU slave 9, functions 03 and 16, until 0x0200 is written to register 410; then a record of 16 bytes a hundred times
+a second, and no answer to anything, until fifty times 0xFF have come in a row. Commands on standard input, beside those of
+the line: ``load FX FY FZ TX TY TZ [SECONDS]``, ``lose COUNT`` (records that are not sent), ``reboot`` (as after a power cycle: no stream),
+``register ADDRESS VALUE``, ``state``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+import time
+from collections.abc import Callable
+
+from . import wire
+from .load import Load
+
+PERIOD_S = 0.01
+STOP_BYTES = 50
+STREAM_SELECT = 410
+GRAVITY = 1000
+ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3
+
+
+def crc(data: bytes) -> int:
+    """Return the CRC of Modbus, bit by bit as its specification draws it."""
+    value = 0xFFFF
+    for byte in data:
+        value ^= byte
+        for _ in range(8):
+            value = value >> 1 ^ 0xA001 if value & 1 else value >> 1
+    return value
+
+
+def framed(body: bytes) -> bytes:
+    """Return a body with its CRC, low byte first."""
+    return body + struct.pack("<H", crc(body))
+
+
+class Sensor:
+    """The sensor without its port; times in seconds of the given clock."""
+
+    def __init__(
+        self, slave: int, firmware: str, serial: int, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.slave, self.clock = slave, clock
+        self.load = Load()
+        self.words = {500 + i: int.from_bytes(firmware[2 * i : 2 * i + 2].encode(), "big") for i in range(3)}
+        self.words |= {510: 0, 511: 0, 512: serial & 0xFFFF, 513: serial >> 16, 514: 2019, STREAM_SELECT: 0}
+        self.received = b""
+        self.heard_s = 0.0
+        self.lose = 0
+        self.reboot()
+
+    def reboot(self) -> None:
+        """Begin anew, as after a power cycle."""
+        self.streaming = False
+        self.stops = 0
+        self.next_s = 0.0
+
+    def connected(self) -> list[bytes]:
+        """Nothing is said to a new master."""
+        return []
+
+    def take(self, data: bytes) -> list[bytes]:
+        """Return the replies to what came."""
+        if self.streaming:
+            for byte in data:
+                self.stops = self.stops + 1 if byte == 0xFF else 0
+            if self.stops >= STOP_BYTES:
+                self.reboot()
+            return []
+        # a frame that was cut off by silence is none
+        now_s = self.clock()
+        if now_s - self.heard_s > 0.02:
+            self.received = b""
+        self.heard_s = now_s
+        self.received = (self.received + data)[-256:]
+        size = self._frame_size(self.received)
+        if size is None or len(self.received) < size:
+            return []
+        frame, self.received = self.received[:size], b""
+        if frame[0] != self.slave or struct.pack("<H", crc(frame[:-2])) != frame[-2:]:
+            return []
+        return [framed(bytes((self.slave,)) + self._answer(frame[1], frame[2:-2]))]
+
+    @staticmethod
+    def _frame_size(data: bytes) -> int | None:
+        if len(data) < 7:
+            return None
+        return 9 + data[6] if data[1] == 16 else 8
+
+    def _answer(self, function: int, body: bytes) -> bytes:
+        if function not in (3, 16):
+            return bytes((function | 0x80, ILLEGAL_FUNCTION))
+        address, count = struct.unpack(">HH", body[:4])
+        if function == 3:
+            try:
+                words = [self._word(at) for at in range(address, address + count)]
+            except KeyError:
+                return bytes((0x83, ILLEGAL_ADDRESS))
+            if not 1 <= count <= 125:
+                return bytes((0x83, ILLEGAL_VALUE))
+            return struct.pack(f">BB{count}H", 3, 2 * count, *words)
+        if (address, count) != (STREAM_SELECT, 1):
+            return bytes((0x90, ILLEGAL_ADDRESS))
+        value = struct.unpack(">H", body[5:7])[0]
+        if value == 0x0200:
+            self.streaming, self.next_s = True, self.clock() + PERIOD_S
+        return struct.pack(">BHH", 16, address, count)
+
+    def _word(self, address: int) -> int:
+        if 180 <= address <= 185:
+            return self.counts(self.clock())[address - 180] & 0xFFFF
+        if 190 <= address <= 192:
+            return GRAVITY if address == 192 else 0
+        if 186 <= address <= 189:
+            return 0
+        return self.words[address]
+
+    def counts(self, now_s: float) -> list[int]:
+        """Return 0.01 N and 0.001 N m."""
+        values, _ = self.load.measured(now_s)
+        return [round(value * (100 if i < 3 else 1000)) for i, value in enumerate(values)]
+
+    def due(self) -> list[bytes]:
+        """Return the records sampled until now."""
+        now_s, records = self.clock(), []
+        while self.streaming and self.next_s <= now_s:
+            body = b"\x20\x4e" + struct.pack("<6h", *self.counts(self.next_s))
+            self.next_s += PERIOD_S
+            if self.lose:
+                self.lose -= 1
+            else:
+                records.append(framed(body))
+        return records
+
+    def handlers(self) -> dict[str, Callable[..., object]]:
+        """Return the commands on standard input."""
+
+        def lose(count: str) -> None:
+            self.lose = int(count)
+
+        def register(address: str, value: str) -> None:
+            self.words[int(address)] = int(value, 0)
+
+        def state() -> dict[str, object]:
+            return {"streaming": self.streaming, "load": self.load.true(self.clock())}
+
+        return {
+            **self.load.handlers(self.clock), "lose": lose, "register": register, "reboot": self.reboot, "state": state,
+        }  # fmt: skip
+
+
+async def main() -> None:
+    """Serve until told to end."""
+    parser = wire.parser("simulated Robotiq FT 300", tcp=True)
+    parser.add_argument("--slave", type=int, default=9)
+    parser.add_argument("--firmware", default="FT3-21", help="six characters")
+    parser.add_argument("--serial", type=int, default=123456)
+    options = parser.parse_args()
+    sensor = Sensor(options.slave, options.firmware, options.serial)
+    await wire.run(sensor, options, sensor.handlers())
+
+
+if __name__ == "__main__":
+    asyncio.run(main())
