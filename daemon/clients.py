@@ -355,9 +355,9 @@ class Clients:
             access &= ~Access.WRITE
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
-        event = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        readable, wake = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         try:
-            fds = [theirs.fileno(), event] + ([session.pidfd] if session.pidfd >= 0 else [])
+            fds = [theirs.fileno(), wake] + ([session.pidfd] if session.pidfd >= 0 else [])
             exclusive = not node.read_only
             try:
                 device.send(
@@ -369,9 +369,10 @@ class Clients:
             self._handles[handle.number] = session.handles[handle.number] = handle
             self._claims.take(handle.claims, handle)
             value = [handle.number, self._server.names.pack(node), node.channels, node.bit]
-            self._send(session, reply(number, value), [device.page_fds[node.block], event, ours.fileno()])
+            self._send(session, reply(number, value), [device.page_fds[node.block], readable, ours.fileno()])
         finally:
-            os.close(event)
+            os.close(readable)
+            os.close(wake)
             ours.close()
             theirs.close()
 

@@ -125,12 +125,8 @@ class AsyncNode(NodeCore):
     async def write(self, records: Records, timeout: float | None = 0.0, *, replace: bool = False) -> int:
         """Write records, all or none; see ``Node.write``."""
         call = self._write(records, timeout, replace)
-        try:
-            tick: int = (await self._requests.call(call)).value
-            return tick
-        finally:
-            for fd in call.fds:
-                os.close(fd)
+        tick: int = (await self._requests.call(call)).value
+        return tick
 
     async def command(
         self, axis: int = 0, *, timeout: float | None = 0.0, replace: bool = False, **words: Any
@@ -178,7 +174,7 @@ class AsyncNode(NodeCore):
                 await self._wake()
 
     async def _wake(self) -> None:
-        """Wait for the eventfd, and look at the page at least every 50 ms: a hung driver wakes nobody."""
+        """Wait for the wake pipe, and look at the page at least every 50 ms: a hung driver wakes nobody."""
         loop = asyncio.get_running_loop()
         woken = loop.create_future()
 

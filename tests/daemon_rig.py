@@ -126,6 +126,7 @@ class Daemon:
                 "state": "leaving",
                 "generation": 0,
                 "pid": 0,
+                "link": "",
             }  # between two processes of a reload
             return next((d for d in cell.status()["devices"] if d["name"] == name), absent)
 

@@ -43,27 +43,30 @@ _DONTWAIT = 0x40
 _ANCILLARY = CMSG_SPACE(8 * 4)
 _FOREVER = pack("ll", 0, 0)
 KEEPALIVE = encode(HandleVerb.KEEPALIVE, 0)
+INTERRUPTIBLE_S = 1.0
+"""A signal that comes just before the interpreter goes to sleep is seen when that wakes: it sleeps this long [s]."""
 GRACE_S = 2.0
 """How much longer than its own time-out an answer may take before the other side counts as hung."""
 
 
 class Call:
-    """A request to be sent: verb, arguments, descriptors, and how long its answer may take.
+    """A request to be sent: verb, arguments, and how long its answer may take.
 
     Attributes:
         what: the request in words, for messages.
+        ahead: records that are sent ahead of it, in parts.
         limit_s: the time-out that the other side has been given [s], None = it may take for ever.
     """
 
-    __slots__ = ("arguments", "fds", "limit_s", "verb", "what")
+    __slots__ = ("ahead", "arguments", "limit_s", "verb", "what")
 
     def __init__(
-        self, what: str, verb: int, *arguments: object, fds: tuple[int, ...] = (), limit_s: float | None = 0.0
+        self, what: str, verb: int, *arguments: object, ahead: tuple[bytes, ...] = (), limit_s: float | None = 0.0
     ) -> None:
         self.what = what
         self.verb = verb
         self.arguments = arguments
-        self.fds = fds
+        self.ahead = ahead
         self.limit_s = limit_s
 
 
@@ -150,11 +153,13 @@ class Channel:
             OSError: the refusal, with its errno and sentence; EIO when the other side is gone,
                 ETIMEDOUT when it does not answer within the time-out and a grace.
         """
-        number = self.send(call)
+        number = 0
         try:
+            number = self.send(call)
             return self.wait(number, call)
         except KeyboardInterrupt:
-            self._abandon(number)
+            if number:
+                self._abandon(number)
             raise
 
     def _abandon(self, number: int) -> None:
@@ -183,12 +188,9 @@ class Channel:
                     errno.EMSGSIZE, f"{call.what}: {len(packet)} bytes in one message; at most {MAX_PACKET}"
                 )
             try:
-                if call.fds:
-                    self._sock.sendmsg(
-                        [packet], [(SOL_SOCKET, SCM_RIGHTS, pack(f"{len(call.fds)}i", *call.fds))]
-                    )
-                else:
-                    self._sock.send(packet)
+                for part in call.ahead:
+                    self._sock.send(encode(HandleVerb.PART, 0, number, part))
+                self._sock.send(packet)
             except OSError as error:
                 raise self._gone(error, call.what) from None
         return number
@@ -219,8 +221,8 @@ class Channel:
             if found is not None:
                 return self.result(found)
             if not lead:
-                left = -1 if deadline is None else max(0.0, deadline - monotonic())
-                turn.acquire(True, left)
+                left = INTERRUPTIBLE_S if deadline is None else deadline - monotonic()
+                turn.acquire(True, max(0.0, min(left, INTERRUPTIBLE_S)))
                 with self._mutex:
                     self._waiting.pop(number, None)
                     late = number not in self._answers and deadline is not None and monotonic() >= deadline
@@ -271,14 +273,11 @@ class Channel:
     def _read(self, number: int, deadline: float | None) -> tuple[list, list[int]] | None:  # type: ignore[type-arg]
         """Read packets until the one with this number has come; None when it is late."""
         while True:
-            if deadline is None:
-                timeout = self.keepalive_s
-            else:
-                timeout = deadline - monotonic()
+            timeout = self.keepalive_s or INTERRUPTIBLE_S
+            if deadline is not None:
+                timeout = min(timeout, deadline - monotonic())
                 if timeout <= 0:
                     return None
-                if self.keepalive_s:
-                    timeout = min(timeout, self.keepalive_s)
             self._set_timeout(timeout)
             try:
                 message, fds = self._packet(0)

@@ -22,6 +22,11 @@ from .channel import KEEPALIVE, Call, Channel
 from .command import command
 from .snapshot import SNAPSHOT, AnalogSnapshot, AxisSnapshot, BinarySnapshot, Layout
 
+_WAKES = 4096
+"""Bytes taken out of the wake pipe in one go, one a publication."""
+_JUDGED_S = 0.1
+"""What a driver may take to judge a packet of records, in pieces between its ticks [s]."""
+
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -154,9 +159,10 @@ class NodeCore:
             return Call(what, HandleVerb.WRITE, int(flags), timeout, data, limit_s=timeout)
         if len(data) > MAX_WRITE:
             raise OSError(errno.EMSGSIZE, f"{what}: {len(data)} bytes of records; at most {MAX_WRITE}")
-        fd = os.memfd_create("sioms-write", os.MFD_CLOEXEC)
-        os.write(fd, data)
-        return Call(what, HandleVerb.WRITE, int(flags), timeout, None, fds=(fd,), limit_s=timeout)
+        parts = [data[i : i + MAX_INLINE] for i in range(0, len(data), MAX_INLINE)]
+        limit_s = None if timeout is None else timeout + _JUDGED_S * len(parts)
+        ahead = tuple(parts[:-1])
+        return Call(what, HandleVerb.WRITE, int(flags), timeout, parts[-1], ahead=ahead, limit_s=limit_s)
 
     def _outputs(self, values: Sequence[float]) -> bytes:
         count = len(self.info.channels)
@@ -193,7 +199,7 @@ class NodeCore:
 
     def _drain(self) -> None:
         try:
-            os.read(self._event, 8)
+            os.read(self._event, _WAKES)
         except BlockingIOError:
             return
 
@@ -294,12 +300,8 @@ class Node(NodeCore):
                 emergency stop; EIO the device is lost. Nothing was taken.
         """
         call = self._write(records, timeout, replace)
-        try:
-            tick: int = self._channel.call(call).value
-            return tick
-        finally:
-            for fd in call.fds:
-                os.close(fd)
+        tick: int = self._channel.call(call).value
+        return tick
 
     def wait_new(self, after: int, timeout: float | None = None) -> Any:
         """Wait for a snapshot newer than a given number and return the newest.
@@ -340,7 +342,7 @@ class Node(NodeCore):
         return value
 
     def _poll(self, deadline: float | None, what: str) -> None:
-        """Wait until the eventfd is readable, then look at the page's state at least every 50 ms."""
+        """Wait until the wake pipe is readable, then look at the page's state at least every 50 ms."""
         left = None if deadline is None else deadline - monotonic()
         if left is not None and left <= 0:
             raise TimeoutError(errno.ETIMEDOUT, f"{what}: nothing within its time-out")

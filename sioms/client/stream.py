@@ -6,7 +6,6 @@ its source; a refusal ends it, and nothing that was written after the refused on
 
 from __future__ import annotations
 
-import os
 from select import POLLIN, poll
 
 TYPE_CHECKING = False
@@ -47,11 +46,7 @@ class Stream:
             OSError: the driver has gone, or has refused an earlier write.
         """
         call = self.node._write(records, None, replace)
-        try:
-            self._pending.append((self._channel.send(call), call))
-        finally:
-            for fd in call.fds:
-                os.close(fd)
+        self._pending.append((self._channel.send(call), call))
         self.settle()
         while len(self._pending) > self._ahead:
             self._oldest()

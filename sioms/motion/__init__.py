@@ -7,7 +7,7 @@ the unit of the axis (m or rad), forces in N or N*m, instants in integer ns of C
 from .bank import AxisBank
 from .commands import Command
 from .drives import ActionKind, DriveAction, DriveBank
-from .queue import Judgement
+from .queue import Judged, Judgement
 from .types import (
     SWITCH_HOME,
     SWITCH_MINUS,
@@ -36,6 +36,7 @@ __all__ = [
     "Event",
     "EventKind",
     "Homing",
+    "Judged",
     "Judgement",
     "MarkerPort",
 ]

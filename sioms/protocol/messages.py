@@ -5,8 +5,9 @@ Reply    [0, id, errno, value or text]   errno 0: value; else text, one sentence
 Reply    [0, id, 0, bytes, true]         a long value: its msgpack, compressed by zlib
 Notice   [verb, 0, arguments...]         draws no reply
 
-Packets are bounded by MAX_PACKET; a larger write carries its records in a sealed memory file whose
-descriptor goes along. Whoever receives something else ends that connection, and nothing else.
+Packets are bounded by MAX_PACKET; a larger write sends the beginning of its records ahead, in notices
+that carry its number. No client passes a descriptor to anybody: closing what a stranger opened may block.
+Whoever receives something else ends that connection, and nothing else.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ else:
 
 MAX_PACKET = 65536
 MAX_INLINE = 49152
-"""Bytes of records up to which a write carries them in the packet."""
+"""Bytes of records that one packet carries."""
 MAX_WRITE = 1 << 24
 """Bytes of records in one write at most."""
 MAX_TEXT = 1024
@@ -71,6 +72,8 @@ class HandleVerb(IntEnum):
     SUBSCRIBE = 3
     KEEPALIVE = 4
     CANCEL = 5
+    PART = 6
+    """[number, records]: the beginning of the records of a write that is to follow; a notice."""
 
 
 class DriverVerb(IntEnum):
@@ -78,7 +81,7 @@ class DriverVerb(IntEnum):
 
     ATTACH = 1
     """D: [handle, block, channels, bit, access, exclusive, rights, lease_ns, who, node]; descriptors: socket,
-    eventfd, pidfd if any."""
+    writing end of the wake pipe, pidfd if any."""
     DETACH = 2
     """D: [handle]: end it, as if its socket had closed."""
     STOP_CHANGED = 3

@@ -6,26 +6,31 @@ Concurrency: the one thread of the driver process.
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import socket
 import time
-from array import array
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sioms.protocol.flags import Access, Right
-from sioms.protocol.messages import MAX_PACKET, MAX_WRITE, DriverVerb, HandleVerb, MalformedMessage, decode
+from sioms.protocol.messages import (
+    MAX_INLINE,
+    MAX_PACKET,
+    MAX_WRITE,
+    DriverVerb,
+    HandleVerb,
+    MalformedMessage,
+    decode,
+)
 
 from .blocks import AxisBlock
-from .handles import Handle
-from .requests import LATER, ioctl, write
+from .handles import LATER, Handle
+from .requests import ioctl
+from .writing import write
 
 if TYPE_CHECKING:
     from .runtime import Runtime
-
-_TWO_FDS = socket.CMSG_LEN(2 * 4)
 
 
 class Attachments:
@@ -68,7 +73,7 @@ class Attachments:
         self, fds: list[int], number: int, block: int, channels: list[int], bit: int, access: int,
         exclusive: bool, rights: int, lease_ns: int, who: str, node: str,
     ) -> None:  # fmt: skip
-        """Take a handle from the daemon: descriptors of socket, eventfd and, if known, the client's process."""
+        """Take a handle from the daemon: descriptors of socket, wake pipe and, if known, the client's process."""
         if len(fds) < 2:  # the kernel drops what goes beyond the limit of open descriptors
             for fd in fds:
                 os.close(fd)
@@ -95,33 +100,34 @@ class Attachments:
         if handle.number not in self.handles:
             return
         try:
-            packet, ancillary, flags, _ = handle.sock.recvmsg(MAX_PACKET, _TWO_FDS)
+            # Descriptors that a client may send along are dropped by the kernel, never opened here.
+            packet = handle.sock.recv(MAX_PACKET + 1)
         except BlockingIOError:
             return
         except OSError:
-            packet, ancillary, flags = b"", [], 0
-        fds = _fds_of(ancillary) if ancillary else []
+            packet = b""
         handle.heard_ns = time.monotonic_ns()
         try:
             if not packet:
                 self.drop(handle)
                 return
-            if flags & socket.MSG_TRUNC:
+            if len(packet) > MAX_PACKET:
                 raise MalformedMessage(f"packet longer than {MAX_PACKET} bytes")
-            self._serve(handle, decode(packet), fds)
+            self._serve(handle, decode(packet))
         except (MalformedMessage, ValueError, TypeError, LookupError, OverflowError) as error:
             self._runtime.log(
                 "warning", f"{handle.node}: connection of {handle.who} ended: malformed message: {error}"
             )
             self.end(handle, errno.EPROTO, f"{handle.node}: malformed message: {error}")
-            return
-        finally:
-            for fd in fds:
-                os.close(fd)
 
-    def _serve(self, handle: Handle, message: list[Any], fds: list[int]) -> None:
+    def _serve(self, handle: Handle, message: list[Any]) -> None:
         verb, number, arguments = HandleVerb(message[0]), message[1], message[2:]
-        if verb is not HandleVerb.KEEPALIVE and (number == 0 or number in handle.waits):
+        if verb is HandleVerb.KEEPALIVE:
+            return
+        if verb is HandleVerb.PART:
+            _keep_part(handle, *arguments)
+            return
+        if number == 0 or number in handle.waits:
             raise MalformedMessage(f"message number {number} is zero or in use")
         # Nothing is taken after a stop, or refused after its reset, because no tick has come in between.
         self._runtime.heed_latch()
@@ -129,8 +135,8 @@ class Attachments:
             match verb:
                 case HandleVerb.WRITE:
                     flags, timeout_s, data = arguments
-                    if data is None:
-                        data = _records_of(fds)
+                    if handle.ahead[1]:
+                        data = _whole(handle, number, data)
                     value = write(self._runtime, handle, number, int(flags), _seconds(timeout_s), data)
                 case HandleVerb.IOCTL:
                     request, argument, timeout_s = arguments
@@ -143,8 +149,6 @@ class Attachments:
                     value = wait is not None
                     if wait is not None:
                         self._runtime.waits.end(wait, errno.ECANCELED, f"{wait.what}: cancelled")
-                case HandleVerb.KEEPALIVE:
-                    return
         except OSError as error:
             handle.refuse(number, error.errno or errno.EIO, error.strerror or str(error))
         else:
@@ -203,29 +207,26 @@ class Attachments:
             self._runtime.log("error", f"safe output of {handle.node} could not be set: {error.strerror}")
 
 
-def _fds_of(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
-    """Return the descriptors that came along with a packet."""
-    fds = array("i")
-    for level, kind, data in ancillary:
-        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
-            fds.frombytes(data[: len(data) - len(data) % fds.itemsize])
-    return fds.tolist()
+def _keep_part(handle: Handle, number: int, records: bytes) -> None:
+    """Keep records that come ahead of their write; those of a write that never came are dropped."""
+    if type(number) is not int or not isinstance(records, bytes) or len(records) > MAX_INLINE:
+        raise MalformedMessage(f"a part of a write without its number, or without up to {MAX_INLINE} bytes")
+    if not handle.writes:
+        return  # its write will be refused
+    if handle.ahead[0] != number:
+        handle.ahead = (number, [])
+    parts = handle.ahead[1]
+    if len(parts) <= MAX_WRITE // MAX_INLINE:  # one more than allowed tells that it is too much
+        parts.append(records)
 
 
-def _records_of(fds: list[int]) -> bytes:
-    """Copy the records of a large write out of the memory file that came with it."""
-    if not fds:
-        raise MalformedMessage("a write without records and without a descriptor")
-    try:
-        fcntl.fcntl(
-            fds[0], fcntl.F_GET_SEALS
-        )  # only memory files have seals; any other file may block for ever
-    except OSError:
-        raise MalformedMessage("the descriptor of a write is no memory file") from None
-    size = os.fstat(fds[0]).st_size
-    if size > MAX_WRITE:
-        raise OSError(errno.EMSGSIZE, f"write of {size} bytes; want at most {MAX_WRITE}")
-    return os.pread(fds[0], size, 0)
+def _whole(handle: Handle, number: int, rest: bytes) -> bytes:
+    """Return all records of a write."""
+    (ahead, parts), handle.ahead = handle.ahead, (0, [])
+    whole = b"".join([*parts, rest]) if ahead == number else rest
+    if len(whole) > MAX_WRITE:
+        raise OSError(errno.EMSGSIZE, f"write {handle.node}: more than {MAX_WRITE} bytes of records")
+    return whole
 
 
 def _seconds(value: Any) -> float | None:

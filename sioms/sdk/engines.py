@@ -15,9 +15,8 @@ from .blocks import AnyBlock, AxisBlock
 from .connection import Connection
 from .driver import LineDriver, LineUnit, Refusal, StreamDriver, TickDriver
 from .exchange import DeviceError, LinkError, Steps
-from .handles import Handle
+from .handles import LATER, Handle
 from .line import Counters, Done, Line, Priority
-from .requests import LATER
 from .side_connection import SideConnection
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """Handles: the connections of clients to this driver process, and what they are waiting for.
 
-A handle is a socket, an eventfd and, for its owner's death, a pidfd. All three belong to the kernel,
-so a client that dies in any way is noticed here directly, without the daemon.
+A handle is a socket, a pipe and, for its owner's death, a pidfd. All three belong to the kernel, so a client that dies in any way is noticed here directly, without the daemon. The client holds the other ends: nothing
+it does to them makes a call of this process block.
 
 Concurrency: owned by the driver process's one thread.
 """
@@ -13,7 +13,7 @@ import os
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,12 @@ from sioms.protocol.messages import encode, refusal, reply
 
 from .blocks import AnyBlock
 
+if TYPE_CHECKING:
+    from .writing import AxesWrite
+
 MAX_WAITS = 64
+LATER = object()
+"""Returned instead of a value when the answer comes later."""
 
 
 @dataclass(slots=True, eq=False)
@@ -35,13 +40,15 @@ class Handle:
         node: name it was opened by.
         who: whose it is, for messages.
         sock: socket to the client, non-blocking.
-        event: eventfd that wakes the client.
+        wakes: writing end of the pipe that wakes the client, non-blocking.
         pidfd: the client's process, -1 when unknown.
         block: what it shows; ``channels`` of it, and one bit of them if ``bit`` >= 0.
         access: what it may do by its mode; ``exclusive`` says that it owns its channels.
         rights: what its user may do.
         lease_ns: longest silence allowed to the client, 0 = any.
-        every: eventfd is written on every n-th publication; 0 = not; -1 = when a binary edge came.
+        every: the client is woken by every n-th publication; 0 = not; -1 = when a binary edge came.
+        writing: writes of axis records that are not in the buffers yet, the oldest first.
+        ahead: number of a write that is to follow, and the records that have come ahead of it.
         waits: unanswered requests by message number; each has a way to be ended.
         writes: whether it may write.
     """
@@ -50,7 +57,7 @@ class Handle:
     node: str
     who: str
     sock: socket.socket
-    event: int
+    wakes: int
     pidfd: int
     block: AnyBlock
     channels: NDArray[np.intp]
@@ -64,7 +71,8 @@ class Handle:
     countdown: int = 0
     writes_under_way: int = 0
     waits: dict[int, Wait] = field(default_factory=dict)
-    full: Callable[[], tuple[Any] | None] | None = None
+    writing: list[AxesWrite] = field(default_factory=list)
+    ahead: tuple[int, list[bytes]] = (0, [])
     writes: bool = field(init=False)
 
     def __post_init__(self) -> None:
@@ -83,16 +91,16 @@ class Handle:
         self._send(encode(0, 0, errno_, text))
 
     def wake(self) -> None:
-        """Make the client's eventfd readable."""
+        """Make the client's end of the pipe readable."""
         try:
-            os.eventfd_write(self.event, 1)
-        except BlockingIOError:
-            return  # it has been readable for 2**64 - 2 publications; it will notice
+            os.write(self.wakes, b"\1")
+        except OSError:
+            return  # full: it has been readable for long; broken: its end of file is on its way
 
     def close(self) -> None:
         """Release the descriptors."""
         self.sock.close()
-        os.close(self.event)
+        os.close(self.wakes)
         if self.pidfd >= 0:
             os.close(self.pidfd)
 

@@ -1,4 +1,4 @@
-"""What clients may ask of a driver on a handle: writes and ioctl requests.
+"""What clients may ask of a driver on a handle beside writes: the ioctl requests.
 
 Every request either takes effect as a whole or is refused with an errno and one sentence that names
 the node, the channel, the field, the value and what would be accepted.
@@ -12,181 +12,25 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sioms.motion import CommandError
-from sioms.protocol.flags import NodeClass, Request, Right, WriteFlag
-from sioms.protocol.records import WRITE_STRUCT, numpy_dtype
+from sioms.protocol.flags import Request, Right
 
-from .blocks import AnalogBlock, AxisBlock, BinaryBlock
+from .blocks import AnalogBlock, AxisBlock
 from .driver import Refusal
-from .handles import Handle, Wait
+from .handles import LATER, Handle, Wait
+from .writing import check_link
 
 if TYPE_CHECKING:
     from .runtime import Runtime
 
-_DTYPE = {cls: np.dtype(numpy_dtype(cls)) for cls in NodeClass}
-_REPLACE = int(WriteFlag.REPLACE)
 FEW_TICKS = 1000
 """Ticks that statistics are told of when nobody asks for more: sorting thousands would delay the next tick."""
-LATER = object()
-"""Returned instead of a value when the answer comes later."""
 
 
 def _refuse(errno_: int, text: str) -> OSError:
     return OSError(errno_, text)
 
-
-# --- write ---------------------------------------------------------------------------------------
-
-
-def write(
-    runtime: Runtime, handle: Handle, number: int, flags: int, timeout_s: float | None, data: bytes
-) -> Any:
-    """Carry out a write of whole records.
-
-    Args:
-        runtime: the driver process.
-        handle: who writes.
-        number: message number, for an answer that comes later.
-        flags: WriteFlag.
-        timeout_s: how long to wait for room in the command buffers [s]; 0: not at all; None: for ever.
-        data: the records, one after the other.
-
-    Returns:
-        The tick number, or LATER.
-
-    Raises:
-        OSError: refused; nothing was taken.
-    """
-    what = f"write {handle.node}"
-    if not handle.writes:
-        raise _refuse(errno.EBADF, f"{what}: the handle is not open for writing")
-    node_class = handle.block.spec.node_class
-    size = WRITE_STRUCT[node_class].size
-    if not data or len(data) % size:
-        raise _refuse(errno.EINVAL, f"{what}: {len(data)} bytes; want whole records of {size} bytes")
-    if runtime.stopped:
-        raise _refuse(errno.EPERM, f"{what}: stopped by emergency stop ({runtime.latch.source}); reset first")
-    _check_link(runtime, handle, what)
-    records = np.frombuffer(data, _DTYPE[node_class])
-    if isinstance(handle.block, AxisBlock):
-        return _write_axes(runtime, handle, number, flags, timeout_s, records, what)
-    channels, values = _output_values(runtime, handle, records, what)
-    for channel in channels:
-        source = runtime.latched_outputs.get((id(handle.block), channel))
-        if source is not None:
-            raise _refuse(errno.EPERM, f"{what}: stopped by emergency stop ({source}); reset the node first")
-    return runtime.engine.write_outputs(handle, number, handle.block, channels, values)
-
-
-def _check_link(runtime: Runtime, handle: Handle, what: str) -> None:
-    """Refuse what would wait for a lost device and begin by itself when that is back."""
-    reason = runtime.pages.why_not(handle.block)
-    if reason:
-        raise _refuse(
-            errno.EIO, f"{what}: its device does not answer ({reason}); write again when it is back"
-        )
-
-
-def _write_axes(
-    runtime: Runtime, handle: Handle, number: int, flags: int, timeout_s: float | None,
-    records: NDArray[Any], what: str,
-) -> Any:  # fmt: skip
-    bank = handle.block.bank  # type: ignore[union-attr]
-    replace = bool(flags & _REPLACE)
-
-    def attempt() -> None:
-        try:
-            bank.append(records, handle.channels, runtime.now_ns(), replace=replace)
-        except CommandError as error:
-            raise _refuse(error.errno, f"{what}: {error}") from None
-        runtime.engine.commands_written(handle.block)
-
-    if replace:
-        attempt()  # what replaces the buffer also replaces what waits to get into it
-        runtime.waits.end_where(
-            lambda w: w.handle is handle and w.cancelled is not None,
-            errno.ECANCELED,
-            "replaced by a later write",
-        )
-        return runtime.tick
-    if timeout_s is not None and timeout_s <= 0:
-        if handle.full is not None:
-            raise _refuse(errno.EAGAIN, f"{what}: an earlier write still waits for room")
-        attempt()
-        return runtime.tick
-
-    def ready() -> tuple[Any] | None:
-        # Writes of one handle keep their order: a later one waits behind the first that found no room.
-        if handle.full not in (None, ready):
-            return None
-        try:
-            attempt()
-        except OSError as error:
-            if error.errno != errno.EAGAIN:
-                handle.full = None
-                raise
-            handle.full = ready
-            return None
-        handle.full = None
-        return (runtime.tick,)
-
-    def cancelled() -> None:
-        if handle.full is ready:
-            handle.full = None
-
-    if handle.full is None:
-        done = ready()
-        if done is not None:
-            return done[0]
-    runtime.waits.add(Wait(handle, number, what, runtime.deadline(timeout_s), ready, frozenset(), cancelled))
-    return LATER
-
-
-def _output_values(
-    runtime: Runtime, handle: Handle, records: NDArray[Any], what: str
-) -> tuple[list[int], list[float]]:
-    """Check the records of an output and turn them into one value for each channel."""
-    block = handle.block
-    ports: dict[int, float] = {}
-    for record in records:
-        index = int(record["channel"])
-        if not 0 <= index < len(handle.channels):
-            raise _refuse(errno.EINVAL, f"{what}: channel {index}; want 0 to {len(handle.channels) - 1}")
-        channel = int(handle.channels[index])
-        info = block.spec.channels[channel]
-        if isinstance(block, BinaryBlock):
-            value, width = int(record["data"]), info.width
-            mask = int(record["mask"]) or (1 << width) - 1
-            if handle.bit >= 0:
-                if value not in (0, 1):
-                    raise _refuse(errno.EINVAL, f"{what}: data {value}; want 0 or 1")
-                value, mask = value << handle.bit, 1 << handle.bit
-            elif not 0 <= value < 1 << width:
-                raise _refuse(
-                    errno.EINVAL, f"{what}: channel {info.name}: data {value}; want 0 to {(1 << width) - 1}"
-                )
-            before = ports.get(channel, runtime.outputs.get((id(block), channel), int(block.data[channel])))
-            ports[channel] = (int(before) & ~mask) | (value & mask)
-        else:
-            number = float(record["data"])
-            low = -math.inf if info.minimum is None else info.minimum
-            high = math.inf if info.maximum is None else info.maximum
-            if not math.isfinite(number):
-                raise _refuse(
-                    errno.EINVAL, f"{what}: channel {info.name}: data {number}; want a finite number"
-                )
-            if not low <= number <= high:
-                raise _refuse(
-                    errno.ERANGE,
-                    f"{what}: channel {info.name}: data {number:g} {info.unit}; want {low:g} to {high:g} {info.unit}",
-                )
-            ports[channel] = number
-    return list(ports), list(ports.values())
-
-
-# --- ioctl ---------------------------------------------------------------------------------------
 
 _NEEDS_OWNER = {
     Request.CALIBRATE_DEVICE, Request.HOME, Request.SET_LIMITS, Request.FLUSH, Request.ZERO_DEVICE, Request.SET_GAINS,
@@ -306,7 +150,7 @@ def _axis_request(
         case Request.FLUSH:
             bank.flush(axes)
         case Request.HOME:
-            _check_link(runtime, handle, what)
+            check_link(runtime, handle, what)
             bank.home(axes, now_ns)
         case Request.SET_LIMITS:
             if not isinstance(argument, dict) or not all(isinstance(k, str) for k in argument):

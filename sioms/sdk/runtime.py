@@ -117,6 +117,7 @@ class Runtime:
         self.clients = Attachments(self)
         self.engine = self._make_engine()
         self.period_ns = int(1e9 / self.engine.tick_hz)
+        self._spare_until_ns = 0
         self._seen_stop = (0, self.latch.resets, self._request.word)
 
     # --- services to the driver (Kit) ------------------------------------------------------------
@@ -144,6 +145,10 @@ class Runtime:
     def deadline(self, timeout_s: float | None) -> int | None:
         """Return when a time-out that begins now ends [ns]."""
         return None if timeout_s is None else time.monotonic_ns() + int(min(max(timeout_s, 0.0), 1e6) * 1e9)
+
+    def has_time(self) -> bool:
+        """Whether what can be done in pieces may do another before the next tick."""
+        return time.monotonic_ns() < self._spare_until_ns
 
     def published(self, block: AnyBlock) -> int:
         """Return the number of a block's newest snapshot."""
@@ -302,6 +307,7 @@ class Runtime:
         engine = self.engine
         engine.tick(scheduled_ns)
         ticked_ns = time.monotonic_ns()
+        self._spare_until_ns = ticked_ns + self.period_ns // 4
         self.pages.alive(ticked_ns)
         if isinstance(engine, TickEngine) and engine.publishes:
             for block in self.blocks:

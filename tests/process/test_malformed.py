@@ -18,7 +18,7 @@ from daemon_rig import Daemon, raises, wait_for
 
 import sioms
 from sioms.protocol.flags import PROTOCOL_VERSION, Request
-from sioms.protocol.messages import MAX_PACKET, MAX_WRITE, ClientVerb, HandleVerb, decode, encode
+from sioms.protocol.messages import MAX_INLINE, MAX_PACKET, MAX_WRITE, ClientVerb, HandleVerb, decode, encode
 from sioms.protocol.records import AXIS_WRITE
 
 SEED = 20240607
@@ -212,22 +212,33 @@ def test_a_write_larger_than_allowed_is_refused_by_both_sides(
     with cell.open("mod0.xaxis", "rw", timeout=3.0) as axis, raises(errno.EMSGSIZE, str(MAX_WRITE)):
         axis.write(bytes(MAX_WRITE + AXIS_WRITE.size))
     _, node = handle("mod0.xaxis")
-    fd = os.memfd_create("large")
-    os.ftruncate(fd, MAX_WRITE + AXIS_WRITE.size)
-    socket.send_fds(node.sock, [encode(HandleVerb.WRITE, 1, 0, 0.0, None)], [fd])
-    os.close(fd)
+    part = bytes(MAX_INLINE)
+    for _ in range(2 * MAX_WRITE // MAX_INLINE):
+        node.sock.sendall(encode(HandleVerb.PART, 0, 1, part))
+    node.sock.sendall(encode(HandleVerb.WRITE, 1, 0, 0.0, bytes(AXIS_WRITE.size)))
     reply = decode(node.sock.recv(MAX_PACKET))
     assert reply[2] == errno.EMSGSIZE, reply
 
 
-def test_a_memory_file_that_is_none_is_refused(handle: Callable[..., tuple[Raw, Raw]], bystander: Bystander) -> None:
+def test_parts_of_a_write_that_never_came_are_dropped(handle: Callable[..., tuple[Raw, Raw]]) -> None:
     _, node = handle("mod0.xaxis")
-    ours, theirs = os.pipe()
-    socket.send_fds(node.sock, [encode(HandleVerb.WRITE, 1, 0, 0.0, None)], [ours])
-    os.close(ours)
-    os.close(theirs)
-    reply = decode(node.sock.recv(MAX_PACKET))
-    assert reply[2] in (errno.EINVAL, errno.ESPIPE, errno.EPROTO), reply
+    good = sioms.command(0, position=0.0)
+    node.sock.sendall(encode(HandleVerb.PART, 0, 1, bytes(AXIS_WRITE.size)))
+    node.sock.sendall(encode(HandleVerb.WRITE, 2, 0, 0.0, good))
+    assert decode(node.sock.recv(MAX_PACKET))[2] == 0
+    node.sock.sendall(encode(HandleVerb.PART, 0, 3, good[:100]))
+    node.sock.sendall(encode(HandleVerb.WRITE, 3, 0, 0.0, good[100:]))
+    assert decode(node.sock.recv(MAX_PACKET))[2] == 0
+
+
+@pytest.mark.parametrize("arguments", [(), (1,), (1, "text"), ("1", b""), (1, bytes(MAX_INLINE + 1)), (1, b"", 2)])
+def test_a_malformed_part_ends_the_connection(
+    handle: Callable[..., tuple[Raw, Raw]], arguments: tuple[object, ...]
+) -> None:
+    _, node = handle("mod0.xaxis")
+    node.sock.sendall(encode(HandleVerb.PART, 0, *arguments))
+    assert decode(node.sock.recv(MAX_PACKET))[2] == errno.EPROTO
+    assert node.is_ended()
 
 
 def test_descriptors_sent_along_do_not_pile_up(

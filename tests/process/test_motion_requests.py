@@ -37,13 +37,80 @@ def _idle(axis: sioms.AxisNode) -> None:
 def test_ten_thousand_commands_in_one_write(cell: sioms.Workcell) -> None:
     with cell.open("mod0.xaxis", "rw") as axis:
         records = b"".join([sioms.command(0, velocity=0.05 * (-1) ** i, time=0.01) for i in range(10_000)])
-        assert len(records) > 1 << 20, "goes as a memory file"
+        assert len(records) > 1 << 20, "goes in many packets"
         began = time.monotonic()
         axis.write(records)
         took = time.monotonic() - began
         print(f"10,000 commands in one write: {took * 1e3:.1f} ms")
         assert took < 2.0
         wait_for(lambda: axis.read().buffered[0] > 9_000, "buffered")
+        _idle(axis)
+
+
+def _doubtful(count: int) -> list[bytes]:
+    """Return timed moves each of which has to be planned to be judged."""
+    return [sioms.command(0, position=0.02 * (-1) ** i, time=0.14) for i in range(count)]
+
+
+def test_a_long_write_that_is_hard_to_judge_delays_no_tick(cell: sioms.Workcell) -> None:
+    with cell.open("mod0.xaxis", "rw") as axis:
+        records = b"".join(_doubtful(axis.info.buffer_capacity))
+        skipped = axis.ioctl(Request.GET_STATISTICS, 1)["skipped"]
+        began = time.monotonic()
+        axis.write(records)
+        took = time.monotonic() - began
+        ticks = axis.ioctl(Request.GET_STATISTICS, int(took * 900))
+        print(f"judging {axis.info.buffer_capacity} trial profiles: {took:.2f} s; {ticks}")
+        assert took > 0.1, "long enough to show"
+        assert ticks["skipped"] - skipped < took * 1000 / 4, "a tick is 1 ms"
+        assert not axis.read().status[0] & AxisStatus.FAULT
+        _idle(axis)
+
+
+@pytest.mark.parametrize("end", ["stop", "emergency stop", "replace", "close"])
+def test_a_write_that_is_being_judged_ends_with_what_it_is_for(cell: sioms.Workcell, end: str) -> None:
+    axis = cell.open("mod0.xaxis", "rw")
+    refused: list[OSError] = []
+    records = b"".join(_doubtful(axis.info.buffer_capacity))
+
+    def write() -> None:
+        try:
+            axis.write(records)
+        except OSError as error:
+            refused.append(error)
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    time.sleep(0.05)
+    if end == "stop":
+        axis.stop()
+    elif end == "emergency stop":
+        axis.ioctl(Request.EMERGENCY_STOP)
+    elif end == "replace":
+        axis.move(0.05, replace=True)
+    else:
+        axis.close()
+    thread.join(10.0)
+    assert not thread.is_alive()
+    assert refused and refused[0].errno in (errno.ECANCELED, errno.EBADF, errno.EIO), refused
+    with cell.open("mod0.xaxis" if end == "close" else "mod0.xaxis.readonly", timeout=5.0) as reader:
+        assert reader.read().buffered[0] <= 1, "nothing of it was taken"
+        if end == "emergency stop":
+            axis.ioctl(Request.RESET)
+        if end != "close":
+            axis.wait_until_idle(5.0)
+            axis.close()
+
+
+def test_writes_keep_their_order_behind_one_that_is_being_judged(cell: sioms.Workcell) -> None:
+    with cell.open("mod0.xaxis", "rw") as axis:
+        long = threading.Thread(target=axis.write, args=(b"".join(_doubtful(4000)),))
+        long.start()
+        time.sleep(0.02)
+        axis.command(position=0.3)
+        long.join(10.0)
+        reading = axis.read()
+        assert reading.buffered[0] > 3900 and abs(reading.position[0]) < 0.1, "the short one comes after"
         _idle(axis)
 
 

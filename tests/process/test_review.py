@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import mmap
 import os
 import resource
@@ -20,7 +21,7 @@ from wire_rig import SLIDE, Wire
 
 import sioms
 from sioms.client.channel import Call, Channel, connect
-from sioms.protocol.flags import PROTOCOL_VERSION
+from sioms.protocol.flags import PROTOCOL_VERSION, Request
 from sioms.protocol.latch import REQUEST_SIZE
 from sioms.protocol.messages import ClientVerb, HandleVerb
 from sioms.protocol.records import BINARY_WRITE
@@ -264,22 +265,17 @@ def test_an_open_that_waits_ends_when_a_reload_changes_its_node(port: tuple[Daem
         assert waiting.errno() == errno.EIO and "changed meanwhile" in str(waiting.error)
 
 
-def test_records_come_out_of_memory_files_only(port: tuple[Daemon, Device], tmp_path: Path) -> None:
-    daemon, device = port
-    record = BINARY_WRITE.pack(0, 0, 7, 0)
-    (tmp_path / "records").write_bytes(record)
-    with daemon.cell("writer") as cell, (tmp_path / "records").open("rb") as file:
-        node = cell.open("port0", "rw")
-        with raises(errno.EPROTO, "no memory file"):
-            node._channel.call(Call("write", HandleVerb.WRITE, 0, 1.0, None, fds=(file.fileno(),)))
-        node.close()
-        assert device.written.count(7) == 0
-        memory = os.memfd_create("records")
-        os.write(memory, record)
-        with cell.open("port0", "rw", timeout=5.0) as node:
-            node._channel.call(Call("write", HandleVerb.WRITE, 0, 1.0, None, fds=(memory,)))
-        os.close(memory)
-        assert device.written.count(7) == 1
+def test_a_client_cannot_block_its_driver_by_the_wake_pipe(daemon: Daemon, cell: sioms.Workcell) -> None:
+    with cell.open("mod0.readonly") as node:
+        wake = node.fileno()
+        os.set_blocking(wake, True)
+        fcntl.fcntl(wake, fcntl.F_SETPIPE_SZ, 4096)
+        first = node.history(0)[-1].number
+        wait_for(lambda: node.history(0, gone=True)[-1].number > first + 5000, "5,000 wakes that nobody takes", 20.0)
+        assert daemon.device("mod0")["generation"] == 1
+        statistics = node.ioctl(Request.GET_STATISTICS, 5000)
+        assert statistics["skipped"] < 50, statistics
+        assert len(os.read(wake, 1 << 16)) == 4096
 
 
 def test_a_driver_without_descriptors_left_lives_on(port: tuple[Daemon, Device]) -> None:

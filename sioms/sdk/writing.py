@@ -1,0 +1,253 @@
+"""Writes: records to the command buffers of axes, or to outputs.
+
+A write takes effect as a whole or is refused with an errno and one sentence that names the node, the
+channel, the field, the value and what would be accepted. A long array of commands is judged in pieces
+between ticks, so that no write delays one.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.motion import CommandError, Judged, Judgement
+from sioms.protocol.flags import NodeClass, WriteFlag
+from sioms.protocol.records import WRITE_STRUCT, numpy_dtype
+
+from .blocks import AxisBlock, BinaryBlock
+from .handles import LATER, Handle, Wait
+
+if TYPE_CHECKING:
+    from .runtime import Runtime
+
+_DTYPE = {cls: np.dtype(numpy_dtype(cls)) for cls in NodeClass}
+_REPLACE = int(WriteFlag.REPLACE)
+_AT_ONCE = 16
+"""Records that are judged and taken at once."""
+
+
+def write(
+    runtime: Runtime, handle: Handle, number: int, flags: int, timeout_s: float | None, data: bytes
+) -> Any:
+    """Carry out a write of whole records.
+
+    Args:
+        runtime: the driver process.
+        handle: who writes.
+        number: message number, for an answer that comes later.
+        flags: WriteFlag.
+        timeout_s: how long to wait for room in the command buffers [s]; 0: not at all; None: for ever.
+        data: the records, one after the other.
+
+    Returns:
+        The tick number, or LATER.
+
+    Raises:
+        OSError: refused; nothing was taken.
+    """
+    what = f"write {handle.node}"
+    if not handle.writes:
+        raise OSError(errno.EBADF, f"{what}: the handle is not open for writing")
+    node_class = handle.block.spec.node_class
+    size = WRITE_STRUCT[node_class].size
+    if not data or len(data) % size:
+        raise OSError(errno.EINVAL, f"{what}: {len(data)} bytes; want whole records of {size} bytes")
+    if runtime.stopped:
+        raise OSError(errno.EPERM, f"{what}: stopped by emergency stop ({runtime.latch.source}); reset first")
+    check_link(runtime, handle, what)
+    records = np.frombuffer(data, _DTYPE[node_class])
+    if isinstance(handle.block, AxisBlock):
+        return _write_axes(runtime, handle, number, flags, timeout_s, records)
+    channels, values = _output_values(runtime, handle, records, what)
+    for channel in channels:
+        source = runtime.latched_outputs.get((id(handle.block), channel))
+        if source is not None:
+            raise OSError(errno.EPERM, f"{what}: stopped by emergency stop ({source}); reset the node first")
+    return runtime.engine.write_outputs(handle, number, handle.block, channels, values)
+
+
+def check_link(runtime: Runtime, handle: Handle, what: str) -> None:
+    """Refuse what would wait for a lost device and begin by itself when that is back."""
+    reason = runtime.pages.why_not(handle.block)
+    if reason:
+        raise OSError(
+            errno.EIO, f"{what}: its device does not answer ({reason}); write again when it is back"
+        )
+
+
+# --- axes ----------------------------------------------------------------------------------------
+
+
+class AxesWrite:
+    """A write of axis records on its way into the buffers.
+
+    It waits for the earlier writes of its handle, is judged in pieces, and waits for room if its writer
+    is patient. One that replaces the buffer overtakes the earlier ones, and ends them when it is taken.
+
+    Attributes:
+        lacks_room: whether it has been found to need more room than there is.
+    """
+
+    __slots__ = ("_handle", "_judgement", "_patient", "_records", "_replace", "_runtime", "lacks_room")
+
+    def __init__(
+        self, runtime: Runtime, handle: Handle, records: NDArray[Any], replace: bool, patient: bool
+    ) -> None:
+        self.lacks_room = False
+        self._runtime = runtime
+        self._handle = handle
+        self._records = records
+        self._replace = replace
+        self._patient = patient
+        self._judgement: Judgement | None = None
+
+    def ready(self) -> tuple[int] | None:
+        """Go on while the tick leaves time; return (tick,) when all is in the buffers.
+
+        Raises:
+            OSError: refused; nothing was taken.
+        """
+        if not self.has_turn():
+            return None
+        while self._runtime.has_time():
+            if self.step():
+                return (self._runtime.tick,)
+            if self.lacks_room:
+                return None
+        return None
+
+    def has_turn(self) -> bool:
+        """Tell whether no earlier write of the handle stands before it.
+
+        Raises:
+            OSError: EAGAIN, one waits for room and this writer does not want to wait.
+        """
+        writing = self._handle.writing
+        if self._replace or not writing or writing[0] is self:
+            return True
+        if writing[0].lacks_room and not self._patient:
+            raise self._refusal(errno.EAGAIN, "an earlier write still waits for room")
+        return False
+
+    def step(self) -> bool:
+        """Judge a piece, or take what has been judged; return whether it is taken.
+
+        Raises:
+            OSError: refused; nothing was taken.
+        """
+        bank, axes = self._handle.block.bank, self._handle.channels  # type: ignore[union-attr]
+        now_ns = self._runtime.now_ns()
+        self.lacks_room = False
+        try:
+            if len(self._records) <= _AT_ONCE:
+                bank.append(self._records, axes, now_ns, replace=self._replace)
+            else:
+                if self._judgement is None:
+                    self._judgement = bank.judge(self._records, axes, now_ns, replace=self._replace)
+                judged = _next(self._judgement)
+                if judged is None:
+                    return False
+                self._judgement = None
+                if not bank.take(judged, now_ns):
+                    return False  # its axes have changed since: judge it again
+        except CommandError as error:
+            self._judgement = None
+            if error.errno != errno.EAGAIN or not self._patient:
+                raise self._refusal(error.errno, str(error)) from None
+            self.lacks_room = True
+            return False
+        self._end_older()
+        self.leave()
+        self._runtime.engine.commands_written(self._handle.block)
+        return True
+
+    def leave(self) -> None:
+        """Let the later writes of the handle have their turn."""
+        if self in self._handle.writing:
+            self._handle.writing.remove(self)
+
+    def _end_older(self) -> None:
+        """What replaces the buffer also replaces what is on its way into it."""
+        writing = self._handle.writing
+        older = writing[: writing.index(self)] if self in writing else list(writing)
+        if older:
+            leaving = [write.leave for write in older]
+            self._runtime.waits.end_where(
+                lambda w: w.cancelled in leaving, errno.ECANCELED, "replaced by a later write"
+            )
+
+    def _refusal(self, errno_: int, text: str) -> OSError:
+        return OSError(errno_, f"write {self._handle.node}: {text}")
+
+
+def _next(judgement: Judgement) -> Judged | None:
+    """Judge one piece more; return the outcome at the end."""
+    try:
+        next(judgement)
+    except StopIteration as end:
+        judged: Judged = end.value
+        return judged
+    return None
+
+
+def _write_axes(
+    runtime: Runtime, handle: Handle, number: int, flags: int, timeout_s: float | None, records: NDArray[Any]
+) -> Any:
+    patient = timeout_s is None or timeout_s > 0
+    write = AxesWrite(runtime, handle, records, bool(flags & _REPLACE), patient)
+    if write.has_turn() and write.step():
+        return runtime.tick
+    limit_ns = runtime.deadline(timeout_s) if patient else None
+    what = f"write {handle.node}"
+    runtime.waits.add(Wait(handle, number, what, limit_ns, write.ready, frozenset(), write.leave))
+    handle.writing.append(write)
+    return LATER
+
+
+# --- outputs -------------------------------------------------------------------------------------
+
+
+def _output_values(
+    runtime: Runtime, handle: Handle, records: NDArray[Any], what: str
+) -> tuple[list[int], list[float]]:
+    """Check the records of an output and turn them into one value for each channel."""
+    block = handle.block
+    ports: dict[int, float] = {}
+    for record in records:
+        index = int(record["channel"])
+        if not 0 <= index < len(handle.channels):
+            raise OSError(errno.EINVAL, f"{what}: channel {index}; want 0 to {len(handle.channels) - 1}")
+        channel = int(handle.channels[index])
+        info = block.spec.channels[channel]
+        if isinstance(block, BinaryBlock):
+            value, width = int(record["data"]), info.width
+            mask = int(record["mask"]) or (1 << width) - 1
+            if handle.bit >= 0:
+                if value not in (0, 1):
+                    raise OSError(errno.EINVAL, f"{what}: data {value}; want 0 or 1")
+                value, mask = value << handle.bit, 1 << handle.bit
+            elif not 0 <= value < 1 << width:
+                raise OSError(
+                    errno.EINVAL, f"{what}: channel {info.name}: data {value}; want 0 to {(1 << width) - 1}"
+                )
+            before = ports.get(channel, runtime.outputs.get((id(block), channel), int(block.data[channel])))
+            ports[channel] = (int(before) & ~mask) | (value & mask)
+        else:
+            number = float(record["data"])
+            low = -math.inf if info.minimum is None else info.minimum
+            high = math.inf if info.maximum is None else info.maximum
+            if not math.isfinite(number):
+                raise OSError(
+                    errno.EINVAL, f"{what}: channel {info.name}: data {number}; want a finite number"
+                )
+            if not low <= number <= high:
+                raise OSError(
+                    errno.ERANGE,
+                    f"{what}: channel {info.name}: data {number:g} {info.unit}; want {low:g} to {high:g} {info.unit}",
+                )
+            ports[channel] = number
+    return list(ports), list(ports.values())
