@@ -510,6 +510,7 @@ class StreamEngine(_Connected):
         self._driver = driver
         self._is_up = False
         self._busy = False
+        self._closed = False
         self._due_ns = 0
         self._good_ns = 0
         self._heard = False
@@ -526,7 +527,7 @@ class StreamEngine(_Connected):
 
     def tick(self, now_ns: int) -> None:
         """Open, keep alive, and watch the stream."""
-        if not self.connect(now_ns) or self.line is None or self._busy:
+        if self._closed or not self.connect(now_ns) or self.line is None or self._busy:
             return
         line = self.line
         if not self._is_up:
@@ -600,7 +601,8 @@ class StreamEngine(_Connected):
         return self.line is None or self.line.is_free
 
     def close(self) -> None:
-        """Stop the stream."""
+        """Stop the stream; no later tick may start it again."""
+        self._closed = True
         line, now_ns = self.line, self._runtime.now_ns()
         if line is not None and self._is_up:
             self._is_up = False
