@@ -84,7 +84,8 @@ class Wire:
     def reads(self, node: str) -> bool:
         """Tell whether a node can be read."""
         try:
-            with self.client.open(f"{node}.readonly") as opened:
+            read_only = self.client.info(node).read_only
+            with self.client.open(node if read_only else f"{node}.readonly") as opened:
                 opened.read()
         except OSError:
             return False

@@ -7,6 +7,7 @@ not in it names its rig itself, in its class attribute ``rig``: a mapping with t
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -92,6 +93,13 @@ class Rig:
         """What kind of line leads to the counterpart: serial, tcp, udp, or '' for none."""
         found = re.search(rf'\b({"|".join(LINES)})\s*=\s*"\{{port\}}"', self.tables)
         return found.group(1) if found else ""
+
+    @property
+    def table(self) -> dict[str, Any]:
+        """The device's table, without what the daemon reads of it, its port a place holder."""
+        port = "127.0.0.1:1" if self.line in ("tcp", "udp") else "/dev/null"
+        device = tomllib.loads(self.tables.replace("{port}", port))["device"][self.device]
+        return {key: value for key, value in device.items() if key != "driver"}
 
     def setting(self, key: str, default: float) -> float:
         """Return a number of the tables, e.g. ``baud`` or ``poll_hz``."""
@@ -194,6 +202,13 @@ RIGS: tuple[Rig, ...] = (
         'line = { serial = "{port}", baud = 921600 }\n',
         ("adc", "--channels", "4", "--columns", "2"),
         analogs=("framed_adc",),
+    ),
+    Rig(
+        "ascii-stream",
+        '[device.ascii_stream]\ndriver = "ascii-stream"\nline = { serial = "{port}" }\ncolumns = ["a", "b"]\n'
+        'rate_hz = 200.0\ntime = "ms"\nunit = "N"\nchecksum = true\n',
+        ("ascii_stream", "--rate", "200", "--time", "ms", "--checksum"),
+        analogs=("ascii_stream",),
     ),
     Rig(
         "modbus-io",

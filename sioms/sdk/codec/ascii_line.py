@@ -27,6 +27,11 @@ class LineCounters:
     bad_checksum: int = 0
     oversized: int = 0
 
+    @property
+    def dropped(self) -> int:
+        """Lines that carried no row although they should have."""
+        return self.bad_columns + self.bad_number + self.bad_checksum + self.oversized
+
 
 class LineReceiver:
     """Turns any cut of the byte stream into rows of ``columns`` finite numbers.
@@ -43,6 +48,10 @@ class LineReceiver:
         self._columns, self._checked = columns, checked
         self._rest = b""
         self._skipping = True
+
+    def restart(self) -> None:
+        """Forget a line that has begun: the device was opened again, and the next line may be cut."""
+        self._rest, self._skipping = b"", True
 
     def feed(self, data: bytes) -> list[tuple[float, ...]]:
         """Return the rows that ``data`` completes, in order."""

@@ -1,0 +1,177 @@
+"""The driver of the ASCII line stream against the simulated board, on an invented clock."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sioms.drivers.ascii_stream import AsciiStream, Inspection
+from sioms.protocol.flags import AnalogStatus
+from sioms.sdk.exchange import DeviceError, Exchange, LinkError
+from sioms.tools.counterparts import ascii_stream as counterpart
+
+
+class Rig:
+    """Driver and board joined without a line; keeps what was published."""
+
+    def __init__(self, *options: str, **table: Any) -> None:
+        self.now_s = 50.0
+        self.device = counterpart.Board(counterpart.options_parser().parse_args(options), lambda: self.now_s)
+        settings = {"line": {"serial": "/x"}, "columns": ["a", "b"], "rate_hz": 80.0, **table}
+        self.driver = AsciiStream("t0", msgspec.convert(settings, AsciiStream.Settings), self)
+        self.published: list[tuple[int, np.ndarray, int]] = []
+
+    def publish(self, block: Any, stamp_ns: int) -> None:
+        self.published.append((stamp_ns, block.data.copy(), int(block.flags[0])))
+
+    def open(self) -> None:
+        """Do the exchange as the kit does, with bytes in pieces of seven."""
+        steps = self.driver.open()
+        step = next(steps)
+        assert isinstance(step, Exchange)
+        self.device.take(step.data)
+        reply, end = b"", self.now_s + step.timeout_s
+        while self.now_s < end:
+            self.now_s += 0.005
+            news = b"".join(self.device.due())
+            for at in range(0, len(news), 7):
+                reply += news[at : at + 7]
+                if (size := step.want(reply)) is not None:
+                    with pytest.raises(StopIteration):
+                        steps.send(step.decode(reply[:size]))
+                    self.driver.feed(reply[size:], round(self.now_s * 1e9))
+                    return
+        raise LinkError("time-out")
+
+    def go(self, seconds: float, delay_s: float = 0.001) -> None:
+        for _ in range(round(seconds * 200)):
+            self.now_s += 0.005
+            for data in self.device.due():
+                self.driver.feed(data, round((self.now_s + delay_s) * 1e9))
+
+
+@pytest.mark.parametrize("unit", ["us", "ms", "s"])
+@pytest.mark.parametrize("start_s", [0.0, 4290.0])
+def test_samples_flags_and_stamps(unit: str, start_s: float) -> None:
+    """The clock of the board is 0.2 % fast, has millisecond steps or fine ones, and wraps after 71.6 minutes."""
+    options = ("--time", unit, "--clock-start-s", str(start_s), "--noise", "0", "--crlf", "--separator", "; ")
+    rig = Rig(*options, time=unit, offset=200, scale=0.01, unit="N", low=0, high=4095)
+    rig.open()
+    rig.device.loads = [3.0, -1.0]
+    rig.go(8.0)
+    stamps = np.array([stamp for stamp, _, _ in rig.published])
+    assert 635 <= len(stamps) <= 641
+    assert rig.published[-1][1] == pytest.approx([3.0, -1.0], abs=0.02) and rig.published[-1][2] == 0
+    steps = np.diff(stamps[320:])
+    assert steps.mean() == pytest.approx(12.5e6, rel=1e-3) and steps.min() > 10e6 and steps.max() < 15e6
+    assert rig.driver.counters()["clock_restarts"] == 0
+    rig.device.loads = [90.0, -1.0]
+    rig.go(0.5)
+    assert rig.published[-1][2] == AnalogStatus.SATURATED
+
+
+def test_without_a_clock_lines_of_one_read_keep_their_distance_on_the_line() -> None:
+    rig = Rig()
+    rig.driver.feed(b"cut\n", 10**9)
+    rig.driver.feed(b"201,199\n202,198\n203,197\n", 2 * 10**9)
+    stamps = [stamp for stamp, _, _ in rig.published]
+    character_ns = 10 / 115200 * 1e9
+    assert stamps[-1] == 2 * 10**9 and np.diff(stamps) == pytest.approx(8 * character_ns, abs=2)
+
+
+def test_a_dropped_line_marks_the_next_good_one() -> None:
+    rig = Rig()
+    rig.driver.feed(b"cut\n1,2\n1,2,3\n1,2\n1,2\n1,x\n1,2*00\n1,2\n", 10**9)
+    overrun = int(AnalogStatus.OVERRUN)
+    assert [flags for _, _, flags in rig.published] == [0, overrun, 0, overrun]
+    counters = rig.driver.counters()
+    assert (counters["bad_columns"], counters["bad_number"], counters["bad_checksum"]) == (1, 1, 1)
+
+
+def test_a_restarted_board_goes_on() -> None:
+    rig = Rig("--time", "us", time="us")
+    rig.open()
+    rig.go(4.0)
+    rig.device.restart()
+    rig.go(2.0)
+    assert rig.driver.counters()["clock_restarts"] == 1
+    assert (rig.now_s + 0.001) * 1e9 - rig.published[-1][0] < 14e6
+
+
+def test_a_board_that_waits_is_started_and_stopped() -> None:
+    rig = Rig("--wait-for", "RUN", "--rate", "200", start="RUN\r\n", stop="x\n", greeting="load cells")
+    with pytest.raises(LinkError):
+        Rig("--wait-for", "RUN", open_s=0.5).open()
+    rig.open()
+    assert rig.device.runs
+    (stop,) = rig.driver.close()
+    rig.device.take(stop.data)
+    assert not rig.device.runs
+
+
+@pytest.mark.parametrize(
+    ("options", "table", "words"),
+    [
+        (("--columns", "3"), {}, r"sends other lines, e.g. '20\d,\d+,\d+'; the configuration says 2 numbers"),
+        (("--time", "ms"), {}, "2 numbers a line, the time column included"),
+        ((), {"greeting": "scale"}, "did not greet with 'scale'"),
+        ((), {"checksum": True}, "without a right checksum"),
+        (("--separator", "|"), {}, r"sends lines that are no numbers|sends other lines"),
+    ],
+)
+def test_another_device_is_refused(options: tuple[str, ...], table: dict[str, Any], words: str) -> None:
+    with pytest.raises(DeviceError, match=words):
+        Rig(*options, **table).open()
+
+
+def test_a_wrong_baud_rate_is_told() -> None:
+    noise = bytes((i * 37 + 128) % 256 or 1 for i in range(5000)).replace(b"\n", b"\xff")
+    with pytest.raises(LinkError, match="without an end of line; is this the right device and baud rate"):
+        Inspection(2, False, "").want(noise)
+    with pytest.raises(DeviceError, match=r"no numbers, .*look at the baud rate"):
+        Inspection(2, False, "").want(b"\n" + b"\xfe\x83\xf8\x91\n" * 6)
+
+
+@given(st.binary(max_size=6000), st.booleans())
+def test_any_first_bytes_are_judged(data: bytes, checked: bool) -> None:
+    inspection = Inspection(2, checked, "")
+    try:
+        size = inspection.want(data)
+    except (LinkError, DeviceError):
+        return
+    assert size is None or data[:size].endswith(b"\n")
+
+
+@given(st.lists(st.binary(max_size=60), max_size=30))
+def test_any_bytes_are_taken_and_stamps_rise(pieces: list[bytes]) -> None:
+    rig = Rig(time="us", columns=["a"])
+    for piece in [*pieces, b"\n", b"5,7\n", b"6,8\n"]:
+        rig.now_s += 0.01
+        rig.driver.feed(piece, round(rig.now_s * 1e9))
+    stamps = [stamp for stamp, _, _ in rig.published]
+    assert stamps == sorted(set(stamps)) and len(stamps) >= 2
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"columns": []}, "columns: none given"),
+        ({"unit": ["N"]}, "unit: 1 for 2 columns"),
+        ({"scale": 0}, r"scale = \[0.*not 0"),
+        ({"offset": [1.0]}, "offset: 1 for 2 columns"),
+        ({"rate_hz": 0.0}, "rate_hz = 0; want 0.1"),
+        ({"rate_hz": 3000.0}, "lines of 4 bytes, the shortest possible, at 115200 baud carry 2736 Hz"),
+        ({"low": 5.0, "high": 5.0}, "want low below high"),
+        ({"start": "é"}, "want ASCII"),
+        ({"open_s": 0.0}, "open_s = 0"),
+    ],
+)
+def test_bad_configurations(table: dict[str, Any], words: str) -> None:
+    settings = {"line": {"serial": "/x"}, "columns": ["a", "b"], "rate_hz": 80.0, **table}
+    with pytest.raises(ValueError, match=words):
+        AsciiStream.describe("t0", msgspec.convert(settings, AsciiStream.Settings))
