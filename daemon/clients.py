@@ -33,8 +33,9 @@ from .devices import DriverProcess, State
 from .marker_owners import MarkerError
 from .marker_verbs import MarkerVerbs
 from .names import READONLY, Node
-from .rights import Rights
+from .rights import RIGHTS, Rights
 from .sessions import LATER, Handle, Refused, Session, Wait, peer_of, pidfd_of
+from .users import Users
 
 if TYPE_CHECKING:
     from .server import Server
@@ -56,7 +57,8 @@ class Clients:
     """
 
     def __init__(self, server: Server, listener: socket.socket) -> None:
-        self.rights = Rights([], os.getuid())
+        self.users = Users()
+        self.rights = Rights([], os.getuid(), self.users)
         self.address = str(listener.getsockname())
         self._server = server
         self._listener = listener
@@ -90,7 +92,7 @@ class Clients:
                 self._server.loop.after(0.2, self.welcome)
             return
         sock.setblocking(False)
-        peer = peer_of(sock)
+        peer = peer_of(sock, self.users)
         if len(self._sessions) >= self.bounds.max_sessions:
             self._server.log("warning", "session refused", peer=peer, why="too many sessions")
             sock.close()
@@ -349,8 +351,9 @@ class Clients:
 
     def _grant(self, session: Session, number: int, node: Node, access: Access, lease_s: float) -> None:
         device = self._server.devices[node.device]
-        handle = Handle(next(self._numbers), session, node, access, time.monotonic_ns(), device.generation)
         rights = self.rights.on_node(session.peer, node.name)
+        now_ns = time.monotonic_ns()
+        handle = Handle(next(self._numbers), session, node, access, now_ns, device.generation, rights)
         if node.read_only:
             access &= ~Access.WRITE
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -406,6 +409,17 @@ class Clients:
                 return True
         self._forget(handle)
         return False
+
+    def take_up_rights(self, rights: Rights) -> None:
+        """Let new grants hold, also for what is open already: a handle that lost a right ends."""
+        self.rights = rights
+        for handle in list(self._handles.values()):
+            lost = handle.rights & ~rights.on_node(handle.session.peer, handle.node.name)
+            device = self._server.devices.get(handle.node.device)
+            if lost and device is not None and device.generation == handle.generation:
+                names = ", ".join(name for name, right in RIGHTS.items() if right & lost)
+                text = f"{handle.node.name}: the right to {names} it was taken away; open it again"
+                device.tell(DriverVerb.DETACH, handle.number, text)
 
     def detached(self, device: DriverProcess, number: int) -> None:
         """The driver has ended a handle: its axes are being halted."""

@@ -13,21 +13,44 @@ from fnmatch import fnmatchcase
 from sioms.protocol.flags import Right
 
 from .config import GrantTable
+from .users import Users
 
-_RIGHT = {"read": Right.READ, "write": Right.WRITE, "stop": Right.STOP, "administer": Right.ADMINISTER}
+RIGHTS = {"read": Right.READ, "write": Right.WRITE, "stop": Right.STOP, "administer": Right.ADMINISTER}
 
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """Credentials of a connected process, as the kernel vouches for them."""
+    """Credentials of a connected process, as the kernel vouches for them; ``user`` is for messages."""
 
     pid: int
     uid: int
     user: str
-    groups: frozenset[str]
+    gids: frozenset[int]
 
     def __str__(self) -> str:
         return f"pid {self.pid} ({self.user})"
+
+
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """A ``[[grant]]`` by numbers.
+
+    Attributes:
+        everybody: whether it is for all users.
+        uids, gids: whom it is for.
+        nodes: patterns of node names.
+        rights: what it allows.
+    """
+
+    everybody: bool
+    uids: frozenset[int]
+    gids: frozenset[int]
+    nodes: tuple[str, ...]
+    rights: Right
+
+    def concerns(self, peer: Peer) -> bool:
+        """Tell whether it is for this peer."""
+        return self.everybody or peer.uid in self.uids or not self.gids.isdisjoint(peer.gids)
 
 
 class Rights:
@@ -36,11 +59,32 @@ class Rights:
     Args:
         grants: of the configuration, empty for the default.
         owner_uid: who runs the daemon.
+        users: turns names into numbers.
+
+    Attributes:
+        unknown: users and groups in the grants that this machine does not know; the grants hold for the others.
     """
 
-    def __init__(self, grants: Sequence[GrantTable], owner_uid: int) -> None:
-        self._grants = grants
+    def __init__(self, grants: Sequence[GrantTable], owner_uid: int, users: Users) -> None:
+        self.unknown: list[str] = []
+        self._grants = [self._resolved(grant, users) for grant in grants]
         self._owner = owner_uid
+
+    def _resolved(self, grant: GrantTable, users: Users) -> Grant:
+        uids = {name: users.uid(name) for name in grant.users if name != "*"}
+        gids = {name: users.gid(name) for name in grant.groups}
+        self.unknown += [f"user {name}" for name, uid in uids.items() if uid is None]
+        self.unknown += [f"group {name}" for name, gid in gids.items() if gid is None]
+        rights = Right(0)
+        for name in grant.rights:
+            rights |= RIGHTS[name]
+        return Grant(
+            "*" in grant.users,
+            frozenset(uid for uid in uids.values() if uid is not None),
+            frozenset(gid for gid in gids.values() if gid is not None),
+            tuple(grant.nodes),
+            rights,
+        )
 
     def on_node(self, peer: Peer, node: str) -> Right:
         """Return what the peer may do with a node."""
@@ -50,9 +94,8 @@ class Rights:
             return Right.READ | Right.WRITE | Right.STOP
         rights = Right(0)
         for grant in self._grants:
-            if self._concerns(grant, peer) and any(fnmatchcase(node, pattern) for pattern in grant.nodes):
-                for name in grant.rights:
-                    rights |= _RIGHT[name]
+            if grant.concerns(peer) and any(fnmatchcase(node, pattern) for pattern in grant.nodes):
+                rights |= grant.rights
         return rights
 
     def on_workcell(self, peer: Peer) -> Right:
@@ -61,12 +104,6 @@ class Rights:
             return self.on_node(peer, "*")
         rights = Right(0)
         for grant in self._grants:
-            if self._concerns(grant, peer):
-                for name in grant.rights:
-                    if "*" in grant.nodes or name == "stop":
-                        rights |= _RIGHT[name]
+            if grant.concerns(peer):
+                rights |= grant.rights if "*" in grant.nodes else grant.rights & Right.STOP
         return rights
-
-    @staticmethod
-    def _concerns(grant: GrantTable, peer: Peer) -> bool:
-        return peer.user in grant.users or "*" in grant.users or not peer.groups.isdisjoint(grant.groups)

@@ -179,7 +179,10 @@ class Server:
                            if plan.stop_sources.get(n) != self._stop_sources.get(n)}  # fmt: skip
         names = self.names
         self.config, self.names, self._stop_sources = plan.config, plan.names, plan.stop_sources
-        self.clients.rights = Rights(plan.config.grants, os.getuid())
+        rights = Rights(plan.config.grants, os.getuid(), self.clients.users)
+        for name in rights.unknown:
+            self.log("warning", "grant to nobody", who=name, why="not known on this machine, or no answer")
+        self.clients.take_up_rights(rights)
         if first and plan.config.workcell.start_stopped:
             self.shared.latch.stop(time.monotonic_ns(), "started stopped, as configured")
         for name, device in list(self.devices.items()):

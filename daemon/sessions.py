@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import grp
 import os
-import pwd
 import socket
 import struct
 import sys
+from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from sioms.protocol.flags import Access
+from sioms.protocol.flags import Access, Right
 
 from .loop import Timer
 from .names import Claim, Node
 from .rights import Peer
+from .users import Users
 
+_SO_PEERGROUPS = 59  # not in the socket module; Linux 4.13
+_MOST_GROUPS = 256
 _SO_PEERPIDFD = 77  # Linux 6.5; not in the socket module of Python 3.11
 
 
@@ -43,6 +45,7 @@ class Handle:
         access: how.
         since_ns: when.
         generation: of the driver process it is attached to.
+        rights: what its user may do with it, as the driver was told.
         closing: message number of the close that waits for the driver, if any.
     """
 
@@ -52,6 +55,7 @@ class Handle:
     access: Access
     since_ns: int
     generation: int
+    rights: Right
     closing: int = 0
 
     @property
@@ -100,21 +104,14 @@ class Session:
         return f"{self.peer}" + (f" {self.name}" if self.name else "")
 
 
-def peer_of(sock: socket.socket) -> Peer:
+def peer_of(sock: socket.socket, users: Users) -> Peer:
     """Return the credentials of the other end, vouched for by the kernel."""
     pid, uid, gid = struct.unpack("3i", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
     try:
-        user = pwd.getpwuid(uid).pw_name
-        gids = os.getgrouplist(user, gid)
-    except KeyError:
-        user, gids = str(uid), [gid]
-    groups = set()
-    for each in gids:
-        try:
-            groups.add(grp.getgrgid(each).gr_name)
-        except KeyError:
-            groups.add(str(each))
-    return Peer(pid, uid, user, frozenset(groups))
+        others = array("I", sock.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, 4 * _MOST_GROUPS))
+    except OSError:
+        others = array("I")  # more than fit: only the first counts
+    return Peer(pid, uid, users.name(uid), frozenset([gid, *others]))
 
 
 def pidfd_of(sock: socket.socket, pid: int) -> int:

@@ -61,13 +61,15 @@ class Attachments:
             if handle.exclusive or not exclusive_only:
                 self.end(handle, errno_, f"{handle.node}: {text}")
 
-    def detach(self, number: int) -> None:
+    def detach(self, number: int, reason: str = "") -> None:
         """End a handle because the daemon says so; one that has ended already is confirmed again."""
         handle = self.handles.get(number)
-        if handle is not None:
-            self.drop(handle)
-        else:
+        if handle is None:
             self._runtime.tell(DriverVerb.DETACHED, number)
+        elif reason:
+            self.end(handle, errno.EACCES, reason)
+        else:
+            self.drop(handle)
 
     def attach(
         self, fds: list[int], number: int, block: int, channels: list[int], bit: int, access: int,

@@ -103,6 +103,9 @@ def ioctl(
         return runtime.driver.ioctl(handle.block.spec, request, [int(c) for c in handle.channels], argument)
     except Refusal as error:
         raise _refuse(error.errno, f"{what}: {error}") from None
+    except Exception as error:  # what a client asks for must not end what others do with the device
+        runtime.log("error", f"{what} with {argument!r:.80}: the driver failed: {error!r}")
+        raise _refuse(errno.EIO, f"{what}: the driver failed: {error!r}") from None
 
 
 def _writable(handle: Handle) -> bool:
@@ -161,6 +164,8 @@ def _axis_request(
                 raise _refuse(errno.EINVAL, f"{what}: {error}") from None
         case Request.GET_LIMITS:
             return bank.get_limits(axes)
+        case Request.GET_PARTICULARS:
+            return bank.particulars(axes)
         case _:
             raise _refuse(errno.ENOTTY, f"{what}: not a request an axis knows")
     runtime.engine.commands_written(handle.block)

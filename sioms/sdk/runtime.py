@@ -267,14 +267,15 @@ class Runtime:
         self.watch(self._control.fileno(), self._control_readable)
         self.watch(self._timer.fd, self._on_timer)
         self.watch(self._line_timer.fd, self._on_line_timer)
-        self._tell_ready()
-        self._look_at_latch()
         phase_ns = int(self._phase * self.period_ns)
-        self._scheduled_ns = (time.monotonic_ns() // self.period_ns + 2) * self.period_ns + phase_ns
-        self._timer.set(self._scheduled_ns, self.period_ns)
-        self._scheduled_ns -= self.period_ns
+        self._scheduled_ns = time.monotonic_ns() // self.period_ns * self.period_ns + phase_ns
+        self._timer.set(self._scheduled_ns + 2 * self.period_ns, self.period_ns)
         status = 0
         try:
+            self._look_at_latch()
+            self._tick_and_publish(self._scheduled_ns)  # who opens a node at once finds readings
+            self._scheduled_ns += self.period_ns
+            self._tell_ready()
             self._loop()
         except Exception as error:  # any failure of a driver: stop first, report second
             status = 1
@@ -305,13 +306,8 @@ class Runtime:
             self._daemon_late = False
         self.clients.check_leases(began_ns)
         engine = self.engine
-        engine.tick(scheduled_ns)
-        ticked_ns = time.monotonic_ns()
+        ticked_ns = self._tick_and_publish(scheduled_ns)
         self._spare_until_ns = ticked_ns + self.period_ns // 4
-        self.pages.alive(ticked_ns)
-        if isinstance(engine, TickEngine) and engine.publishes:
-            for block in self.blocks:
-                self.publish(block, block.stamp_ns or scheduled_ns)
         self.after_publication(ticked_ns)
         ended_ns = time.monotonic_ns()
         self.statistics.record(scheduled_ns, began_ns, self.driver.inputs_ns, ticked_ns, ended_ns)
@@ -319,6 +315,17 @@ class Runtime:
             self._maybe_end(ended_ns)
         elif isinstance(engine, TickEngine):
             engine.slack(ended_ns, scheduled_ns + self.period_ns)
+
+    def _tick_and_publish(self, scheduled_ns: int) -> int:
+        """Return when the tick itself was done."""
+        engine = self.engine
+        engine.tick(scheduled_ns)
+        ticked_ns = time.monotonic_ns()
+        self.pages.alive(ticked_ns)
+        if isinstance(engine, TickEngine) and engine.publishes:
+            for block in self.blocks:
+                self.publish(block, block.stamp_ns or scheduled_ns)
+        return ticked_ns
 
     def _on_line_timer(self) -> None:
         self._line_timer.expirations()
@@ -501,7 +508,7 @@ class Runtime:
             case DriverVerb.ATTACH:
                 self.clients.attach(fds, *arguments)
             case DriverVerb.DETACH:
-                self.clients.detach(arguments[0])
+                self.clients.detach(*arguments)
             case DriverVerb.STOP_CHANGED:
                 self._look_at_latch()
             case DriverVerb.SHUTDOWN:

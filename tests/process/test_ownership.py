@@ -10,9 +10,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import pytest
-from daemon_rig import WORKCELL, Client, Daemon, raises, wait_for
+from daemon_rig import WORKCELL, Client, Daemon, at_rest, raises, wait_for
 
 import sioms
 import sioms.aio
@@ -325,6 +326,49 @@ def test_foreign_user_without_any_grants_may_read_write_and_stop_but_not_adminis
     said = _foreign(daemon, start)
     assert said["write mod0"][0] == 0 and said["stop"][0] == 0 and said["reset"][0] == 0
     assert said["reload"][0] == errno.EPERM
+
+
+HOLDING = """
+import os, pwd, sys, time, sioms
+[getattr(sioms, name) for name in sioms.__all__]
+nobody = pwd.getpwnam('nobody')
+os.setgroups([]); os.setgid(nobody.pw_gid); os.setuid(nobody.pw_uid)
+cell = sioms.Workcell(sys.argv[1], 'foreign')
+axis, watch = cell.open('mod0.xaxis', 'rw'), cell.open('io0.readonly')
+axis.command(velocity=0.1)
+while not axis.read().in_motion[0]:
+    time.sleep(0.001)
+print('moving', flush=True)
+try:
+    while True:
+        axis.ioctl(sioms.Request.GET_LIMITS)
+        time.sleep(0.005)
+except OSError as error:
+    print(error.errno, error.strerror, flush=True)
+watch.read()
+print('still reads', flush=True)
+"""
+
+
+@pytest.mark.root
+def test_a_right_that_a_reload_takes_away_ends_what_was_open(
+    start_daemon: Callable[..., Daemon], start: Callable[..., Any]
+) -> None:
+    text = WORKCELL.replace('name = "test"', 'name = "test"\nsocket_mode = "0666"')
+    grant = '[[grant]]\nusers = ["nobody"]\nrights = ["read", "write"]\n'
+    daemon = start_daemon(text + grant)
+    os.chmod(daemon.folder.parent, 0o755)
+    client = start([sys.executable, "-c", HOLDING, daemon.socket])
+    client.wait_line("moving")
+    daemon.config.write_text(text + grant.replace('"read", "write"', '"read"'))
+    with daemon.cell() as cell, cell.open("mod0.xaxis.readonly") as watch:
+        pid = daemon.device("mod0")["pid"]
+        cell.reload()
+        at_rest(watch)
+        assert client.wait_exit() == 0
+        assert any(f"{errno.EACCES} mod0.xaxis: the right to write it" in line for line in client.lines), client.lines
+        assert client.lines[-1] == "still reads"
+        assert daemon.device("mod0")["pid"] == pid, "the device was not touched"
 
 
 def _quiet(call: Callable[[], object]) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
+import pwd
 import socket
+import threading
 
 import pytest
 
@@ -16,13 +18,14 @@ from sioms.daemon.notify import ServiceManager
 from sioms.daemon.restarts import FIRST_PAUSE_NS, LIMIT, WINDOW_NS, Restarts
 from sioms.daemon.rights import Peer, Rights
 from sioms.daemon.sessions import peer_of, pidfd_of
+from sioms.daemon.users import Users
 from sioms.protocol.flags import Right
 from sioms.protocol.markers import MARKERS, TABLE_SIZE, MarkerTable, split_token
 
 S = 1_000_000_000
-EVA = Peer(10, 1000, "eva", frozenset({"lab", "eva"}))
-TOM = Peer(11, 1001, "tom", frozenset({"guests"}))
-ROOT = Peer(1, 0, "root", frozenset({"root"}))
+EVA = Peer(10, 1000, "eva", frozenset({20, 1000}))
+TOM = Peer(11, 1001, "tom", frozenset({30}))
+ROOT = Peer(1, 0, "root", frozenset({0}))
 OWNER = Peer(2, 900, "sioms", frozenset())
 GRANTS = [
     GrantTable(["read", "write"], groups=["lab"], nodes=["mod*", "io0"]),
@@ -30,6 +33,16 @@ GRANTS = [
     GrantTable(["stop"], users=["tom"], nodes=["mod0"]),
     GrantTable(["administer"], users=["eva"]),
 ]
+
+
+class Machine(Users):
+    """A machine with two users and a group."""
+
+    def uid(self, name: str) -> int | None:
+        return {"eva": 1000, "tom": 1001}.get(name)
+
+    def gid(self, name: str) -> int | None:
+        return {"lab": 20}.get(name)
 
 
 @pytest.mark.parametrize(
@@ -46,23 +59,55 @@ GRANTS = [
     ],
 )
 def test_rights_on_nodes(peer: Peer, node: str, expected: Right) -> None:
-    assert Rights(GRANTS, 900).on_node(peer, node) == expected
+    assert Rights(GRANTS, 900, Machine()).on_node(peer, node) == expected
 
 
 def test_rights_on_the_workcell() -> None:
-    rights = Rights(GRANTS, 900)
+    rights = Rights(GRANTS, 900, Machine())
     assert rights.on_workcell(EVA) == Right.READ | Right.ADMINISTER
     assert rights.on_workcell(TOM) == Right.READ | Right.STOP, "who may stop anything may stop everything"
-    assert Rights([], 900).on_workcell(TOM) == Right.READ | Right.WRITE | Right.STOP
-    nobody = Rights([GrantTable(["read"], users=["eva"])], 900).on_node(TOM, "mod0")
+    assert Rights([], 900, Machine()).on_workcell(TOM) == Right.READ | Right.WRITE | Right.STOP
+    nobody = Rights([GrantTable(["read"], users=["eva"])], 900, Machine()).on_node(TOM, "mod0")
     assert nobody == Right(0)
+
+
+def test_a_grant_to_nobody_is_told_and_holds_for_the_others() -> None:
+    rights = Rights([GrantTable(["read"], users=["eva", "ewa"], groups=["lap"])], 900, Machine())
+    assert rights.unknown == ["user ewa", "group lap"]
+    assert rights.on_node(EVA, "mod0") == Right.READ
+
+
+def test_names_come_from_the_machine() -> None:
+    users = Users()
+    assert users.name(0) == "root" and users.uid("root") == 0 and users.gid("root") == 0
+    assert users.uid("no such user") is None
+    assert users.name(4_000_000_000) == "uid 4000000000"
+
+
+def test_a_name_service_that_hangs_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    gate = threading.Event()
+    entry = pwd.getpwuid(0)
+
+    def hang(_: int) -> pwd.struct_passwd:
+        gate.wait(10.0)
+        return entry
+
+    monkeypatch.setattr(pwd, "getpwuid", hang)
+    users = Users(answer_s=0.001)
+    assert users.name(1234) == "uid 1234"
+    gate.set()
+    for _ in range(1000):
+        if users.name(1234) == "root":
+            return
+    raise AssertionError("the answer that came later is not remembered")
 
 
 def test_credentials_come_from_the_kernel() -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, theirs:
-        peer = peer_of(ours)
+        peer = peer_of(ours, Users())
         assert (peer.pid, peer.uid) == (os.getpid(), os.getuid())
+        assert peer.gids == {os.getgid(), *os.getgroups()}
         pidfd = pidfd_of(ours, peer.pid)
         assert pidfd >= 0
         os.close(pidfd)
