@@ -98,15 +98,17 @@ class AnalogBlock(Block):
     """Analog channels: ``data`` (n,) in declared units and ``flags`` (n,) of AnalogStatus.
 
     What is published is ``gains @ (data - offset)``: zero and gain matrix are the same for all analog
-    devices, so no driver does them.
+    devices, so no driver does them, unless they act deeper in the driver than on what it publishes.
 
     Attributes:
         offset: shape (n,), subtracted; set by ZERO_DEVICE.
         gains: shape (n, n), or None for the unit matrix; set by SET_GAINS.
+        corrected_by_driver: the driver's ``ioctl`` answers ZERO_DEVICE, SET_GAINS and GET_GAINS; nothing is done here.
     """
 
     def __init__(self, spec: BlockSpec) -> None:
         super().__init__(spec)
+        self.corrected_by_driver = False
         self.data: NDArray[np.float64] = self.fields[0]
         self.flags: NDArray[np.int64] = self.words[1]
         self.offset: NDArray[np.float64] = np.zeros(self.n)

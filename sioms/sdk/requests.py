@@ -43,6 +43,7 @@ _NEEDS_RIGHT = {
     Request.CANCEL_WAITS: Right.WRITE | Right.ADMINISTER,
     Request.ZERO_DEVICE: Right.WRITE,
     Request.SET_GAINS: Right.WRITE,
+    Request.CALIBRATE_DEVICE: Right.WRITE,
 }
 
 
@@ -90,9 +91,9 @@ def ioctl(
             return runtime.statistics_report(argument or FEW_TICKS)
         case Request.WAIT_UNTIL_EVENT:
             raise _refuse(errno.ENOTTY, f"{what}: is answered by the client library, out of the page")
-        case Request.ZERO_DEVICE if isinstance(handle.block, AnalogBlock):
+        case Request.ZERO_DEVICE if _corrected_here(handle):
             return _zero_analog(runtime, handle, number, argument, timeout_s, what)
-        case Request.SET_GAINS | Request.GET_GAINS if isinstance(handle.block, AnalogBlock):
+        case Request.SET_GAINS | Request.GET_GAINS if _corrected_here(handle):
             return _gains(handle, request, argument, what)
     if isinstance(handle.block, AxisBlock):
         try:
@@ -106,6 +107,10 @@ def ioctl(
     except Exception as error:  # what a client asks for must not end what others do with the device
         runtime.log("error", f"{what} with {argument!r:.80}: the driver failed: {error!r}")
         raise _refuse(errno.EIO, f"{what}: the driver failed: {error!r}") from None
+
+
+def _corrected_here(handle: Handle) -> bool:
+    return isinstance(handle.block, AnalogBlock) and not handle.block.corrected_by_driver
 
 
 def _writable(handle: Handle) -> bool:
