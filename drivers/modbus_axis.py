@@ -56,7 +56,7 @@ DEAD_MAN_SHARE = 0.75
 _SERVO_KEYS = ("kind", "modes", "homing", "jerk_max", "force_max", "k", "kz", "kp", "kb", "force_offset")
 AxisTable: Any = table_type(
     AxisSettings,
-    without=(*_SERVO_KEYS, "velocity_filter_s", "following_error_max"),
+    without=(*_SERVO_KEYS, "velocity_filter_s", "following_error_max", "start_velocity"),
     extra={
         "address": (int, 1),
         "travel_per_turn": (float, 2 * math.pi),

@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from sioms.motion import AxisBank, AxisSettings, CommandError, Event, EventKind
+from sioms.motion import ActionKind, AxisBank, AxisSettings, CommandError, DriveBank, Event, EventKind, Keeper
 from sioms.motion.bank import ROW
 from sioms.motion.commands import WIRE_DTYPE
 from sioms.protocol.flags import ControlMode
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable, split_token, token_of
 
 TICK_NS = 1_000_000
+MODE = ControlMode
 
 
 class Markers:
@@ -84,10 +85,12 @@ class Rig:
         tick_ns: int = TICK_NS,
         start: Sequence[float] | None = None,
         plant: Callable[[np.ndarray, float], np.ndarray] | None = None,
+        keeper: Keeper | None = None,
         **arguments: Any,
     ) -> None:
         self.markers = Markers()
         self.bank = AxisBank(settings, tick_s=tick_ns * 1e-9, markers=self.markers, **arguments)
+        self.bank.keeper = keeper
         self.axes = list(range(len(settings)))
         self.now_ns = 1_000_000_000
         self.tick_ns = tick_ns
@@ -141,4 +144,80 @@ class Rig:
         return [e.kind for e in self.events]
 
 
-MODE = ControlMode
+DRIVE_MODES = (
+    MODE.POSITION | MODE.VELOCITY | MODE.RELATIVE | MODE.SPECIFIED_TIME | MODE.WAIT_FOR_EXTERNAL_SYNCH
+    | MODE.SPECIFIED_WAIT_MARKER | MODE.SPECIFIED_SIGNAL_MARKER | MODE.SPECIFIED_MAX_VEL_ACC
+)  # fmt: skip
+POLL_NS = 10_000_000
+
+
+class Drive:
+    """A drive of its own loop: moves with constant velocity to its target; takes one poll to begin."""
+
+    def __init__(self):
+        self.position, self.velocity, self.target, self.wish = 0.0, 0.0, None, None
+        self.fault, self.log = "", []
+
+    def take(self, action):
+        self.log.append(action.kind)
+        if action.kind is ActionKind.START:
+            c = action.command
+            if c.control_mode & MODE.POSITION:
+                self.target, self.wish = c.position, action.velocity_max
+            else:
+                self.target, self.wish = None, c.velocity
+        elif action.is_stop:
+            self.target, self.wish, self.velocity = None, 0.0, 0.0
+        elif action.kind is ActionKind.RESET:
+            self.fault = ""
+
+    def step(self, dt):
+        if self.wish is None:
+            return
+        if self.target is None:
+            self.velocity = self.wish
+            self.position += self.velocity * dt
+            return
+        left = self.target - self.position
+        go = np.clip(left, -abs(self.wish) * dt, abs(self.wish) * dt)
+        self.position += go
+        self.velocity = go / dt if abs(left) > 0 else 0.0
+
+
+class Cell:
+    """Drives of their own loops behind a DriveBank, polled by an invented clock."""
+
+    def __init__(self, n=2, **settings):
+        self.markers = Markers()
+        self.bank = DriveBank([axis(modes=DRIVE_MODES, k=None, **settings) for _ in range(n)], markers=self.markers)
+        self.drives = [Drive() for _ in range(n)]
+        self.now_ns, self.axes, self.events, self.starts = 10**9, list(range(n)), [], []
+        self.poll()
+
+    def poll(self, count=1):
+        for _ in range(count):
+            self.now_ns += POLL_NS
+            for d in self.drives:
+                d.step(POLL_NS * 1e-9)
+            velocity = np.array([d.velocity for d in self.drives])
+            moving = np.abs(velocity) > 0
+            self.bank.poll(
+                self.now_ns, np.array([d.position for d in self.drives]), velocity, moving, ~moving,
+                [d.fault for d in self.drives],
+            )  # fmt: skip
+            self.send()
+            self.events += self.bank.take_events()
+
+    def send(self):
+        for action in self.bank.take_actions():
+            self.drives[action.axis].take(action)
+            if action.kind is ActionKind.START:
+                self.starts.append((self.now_ns, action.axis))
+            self.bank.action_done(action, self.now_ns)
+
+    def write(self, *, replace=False, **fields):
+        self.bank.append(records(**fields), self.axes, self.now_ns, replace=replace)
+        self.send()
+
+    def status(self, i=0):
+        return int(self.bank.fields[11].view(np.int64)[i])

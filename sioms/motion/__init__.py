@@ -12,13 +12,17 @@ from .types import (
     SWITCH_HOME,
     SWITCH_MINUS,
     SWITCH_PLUS,
+    Arrival,
     AxisKind,
     AxisSettings,
+    Backlash,
     CommandError,
     Event,
     EventKind,
     Homing,
+    Keeper,
     MarkerPort,
+    Restore,
 )
 
 __all__ = [
@@ -26,9 +30,11 @@ __all__ = [
     "SWITCH_MINUS",
     "SWITCH_PLUS",
     "ActionKind",
+    "Arrival",
     "AxisBank",
     "AxisKind",
     "AxisSettings",
+    "Backlash",
     "Command",
     "CommandError",
     "DriveAction",
@@ -38,5 +44,7 @@ __all__ = [
     "Homing",
     "Judged",
     "Judgement",
+    "Keeper",
     "MarkerPort",
+    "Restore",
 ]

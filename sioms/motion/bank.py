@@ -24,11 +24,11 @@ from .plain import MOST, Taken
 from .queue import AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
 from .sequencer import FORCE, HOLD, STOP, Sequencer
 from .store import NEVER_NS
-from .types import SWITCH_MINUS, SWITCH_PLUS, AxisSettings, CommandError, Event, EventKind, MarkerPort
+from .types import SWITCH_MINUS, SWITCH_PLUS, AxisSettings, CommandError, Event, EventKind, Keeper, MarkerPort
 
 Axes = NDArray[np.int64]
 ROW = {name: i for i, (name, _) in enumerate(AXIS_READ_FIELDS)}
-EMERGENCY_STOP, HOMING = int(AxisStatus.EMERGENCY_STOP), int(AxisStatus.HOMING)
+EMERGENCY_STOP, HOMING, HOMED = int(AxisStatus.EMERGENCY_STOP), int(AxisStatus.HOMING), int(AxisStatus.HOMED)
 
 
 class AxisBank:
@@ -43,7 +43,7 @@ class AxisBank:
 
     ``fields`` is (13, n) float64 in the order of AXIS_READ_FIELDS, contiguous; integer rows are the
     same memory seen as int64. ``stepper`` (n,) tells which entries of tick()'s answer are raw output
-    positions; the others are forces or torques.
+    positions; the others are forces or torques. ``keeper`` may be set before the first tick.
 
     Concurrency: one thread.
     """
@@ -89,6 +89,7 @@ class AxisBank:
         self._last_ns = 0
         self._seen = False
         self._inbox: list[Taken] = []
+        self.keeper: Keeper | None = None
 
     # -- writing ------------------------------------------------------------------------------
 
@@ -358,7 +359,7 @@ class AxisBank:
         self._offset[axis] += by
         self._position[axis] += by
         self._desired[axis] += by
-        self._law.slewed[axis] += by
+        self._law.shift(axis, by)
         self._sequencer.store.shift(np.array([axis]), by)
 
     def drive(self, axis: int, velocity: float, now_ns: int) -> None:
@@ -410,6 +411,8 @@ class AxisBank:
             sequencer.store.evaluate(now_ns, self._desired, self._desired_velocity)
         self._control(dt)
         self._watch(switches, now_ns)
+        if self.keeper is not None:
+            self._keep(self.keeper)
         return self._actuator
 
     def _stop_late(self, last_ns: int, now_ns: int) -> None:
@@ -429,13 +432,13 @@ class AxisBank:
         sequencer.refresh(moving)
 
     def _measure(self, position: NDArray[np.float64], dt: float, now_ns: int) -> None:
-        raw, scratch, velocity = self._raw, self._scratch, self._velocity
+        raw, scratch, velocity, told = self._raw, self._scratch, self._velocity, position
         if not np.isfinite(position.sum()):
             position = self._refuse_measurement(position, now_ns)
         raw[:] = position
         np.add(raw, self._offset, out=self._position)
         if not self._seen:
-            self._first_measurement(now_ns)
+            self._first_measurement(told, now_ns)
         np.subtract(raw, self._last_raw, out=scratch)
         scratch /= dt
         scratch -= velocity
@@ -443,10 +446,16 @@ class AxisBank:
         velocity += scratch
         self._last_raw[:] = raw
 
-    def _first_measurement(self, now_ns: int) -> None:
+    def _first_measurement(self, told: NDArray[np.float64], now_ns: int) -> None:
         self._seen = True
         self._last_raw[:] = self._raw
+        if self.keeper is not None:
+            offset, homed = self.keeper.restored(told)
+            self._offset[:] = offset
+            np.add(self._raw, offset, out=self._position)
+            self._queue.set_homed(np.flatnonzero(homed), True, now_ns)
         self._law.slewed[:] = self._position
+        self._law.anchor[:] = self._offset
         self._sequencer.hold(np.arange(self.n), self._position, now_ns)
 
     def _refuse_measurement(self, position: NDArray[np.float64], now_ns: int) -> NDArray[np.float64]:
@@ -478,7 +487,7 @@ class AxisBank:
         self._force[:] = law.output
         if not law.all_servo:
             s = law.stepper_rows
-            self._actuator[s] = law.slewed[s] - self._offset[s]
+            self._actuator[s] = law.slewed[s] - law.anchor[s]
             self._force[s] = 0.0
             desired[s] = law.slewed[s]
         np.subtract(desired, self._position, out=self._following)
@@ -530,12 +539,28 @@ class AxisBank:
         if hit.any():
             self._abandon(np.flatnonzero(hit), now_ns, errno.ERANGE, "stopped by an end switch")
 
+    def _keep(self, keeper: Keeper) -> None:
+        """Note where the axes are; before the actuators hear of a motion."""
+        latched = self._queue.latched
+        at_rest = (self._sequencer.kind == HOLD) & ~self._limp & ((latched & HOMING) == 0)
+        keeper.note(at_rest, (latched & HOMED) != 0, self._raw, self._position)
+
     # -- answers ------------------------------------------------------------------------------
 
     def is_idle(self, axes: AxesLike) -> bool:
         """Tell whether these axes hold still, have no commands and are not homing."""
         self._work_in()
         return bool(self._sequencer.is_idle(np.asarray(axes, dtype=np.int64)).all())
+
+    def particulars(self, axes: AxesLike) -> dict[str, list[float]]:
+        """Return what the readings do not tell of these axes, by name.
+
+        Raw is what the device counts, offset what makes a position of it; retries belong to the last point
+        move, misses are counted since the start.
+        """
+        chosen = np.asarray(axes)
+        report = {"raw": self._raw[chosen].tolist(), "offset": self._offset[chosen].tolist()}
+        return report | self._sequencer.arrivals.report(chosen)
 
     def take_events(self) -> list[Event]:
         """Return what happened since the last call, oldest first."""

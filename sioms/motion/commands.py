@@ -29,12 +29,14 @@ COMBINATIONS = (
     M.JERK,
     M.ACCELERATION,
     M.VELOCITY,
+    M.VELOCITY | M.ACCELERATION,
     M.POSITION,
     M.POSITION | M.VELOCITY,
     M.POSITION | M.VELOCITY | M.ACCELERATION,
     M.FORCE,
     M.FORCE_VELOCITY,
 )
+POINT_MOVE = int(M.POSITION), int(M.POSITION | M.VELOCITY | M.ACCELERATION | M.SPECIFIED_TIME)
 FORCE_FLAGS = M.FORCE | M.FORCE_VELOCITY | M.SPECIFIED_FORCE_OFFSET | M.SPECIFIED_MAX_FORCE
 _IS_COMBINATION = np.zeros(QUANTITIES + 1, dtype=bool)
 _IS_COMBINATION[[int(c) for c in COMBINATIONS]] = True
@@ -66,6 +68,12 @@ class Command(NamedTuple):
     wait_generation: int
 
 
+def is_point_move(mode: Any) -> Any:
+    """Tell whether a control mode, or each of an array of them, commands a point move (see arrival.py)."""
+    quantity, mask = POINT_MOVE
+    return (mode & mask) == quantity
+
+
 class Limits:
     """Limits of every axis as arrays (n,), absent ones infinite.
 
@@ -85,6 +93,19 @@ class Limits:
         self.acceleration = column("acceleration_max", inf)
         self.jerk = column("jerk_max", inf)
         self.force = column("force_max", inf)
+        take_up = np.array([s.backlash.distance if s.backlash else 0.0 for s in settings])
+        self.room_below, self.room_above = np.maximum(take_up, 0.0), np.maximum(-take_up, 0.0)
+        """Stretches inside the soft limits that point moves leave for their take-up."""
+
+    def about_room(self, axis: int) -> str:
+        """Return what to add to the limits in a message, when a take-up narrows them."""
+        room = float(max(self.room_below[axis], self.room_above[axis]))
+        return f" with {room:g} left for the take-up of backlash" if room else ""
+
+    def reach(self, axis: NDArray[np.int64], mode: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the lowest and highest position that each command of these modes may lead its axis to."""
+        low, high, point = self.minimum[axis], self.maximum[axis], is_point_move(mode)
+        return low + point * self.room_below[axis], high - point * self.room_above[axis]
 
 
 class Rule(NamedTuple):
@@ -114,6 +135,9 @@ RULES = (
     Rule(M.SPECIFIED_MAX_VEL_ACC, "max_acceleration", "acceleration", True, "{u}/s^2"),
     Rule(M.SPECIFIED_MAX_FORCE, "max_force", "force", True, "{f}"),
 )
+
+TOWARDS = Rule(M.ACCELERATION, "acceleration", "acceleration", True, "{u}/s^2")
+"""With a velocity to go over to, the acceleration is a size."""
 
 
 class Validator:
@@ -216,6 +240,11 @@ class Validator:
                     raise self._out_of_range(commands, int(bad.argmax()), rule, bound)
         if present & M.SPECIFIED_TIME:
             self._check_time(commands)
+        if present & M.ACCELERATION:
+            towards = (mode & QUANTITIES) == int(M.VELOCITY | M.ACCELERATION)
+            bad = towards & (commands["acceleration"] <= 0)
+            if bad.any():
+                raise self._out_of_range(commands, int(bad.argmax()), TOWARDS, self._limits.acceleration[axis])
         if present & M.SPECIFIED_GAINS:
             bad = ((mode & int(M.SPECIFIED_GAINS)) != 0) & (np.abs(commands["kp"]) >= 1)
             if bad.any():
@@ -257,7 +286,7 @@ class Validator:
         if bad.any():
             i = int(bad.argmax())
             raise self.refuse(errno.EINVAL, commands, i, f"position is {value[i]}; a finite number")
-        low, high = self._limits.minimum[axis], self._limits.maximum[axis]
+        low, high = self._limits.reach(axis, mode)
         bad = held & ((mode & int(M.RELATIVE)) == 0) & ((value < low) | (value > high))
         if bad.any():
             i = int(bad.argmax())
@@ -265,6 +294,7 @@ class Validator:
             raise self.refuse(
                 errno.ERANGE, commands, i,
                 f"position {value[i]:g} {unit} is outside the soft limits; {low[i]:g} to {high[i]:g} {unit}"
+                + self._limits.about_room(int(axis[i])),
             )
 
     def _capture(self, commands: NDArray[Any]) -> None:

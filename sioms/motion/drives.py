@@ -8,8 +8,9 @@ action_failed() tell how that went. Pure, and one thread, as AxisBank.
 from __future__ import annotations
 
 import errno
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -20,9 +21,11 @@ from sioms.protocol.flags import AxisStatus
 from sioms.protocol.records import AXIS_READ_FIELDS
 
 from . import modes
-from .commands import Command
+from .arrival import Approach, Arrivals
+from .commands import Command, is_point_move
+from .profile import InfeasibleError
 from .queue import AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
-from .types import AxisSettings, CommandError, Event, EventKind, MarkerPort
+from .types import AxisSettings, CommandError, Event, EventKind, Keeper, MarkerPort
 
 NEVER_NS = 2**62
 Axes = NDArray[np.int64]
@@ -76,7 +79,7 @@ class DriveBank:
         settle_s: how long after its start a command may take to be reported as moving [s]; until
             then 'done' reports are not believed.
 
-    ``fields`` as in AxisBank. Concurrency: one thread.
+    ``fields`` and ``keeper`` as in AxisBank. Concurrency: one thread.
     """
 
     def __init__(
@@ -113,6 +116,13 @@ class DriveBank:
         self._target = np.zeros(n)
         self._settle_ns = int(settle_s * 1e9)
         self._acknowledged = np.zeros(n, dtype=bool)
+        self._approaches = [Approach.of(s) for s in settings]
+        self._arrivals = Arrivals(settings)
+        self._take_ups: list[float | None] = [None] * n
+        """Targets of the axes on their way to the place from which they take up their play."""
+        self._settled_ns = np.full(n, NEVER_NS, dtype=np.int64)
+        self._taken = np.zeros(n, dtype=bool)
+        self._outcome = np.zeros(n, dtype=np.int64)
         self._homing = np.zeros(n, dtype=bool)
         self._resetting = np.zeros(n, dtype=bool)
         self._stops: dict[int, ActionKind] = {}
@@ -120,6 +130,7 @@ class DriveBank:
         self._seen = False
         self._last_ns = 0
         self._moving = np.zeros(n, dtype=bool)
+        self.keeper: Keeper | None = None
 
     # -- verbs: as AxisBank --------------------------------------------------------------------
 
@@ -243,10 +254,18 @@ class DriveBank:
             self._actions.append(self._action(ActionKind.HOME, axis))
             self._engage(axis, now_ns)
         self._homing[chosen] = True
+        self._taken[chosen] = False
 
     def is_idle(self, axes: AxesLike) -> bool:
         """Tell whether these axes stand still and have no commands."""
         return bool(self._idle(np.asarray(axes, dtype=np.int64)).all())
+
+    def particulars(self, axes: AxesLike) -> dict[str, list[float]]:
+        """Return what the readings do not tell of these axes, by name; see AxisBank.particulars()."""
+        chosen = np.asarray(axes)
+        raw, offset = self._position - self._offset, self._offset
+        report = {"raw": raw[chosen].tolist(), "offset": offset[chosen].tolist()}
+        return report | self._arrivals.report(chosen)
 
     def take_events(self) -> list[Event]:
         """Return what happened since the last call, oldest first."""
@@ -281,11 +300,22 @@ class DriveBank:
             force: measured forces or torques (n,), None when the drive tells none.
         """
         self._last_ns = now_ns
+        if self.keeper is not None and not self._seen:
+            self._offset[:], homed = self.keeper.restored(position)
+            self.set_homed(np.flatnonzero(homed))
         self._seen = True
         self._moving = moving.copy()
         self._take(now_ns, position, velocity, fault, force)
         self._end_reached(now_ns, moving, done)
         self.advance(now_ns)
+        self._keep()
+
+    def _keep(self) -> None:
+        """Note where the axes are; before the drives hear of a motion."""
+        if self.keeper is not None and self._seen:
+            homed = (self._queue.latched & int(AxisStatus.HOMED)) != 0
+            raw = self._position - self._offset
+            self.keeper.note(~self._active & ~self._moving, homed, raw, self._position)
 
     def advance(self, now_ns: int) -> None:
         """Do what time and markers allow without a new report: end timed commands, begin what waits."""
@@ -306,6 +336,7 @@ class DriveBank:
 
     def take_actions(self) -> list[DriveAction]:
         """Return what shall be sent, stops first; each is handed out once."""
+        self._keep()
         actions = [self._action(kind, axis) for axis, kind in self._stops.items()]
         actions += self._actions
         self._stops.clear()
@@ -383,7 +414,53 @@ class DriveBank:
             elif self._homing[axis] and reached[axis]:
                 self._homed(axis, now_ns)
             elif reached[axis] and command is not None and _ends_by_itself(command):
-                self._end(axis, now_ns)
+                self._arrive(axis, command, now_ns)
+
+    def _arrive(self, axis: int, command: Command, now_ns: int) -> None:
+        """The drive stands where it was told to go: take up the play, settle, look, try again or end."""
+        approach, take_up = self._approach_of(axis, command), self._take_ups[axis]
+        if approach is None:
+            self._end(axis, now_ns)
+        elif take_up is not None:
+            self._take_ups[axis] = None
+            self._send_to(axis, command, take_up, now_ns, (approach.velocity, approach.acceleration))
+        elif self._has_settled(axis, approach, now_ns):
+            self._taken[axis] = bool(approach.distance)
+            one = np.array([axis])
+            missed, again = self._arrivals.judge(one, self._target[one] - self._position[one])
+            if again[0]:
+                self._go(axis, command, approach, now_ns)
+                return
+            self._outcome[axis] = int(AxisStatus.MISSED_TARGET) if missed[0] else 0
+            self._end(axis, now_ns)
+
+    def _has_settled(self, axis: int, approach: Approach, now_ns: int) -> bool:
+        if self._settled_ns[axis] == NEVER_NS:
+            self._settled_ns[axis] = now_ns + int(approach.settle_s * 1e9)
+        return bool(now_ns >= self._settled_ns[axis])
+
+    def _approach_of(self, axis: int, command: Command) -> Approach | None:
+        return self._approaches[axis] if is_point_move(command.control_mode) else None
+
+    def _go(self, axis: int, command: Command, approach: Approach, now_ns: int) -> None:
+        """Send the drive to its target, where needed by way of the place from which it takes up the play."""
+        target, present = float(self._target[axis]), float(self._position[axis])
+        stands, taken = not self._moving[axis], bool(self._taken[axis])
+        straight = not approach.distance or (stands and approach.is_straight(target, present, taken))
+        self._take_ups[axis] = None if straight else target
+        self._settled_ns[axis] = NEVER_NS
+        self._taken[axis] = False
+        self._send_to(axis, command, target if straight else target - approach.distance, now_ns)
+
+    def _send_to(
+        self, axis: int, command: Command, place: float, now_ns: int, most: tuple[float, float] = (math.inf, math.inf)
+    ) -> None:
+        """Tell the drive to go to a place, at a velocity and an acceleration of at most so much."""
+        command = command._replace(position=float(place - self._offset[axis]))
+        action = self._action(ActionKind.START, axis, command)
+        velocity, acceleration = min(action.velocity_max, most[0]), min(action.acceleration_max, most[1])
+        self._actions.append(replace(action, velocity_max=velocity, acceleration_max=acceleration))
+        self._engage(axis, now_ns)
 
     def _homed(self, axis: int, now_ns: int) -> None:
         self._homing[axis] = False
@@ -430,13 +507,18 @@ class DriveBank:
         command, one = self._queue.heads[axis], np.array([axis])
         if command is None:
             return
-        mode = command.control_mode
+        mode, approach = command.control_mode, None
         if mode & modes.POSITION:
             target = command.position + (self._target[axis] if mode & modes.RELATIVE else 0.0)
             low, high = self._limits.minimum[axis], self._limits.maximum[axis]
-            if not low <= target <= high:
-                text = f"position {target:g} is outside the soft limits; {low:g} to {high:g}"
-                self.fault(one, text, now_ns)
+            approach = self._approach_of(axis, command)
+            try:
+                if not low <= target <= high:
+                    raise InfeasibleError(f"position {target:g} is outside the soft limits; {low:g} to {high:g}")
+                if approach is not None:
+                    approach.begin_of_take_up(target, low, high)
+            except InfeasibleError as error:
+                self.fault(one, str(error), now_ns)
                 return
             self._target[axis] = target
             command = command._replace(position=float(target - self._offset[axis]))
@@ -454,15 +536,22 @@ class DriveBank:
         self._end_fraction[axis] = total % 1.0 if timed else 0.0
         self._queue.has_head[axis] = False
         self._running[axis] = command
-        self._engage(axis, now_ns)
+        self._outcome[axis] = self._arrivals.tries[axis] = 0
         self._queue.emit(EventKind.STARTED, one, now_ns)
-        self._actions.append(self._action(ActionKind.START, axis, command))
+        if approach is None:
+            self._taken[axis] = False
+            self._engage(axis, now_ns)
+            self._actions.append(self._action(ActionKind.START, axis, command))
+        elif not self._active[axis] and approach.is_idle_for(self._target[axis], self._position[axis]):
+            self._end(axis, now_ns)
+        else:
+            self._go(axis, command, approach, now_ns)
 
     def _halt(self, axes: Axes, *, fastest: bool) -> None:
         self._queue.clear(axes)
         self._actions = [a for a in self._actions if a.axis not in axes or a.kind is ActionKind.RESET]
         self._queue.latched[axes] &= ~int(AxisStatus.HOMING)
-        self._homing[axes] = False
+        self._homing[axes] = self._taken[axes] = False
         for axis in axes.tolist():
             self._running[axis] = None
             if fastest or self._stops.get(axis) is not ActionKind.QUICK_STOP:
@@ -481,7 +570,7 @@ class DriveBank:
         np.subtract(self._desired, self._position, out=self._following)
         busy = self._active | self._moving
         self._in_motion[:] = busy
-        status = self._queue.latched.copy()
+        status = self._queue.latched | self._outcome
         status |= np.where(busy, int(AxisStatus.MOVING), 0)
         status |= np.where(self._stopping, int(AxisStatus.STOPPING), 0)
         status |= np.where(self._queue.gated_marker & ~running, int(AxisStatus.WAITING_MARKER), 0)

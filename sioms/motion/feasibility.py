@@ -108,7 +108,7 @@ class Feasibility:
         self, commands: NDArray[Any], order: NDArray[np.int64], c: NDArray[Any], end: Floats, velocity: Floats
     ) -> None:
         """Relative targets inside the soft limits, passing velocities inside the specified maximum."""
-        low, high = self._limits.minimum[c["axis"]], self._limits.maximum[c["axis"]]
+        low, high = self._limits.reach(c["axis"], c["control_mode"])
         bad = (end[:, 0] < low) | (end[:, 0] > high)
         if bad.any():
             i = int(bad.argmax())
@@ -151,7 +151,7 @@ class Feasibility:
     def _try(self, commands: NDArray[Any], i: int, record: Any, begin: Floats, bounds: Floats) -> None:
         state: State = (float(begin[0]), float(begin[1]), float(begin[2]))
         try:
-            self._planner.plan(Command._make(record.item()), state, Bounds._make(bounds.tolist()))
+            self._planner.plan(Command._make(record.item()), state, Bounds(*bounds.tolist()))
         except InfeasibleError as e:
             raise self._refusal(commands, i, str(e)) from None
 

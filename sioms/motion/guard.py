@@ -50,7 +50,7 @@ class LimitGuard:
         if not hit.any():
             return False
         for bit, sign in ((AxisStatus.LIMIT_MINUS, -1), (AxisStatus.LIMIT_PLUS, 1)):
-            sequencer.limit_bits[axes[side == sign]] |= int(bit)
+            sequencer.outcome[axes[side == sign]] |= int(bit)
         self._queue.emit(EventKind.DROPPED, axes[hit], now_ns, errno.ERANGE, TEXT)
         sequencer.drop(axes[hit])
         free = axes[hit & force]

@@ -59,6 +59,10 @@ class ControlLaw:
         """tau[n-1] of servos, w[n-1] of steppers."""
         self.slewed = np.zeros(n)
         """Output position of steppers."""
+        self.anchor = np.zeros(n)
+        """What output positions count from: the raw output is slewed - anchor."""
+        self._start_velocity = np.array([s.start_velocity for s in settings], dtype=np.float64)
+        self._any_start = bool(self._start_velocity.any())
         self.saturated = np.zeros(n, dtype=bool)
         self.all_servo = not self.stepper.any()
         self.stepper_rows: slice | NDArray[np.int64] = np.flatnonzero(self.stepper)
@@ -70,6 +74,16 @@ class ControlLaw:
         self._term = np.zeros(n)
         self._low = np.zeros(n)
         self._last_velocity = np.zeros(n)
+
+    def anchor_at(self, axis: int, position: float) -> None:
+        """Call the place at which a stepper stands ``position``; the raw output does not change."""
+        self.anchor[axis] += position - self.slewed[axis]
+        self.slewed[axis] = position
+
+    def shift(self, axis: int, by: float) -> None:
+        """Add to the coordinate of an axis; the raw output does not change."""
+        self.slewed[axis] += by
+        self.anchor[axis] += by
 
     def step(
         self,
@@ -131,16 +145,33 @@ class ControlLaw:
         wish = self._brakable(free, e, dv, self._spare(limit, dv, s, dt), dt)
         # Rounding must not count as saturation: a profile at full acceleration is within the limits.
         v, a = self.velocity_limit[s] * (1 + 1e-6), limit * dt * (1 + 1e-6)
-        w = np.clip(np.clip(wish, w_last - a, w_last + a), -v, v)
+        low, high = w_last - a, w_last + a
+        if self._any_start:
+            low, high = self._jump_over(low, high, a, s)
+        w = np.clip(np.clip(wish, low, high), -v, v)
         # Dead beat on a set-point that the limits allow to reach in this tick, however long it is.
         locked = (self.k[s] * dt >= 0.999) & (self.kz[s] == 0.0) & (self.kp[s] == 0.0) & (self.kb[s] == 0.0)
-        locked &= (np.abs(dv - w_last) <= a) & (np.abs(dv) <= v)
-        locked &= np.abs(e - w_last * dt) <= 0.5 * a * dt + 1e-12
+        locked &= (dv >= low) & (dv <= high) & (np.abs(dv) <= v)
+        near = np.abs(e - w_last * dt) <= 0.5 * a * dt + 1e-12
+        if self._any_start:
+            near |= np.abs(e) <= (self._start_velocity[s] + a) * dt
+        locked &= near
         self.slewed[s] = np.where(locked, desired[s], self.slewed[s] + w * dt)
         w = np.where(locked, dv, w)
         self.output[s] = w
         self.error[s] = e
         self.saturated[s] = ~locked & (np.abs(w - free) > 1e-3 * v)
+
+    def _jump_over(
+        self, low: Vector, high: Vector, a: Vector, s: slice | NDArray[np.int64]
+    ) -> tuple[Vector, Vector]:
+        """Widen the velocities that can be had in this tick: those up to the start velocity follow from each other at once."""
+        jump = self._start_velocity[s]
+        within = (low <= jump) & (high >= -jump)
+        return (
+            np.where(within, np.minimum(low, -jump - a), low),
+            np.where(within, np.maximum(high, jump + a), high),
+        )
 
     def _spare(
         self, limit: Vector, desired_velocity: Vector, s: slice | NDArray[np.int64], dt: float

@@ -57,6 +57,7 @@ class PlainCheck:
     def __init__(self, offered: Sequence[int], limits: Limits) -> None:
         self._offered = list(offered)
         self._minimum, self._maximum = limits.minimum, limits.maximum
+        self._below, self._above = limits.room_below.tolist(), limits.room_above.tolist()
         self._checks: dict[int, tuple[Check, ...]] = {}
         for quantity in _QUANTITIES:
             for beside in range(1 << len(_BESIDE)):
@@ -80,7 +81,8 @@ class PlainCheck:
                 return None
         if mode & modes.POSITION:
             position = record[4]
-            low, high = max(self._minimum[axis], -GREATEST), min(self._maximum[axis], GREATEST)
+            low = max(self._minimum[axis] + self._below[axis], -GREATEST)  # all plain ones are point moves
+            high = min(self._maximum[axis] - self._above[axis], GREATEST)
             if not low <= position <= high:
                 return None
         return Command._make((axis, mode, 0, 0, *record[4:], 0, 0))

@@ -17,8 +17,8 @@ import ruckig
 from . import modes
 from .commands import Command
 
-MAX_SEGMENTS = 13
-"""Two brake phases, seven of the profile, two of arrival, the hold, one to spare."""
+MAX_SEGMENTS = 23
+"""Two brake phases, seven of the profile, two of arrival; nine of a take-up; a hold, two to spare."""
 SHORTEST_S = 1e-11
 POSITION_INTERFACE = ruckig.ControlInterface.Position
 VELOCITY_INTERFACE = ruckig.ControlInterface.Velocity
@@ -35,13 +35,14 @@ class InfeasibleError(Exception):
 
 
 class Bounds(NamedTuple):
-    """Limits that hold for a plan; jerk may be infinite, positions too."""
+    """Limits that hold for a plan; jerk may be infinite, positions too. Speeds up to ``start`` are taken at once."""
 
     velocity: float
     acceleration: float
     jerk: float
     minimum: float
     maximum: float
+    start: float = 0.0
 
 
 class Plan(NamedTuple):
@@ -79,15 +80,35 @@ class Planner:
             return self._position(command, state, bounds)
         duration = command.time if mode & modes.TIME and command.time > 0 else math.inf
         velocity, limited = _velocity_goal(command, state, bounds)
+        if bounds.start and mode & modes.VELOCITY and abs(state[1]) <= bounds.start:
+            state = (state[0], math.copysign(min(bounds.start, abs(velocity)), velocity), 0.0)
         return self._velocity(velocity, duration, state, limited)
 
-    def _position(self, command: Command, state: State, bounds: Bounds) -> Plan:
-        mode = command.control_mode
-        target = command.position + (state[0] if mode & modes.RELATIVE else 0.0)
+    def target(self, command: Command, state: State, bounds: Bounds) -> float:
+        """Return where a position command leads.
+
+        Raises:
+            InfeasibleError: outside the soft limits.
+        """
+        target = command.position + (state[0] if command.control_mode & modes.RELATIVE else 0.0)
         if not bounds.minimum <= target <= bounds.maximum:
             raise InfeasibleError(
                 f"position {target:g} is outside the soft limits; {bounds.minimum:g} to {bounds.maximum:g}"
             )
+        return target
+
+    def reach(self, target: float, state: State, bounds: Bounds) -> Plan:
+        """Return the time-optimal motion from a state to rest at a place."""
+        return self._optimal(state, (target, 0.0, 0.0), bounds, None)
+
+    def overshoots(self, target: float, side: float) -> bool:
+        """Tell whether the last profile went beyond a place, on the side given by the sign of ``side``."""
+        extent = self._trajectory.position_extrema[0]
+        return bool(extent.max > target + 1e-9 if side > 0 else extent.min < target - 1e-9)
+
+    def _position(self, command: Command, state: State, bounds: Bounds) -> Plan:
+        mode = command.control_mode
+        target = self.target(command, state, bounds)
         final = (
             target,
             command.velocity if mode & modes.VELOCITY else 0.0,
@@ -126,12 +147,13 @@ class Planner:
 
     def _optimal(self, state: State, final: State, bounds: Bounds, exact_s: float | None) -> Plan:
         given = self._input
+        begin, end = _with_jumps(state, final, bounds) if bounds.start and exact_s is None else (state, final)
         given.control_interface = POSITION_INTERFACE
-        given.target_position = [final[0]]
-        given.target_velocity = [final[1]]
-        given.target_acceleration = [final[2]]
+        given.target_position = [end[0]]
+        given.target_velocity = [end[1]]
+        given.target_acceleration = [end[2]]
         given.minimum_duration = exact_s
-        segments = self._calculate(state, bounds) or [(0.0, *final, 0.0, 0.0, 0.0)]
+        segments = self._calculate(begin, bounds) or [(0.0, *final, 0.0, 0.0, 0.0)]
         duration = self._trajectory.duration
         if exact_s is not None:
             if duration > exact_s + TIME_TOLERANCE_S:
@@ -243,10 +265,24 @@ def fault_of_pass(coefficients: tuple[float, ...], time: float, bounds: Bounds) 
     return ""
 
 
+def _with_jumps(state: State, final: State, bounds: Bounds) -> tuple[State, State]:
+    """Return the ends of a stepper's profile: at rest it takes its start velocity at once, and gives it up at once."""
+    way = final[0] - state[0]
+    jump = math.copysign(min(bounds.start, bounds.velocity), way)
+    if way and abs(state[1]) <= bounds.start:
+        state = (state[0], jump, 0.0)
+    towards = state[1] * way > 0 and state[1] ** 2 <= 2 * bounds.acceleration * abs(way) + bounds.start**2
+    if towards and final[1:] == (0.0, 0.0):
+        final = (final[0], jump, 0.0)
+    return state, final
+
+
 def _velocity_goal(command: Command, state: State, bounds: Bounds) -> tuple[float, Bounds]:
     """Return the velocity that a v/a/j command drives at, and the bounds on the way there."""
     mode = command.control_mode
     if mode & modes.VELOCITY:
+        if mode & modes.ACCELERATION:
+            bounds = bounds._replace(acceleration=min(abs(command.acceleration), bounds.acceleration))
         return max(-bounds.velocity, min(bounds.velocity, command.velocity)), bounds
     if mode & modes.ACCELERATION and command.acceleration != 0:
         goal = math.copysign(bounds.velocity, command.acceleration)

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import AxisStatus
 
 from . import modes
-from .commands import Command
+from .arrival import Approach, Arrivals, plan_point
+from .commands import Command, is_point_move
 from .law import ControlLaw
 from .profile import Bounds, InfeasibleError, Plan, Planner, State
 from .queue import CommandQueue
@@ -57,7 +58,7 @@ _HOMING = int(AxisStatus.HOMING)
 
 class Sequencer:
     """Plans of n axes in time. Arrays (n,): ``kind`` of the running plan, ``guard`` where soft limits are
-    watched in every tick, ``limit_bits`` LIMIT_* of the last limit stop, ``status`` and ``in_motion``
+    watched in every tick, ``outcome`` LIMIT_* and MISSED_TARGET of the last motion, ``status`` and ``in_motion``
     as they change with events.
 
     Args:
@@ -82,7 +83,7 @@ class Sequencer:
         self.store = PlanStore(n)
         self.kind = np.zeros(n, dtype=np.int64)
         self.guard = np.zeros(n, dtype=bool)
-        self.limit_bits = np.zeros(n, dtype=np.int64)
+        self.outcome = np.zeros(n, dtype=np.int64)
         self.status = np.zeros(n, dtype=np.int64)
         self._velocity_limit, self._acceleration_limit = queue.in_force
         self.any_force = False
@@ -99,6 +100,11 @@ class Sequencer:
         self._row_command: list[Command | None] = [None] * (2 * n)
         self._row_signals = np.zeros(2 * n, dtype=bool)
         self._row_sets = np.zeros(2 * n, dtype=bool)
+        self._row_checked = np.zeros(2 * n, dtype=bool)
+        self._row_taken = np.zeros(2 * n, dtype=bool)
+        self.arrivals = Arrivals(settings)
+        self._approaches = [Approach.of(s) for s in settings]
+        self._start_velocity = [s.start_velocity for s in settings]
         self._ready = np.zeros(n, dtype=bool)
         self._todo: dict[int, None] = {}
 
@@ -114,7 +120,8 @@ class Sequencer:
     def replaced(self, axes: Axes, now_ns: int) -> None:
         """New commands shall take over at now from whatever runs, without its signal."""
         self._todo.update(dict.fromkeys(axes.tolist()))
-        self._row_signals[self.store.row[axes]] = False
+        rows = self.store.row[axes]
+        self._row_signals[rows] = self._row_checked[rows] = self._row_taken[rows] = False
         self.store.cut(axes, now_ns)
         self.advance(now_ns)
         self.refresh(axes)
@@ -188,6 +195,7 @@ class Sequencer:
 
     def _run_now(self, axes: Axes, kind: int, start_ns: int) -> None:
         self._set_kind(axes, kind)
+        self._row_taken[self.store.row[axes]] = False
         self.store.begin(axes, np.full(axes.size, start_ns), np.zeros(axes.size))
         self._settle_masks()
         self.refresh(axes)
@@ -218,6 +226,10 @@ class Sequencer:
 
     def _finish(self, axes: Axes, now_ns: int) -> None:
         """End the running plans of these axes and begin what follows."""
+        if self.arrivals.watched:
+            axes = self._look_at_arrivals(axes, now_ns)
+            if not axes.size:
+                return
         store, queue = self.store, self._queue
         rows = store.row[axes]
         start_ns, fraction = store.ended_at(axes)
@@ -240,6 +252,43 @@ class Sequencer:
             rest = ~go
             self._rest(axes[rest], state[rest], start_ns[rest], fraction[rest], now_ns)
 
+    def _look_at_arrivals(self, axes: Axes, now_ns: int) -> Axes:
+        """Try point moves that missed their targets again, as often as is allowed; return the axes that have ended."""
+        rows = self.store.row[axes]
+        checked = self._row_checked[rows]
+        if not checked.any():
+            return axes
+        looked, at = axes[checked], rows[checked]
+        missed, again = self.arrivals.judge(looked, self.store.final[at, 0] - self._position[looked])
+        self._row_checked[at[~again]] = False
+        failed = [axis for axis in looked[again].tolist() if not self._try_again(axis)]
+        self.arrivals.misses[failed] += 1
+        self.outcome[[*looked[missed].tolist(), *failed]] |= int(AxisStatus.MISSED_TARGET)
+        tries = np.setdiff1d(looked[again], failed)
+        return axes[~np.isin(axes, tries)]
+
+    def _try_again(self, axis: int) -> bool:
+        """Begin the running point move of a stepper anew, from where it is measured to be; tell whether that is possible."""
+        store, row = self.store, int(self.store.row[axis])
+        command, approach = self._row_command[row], self._approaches[axis]
+        if command is None or approach is None:
+            return False
+        one, measured = np.array([axis]), float(self._position[axis])
+        start_ns, fraction = store.ended_at(one)
+        command = command._replace(position=float(store.final[row, 0]), control_mode=command.control_mode & ~modes.RELATIVE)
+        bounds, taken = self._bounds(axis, command), bool(self._row_taken[row])
+        try:
+            approach = approach._replace(deadband=0.0)
+            plan, taken, _ = plan_point(self._planner, command, (measured, 0.0, 0.0), bounds, approach, taken)
+        except InfeasibleError:
+            self._row_checked[row] = False
+            return False
+        self._law.anchor_at(axis, measured)
+        store.put(row, plan)
+        self._row_taken[row] = taken
+        store.begin(one, start_ns, fraction)
+        return True
+
     def _signal(self, row: int, now_ns: int) -> None:
         command = self._row_command[row]
         self._row_signals[row] = False
@@ -255,7 +304,9 @@ class Sequencer:
         self._queue.has_head[axes] = False
         self.kind[axes] = self._row_kind[rows]
         self.guard[axes] = self._row_guard[rows]
-        self.limit_bits[axes] = 0
+        self.outcome[axes] = 0
+        if self.arrivals.watched:
+            self.arrivals.tries[axes] = 0
         self._todo.update(dict.fromkeys(axes.tolist()))
         for row in rows[self._row_sets[rows]].tolist():
             self._put_in_force(row // 2, self._row_command[row])
@@ -303,7 +354,7 @@ class Sequencer:
         rows = self.store.row[axes]
         self.kind[axes] = self._row_kind[rows] = kind
         self.guard[axes] = False
-        self._row_signals[rows] = False
+        self._row_signals[rows] = self._row_checked[rows] = False
 
     def _settle_masks(self) -> None:
         self.any_force = bool((self.kind == FORCE).any())
@@ -314,7 +365,7 @@ class Sequencer:
         kind, queue = self.kind[axes], self._queue
         status = _KIND_STATUS[kind]
         status |= queue.latched[axes]
-        status |= self.limit_bits[axes]
+        status |= self.outcome[axes]
         marker, synch = queue.gated_marker[axes], queue.gated_synch[axes]
         if marker.any() or synch.any():
             waiting = self.is_open_ended(axes)
@@ -348,10 +399,16 @@ class Sequencer:
         if command is None:
             return
         mode = command.control_mode
-        row = int(self.store.row[axis]) ^ 1
+        running = int(self.store.row[axis])
+        row, approach = running ^ 1, self._approaches[axis] if is_point_move(mode) else None
+        taken = looked_at = False
         try:
             if mode & modes.ANY_FORCE:
                 plan, kind = self._plan_force(axis, command), FORCE
+            elif approach is not None:
+                kind, taken = POSITION, bool(self._row_taken[running])
+                bounds = self._bounds(axis, command)
+                plan, taken, looked_at = plan_point(self._planner, command, state, bounds, approach, taken)
             else:
                 plan = self._planner.plan(command, state, self._bounds(axis, command))
                 kind = POSITION if mode & modes.POSITION else RATE
@@ -364,6 +421,7 @@ class Sequencer:
         self._row_command[row] = command
         self._row_signals[row] = bool(mode & modes.SIGNAL_MARKER)
         self._row_sets[row] = bool(mode & modes.SETTINGS)
+        self._row_checked[row], self._row_taken[row] = looked_at, taken
         self._ready[axis] = True
 
     def _bounds(self, axis: int, command: Command) -> Bounds:
@@ -373,7 +431,8 @@ class Sequencer:
         else:
             velocity, acceleration = float(self._velocity_limit[axis]), float(self._acceleration_limit[axis])
         return Bounds(
-            velocity, acceleration, float(limits.jerk[axis]), float(limits.minimum[axis]), float(limits.maximum[axis])
+            velocity, acceleration, float(limits.jerk[axis]), float(limits.minimum[axis]), float(limits.maximum[axis]),
+            self._start_velocity[axis],
         )
 
     def _plan_force(self, axis: int, command: Command) -> Plan:

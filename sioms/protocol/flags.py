@@ -20,9 +20,10 @@ class NodeClass(IntEnum):
 class ControlMode(IntFlag):
     """The ``control_mode`` field of an axis write record (dissertation, table F.4).
 
-    Exactly one of the first six says what is commanded, with one extension: POSITION together with
+    Exactly one of the first six says what is commanded, with two extensions: POSITION together with
     VELOCITY (and ACCELERATION) commands a position that is passed with that velocity (and
-    acceleration) instead of reached at rest. The other flags say which further fields hold.
+    acceleration) instead of reached at rest; VELOCITY together with ACCELERATION goes over to that
+    velocity with that acceleration at most. The other flags say which further fields hold.
     """
 
     JERK = 0x0001
@@ -66,6 +67,8 @@ class AxisStatus(IntFlag):
     SWITCH_MINUS = 0x2000
     SWITCH_PLUS = 0x4000
     STALLED = 0x8000
+    MISSED_TARGET = 0x10000
+    """The last point move ended farther from its target than the tolerance, after all its retries."""
 
 
 class AnalogStatus(IntFlag):
@@ -101,6 +104,7 @@ class Request(IntEnum):
     FLUSH = 25
     CANCEL_WAITS = 26
     GET_STATISTICS = 27
+    GET_PARTICULARS = 28
 
 
 class Access(IntFlag):

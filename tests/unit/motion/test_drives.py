@@ -4,86 +4,10 @@ import errno
 
 import numpy as np
 import pytest
-from motion_rig import MODE, Markers, axis, records
+from motion_rig import DRIVE_MODES, MODE, POLL_NS, Cell, axis, records
 
 from sioms.motion import ActionKind, CommandError, DriveBank, EventKind
 from sioms.protocol.flags import AxisStatus as S
-
-MODES = (
-    MODE.POSITION | MODE.VELOCITY | MODE.RELATIVE | MODE.SPECIFIED_TIME | MODE.WAIT_FOR_EXTERNAL_SYNCH
-    | MODE.SPECIFIED_WAIT_MARKER | MODE.SPECIFIED_SIGNAL_MARKER | MODE.SPECIFIED_MAX_VEL_ACC
-)  # fmt: skip
-POLL_NS = 10_000_000
-
-
-class Drive:
-    """Moves with constant velocity to its target; takes one poll to begin."""
-
-    def __init__(self):
-        self.position, self.velocity, self.target, self.wish = 0.0, 0.0, None, None
-        self.fault, self.log = "", []
-
-    def take(self, action):
-        self.log.append(action.kind)
-        if action.kind is ActionKind.START:
-            c = action.command
-            if c.control_mode & MODE.POSITION:
-                self.target, self.wish = c.position, action.velocity_max
-            else:
-                self.target, self.wish = None, c.velocity
-        elif action.is_stop:
-            self.target, self.wish, self.velocity = None, 0.0, 0.0
-        elif action.kind is ActionKind.RESET:
-            self.fault = ""
-
-    def step(self, dt):
-        if self.wish is None:
-            return
-        if self.target is None:
-            self.velocity = self.wish
-            self.position += self.velocity * dt
-            return
-        left = self.target - self.position
-        go = np.clip(left, -abs(self.wish) * dt, abs(self.wish) * dt)
-        self.position += go
-        self.velocity = go / dt if abs(left) > 0 else 0.0
-
-
-class Cell:
-    def __init__(self, n=2):
-        self.markers = Markers()
-        self.bank = DriveBank([axis(modes=MODES) for _ in range(n)], markers=self.markers)
-        self.drives = [Drive() for _ in range(n)]
-        self.now_ns, self.axes, self.events, self.starts = 10**9, list(range(n)), [], []
-        self.poll()
-
-    def poll(self, count=1):
-        for _ in range(count):
-            self.now_ns += POLL_NS
-            for d in self.drives:
-                d.step(POLL_NS * 1e-9)
-            velocity = np.array([d.velocity for d in self.drives])
-            moving = np.abs(velocity) > 0
-            self.bank.poll(
-                self.now_ns, np.array([d.position for d in self.drives]), velocity, moving, ~moving,
-                [d.fault for d in self.drives],
-            )  # fmt: skip
-            self.send()
-            self.events += self.bank.take_events()
-
-    def send(self):
-        for action in self.bank.take_actions():
-            self.drives[action.axis].take(action)
-            if action.kind is ActionKind.START:
-                self.starts.append((self.now_ns, action.axis))
-            self.bank.action_done(action, self.now_ns)
-
-    def write(self, *, replace=False, **fields):
-        self.bank.append(records(**fields), self.axes, self.now_ns, replace=replace)
-        self.send()
-
-    def status(self, i=0):
-        return int(self.bank.fields[11].view(np.int64)[i])
 
 
 def test_commands_run_in_order_each_after_the_drive_is_done():
@@ -212,7 +136,7 @@ def test_homing_is_the_drives_own():
     from sioms.motion import Homing
 
     cell = Cell(1)
-    cell.bank = DriveBank([axis(modes=MODES, homing=Homing(0.1, 0.01, required=True))], markers=cell.markers)
+    cell.bank = DriveBank([axis(modes=DRIVE_MODES, homing=Homing(0.1, 0.01, required=True))], markers=cell.markers)
     cell.poll()
     with pytest.raises(CommandError, match="home required"):
         cell.write(mode=MODE.POSITION, position=0.1)
