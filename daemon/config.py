@@ -6,6 +6,7 @@ validated by the driver's ``Settings`` in the nursery, so that every device repo
 
 from __future__ import annotations
 
+import os.path
 import tomllib
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar
@@ -34,6 +35,7 @@ class WorkcellTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_handles: Count = 256
     max_markers: Annotated[int, Meta(ge=0, le=1023)] = 128
     max_waits: Count = 64
+    state_folder: str = ""
 
 
 class GrantTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -88,6 +90,11 @@ class Config(msgspec.Struct, frozen=True):
     grants: list[GrantTable]
     stop_sources: list[StopSourceTable]
     folder: str
+
+    def state_folder(self, environment: Mapping[str, str]) -> str:
+        """Return where drivers keep what outlives them, '' when nowhere; systemd tells it in $STATE_DIRECTORY."""
+        named = self.workcell.state_folder or environment.get("STATE_DIRECTORY", "").split(":")[0]
+        return os.path.join(self.folder, named) if named else ""
 
 
 _SECTIONS = ("workcell", "device", "node", "grant", "emergency_stop")

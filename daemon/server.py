@@ -211,6 +211,7 @@ class Server:
             "stop_sources": self._stop_sources.get(name, []),
             "daemon_lease_s": self.config.workcell.daemon_lease_s,
             "folder": self.config.folder,
+            "state_folder": self.config.state_folder(os.environ),
             # Golden-ratio steps: however many drivers there are, their ticks do not fall together.
             "phase": (list(self.config.devices).index(name) * 0.6180339887) % 1.0,
         }

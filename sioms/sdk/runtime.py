@@ -37,6 +37,7 @@ from .driver import Driver, LineDriver, StreamDriver, TickDriver
 from .engines import Engine, LineEngine, StreamEngine, TickEngine
 from .handles import Waits
 from .inputs import Input
+from .keeping import keep_positions
 from .markers import Markers
 from .pages import Pages
 from .rt import TimerFd, become_realtime, name_process
@@ -64,7 +65,7 @@ def run(
         device: device name.
         settings: its validated settings.
         generation: number of this process among the device's.
-        options: stop_sources, daemon_lease_s, realtime_priority, user, phase of the tick [period].
+        options: stop_sources, daemon_lease_s, realtime_priority, user, phase of the tick [period], state_folder.
         fds: control socket, latch page, stop-request page, marker table.
     """
     name_process(f"sioms:{device}")
@@ -112,6 +113,7 @@ class Runtime:
         self._ending_ns = 0
         self.driver = driver.variant(settings)(device, settings, self)
         self.blocks = list(self.driver.blocks)
+        self._kept = keep_positions(str(options["state_folder"]), device, self.blocks, self.log)
         lease_ns = int(description.lease_s * 1e9)
         self.pages = Pages(device, self.blocks, lease_ns, generation)
         self.clients = Attachments(self)
@@ -388,6 +390,8 @@ class Runtime:
             self.engine.close()
             self._closing = True
         if self.engine.is_quiet() or late:
+            for kept in self._kept:
+                kept.close()
             self.pages.close(self._end_reason)
             self.running = False
 

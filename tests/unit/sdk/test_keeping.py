@@ -1,0 +1,211 @@
+"""Positions over a restart: files, what of them is believed, and that no interruption leaves a wrong entry."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from motion_rig import MODE, Rig, axis, records
+
+from sioms.motion import AxisKind, Homing, Restore
+from sioms.protocol.flags import AxisStatus as S
+from sioms.sdk.keeping import AT_REST, HOMED, Contents, Entry, PositionFile, decode, encode, offset_of
+
+BOOT = "b007"
+ALWAYS, MATCHING = Restore("always"), Restore("matching", 1e-3)
+
+
+class Kept:
+    """A bank with a file, that can be killed and started again."""
+
+    def __init__(self, path, given, start=0.0, boot=BOOT):
+        self.said = []
+        self.file = PositionFile(str(path), [given], boot, lambda level, text: self.said.append(f"{level} {text}"))
+        self.rig = Rig([given], start=[start], keeper=self.file)
+
+
+def moved_to(path, position, rule, *, offset=0.25, homed=True, close=False, ticks=None):
+    """Calibrate an axis, home it, move it, and let its process end."""
+    cell = Kept(path, axis(restore=rule))
+    cell.rig.bank.calibrate([0], [offset])
+    cell.rig.bank.set_homed([0], homed)
+    cell.rig.write(mode=MODE.POSITION, position=position)
+    if ticks is None:
+        cell.rig.run()
+        cell.rig.tick(2)
+    else:
+        cell.rig.tick(ticks)
+    if close:
+        cell.file.close()
+    return cell
+
+
+@pytest.mark.parametrize(("rule", "reads"), [(ALWAYS, 0.0), (ALWAYS, 7.0), (MATCHING, 0.5), (MATCHING, 0.5009)])
+@pytest.mark.parametrize("homed", [True, False])
+def test_a_position_at_rest_comes_back_and_homed_as_it_was(tmp_path, rule, reads, homed):
+    moved_to(tmp_path / "x", 0.75, rule, homed=homed)  # the device reads 0.5
+    after = Kept(tmp_path / "x", axis(restore=rule), start=reads)
+    wanted = 0.75 if rule is ALWAYS else reads + 0.25
+    assert after.rig.field("position") == pytest.approx(wanted) == after.rig.field("commanded_position")
+    assert bool(after.rig.field("status") & S.HOMED) == homed
+    assert "restored" in after.said[-1]
+    after.rig.write(mode=MODE.POSITION, position=1.0)
+    after.rig.run()
+    assert after.rig.field("position") == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("reads", [0.502, 0.0, -0.5, math.nan])
+def test_what_reads_otherwise_has_moved_and_is_not_restored(tmp_path, reads):
+    moved_to(tmp_path / "x", 0.75, MATCHING)
+    after = Kept(tmp_path / "x", axis(restore=MATCHING), start=reads)
+    assert not after.rig.field("status") & S.HOMED
+    assert "not restored, not homed" in after.said[-1]
+    if math.isfinite(reads):
+        assert after.rig.field("position") == reads and "reads" in after.said[-1]
+
+
+@pytest.mark.parametrize("rule", [ALWAYS, MATCHING])
+@pytest.mark.parametrize("ticks", [1, 2, 100, 400])
+def test_what_was_in_motion_is_not_restored(tmp_path, rule, ticks):
+    before = moved_to(tmp_path / "x", 0.75, rule, ticks=ticks)
+    after = Kept(tmp_path / "x", axis(restore=rule), start=before.rig.raw[0])
+    assert not after.rig.field("status") & S.HOMED
+    assert "not known to be at rest" in after.said[-1]
+
+
+def test_without_the_first_reading_nothing_is_forgotten(tmp_path):
+    moved_to(tmp_path / "x", 0.75, ALWAYS)
+    for _ in range(3):  # started and killed before the device has answered
+        PositionFile(str(tmp_path / "x"), [axis(restore=ALWAYS)], BOOT, lambda *_: None)
+    assert Kept(tmp_path / "x", axis(restore=ALWAYS)).rig.field("position") == pytest.approx(0.75)
+
+
+def test_a_process_on_its_way_out_cannot_write_into_its_successor(tmp_path):
+    before = moved_to(tmp_path / "x", 0.75, ALWAYS)
+    after = Kept(tmp_path / "x", axis(restore=ALWAYS))
+    before.rig.write(mode=MODE.POSITION, position=2.0)
+    before.rig.run()
+    before.file.close()
+    held = decode((tmp_path / "x").read_bytes())
+    assert held.entries["x"].position == pytest.approx(0.75) == after.rig.field("position") and not held.closed
+
+
+def test_after_another_boot_only_an_orderly_end_is_believed(tmp_path):
+    moved_to(tmp_path / "x", 0.75, ALWAYS)
+    fallen = Kept(tmp_path / "x", axis(restore=ALWAYS), boot="other")
+    assert fallen.rig.field("position") == 0.0 and "orderly end" in fallen.said[-1]
+    moved_to(tmp_path / "x", 0.75, ALWAYS, close=True)
+    assert Kept(tmp_path / "x", axis(restore=ALWAYS), boot="other").rig.field("position") == pytest.approx(0.75)
+    moved_to(tmp_path / "x", 0.75, ALWAYS)
+    unknown = Kept(tmp_path / "x", axis(restore=ALWAYS), boot="")
+    assert unknown.rig.field("position") == 0.0, "a system that does not tell its boot"
+
+
+def test_an_axis_without_a_rule_keeps_to_its_device_and_others_are_found_by_name(tmp_path):
+    settings = [axis(name="a", restore=ALWAYS), axis(name="b"), axis(name="c", restore=ALWAYS)]
+    rig = Rig(settings, keeper=PositionFile(str(tmp_path / "x"), settings, BOOT, lambda *_: None))
+    rig.bank.calibrate([0, 1, 2], [1.0, 2.0, 3.0 - 1e-3])
+    rig.tick()
+    settings = settings[::-1]
+    rig = Rig(settings, keeper=PositionFile(str(tmp_path / "x"), settings, BOOT, lambda *_: None))
+    assert rig.bank.fields[0].tolist() == [pytest.approx(3.0 - 1e-3), 0.0, 1.0]
+
+
+@pytest.mark.parametrize("data", [b"", b"SIOMSPOS", b"x" * 200, encode(Contents({"x": Entry(3, 1.0, 1.0)}, True, BOOT))[:-1]])
+def test_a_file_that_is_none_is_told_and_replaced(tmp_path, data):
+    (tmp_path / "x").write_bytes(data)
+    cell = Kept(tmp_path / "x", axis(restore=ALWAYS))
+    assert cell.rig.field("position") == 0.0 and any("not restored" in said for said in cell.said)
+    assert decode((tmp_path / "x").read_bytes()).entries["x"].state == AT_REST
+
+
+def test_a_stepper_stays_where_it_is_when_its_position_is_restored(tmp_path):
+    given = axis(kind=AxisKind.STEPPER, k=None, restore=ALWAYS)
+    (tmp_path / "x").write_bytes(encode(Contents({"x": Entry(AT_REST, 9.0, 1.5)}, True, BOOT)))
+    cell = Kept(tmp_path / "x", given, start=0.2)
+    assert cell.rig.field("position") == pytest.approx(1.5)
+    assert cell.rig.bank.tick(cell.rig.now_ns + 10**6, cell.rig.raw)[0] == pytest.approx(0.2)
+
+
+def test_what_must_be_homed_may_move_when_it_was_restored_homed(tmp_path):
+    given = axis(restore=ALWAYS, homing=Homing(0.5, 0.05, required=True))
+    (tmp_path / "x").write_bytes(encode(Contents({"x": Entry(AT_REST | HOMED, 9.0, 1.5)}, True, BOOT)))
+    Kept(tmp_path / "x", given).rig.write(mode=MODE.POSITION, position=1.0)
+
+
+entries = st.dictionaries(
+    st.text("abcdefgh_0123456789-", min_size=1, max_size=20),
+    st.builds(Entry, st.integers(0, 3), st.floats(allow_nan=False), st.floats(allow_nan=False)), max_size=8,
+)  # fmt: skip
+
+
+@given(entries, st.booleans(), st.sampled_from(["", BOOT, "f" * 32]))
+def test_a_file_is_read_as_it_was_written(found, closed, boot):
+    assert decode(encode(Contents(found, closed, boot))) == Contents(found, closed, boot)
+
+
+@given(st.binary(max_size=300), st.integers(0, 200))
+def test_no_bytes_do_more_than_be_refused(tail, keep):
+    try:
+        decode(encode(Contents({"x": Entry(3, 1.0, 2.0)}, True, BOOT))[:keep] + tail)
+    except ValueError as error:
+        assert str(error)
+
+
+class Killed(Exception):
+    """The process ends here."""
+
+
+class Column(np.ndarray):
+    """A column of a file; its process is killed before one of its stores, when ``left`` is used up."""
+
+    left = 0
+
+    def __setitem__(self, rows, values):
+        if not Column.left:
+            raise Killed
+        Column.left -= 1
+        super().__setitem__(rows, values)
+
+
+@settings(max_examples=100)
+@given(st.lists(st.tuples(st.booleans(), st.floats(-2, 2), st.floats(-2, 2)), min_size=1, max_size=8), st.data())
+def test_wherever_a_process_is_killed_no_entry_is_wrong(tmp_path_factory, history, data):
+    """What is marked at rest is, whole, the place noted last or, before that note is done, the one before it."""
+    path = tmp_path_factory.mktemp("kept") / "x"
+    file = PositionFile(str(path), [axis(restore=ALWAYS)], BOOT, lambda *_: None)
+    file._state, file._raw, file._position = (c.view(Column) for c in (file._state, file._raw, file._position))
+    Column.left = data.draw(st.integers(0, 4 * len(history)))
+    noted = [(False, 0.0, 0.0)]
+    complete = False
+    try:
+        for at_rest, raw, position in history:
+            noted.append((at_rest, raw, position))
+            complete = False
+            file.note(*(np.array([v]) for v in (at_rest, at_rest, raw, position)))
+            complete = True
+    except Killed:
+        assert not complete
+    entry = decode(path.read_bytes()).entries["x"]
+    if complete:
+        assert bool(entry.state & AT_REST) == noted[-1][0]
+    believable = [note[1:] for note in (noted[-1:] if complete else noted[-2:]) if note[0]]
+    assert not entry.state & AT_REST or entry[1:] in believable
+
+
+def test_offsets_are_those_of_the_rule():
+    entry = Entry(AT_REST, 0.5, 0.75)
+    assert offset_of(entry, axis(restore=ALWAYS), 0.1) == (0.65, "")
+    assert offset_of(entry, axis(restore=MATCHING), 0.5005) == (0.25, "")
+    assert offset_of(entry, axis(), 0.5)[0] is None
+    assert offset_of(entry._replace(state=HOMED), axis(restore=ALWAYS), 0.5)[0] is None
+
+
+def test_keeping_has_no_say_in_the_motion(tmp_path):
+    """The same commands give the same set-points with a file and without."""
+    plain, kept = Rig([axis()]), Kept(tmp_path / "x", axis(restore=ALWAYS)).rig
+    for rig in (plain, kept):
+        rig.bank.append(records(mode=MODE.POSITION, position=0.3), [0], rig.now_ns)
+        rig.run()
+    assert np.array_equal(plain.trace("commanded_position"), kept.trace("commanded_position"))
