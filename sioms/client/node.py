@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from typing import Any, Self, TypeAlias
 
+    from .coordinates import UserAxis
     from .workcell import Workcell
 
     Records: TypeAlias = bytes | bytearray | memoryview | Iterable[bytes]
@@ -381,6 +382,38 @@ class AxisNode(Node):
     ) -> int:
         """Append one command; see ``sioms.command`` for the words."""
         return self.write(command(axis, **words), timeout, replace=replace)
+
+    def jog(self, velocity: float, axis: int = 0, *, acceleration: float | None = None) -> int:
+        """Go over to a velocity at once, instead of what the axis does, until told otherwise; ``stop`` ends it.
+
+        Args:
+            velocity: signed [unit/s].
+            axis: index of the axis in the node.
+            acceleration: at most so much, for this jog alone [unit/s^2]; None: that of the axis.
+
+        Jogs end with this client, however that ends; open with a lease if it may hang.
+        """
+        words = {} if acceleration is None else {"acceleration": acceleration}
+        return self.command(axis, velocity=velocity, replace=True, **words)
+
+    def tweak(self, step: float, axis: int = 0, **words: Any) -> int:
+        """Append a step from where the preceding command ends, so that quick tweaks add up; see ``command``."""
+        return self.write(command(axis, position=step, relative=True, **words))
+
+    def user(self, axis: int = 0, *, offset: float = 0.0, direction: int = 1) -> UserAxis:
+        """Return one axis in coordinates of one's own: user = direction * position + offset."""
+        from .coordinates import UserAxis
+
+        return UserAxis(self, axis, offset, direction)
+
+    def particulars(self) -> dict[str, list[float]]:
+        """Return what readings do not tell, one value an axis: raw and offset [unit], retries and misses.
+
+        ``raw`` is what the device counts; ``raw + offset`` is the position; ``retries`` are those of the last
+        point move, ``misses`` all since the driver started.
+        """
+        value: dict[str, list[float]] = self.ioctl(Request.GET_PARTICULARS)
+        return value
 
     def wait_until_idle(self, timeout: float | None = None) -> None:
         """Wait until all axes of the node stand still and their buffers are empty.

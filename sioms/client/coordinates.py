@@ -1,0 +1,88 @@
+"""One axis in the user's own coordinates: another zero, another direction.
+
+The coordinates of a node are shared by all its clients: raw is what the device counts, CALIBRATE_DEVICE and
+homing set the offset from it. User coordinates are this client's own view of them and change nothing in the driver.
+
+Concurrency: as the node that it looks at.
+"""
+
+from __future__ import annotations
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any
+
+    from .node import AxisNode
+
+_SIGNED = ("velocity", "acceleration", "jerk", "force", "force_velocity", "force_offset")
+
+
+class UserAxis:
+    """An axis of an open node, seen as ``user = direction * position + offset``.
+
+    Args:
+        node: open axis node.
+        axis: index of the axis in the node.
+        offset: user coordinate of the node's position 0 [unit].
+        direction: 1, or -1 when user coordinates grow against the axis.
+
+    Raises:
+        ValueError: another direction.
+
+    Example:
+        >>> UserAxis(None, 0, 0.5, -1).to_node(0.2)
+        0.3
+    """
+
+    __slots__ = ("axis", "direction", "node", "offset")
+
+    def __init__(self, node: AxisNode, axis: int = 0, offset: float = 0.0, direction: int = 1) -> None:
+        if direction not in (1, -1):
+            raise ValueError(f"make user coordinates: direction {direction!r}; want 1 or -1")
+        self.node, self.axis, self.offset, self.direction = node, axis, offset, direction
+
+    def to_node(self, user: float) -> float:
+        """Return the node's position of a user position."""
+        return (user - self.offset) * self.direction
+
+    def to_user(self, position: float) -> float:
+        """Return the user position of one of the node's."""
+        return self.direction * position + self.offset
+
+    @property
+    def position(self) -> float:
+        """The measured position."""
+        return self.to_user(self.node.read().position[self.axis])
+
+    @property
+    def velocity(self) -> float:
+        """The measured velocity."""
+        velocity: float = self.node.read().velocity[self.axis]
+        return self.direction * velocity
+
+    def call_here(self, user: float) -> None:
+        """Let the present place have this user coordinate; nothing moves, and no other client sees it."""
+        self.offset = user - self.direction * self.node.read().position[self.axis]
+
+    def limits(self) -> tuple[float | None, float | None]:
+        """Return the lowest and highest user position, None where there is no soft limit."""
+        found = self.node.limits()
+        low, high = (found[name][self.axis] for name in ("position_min", "position_max"))
+        ends = [None if end is None else self.to_user(end) for end in (low, high)]
+        return (ends[0], ends[1]) if self.direction > 0 else (ends[1], ends[0])
+
+    def move(self, position: float, *, replace: bool = False, timeout: float | None = 0.0, **words: Any) -> int:
+        """Append a command to a user position; the words of ``sioms.command`` in user coordinates."""
+        place = self.direction * position if words.get("relative") else self.to_node(position)
+        return self.node.move(place, self.axis, replace=replace, timeout=timeout, **self._turned(words))
+
+    def tweak(self, step: float, **words: Any) -> int:
+        """Append a step from where the preceding command ends."""
+        return self.node.tweak(self.direction * step, self.axis, **self._turned(words))
+
+    def jog(self, velocity: float, *, acceleration: float | None = None) -> int:
+        """Go over to a velocity; see ``AxisNode.jog``."""
+        return self.node.jog(self.direction * velocity, self.axis, acceleration=acceleration)
+
+    def _turned(self, words: dict[str, Any]) -> dict[str, Any]:
+        return {name: self.direction * word if name in _SIGNED else word for name, word in words.items()}
