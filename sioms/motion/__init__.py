@@ -8,7 +8,7 @@ from .bank import AxisBank
 from .commands import Command
 from .drives import ActionKind, DriveAction, DriveBank
 from .queue import Judged, Judgement
-from .types import (
+from .settings import (
     SWITCH_HOME,
     SWITCH_MINUS,
     SWITCH_PLUS,
@@ -16,14 +16,10 @@ from .types import (
     AxisKind,
     AxisSettings,
     Backlash,
-    CommandError,
-    Event,
-    EventKind,
     Homing,
-    Keeper,
-    MarkerPort,
     Restore,
 )
+from .types import CommandError, Event, EventKind, Keeper, MarkerPort
 
 __all__ = [
     "SWITCH_HOME",

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from .commands import Command
 from .profile import Bounds, InfeasibleError, Plan, Planner, State
-from .types import AxisSettings
+from .settings import AxisSettings
 
 CLOSE = 1 - 1e-9
 """Part of the distance that must be left for a straight move: what rounding takes away does not count."""

@@ -23,8 +23,9 @@ from .law import ControlLaw
 from .plain import MOST, Taken
 from .queue import AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
 from .sequencer import FORCE, HOLD, STOP, Sequencer
+from .settings import SWITCH_MINUS, SWITCH_PLUS, AxisSettings
 from .store import NEVER_NS
-from .types import SWITCH_MINUS, SWITCH_PLUS, AxisSettings, CommandError, Event, EventKind, Keeper, MarkerPort
+from .types import CommandError, Event, EventKind, Keeper, MarkerPort
 
 Axes = NDArray[np.int64]
 ROW = {name: i for i, (name, _) in enumerate(AXIS_READ_FIELDS)}

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import QUANTITIES, ControlMode, NodeClass
 from sioms.protocol.records import numpy_dtype
 
-from .types import AxisKind, AxisSettings, CommandError, MarkerPort, RecordError
+from .settings import AxisKind, AxisSettings
+from .types import CommandError, MarkerPort, RecordError
 
 WIRE_DTYPE = np.dtype(numpy_dtype(NodeClass.AXIS))
 COMMAND_DTYPE = np.dtype([*numpy_dtype(NodeClass.AXIS), ("signal_generation", "<i8"), ("wait_generation", "<i8")])

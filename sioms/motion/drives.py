@@ -25,7 +25,8 @@ from .arrival import Approach, Arrivals
 from .commands import Command, is_point_move
 from .profile import InfeasibleError
 from .queue import AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
-from .types import AxisSettings, CommandError, Event, EventKind, Keeper, MarkerPort
+from .settings import AxisSettings
+from .types import CommandError, Event, EventKind, Keeper, MarkerPort
 
 NEVER_NS = 2**62
 Axes = NDArray[np.int64]

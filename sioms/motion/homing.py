@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import AxisStatus
 
 from .queue import CommandQueue
-from .types import HOME_SWITCHES, SWITCH_MINUS, SWITCH_PLUS, AxisSettings, EventKind, Homing
+from .settings import HOME_SWITCHES, SWITCH_MINUS, SWITCH_PLUS, AxisSettings, Homing
+from .types import EventKind
 
 
 class Phase(Enum):

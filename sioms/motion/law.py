@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from .types import AxisKind, AxisSettings
+from .settings import AxisKind, AxisSettings
 
 Vector = NDArray[np.float64]
 

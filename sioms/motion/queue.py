@@ -21,7 +21,8 @@ from .buffers import Chunk, CommandBuffers, cut
 from .commands import WIRE_DTYPE, Command, Limits, Validator
 from .feasibility import Feasibility, Tail
 from .plain import MOST, PlainCheck
-from .types import AxisSettings, CommandError, Event, EventKind, MarkerPort, RecordError
+from .settings import AxisSettings
+from .types import CommandError, Event, EventKind, MarkerPort, RecordError
 
 AxesLike = Sequence[int] | NDArray[np.int64]
 LimitValue = float | None | Sequence[float | None]

@@ -24,8 +24,9 @@ from .commands import Command, is_point_move
 from .law import ControlLaw
 from .profile import Bounds, InfeasibleError, Plan, Planner, State
 from .queue import CommandQueue
+from .settings import AxisSettings
 from .store import UNCUT_NS, PlanStore
-from .types import AxisSettings, EventKind
+from .types import EventKind
 
 Axes = NDArray[np.int64]
 Floats = NDArray[np.float64]
