@@ -47,6 +47,9 @@ class Engine(Protocol):
     ) -> Any:
         """Set outputs for a client (handle) or for safety (None)."""
 
+    def carry_out(self, handle: Handle, number: int, steps: Steps, what: str) -> Any:
+        """Run the steps that answer a client's request."""
+
     def commands_written(self, block: AnyBlock) -> None:
         """A bank's buffers have changed between two ticks."""
 
@@ -115,6 +118,10 @@ class TickEngine:
         for channel, value in zip(channels, values, strict=True):
             self._runtime.outputs[(id(block), channel)] = value
         return self._runtime.tick
+
+    def carry_out(self, handle: Handle, number: int, steps: Steps, what: str) -> Any:
+        """Refuse: a driver without a line has none to send steps on."""
+        raise TypeError(f"{what}: {type(self._driver).__name__} has no line for steps")
 
     def slack(self, now_ns: int, until_ns: int) -> None:
         """Let the driver use the time that is left."""
@@ -225,7 +232,7 @@ class _Connected:
             self.line_lost(error.strerror or str(error), now_ns)
         self._arm()
 
-    def carry_out(self, handle: Handle, number: int, steps: Steps, what: str) -> None:
+    def carry_out(self, handle: Handle, number: int, steps: Steps, what: str) -> Any:
         """Run the steps that a client's request takes; its answer comes when they end."""
         line, now_ns = self.line, self._runtime.now_ns()
         if line is None:
@@ -239,6 +246,7 @@ class _Connected:
                 handle.refuse(number, errno_, f"{what}: {error}")
 
         self.guarded(lambda: line.submit(steps, Priority.ACT, done, now_ns), now_ns)
+        return LATER
 
     def _readable(self) -> None:
         now_ns = self._runtime.now_ns()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import errno
 import math
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -101,12 +101,16 @@ def ioctl(
         except CommandError as error:
             raise _refuse(error.errno, f"{what}: {error}") from None
     try:
-        return runtime.driver.ioctl(handle.block.spec, request, [int(c) for c in handle.channels], argument)
+        answer = runtime.driver.ioctl(handle.block.spec, request, [int(c) for c in handle.channels], argument)
     except Refusal as error:
         raise _refuse(error.errno, f"{what}: {error}") from None
     except Exception as error:  # what a client asks for must not end what others do with the device
         runtime.log("error", f"{what} with {argument!r:.80}: the driver failed: {error!r}")
         raise _refuse(errno.EIO, f"{what}: the driver failed: {error!r}") from None
+    if not isinstance(answer, Generator):
+        return answer
+    check_link(runtime, handle, what)
+    return runtime.engine.carry_out(handle, number, answer, what)
 
 
 def _corrected_here(handle: Handle) -> bool:
