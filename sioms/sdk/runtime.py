@@ -253,8 +253,8 @@ class Runtime:
         counters = getattr(self.engine, "counters", None)
         if counters is not None:
             report["link"] = {name: getattr(counters, name) for name in counters.__slots__}
-        if isinstance(self.driver, StreamDriver):
-            report["stream"] = dict(self.driver.counters())
+        if counters := self.driver.counters():
+            report["stream"] = dict(counters)
         return report
 
     # --- life ------------------------------------------------------------------------------------
