@@ -134,6 +134,10 @@ class Driver(ABC):
     def blocks(self) -> Sequence[AnyBlock]:
         """The blocks in the order of the description, made in __init__."""
 
+    def counters(self) -> Mapping[str, int | str]:
+        """Return the counters that the driver's codec keeps, and the device's status in words, for GET_STATISTICS."""
+        return {}
+
     def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
         """Answer a request that the kit does not answer itself: CALIBRATE_DEVICE of a sensor with a tare of its own ...
 
@@ -299,10 +303,6 @@ class StreamDriver(Driver):
     def heartbeat(self) -> Steps:
         """Keep the stream alive."""
         yield from ()
-
-    def counters(self) -> Mapping[str, int | str]:
-        """Return the link counters that the codec keeps, and the device's status in words."""
-        return {}
 
     def close(self) -> Steps:
         """Stop the stream."""
