@@ -481,8 +481,7 @@ class AxisBank:
         if rows is not None:
             self._follow_actual(rows)
         if self._any_limp:
-            law.output[self._limp] = 0.0
-            law.error[self._limp] = 0.0
+            law.relax(self._limp)
             self._follow_actual(self._limp)
         self._actuator[:] = law.output
         self._force[:] = law.output

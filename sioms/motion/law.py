@@ -2,7 +2,8 @@
 
 Servo (dissertation, section F.2.4): ``u[n] = k (e[n] + kz e[n-1]) - kp tau[n-1] + kb v[n] + tau_o``,
 ``tau[n] = clip(u[n], -tau_m, tau_m)``; e desired minus actual position, v the filtered actual
-velocity. In force mode ``u = force + kb v + tau_o``. Damping is ``kb < 0``.
+velocity. In force mode ``u = force + kb v + tau_o``. Damping is ``kb < 0``. Where an axis is given an integral
+gain ki, which the section does not have, u gets ``ki sum(e dt)``, bounded by tau_m and not growing while u is clipped.
 
 Stepper: the same form slews the output position: e is desired minus output position, the law gives
 the output velocity w (``kp`` acts on w[n-1], ``kb`` on the desired velocity), which is clipped to
@@ -54,6 +55,9 @@ class ControlLaw:
         self.force_limit = np.array([s.force_max for s in settings], dtype=np.float64)
         self.velocity_limit = np.array([s.velocity_max for s in settings], dtype=np.float64)
         self.acceleration_limit = np.array([s.acceleration_max for s in settings], dtype=np.float64)
+        self._integral_gain = np.array([s.ki for s in settings], dtype=np.float64)
+        self._any_integral = bool(self._integral_gain.any())
+        self._integral = np.zeros(n)
         self.error = np.zeros(n)
         self.output = np.zeros(n)
         """tau[n-1] of servos, w[n-1] of steppers."""
@@ -108,10 +112,12 @@ class ControlLaw:
             rows = self.stepper_rows
             w_last, e_last = self.output[rows].copy(), self.error[rows].copy()
         self._servo(desired, actual, velocity)
+        if self._any_integral:
+            self._integrate(dt)
         if force_rows is not None:
             np.add(desired, self.kb * velocity, out=self._u, where=force_rows)
             np.add(self._u, self.offset, out=self._u, where=force_rows)
-            self.error[force_rows] = 0.0
+            self.error[force_rows] = self._integral[force_rows] = 0.0
         self._clip()
         if not self.all_servo:
             self._slew(desired, desired_velocity, w_last, e_last, dt)
@@ -128,6 +134,20 @@ class ControlLaw:
         np.multiply(self.kb, velocity, out=term)
         u += term
         u += self.offset
+
+    def _integrate(self, dt: float) -> None:
+        """Add the integral of the error, which does not wind up while the output is clipped (of the tick before)."""
+        integral, term, limit = self._integral, self._term, self.force_limit
+        np.multiply(self._integral_gain, self.error, out=term)
+        term *= dt
+        term[self.saturated & (term * self.output > 0)] = 0.0
+        integral += term
+        np.clip(integral, -limit, limit, out=integral)
+        self._u += integral
+
+    def relax(self, axes: NDArray[np.bool_]) -> None:
+        """Let the outputs of axes (a mask) be zero, and forget what led to them."""
+        self.output[axes] = self.error[axes] = self._integral[axes] = 0.0
 
     def _clip(self) -> None:
         np.negative(self.force_limit, out=self._low)

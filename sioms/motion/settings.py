@@ -169,6 +169,7 @@ class AxisSettings:
         acceleration_max: > 0 [unit/s^2].
         jerk_max: > 0 [unit/s^3], None when unlimited.
         force_max: > 0 [N or N*m]; servo only.
+        ki: integral gain beside that law [N/(m s) or N*m/(rad s)]; servo only.
         velocity_filter_s: time constant of the velocity filter [s].
         following_error_max: [unit], None when not watched.
         homing: None when the axis cannot be homed.
@@ -193,6 +194,7 @@ class AxisSettings:
     kz: float = 0.0
     kp: float = 0.0
     kb: float = 0.0
+    ki: float = 0.0
     force_offset: float = 0.0
     velocity_filter_s: float = 0.0
     following_error_max: float | None = None
@@ -221,6 +223,8 @@ class AxisSettings:
             raise ValueError(f"axis {self.name}: velocity_filter_s {self.velocity_filter_s:g}; want 0 or more")
         if not -1 < self.kp < 1:
             raise ValueError(f"axis {self.name}: kp {self.kp:g} makes the law unstable; want between -1 and 1")
+        if not 0 <= self.ki < float("inf"):
+            raise ValueError(f"axis {self.name}: ki {self.ki:g}; want 0 or more")
         self._check_arrival()
 
     def _check_arrival(self) -> None:
@@ -234,6 +238,8 @@ class AxisSettings:
                 raise ValueError(
                     f"axis {self.name}: backlash: distance {distance:g} does not fit between the soft limits; want below {range_:g}"
                 )
+        if self.kind is AxisKind.STEPPER and self.ki:
+            raise ValueError(f"axis {self.name}: ki {self.ki:g}; want 0: a stepper goes where it is told")
         if self.kind is AxisKind.STEPPER or self.k is None:
             return
         if self.arrival is not None and self.arrival.retries:

@@ -39,7 +39,7 @@ SHORT_NS = 500_000_000
 """How long an axis may stand short of its target before that is a fault."""
 LATENCY_S = 0.03
 """Longest time that a start may wait for the line before the drive gets it."""
-_SERVO_KEYS = ("kind", "modes", "homing", "jerk_max", "k", "kz", "kp", "kb", "force_offset")
+_SERVO_KEYS = ("kind", "modes", "homing", "jerk_max", "k", "kz", "kp", "kb", "ki", "force_offset")
 _UNUSED_KEYS = (*_SERVO_KEYS, "velocity_filter_s", "following_error_max", "start_velocity")
 
 

@@ -312,6 +312,8 @@ def test_a_stepper_jogs_below_its_start_velocity_without_a_ramp():
         (lambda: axis(arrival=Arrival(0.0, 1e-3, 2)), "the loop of a servo"),
         (lambda: axis(start_velocity=0.1), "only a stepper"),
         (lambda: axis(deadband=-1.0), "deadband -1"),
+        (lambda: axis(ki=-1.0), "ki -1"),
+        (lambda: stepper(ki=1.0), "goes where it is told"),
         (lambda: Restore("perhaps"), "when = 'perhaps'"),
         (lambda: Restore("matching", -1.0), "tolerance -1"),
     ],

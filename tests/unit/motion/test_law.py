@@ -87,3 +87,44 @@ def test_stepper_comes_to_rest_on_a_jump_without_swinging(steps_s):
     assert trace[-1] == pytest.approx(0.2, abs=1e-9)
     assert max(trace) < 0.2 + 2 * 10.0 * max(steps_s) ** 2  # a long tick cannot be foreseen
     assert law.output[0] == pytest.approx(0.0, abs=1e-6)
+
+
+class Loaded:
+    """A mass of 1 kg with a little friction, a constant load, and a stop that it may be held at."""
+
+    def __init__(self, ki, load=-5.0):
+        self.x = self.v = 0.0
+        self.load, self.held = load, False
+        self.law = law_of(AxisSettings("x", k=400.0, kb=-40.0, ki=ki, force_max=20.0))
+
+    def go(self, desired, seconds):
+        path = []
+        for _ in range(round(seconds * 1000)):
+            self.law.step(np.array([desired]), np.zeros(1), np.array([self.x]), np.array([self.v]), 1e-3)
+            self.v = 0.0 if self.held else self.v + (self.law.output[0] + self.load - 2.0 * self.v) * 1e-3
+            self.x += self.v * 1e-3
+            path.append(self.x)
+        return np.array(path)
+
+
+def test_an_integral_gain_leaves_no_error_under_a_constant_load():
+    assert Loaded(0.0).go(0.02, 5.0)[-1] == pytest.approx(0.02 - 5.0 / 400.0, rel=1e-3)
+    assert Loaded(1000.0).go(0.02, 5.0)[-1] == pytest.approx(0.02, abs=1e-6)
+
+
+def test_an_integral_does_not_wind_up_while_the_axis_is_held():
+    free, held = Loaded(1000.0, load=0.0), Loaded(1000.0, load=0.0)
+    plain = free.go(0.2, 3.0).max() - 0.2
+    held.held = True
+    held.go(0.2, 10.0)  # clipped all the time
+    held.held = False
+    assert held.go(0.2, 3.0).max() - 0.2 < plain + 0.02
+    assert held.x == pytest.approx(0.2, abs=1e-4)
+
+
+def test_a_limp_axis_forgets_its_integral():
+    axis = Loaded(1000.0)
+    axis.go(0.0, 3.0)
+    axis.law.relax(np.array([True]))
+    axis.law.step(np.array([axis.x]), np.zeros(1), np.array([axis.x]), np.zeros(1), 1e-3)
+    assert axis.law.output[0] == 0.0
