@@ -536,12 +536,7 @@ class Clients:
         wait = self.wait(session, number, None, "reload")
 
         def done(errors: list[str]) -> None:
-            if errors:
-                self.answer(
-                    wait, refusal(number, errno.EINVAL, "reload: nothing taken up: " + "; ".join(errors))
-                )
-            else:
-                self.answer(wait, reply(number))
+            self.answer(wait, reply(number, errors))
 
         self._server.load(done)
         return LATER

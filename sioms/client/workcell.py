@@ -278,7 +278,9 @@ class Workcell:
         Raises:
             OSError: EINVAL with all errors; nothing was taken up.
         """
-        self._call("reload", ClientVerb.RELOAD, limit_s=60.0)
+        errors: list[str] = self._call("reload", ClientVerb.RELOAD, limit_s=60.0)
+        if errors:
+            raise OSError(errno.EINVAL, "reload: nothing taken up: " + "; ".join(errors))
 
     def _call(self, what: str, verb: ClientVerb, *arguments: object, limit_s: float | None = 0.0) -> Any:
         return self._channel.call(Call(what, verb, *arguments, limit_s=limit_s)).value

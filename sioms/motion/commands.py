@@ -142,12 +142,22 @@ TOWARDS = Rule(M.ACCELERATION, "acceleration", "acceleration", True, "{u}/s^2")
 
 
 class Validator:
-    """Checks arrays of records against the axes of one bank. Pure: keeps no record."""
+    """Checks arrays of records against the axes of one bank. Pure: keeps no record.
 
-    def __init__(self, settings: Sequence[AxisSettings], limits: Limits, markers: MarkerPort) -> None:
+    Args:
+        settings: of the axes.
+        limits: of the axes.
+        markers: seam to the marker table.
+        passing: whether the axes can pass a position at a velocity.
+    """
+
+    def __init__(
+        self, settings: Sequence[AxisSettings], limits: Limits, markers: MarkerPort, passing: bool = True
+    ) -> None:
         self._settings = settings
         self._limits = limits
         self._markers = markers
+        self._passing = passing
         self._modes = np.array([int(s.modes) for s in settings], dtype=np.uint32)
         stepper = np.array([s.kind is AxisKind.STEPPER for s in settings])
         self._modes[stepper] &= np.uint32(KNOWN & ~FORCE_FLAGS)
@@ -212,6 +222,15 @@ class Validator:
             raise self.refuse(
                 errno.EINVAL, commands, i, f"control_mode {int(mode[i]):#06x} is no command; one of {names}, "
                 "RELATIVE only with POSITION"
+            )
+        passes = int(M.POSITION | M.VELOCITY)
+        bad = (mode & passes) == passes
+        if bad.any() and not self._passing:
+            raise self.refuse(
+                errno.EINVAL,
+                commands,
+                int(bad.argmax()),
+                "this axis cannot pass a position at a velocity; POSITION or VELOCITY alone",
             )
         missing = mode & ~self._modes[commands["axis"]]
         if missing.any():

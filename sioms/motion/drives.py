@@ -102,7 +102,7 @@ class DriveBank:
             self.fields[9],
         )
         self._in_motion, self._status_word, self._buffered = integers[10], integers[11], integers[12]
-        self._queue = CommandQueue(settings, markers, capacity)
+        self._queue = CommandQueue(settings, markers, capacity, passing=False)
         self._limits = self._queue.limits
         self._velocity_limit, self._acceleration_limit = self._queue.in_force
         self._running: list[Command | None] = [None] * n

@@ -75,7 +75,9 @@ class CommandQueue:
     the persistent AxisStatus bits (HOMED, FAULT, EMERGENCY_STOP, FOLLOWING_ERROR, STALLED, HOMING).
     """
 
-    def __init__(self, settings: Sequence[AxisSettings], markers: MarkerPort, capacity: int) -> None:
+    def __init__(
+        self, settings: Sequence[AxisSettings], markers: MarkerPort, capacity: int, passing: bool = True
+    ) -> None:
         self.n = len(settings)
         self.settings = tuple(settings)
         self.limits = Limits(settings)
@@ -88,7 +90,7 @@ class CommandQueue:
         self.home_required = np.array([s.homing is not None and s.homing.required for s in settings], dtype=bool)
         self._buffers = CommandBuffers(self.n, capacity)
         self._markers = markers
-        self._validator = Validator(settings, self.limits, markers)
+        self._validator = Validator(settings, self.limits, markers, passing)
         self.in_force = (self.limits.velocity.copy(), self.limits.acceleration.copy())
         """Velocity and acceleration limits that commands have specified, (n,) each."""
         self.tail = Tail(np.full((self.n, 3), np.nan), self.in_force[0].copy(), self.in_force[1].copy())

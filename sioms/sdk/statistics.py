@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Sequence
 
 PHASES = ("late_ns", "input_ns", "control_ns", "publish_ns", "busy_ns", "total_ns")
@@ -20,7 +21,7 @@ class TickStatistics:
     """
 
     def __init__(self) -> None:
-        self._ring = [[0] * _SIZE for _ in PHASES]
+        self._ring = [array("q", bytes(8 * _SIZE)) for _ in PHASES]  # of fixed size, as lists of numbers are not
         self.ticks = 0
         self.skipped = 0
         self.longest_ns = 0

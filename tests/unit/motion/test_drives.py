@@ -32,6 +32,15 @@ def test_modes_that_the_drive_lacks_are_refused_before_anything_moves():
     assert cell.drives[0].log == []
 
 
+def test_a_position_that_is_to_be_passed_is_refused_before_anything_moves():
+    cell = Cell()
+    with pytest.raises(CommandError, match="record 1: this axis cannot pass a position") as caught:
+        cell.write(mode=[MODE.POSITION, MODE.POSITION | MODE.VELOCITY], position=0.5, velocity=0.1)
+    assert caught.value.errno == errno.EINVAL
+    cell.poll(5)
+    assert cell.drives[0].log == []
+
+
 def test_timed_velocity_stops_when_nothing_follows():
     cell = Cell()
     cell.write(mode=MODE.VELOCITY | MODE.SPECIFIED_TIME, velocity=1.0, time=0.5)
