@@ -73,6 +73,25 @@ class StopSourceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     active: Literal[0, 1] = 0
 
 
+class AlarmTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[[alarm]]``: limits of the channels of an analog node, minor inside and major outside."""
+
+    node: str
+    lolo: float | None = None
+    low: float | None = None
+    high: float | None = None
+    hihi: float | None = None
+    hysteresis: Annotated[float, Meta(ge=0)] = 0.0
+
+    def __post_init__(self) -> None:
+        limits = [limit for limit in (self.lolo, self.low, self.high, self.hihi) if limit is not None]
+        if not limits:
+            raise ValueError("no limit; want at least one of lolo, low, high, hihi")
+        if limits != sorted(limits):
+            given = ", ".join(f"{limit:g}" for limit in limits)
+            raise ValueError(f"limits {given}; want lolo, low, high and hihi to rise in this order")
+
+
 class Device(msgspec.Struct, frozen=True):
     """A configured device: the daemon's part and the driver's."""
 
@@ -89,6 +108,7 @@ class Config(msgspec.Struct, frozen=True):
     nodes: dict[str, NodeTable]
     grants: list[GrantTable]
     stop_sources: list[StopSourceTable]
+    alarms: list[AlarmTable]
     folder: str
 
     def state_folder(self, environment: Mapping[str, str]) -> str:
@@ -97,7 +117,7 @@ class Config(msgspec.Struct, frozen=True):
         return os.path.join(self.folder, named) if named else ""
 
 
-_SECTIONS = ("workcell", "device", "node", "grant", "emergency_stop")
+_SECTIONS = ("workcell", "device", "node", "grant", "emergency_stop", "alarm")
 _COMMON = tuple(field.name for field in msgspec.structs.fields(DeviceTable))
 
 
@@ -135,7 +155,8 @@ def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
     sources = _list(root, "emergency_stop", StopSourceTable, errors)
     if not devices and not errors:
         errors.append("read configuration: no [device.NAME] in it; want at least one")
-    return Config(workcell, devices, nodes, grants, sources, folder), errors
+    alarms = _list(root, "alarm", AlarmTable, errors)
+    return Config(workcell, devices, nodes, grants, sources, alarms, folder), errors
 
 
 def _tables(root: Mapping[str, Any], section: str, errors: list[str]) -> list[tuple[str, dict[str, Any]]]:

@@ -5,6 +5,7 @@ Everything is checked before anything is touched, and all errors of all devices 
 
 from __future__ import annotations
 
+import math
 import os
 import pwd
 import zlib
@@ -29,12 +30,14 @@ class Plan:
 
     Attributes:
         stop_sources: for each device with emergency-stop inputs [block, channel, bit, active] lists.
+        alarms: for each device with alarm limits [block, channels, lolo, low, high, hihi, hysteresis] lists.
     """
 
     config: Config
     names: NameTable
     nursery: Nursery
     stop_sources: dict[str, list[list[int]]]
+    alarms: dict[str, list[list[Any]]]
 
 
 class Loader:
@@ -118,14 +121,14 @@ class Loader:
             {n: self._infos[n] for n in self._config.devices if n in self._infos}, self._config.nodes
         )
         self._errors += _unknown_users(self._config)
-        sources = self._stop_sources(names)
+        sources, alarms = self._stop_sources(names), self._alarms(names)
         if not self._errors:
             self._errors += names.errors
         if self._errors:
             self._nursery.close()
             self._done(None, self._errors)
             return
-        self._done(Plan(self._config, names, self._nursery, sources), [])
+        self._done(Plan(self._config, names, self._nursery, sources, alarms), [])
 
     def _stop_sources(self, names: NameTable) -> dict[str, list[list[int]]]:
         found: dict[str, list[list[int]]] = {}
@@ -138,6 +141,20 @@ class Loader:
                 continue
             found.setdefault(node.device, []).append(
                 [node.block, node.channels[0], max(node.bit, 0), int(source.active)]
+            )
+        return found
+
+    def _alarms(self, names: NameTable) -> dict[str, list[list[Any]]]:
+        found: dict[str, list[list[Any]]] = {}
+        for alarm in self._config.alarms:
+            node = names.nodes.get(alarm.node)
+            if node is None or names.block(node).node_class.name != "ANALOG":
+                names.errors.append(f"[[alarm]]: node = {alarm.node}; want the name of an analog node")
+                continue
+            low = [-math.inf if limit is None else limit for limit in (alarm.lolo, alarm.low)]
+            high = [math.inf if limit is None else limit for limit in (alarm.high, alarm.hihi)]
+            found.setdefault(node.device, []).append(
+                [node.block, list(node.channels), *low, *high, alarm.hysteresis]
             )
         return found
 

@@ -53,6 +53,7 @@ class Server:
         self._path = config_path
         self._nursery: Nursery | None = None
         self._stop_sources: dict[str, list[list[int]]] = {}
+        self._alarms: dict[str, list[list[Any]]] = {}
         self._leaving: dict[str, DriverProcess] = {}
         self._loader: Loader | None = None
         self._manager = ServiceManager()
@@ -177,8 +178,10 @@ class Server:
         old, self._nursery = self._nursery, plan.nursery
         changed_sources = {n for n in {*plan.stop_sources, *self._stop_sources}
                            if plan.stop_sources.get(n) != self._stop_sources.get(n)}  # fmt: skip
+        changed_alarms = {n for n in {*plan.alarms, *self._alarms} if plan.alarms.get(n) != self._alarms.get(n)}
         names = self.names
         self.config, self.names, self._stop_sources = plan.config, plan.names, plan.stop_sources
+        self._alarms = plan.alarms
         rights = Rights(plan.config.grants, os.getuid(), self.clients.users)
         for name in rights.unknown:
             self.log("warning", "grant to nobody", who=name, why="not known on this machine, or no answer")
@@ -188,7 +191,7 @@ class Server:
         for name, device in list(self.devices.items()):
             wanted = plan.config.devices.get(name)
             same = wanted == device.device and plan.names.devices[name].facts() == device.info.facts()
-            if not same or name in changed_sources:
+            if not same or name in changed_sources | changed_alarms:
                 self.log("info", "device ends", device=name, why="removed" if wanted is None else "changed")
                 self._retire(device)
         for name in plan.config.devices:
@@ -209,6 +212,7 @@ class Server:
             return
         options = {
             "stop_sources": self._stop_sources.get(name, []),
+            "alarms": self._alarms.get(name, []),
             "daemon_lease_s": self.config.workcell.daemon_lease_s,
             "folder": self.config.folder,
             "state_folder": self.config.state_folder(os.environ),

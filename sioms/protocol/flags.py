@@ -70,6 +70,11 @@ class AxisStatus(IntFlag):
     MISSED_TARGET = 0x10000
     """The last point move ended farther from its target than the tolerance, after all its retries."""
 
+    @property
+    def severity(self) -> int:
+        """How bad it is: 0 good, 1 minor (a limit, a miss, saturation), 2 major (fault, stall, emergency stop)."""
+        return 2 if int(self) & 0x80E0 else 1 if int(self) & 0x1640C else 0
+
 
 class AnalogStatus(IntFlag):
     """The ``flags`` word of an analog reading; 0 is a good value."""
@@ -78,6 +83,16 @@ class AnalogStatus(IntFlag):
     INVALID = 0x2
     OVERRUN = 0x4
     """Samples were lost before this one."""
+    LOW = 0x8
+    HIGH = 0x10
+    LOLO = 0x20
+    HIHI = 0x40
+    """At or beyond a limit of its ``[[alarm]]``."""
+
+    @property
+    def severity(self) -> int:
+        """How bad it is: 0 good, 1 minor, 2 major."""
+        return 2 if int(self) & 0x62 else 1 if int(self) & 0x1D else 0
 
 
 class Request(IntEnum):

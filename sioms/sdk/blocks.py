@@ -8,8 +8,9 @@ Concurrency: owned by the one thread of the driver process.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.protocol.records import READ_FIELDS
+
+from .alarms import Alarms
 
 if TYPE_CHECKING:
     from sioms.motion import AxisBank, DriveBank
@@ -103,6 +106,7 @@ class AnalogBlock(Block):
     Attributes:
         offset: shape (n,), subtracted; set by ZERO_DEVICE.
         gains: shape (n, n), or None for the unit matrix; set by SET_GAINS.
+        alarms: limits of what is published, whose bits join ``flags``; None when there are none.
         corrected_by_driver: the driver's ``ioctl`` answers ZERO_DEVICE, SET_GAINS and GET_GAINS; nothing is done here.
     """
 
@@ -113,6 +117,7 @@ class AnalogBlock(Block):
         self.flags: NDArray[np.int64] = self.words[1]
         self.offset: NDArray[np.float64] = np.zeros(self.n)
         self.gains: NDArray[np.float64] | None = None
+        self.alarms: Alarms | None = None
         self._shown = np.zeros_like(self.fields)
         self._shown_flags = self._shown.view(np.int64)[1]
         self._bytes = self._shown.data.cast("B")
@@ -124,6 +129,8 @@ class AnalogBlock(Block):
         if self.gains is not None:
             shown[:] = self.gains @ shown
         self._shown_flags[:] = self.flags
+        if self.alarms is not None:
+            self._shown_flags |= self.alarms.look(shown)
         return self._bytes
 
 
@@ -173,3 +180,12 @@ class AxisBlock:
 
 
 AnyBlock = AxisBlock | AnalogBlock | BinaryBlock
+
+
+def set_alarms(blocks: Sequence[AnyBlock], alarms: Sequence[Sequence[Any]]) -> None:
+    """Give analog blocks their alarm limits: [block, channels, lolo, low, high, hihi, hysteresis] each."""
+    for number, channels, *limits in alarms:
+        block = blocks[number]
+        if isinstance(block, AnalogBlock):
+            block.alarms = block.alarms or Alarms(block.n)
+            block.alarms.watch(channels, *limits)

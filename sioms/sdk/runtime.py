@@ -32,16 +32,19 @@ from sioms.protocol.messages import (
 )
 
 from .attachments import Attachments
-from .blocks import AnyBlock, AxisBlock, BinaryBlock
+from .blocks import AnyBlock, AxisBlock, BinaryBlock, set_alarms
 from .driver import Driver, LineDriver, StreamDriver, TickDriver
-from .engines import Engine, LineEngine, StreamEngine, TickEngine
+from .engine import Engine
 from .handles import Waits
 from .inputs import Input
 from .keeping import keep_positions
+from .line_engine import LineEngine
 from .markers import Markers
 from .pages import Pages
 from .rt import TimerFd, become_realtime, name_process
 from .statistics import TickStatistics
+from .stream_engine import StreamEngine
+from .tick_engine import TickEngine
 
 STOP_GRACE_NS = 2_000_000_000
 """How long axes may take to stop before the process ends all the same."""
@@ -65,7 +68,7 @@ def run(
         device: device name.
         settings: its validated settings.
         generation: number of this process among the device's.
-        options: stop_sources, daemon_lease_s, realtime_priority, user, phase of the tick [period], state_folder.
+        options: stop_sources, alarms, daemon_lease_s, realtime_priority, user, phase of the tick [period], state_folder.
         fds: control socket, latch page, stop-request page, marker table.
     """
     name_process(f"sioms:{device}")
@@ -113,6 +116,7 @@ class Runtime:
         self._ending_ns = 0
         self.driver = driver.variant(settings)(device, settings, self)
         self.blocks = list(self.driver.blocks)
+        set_alarms(self.blocks, options["alarms"])
         self._kept = keep_positions(str(options["state_folder"]), device, self.blocks, self.log)
         lease_ns = int(description.lease_s * 1e9)
         self.pages = Pages(device, self.blocks, lease_ns, generation)

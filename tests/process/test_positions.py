@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from conftest import Running
-from daemon_rig import Daemon, raises, wait_for
+from daemon_rig import FORCE, Daemon, raises, wait_for
 
 import sioms
 from sioms.protocol.flags import AxisStatus
@@ -83,7 +84,7 @@ def test_positions_survive_driver_and_daemon_unless_the_axis_moved(
     daemon = start_daemon(text)
     daemon.wait_up("mod0")
     with daemon.cell() as cell, cell.open("mod0.x", "rw") as axis:
-        with raises(1, "home required"):
+        with raises(errno.EPERM, "home required"):
             axis.move(0.2)
         axis.home()
         axis.wait_until_idle(10.0)
@@ -134,8 +135,27 @@ def test_a_drive_that_counts_on_keeps_its_coordinates_and_takes_up_its_play(
     assert look(daemon, "slide0")[0] == pytest.approx(before, abs=1e-9)
 
 
-def test_a_workcell_without_a_folder_says_that_nothing_is_kept(start_daemon: Callable[..., Daemon], tmp_path: Path) -> None:
-    daemon = start_daemon(SIM.format(folder=tmp_path).replace("state_folder", "#"), {"STATE_DIRECTORY": ""})
+ALARM = """
+[[alarm]]
+node = "force0.fx"
+high = 0.5
+hihi = 2.0
+[[alarm]]
+node = "force0.fy"
+high = 5.0
+"""
+
+
+def test_a_workcell_says_what_is_not_kept_and_shows_its_alarms(start_daemon: Callable[..., Daemon], tmp_path: Path) -> None:
+    text = SIM.format(folder=tmp_path).replace("state_folder", "#") + FORCE + ALARM
+    daemon = start_daemon(text, {"STATE_DIRECTORY": ""})
     assert "give [workcell] a state_folder" in daemon.said("positions are not kept")
-    with daemon.cell() as cell, cell.open("mod0.x.readonly") as axis:
-        wait_for(lambda: sioms.AxisStatus(axis.read().status[0]) == sioms.AxisStatus(0), "as it was")
+    daemon.wait_up("force0")
+    with daemon.cell() as cell, cell.open("force0") as force:
+        reading = wait_for(lambda: force.read() if force.read().number else None, "a reading")
+        flags = [sioms.AnalogStatus(f) for f in reading.flags]
+        assert reading.data[:2] == (pytest.approx(1.0), pytest.approx(2.0))
+        assert (flags[0], flags[1], flags[0].severity) == (sioms.AnalogStatus.HIGH, 0, 1)
+    daemon.config.write_text(text.replace("hihi = 2.0", "hihi = 1.0").replace("node = \"force0.fy\"", "node = \"mod0\""))
+    with daemon.cell() as cell, raises(errno.EINVAL, "[[alarm]]: node = mod0"):
+        cell.reload()
