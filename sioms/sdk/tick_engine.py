@@ -1,0 +1,97 @@
+"""The engine of a TickDriver: the host closes the loop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from sioms.protocol.flags import PageState
+
+from .blocks import AnyBlock
+from .connected import FIRST_PAUSE_NS, LONGEST_PAUSE_NS
+from .driver import Refusal, TickDriver
+from .exchange import LinkError, Steps
+from .handles import Handle
+
+if TYPE_CHECKING:
+    from .runtime import Runtime
+
+
+class TickEngine:
+    """Runs a TickDriver."""
+
+    def __init__(self, runtime: Runtime, driver: TickDriver, tick_hz: float) -> None:
+        self.tick_hz = tick_hz
+        self._runtime = runtime
+        self._driver = driver
+        self._is_open = False
+        self._retry_ns = 0
+        self._pause_ns = FIRST_PAUSE_NS
+
+    def tick(self, now_ns: int) -> None:
+        """Tick the driver and publish all blocks."""
+        if not self._is_open and not self._open(now_ns):
+            return
+        self._driver.tick(now_ns)
+
+    def _open(self, now_ns: int) -> bool:
+        if now_ns < self._retry_ns:
+            return False
+        try:
+            self._driver.open()
+        except (LinkError, OSError) as error:
+            self._runtime.set_link(self._driver.blocks, PageState.LINK_LOST, str(error))
+            self._retry_ns = now_ns + self._pause_ns
+            self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
+            return False
+        self._is_open = True
+        self._runtime.set_link(self._driver.blocks, PageState.GOOD, "")
+        return True
+
+    @property
+    def publishes(self) -> bool:
+        """Whether there are readings to publish."""
+        return self._is_open
+
+    def write_outputs(
+        self,
+        handle: Handle | None,
+        number: int,
+        block: AnyBlock,
+        channels: Sequence[int],
+        values: Sequence[float],
+    ) -> Any:
+        """Hand the values to the driver; they take effect in the next tick."""
+        try:
+            self._driver.write_outputs(block.spec, channels, values)
+        except Refusal as error:
+            raise OSError(error.errno, str(error)) from None
+        for channel, value in zip(channels, values, strict=True):
+            self._runtime.outputs[(id(block), channel)] = value
+        return self._runtime.tick
+
+    def carry_out(self, handle: Handle, number: int, steps: Steps, what: str) -> Any:
+        """Refuse: a driver without a line has none to send steps on."""
+        raise TypeError(f"{what}: {type(self._driver).__name__} has no line for steps")
+
+    def slack(self, now_ns: int, until_ns: int) -> None:
+        """Let the driver use the time that is left."""
+        self._driver.slack(now_ns, until_ns)
+
+    def commands_written(self, block: AnyBlock) -> None:
+        """Nothing: the next tick sees it."""
+
+    def stop(self, blocks: Sequence[AnyBlock]) -> None:
+        """Nothing: the banks command the device in the next tick."""
+
+    def recover(self, reason: str) -> None:
+        """Nothing is under way between two ticks."""
+
+    def is_quiet(self) -> bool:
+        """A tick is all there is."""
+        return True
+
+    def close(self) -> None:
+        """Leave the device safe."""
+        if self._is_open:
+            self._driver.close()
