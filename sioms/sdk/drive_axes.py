@@ -209,6 +209,8 @@ class AxesUnit(LineUnit):
         if action.is_stop:
             self._epoch[action.axis] += 1
             return self.halt(action.axis, fastest=action.kind is ActionKind.QUICK_STOP)
+        if action.kind is ActionKind.RESET:
+            return self.reset(action.axis)  # a stop that overtakes it does not make it void
         return self._while_wanted(action, self._epoch[action.axis])
 
     def stop(self) -> Steps:

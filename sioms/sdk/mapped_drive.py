@@ -130,7 +130,7 @@ class DriveUnit(LineUnit):
     # --- inside ----------------------------------------------------------------------------------
 
     def _act(self, action: DriveAction, epoch: int) -> Steps:
-        if epoch != self._epoch:
+        if epoch != self._epoch and action.kind is not ActionKind.RESET:
             return
         match action.kind:
             case ActionKind.START:
