@@ -1,15 +1,11 @@
-"""Commands of ``sioms`` that ask the daemon, or about it: list, info, status, stop, reset, reload, check, driver."""
+"""Commands of ``sioms`` that ask the daemon, or about it: list, info, status, stop, reset, reload, check."""
 
 from __future__ import annotations
 
 import argparse
-import ast
 import os
 import sys
 from collections.abc import Iterable, Sequence
-from importlib.metadata import EntryPoint, entry_points
-from importlib.util import find_spec
-from pathlib import Path
 from time import monotonic_ns
 from typing import Any
 
@@ -23,20 +19,28 @@ READONLY = ".readonly"
 def add_parser(subparsers: Any) -> None:
     """Add the commands of this module."""
     one = subparsers.add_parser("list", help="list the nodes of the workcell")
-    one.add_argument("-v", "--verbose", action="store_true", help="also parts of nodes and read-only companions")
-    one.add_argument("--names", action="store_true", help="only names, one a line; nothing when no daemon is there")
+    one.add_argument(
+        "-v", "--verbose", action="store_true", help="also parts of nodes and read-only companions"
+    )
+    one.add_argument(
+        "--names", action="store_true", help="only names, one a line; nothing when no daemon is there"
+    )
     one = subparsers.add_parser("info", help="tell what a node is")
     one.add_argument("node", metavar="NODE")
     subparsers.add_parser("status", help="tell how devices, sessions and the emergency stop stand")
     subparsers.add_parser("reload", help="have the daemon take up its configuration anew")
-    one = subparsers.add_parser("stop", help="emergency stop; latches until `sioms reset`; no safety-rated function")
-    one.add_argument("node", metavar="NODE", nargs="?", default="", help="one node; the whole workcell without")
+    one = subparsers.add_parser(
+        "stop", help="emergency stop; latches until `sioms reset`; no safety-rated function"
+    )
+    one.add_argument(
+        "node", metavar="NODE", nargs="?", default="", help="one node; the whole workcell without"
+    )
     one = subparsers.add_parser("reset", help="clear a latched stop or fault; nothing resumes by itself")
-    one.add_argument("node", metavar="NODE", nargs="?", default="", help="one node; the whole workcell without")
+    one.add_argument(
+        "node", metavar="NODE", nargs="?", default="", help="one node; the whole workcell without"
+    )
     one = subparsers.add_parser("check", help="check a configuration; exit status 2 when it is not good")
     one.add_argument("config", metavar="CONFIG", help="configuration (TOML)")
-    one = subparsers.add_parser("driver", help="about drivers")
-    one.add_argument("action", choices=("list",), help="list: which are installed")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -61,10 +65,10 @@ def run(args: argparse.Namespace) -> int:
                 cell.reset(args.node)
         case "check":
             # Another program by design: tools know no daemon.
-            os.execv(sys.executable, [sys.executable, "-m", "sioms.daemon.main", "--check", "--config", args.config])
-        case "driver":
-            for line in table(("driver", "module", "what it is"), [_driver(e) for e in drivers()]):
-                print(line)
+            os.execv(
+                sys.executable,
+                [sys.executable, "-m", "sioms.daemon.main", "--check", "--config", args.config],
+            )
     return 0
 
 
@@ -77,7 +81,10 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """
     cells = [tuple(head), *[tuple(row) for row in rows]]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
-    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in cells]
+    return [
+        "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+        for row in cells
+    ]
 
 
 def _list(verbose: bool, names_only: bool) -> int:
@@ -126,7 +133,9 @@ def describe(info: NodeInfo) -> list[str]:
         lines.append(f"buffer:    {info.buffer_capacity} commands an axis")
     lines.append("")
     rows = [_channel(i, channel, info.node_class) for i, channel in enumerate(info.channels)]
-    return lines + table(("#", "channel", "unit", "from", "to", "further limits", "modes", "description"), rows)
+    return lines + table(
+        ("#", "channel", "unit", "from", "to", "further limits", "modes", "description"), rows
+    )
 
 
 def _channel(index: int, channel: ChannelInfo, node_class: NodeClass) -> tuple[str, ...]:
@@ -135,7 +144,9 @@ def _channel(index: int, channel: ChannelInfo, node_class: NodeClass) -> tuple[s
     limits = ", ".join(f"{name} {value:g}" for name, value in channel.limits.items())
     modes = ""
     if node_class is NodeClass.AXIS:
-        quantities = [m.name.lower().replace("_", " ") for m in ControlMode if m & 0x3F & channel.modes and m.name]
+        quantities = [
+            m.name.lower().replace("_", " ") for m in ControlMode if m & 0x3F & channel.modes and m.name
+        ]
         modes = ", ".join(quantities)
     elif node_class is NodeClass.BINARY:
         limits = f"{channel.width} bit{'s' * (channel.width != 1)}"
@@ -147,7 +158,9 @@ def status_lines(status: dict[str, Any], now_ns: int) -> list[str]:
     stopped = status["stopped_ns"]
     lines = [f"workcell {status['workcell']}, daemon pid {status['pid']}"]
     if stopped:
-        lines.append(f"EMERGENCY STOP for {(now_ns - stopped) / 1e9:.1f} s: {status['stop_source']}; `sioms reset` clears it")
+        lines.append(
+            f"EMERGENCY STOP for {(now_ns - stopped) / 1e9:.1f} s: {status['stop_source']}; `sioms reset` clears it"
+        )
     rows = [
         (d["name"], d["driver"], d["state"], d["link"], str(d["pid"] or ""), f"{d['tick_hz']:g} Hz", f"{d['age_s']:.0f} s",
          str(d["deaths"]), d["reason"] or d["link_reason"])
@@ -156,22 +169,8 @@ def status_lines(status: dict[str, Any], now_ns: int) -> list[str]:
     head = ("device", "driver", "state", "link", "pid", "rate", "up for", "deaths", "why")
     lines += ["", *table(head, rows), ""]
     holders = [(name, who, f"{held_s:.1f} s") for name, who, held_s in status["holders"]]
-    sessions = [(who, str(handles), str(waits), str(markers)) for who, handles, waits, markers in status["sessions"]]
+    sessions = [
+        (who, str(handles), str(waits), str(markers)) for who, handles, waits, markers in status["sessions"]
+    ]
     lines += [*table(("held node", "by", "for"), holders), ""] if holders else []
     return lines + table(("session", "handles", "waits", "markers"), sessions)
-
-
-def drivers() -> list[EntryPoint]:
-    """Return the installed drivers by name."""
-    return sorted(entry_points(group="sioms.drivers"), key=lambda entry: entry.name)
-
-
-def _driver(entry: EntryPoint) -> tuple[str, str, str]:
-    """Describe a driver by the first line of its module, which is read and not imported."""
-    try:
-        spec = find_spec(entry.module)
-        source = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
-        text = ast.get_docstring(ast.parse(source)) or ""
-    except (ImportError, OSError, SyntaxError) as error:
-        text = f"cannot be read: {error}"
-    return entry.name, entry.module, text.partition("\n")[0]

@@ -35,7 +35,7 @@ COMMANDS: dict[str, Command] = {
     "reset": Command("cell", "clear a latched stop or fault"),
     "reload": Command("cell", "have the daemon take up its configuration anew"),
     "check": Command("cell", "check a configuration"),
-    "driver": Command("cell", "tell which drivers are installed"),
+    "driver": Command("driver", "list, check, trace and replay drivers"),
     "bench": Command("bench", "measure latencies and throughput on this machine"),
     "tactile": Command("tactile", "design, calibrate and measure elastic fingers"),
     "reconcile": Command("reconcile", "find where simulation and measurement disagree"),

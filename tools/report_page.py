@@ -17,6 +17,7 @@ body { font: 15px/1.5 system-ui, sans-serif; max-width: 62em; margin: 2em auto; 
 table { border-collapse: collapse; margin: 1em 0; font-variant-numeric: tabular-nums; }
 th, td { border-bottom: 1px solid #ccc; padding: .25em .7em; text-align: left; vertical-align: top; }
 th { border-bottom: 2px solid #888; }
+pre { background: #f4f4f4; padding: .6em; overflow-x: auto; }
 figure { margin: 1.5em 0; } img { max-width: 100%; } figcaption { color: #555; }
 .good { color: #06662a; } .bad { color: #a01010; } .warn { background: #fff3d0; padding: .4em .8em; }
 """
@@ -40,6 +41,10 @@ class Page:
     def warn(self, text: str) -> None:
         """Add a paragraph that stands out."""
         self._parts.append(f'<p class="warn">{html.escape(text)}</p>')
+
+    def lines(self, lines: Iterable[str]) -> None:
+        """Add lines as they are, in a fixed pitch."""
+        self._parts.append(f"<pre>{html.escape(chr(10).join(lines))}</pre>")
 
     def table(self, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
         """Add a table; a cell that begins with "ok:" or "no:" is coloured."""

@@ -5,6 +5,7 @@ A message is what arrived in one read: on the lines of half-duplex devices a req
 
 from __future__ import annotations
 
+import itertools
 import random
 from collections import deque
 from collections.abc import Sequence
@@ -118,9 +119,11 @@ class Bender:
             case "bytes":
                 return [Piece(data[i : i + 1], delay_ns if i == 0 else 150_000) for i in range(len(data))]
             case "cuts":
-                places = sorted(self.chance.sample(range(1, len(data)), min(len(data) - 1, self.chance.randint(1, 3))))
+                places = sorted(
+                    self.chance.sample(range(1, len(data)), min(len(data) - 1, self.chance.randint(1, 3)))
+                )
                 ends = [0, *places, len(data)]
-                pieces = [data[a:b] for a, b in zip(ends, ends[1:], strict=False)]
+                pieces = [data[a:b] for a, b in itertools.pairwise(ends)]
                 return [
                     Piece(piece, delay_ns if i == 0 else self.chance.randrange(1_500_000), at_once=True)
                     for i, piece in enumerate(pieces)

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from sioms.client.workcell import Workcell
-from sioms.protocol.flags import ControlMode, NodeClass
+from sioms.protocol.flags import AxisStatus, ControlMode, NodeClass
 
 from ..bench.rig import Daemon
 from ..cell import READONLY, is_part
@@ -56,8 +56,12 @@ class Peer:
                 line = self._line(START_S)
         except Unanswered as error:
             self.close()
-            said = self._process.stderr.read().decode("utf-8", "replace")[-600:] if self._process.stderr else ""
-            raise Unanswered(f"start {what}: no line 'ready PORT' ({error}); it said: {said.strip()}") from None
+            said = (
+                self._process.stderr.read().decode("utf-8", "replace")[-600:] if self._process.stderr else ""
+            )
+            raise Unanswered(
+                f"start {what}: no line 'ready PORT' ({error}); it said: {said.strip()}"
+            ) from None
         self.port = line.split(maxsplit=1)[1]
 
     def tell(self, line: str) -> Any:
@@ -160,7 +164,9 @@ class Station:
         link = [] if rig.tcp else ["--link", str(self._folder / "device")]
         command = [sys.executable, *program, *link, *options]
         self.counterpart = Peer(command, f"counterpart {name}", self._base)
-        speed = ["--baud", str(self.baud), "--bits", str(rig.bits_per_character)] if paced and self.baud else []
+        speed = (
+            ["--baud", str(self.baud), "--bits", str(rig.bits_per_character)] if paced and self.baud else []
+        )
         self.wire = Peer(
             [sys.executable, "-m", "sioms.tools.author.wire", "--kind", rig.line or "serial", "--device",
              self.counterpart.port, "--link", str(self._folder / "port"), *speed],
@@ -217,7 +223,9 @@ class Station:
     def _look(self) -> None:
         """Find out the nodes of the device, and its axes and outputs unless the rig tells them."""
         entries = [e for e in self.cell.nodes() if e.device == self.rig.device]
-        whole = [e for e in entries if not is_part(e, entries)]
+        whole = [
+            e for e in entries if not is_part(e, entries) and not _is_same(e.name, {o.name for o in entries})
+        ]
         self.nodes = [Node(e.name, e.node_class, e.read_only) for e in whole]
         rig = self.rig
         if not rig.axes:
@@ -225,7 +233,9 @@ class Station:
             rig = replace(rig, axes=tuple(self._axis(name) for name in names if not name.endswith(READONLY)))
         if not rig.outputs:
             names = [e.name for e in whole if e.node_class is NodeClass.BINARY and not e.read_only]
-            rig = replace(rig, outputs=tuple(Output(n, self.cell.info(n).channels[0].width, None) for n in names))
+            rig = replace(
+                rig, outputs=tuple(Output(n, self.cell.info(n).channels[0].width, None) for n in names)
+            )
         self.rig = rig
 
     def _axis(self, name: str) -> Axis:
@@ -239,7 +249,15 @@ class Station:
     def status(self) -> dict[str, Any]:
         """Return what the daemon says of the device."""
         found = [d for d in self.cell.status()["devices"] if d["name"] == self.rig.device]
-        absent = {"state": "leaving", "link": "", "pid": 0, "generation": 0, "deaths": 0, "reason": "", "link_reason": ""}
+        absent = {
+            "state": "leaving",
+            "link": "",
+            "pid": 0,
+            "generation": 0,
+            "deaths": 0,
+            "reason": "",
+            "link_reason": "",
+        }
         return dict(found[0]) if found else absent
 
     def is_good(self) -> bool:
@@ -320,12 +338,18 @@ class Station:
         for axis in self.rig.axes[:1]:
             with contextlib.suppress(OSError), self.cell.open(axis.node, "rw", timeout=2.0) as node:
                 node.reset()
+                wait_for(lambda node=node: not node.read().status[0] & AxisStatus.FAULT, 2.0)
 
     def start_client(self, script: str, *words: str) -> Client:
         """Start a client in a process of its own; it must print a line when it is ready."""
         if self.daemon is None:
             raise Unanswered("no daemon runs")
         return Client(script, self.daemon.socket, *words)
+
+
+def _is_same(name: str, names: set[str]) -> bool:
+    """Tell whether a node of one channel has a shorter name, too: that of its device."""
+    return name.rpartition(".")[0] in names
 
 
 PROLOGUE = "import sys, time, sioms\ncell = sioms.Workcell(sys.argv[1], 'victim')\n"

@@ -157,7 +157,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="wire between a driver and its device")
     parser.add_argument("--kind", choices=("serial", "tcp", "udp"), required=True)
     parser.add_argument("--device", required=True, metavar="PORT")
-    parser.add_argument("--link", type=Path, default=Path("/nonexistent"), help="path of the driver's serial port")
+    parser.add_argument(
+        "--link", type=Path, default=Path("/nonexistent"), help="path of the driver's serial port"
+    )
     parser.add_argument("--baud", type=float, default=0.0, help="speed of the line; 0 takes no time")
     parser.add_argument("--bits", type=int, default=10, help="bits of a character")
     parser.add_argument("--seed", type=int, default=1)

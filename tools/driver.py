@@ -1,0 +1,74 @@
+"""``sioms driver``: what is installed, and the author's tools check, trace and replay."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from .cell import table
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command."""
+    actions = subparsers.add_parser("driver", help="list and check drivers, record and replay their lines")
+    actions = actions.add_subparsers(dest="action", metavar="ACTION", required=True)
+    actions.add_parser("list", help="tell which drivers are installed")
+    one = actions.add_parser("check", help="put drivers through noise, loss, unplugging, stops and deaths")
+    one.add_argument(
+        "drivers", metavar="DRIVER", nargs="*", help="registered name, register map, or a Python file"
+    )
+    one.add_argument("--all", action="store_true", help="all shipped drivers and register maps")
+    one.add_argument(
+        "--full", action="store_true", help="longer trials and all combinations: minutes a driver"
+    )
+    one.add_argument("--only", metavar="TRIAL,...", default="", help="these trials alone; help names them")
+    one.add_argument(
+        "--counterpart", metavar="COMMAND", default="", help="module or file of the device, and options"
+    )
+    one.add_argument(
+        "--config", metavar="FILE", type=Path, help="TOML of the device; {port} stands for its port"
+    )
+    one.add_argument(
+        "--report", metavar="FILE", type=Path, help="write the report, as HTML when it ends in .html"
+    )
+    one.add_argument("--json", metavar="FILE", type=Path, help="write all results as JSON")
+    one.add_argument(
+        "-j", "--jobs", metavar="N", type=int, default=1, help="drivers checked at the same time"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run one of the actions; return the exit status."""
+    match args.action:
+        case "list":
+            for line in table(("driver", "module", "what it is"), [_driver(e) for e in drivers()]):
+                print(line)
+            return 0
+        case "check":
+            from .author.command import run_check
+
+            return run_check(args)
+    raise ValueError(f"sioms driver: no action {args.action}")
+
+
+# --- list ----------------------------------------------------------------------------------------
+
+
+def drivers() -> list[EntryPoint]:
+    """Return the installed drivers by name."""
+    return sorted(entry_points(group="sioms.drivers"), key=lambda entry: entry.name)
+
+
+def _driver(entry: EntryPoint) -> tuple[str, str, str]:
+    """Describe a driver by the first line of its module, which is read and not imported."""
+    try:
+        spec = find_spec(entry.module)
+        source = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
+        text = ast.get_docstring(ast.parse(source)) or ""
+    except (ImportError, OSError, SyntaxError) as error:
+        text = f"cannot be read: {error}"
+    return entry.name, entry.module, text.partition("\n")[0]
