@@ -413,7 +413,7 @@ class AxisBank:
         self._control(dt)
         self._watch(switches, now_ns)
         if self.keeper is not None:
-            self._keep(self.keeper)
+            self._keep(self.keeper, now_ns)
         return self._actuator
 
     def _stop_late(self, last_ns: int, now_ns: int) -> None:
@@ -539,11 +539,11 @@ class AxisBank:
         if hit.any():
             self._abandon(np.flatnonzero(hit), now_ns, errno.ERANGE, "stopped by an end switch")
 
-    def _keep(self, keeper: Keeper) -> None:
+    def _keep(self, keeper: Keeper, now_ns: int) -> None:
         """Note where the axes are; before the actuators hear of a motion."""
         latched = self._queue.latched
         at_rest = (self._sequencer.kind == HOLD) & ~self._limp & ((latched & HOMING) == 0)
-        keeper.note(at_rest, (latched & HOMED) != 0, self._raw, self._position)
+        keeper.note(at_rest, (latched & HOMED) != 0, self._raw, self._position, now_ns)
 
     # -- answers ------------------------------------------------------------------------------
 

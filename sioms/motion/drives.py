@@ -316,7 +316,7 @@ class DriveBank:
         if self.keeper is not None and self._seen:
             homed = (self._queue.latched & int(AxisStatus.HOMED)) != 0
             raw = self._position - self._offset
-            self.keeper.note(~self._active & ~self._moving, homed, raw, self._position)
+            self.keeper.note(~self._active & ~self._moving, homed, raw, self._position, self._last_ns)
 
     def advance(self, now_ns: int) -> None:
         """Do what time and markers allow without a new report: end timed commands, begin what waits."""

@@ -109,5 +109,6 @@ class Keeper(Protocol):
         homed: NDArray[np.bool_],
         raw: NDArray[np.float64],
         position: NDArray[np.float64],
+        now_ns: int,
     ) -> None:
-        """Keep the present state of all axes (n,); called before anything moves an axis that has been at rest."""
+        """Keep the present state of all axes (n,); called before anything moves an axis that has been told to rest."""

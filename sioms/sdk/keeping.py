@@ -1,6 +1,6 @@
 """Positions that outlive their driver process: a small file for each block of axes, mapped into memory.
 
-While an axis is at rest its entry holds where it is, marked "at rest"; the mark is taken away before anything
+While an axis is at rest (told to, and its reading still for STILL_NS) its entry holds where it is, marked "at rest"; the mark is taken away before anything
 moves it, and comes back, with the new place, when it rests again. That is a store into memory: no call that
 could delay a tick, and what a killed process has stored is in the file. What the kernel has not written out when
 the power goes is lost, so entries of an earlier boot count only if the process that wrote them ended in order.
@@ -31,6 +31,8 @@ HEADER = Struct("<8sIIQ32s8x")
 CLOSED, CLOSED_AT = Struct("<Q"), 16
 MOST_BYTES = 1 << 20
 AT_REST, HOMED = 1, 2
+STILL_NS = 100_000_000
+"""So long the reading of an axis at rest has stayed within its tolerance: servos go on settling after their set-points."""
 
 Log = Callable[[str, str], None]
 
@@ -130,6 +132,8 @@ class PositionFile:
         self._state = np.frombuffer(self._map, "<i8", count, first)
         self._raw = np.frombuffer(self._map, "<f8", count, first + 8 * count)
         self._position = np.frombuffer(self._map, "<f8", count, first + 16 * count)
+        self._tolerance = np.array([axis.restore.tolerance if axis.restore else 0.0 for axis in settings])
+        self._still_at, self._still_ns = np.full(count, np.nan), np.zeros(count, dtype=np.int64)
 
     def _read(self, path: str, boot: str) -> Mapping[str, Entry]:
         """Return the entries of the file before this one that can be believed."""
@@ -169,8 +173,13 @@ class PositionFile:
         homed: NDArray[np.bool_],
         raw: NDArray[np.float64],
         position: NDArray[np.float64],
+        now_ns: int,
     ) -> None:
         """Keep the present state (motion.Keeper); whenever this is cut short, no entry is wrong."""
+        moved = ~(np.abs(raw - self._still_at) <= self._tolerance)
+        if np.count_nonzero(moved):
+            self._still_at[moved], self._still_ns[moved] = raw[moved], now_ns
+        at_rest = at_rest & (now_ns - self._still_ns >= STILL_NS)
         state = at_rest * AT_REST + homed * HOMED
         changed = (state != self._state) | (at_rest & ((raw != self._raw) | (position != self._position)))
         if not np.count_nonzero(changed):

@@ -15,6 +15,7 @@ from daemon_rig import FORCE, Daemon, raises, wait_for
 
 import sioms
 from sioms.protocol.flags import AxisStatus
+from sioms.sdk.keeping import AT_REST, decode
 
 SIM = """
 [workcell]
@@ -63,6 +64,12 @@ def port(tmp_path: Path) -> Iterator[str]:
         drive.end()
 
 
+def kept_at_rest(folder: Path, device: str) -> None:
+    """Wait until the file of a device says that it is at rest."""
+    path = folder / f"{device}.positions"
+    wait_for(lambda: all(e.state & AT_REST for e in decode(path.read_bytes()).entries.values()), "noted at rest")
+
+
 def kill(daemon: Daemon, device: str) -> None:
     """Kill a driver and wait for its successor."""
     was = daemon.device(device)
@@ -90,10 +97,11 @@ def test_positions_survive_driver_and_daemon_unless_the_axis_moved(
         axis.wait_until_idle(10.0)
         axis.move(0.35)
         axis.wait_until_idle(5.0)
+    kept_at_rest(tmp_path / "state", "mod0")
     kill(daemon, "mod0")
     assert look(daemon) == (pytest.approx(0.35, abs=1e-4), True)
-    assert daemon.said("x: position 0.35.* restored, homed")
-
+    assert daemon.said("x: position 0.3[0-9]* m restored, homed")
+    kept_at_rest(tmp_path / "state", "mod0")
     daemon.running.signal(signal.SIGKILL)
     daemon.running.wait_exit(5.0)
     daemon = start_daemon(text)
@@ -131,6 +139,7 @@ def test_a_drive_that_counts_on_keeps_its_coordinates_and_takes_up_its_play(
         assert axis.particulars()["offset"] == [pytest.approx(0.5)]
         assert axis.particulars()["retries"] == [0]
         before = axis.read().position[0]
+    kept_at_rest(tmp_path / "state", "slide0")
     kill(daemon, "slide0")
     assert look(daemon, "slide0")[0] == pytest.approx(before, abs=1e-9)
 

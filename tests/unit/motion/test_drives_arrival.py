@@ -169,7 +169,7 @@ def test_a_keeper_hears_of_a_motion_before_the_drive_does():
         def restored(self, raw):
             return np.array([0.5]), np.array([True])
 
-        def note(self, at_rest, homed, raw, position):
+        def note(self, at_rest, homed, raw, position, now_ns):
             self.notes.append((bool(at_rest[0]), bool(homed[0]), float(raw[0]), float(position[0])))
 
     keeper = Keeper()

@@ -33,7 +33,7 @@ def moved_to(path, position, rule, *, offset=0.25, homed=True, close=False, tick
     cell.rig.write(mode=MODE.POSITION, position=position)
     if ticks is None:
         cell.rig.run()
-        cell.rig.tick(2)
+        cell.rig.tick(102)
     else:
         cell.rig.tick(ticks)
     if close:
@@ -74,6 +74,27 @@ def test_what_was_in_motion_is_not_restored(tmp_path, rule, ticks):
     assert "not known to be at rest" in after.said[-1]
 
 
+def test_a_servo_that_still_settles_is_not_at_rest(tmp_path):
+    """The set-point has arrived, the axis swings on: a kill now would leave it anywhere near."""
+    swing = {"t": 0.0}
+
+    def plant(_output, dt):
+        swing["t"] += dt
+        return np.array([0.01 * math.exp(-swing["t"] / 0.05) * math.cos(60 * swing["t"])])
+
+    file = PositionFile(str(tmp_path / "x"), [axis(restore=ALWAYS)], BOOT, lambda *_: None)
+    rig = Rig([axis(restore=ALWAYS)], keeper=file, plant=plant)
+    marked = []
+    for _ in range(700):
+        rig.tick()
+        marked.append(decode((tmp_path / "x").read_bytes()).entries["x"].state & AT_REST)
+    first = marked.index(AT_REST)
+    assert rig.bank.is_idle([0]) and 0.3 < first * 1e-3 < 0.6 and all(marked[first:])
+    swing["t"] = 0.0  # pushed
+    rig.tick(2)
+    assert not decode((tmp_path / "x").read_bytes()).entries["x"].state & AT_REST
+
+
 def test_without_the_first_reading_nothing_is_forgotten(tmp_path):
     moved_to(tmp_path / "x", 0.75, ALWAYS)
     for _ in range(3):  # started and killed before the device has answered
@@ -86,6 +107,7 @@ def test_a_process_on_its_way_out_cannot_write_into_its_successor(tmp_path):
     after = Kept(tmp_path / "x", axis(restore=ALWAYS))
     before.rig.write(mode=MODE.POSITION, position=2.0)
     before.rig.run()
+    after.rig.tick(102)
     before.file.close()
     held = decode((tmp_path / "x").read_bytes())
     assert held.entries["x"].position == pytest.approx(0.75) == after.rig.field("position") and not held.closed
@@ -106,7 +128,7 @@ def test_an_axis_without_a_rule_keeps_to_its_device_and_others_are_found_by_name
     settings = [axis(name="a", restore=ALWAYS), axis(name="b"), axis(name="c", restore=ALWAYS)]
     rig = Rig(settings, keeper=PositionFile(str(tmp_path / "x"), settings, BOOT, lambda *_: None))
     rig.bank.calibrate([0, 1, 2], [1.0, 2.0, 3.0 - 1e-3])
-    rig.tick()
+    rig.tick(102)
     settings = settings[::-1]
     rig = Rig(settings, keeper=PositionFile(str(tmp_path / "x"), settings, BOOT, lambda *_: None))
     assert rig.bank.fields[0].tolist() == [pytest.approx(3.0 - 1e-3), 0.0, 1.0]
@@ -117,6 +139,7 @@ def test_a_file_that_is_none_is_told_and_replaced(tmp_path, data):
     (tmp_path / "x").write_bytes(data)
     cell = Kept(tmp_path / "x", axis(restore=ALWAYS))
     assert cell.rig.field("position") == 0.0 and any("not restored" in said for said in cell.said)
+    cell.rig.tick(102)
     assert decode((tmp_path / "x").read_bytes()).entries["x"].state == AT_REST
 
 
@@ -180,10 +203,11 @@ def test_wherever_a_process_is_killed_no_entry_is_wrong(tmp_path_factory, histor
     noted = [(False, 0.0, 0.0)]
     complete = False
     try:
-        for at_rest, raw, position in history:
+        for i, (at_rest, raw, position) in enumerate(history):
+            file._still_at[0] = raw  # has stood there for long
             noted.append((at_rest, raw, position))
             complete = False
-            file.note(*(np.array([v]) for v in (at_rest, at_rest, raw, position)))
+            file.note(*(np.array([v]) for v in (at_rest, at_rest, raw, position)), now_ns=(i + 1) * 10**9)
             complete = True
     except Killed:
         assert not complete
