@@ -30,6 +30,7 @@ from .types import CommandError, Event, EventKind, Keeper, MarkerPort
 Axes = NDArray[np.int64]
 ROW = {name: i for i, (name, _) in enumerate(AXIS_READ_FIELDS)}
 EMERGENCY_STOP, HOMING, HOMED = int(AxisStatus.EMERGENCY_STOP), int(AxisStatus.HOMING), int(AxisStatus.HOMED)
+FOLLOWING_ERROR = int(AxisStatus.FOLLOWING_ERROR)
 
 
 class AxisBank:
@@ -272,9 +273,18 @@ class AxisBank:
         return self._queue.fault_text(axis)
 
     def reset(self, axes: AxesLike) -> None:
-        """Clear emergency stop and fault; axes without force hold where they are. Nothing resumes."""
+        """Clear emergency stop and fault; axes without force, and steppers that lost steps, hold where they are.
+
+        Nothing resumes.
+        """
         chosen = np.asarray(axes, dtype=np.int64)
+        lost = chosen[self.stepper[chosen] & ((self._queue.latched[chosen] & FOLLOWING_ERROR) != 0)]
+        lost = lost[self._sequencer.kind[lost] == HOLD]
         self._queue.unlatch(chosen)
+        if lost.size:
+            for axis in lost.tolist():
+                self._law.anchor_at(axis, float(self._position[axis]))
+            self._sequencer.hold(lost, self._position[lost], self._last_ns)
         limp = chosen[self._limp[chosen]]
         if limp.size:
             self._limp[limp] = False

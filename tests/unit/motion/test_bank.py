@@ -238,6 +238,12 @@ def test_stepper_that_loses_steps_is_stalled_and_stops():
     rig.tick(1500)
     assert rig.field("status") & S.STALLED
     assert rig.bank.is_idle([0])
+    output = rig.bank.tick(rig.now_ns + TICK_NS, rig.raw)[0]
+    rig.bank.reset([0])
+    rig.tick(5)
+    assert not rig.field("status") & (S.STALLED | S.FAULT)
+    assert rig.field("commanded_position") == rig.field("position") == 0.0
+    assert rig.bank.tick(rig.now_ns + TICK_NS, rig.raw)[0] == pytest.approx(output), "the motor stays where it is"
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
