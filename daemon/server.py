@@ -127,12 +127,12 @@ class Server:
             for name in other.info.inputs:
                 if other is device or self.names.nodes[name].device == device.name:
                     self._send_input(other, name)
-        self.clients.retry_opens()
+        self.clients.nodes.retry_opens()
         self._maybe_ready()
 
     def device_gone(self, device: DriverProcess, reason: str) -> None:
         """Void the handles of a process that is no more, and stop what is tied to it."""
-        self.clients.device_gone(device, reason)
+        self.clients.nodes.device_gone(device, reason)
         if device.state is not State.DOWN and device.device.common.on_loss == "stop":
             self.stop_workcell(f"device {device.name} lost: {reason}")
         self._maybe_ready()
@@ -147,7 +147,7 @@ class Server:
         """Take a notice of a driver."""
         match verb:
             case DriverVerb.DETACHED:
-                self.clients.detached(device, arguments[0])
+                self.clients.nodes.detached(device, arguments[0])
             case DriverVerb.MARKER_SIGNALLED:
                 self.clients.markers.signalled()
             case DriverVerb.STOPPED:

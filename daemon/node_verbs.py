@@ -1,0 +1,258 @@
+"""Node requests of clients: list, information, open, close.
+
+Concurrency: everything runs in the daemon's loop.
+"""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from sioms.protocol.flags import Access, Right
+from sioms.protocol.messages import DriverVerb, refusal, reply
+from sioms.wording import did_you_mean
+
+from .claims import Claims
+from .devices import DriverProcess, State
+from .names import READONLY, Node
+from .rights import RIGHTS, Rights
+from .sessions import LATER, Handle, Refused, Session, Wait
+
+if TYPE_CHECKING:
+    from .clients import Clients
+    from .server import Server
+
+_SEND_BUFFER = 1 << 18
+
+
+class NodeVerbs:
+    """Nodes on behalf of clients: who has which open.
+
+    Args:
+        server: the daemon: names and devices.
+        clients: who asks, waits and is answered, and what they may.
+    """
+
+    def __init__(self, server: Server, clients: Clients) -> None:
+        self._server = server
+        self._clients = clients
+        self._handles: dict[int, Handle] = {}
+        self._claims: Claims[Handle] = Claims()
+        self._opens: list[tuple[Wait, Callable[[], bool]]] = []
+        self._numbers = itertools.count(1)
+
+    def find(self, session: Session, what: str, name: str) -> Node:
+        """Return a node that the session may read.
+
+        Raises:
+            Refused: ENOENT, EACCES.
+        """
+        node = self._server.names.nodes.get(str(name))
+        if node is None:
+            raise Refused(
+                errno.ENOENT,
+                f"{what} of {name}: no such node{did_you_mean(str(name), self._server.names.nodes)}",
+            )
+        if not self._clients.rights.on_node(session.peer, node.name) & Right.READ:
+            raise Refused(
+                errno.EACCES,
+                f"{what} of {name}: {session.peer.user} has no right to read it; ask for a [[grant]]",
+            )
+        return node
+
+    def open(
+        self, session: Session, number: int, name: str, mode: int, timeout_s: float | None, lease_s: float
+    ) -> Any:
+        """Open a node, at once or when it becomes free."""
+        node = self.find(session, "open", name)
+        access = Access(int(mode))
+        rights = self._clients.rights.on_node(session.peer, node.name)
+        if not access:
+            raise Refused(errno.EINVAL, f"open {name}: mode 0; want read, write or both")
+        if access & Access.WRITE and node.read_only:
+            raise Refused(
+                errno.EACCES, f"open {name} for writing: it is a read-only node; open it for reading"
+            )
+        if not node.read_only and not rights & Right.WRITE:
+            raise Refused(
+                errno.EACCES,
+                f"open {name}: {session.peer.user} has no right to write it; use {name}{READONLY} to observe",
+            )
+        if not 0 <= float(lease_s) <= 3600:
+            raise Refused(errno.EINVAL, f"open {name}: lease {lease_s} s; want 0 (none) to 3600")
+        if len(session.handles) >= self._clients.bounds.max_handles:
+            raise Refused(
+                errno.EMFILE, f"open {name}: this session has {len(session.handles)} open handles; close some"
+            )
+        obstacle = self._obstacle(node)
+        if obstacle is None:
+            self._grant(session, number, node, access, float(lease_s))
+            return LATER
+        if timeout_s is not None and float(timeout_s) <= 0:
+            raise obstacle
+        wait = self._clients.wait(session, number, timeout_s, f"open {name}")
+        wait.why = lambda: str(self._obstacle(node) or "it has just become free").removeprefix(
+            f"open {name}: "
+        )
+
+        def retry() -> bool:
+            if self._server.names.nodes.get(node.name) != node:  # a reload came in between
+                why = f"open {name}: it has been removed or changed meanwhile; open it again"
+                self._clients.answer(wait, refusal(wait.number, errno.EIO, why))
+                return True
+            if self._obstacle(node) is not None:
+                return False
+            if self._clients.drop(wait):
+                try:
+                    self._grant(session, number, node, access, float(lease_s))
+                except Refused as error:
+                    self._clients.send(session, refusal(number, error.errno, str(error)))
+            return True
+
+        self._opens.append((wait, retry))
+        return LATER
+
+    def _obstacle(self, node: Node) -> Refused | None:
+        """Return why a node cannot be opened now, or None."""
+        holder = self._claims.holder(node)
+        if holder is not None:
+            held_s = (time.monotonic_ns() - holder.since_ns) / 1e9
+            other = "" if holder.node.name == node.name else f" through {holder.node.name}"
+            return Refused(
+                errno.EBUSY,
+                f"open {node.name}: held by {holder.session} for {held_s:.1f} s{other}; use {node.name}{READONLY} to observe",
+            )
+        device = self._server.devices.get(node.device)
+        if device is None or device.state is not State.UP:
+            state, reason = (
+                (device.state.value, device.reason) if device else ("gone", "not configured any more")
+            )
+            return Refused(
+                errno.EIO,
+                f"open {node.name}: device {node.device} is {state}" + (f": {reason}" if reason else ""),
+            )
+        return None
+
+    def _grant(self, session: Session, number: int, node: Node, access: Access, lease_s: float) -> None:
+        device = self._server.devices[node.device]
+        rights = self._clients.rights.on_node(session.peer, node.name)
+        now_ns = time.monotonic_ns()
+        handle = Handle(next(self._numbers), session, node, access, now_ns, device.generation, rights)
+        if node.read_only:
+            access &= ~Access.WRITE
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+        readable, wake = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+        try:
+            fds = [theirs.fileno(), wake] + ([session.pidfd] if session.pidfd >= 0 else [])
+            exclusive = not node.read_only
+            try:
+                device.send(
+                    DriverVerb.ATTACH, handle.number, node.block, node.channels, node.bit, int(access), exclusive,
+                    int(rights), int(lease_s * 1e9), str(session), node.name, fds=fds,
+                )  # fmt: skip
+            except OSError as error:
+                raise Refused(errno.EIO, f"open {node.name}: {error.strerror}") from None
+            self._handles[handle.number] = session.handles[handle.number] = handle
+            self._claims.take(handle.claims, handle)
+            value = [handle.number, self._server.names.pack(node), node.channels, node.bit]
+            self._clients.send(
+                session, reply(number, value), [device.page_fds[node.block], readable, ours.fileno()]
+            )
+        finally:
+            os.close(readable)
+            os.close(wake)
+            ours.close()
+            theirs.close()
+
+    def retry_opens(self) -> None:
+        """Try the waiting opens again, the oldest first."""
+        for _, retry in list(self._opens):
+            retry()
+
+    def close(self, session: Session, number: int, handle_number: int) -> Any:
+        """Close a handle; answered when its driver has halted what it owned."""
+        handle = session.handles.get(handle_number)
+        if handle is None:
+            raise Refused(errno.EBADF, f"close: this session has no handle {handle_number}")
+        if handle.claims and self.detach(handle):
+            handle.closing = number
+            session.waits[number] = Wait(number, session, None, f"close {handle.node.name}")
+            return LATER
+        self._forget(handle)
+        return None
+
+    def detach(self, handle: Handle) -> bool:
+        """Ask the driver to end a handle; its channels are free when the driver says so.
+
+        Returns:
+            Whether there is a driver to wait for.
+        """
+        device = self._server.devices.get(handle.node.device)
+        there = device is not None and device.generation == handle.generation and device.state is State.UP
+        if device is not None and there:
+            device.tell(DriverVerb.DETACH, handle.number)
+            if handle.claims:
+                return True
+        self._forget(handle)
+        return False
+
+    def take_up_rights(self, rights: Rights) -> None:
+        """Let new grants hold, also for what is open already: a handle that lost a right ends."""
+        for handle in list(self._handles.values()):
+            lost = handle.rights & ~rights.on_node(handle.session.peer, handle.node.name)
+            device = self._server.devices.get(handle.node.device)
+            if lost and device is not None and device.generation == handle.generation:
+                names = ", ".join(name for name, right in RIGHTS.items() if right & lost)
+                text = f"{handle.node.name}: the right to {names} it was taken away; open it again"
+                device.tell(DriverVerb.DETACH, handle.number, text)
+
+    def detached(self, device: DriverProcess, number: int) -> None:
+        """The driver has ended a handle: its axes are being halted."""
+        handle = self._handles.get(number)
+        if handle is not None and handle.node.device == device.name:
+            self._forget(handle)
+
+    def _forget(self, handle: Handle) -> None:
+        if self._handles.pop(handle.number, None) is None:
+            return
+        handle.session.handles.pop(handle.number, None)
+        self._claims.release(handle.claims)
+        wait = handle.session.waits.get(handle.closing)
+        if wait is not None:
+            self._clients.answer(wait, reply(handle.closing))
+        if self._opens:
+            self.retry_opens()
+
+    def device_gone(self, device: DriverProcess, reason: str) -> None:
+        """Void all handles of a driver process that is no more."""
+        for handle in [h for h in self._handles.values() if h.node.device == device.name]:
+            self._forget(handle)
+
+    def holders(self) -> Iterator[Handle]:
+        """Return the handles that own outputs."""
+        return (handle for handle in self._handles.values() if handle.claims)
+
+    def forget_wait(self, wait: Wait) -> None:
+        """Drop a waiting open that has ended in another way."""
+        self._opens = [entry for entry in self._opens if entry[0] is not wait]
+
+    def listing(self, session: Session) -> list[object]:
+        """Return the nodes that the session may read, and who holds them."""
+        names = self._server.names
+        listed: list[object] = []
+        for node in names.nodes.values():
+            if self._clients.rights.on_node(session.peer, node.name) & Right.READ:
+                holder = self._claims.holder(node)
+                device = self._server.devices.get(node.device)
+                state = device.state.value if device else "gone"
+                listed.append([
+                    node.name, int(names.block(node).node_class), len(node.channels), node.read_only,
+                    node.device, state, str(holder.session) if holder else "", node.bit,
+                ])  # fmt: skip
+        return listed

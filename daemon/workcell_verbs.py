@@ -1,0 +1,134 @@
+"""Workcell requests of clients: hello, status, emergency stop, reset, reload.
+
+Concurrency: everything runs in the daemon's loop.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import time
+from typing import TYPE_CHECKING, Any
+
+from sioms.protocol.flags import PROTOCOL_VERSION, Right
+from sioms.protocol.messages import DriverVerb, reply
+
+from .devices import State
+from .names import Node
+from .sessions import LATER, Refused, Session
+
+if TYPE_CHECKING:
+    from .clients import Clients
+    from .server import Server
+
+
+class WorkcellVerbs:
+    """The workcell as a whole, and stops, on behalf of clients.
+
+    Args:
+        server: the daemon.
+        clients: who asks, waits and is answered, and what they may.
+    """
+
+    def __init__(self, server: Server, clients: Clients) -> None:
+        self._server = server
+        self._clients = clients
+
+    def hello(self, session: Session, number: int, version: int, name: str) -> Any:
+        """Answer a client that says who it is."""
+        if version != PROTOCOL_VERSION:
+            raise Refused(
+                errno.EPROTO, f"hello: protocol version {version}; this daemon speaks {PROTOCOL_VERSION}"
+            )
+        session.name = str(name)[:80]
+        rights = self._clients.rights.on_workcell(session.peer)
+        value = [PROTOCOL_VERSION, self._clients.bounds.name, int(rights)]
+        fds = [self._server.shared.request_fd] if rights & Right.STOP else []
+        self._clients.send(session, reply(number, value), fds)
+        return LATER
+
+    def status(self) -> dict[str, object]:
+        """Return what `sioms status` shows."""
+        server = self._server
+        now = time.monotonic_ns()
+        latch = server.shared.latch
+        return {
+            "workcell": self._clients.bounds.name,
+            "pid": os.getpid(),
+            "stopped_ns": latch.stopped_ns,
+            "stop_source": latch.source if latch.stopped_ns else "",
+            "devices": [
+                {
+                    "name": d.name, "driver": d.info.driver, "state": d.state.value, "pid": d.pid,
+                    "generation": d.generation, "reason": d.reason, "link": d.link[0].name.lower(),
+                    "link_reason": d.link[1], "tick_hz": d.info.tick_hz, "deaths": len(d.restarts.deaths_ns),
+                    "age_s": (now - d.started_ns) / 1e9 if d.started_ns else 0.0,
+                }
+                for d in server.devices.values()
+            ],
+            "sessions": [[str(s), len(s.handles), len(s.waits), self._clients.markers.count(s)] for s in self._clients.sessions],
+            "holders": [[h.node.name, str(h.session), (now - h.since_ns) / 1e9] for h in self._clients.nodes.holders()],
+        }  # fmt: skip
+
+    def emergency_stop(self, session: Session, name: str, why: str) -> None:
+        """Stop the workcell, or a node."""
+        source = f"{session}" + (f": {str(why)[:80]}" if why else "")
+        if not name:
+            if not self._clients.rights.on_workcell(session.peer) & Right.STOP:
+                raise Refused(
+                    errno.EPERM,
+                    f"emergency stop: {session.peer.user} has no right to stop; ask for a [[grant]]",
+                )
+            self._server.stop_workcell(source)
+            return
+        node = self._clients.nodes.find(session, "emergency stop", name)
+        if not self._clients.rights.on_node(session.peer, node.name) & Right.STOP:
+            raise Refused(
+                errno.EPERM, f"emergency stop of {name}: {session.peer.user} has no right to stop it"
+            )
+        self._to_device(node, DriverVerb.NODE_STOP, source)
+        self._server.log("warning", "emergency stop", node=name, source=source)
+
+    def reset(self, session: Session, name: str) -> None:
+        """Reset the workcell, or a node, or the fault of its device."""
+        if not name:
+            if not self._clients.rights.on_workcell(session.peer) & (Right.ADMINISTER | Right.WRITE):
+                raise Refused(
+                    errno.EPERM, f"reset: {session.peer.user} has no right to write or administer every node"
+                )
+            self._server.reset_workcell(str(session))
+            return
+        node = self._clients.nodes.find(session, "reset", name)
+        if not self._clients.rights.on_node(session.peer, node.name) & (Right.ADMINISTER | Right.WRITE):
+            raise Refused(errno.EPERM, f"reset {name}: {session.peer.user} has no right to write it")
+        device = self._server.devices.get(node.device)
+        if device is not None and device.state is State.FAULT:
+            device.reset()
+            return
+        latch = self._server.shared.latch
+        if latch.stopped_ns:
+            raise Refused(
+                errno.EPERM, f"reset {name}: the whole workcell is stopped ({latch.source}); reset that"
+            )
+        self._to_device(node, DriverVerb.NODE_RESET, str(session))
+
+    def _to_device(self, node: Node, verb: DriverVerb, text: str) -> None:
+        device = self._server.devices.get(node.device)
+        try:
+            if device is None:
+                raise OSError(errno.EIO, "not configured any more")
+            device.send(verb, node.block, node.channels, text)
+        except OSError as error:
+            raise Refused(errno.EIO, f"{verb.name.lower()} {node.name}: {error.strerror}") from None
+
+    def reload(self, session: Session, number: int) -> Any:
+        """Take up the configuration anew; answered with all errors."""
+        if not self._clients.rights.on_workcell(session.peer) & Right.ADMINISTER:
+            raise Refused(errno.EPERM, f"reload: {session.peer.user} has no right to administer every node")
+        wait = self._clients.wait(session, number, None, "reload")
+
+        def done(errors: list[str]) -> None:
+            self._clients.answer(wait, reply(number, errors))
+
+        self._server.load(done)
+        return LATER
