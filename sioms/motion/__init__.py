@@ -4,9 +4,10 @@ AxisBank closes the loop on the host; DriveBank feeds drives that close their ow
 the unit of the axis (m or rad), forces in N or N*m, instants in integer ns of CLOCK_MONOTONIC.
 """
 
+from .actions import ActionKind, DriveAction
 from .bank import AxisBank
 from .commands import Command
-from .drives import ActionKind, DriveAction, DriveBank
+from .drives import DriveBank
 from .queue import Judged, Judgement
 from .settings import (
     SWITCH_HOME,

@@ -10,8 +10,7 @@ from __future__ import annotations
 import errno
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from sioms.protocol.flags import AxisStatus
 from sioms.protocol.records import AXIS_READ_FIELDS
 
 from . import modes
+from .actions import ActionKind, DriveAction
 from .arrival import Approach, Arrivals
 from .commands import Command, is_point_move
 from .profile import InfeasibleError
@@ -30,43 +30,6 @@ from .types import CommandError, Event, EventKind, Keeper, MarkerPort
 
 NEVER_NS = 2**62
 Axes = NDArray[np.int64]
-
-
-class ActionKind(Enum):
-    """What a drive shall do."""
-
-    START = "start"
-    STOP = "stop"
-    """Stop at maximum deceleration and hold."""
-    QUICK_STOP = "quick stop"
-    """The fastest stop that the drive has (emergency stop, fault)."""
-    HOME = "home"
-    RESET = "reset"
-    """Clear the drive's own fault."""
-
-
-@dataclass(frozen=True, slots=True)
-class DriveAction:
-    """One thing that the driver shall send to one drive.
-
-    Args:
-        kind: what to do.
-        axis: bank axis.
-        command: for START the command; its position is absolute and in the drive's raw coordinates.
-        velocity_max: velocity limit in force [unit/s].
-        acceleration_max: acceleration limit in force [unit/s^2].
-    """
-
-    kind: ActionKind
-    axis: int
-    command: Command | None
-    velocity_max: float
-    acceleration_max: float
-
-    @property
-    def is_stop(self) -> bool:
-        """Tell whether it stops the axis and must overtake everything else."""
-        return self.kind in (ActionKind.STOP, ActionKind.QUICK_STOP)
 
 
 class DriveBank:
