@@ -118,9 +118,9 @@ def locate(problem: Problem, model: AxisModel, rng: np.random.Generator, shifts:
     out = []
     for name, (unit, parts) in variables(motions, model, dead_band(problem, model)).items():
         v = problem.join(parts)
-        bins = _bins(v)
-        share = _between(r, bins)
-        chance = [_between(np.roll(r, int(s)), bins) for s in rng.integers(len(r) // 20, len(r), shifts)]
+        bins = bins_of(v)
+        share = explained(r, bins)
+        chance = [explained(np.roll(r, int(s)), bins) for s in rng.integers(len(r) // 20, len(r), shifts)]
         p = (1 + sum(c >= share for c in chance)) / (shifts + 1)
         count = np.maximum(np.bincount(bins), 1)
         mean = np.bincount(bins, weights=r) / count
@@ -129,14 +129,15 @@ def locate(problem: Problem, model: AxisModel, rng: np.random.Generator, shifts:
     return sorted(out, key=lambda q: -q.explained)
 
 
-def _bins(v: Array) -> NDArray[np.int64]:
+def bins_of(v: Array) -> NDArray[np.int64]:
     """Bin numbers with about equal counts, without empty bins."""
     edges = np.unique(np.quantile(v, np.linspace(0.0, 1.0, BINS + 1)[1:-1]))
     number = np.searchsorted(edges, v, side="right")
     return np.asarray(np.unique(number, return_inverse=True)[1], dtype=np.int64)
 
 
-def _between(r: Array, bins: NDArray[np.int64]) -> float:
+def explained(r: Array, bins: NDArray[np.int64]) -> float:
+    """Share of the variance of r between bins."""
     count = np.maximum(np.bincount(bins), 1)
     mean = np.bincount(bins, weights=r) / count
     centred = mean - r.mean()
