@@ -160,6 +160,8 @@ class TickDriver(Driver):
     def tick(self, now_ns: int) -> None:
         """Do one period: read inputs, tick the banks, drive the outputs, fill the blocks.
 
+        A LinkError says that the device is gone: the kit tells the readers and opens it again.
+
         Args:
             now_ns: the scheduled time of this tick [ns, CLOCK_MONOTONIC], not the time it began.
         """

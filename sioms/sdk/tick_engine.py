@@ -32,7 +32,11 @@ class TickEngine:
         """Tick the driver and publish all blocks."""
         if not self._is_open and not self._open(now_ns):
             return
-        self._driver.tick(now_ns)
+        try:
+            self._driver.tick(now_ns)
+        except LinkError as error:  # the device is gone; open will find it again
+            self._is_open, self._retry_ns = False, now_ns + self._pause_ns
+            self._runtime.lose(self._driver.blocks, str(error))
 
     def _open(self, now_ns: int) -> bool:
         if now_ns < self._retry_ns:
@@ -44,7 +48,7 @@ class TickEngine:
             self._retry_ns = now_ns + self._pause_ns
             self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
             return False
-        self._is_open = True
+        self._is_open, self._pause_ns = True, FIRST_PAUSE_NS
         self._runtime.set_link(self._driver.blocks, PageState.GOOD, "")
         return True
 
