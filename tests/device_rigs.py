@@ -22,9 +22,18 @@ __all__ = ["RIGS", "Axis", "Output", "Rig", "everything"]
 
 LIMITS = "position_min = -1.0\nposition_max = 1.0\n"
 
-# Rigs of the shipped drivers stand in sioms.tools.counterparts.rigs.
+GPIO = Path(__file__).with_name("gpio_stand_in.py")
+
+# Rigs of the shipped drivers stand in sioms.tools.counterparts.rigs; that of the GPIO lines, which no process can simulate, here.
 RIGS = (
     *SHIPPED,
+    Rig(
+        str(GPIO),
+        f'[device.gpio]\ndriver = "{GPIO}"\nchip = "/dev/gpiochip0"\n'
+        + "".join(f"[[device.gpio.output]]\nline = {i}\nsafe = {i % 2}\n" for i in range(4))
+        + "".join(f"[[device.gpio.input]]\nline = {8 + i}\n" for i in range(4)),
+        inputs=("gpio.in",), outputs=(Output("gpio", 4, 0b1010),), name="gpio",
+    ),
 )  # fmt: skip
 
 

@@ -15,12 +15,12 @@ from device_rigs import RIGS, Rig
 
 import sioms
 
-every_rig = pytest.mark.parametrize("rig", RIGS, ids=lambda rig: rig.driver)
+every_rig = pytest.mark.parametrize("rig", RIGS, ids=lambda rig: rig.title)
 
 
 def test_every_registered_driver_has_a_rig() -> None:
     registered = {point.name for point in entry_points(group="sioms.drivers")}
-    assert registered == {rig.driver for rig in RIGS}, "add a rig to tests/device_rigs.py"
+    assert registered == {rig.title for rig in RIGS}, "add a rig to tests/device_rigs.py"
     assert all(rig.nodes for rig in RIGS)
 
 
