@@ -1,4 +1,4 @@
-"""Connections: a serial port, a TCP stream or a UDP association as one non-blocking descriptor."""
+"""Connections: a serial port, a TCP stream, a UDP association or a device file as one non-blocking descriptor."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import select
 import socket
 import termios
 from collections.abc import Callable
+from io import FileIO
 
 import serial
 
@@ -31,17 +32,20 @@ class Connection:
         self._serial: serial.Serial | None = None
         self._sock: socket.socket | None = None
         self._datagrams: Datagrams | None = None
+        self._file: FileIO | None = None
         if settings.serial is not None:
             self._open_serial(settings)
         elif settings.udp is not None:
             self._datagrams = Datagrams(settings.udp, settings.local, stranger)
+        elif settings.path is not None:
+            self._open_file(settings.path)
         else:
             self._open_tcp(settings)
 
     @property
     def fd(self) -> int:
         """The descriptor, for epoll."""
-        owner = self._serial or self._sock or self._datagrams
+        owner = self._serial or self._sock or self._datagrams or self._file
         return owner.fileno() if owner is not None else -1
 
     def is_connected(self) -> bool:
@@ -92,6 +96,20 @@ class Connection:
             self._sock.close()
         if self._datagrams is not None:
             self._datagrams.close()
+        if self._file is not None:
+            self._file.close()
+
+    def _open_file(self, path: str) -> None:
+        try:
+            fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        except OSError as error:
+            hint = {
+                errno.ENOENT: "no such device; is it plugged in, and its driver loaded",
+                errno.EACCES: "no permission; give the daemon's user rights on it by a udev rule",
+                errno.EBUSY: "in use by another process",
+            }.get(error.errno or 0, os.strerror(error.errno or errno.EIO).lower())
+            raise OSError(error.errno, f"open {path}: {hint}") from None
+        self._file = FileIO(fd)
 
     def _open_serial(self, settings: LineSettings) -> None:
         try:

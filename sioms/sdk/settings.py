@@ -16,7 +16,8 @@ class LineSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ``line = { serial = "/dev/ttyUSB0", baud = 115200, parity = "N" }``,
     ``line = { tcp = "192.168.0.20:502" }`` or
     ``line = { udp = "192.168.1.1:49152" }``. ``local`` is the address on this side, where it matters; with it the port
-    of ``udp`` may be 0, which listens to any port of that host.
+    of ``udp`` may be 0, which listens to any port of that host. ``path`` is a device file that only sends; drivers of the
+    kernel's own interfaces give it, not the configuration.
     """
 
     serial: str | None = None
@@ -25,11 +26,12 @@ class LineSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stop_bits: Literal[1, 2] = 1
     tcp: str | None = None
     udp: str | None = None
+    path: str | None = None
     local: str = ""
     connect_timeout_s: float = 1.0
 
     def __post_init__(self) -> None:
-        named = [key for key in ("serial", "tcp", "udp") if getattr(self, key) is not None]
+        named = [key for key in ("serial", "tcp", "udp", "path") if getattr(self, key) is not None]
         if len(named) != 1:
             raise ValueError(
                 f"line names {', '.join(named) or 'nothing'}; want exactly one of serial, tcp, udp"
@@ -49,7 +51,7 @@ class LineSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return 9 + (self.parity != "N") + self.stop_bits
 
     def __str__(self) -> str:
-        return self.serial or self.tcp or self.udp or "?"
+        return self.serial or self.tcp or self.udp or self.path or "?"
 
 
 def _check_address(key: str, value: str, lowest: int = 1) -> None:

@@ -211,6 +211,12 @@ RIGS: tuple[Rig, ...] = (
         analogs=("ascii_stream",),
     ),
     Rig(
+        "iio",
+        '[device.iio]\ndriver = "iio"\ndevice = "iio_dummy_part_no"\nmode = "buffer"\ntrigger = "instance1"\n'
+        'channels = ["voltage0", "accel_x"]\nrate_hz = 200.0\nsysfs = "{port}/sysfs"\ndev = "{port}/dev"\n',
+        ("iio",), analogs=("iio",), checked=False,
+    ),
+    Rig(
         "modbus-io",
         '[device.modbus_io]\ndriver = "modbus-io"\nmap = "moxa_e1200"\nmodel = "E1212"\nsafe = { do = 0 }\n'
         'line = { tcp = "{port}" }\n',

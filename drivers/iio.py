@@ -1,0 +1,313 @@
+"""Analog inputs behind Linux IIO: converters, accelerometers, thermometers that the kernel has a driver for.
+
+Mode "raw" reads each channel's attribute in every tick; mode "buffer" lets the kernel collect whole scans, each with the time
+at which it was taken, and reads them from ``/dev/iio:deviceN``. Values are in SI: what the kernel calls millivolts, kilopascals or
+gauss becomes V, Pa and T.
+
+    [device.adc0]
+    driver = "iio"
+    device = "ads1115"
+    channels = ["voltage0", "voltage1"]
+    mode = "buffer"
+    rate_hz = 860.0
+    trigger = "sioms-hrtimer"
+"""
+
+from __future__ import annotations
+
+import errno
+import time
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.protocol.flags import AnalogStatus, NodeClass
+from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
+from sioms.sdk.codec.iio_scan import ElementType, ScanReceiver, kind_of, unit_of
+from sioms.sdk.driver import Driver, Kit, StreamDriver, TickDriver
+from sioms.sdk.exchange import LinkError, Steps
+from sioms.sdk.iio_device import TIMESTAMP, IioDevice, find_device
+from sioms.sdk.settings import LineSettings
+
+RATE_TOLERANCE = 0.05
+"""So far may the device's rate be from the configured one."""
+
+
+class IioSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Keys of the device.
+
+    Attributes:
+        device: its name or label, or ``iio:device0`` where names are not unique.
+        channels: as the kernel names them, without ``in_`` and ``_raw``: voltage0, voltage0-voltage1, accel_x, temp.
+        mode: "raw": attributes read one by one; "buffer": scans collected by the kernel.
+        rate_hz: readings, or scans, per second; a buffer's device is set to it where it can be.
+        trigger: name of the trigger that starts each scan; '' leaves what is set.
+        buffer_length: scans that the kernel keeps.
+        watermark: scans after which the driver is woken.
+        minimum, maximum: range of the values, in SI.
+        history: snapshots kept for readers.
+        sysfs: where the devices are.
+        dev: where their buffers are.
+    """
+
+    device: str
+    channels: list[str]
+    mode: Literal["raw", "buffer"] = "raw"
+    rate_hz: float = 50.0
+    trigger: str = ""
+    buffer_length: int = 256
+    watermark: int = 1
+    minimum: float | None = None
+    maximum: float | None = None
+    history: int = 256
+    sysfs: str = "/sys/bus/iio/devices"
+    dev: str = "/dev"
+
+
+class Iio(StreamDriver):
+    """Scans of a buffer.
+
+    Concurrency: the one thread of the driver process.
+    """
+
+    Settings = IioSettings
+
+    @classmethod
+    def variant(cls, settings: IioSettings) -> type[Driver]:
+        """Return the class of the mode."""
+        return IioRaw if settings.mode == "raw" else cls
+
+    @classmethod
+    def describe(cls, name: str, settings: IioSettings) -> Description:
+        """Tell the channels; raises ValueError for settings that cannot be."""
+        return _describe(settings)
+
+    def __init__(self, name: str, settings: IioSettings, kit: Kit) -> None:
+        super().__init__(name, settings, kit)
+        self._block = AnalogBlock(_describe(settings).blocks[0])
+        self.silence_s = max(0.5, (20 + 3 * settings.watermark) / settings.rate_hz)
+        self._stamp_ns = 0
+        self._scans = self._lost = 0
+
+    @property
+    def line(self) -> LineSettings:  # type: ignore[override]  # found anew each time: numbers change with plugging
+        """The buffer's character device."""
+        try:
+            folder = find_device(self.settings.sysfs, self.settings.device)
+        except LinkError as error:
+            raise OSError(errno.ENODEV, str(error)) from None
+        return LineSettings(path=f"{self.settings.dev}/{folder.name}")
+
+    @property
+    def blocks(self) -> Sequence[AnyBlock]:
+        """The channels."""
+        return (self._block,)
+
+    def open(self) -> Steps:
+        """Set up the scan, then switch the buffer on; a driver that was killed may have left it on."""
+        settings = self.settings
+        device = self._device()
+        device.write(f"{device.buffer}/enable", 0)
+        layout = device.switch_on(settings.channels, timestamp=True)
+        if settings.trigger:
+            device.write("trigger/current_trigger", settings.trigger)
+        self._has_rate = self._set_rate(device)
+        self._is_realtime = not self._choose_clock(device)
+        for key, value in (("length", settings.buffer_length), ("watermark", settings.watermark)):
+            if device.has(f"{device.buffer}/{key}"):
+                device.write(f"{device.buffer}/{key}", value)
+        self._layout, self._receiver = layout, ScanReceiver(layout.size)
+        self._scaling = [_Scaling(device, channel) for channel in settings.channels]
+        self._types = {element.name: element.type for element in layout.elements}
+        self._last_ns = 0
+        device.write(f"{device.buffer}/enable", 1)
+        yield from ()
+
+    def feed(self, data: bytes, now_ns: int) -> int:
+        """Publish a snapshot for every scan."""
+        raw = self._layout.decode(self._receiver.feed(data))
+        scans = len(raw[self.settings.channels[0]])
+        if not scans:
+            return 0
+        values = np.empty((scans, self._block.n))
+        flags = np.empty((scans, self._block.n), dtype=np.int64)
+        for index, (channel, scaling) in enumerate(zip(self.settings.channels, self._scaling, strict=True)):
+            values[:, index] = scaling.to_si(raw[channel])
+            flags[:, index] = _saturated(raw[channel], self._types[channel])
+        stamps = self._stamps(raw, scans, now_ns)
+        for row, flag, stamp_ns in zip(values, flags, stamps, strict=True):
+            self._block.data[:] = row
+            self._block.flags[:] = flag | self._overrun(stamp_ns)
+            self._stamp_ns = self._block.stamp_ns = max(stamp_ns, self._stamp_ns + 1)
+            self.kit.publish(self._block, self._block.stamp_ns)
+        self._scans += scans
+        return scans
+
+    def counters(self) -> Mapping[str, int | str]:
+        """Return how many scans came, and how many are missing between them."""
+        return {"scans": self._scans, "lost_scans": self._lost}
+
+    def close(self) -> Steps:
+        """Switch the buffer off."""
+        device = self._device()
+        device.write(f"{device.buffer}/enable", 0)
+        yield from ()
+
+    def _device(self) -> IioDevice:
+        return IioDevice(find_device(self.settings.sysfs, self.settings.device))
+
+    def _set_rate(self, device: IioDevice) -> bool:
+        """Set the rate of device or trigger; return whether it is known to keep it."""
+        settings = self.settings
+        holders = [
+            (device, "sampling_frequency"),
+            (device, f"in_{kind_of(settings.channels[0])}_sampling_frequency"),
+        ]
+        for folder in device.folder.parent.glob("trigger*"):
+            trigger = IioDevice(folder)
+            if settings.trigger and trigger.has("name") and trigger.read("name") == settings.trigger:
+                holders.append((trigger, "sampling_frequency"))
+        there = [(holder, attribute) for holder, attribute in holders if holder.has(attribute)]
+        for holder, attribute in there:
+            holder.write(attribute, f"{settings.rate_hz:g}")
+            got_hz = holder.number(attribute)
+            if abs(got_hz / settings.rate_hz - 1) > RATE_TOLERANCE:
+                can = holder.read(f"{attribute}_available") if holder.has(f"{attribute}_available") else ""
+                text = f"rate_hz = {settings.rate_hz:g}, but {holder.folder.name} samples at {got_hz:g} Hz"
+                raise LinkError(f"open {self.name}: {text}; want {'one of ' + can if can else 'that'}")
+        return bool(there)
+
+    def _choose_clock(self, device: IioDevice) -> bool:
+        """Ask for stamps of the monotonic clock; return whether that is granted."""
+        if not device.has("current_timestamp_clock"):
+            return False
+        device.write("current_timestamp_clock", "monotonic")
+        return device.read("current_timestamp_clock") == "monotonic"
+
+    def _stamps(self, raw: Mapping[str, NDArray[np.int64]], scans: int, now_ns: int) -> list[int]:
+        """Return when each scan was taken [ns, CLOCK_MONOTONIC]; never later than now."""
+        if TIMESTAMP not in raw:
+            return [now_ns - round((scans - 1 - i) * 1e9 / self.settings.rate_hz) for i in range(scans)]
+        ahead_ns = time.time_ns() - time.monotonic_ns() if self._is_realtime else 0
+        return [min(int(stamp) - ahead_ns, now_ns) for stamp in raw[TIMESTAMP]]
+
+    def _overrun(self, stamp_ns: int) -> int:
+        """Return OVERRUN when the time since the last scan holds more than one of them."""
+        last_ns, self._last_ns = self._last_ns, stamp_ns
+        if not last_ns or not self._has_rate or TIMESTAMP not in self._types:
+            return 0
+        missing = round((stamp_ns - last_ns) / 1e9 * self.settings.rate_hz) - 1
+        self._lost += max(0, missing)
+        return int(AnalogStatus.OVERRUN) if missing > 0 else 0
+
+
+class IioRaw(TickDriver):
+    """Attributes read one by one.
+
+    Concurrency: the one thread of the driver process; a slow converter keeps it, and its tick, for as long as a conversion takes.
+    """
+
+    Settings = IioSettings
+
+    @classmethod
+    def describe(cls, name: str, settings: IioSettings) -> Description:
+        """Tell the channels."""
+        return _describe(settings)
+
+    def __init__(self, name: str, settings: IioSettings, kit: Kit) -> None:
+        super().__init__(name, settings, kit)
+        self._block = AnalogBlock(_describe(settings).blocks[0])
+        self._failed = 0
+
+    @property
+    def blocks(self) -> Sequence[AnyBlock]:
+        """The channels."""
+        return (self._block,)
+
+    def open(self) -> None:
+        """Find the device and how its channels are scaled."""
+        self._device = IioDevice(find_device(self.settings.sysfs, self.settings.device))
+        self._scaling = [_Scaling(self._device, channel) for channel in self.settings.channels]
+        for scaling in self._scaling:
+            self._device.read(scaling.attribute)
+
+    def tick(self, now_ns: int) -> None:
+        """Read every channel; one that fails is INVALID, a device that is gone is a loss."""
+        for index, scaling in enumerate(self._scaling):
+            try:
+                self._block.data[index] = scaling.value(self._device.number(scaling.attribute))
+                self._block.flags[index] = 0
+            except LinkError:
+                if not self._device.folder.exists():
+                    raise
+                self._failed += 1
+                self._block.flags[index] = int(AnalogStatus.INVALID)
+        self._block.stamp_ns = time.monotonic_ns()
+
+    def counters(self) -> Mapping[str, int | str]:
+        """Return how many readings the device did not give."""
+        return {"failed_readings": self._failed}
+
+
+class _Scaling:
+    """How a channel's number becomes SI.
+
+    Attributes:
+        attribute: where a single reading stands; ``_input`` ones are scaled by the kernel.
+    """
+
+    def __init__(self, device: IioDevice, channel: str) -> None:
+        _, self._factor = unit_of(channel)
+        self.attribute = f"in_{channel}_raw"
+        self._offset, self._scale = device.scaling(channel)
+        if not device.has(self.attribute) and device.has(f"in_{channel}_input"):
+            self.attribute, self._offset, self._scale = f"in_{channel}_input", 0.0, 1.0
+
+    def value(self, number: float) -> float:
+        return (number + self._offset) * self._scale * self._factor
+
+    def to_si(self, raw: NDArray[np.int64]) -> NDArray[np.float64]:
+        values: NDArray[np.float64] = (raw.astype(np.float64) + self._offset) * (self._scale * self._factor)
+        return values
+
+
+def _saturated(raw: NDArray[np.int64], kind: ElementType) -> NDArray[np.int64]:
+    """Return SATURATED where a converter is at its end; an unsigned 0 is an input at rest."""
+    top = (1 << kind.bits - kind.signed) - 1
+    at_end = (raw >= top) | (raw <= -top - 1) if kind.signed else raw >= top
+    return np.where(at_end, int(AnalogStatus.SATURATED), 0)
+
+
+def _describe(settings: IioSettings) -> Description:
+    _check(settings)
+    channels = tuple(
+        ChannelInfo(name, unit_of(name)[0], settings.minimum, settings.maximum) for name in settings.channels
+    )
+    block = BlockSpec("", NodeClass.ANALOG, channels, history=settings.history)
+    return Description((block,), settings.rate_hz, lease_s=max(0.5, 10 / settings.rate_hz))
+
+
+def _check(settings: IioSettings) -> None:
+    """Raise ValueError for settings that contradict each other."""
+    if not settings.channels:
+        raise ValueError("channels: none given; want e.g. voltage0")
+    for channel in settings.channels:
+        if settings.channels.count(channel) > 1:
+            raise ValueError(
+                f"channels: {channel} is given {settings.channels.count(channel)} times; want each once"
+            )
+        if channel.startswith("in_") or channel.endswith("_raw") or channel == TIMESTAMP:
+            raise ValueError(f"channels: {channel}; want the name alone, e.g. voltage0 for in_voltage0_raw")
+    most_hz = 1000 if settings.mode == "raw" else 20_000
+    if not 0.1 <= settings.rate_hz <= most_hz:
+        raise ValueError(f"rate_hz = {settings.rate_hz:g}; want 0.1 to {most_hz} in mode {settings.mode}")
+    if settings.mode == "raw" and settings.trigger:
+        raise ValueError(f"trigger = {settings.trigger}: readings in mode raw have none; want mode = buffer")
+    if not 1 <= settings.watermark <= settings.buffer_length:
+        raise ValueError(
+            f"watermark = {settings.watermark}, buffer_length = {settings.buffer_length}; want 1 to the length"
+        )

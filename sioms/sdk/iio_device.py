@@ -1,0 +1,142 @@
+"""A Linux IIO device in sysfs: found by name, read and set attribute by attribute, failures told in sentences."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from .codec.iio_scan import Element, Layout, kind_of, parse_type
+from .exchange import LinkError
+
+TIMESTAMP = "timestamp"
+"""Name of the channel that carries the time of a scan."""
+
+
+def find_device(sysfs: str, wanted: str) -> Path:
+    """Return the folder of a device.
+
+    Args:
+        sysfs: where the devices are, ``/sys/bus/iio/devices``.
+        wanted: its name or label, or its number as ``iio:device0``.
+
+    Raises:
+        LinkError: there is none, or several of that name.
+    """
+    folders = sorted(Path(sysfs).glob("iio:device*"))
+    names = {folder: {folder.name, *_names(folder)} for folder in folders}
+    found = [folder for folder in folders if wanted in names[folder]]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        which = ", ".join(folder.name for folder in found)
+        raise LinkError(f"find IIO device {wanted!r}: {len(found)} bear that name; want one of {which}")
+    there = ", ".join(f"{folder.name} ({', '.join(_names(folder)) or 'no name'})" for folder in folders)
+    raise LinkError(f"find IIO device {wanted!r} in {sysfs}: there is {there or 'no IIO device at all'}")
+
+
+def _names(folder: Path) -> list[str]:
+    found = []
+    for attribute in ("name", "label"):
+        try:
+            found.append((folder / attribute).read_text().strip())
+        except OSError:
+            continue
+    return found
+
+
+class IioDevice:
+    """One device.
+
+    Args:
+        folder: of its attributes.
+
+    Concurrency: one thread.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def has(self, attribute: str) -> bool:
+        """Tell whether it has an attribute."""
+        return (self.folder / attribute).exists()
+
+    def read(self, attribute: str) -> str:
+        """Return an attribute.
+
+        Raises:
+            LinkError: it is not there, or the device does not answer the kernel.
+        """
+        try:
+            return (self.folder / attribute).read_text().strip()
+        except OSError as error:
+            raise LinkError(f"read {self.folder / attribute}: {_why(error)}") from None
+
+    def number(self, attribute: str) -> float:
+        """Return an attribute that is a number."""
+        text = self.read(attribute)
+        try:
+            return float(text.split()[0])
+        except (ValueError, IndexError):
+            raise LinkError(f"read {self.folder / attribute}: {text!r} is no number") from None
+
+    def write(self, attribute: str, value: object) -> None:
+        """Set an attribute.
+
+        Raises:
+            LinkError: it is not there, may not be written, or refuses the value.
+        """
+        path = self.folder / attribute
+        try:
+            fd = os.open(path, os.O_WRONLY | os.O_TRUNC | os.O_CLOEXEC)
+            try:
+                os.write(fd, f"{value}\n".encode())
+            finally:
+                os.close(fd)
+        except OSError as error:
+            raise LinkError(f"write {value} to {path}: {_why(error)}") from None
+
+    def scaling(self, channel: str) -> tuple[float, float]:
+        """Return offset and scale of a channel, its own or those of all of its kind: value = (raw + offset) * scale."""
+        kind = kind_of(channel)
+        shared = [f"in_{channel}", *([f"in_{kind}-{kind}"] if "-" in channel else []), f"in_{kind}"]
+        pair = []
+        for what, default in (("offset", 0.0), ("scale", 1.0)):
+            there = [f"{name}_{what}" for name in shared if self.has(f"{name}_{what}")]
+            pair.append(self.number(there[0]) if there else default)
+        return pair[0], pair[1]
+
+    @property
+    def buffer(self) -> str:
+        """Where its buffer is set up; since kernel 5.11 there may be several, of which this is the first."""
+        return "buffer" if self.has("buffer") else "buffer0"
+
+    def switch_on(self, channels: Sequence[str], *, timestamp: bool) -> Layout:
+        """Choose what a scan holds, with the buffer off; return where it lies."""
+        scan = "scan_elements" if self.has("scan_elements") else "buffer0"
+        there = {path.name[3:-3] for path in (self.folder / scan).glob("in_*_en")}
+        for channel in channels:
+            if channel not in there:
+                has = ", ".join(sorted(there - {TIMESTAMP})) or "none"
+                raise LinkError(f"switch on channel {channel} of {self.folder.name}: it has {has}")
+        wanted = {*channels, *([TIMESTAMP] if timestamp and TIMESTAMP in there else [])}
+        for name in sorted(there - wanted) + sorted(wanted):
+            self.write(f"{scan}/in_{name}_en", int(name in wanted))
+        elements = []
+        for name in wanted:
+            try:
+                kind = parse_type(self.read(f"{scan}/in_{name}_type"))
+            except ValueError as error:
+                raise LinkError(f"switch on channel {name} of {self.folder.name}: {error}") from None
+            elements.append(Element(name, int(self.number(f"{scan}/in_{name}_index")), kind))
+        return Layout(elements)
+
+
+def _why(error: OSError) -> str:
+    return {
+        errno.EACCES: "no permission; give the daemon's user rights on it by a udev rule",
+        errno.EBUSY: "busy; its buffer is on, or another program uses it",
+        errno.ENOENT: "no such attribute; look at the device, and whether it is still there",
+        errno.EINVAL: "the device does not take that value",
+    }.get(error.errno or 0, os.strerror(error.errno or errno.EIO).lower())

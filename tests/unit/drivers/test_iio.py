@@ -1,0 +1,117 @@
+"""Linux IIO: finding a device among several, its attributes, and settings that contradict each other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from sioms.drivers.iio import Iio, IioRaw
+from sioms.sdk.exchange import LinkError
+from sioms.sdk.iio_device import IioDevice, find_device
+from sioms.tools.counterparts.iio import Dummy
+
+
+@pytest.fixture
+def sysfs(tmp_path: Path) -> Path:
+    for number, name in enumerate(("adc", "gyro", "adc")):
+        folder = tmp_path / f"iio:device{number}"
+        folder.mkdir()
+        (folder / "name").write_text(f"{name}\n")
+    (tmp_path / "iio:device2" / "label").write_text("left\n")
+    return tmp_path
+
+
+def test_devices_are_found_by_name_label_and_number(sysfs: Path) -> None:
+    assert find_device(str(sysfs), "gyro").name == "iio:device1"
+    assert find_device(str(sysfs), "left").name == "iio:device2"
+    assert find_device(str(sysfs), "iio:device0").name == "iio:device0"
+    with pytest.raises(LinkError, match="2 bear that name; want one of iio:device0, iio:device2"):
+        find_device(str(sysfs), "adc")
+    with pytest.raises(
+        LinkError, match=r"there is iio:device0 \(adc\), iio:device1 \(gyro\), iio:device2 \(adc, left\)"
+    ):
+        find_device(str(sysfs), "thermo")
+
+
+def test_scaling_is_the_channels_own_or_its_kinds(sysfs: Path) -> None:
+    device = IioDevice(sysfs / "iio:device0")
+    for attribute, value in {
+        "in_voltage_scale": 2.0, "in_voltage1_scale": 3.0, "in_voltage1_offset": -5.0, "in_voltage-voltage_scale": 4.0,
+    }.items():  # fmt: skip
+        (device.folder / attribute).write_text(f"{value}\n")
+    assert device.scaling("voltage0") == (0.0, 2.0)
+    assert device.scaling("voltage1") == (-5.0, 3.0)
+    assert device.scaling("voltage0-voltage1") == (0.0, 4.0)
+    assert device.scaling("temp") == (0.0, 1.0)
+    with pytest.raises(LinkError, match="in_temp_raw: no such attribute"):
+        device.number("in_temp_raw")
+    (device.folder / "in_temp_raw").write_text("\n")
+    with pytest.raises(LinkError, match="'' is no number"):
+        device.number("in_temp_raw")
+    with pytest.raises(LinkError, match=r"write 1 to .*buffer/enable: no such attribute"):
+        device.write("buffer/enable", 1)
+
+
+class Kit:
+    """Keeps what is published."""
+
+    def __init__(self) -> None:
+        self.published: list[tuple[int, list[float], int]] = []
+
+    def publish(self, block: Any, stamp_ns: int) -> None:
+        self.published.append((stamp_ns, block.data.tolist(), int(block.flags[0])))
+
+
+def test_scans_without_a_clock_of_ours_are_mapped(tmp_path: Path) -> None:
+    """A device that stamps with the wall clock, and one that does not stamp at all."""
+    dummy = Dummy(tmp_path, 0, "dummy")
+    dummy.plug()
+    (dummy.root / "current_timestamp_clock").unlink()
+    table = {"device": "dummy", "channels": ["voltage0"], "mode": "buffer", "rate_hz": 100.0, "trigger": "instance1",
+             "sysfs": str(tmp_path / "sysfs"), "dev": str(tmp_path / "dev")}  # fmt: skip
+    try:
+        for stamped in (True, False):
+            kit = Kit()
+            if not stamped:
+                for name in ("en", "index", "type"):
+                    (dummy.root / f"scan_elements/in_timestamp_{name}").unlink()
+            driver = Iio("a", msgspec.convert(table, Iio.Settings), kit)  # type: ignore[arg-type]
+            assert list(driver.open()) == []
+            scans = [dummy._scan(50.0 + i / 100) for i in range(5)]
+            driver.feed(b"".join(scans), 51_000_000_000)
+            stamps = [stamp for stamp, _, _ in kit.published]
+            wanted = 50.0 if stamped else 50.96
+            assert stamps == pytest.approx([(wanted + i / 100) * 1e9 for i in range(5)], abs=2e6)
+            assert np.array([data for _, data, _ in kit.published]) == pytest.approx(80 * 1.3333e-3)
+            list(driver.close())
+    finally:
+        dummy.unplug()
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"channels": []}, "channels: none given"),
+        ({"channels": ["voltage0", "voltage0"]}, "voltage0 is given 2 times"),
+        ({"channels": ["in_voltage0_raw"]}, "want the name alone, e.g. voltage0"),
+        ({"rate_hz": 5000.0}, "rate_hz = 5000; want 0.1 to 1000 in mode raw"),
+        ({"trigger": "t"}, "readings in mode raw have none"),
+        ({"mode": "buffer", "watermark": 300}, "watermark = 300, buffer_length = 256"),
+    ],
+)
+def test_bad_configurations(table: dict[str, Any], words: str) -> None:
+    settings = msgspec.convert({"device": "adc", "channels": ["voltage0"], **table}, Iio.Settings)
+    with pytest.raises(ValueError, match=words):
+        Iio.describe("a", settings)
+
+
+def test_the_mode_chooses_the_class() -> None:
+    for mode, kind in (("raw", IioRaw), ("buffer", Iio)):
+        assert (
+            Iio.variant(msgspec.convert({"device": "adc", "channels": ["temp"], "mode": mode}, Iio.Settings))
+            is kind
+        )
