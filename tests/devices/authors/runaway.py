@@ -1,0 +1,32 @@
+"""A driver that does not stop: its module never hears of a stop."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sioms.drivers.tmcl import Tmcl, TmclUnit
+from sioms.sdk.driver import Kit
+from sioms.sdk.exchange import Steps
+
+
+class RunawayUnit(TmclUnit):
+    def halt(self, axis: int, *, fastest: bool) -> Steps:
+        yield from ()
+
+
+class Runaway(Tmcl):
+    rig = {
+        "counterpart": ["tmcl"],
+        "tables": (
+            '[device.runaway]\ndriver = "{driver}"\nmodule = 1140\npoll_hz = 50.0\n'
+            'line = { serial = "{port}", baud = 115200 }\n[[device.runaway.axis]]\nname = "x"\nmotor = 0\n'
+            "travel_per_turn = 0.01\nvelocity_max = 0.1\nacceleration_max = 2.0\nposition_min = -1.0\nposition_max = 1.0\n"
+        ),
+    }
+
+    def __init__(self, name: str, settings: Any, kit: Kit) -> None:
+        super().__init__(name, settings, kit)
+        self._units = (RunawayUnit(name, settings, self.describe(name, settings).blocks[0], kit),)
+
+
+DRIVER = Runaway

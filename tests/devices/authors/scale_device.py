@@ -1,0 +1,24 @@
+"""The scale as a process: ``python scale_device.py --link PATH``. Nothing of SIOMS is in it."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import tty
+
+master, slave = os.openpty()
+tty.setraw(slave)
+link = sys.argv[sys.argv.index("--link") + 1]
+os.symlink(os.ttyname(slave), link)
+print(f"ready {link}", flush=True)
+while True:
+    ready, _, _ = select.select([0, master], [], [])
+    if 0 in ready and not os.read(0, 1000):
+        break
+    if master in ready and b"W\r" in os.read(master, 100):
+        text = b"+0012.340"
+        value = 0
+        for byte in text:
+            value ^= byte
+        os.write(master, text + b"*%02X\r\n" % value)

@@ -1,0 +1,112 @@
+"""``sioms driver check``: shipped drivers pass it, drivers that are broken on purpose do not."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import pytest
+from device_rigs import RIGS
+
+from sioms.tools.counterparts.rigs import MAP_RIGS
+
+AUTHORS = Path(__file__).parent / "authors"
+WIRED = [rig.title for rig in RIGS if rig.line]
+BY_MAP = {rig.driver for rig in MAP_RIGS}
+SHIPPED = [name for name in WIRED if name not in BY_MAP] + [rig.title for rig in MAP_RIGS]
+"""Every driver with a wire; those of register maps by their maps."""
+
+
+def run(*words: str) -> tuple[int, list[dict[str, Any]], str]:
+    """Run the check as its users do; return its status, its reports and what it said."""
+    with TemporaryDirectory() as folder:
+        out = Path(folder) / "out.json"
+        command = [sys.executable, "-m", "sioms.tools.front", "driver", "check", *words, "--json", str(out)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=110)
+        reports = json.loads(out.read_text()) if out.exists() else []
+        return done.returncode, reports, done.stdout + done.stderr
+
+
+@cache
+def shipped() -> tuple[dict[str, dict[str, Any]], str]:
+    _, reports, said = run(*SHIPPED, "-j", "4")
+    return {report["driver"]: report for report in reports}, said
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_driver_passes(name: str) -> None:
+    reports, said = shipped()
+    assert name in reports, said
+    trials = reports[name]["trials"]
+    failed = [
+        f"{t['name']}: expected {t['expected']}; saw {t['seen']}" for t in trials if t["verdict"] == "FAILED"
+    ]
+    assert not failed, "\n".join(failed)
+    passed = {t["name"] for t in trials if t["verdict"] == "passed"}
+    assert {"golden", "mute", "unplugged", "random", "kill driver", "kill daemon"} <= passed | {"golden"}
+
+
+@cache
+def broken() -> dict[str, tuple[int, dict[str, dict[str, Any]], str]]:
+    found = {}
+    for name, only in (
+        ("scale", "golden,chopped,noisy,late,random"),
+        ("brittle", "golden,noisy"),
+        ("hasty", "late"),
+        ("runaway", "stop running,kill client"),
+    ):
+        status, reports, said = run(str(AUTHORS / f"{name}.py"), "--only", only)
+        found[name] = status, {t["name"]: t for t in reports[0]["trials"]} if reports else {}, said
+    return found
+
+
+def test_a_file_with_its_own_counterpart_passes() -> None:
+    status, trials, said = broken()["scale"]
+    assert status == 0, said
+    assert {t["verdict"] for t in trials.values()} == {"passed"} and len(trials) == 5
+
+
+def test_a_driver_that_dies_on_noise_fails() -> None:
+    status, trials, said = broken()["brittle"]
+    assert status == 1, said
+    assert trials["golden"]["verdict"] == "FAILED"
+    assert trials["noisy"]["verdict"] == "FAILED" and trials["noisy"]["traffic"]
+
+
+def test_a_driver_that_takes_a_late_reply_for_the_next_fails() -> None:
+    status, trials, said = broken()["hasty"]
+    assert status == 1 and "readings were wrong" in trials["late"]["seen"], said
+    assert any("late" in line for line in trials["late"]["traffic"]), "the bytes concerned"
+
+
+def test_a_driver_that_does_not_stop_fails() -> None:
+    status, trials, said = broken()["runaway"]
+    assert status == 1, said
+    for name in ("stop running", "kill client"):
+        assert trials[name]["verdict"] == "FAILED" and "rest" in trials[name]["expected"], trials[name]
+
+
+def test_a_report_is_a_page(tmp_path: Path) -> None:
+    page = tmp_path / "report.html"
+    status, _, said = run(str(AUTHORS / "brittle.py"), "--only", "golden", "--report", str(page))
+    assert status == 1, said
+    text = page.read_text()
+    assert "FAILED" in text and "brittle.py" in text and "&lt; 2b" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("nobody",), "no such driver"),
+        (("tmcl", "--only", "nothing"), "no trial nothing; there are: golden, timing"),
+        ((), "name one, or --all"),
+    ],
+)
+def test_what_cannot_be_checked_is_a_sentence(words: tuple[str, ...], sentence: str) -> None:
+    status, _, said = run(*words)
+    assert status == 2 and sentence in said
