@@ -140,13 +140,13 @@ class Way:
         in_order: later messages wait for earlier ones; not so with datagrams.
 
     Attributes:
-        messages, bytes: carried so far.
+        messages, characters: carried so far.
     """
 
     character_ns: float = 0.0
     in_order: bool = True
     messages: int = 0
-    bytes: int = 0
+    characters: int = 0
     _free_ns: float = 0.0
     _queue: deque[tuple[int, bytes]] = field(default_factory=deque)
 
@@ -155,7 +155,7 @@ class Way:
         at_ns = float(now_ns)
         self.messages += 1
         for piece in pieces:
-            self.bytes += len(piece.data)
+            self.characters += len(piece.data)
             start_ns = max(at_ns, self._free_ns if self.in_order else 0.0) + piece.delay_ns
             at_ns = start_ns + len(piece.data) * self.character_ns
             self._free_ns = at_ns

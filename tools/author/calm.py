@@ -14,7 +14,7 @@ from sioms.protocol.flags import AnalogStatus, AxisStatus, NodeClass
 
 from .station import Node, Station
 
-REST_S = 0.3
+REST_S = 0.2
 BAD = int(AnalogStatus.INVALID)
 WIDER = 1.0
 """An analog reading may leave the band that it had at rest by so many of its widths."""

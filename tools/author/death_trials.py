@@ -9,7 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from .motion_trials import REST_S, SLOW, STILL_S, check_rest, run, wait_moving
+from sioms.protocol.flags import ControlMode
+
+from .motion_trials import REST_S, SLOW, STILL_S, check_rest, run, slowly, wait_moving
 from .station import Client, Station, wait_for
 from .trial import Failed, NotApplicable, Trial
 
@@ -33,17 +35,11 @@ time.sleep(1000)
 
 def _runner(station: Station, read: Callable[[], Any]) -> Client:
     """Start a client of its own that runs the first axis."""
-    from sioms.protocol.flags import ControlMode
-
     axis = station.rig.axes[0]
     way = -1.0 if read().position[0] > 0 else 1.0
     words = {"velocity": way * axis.velocity}
     if not station.has(ControlMode.VELOCITY):
-        words = {
-            "position": way * 20 * axis.reach,
-            "max_velocity": axis.velocity,
-            "max_acceleration": 10 * axis.velocity,
-        }
+        words = {"position": way * 20 * axis.reach, **slowly(station, axis)}
     return station.start_client(RUN, axis.node, *(f"{key}={value}" for key, value in words.items()))
 
 

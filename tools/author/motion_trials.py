@@ -16,7 +16,7 @@ from .trial import Failed, NotApplicable, Trial
 
 REST_S = 3.0
 """Longest time from a stop to rest [s]; braking from the rig's velocity takes a small part of it."""
-STILL_S = 0.25
+STILL_S = 0.15
 SLOW = 0.05
 """Part of the velocity below which the device counts as standing."""
 
@@ -32,7 +32,14 @@ def run(station: Station, node: Any, axis: Axis) -> None:
     if station.has(ControlMode.VELOCITY):
         node.command(velocity=way * axis.velocity)
     else:
-        node.move(way * 20 * axis.reach, max_velocity=axis.velocity, max_acceleration=10 * axis.velocity)
+        node.move(way * 20 * axis.reach, **slowly(station, axis))
+
+
+def slowly(station: Station, axis: Axis) -> dict[str, float]:
+    """Return the words that let a move take its time, none where the drive has its own speed alone."""
+    if not station.has(ControlMode.SPECIFIED_MAX_VEL_ACC):
+        return {}
+    return {"max_velocity": axis.velocity, "max_acceleration": 10 * axis.velocity}
 
 
 def wait_moving(station: Station, read: Callable[[], Any], axis: Axis) -> float:
@@ -96,7 +103,7 @@ def _in_motion(station: Station, node: Any, axis: Axis) -> float:
 
 def _in_move(station: Station, node: Any, axis: Axis) -> float:
     way = forward(node, axis)
-    node.move(way * 20 * axis.reach, max_velocity=axis.velocity, max_acceleration=10 * axis.velocity)
+    node.move(way * 20 * axis.reach, **slowly(station, axis))
     return wait_moving(station, node.read, axis)
 
 

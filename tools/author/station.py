@@ -338,13 +338,18 @@ class Station:
         for axis in self.rig.axes[:1]:
             with contextlib.suppress(OSError), self.cell.open(axis.node, "rw", timeout=2.0) as node:
                 node.reset()
-                wait_for(lambda node=node: not node.read().status[0] & AxisStatus.FAULT, 2.0)
+                _wait_sound(node)
 
     def start_client(self, script: str, *words: str) -> Client:
         """Start a client in a process of its own; it must print a line when it is ready."""
         if self.daemon is None:
             raise Unanswered("no daemon runs")
         return Client(script, self.daemon.socket, *words)
+
+
+def _wait_sound(node: Any) -> None:
+    """Wait until a reset has taken effect."""
+    wait_for(lambda: not node.read().status[0] & AxisStatus.FAULT, 2.0)
 
 
 def _is_same(name: str, names: set[str]) -> bool:

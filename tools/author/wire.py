@@ -86,8 +86,8 @@ class Wire:
     def totals(self) -> dict[str, int]:
         """Return what was carried."""
         return {
-            "requests": self.to_device.messages, "request_bytes": self.to_device.bytes,
-            "replies": self.to_host.messages, "reply_bytes": self.to_host.bytes, "bent": self.bender.hits,
+            "requests": self.to_device.messages, "request_bytes": self.to_device.characters,
+            "replies": self.to_host.messages, "reply_bytes": self.to_host.characters, "bent": self.bender.hits,
         }  # fmt: skip
 
     def turn(self) -> None:
