@@ -228,24 +228,17 @@ def test_tweaks_add_up_also_in_coordinates_of_ones_own(cell: sioms.Workcell, axi
         user = node.user(direction=-1, offset=0.3)
         low, high = user.limits()
         assert (low, high) == (pytest.approx(0.3 - node.limits()["position_max"][0]), pytest.approx(1.3))
-        for _ in range(4):  # appended while the first still runs
-            user.tweak(-axis.reach / 4)
+        user.tweak(-axis.reach / 4)
+        user.tweak(-axis.reach / 4)  # appended while the first still runs
         node.wait_until_idle(20.0)
         node.wait_new(node.read().number, 5.0)
-        assert node.read().position[0] == pytest.approx(axis.reach, abs=axis.tolerance)
-        assert user.position == pytest.approx(0.3 - axis.reach, abs=axis.tolerance)
+        assert node.read().position[0] == pytest.approx(axis.reach / 2, abs=axis.tolerance)
+        assert user.position == pytest.approx(0.3 - axis.reach / 2, abs=axis.tolerance)
         user.call_here(0.0)
-        user.move(axis.reach)
+        user.move(axis.reach / 2)
         node.wait_until_idle(20.0)
         node.wait_new(node.read().number, 5.0)
         assert node.read().position[0] == pytest.approx(0.0, abs=2 * axis.tolerance)
-        if has_velocity(node):
-            user.jog(-axis.velocity)
-            wait_for(lambda: user.velocity < -0.5 * axis.velocity, "jogging")
-            assert node.read().velocity[0] > 0
-            node.stop()
-            at_rest(node)
-        home(node)
 
 
 @every_axis

@@ -53,6 +53,17 @@ restore = {{ when = "matching" }}
 """
 
 
+ALARM = """
+[[alarm]]
+node = "force0.fx"
+high = 0.5
+hihi = 2.0
+[[alarm]]
+node = "force0.fy"
+high = 5.0
+"""
+
+
 @pytest.fixture
 def port(tmp_path: Path) -> Iterator[str]:
     """A drive that lives on when its driver dies."""
@@ -144,27 +155,15 @@ def test_a_drive_that_counts_on_keeps_its_coordinates_and_takes_up_its_play(
     assert look(daemon, "slide0")[0] == pytest.approx(before, abs=1e-9)
 
 
-ALARM = """
-[[alarm]]
-node = "force0.fx"
-high = 0.5
-hihi = 2.0
-[[alarm]]
-node = "force0.fy"
-high = 5.0
-"""
-
-
-def test_a_workcell_says_what_is_not_kept_and_shows_its_alarms(start_daemon: Callable[..., Daemon], tmp_path: Path) -> None:
-    text = SIM.format(folder=tmp_path).replace("state_folder", "#") + FORCE + ALARM
-    daemon = start_daemon(text, {"STATE_DIRECTORY": ""})
-    assert "give [workcell] a state_folder" in daemon.said("positions are not kept")
+def test_alarms_show_and_a_wrong_one_is_told(start_daemon: Callable[..., Daemon]) -> None:
+    text = FORCE + ALARM
+    daemon = start_daemon(text)
     daemon.wait_up("force0")
     with daemon.cell() as cell, cell.open("force0") as force:
         reading = wait_for(lambda: force.read() if force.read().number else None, "a reading")
         flags = [sioms.AnalogStatus(f) for f in reading.flags]
         assert reading.data[:2] == (pytest.approx(1.0), pytest.approx(2.0))
         assert (flags[0], flags[1], flags[0].severity) == (sioms.AnalogStatus.HIGH, 0, 1)
-    daemon.config.write_text(text.replace("hihi = 2.0", "hihi = 1.0").replace("node = \"force0.fy\"", "node = \"mod0\""))
-    with daemon.cell() as cell, raises(errno.EINVAL, "[[alarm]]: node = mod0"):
+    daemon.config.write_text(text.replace("hihi = 2.0", "hihi = 1.0").replace("node = \"force0.fy\"", "node = \"io0\""))
+    with daemon.cell() as cell, raises(errno.EINVAL, "[[alarm]]: node = io0"):
         cell.reload()

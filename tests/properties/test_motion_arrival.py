@@ -69,7 +69,7 @@ class Loose(Rig):
         self.bank.reset([0])
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(distance, st.booleans(), history)
 def test_whatever_came_before_the_load_ends_at_the_same_side_of_its_play(backlash, slow, steps):
     given = axis(backlash=Backlash(backlash, velocity=0.3 if slow else None), arrival=Arrival(settle_s=0.01))
@@ -91,7 +91,7 @@ def test_whatever_came_before_the_load_ends_at_the_same_side_of_its_play(backlas
     assert np.abs(np.diff(v)).max(initial=0) <= A * TICK_S * (1 + 1e-4) + 1e-9
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(st.lists(st.floats(-0.3, 0.3), min_size=1, max_size=12), st.sampled_from([0.1, -0.1]))
 def test_every_tweak_of_a_chain_arrives_with_its_play_taken_up(steps, backlash):
     rig = Loose(axis(backlash=Backlash(backlash)))
@@ -105,7 +105,7 @@ def test_every_tweak_of_a_chain_arrives_with_its_play_taken_up(steps, backlash):
         assert abs(rig.load - (place - math.copysign(PLAY / 2, backlash))) <= 1e-9
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(
     st.lists(st.floats(-0.05, 0.05), min_size=1, max_size=12), st.integers(0, 4), st.lists(position, min_size=1, max_size=3)
 )
@@ -130,7 +130,7 @@ def test_a_stepper_is_where_its_encoder_says_or_says_that_it_is_not(losses, retr
     assert rig.kinds().count(EventKind.ENDED) == len(places)
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(st.lists(st.tuples(position, st.integers(1, 300)), min_size=1, max_size=5), st.floats(0.01, 0.5))
 def test_a_start_velocity_keeps_the_limits_and_ends_exactly(moves, jump):
     rig = Rig([axis(kind=AxisKind.STEPPER, k=None, start_velocity=jump)], tick_ns=TICK_NS)

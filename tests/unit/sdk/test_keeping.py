@@ -10,7 +10,20 @@ from motion_rig import MODE, Rig, axis, records
 
 from sioms.motion import AxisKind, Homing, Restore
 from sioms.protocol.flags import AxisStatus as S
-from sioms.sdk.keeping import AT_REST, HOMED, Contents, Entry, PositionFile, decode, encode, offset_of
+from sioms.protocol.flags import NodeClass
+from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.sdk.blocks import AxisBlock, BlockSpec
+from sioms.sdk.keeping import (
+    AT_REST,
+    HOMED,
+    Contents,
+    Entry,
+    PositionFile,
+    decode,
+    encode,
+    keep_positions,
+    offset_of,
+)
 
 BOOT = "b007"
 ALWAYS, MATCHING = Restore("always"), Restore("matching", 1e-3)
@@ -216,6 +229,20 @@ def test_wherever_a_process_is_killed_no_entry_is_wrong(tmp_path_factory, histor
         assert bool(entry.state & AT_REST) == noted[-1][0]
     believable = [note[1:] for note in (noted[-1:] if complete else noted[-2:]) if note[0]]
     assert not entry.state & AT_REST or entry[1:] in believable
+
+
+def test_only_banks_that_ask_for_it_get_a_file_and_a_missing_folder_is_told(tmp_path):
+    said = []
+    block = AxisBlock(BlockSpec("", NodeClass.AXIS, (ChannelInfo("x", "m"),)), Rig([axis(restore=ALWAYS)]).bank)
+    plain = AxisBlock(BlockSpec("plain", NodeClass.AXIS, (ChannelInfo("x", "m"),)), Rig([axis()]).bank)
+    log = lambda level, text: said.append(text)  # noqa: E731
+    assert keep_positions("", "mod0", [block, plain], log) == [] and "give [workcell] a state_folder" in said[0]
+    (tmp_path / "file").write_text("")
+    assert keep_positions(str(tmp_path / "file"), "mod0", [block], log) == [] and "not kept" in said[1]
+    assert block.bank.keeper is None
+    kept = keep_positions(str(tmp_path / "new" / "folder"), "mod0", [block, plain], log)
+    assert kept == [block.bank.keeper] and plain.bank.keeper is None and len(said) == 2
+    assert [p.name for p in (tmp_path / "new" / "folder").iterdir()] == ["mod0.positions"]
 
 
 def test_offsets_are_those_of_the_rule():
