@@ -39,7 +39,8 @@ PAGE_TIMEOUT_S = 2.0
 TRUSTED_NS = 2_000_000_000
 """A sensor that was silent for less than this is still the same one: only the stream is started again."""
 CLOCK_TOLERANCE = 0.01
-CLOCK_CHECK_NS = 2_000_000_000
+CLOCK_CHECK_NS = 5_000_000_000
+"""Long enough that records which arrive together do not matter."""
 LOOK_AT_THE_SENSOR = "look at host and port, and that RDT is enabled on the sensor's communication page"
 
 
@@ -123,6 +124,7 @@ class AtiRdt(StreamDriver):
             self._identify(page)
         yield from self._stop(1)
         self._sequence.expect_anew()
+        self._clock.expect_anew()
         command = rdt.Command.BUFFERED if self.settings.buffered else rdt.Command.REALTIME
         try:
             first: rdt.Record = yield rdt.start(command, self.silence_s)
@@ -247,6 +249,11 @@ class SampleClock:
     def restarts(self) -> int:
         """Times the sensor's count began anew."""
         return self._fit.restarts
+
+    def expect_anew(self) -> None:
+        """Forget the count: the sensor may have lost its power."""
+        self._fit.expect_anew()
+        self._first = None
 
     def to_host(self, count: int, now_ns: int) -> int:
         """Return the time of a sample [ns, CLOCK_MONOTONIC]; its arrival when the count has another rate."""

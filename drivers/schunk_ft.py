@@ -100,6 +100,7 @@ class SchunkFt(StreamDriver):
             if settings.noise_filter is not None:
                 yield Aside(commands.act(Command.NOISE_FILTER, settings.noise_filter))
             self._sequence.expect_anew()
+            self._clock.expect_anew()
             self._packet = None
             yield Aside(commands.act(Command.START))
         except LinkError as error:

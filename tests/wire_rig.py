@@ -46,12 +46,12 @@ class Wire:
         start: starts processes that end with the test.
         folder: a short path.
         name: of the counterpart's module.
-        options: of the counterpart; without ``--tcp`` it serves the link ``folder/port``.
+        options: of the counterpart; without ``--tcp`` or ``--port`` it serves the link ``folder/port``.
     """
 
     def __init__(self, start: Callable[..., Any], folder: Path, name: str, *options: object) -> None:
         self._start, self.folder = start, folder
-        port = () if "--tcp" in options else ("--link", folder / "port")
+        port = () if {"--tcp", "--port"}.intersection(options) else ("--link", folder / "port")
         command = [sys.executable, "-m", f"sioms.tools.counterparts.{name}", *port, *options]
         self.device = start([str(part) for part in command])
         self.port: str = self.device.wait_line(r"^ready (\S+)$").group(1)

@@ -81,12 +81,12 @@ def start(command: Command, timeout_s: float) -> Exchange:
     what = f"start the {command.name.lower()} stream"
 
     def want(reply: bytes) -> int | None:
-        if len(reply) % RECORD_BYTES:
-            raise LinkError(f"{what}: {len(reply)} bytes came, which are no records of {RECORD_BYTES}")
-        return RECORD_BYTES if reply else None
+        return RECORD_BYTES if reply and decode(reply) else None
 
     def decode(reply: bytes) -> Record:
-        return Record._make(_RECORD.unpack(reply[:RECORD_BYTES]))
+        if not reply or len(reply) % RECORD_BYTES:
+            raise LinkError(f"{what}: {len(reply)} bytes came, which are no records of {RECORD_BYTES}")
+        return Record._make(_RECORD.unpack_from(reply))
 
     return Exchange(request(command), want, decode, timeout_s, True, what)
 

@@ -61,6 +61,10 @@ class ClockFit:
         self._mapped_ns = max(min(self._map(device_ns), now_ns), self._mapped_ns)
         return self._mapped_ns
 
+    def expect_anew(self) -> None:
+        """Forget what was fitted: the device may have begun anew meanwhile. Mapped stamps still never go back."""
+        self._reset()
+
     def _reset(self) -> None:
         self._points: deque[tuple[int, int]] = deque(maxlen=BUCKETS)
         self._bucket_end_ns = 0
