@@ -38,6 +38,7 @@ class Stepper:
         limit_minus, limit_plus: the limit switches are on at and beyond these.
         home: the home switch is on at positions at and below this.
         start: true position at the start, where the field is too.
+        encoder_step: resolution of an encoder on the rotor [m or rad]; 0: there is none.
     """
 
     mass: float
@@ -52,6 +53,7 @@ class Stepper:
     limit_plus: float = math.inf
     home: float = -math.inf
     start: float = 0.0
+    encoder_step: float = 0.0
 
     @property
     def stiffness(self) -> float:
@@ -72,7 +74,8 @@ class StepperBank:
 
     Attributes (shape (n,), overwritten by each tick):
         position, velocity: true motion of the rotor [m, m/s].
-        reading: position of the field [m], all that a drive without encoder knows.
+        field: where the field is [m].
+        reading: what the drive knows [m]: the encoder's position, without one that of the field.
         stalled: the rotor is out of step with the field.
         lost_steps: full steps the rotor is behind the field since the start, counted when a stall ends.
         at_limit_minus, at_limit_plus, at_home: switches, at the true position.
@@ -105,7 +108,10 @@ class StepperBank:
         self._wave_number = math.pi / (2 * self._step)
         self._hold, self._load = _column(steppers, "hold_force"), _column(steppers, "load_force")
         self._per_corner = 1 / _column(steppers, "corner_velocity")
-        self.reading = np.round(self.position / self._micro) * self._micro
+        self.field = np.round(self.position / self._micro) * self._micro
+        self._encoder_step = _column(steppers, "encoder_step")
+        self._encoded = np.flatnonzero(self._encoder_step)
+        self.reading = self.field.copy()
         self._switches = [_column(steppers, name) for name in ("limit_minus", "limit_plus", "home")]
         self.at_limit_minus, self.at_limit_plus, self.at_home = np.zeros((3, n), dtype=np.bool_)
         self.stalled, self._flag = np.zeros((2, n), dtype=np.bool_)
@@ -121,12 +127,12 @@ class StepperBank:
         np.divide(position, self._micro, out=goal)
         np.round(goal, out=goal)
         np.multiply(goal, self._micro, out=goal)
-        np.subtract(goal, self.reading, out=move)
+        np.subtract(goal, self.field, out=move)
         # Rotors that rest on a resting field stay there: their force stays below stiction.
         if np.count_nonzero(move) or np.count_nonzero(self.velocity) or not self._rested:
             self._turn()
         self._rested = not np.count_nonzero(move)
-        np.copyto(self.reading, goal)
+        np.copyto(self.field, goal)
         self._sense()
 
     def _turn(self) -> None:
@@ -145,7 +151,7 @@ class StepperBank:
         """Step the rotors under the field at the middle of the substep."""
         field, force, work = self._field, self._force, self._work
         np.multiply(self._move, share, out=field)
-        np.add(field, self.reading, out=field)
+        np.add(field, self.field, out=field)
         np.multiply(self.velocity, self._substep_s / 2, out=force)
         np.add(force, self.position, out=force)
         np.subtract(field, force, out=force)
@@ -180,9 +186,13 @@ class StepperBank:
         np.add(self._force, brake, out=self._force)
 
     def _sense(self) -> None:
-        """Set step loss and switches."""
+        """Set reading, step loss and switches."""
+        np.copyto(self.reading, self.field)
+        if self._encoded.size:
+            rows, step = self._encoded, self._encoder_step[self._encoded]
+            self.reading[rows] = np.round(self.position[rows] / step) * step
         lag, work = self._field, self._work
-        np.subtract(self.reading, self.position, out=lag)
+        np.subtract(self.field, self.position, out=lag)
         np.divide(lag, self._step, out=lag)
         np.subtract(lag, self.lost_steps, out=work)
         np.abs(work, out=work)
@@ -219,6 +229,8 @@ def _check(steppers: Sequence[Stepper], tick_s: float) -> None:
             value = getattr(motor, name)
             if not value > 0:
                 raise ValueError(f"build stepper {axis}: {name} {value:g}; must be positive")
+        if not motor.encoder_step >= 0:
+            raise ValueError(f"build stepper {axis}: encoder_step {motor.encoder_step:g}; must be 0 or more")
         if not 0 <= motor.coulomb + abs(motor.load_force) < motor.hold_force or motor.damping_ratio < 0:
             raise ValueError(
                 f"build stepper {axis}: coulomb {motor.coulomb:g}, load_force {motor.load_force:g}, damping_ratio "

@@ -70,6 +70,37 @@ def test_stepper_that_loses_steps_does_not_notice_but_the_world_does(bench):
     assert mod.blocks[1].data[0] < 0.29
 
 
+def test_stepper_with_an_encoder_finds_its_lost_steps_again(bench):
+    """At full speed it falls out of step; the way that is left is too short to get so fast."""
+    fast = STEPPER | {
+        "acceleration_max": 8.0, "velocity_max": 1.5,
+        "stepper": STEPPER["stepper"] | {"corner_velocity": 0.05, "load_force": -4.0, "encoder_step": 1e-6},
+        "arrival": {"settle_s": 0.05, "tolerance": 1e-4, "retries": 10},
+    }  # fmt: skip
+    mod = bench.make(SimAxes, "belt0", {"axis": [fast]})
+    bench.run(0.01)
+    bench.write(mod, control_mode=ControlMode.POSITION, position=0.03)
+    bench.run(3.0, until=lambda: mod.bank.is_idle([0]))
+    tried = mod.bank.particulars([0])["retries"][0]
+    assert 0 < tried < 10 and not status(mod) & AxisStatus.MISSED_TARGET
+    assert mod.blocks[1].data[0] == pytest.approx(0.03, abs=1e-4 + 1e-6), "the load is there"
+    assert mod.bank.fields[0, 0] == pytest.approx(0.03, abs=1e-4)
+
+
+def test_stepper_that_slips_every_time_says_so(bench):
+    stuck = STEPPER | {
+        "stepper": STEPPER["stepper"] | {"hold_force": 3.2, "encoder_step": 1e-6},
+        "arrival": {"tolerance": 1e-4, "retries": 3},
+    }
+    mod = bench.make(SimAxes, "belt0", {"axis": [stuck]})
+    bench.run(0.01)
+    bench.write(mod, control_mode=ControlMode.POSITION, position=0.05)
+    bench.run(4.0, until=lambda: mod.bank.is_idle([0]))
+    assert mod.bank.particulars([0])["retries"] == [3] and mod.bank.particulars([0])["misses"] == [1]
+    assert status(mod) & AxisStatus.MISSED_TARGET
+    assert mod.blocks[1].data[0] == pytest.approx(mod.bank.fields[0, 0], abs=1e-5) and mod.bank.fields[0, 0] < 0.04
+
+
 def test_homing_finds_the_switch_edge(bench):
     homing = {"velocity": 0.1, "slow_velocity": 0.01, "direction": -1, "offset": 0.0}
     axis = SERVO | {

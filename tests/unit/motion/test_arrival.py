@@ -67,6 +67,19 @@ def test_a_move_that_comes_from_the_right_side_is_not_longer_than_without_a_take
     assert times[0] == times[1]
 
 
+def test_a_move_too_fast_to_stop_at_its_new_target_comes_back_to_it_from_its_side():
+    rig = Rig([PLUS])
+    rig.write(mode=MODE.VELOCITY, velocity=2.0)
+    rig.tick(600)
+    here = rig.field("commanded_position")
+    target = here + 1.5 * D  # more than the take-up ahead, and less than the way to a stop
+    rig.write(mode=MODE.POSITION, position=target, replace=True)
+    rig.run()
+    p, v = rig.trace("commanded_position"), rig.trace("commanded_velocity")
+    assert p.max() > target + D and p[-1] == pytest.approx(target)
+    assert last_turn(p, v) == pytest.approx(target - D, abs=1e-3)
+
+
 def test_the_take_up_has_its_own_velocity_and_acceleration():
     rig = Rig([PLUS], start=[1.0])
     rig.write(mode=MODE.POSITION, position=0.0)
