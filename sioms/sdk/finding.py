@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import sys
 from collections import Counter
 from collections.abc import Mapping
 from functools import cache
@@ -65,9 +66,11 @@ def _from_file(path: str) -> type[Driver]:
     if spec is None or spec.loader is None or not os.path.isfile(path):
         raise DriverNotFound(f"driver = {path}: no such file; want a Python file that defines DRIVER")
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where annotations that are still text are looked up
     try:
         spec.loader.exec_module(module)
     except Exception as error:
+        del sys.modules[spec.name]
         raise DriverNotFound(f"driver = {path}: import failed: {type(error).__name__}: {error}") from error
     if not hasattr(module, "DRIVER"):
         raise DriverNotFound(f"driver = {path}: it defines no DRIVER; set DRIVER to the driver's class")

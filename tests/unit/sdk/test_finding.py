@@ -1,0 +1,61 @@
+"""Drivers found by the path of a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sioms.sdk.finding import DriverNotFound, find_driver, read_settings
+
+FILE = """
+from __future__ import annotations
+
+import msgspec
+
+from sioms.sdk.blocks import Description
+from sioms.sdk.driver import TickDriver
+from sioms.sdk.settings import LineSettings
+
+
+class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    line: LineSettings
+
+
+class Own(TickDriver):
+    Settings = Settings
+
+    @classmethod
+    def describe(cls, name, settings):
+        return Description((), 10.0)
+
+    blocks = ()
+
+    def tick(self, now_ns):
+        pass
+
+
+DRIVER = Own
+"""
+
+
+def test_annotations_that_are_text_are_understood(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(FILE)
+    driver = find_driver("./own.py", str(tmp_path))
+    settings, errors = read_settings(driver, {"line": {"serial": "/dev/ttyUSB0"}}, str(tmp_path))
+    assert not errors and settings.line.serial == "/dev/ttyUSB0"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "no such file"),
+        ("1 / 0", "import failed: ZeroDivisionError"),
+        ("x = 1", "it defines no DRIVER"),
+    ],
+)
+def test_files_that_are_no_driver(tmp_path: Path, text: str | None, words: str) -> None:
+    if text is not None:
+        (tmp_path / "own.py").write_text(text)
+    with pytest.raises(DriverNotFound, match=words):
+        find_driver("./own.py", str(tmp_path))
