@@ -124,6 +124,7 @@ class Iio(StreamDriver):
         self._scaling = [_Scaling(device, channel) for channel in settings.channels]
         self._types = {element.name: element.type for element in layout.elements}
         self._last_ns = 0
+        self._began_ns = time.monotonic_ns() if TIMESTAMP in self._types else 0
         device.write(f"{device.buffer}/enable", 1)
         yield from ()
 
@@ -140,6 +141,8 @@ class Iio(StreamDriver):
             flags[:, index] = _saturated(raw[channel], self._types[channel])
         stamps = self._stamps(raw, scans, now_ns)
         for row, flag, stamp_ns in zip(values, flags, stamps, strict=True):
+            if stamp_ns < self._began_ns:
+                continue  # left over from before: the driver was killed with the buffer on
             self._block.data[:] = row
             self._block.flags[:] = flag | self._overrun(stamp_ns)
             self._stamp_ns = self._block.stamp_ns = max(stamp_ns, self._stamp_ns + 1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -55,6 +57,15 @@ def test_scans_of_a_buffer(start: Callable[..., Any], short_folder: Path) -> Non
         assert sum(bool(old.flags[0] & AnalogStatus.OVERRUN) for old in node.history(number)) == 1
         wire.tell("volt accel_x 1000")
         wait_for(lambda: node.read().flags == (0, 0, AnalogStatus.SATURATED), "the converter's end")
+        # a driver killed with the buffer on: the new one takes no old scans for new ones
+        wire.tell("bytes 65536")  # a pipe keeps half a scan for the next reader, the kernel does not
+        time.sleep(0.05)
+        killed, before_ns = wire.pid("adc0"), time.monotonic_ns()
+        os.kill(killed, signal.SIGKILL)
+        wait_for(lambda: wire.pid("adc0") not in (0, killed), "a new driver")
+        wire.wait_up("adc0")
+        with cell.open("adc0") as again:
+            assert all(old.stamp_ns > before_ns for old in again.history(0))
         # the cable pulled and put back
         wire.tell("unplug")
         wait_for(lambda: not wire.reads("adc0"), "the loss")

@@ -12,9 +12,11 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import fcntl
 import os
 import shutil
 import struct
+import termios
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -132,12 +134,16 @@ class Dummy:
             if self.lose:
                 self.lose, self.lost = self.lose - 1, self.lost + 1
                 continue
-            try:
-                for at in range(0, len(scan), self.piece):
-                    os.write(self._pipe, scan[at : at + self.piece])
-                self.sent += 1
-            except BlockingIOError:
-                self.lost += 1
+            if self._waiting() >= int(self.read("buffer/length") or 2) * len(scan):
+                self.lost += 1  # the kernel's buffer keeps the oldest
+                continue
+            for at in range(0, len(scan), self.piece):
+                os.write(self._pipe, scan[at : at + self.piece])
+            self.sent += 1
+
+    def _waiting(self) -> int:
+        """Return how many bytes the reader has not taken."""
+        return int(struct.unpack("i", fcntl.ioctl(self._pipe, termios.FIONREAD, bytes(4)))[0])
 
     def _scan(self, at_s: float) -> bytes:
         """Return a scan of what is switched on: each value at its own alignment, the whole padded to the largest."""

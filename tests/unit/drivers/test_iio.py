@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -81,10 +82,11 @@ def test_scans_without_a_clock_of_ours_are_mapped(tmp_path: Path) -> None:
                     (dummy.root / f"scan_elements/in_timestamp_{name}").unlink()
             driver = Iio("a", msgspec.convert(table, Iio.Settings), kit)  # type: ignore[arg-type]
             assert list(driver.open()) == []
-            scans = [dummy._scan(50.0 + i / 100) for i in range(5)]
-            driver.feed(b"".join(scans), 51_000_000_000)
+            began_s = time.monotonic()
+            scans = [dummy._scan(began_s + (i - 1) / 100) for i in range(6)]
+            driver.feed(b"".join(scans[not stamped :]), round((began_s + 1) * 1e9))
             stamps = [stamp for stamp, _, _ in kit.published]
-            wanted = 50.0 if stamped else 50.96
+            wanted = began_s if stamped else began_s + 0.96  # the scan from before the opening is not taken
             assert stamps == pytest.approx([(wanted + i / 100) * 1e9 for i in range(5)], abs=2e6)
             assert np.array([data for _, data, _ in kit.published]) == pytest.approx(80 * 1.3333e-3)
             list(driver.close())
