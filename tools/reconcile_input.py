@@ -75,7 +75,7 @@ def _files(data: Path) -> list[Path]:
     return [data] if data.is_file() else sorted(p for p in data.iterdir() if p.suffix in SUFFIXES)
 
 
-def _load(path: Path) -> dict[str, Array]:
+def load_columns(path: Path) -> dict[str, Array]:
     """Read the columns of one file."""
     if not path.exists():
         raise BadInputError(f"read {path}: no such file")
@@ -102,7 +102,7 @@ def _load(path: Path) -> dict[str, Array]:
 
 
 def _record(path: Path, columns: Mapping[str, Any], model: AxisModel) -> Record:
-    raw = _load(path)
+    raw = load_columns(path)
     only(columns, QUANTITIES, "the column description")
     found: dict[str, Array] = {}
     for quantity, spec in columns.items():
@@ -133,7 +133,7 @@ def read_layout(folder: Path, model: AxisModel) -> Session:
     """Read ``rec_*.npz`` with counts, cmd16, force, force_meas and index."""
     records = []
     for path in sorted(folder.glob("rec_*.npz")):
-        raw = _load(path)
+        raw = load_columns(path)
         for needed in ("counts", "force"):
             if needed not in raw:
                 raise BadInputError(f"read {path.name}: no array {needed}; has {', '.join(sorted(raw))}")

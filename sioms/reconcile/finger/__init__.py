@@ -1,0 +1,1 @@
+"""Reconcile for the tactile finger: what the simulation of its outputs lacks."""

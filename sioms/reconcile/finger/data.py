@@ -1,0 +1,230 @@
+"""Lay touches, courses, untouched frames, ramps and the load cell out as rows for the fit.
+
+Views: ``touch`` (output of every element under every touch), ``course`` (how the touch develops while the load stays),
+``drift`` (level of untouched outputs over temperature), ``ramp``, ``cell``. Nuisances are projected out: the true load of a
+touch within the load cell's noise, zero and scale of a ramp, the level at power-up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.reconcile.finger.belief import Belief, Scene, late, outputs, scene_of
+from sioms.reconcile.finger.pressures import Floats
+from sioms.reconcile.finger.records import PARTS, Ramped, Touched, Untouched
+from sioms.reconcile.sensors.effect import SensorModel
+
+VIEWS = ("touch", "course", "drift", "ramp", "cell")
+TOUCH, COURSE, DRIFT, RAMP, CELL = range(5)
+GROUP = 6  # touches in a block
+_CONTRASTS = np.array([[-3, -1, 1, 3], [1, -1, -1, 1], [-1, 3, -3, 1]]) / np.array([[20**0.5], [2.0], [20**0.5]])
+
+
+@dataclass(frozen=True, eq=False)
+class FingerData:
+    """Rows of one finger; immutable. Make it with ``lay_out``."""
+
+    touched: Touched
+    scene: Scene
+    alive: NDArray[np.intp]
+    untouched: Untouched | None
+    ramps: tuple[Ramped, ...]
+    ramp_scene: Scene | None
+    load_share: Floats  # relative standard deviation of each touch's load
+    cell_spread: float  # relative spread of the cell about the commanded load, nan without a cell
+    view: NDArray[np.int64]
+    block: NDArray[np.int64]
+    element: NDArray[np.int64]
+    views: tuple[str, ...] = VIEWS
+
+    def predict(self, model: SensorModel) -> Floats:
+        """See ``sensors.fit.Data``; outputs in units of their noise."""
+        b: Belief = model.belief()
+        t = self.touched
+        out = outputs(b, self.scene)[:, self.alive]
+        course = late(b, t.since)
+        mean = course.mean(1)
+        rows = [(out * mean[:, None] / self._sigma).ravel()]
+        rows.append((((course - mean[:, None]) @ _CONTRASTS.T) / self.course_sigma[:, None]).ravel())
+        rows.append(self._drift(b))
+        rows.append(self._ramps(b))
+        if np.isfinite(self.cell_spread):
+            rows.append(np.full(len(t), (1.0 + b.cell) / self.cell_spread))
+        return np.concatenate(rows)
+
+    def miss(self, predicted: Floats) -> Floats:
+        """See ``sensors.fit.Data``."""
+        return self.whiten(predicted - self.measured())
+
+    def measured(self) -> Floats:
+        """Return the measured rows in the units of ``predict``."""
+        t = self.touched
+        rows = [(t.output[:, self.alive] / self._sigma).ravel()]
+        weight = self._weight
+        relative = np.einsum("ji,jpi->jp", weight, t.part[:, :, self.alive] - t.output[:, None, self.alive])
+        rows.append(((relative @ _CONTRASTS.T) / self.course_sigma[:, None]).ravel())
+        level = t.level[:, self.alive].mean(1) / self._level_sigma
+        rows.append(level if self._has_temperature else np.empty(0))
+        if self.untouched is not None:
+            rows.append((self.untouched.output[:, self.alive] / self.untouched.noise[self.alive]).ravel())
+        rows += [r.output / r.noise for r in self.ramps]
+        if np.isfinite(self.cell_spread):
+            rows.append(t.cell / t.load / self.cell_spread)
+        return np.concatenate(rows)
+
+    def whiten(self, change: Floats) -> Floats:
+        """Project out the nuisances, shape (n,) or (n, k)."""
+        flat = change.ndim == 1
+        c = change[:, None].copy() if flat else change.copy()
+        count, ns, k = len(self.touched), len(self.alive), c.shape[1]
+        touch = c[: count * ns].reshape(count, ns, k)
+        u = self.touched.output[:, self.alive] / self._sigma
+        n = np.einsum("ji,ji->j", u, u)
+        factor = (1.0 - 1.0 / np.sqrt(1.0 + n * self.load_share**2)) / np.maximum(n, 1e-12)
+        touch -= factor[:, None, None] * u[:, :, None] * np.einsum("ji,jik->jk", u, touch)[:, None]
+        for begin, stop, basis in self._projected:
+            part = c[begin:stop]
+            part -= basis @ (basis.T @ part)
+        return c[:, 0] if flat else c
+
+    @cached_property
+    def _sigma(self) -> Floats:
+        """Noise of a touch's output, shape (nt, alive)."""
+        out: Floats = np.sqrt(self.touched.share)[:, None] * self.touched.noise[self.alive]
+        return out
+
+    @cached_property
+    def _weight(self) -> Floats:
+        """Weights that turn a touch's outputs into one relative number, shape (nt, alive)."""
+        loud = self.touched.output[:, self.alive]
+        loud = np.where(np.abs(loud) > 0.25 * np.abs(loud).max(1, keepdims=True), loud, 0.0)
+        w = loud / self.touched.noise[self.alive] ** 2
+        out: Floats = w / np.maximum(np.einsum("ji,ji->j", w, loud), 1e-12)[:, None]
+        return out
+
+    @cached_property
+    def course_sigma(self) -> Floats:
+        """Noise of one contrast of a touch's course, shape (nt,)."""
+        own = np.sqrt(np.einsum("ji,i->j", self._weight**2, self.touched.noise[self.alive] ** 2))
+        frames = 2.0 / self.touched.share
+        out: Floats = own * np.sqrt(PARTS / frames)
+        return out
+
+    @cached_property
+    def _has_temperature(self) -> bool:
+        return warm_known(self.touched)
+
+    @cached_property
+    def _level_sigma(self) -> float:
+        t = self.touched
+        own = float(np.mean(t.noise[self.alive] ** 2) * np.median(t.share)) / 2.0 / len(self.alive)
+        level, warm = t.level[:, self.alive].mean(1), t.temperature - t.temperature.mean()
+        slope = float(warm @ level) / max(float(warm @ warm), 1e-12)
+        return float(np.sqrt(own + slope**2 * np.median(t.temperature_noise) ** 2))
+
+    def _drift(self, b: Belief) -> Floats:
+        rows = []
+        if self._has_temperature:
+            rows.append(self.touched.temperature * b.temperature[self.alive].mean() / self._level_sigma)
+        if self.untouched is not None:
+            u = self.untouched
+            rows.append((u.temperature[:, None] * b.temperature[self.alive] / u.noise[self.alive]).ravel())
+        return np.concatenate(rows) if rows else np.empty(0)
+
+    def _ramps(self, b: Belief) -> Floats:
+        if self.ramp_scene is None:
+            return np.empty(0)
+        full, at, out = outputs(b, self.ramp_scene), 0, []
+        for r in self.ramps:
+            n = len(r.load)
+            own = full[at : at + n, r.element]
+            at += n
+            if b.creep:
+                own = own - b.creep * b.creep_time * -np.expm1(-r.since / b.creep_time) * np.gradient(own, r.since)
+            out.append(own / r.noise)
+        return np.concatenate(out)
+
+    @cached_property
+    def _projected(self) -> list[tuple[int, int, Floats]]:
+        """Spans of rows with the nuisance directions that are taken off them, orthonormal."""
+        out: list[tuple[int, int, Floats]] = []
+        at = len(self.touched) * (len(self.alive) + len(_CONTRASTS))
+        if self._has_temperature:
+            n = len(self.touched)
+            out.append((at, at + n, np.full((n, 1), n**-0.5)))
+            at += n
+        if self.untouched is not None:
+            n, ns = self.untouched.output[:, self.alive].shape
+            basis = np.zeros((n, ns, ns))
+            basis[:, np.arange(ns), np.arange(ns)] = n**-0.5
+            out.append((at, at + n * ns, basis.reshape(n * ns, ns)))
+            at += n * ns
+        for r in self.ramps:
+            n = len(r.load)
+            out.append((at, at + n, np.linalg.qr(np.stack([np.ones(n), r.output], axis=1))[0]))
+            at += n
+        return out
+
+
+def lay_out(touched: Touched, alive: NDArray[np.intp], untouched: Untouched | None, ramps: tuple[Ramped, ...],
+            elements: Floats, load_share: Floats, load: Floats, cell_spread: float) -> FingerData:
+    """Lay out the rows.
+
+    Args:
+        alive: elements that answer.
+        elements: angles of the elements [rad]; ramps lie over them.
+        load: best guess of each touch's load [N/m] and its relative standard deviation beside it.
+        cell_spread: relative spread of the cell about the commanded load, nan without a cell.
+    """
+    warm = np.nan_to_num(touched.temperature - np.nanmean(touched.temperature)) if warm_known(touched) else 0.0 * load
+    scene = Scene(touched.place, load, touched.radius, touched.since, touched.time - touched.time.mean(), warm)
+    ramp_scene = None
+    if ramps:
+        place = np.concatenate([np.full(len(r.load), elements[r.element]) for r in ramps])
+        loads = np.concatenate([r.load for r in ramps])
+        ramp_scene = scene_of(place, loads, np.zeros(len(loads)))
+    count, ns = len(touched), len(alive)
+    group = np.arange(count) // GROUP
+    group = np.minimum(group, max(count // GROUP - 1, 0))
+    parts: list[tuple[int, NDArray[np.int64], NDArray[np.int64]]] = [
+        (TOUCH, np.repeat(group, ns), np.tile(alive, count)),
+        (COURSE, np.repeat(group, len(_CONTRASTS)), np.full(count * len(_CONTRASTS), -1)),
+    ]
+    if warm_known(touched):
+        parts.append((DRIFT, group, np.full(count, -1)))
+    if untouched is not None:
+        n = len(untouched.temperature)
+        parts.append((DRIFT, np.repeat(np.arange(n) * 12 // n, ns), np.tile(alive, n)))
+    for r in ramps:
+        parts.append((RAMP, np.zeros(len(r.load), dtype=np.int64), np.full(len(r.load), r.element)))
+    if np.isfinite(cell_spread):
+        parts.append((CELL, group, np.full(count, -1)))
+    blocks, first = [], 0
+    for _, own, _ in parts:
+        blocks.append(own + first)
+        first += int(own.max()) + 1
+    return FingerData(
+        touched, scene, alive, untouched, ramps, ramp_scene, load_share, cell_spread,
+        np.concatenate([np.full(len(own), v) for v, own, _ in parts]), np.concatenate(blocks),
+        np.concatenate([e for _, _, e in parts]).astype(np.int64))
+
+
+def warm_known(touched: Touched) -> bool:
+    """Say whether the temperature was recorded, and not as a constant."""
+    return bool(np.isfinite(touched.temperature).all() and np.ptp(touched.temperature) > 0.0)
+
+
+def only(data: FingerData, which: NDArray[np.bool_], elements: Floats) -> FingerData:
+    """Return the rows of some touches, and every fifth or the other untouched rows and ramps with them."""
+    few = np.count_nonzero(which) < 0.5 * len(which)
+    u = data.untouched
+    if u is not None:
+        mine = (np.arange(len(u.temperature)) % 5 == 2) == few
+        u = replace(u, output=u.output[mine], temperature=u.temperature[mine])
+    ramps = tuple(r for i, r in enumerate(data.ramps) if (i % 5 == 2) == few)
+    return lay_out(data.touched.pick(which), data.alive, u, ramps, elements, data.load_share[which],
+                   data.scene.load[which], data.cell_spread)

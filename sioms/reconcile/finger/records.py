@@ -1,0 +1,233 @@
+"""Reduce recorded frames to what is fitted: touches with their course in time, untouched frames, load ramps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.finger.pressures import Floats
+from sioms.tactile.touches import BASELINE, LOADED, Recording
+
+PARTS = 4  # of the course of a touch under load
+LEAST_TOUCHES = 24
+RAMP_BINS = 16
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Touched:
+    """Touches of all experiments, averaged; outputs as fractions, shape (nt, ns) where not said.
+
+    Attributes:
+        name: experiment of each touch.
+        place, load, radius: as commanded [rad, N/m, m], shape (nt,).
+        cell: load cell, loaded less baseline [N/m], nan without; cell_noise: its standard deviation.
+        output: mean under load less baseline; part: the same for ``PARTS`` parts, shape (nt, PARTS, ns).
+        since: middle of each part after the load came on [s], shape (nt, PARTS).
+        level: baseline; temperature, temperature_noise: [deg C] of the baseline, nan without; time: [s] of the baseline.
+        share: 1/frames under load + 1/frames of baseline, shape (nt,): variance of a mean over that of a frame.
+        noise: standard deviation of one frame, shape (ns,).
+    """
+
+    name: tuple[str, ...]
+    place: Floats
+    load: Floats
+    radius: Floats
+    cell: Floats
+    cell_noise: Floats
+    output: Floats
+    part: Floats
+    since: Floats
+    level: Floats
+    temperature: Floats
+    temperature_noise: Floats
+    time: Floats
+    share: Floats
+    noise: Floats
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+    def pick(self, which: NDArray[np.bool_]) -> Touched:
+        """Return some of the touches."""
+        own = {n: getattr(self, n)[which] for n in ("place", "load", "radius", "cell", "cell_noise", "output", "part", "since",
+                                                    "level", "temperature", "temperature_noise", "time", "share")}
+        return Touched(name=tuple(n for n, w in zip(self.name, which, strict=True) if w), noise=self.noise, **own)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Untouched:
+    """Frames without contact: outputs (n, ns) as fractions, temperature [deg C] (n,), noise of a row (ns,)."""
+
+    output: Floats
+    temperature: Floats
+    noise: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ramped:
+    """One load ramp of an edge over one element, in bins: output (n,), load [N/m] (n,), time since its start [s] (n,)."""
+
+    element: int
+    output: Floats
+    load: Floats
+    since: Floats
+    noise: float
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line in the spectrum of untouched frames: frequency [Hz], amplitude and its deviation [output]."""
+
+    frequency: float
+    amplitude: float
+    deviation: float
+
+
+def reduce_touches(
+    experiments: Sequence[tuple[str, Recording, Floats, Floats, Floats]], scale: float, dead: NDArray[np.bool_],
+    lines: Sequence[Line] = (),
+) -> tuple[Touched, list[str]]:
+    """Average the touches of all experiments.
+
+    Args:
+        experiments: name, recording, and per touch place [rad], load [N/m], indenter radius [m].
+        scale: output per raw unit.
+        dead: elements whose readings are not looked at.
+        lines: taken off within every phase of every touch.
+
+    Returns:
+        The touches, and notes on those left out.
+    """
+    rows: dict[str, list[object]] = {k: [] for k in ("name", "place", "load", "radius", "cell", "cell_noise", "output", "part",
+                                                     "since", "level", "temperature", "temperature_noise", "time", "share")}
+    variances: list[Floats] = []
+    notes: list[str] = []
+    for name, r, place, load, radius in experiments:
+        left = 0
+        for number in range(len(place)):
+            mine = np.flatnonzero(r.touch == number)
+            before, under = mine[r.phase[mine] == BASELINE], mine[r.phase[mine] == LOADED]
+            readings = r.raw[np.concatenate([before, under])][:, ~dead]
+            if len(before) < 2 or len(under) < PARTS or not np.isfinite(readings).all():
+                left += 1
+                continue
+            quiet = _without_lines(r.raw[before] * scale, r.time_s[before], lines)
+            loud = _without_lines(r.raw[under] * scale, r.time_s[under], lines)
+            onset = _onset(r, mine, before, under)
+            parts = np.array_split(np.arange(len(under)), PARTS)
+            level = quiet.mean(0)
+            variances.append(quiet.var(0, ddof=1))
+            cell = r.force[under].mean() - r.force[before].mean()
+            spread = np.sqrt(np.var(r.force[under], ddof=1) / len(under) + np.var(r.force[before], ddof=1) / len(before))
+            values = (name, place[number], load[number], radius[number], cell, spread, loud.mean(0) - level,
+                      np.array([loud[p].mean(0) - level for p in parts]),
+                      np.array([r.time_s[under[p]].mean() - onset for p in parts]), level,
+                      r.temperature_c[before].mean(),
+                      np.std(r.temperature_c[before], ddof=1) / np.sqrt(len(before)), r.time_s[before].mean(), 1.0 / len(under) + 1.0 / len(before))
+            for key, value in zip(rows, values, strict=True):
+                rows[key].append(value)
+        if left:
+            notes.append(f"{name}: {left} of {len(place)} touches left out, frames are missing or no numbers")
+    count = len(rows["place"])
+    if count < LEAST_TOUCHES:
+        raise BadInputError(f"read touches: {count} complete touches are too few; record {LEAST_TOUCHES} or more over the arc")
+    arrays = {k: np.array(v, dtype=np.float64) for k, v in rows.items() if k != "name"}
+    noise = np.sqrt(np.mean(variances, axis=0))
+    return Touched(name=tuple(str(n) for n in rows["name"]), noise=noise, **arrays), notes
+
+
+def _onset(r: Recording, mine: NDArray[np.intp], before: NDArray[np.intp], under: NDArray[np.intp]) -> float:
+    """Return when the load came on: at half its height where that was recorded, else right after the baseline."""
+    between = mine[(mine > before[-1]) & (mine < under[0])]
+    if len(between) and np.isfinite(r.force[between]).all():
+        half = 0.5 * (r.force[before].mean() + r.force[under].mean())
+        above = between[r.force[between] >= half]
+        return float(r.time_s[above[0]] if len(above) else r.time_s[under[0]])
+    return float(r.time_s[before[-1]])
+
+
+def _without_lines(frames: Floats, time: Floats, lines: Sequence[Line]) -> Floats:
+    """Take sines of known frequencies off a run of frames; amplitudes and phases are free."""
+    if not lines or len(frames) < 2 * len(lines) + 4:
+        return frames
+    angle = 2.0 * np.pi * np.array([line.frequency for line in lines]) * (time - time[0])[:, None]
+    waves = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
+    full = np.concatenate([np.ones((len(time), 1)), waves], axis=1)
+    c = np.linalg.lstsq(full, frames, rcond=1e-8)[0]
+    out: Floats = frames - waves @ c[1:]
+    return out
+
+
+def reduce_untouched(r: Recording, scale: float, skip_s: float = 10.0, after_s: float = -np.inf) -> Untouched | None:
+    """Return untouched frames with their temperature; those whose time reaches back to a touch are left out."""
+    step = float(np.median(np.diff(r.time_s))) if len(r.time_s) > 1 else 0.0
+    good = np.isfinite(r.temperature_c) & np.isfinite(r.raw).all(axis=1) & (r.time_s - step > after_s + skip_s)
+    if np.count_nonzero(good) < 8:
+        return None
+    output = r.raw[good] * scale
+    # what goes with the temperature is no noise, and does not pass for it where it swings fast
+    warm = r.temperature_c[good] - r.temperature_c[good].mean()
+    own = np.stack([np.ones_like(warm), warm, warm**2], axis=1)
+    second = np.diff(output - own @ np.linalg.lstsq(own, output, rcond=1e-10)[0], 2, axis=0)
+    noise = np.sqrt(np.mean(second**2, axis=0) / 6.0)
+    return Untouched(output, r.temperature_c[good], np.maximum(noise, 1e-9))
+
+
+def reduce_ramps(r: Recording, scale: float, dead: NDArray[np.bool_]) -> list[Ramped]:
+    """Return load ramps in bins; touch n lies over element n; the load is the line through the load cell's readings."""
+    out = []
+    for number in np.unique(r.touch[r.touch >= 0]):
+        n = int(number)
+        mine = r.touch == number
+        before, under = np.flatnonzero(mine & (r.phase == BASELINE)), np.flatnonzero(mine & (r.phase == LOADED))
+        if len(under) < 2 * RAMP_BINS or len(before) < 2 or n >= r.raw.shape[1] or dead[n]:
+            continue
+        clock = r.time_s[under] - r.time_s[before[-1]]
+        if not (np.isfinite(r.raw[under, n]).all() and np.isfinite(r.force[under]).all()):
+            continue
+        load = np.polyval(np.polyfit(clock, r.force[under] - r.force[before].mean(), 1), clock)
+        output = scale * (r.raw[under, n] - r.raw[before, n].mean())
+        bins = np.array_split(np.arange(len(under)), RAMP_BINS)
+        keep = [p for p in bins if load[p].min() > 0.02 * load.max()]
+        if len(keep) < 4:
+            continue
+        noise = float(np.sqrt(np.mean(np.diff(output, 2) ** 2) / 6.0 / len(keep[0])))
+        out.append(Ramped(n, np.array([output[p].mean() for p in keep]), np.array([load[p].mean() for p in keep]),
+                          np.array([clock[p].mean() for p in keep]), noise))
+    return out
+
+
+def find_lines(r: Recording, scale: float, outstanding: float = 60.0) -> list[Line]:
+    """Return lines that stand out of the spectrum of untouched frames, the loudest first.
+
+    Power is averaged over elements; noise of any colour has no single bin that many times above its neighbours.
+    """
+    good = np.isfinite(r.raw).all(axis=1)
+    raw = (r.raw[good] - r.raw[good].mean(0)) * scale
+    frames = len(raw)
+    if frames < 1024 or not np.any(raw):
+        return []
+    window = np.hanning(frames)
+    spectrum = np.abs(np.fft.rfft(raw * window[:, None], axis=0)) ** 2
+    power = spectrum.mean(1)
+    reach = max(frames // 64, 16)
+    padded = np.pad(power, reach, mode="reflect")
+    floor = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1), axis=1)
+    frequency = np.fft.rfftfreq(frames, 1.0 / r.rate_hz)
+    out: list[Line] = []
+    taken = np.zeros(len(power), dtype=bool)
+    taken[:8] = True
+    for place in np.argsort(-power)[:64]:
+        if taken[place] or power[place] < outstanding * floor[place]:
+            continue
+        taken[max(place - 6, 0) : place + 7] = True
+        near = slice(max(int(place) - 1, 0), int(place) + 2)
+        fine = float(np.sum(frequency[near] * power[near]) / np.sum(power[near]))
+        angle = 2.0 * np.pi * fine * np.arange(frames) / r.rate_hz
+        amplitude = np.hypot(np.cos(angle) @ raw, np.sin(angle) @ raw) * 2.0 / frames
+        out.append(Line(fine, float(np.sqrt(np.mean(amplitude**2))), float(np.std(amplitude) / np.sqrt(raw.shape[1]))))
+    return out[:4]

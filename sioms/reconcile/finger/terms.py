@@ -1,0 +1,85 @@
+"""Nameless terms: what a refusal may offer for a finger when no effect of the library explains the touches.
+
+A term describes the residual in symbols; it claims no cause and is kept out of the list of named effects.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sioms.reconcile.effect import Channel
+from sioms.reconcile.finger.belief import Belief, Response, Scene
+from sioms.reconcile.finger.pressures import Floats
+from sioms.reconcile.sensors.effect import Quantity, SensorEffect, Values
+
+TERM_PREFIX = "term_"
+_LOAD = 200.0
+
+
+def cubed(output: Floats, scene: Scene, p: Floats) -> Floats:
+    """Add k d^3."""
+    out: Floats = output + p[0] * output**3
+    return out
+
+
+def fading(output: Floats, scene: Scene, p: Floats) -> Floats:
+    """Multiply by 1 + k (t - mean t)."""
+    out: Floats = output * (1.0 + p[0] * scene.time)[:, None]
+    return out
+
+
+def warming(output: Floats, scene: Scene, p: Floats) -> Floats:
+    """Multiply by 1 + k (T - mean T)."""
+    out: Floats = output * (1.0 + p[0] * scene.temperature)[:, None]
+    return out
+
+
+def lifted(output: Floats, scene: Scene, p: Floats) -> Floats:
+    """Add k, wherever the touch is."""
+    return output + p[0]
+
+
+def stiffening(output: Floats, scene: Scene, p: Floats) -> Floats:
+    """Multiply by (P / 200 N/m)^k."""
+    out: Floats = output * (np.maximum(scene.load, 1e-3) / _LOAD)[:, None] ** p[0]
+    return out
+
+
+def lopsided(output: Floats, scene: Scene, p: Floats) -> Floats:
+    """Add k x exp(-|x|/w), x the angle from the touch."""
+    if scene.distance is None:
+        return output
+    out: Floats = output + p[0] * scene.distance / p[1] * np.exp(-np.abs(scene.distance) / p[1])
+    return out
+
+
+def rippled(output: Floats, scene: Scene, p: Floats) -> Floats:
+    """Add k sin(n t_i + phase) cos-like over the angle of the element, wherever the touch is."""
+    if scene.distance is None:
+        return output
+    angle = scene.distance + scene.place[:, None]
+    out: Floats = output + p[0] * np.sin(p[2] * angle + p[1])
+    return out
+
+
+def _term(name: str, equation: str, response: Response, *parameters: Quantity, lookalikes: tuple[str, ...] = ()) -> SensorEffect:
+    def change(b: Belief, v: Values) -> Belief:
+        return b.responding(response, np.concatenate([v[q.symbol] for q in parameters]))
+
+    return SensorEffect(name=TERM_PREFIX + name, title=equation, channel=Channel.SENSOR, equation=equation, change=change,
+                        parameters=parameters, signature="", lookalikes=lookalikes, separate="")
+
+
+TERMS = (
+    _term("cube", "d = l + k l^3", cubed, Quantity("k", "1", -500.0, 500.0, 20.0, "size"), lookalikes=("quadratic",)),
+    _term("time", "d = l (1 + k (t - mean t))", fading, Quantity("k", "1/s", -0.1, 0.1, 1e-5, "size")),
+    _term("warmth", "d = l (1 + k (T - mean T))", warming, Quantity("k", "1/K", -1.0, 1.0, 0.01, "size")),
+    _term("offset", "d = l + k under any touch", lifted, Quantity("k", "1", -0.3, 0.3, 1e-3, "size"), lookalikes=("proximity",)),
+    _term("load", "d = l (P / 200 N/m)^k", stiffening, Quantity("k", "1", -1.0, 1.0, 0.02, "exponent"),
+          lookalikes=("quadratic", "hertz")),
+    _term("lopsided", "d = l + k x/w exp(-|x|/w), x from the touch", lopsided, Quantity("k", "1", -0.3, 0.3, 2e-3, "size"),
+          Quantity("w", "rad", 0.02, 1.0, 0.05, "reach", starts=(0.05, 0.15, 0.4)), lookalikes=("sliding_friction", "angle_offset")),
+    _term("ripple", "d = l + k sin(n t_i + phase) under any touch", rippled, Quantity("k", "1", 0.0, 0.3, 1e-3, "size"),
+          Quantity("phase", "rad", -np.pi, np.pi, 0.3, "phase", phase=True),
+          Quantity("n", "1", 0.5, 20.0, 0.3, "order", starts=(1.0, 2.0, 4.0, 8.0))),
+)

@@ -1,0 +1,73 @@
+"""What the simulation believes about a force/torque sensor, and the readings that follow from known loads.
+
+Loads and readings are shares of each component's full range, so that forces and torques stand on one footing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Response = Callable[[Floats, "Loads", Floats], Floats]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Loads:
+    """Known loads in the order of time; immutable.
+
+    Attributes:
+        load: share of full range, shape (n, components).
+        time: since the first row [s]; warmth: temperature less its mean [K], zero where not known; shape (n,).
+        record: number of the recording of each row, shape (n,).
+    """
+
+    load: Floats
+    time: Floats
+    warmth: Floats
+    record: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForceBelief:
+    """The sensor as the simulation has it; immutable.
+
+    Attributes:
+        full: full range of each component [N, N m]; only for reports.
+        matrix: reading per load, both in shares of full range, shape (components, components).
+        responses: further changes of the reading with their parameters, in order.
+    """
+
+    full: Floats
+    matrix: Floats
+    responses: tuple[tuple[Response, Floats], ...] = field(default=())
+
+    def responding(self, response: Response, parameters: Floats) -> ForceBelief:
+        """Return the belief with one more response."""
+        return replace(self, responses=(*self.responses, (response, parameters)))
+
+
+def readings(b: ForceBelief, loads: Loads) -> Floats:
+    """Return the readings without their zero, shape (n, components)."""
+    out: Floats = loads.load @ b.matrix.T
+    for response, parameters in b.responses:
+        out = response(out, loads, parameters)
+    return out
+
+
+def play(load: Floats, width: float, record: NDArray[np.int64]) -> Floats:
+    """Return the play operator of every column: what follows the load once it has moved ``width`` from where it turned.
+
+    Source: M. A. Krasnosel'skii, A. V. Pokrovskii, "Systems with Hysteresis", 1989, sec. 2; it starts relaxed in every record.
+    """
+    out = np.empty_like(load)
+    state = load[0].copy()
+    for i in range(len(load)):
+        if i and record[i] != record[i - 1]:
+            state = load[i].copy()
+        state = np.minimum(np.maximum(state, load[i] - width), load[i] + width)
+        out[i] = state
+    return out

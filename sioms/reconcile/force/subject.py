@@ -1,0 +1,307 @@
+"""Prepare a force/torque sensor for the workflow: checks, noise floor, rows, and what the report wants."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.force.belief import Floats, Loads, readings
+from sioms.reconcile.force.effects import TERM_PREFIX
+from sioms.reconcile.refuse import hats
+from sioms.reconcile.sensors.analyse import Options, View, analyse
+from sioms.reconcile.sensors.effect import SensorModel
+from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
+from sioms.reconcile.verdict import NamedEffect
+
+LEAST_ROWS = 40
+BLOCKS = 40
+FACTOR = 30.0  # a component off by more is in another unit
+LEAST_LIKE = 0.3  # correlation of readings and loads below which it is another sensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForceRecords:
+    """Recorded known loads and readings [N, N m], shape (n, components), in the order of time.
+
+    Attributes:
+        time: [s]; temperature: [deg C], nan without; record: number of the file of each row; shape (n,).
+    """
+
+    names: tuple[str, ...]
+    load: Floats
+    reading: Floats
+    time: Floats
+    temperature: Floats
+    record: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class ForceData:
+    """Rows of one sensor, by component and time; see ``sensors.fit.Data``. A view for each component.
+
+    Attributes:
+        measured: readings as shares of full range, all rows of time; which: rows of time that count.
+        sigma: noise of a reading, shape (components,).
+    """
+
+    loads: Loads
+    measured: Floats
+    sigma: Floats
+    which: NDArray[np.bool_]
+    views: tuple[str, ...]
+
+    @cached_property
+    def view(self) -> NDArray[np.int64]:
+        """View of each row: its component."""
+        return np.repeat(np.arange(len(self.views)), int(self.which.sum()))
+
+    @property
+    def element(self) -> NDArray[np.int64]:
+        """Component of each row."""
+        return self.view
+
+    @cached_property
+    def block(self) -> NDArray[np.int64]:
+        """Blocks of consecutive rows of each component."""
+        own = np.unique(blocks_of(len(self.which))[self.which], return_inverse=True)[1]
+        return np.concatenate([own + i * (int(own.max()) + 1) for i in range(len(self.views))])
+
+    def predict(self, model: SensorModel) -> Floats:
+        """Readings in units of their noise."""
+        said = readings(model.belief(), self.loads)
+        return np.asarray((said / self.sigma)[self.which].T.ravel())
+
+    def miss(self, predicted: Floats) -> Floats:
+        """Predicted less measured, the zero of every record projected out."""
+        return self.whiten(predicted - (self.measured / self.sigma)[self.which].T.ravel())
+
+    def whiten(self, change: Floats) -> Floats:
+        """Take the mean of every record and component off, shape (n,) or (n, k)."""
+        c = change.reshape(len(self.views), int(self.which.sum()), -1)
+        record = self.loads.record[self.which]
+        out = c.copy()
+        for number in np.unique(record):
+            mine = record == number
+            out[:, mine] -= c[:, mine].mean(1, keepdims=True)
+        return out.reshape(change.shape)
+
+
+def blocks_of(count: int) -> NDArray[np.int64]:
+    """Number of the block of each row of time."""
+    return np.arange(count) * min(BLOCKS, max(count // 8, 5)) // count
+
+
+@dataclass(frozen=True, slots=True)
+class ForceSubject:
+    """A prepared sensor; see ``sensors.analyse.Subject``."""
+
+    whole: ForceData
+    training: ForceData
+    final: ForceData
+    model: SensorModel
+    records: ForceRecords
+    notes: tuple[str, ...]
+    names: tuple[str, ...] = ()
+    terms: tuple[str, ...] = ()
+    settled: tuple[NamedEffect, ...] = field(default=())
+
+    def views(self) -> Mapping[str, View]:
+        """Readings in their own units."""
+        full = self.model.base.full
+        return {n: View(f"reading {n}", unit_of(n), float(s * f)) for n, s, f in
+                zip(self.whole.views, self.whole.sigma, full, strict=True)}
+
+    def features(self) -> Mapping[int, Floats]:
+        """Columns of the state, the same for every component."""
+        d = self.training
+        mine, loads = d.which, d.loads
+        columns = [hats(loads.time, _knots(loads.time, 12))]
+        for i in range(loads.load.shape[1]):
+            own = loads.load[:, i]
+            if np.ptp(own) == 0.0:
+                continue
+            way = np.sign(np.gradient(own))
+            columns += [hats(own, _knots(own, 10)), hats(own, _knots(own, 6)) * way[:, None],
+                        own[:, None] * hats(loads.time, _knots(loads.time, 6)), (own * loads.warmth)[:, None]]
+            columns += [(own * loads.load[:, j])[:, None] for j in range(i)]
+        columns.append(hats(loads.warmth, _knots(loads.warmth, 6)))
+        full = np.concatenate(columns, axis=1)[mine]
+        full = full - full.mean(0)
+        return {i: full / s for i, s in enumerate(d.sigma)}
+
+    def groups(self) -> Floats:
+        """Row of time of each row of the first component."""
+        return np.arange(int(self.training.which.sum()))
+
+    def variables(self) -> Sequence[tuple[str, str, int, Floats]]:
+        """What the disagreement is located by."""
+        out: list[tuple[str, str, int, Floats]] = []
+        r = self.records
+        for i in range(len(r.names)):
+            out += [(f"load {n}", unit_of(n), i, r.load[:, j]) for j, n in enumerate(r.names)]
+            out.append(("direction of its load", "1", i, np.sign(np.gradient(r.load[:, i]))))
+            out.append(("time", "s", i, r.time - r.time[0]))
+            if np.isfinite(r.temperature).all():
+                out.append(("temperature", "K", i, r.temperature))
+        return out
+
+    def propose(self, models: Sequence[SensorModel]) -> Proposal | None:
+        """Choose the programme of loads on which the models differ most."""
+        if len(models) < 2:
+            return None
+        found = []
+        for name, text, loads in catalogue(len(self.records.names)):
+            said = [readings(m.belief(), loads) / self.whole.sigma for m in models]
+            said = [s - s.mean(0) for s in said]
+            apart = min(float(np.linalg.norm(a - b)) for i, a in enumerate(said) for b in said[i + 1 :])
+            found.append(Proposal(name, text, apart))
+        return max(found, key=lambda p: p.separation)
+
+    def curves(self, before: SensorModel, after: SensorModel) -> tuple[Curve, ...]:
+        """Reading less load of the components that disagreed most, over time."""
+        r, full = self.records, before.base.full
+        old, new = (readings(m.belief(), self.whole.loads) * full for m in (before, after))
+        size = np.sum(((old - r.reading) / full / self.whole.sigma) ** 2, axis=0)
+        out = []
+        for i in np.argsort(-size)[:3]:
+            shift = [np.mean(r.reading[:, i] - v[:, i]) for v in (old, new)]
+            out.append(Curve(f"{r.names[i]}: reading less load", "time, s", unit_of(r.names[i]), r.time - r.time[0],
+                             r.reading[:, i] - r.load[:, i], old[:, i] + shift[0] - r.load[:, i], new[:, i] + shift[1] - r.load[:, i]))
+        return tuple(out)
+
+    def unit(self, effect: str, symbol: str) -> str:
+        """Return the unit of a parameter."""
+        return next(q.unit for q in self.model.library[effect].parameters if q.symbol == symbol)
+
+
+def unit_of(name: str) -> str:
+    """Return N m for torques (names that begin with t or m), else N."""
+    return "N m" if name[:1].lower() in ("t", "m") else "N"
+
+
+def _knots(values: Floats, count: int) -> Floats:
+    q = np.unique(np.quantile(values, np.linspace(0.0, 1.0, count)))
+    return q if len(q) > 1 else np.array([q[0], q[0] + 1.0])
+
+
+def catalogue(count: int) -> Sequence[tuple[str, str, Loads]]:
+    """Programmes of loads: each component alone, rest, rest with a temperature step, cold and warm."""
+    up = np.concatenate([np.linspace(0, 1, 6), np.linspace(0.8, -1, 10), np.linspace(-0.8, 0, 5)])
+    alone = np.concatenate([np.outer(up, np.eye(count)[i]) for i in range(count)])
+    seconds = 10.0 * np.arange(len(alone), dtype=np.float64)
+    still, rest = np.zeros((60, count)), 10.0 * np.arange(60, dtype=np.float64)
+    one = np.zeros(len(alone), dtype=np.int64)
+    return (
+        ("alone", "load each component alone in steps up and down, in both directions", Loads(alone, 0 * seconds, 0 * seconds, one)),
+        ("rest", "ten minutes at zero load at constant temperature", Loads(still, rest, 0 * rest, one[:1].repeat(60))),
+        ("warm", "a temperature step of 5 K at zero load", Loads(still, 0 * rest, 5.0 * (rest > 300.0), one[:1].repeat(60))),
+        ("cold and warm", "each component alone, cold and 10 K warmer",
+         Loads(np.concatenate([alone, alone]), np.zeros(2 * len(alone)), np.repeat([-5.0, 5.0], len(alone)), one.repeat(2))),
+    )
+
+
+def prepare(records: ForceRecords, model: SensorModel) -> ForceSubject:
+    """Check the recordings and lay them out.
+
+    Raises:
+        BadInputError: they cannot be used; the message says why.
+    """
+    notes = check(records, model)
+    full = model.base.full
+    t = records.temperature
+    known = bool(np.isfinite(t).all() and np.ptp(t) > 0.0)
+    if not known:
+        notes.append("temperature was not recorded, or is constant: what follows the temperature is not judged")
+    loads = Loads(records.load / full, records.time - records.time[0], t - t.mean() if known else np.zeros(len(t)), records.record)
+    measured = records.reading / full
+    sigma = noise_of(loads, measured)
+    block = blocks_of(len(measured))
+    mine = block % 5 == 2
+    everything = np.ones(len(measured), dtype=bool)
+    data = [ForceData(loads, measured, sigma, w, records.names) for w in (everything, ~mine, mine)]
+    names = tuple(n for n, e in model.library.items() if e.rankable and not n.startswith(TERM_PREFIX))
+    terms = tuple(n for n in model.library if n.startswith(TERM_PREFIX))
+    return ForceSubject(data[0], data[1], data[2], model, records, tuple(notes), names, terms)
+
+
+def noise_of(loads: Loads, measured: Floats) -> Floats:
+    """Return the noise of each component: what no smooth function of load, time and temperature explains, row to row."""
+    n = len(measured)
+    columns = [np.ones((n, 1)), loads.load, loads.load**2, loads.load**3, loads.time[:, None], loads.warmth[:, None]]
+    way = np.sign(np.gradient(loads.load, axis=0))
+    a = np.concatenate([*columns, way], axis=1)
+    size = np.linalg.norm(a, axis=0)
+    a = a[:, size > 0.0] / size[size > 0.0]
+    rest = measured - a @ np.linalg.lstsq(a, measured, rcond=1e-9)[0]
+    second = np.diff(rest, 2, axis=0)
+    noise = 1.4826 * np.median(np.abs(second), axis=0) / np.sqrt(6.0)
+    steps = [np.diff(np.unique(np.round(measured[:, i], 12))) for i in range(measured.shape[1])]
+    floor = np.array([float(s.min()) / np.sqrt(12.0) if len(s) and len(s) < n // 2 else 0.0 for s in steps])
+    return np.maximum(np.maximum(noise, floor), 1e-9)
+
+
+def check(r: ForceRecords, model: SensorModel) -> list[str]:
+    """Check the records by themselves and against the model.
+
+    Raises:
+        BadInputError: with what is wrong and what would be right.
+    """
+    if len(r.load) < LEAST_ROWS:
+        raise BadInputError(f"read loads: {len(r.load)} rows are too few; record {LEAST_ROWS} or more")
+    for what, values in (("load", r.load), ("reading", r.reading), ("time", r.time[:, None])):
+        bad = ~np.isfinite(values)
+        if bad.any():
+            column = int(np.flatnonzero(bad.any(0))[0])
+            name = what if what == "time" else f"{what} {r.names[column]}"
+            raise BadInputError(f"read loads: {name} has {int(bad[:, column].sum())} values that are no numbers")
+    if np.any(np.diff(r.time)[np.diff(r.record) == 0] < 0.0):
+        raise BadInputError("read loads: time does not rise; needs seconds in the order of recording")
+    notes: list[str] = []
+    moved = np.ptp(r.load, axis=0) > 1e-3 * model.base.full
+    if not moved.any():
+        raise BadInputError("read loads: no load changes by a thousandth of full range; apply known loads")
+    for n, here in zip(r.names, moved, strict=True):
+        if not here:
+            notes.append(f"{n} was never loaded: its gain and what it gives to others are not judged")
+    for i, n in enumerate(r.names):
+        if np.ptp(r.reading[:, i]) == 0.0:
+            raise BadInputError(f"read loads: reading {n} is constant at {r.reading[0, i]:g} {unit_of(n)}; the component is dead or "
+                                "the wrong column was named")
+    _check_match(r, model, moved)
+    return notes
+
+
+def _check_match(r: ForceRecords, model: SensorModel, moved: NDArray[np.bool_]) -> None:
+    loads = Loads(r.load / model.base.full, r.time - r.time[0], np.zeros(len(r.time)), r.record)
+    said = readings(model.belief(), loads) * model.base.full
+    said, got = said - said.mean(0), r.reading - r.reading.mean(0)
+    like = []
+    for i in np.flatnonzero(moved):
+        n, s, g = r.names[i], said[:, i], got[:, i]
+        correlation = float(s @ g / np.sqrt((s @ s) * (g @ g) + 1e-300))
+        like.append(abs(correlation))
+        if abs(correlation) < LEAST_LIKE:
+            continue
+        scale = float(s @ g / (s @ s))
+        if scale < 0.0:
+            raise BadInputError(f"compare readings with loads: {n} falls when its load rises; the sign of one of them is turned round")
+        if not 1.0 / FACTOR < scale < FACTOR:
+            raise BadInputError(f"compare readings with loads: {n} reads {scale:.4g} times its load (about "
+                                f"{10.0 ** round(np.log10(scale)):g}); check the units (N against mN or kN, N m against N mm)")
+    if np.median(like) < LEAST_LIKE:
+        raise BadInputError(f"compare readings with loads: they agree to {100 * float(np.median(like)):.0f} % (correlation); it is "
+                            "another sensor, or columns are exchanged")
+
+
+def reconcile(records: ForceRecords, model: SensorModel, options: Options | None = None) -> SensorVerdict:
+    """Prepare and analyse one sensor.
+
+    Raises:
+        BadInputError: the recordings cannot be used.
+    """
+    return analyse(prepare(records, model), options)

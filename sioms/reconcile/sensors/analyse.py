@@ -1,0 +1,303 @@
+"""The workflow for a sensor: gate, search, refuse, doubt, show; the steps and their rules are those of the axis.
+
+``analyse`` takes a prepared subject and returns a ``SensorVerdict``. It is deterministic by ``seed`` and reads and
+writes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.reconcile.blocks import bootstrap
+from sioms.reconcile.excitation import SAME, common
+from sioms.reconcile.locate import Place, bins_of, explained
+from sioms.reconcile.noise import effective_samples
+from sioms.reconcile.search import GAIN
+from sioms.reconcile.sensors.effect import Array, SensorEffect, SensorModel
+from sioms.reconcile.sensors.fit import Data, Fit, refit
+from sioms.reconcile.sensors.refuse import burst_share, smoother_share
+from sioms.reconcile.sensors.search import Found, Rival, Searcher, screening_columns
+from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
+from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome
+
+TERM_PREFIX = "term_"
+UNEXPLAINED = 0.2  # share that a generic smoother explains beyond the named model: something is missing
+LEAST_ODD = 1.15  # multiple of the floor below which nothing is called unexplained
+BURSTS = 0.8
+QUIET = 1.6
+LEAST_TRACE = 6.0  # an effect of natural size must change the rows by this many standard deviations in all
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """Settings of one analysis: seed of permutations and bootstrap, replicates, pictures, and who is told."""
+
+    seed: int = 1
+    replicates: int = 200
+    pictures: bool = True
+    progress: Callable[[str], None] = field(default=lambda text: None)
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """How a view is reported: what it is called, its unit, and what one floor is in that unit."""
+
+    title: str
+    unit: str
+    floor: float
+
+
+class Subject(Protocol):
+    """A prepared sensor: rows, model and what the report wants.
+
+    Attributes:
+        whole, training, final: all rows; those of the search; those that take no part in it.
+        model: the nominal model with the whole library (terms too).
+        names, terms: effects that are tried, and the nameless terms beside them.
+        settled: effects found by a channel of their own, with their values in the model as well.
+    """
+
+    @property
+    def whole(self) -> Data: ...
+    @property
+    def training(self) -> Data: ...
+    @property
+    def final(self) -> Data: ...
+    @property
+    def model(self) -> SensorModel: ...
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def terms(self) -> tuple[str, ...]: ...
+    @property
+    def settled(self) -> tuple[NamedEffect, ...]: ...
+    @property
+    def notes(self) -> tuple[str, ...]: ...
+
+    def views(self) -> Mapping[str, View]:
+        """Return how each view is reported."""
+        ...
+
+    def features(self) -> Mapping[int, Array]:
+        """Return columns of the state for the generic smoother, per view of ``training``."""
+        ...
+
+    def groups(self) -> Array:
+        """Return the number of the touch or sample of each row of view 0 of ``training``."""
+        ...
+
+    def variables(self) -> Sequence[tuple[str, str, int, Array]]:
+        """Return name, unit, view and value per row of that view of ``whole``, to locate the disagreement by."""
+        ...
+
+    def propose(self, models: Sequence[SensorModel]) -> Proposal | None:
+        """Return the experiment on which the models differ most."""
+        ...
+
+    def curves(self, before: SensorModel, after: SensorModel) -> tuple[Curve, ...]:
+        """Return curves for the pictures."""
+        ...
+
+    def unit(self, effect: str, symbol: str) -> str:
+        """Return the unit of a parameter on this sensor."""
+        ...
+
+
+def analyse(subject: Subject, options: Options | None = None) -> SensorVerdict:
+    """Find what the nominal model of a sensor lacks."""
+    o = options or Options()
+    frozen = tuple(e.name for e in subject.settled)
+    o.progress("excitation: what can these records show")
+    missing, pairs = gate(subject)
+    names = tuple(n for n in subject.names if n not in missing)
+    searcher = Searcher(subject.training, names, frozen, o.progress)
+    found = searcher.run(subject.model)
+    features = subject.features()
+    share, where = smoother_share(subject.training, found.fit, searcher.weights, features)
+    bursts = _bursts(subject, searcher, found)
+    rejected: tuple[str, ...] = ()
+    odd = share > UNEXPLAINED and _loud(searcher, found, where)
+    if odd:
+        o.progress(f"a smoother explains {100 * share:.0f} % of what remains of {where}: searching for a term")
+        before = found
+        searcher.names = names + subject.terms
+        found = searcher.run(subject.model)
+        rejected = tuple(n for n in before.fit.model.effects if n not in found.fit.model.effects)
+        share, where = smoother_share(subject.training, found.fit, searcher.weights, features)
+        searcher.names = names
+    o.progress("identifiability: look-alikes in the place of each effect")
+    others = searcher.rivals(found)
+    left = share > UNEXPLAINED and _loud(searcher, found, where)
+    return _conclude(subject, o, searcher, found, others, missing, pairs, share, left, bursts, rejected)
+
+
+def gate(subject: Subject) -> tuple[dict[str, str], tuple[tuple[str, str, float], ...]]:
+    """Score the records before fitting: effects not excited, and pairs that these records cannot tell apart."""
+    model, data = subject.model, subject.training
+    columns = {n: screening_columns(data, model, model.library[n]) for n in subject.names}
+    missing = {n: model.library[n].separate for n, c in columns.items() if np.linalg.norm(c) < LEAST_TRACE}
+    pairs = []
+    shown = [n for n in columns if n not in missing]
+    for i, a in enumerate(shown):
+        for b in shown[i + 1 :]:
+            own, other = model.library[a], model.library[b]
+            alike = (b in own.lookalikes or a in other.lookalikes) and b not in own.replaces and a not in other.replaces
+            if alike and columns[a].shape[1] == columns[b].shape[1] == 1:
+                same = common(columns[a], columns[b])
+                if same > SAME:
+                    pairs.append((a, b, same))
+    return missing, tuple(sorted(pairs, key=lambda p: -p[2]))
+
+
+def _loud(searcher: Searcher, found: Found, view: str) -> bool:
+    """Say whether a view is still above its floor."""
+    ratios = searcher.ratios(found.fit.model)
+    return view != "" and bool(ratios[searcher.data.views.index(view)] > LEAST_ODD)
+
+
+def _bursts(subject: Subject, searcher: Searcher, found: Found) -> float:
+    mine = subject.training.view == 0
+    ratio = searcher.ratios(found.fit.model)[0]
+    return burst_share(found.fit.residual[mine], subject.groups()) if ratio > QUIET else 0.0
+
+
+def _conclude(subject: Subject, o: Options, searcher: Searcher, found: Found, others: Sequence[Rival], missing: dict[str, str],
+              pairs: tuple[tuple[str, str, float], ...], share: float, left: bool, bursts: float,
+              rejected: tuple[str, ...]) -> SensorVerdict:
+    rng = np.random.default_rng(o.seed)
+    o.progress("untouched rows: gap before and after")
+    start = found.ladder[0].model
+    gaps = _gaps(subject, start, found.fit.model)
+    weights = 1.0 / np.maximum(_ratios(subject.whole, found.fit.model), 1.0)[subject.whole.view]
+    fit = refit(subject.whole, found.fit.model, weights, searcher.frozen)
+    named, terms = _describe(subject, fit, found, searcher, others, o.replicates, rng)
+    open_rivals = [r for r in others if r.open]
+    disturbed = bursts > BURSTS and share < UNEXPLAINED
+    unexplained = bool(terms) or left or disturbed
+    ambiguous = bool(open_rivals)
+    outcome = (Outcome.UNEXPLAINED if unexplained else Outcome.AMBIGUOUS if ambiguous
+               else Outcome.NAMED if named else Outcome.NONE)
+    alternatives: tuple[tuple[str, ...], ...] = ()
+    plan = None
+    if outcome is Outcome.AMBIGUOUS:
+        alternatives = tuple(tuple(r.rival if n == r.effect else n for n in fit.model.effects) for r in open_rivals)
+        plan = subject.propose([fit.model, *(r.fit.model for r in open_rivals)])
+    notes = list(subject.notes)
+    if disturbed:
+        notes.append(f"the residual comes in bursts ({100 * bursts:.0f} % of its energy in a tenth of the touches) that no state "
+                     "orders: a disturbance from outside, not an effect")
+    places: tuple[Place, ...] = ()
+    curves: tuple[Curve, ...] = ()
+    if o.pictures:
+        o.progress("locating the disagreement")
+        places = tuple(locate(subject, start, rng))
+        curves = subject.curves(start, fit.model)
+    floors = dict(zip(subject.whole.views, (float(v) for v in _ratios(subject.whole, fit.model)), strict=True))
+    mine = subject.whole.view == 0
+    e = subject.whole.miss(subject.whole.predict(fit.model))
+    return SensorVerdict(outcome, subject.model, fit.model, tuple(named), alternatives, tuple(terms), gaps, found.ladder, floors,
+                         missing, pairs, places, plan, max(floors.values()), share, bursts, effective_samples(e[mine]), len(e),
+                         tuple(notes), curves, rejected)
+
+
+def _ratios(data: Data, model: SensorModel) -> Array:
+    e = data.miss(data.predict(model))
+    count = np.bincount(data.view, minlength=len(data.views))
+    square = np.bincount(data.view, weights=e**2, minlength=len(data.views))
+    return np.asarray(np.sqrt(square / np.maximum(count, 1)))
+
+
+def _gaps(subject: Subject, before: SensorModel, after: SensorModel) -> tuple[Gap, ...]:
+    """Compare on the rows that took no part in any choice."""
+    old, new = _ratios(subject.final, before), _ratios(subject.final, after)
+    told = subject.views()
+    present = np.bincount(subject.final.view, minlength=len(subject.final.views)) > 0
+    return tuple(Gap(told[v].title, told[v].unit, float(b) * told[v].floor, float(a) * told[v].floor, told[v].floor)
+                 for v, b, a, here in zip(subject.final.views, old, new, present, strict=True) if here)
+
+
+def _describe(subject: Subject, fit: Fit, found: Found, searcher: Searcher, others: Sequence[Rival], replicates: int,
+              rng: np.random.Generator) -> tuple[list[NamedEffect], list[NamedEffect]]:
+    """Describe every effect, the largest first; terms apart."""
+    moves = bootstrap(fit, subject.whole.block, replicates, rng) * np.array([f.quantity.size for f in fit.free])[None, :]
+    spread = {(f.effect, f.quantity.symbol, f.index): 1.96 * float(s)
+              for f, s in zip(fit.free, np.std(moves, axis=0) if len(fit.free) else (), strict=True)}
+    out: list[tuple[float, NamedEffect]] = [(np.inf, e) for e in subject.settled]
+    for name in [n for n in fit.model.effects if n not in searcher.frozen]:
+        effect = fit.model.library[name]
+        bare = searcher.fit(found.fit.model.without_effect(name), 4)
+        loss = searcher.loss(bare)
+        gap = searcher.saving(found.losses, loss)
+        frequency = _frequency(searcher, found.losses, loss, gap.view, rng)
+        estimates = _estimates(subject, effect, fit.model, spread)
+        evidence = [f"without it {100 * gap.share:.1f} % of the squares of {gap.view} would come back ({gap.errors:.1f} standard errors)"]
+        ruled = {r.rival: f"reproduces all but {100 * r.missed:.1f} % of it, {r.errors:.1f} standard errors worse"
+                 for r in others if r.effect == name and not r.open}
+        ruled.update({n: f"saved {100 * g:.0f} % where this saved {100 * s.saved:.0f} %" for s in found.ladder
+                      if s.effect == name for n, g in s.rivals.items()
+                      if n in effect.lookalikes and n not in ruled and n not in fit.model.effects})
+        still = {r.rival: f"leaves only {100 * r.missed:.1f} % of it unexplained" for r in others if r.effect == name and r.open}
+        ruled = {k: v for k, v in ruled.items() if k not in still}
+        out.append((bare.cost - found.fit.cost, NamedEffect(
+            name, effect.title, effect.equation, effect.channel.value, estimates, gap.share, gap.errors, frequency,
+            tuple(evidence), ruled, still)))
+    out.sort(key=lambda e: -e[0])
+    ordered = [e for _, e in out]
+    return ([e for e in ordered if not e.name.startswith(TERM_PREFIX)], [e for e in ordered if e.name.startswith(TERM_PREFIX)])
+
+
+def _estimates(subject: Subject, effect: SensorEffect, model: SensorModel,
+               spread: Mapping[tuple[str, str, int], float]) -> tuple[Estimate, ...]:
+    out = []
+    for q in effect.parameters:
+        values = model.effects[effect.name][q.symbol]
+        for i, v in enumerate(values):
+            s = spread.get((effect.name, q.symbol, i), 0.0)
+            symbol = f"{q.symbol}[{i}]" if len(values) > 1 else q.symbol
+            out.append(Estimate(symbol, float(v), float(v) - s, float(v) + s, subject.unit(effect.name, q.symbol), q.text))
+    return tuple(out)
+
+
+def _frequency(searcher: Searcher, good: Array, bad: Array, view: str, rng: np.random.Generator) -> float:
+    """Share of block bootstrap replicates in which an effect saves its share of its best view."""
+    of_block = np.zeros(len(good), dtype=np.int64)
+    of_block[searcher.data.block] = searcher.data.view
+    mine = of_block == searcher.data.views.index(view)
+    d, b = (bad - good)[mine], bad[mine]
+    draws = rng.integers(0, len(d), (200, len(d)))
+    return float(np.mean(d[draws].sum(1) > GAIN * b[draws].sum(1)))
+
+
+def locate(subject: Subject, model: SensorModel, rng: np.random.Generator, shifts: int = 99) -> list[Place]:
+    """Rank the variables by how far they order the residual of the nominal model, with permutation p-values."""
+    data = subject.whole
+    e = -data.miss(data.predict(model))
+    out = []
+    told = subject.views()
+    for name, unit, view, values in subject.variables():
+        mine = np.flatnonzero(data.view == view)
+        r = e[mine]
+        if len(r) < 40 or np.ptp(values) == 0.0:
+            continue
+        bins = bins_of(values)
+        share = explained(r, bins)
+        chance = [explained(np.roll(r, int(s)), bins) for s in rng.integers(len(r) // 20 + 1, len(r), shifts)]
+        p = (1 + sum(c >= share for c in chance)) / (shifts + 1)
+        count = np.maximum(np.bincount(bins), 1)
+        floor = told[data.views[view]].floor
+        mean = np.bincount(bins, weights=r) / count
+        spread = np.sqrt(np.maximum(np.bincount(bins, weights=r**2) / count - mean**2, 0.0))
+        out.append(Place(f"{name} ({told[data.views[view]].title})", unit, share, p, np.bincount(bins, weights=values) / count,
+                         mean * floor, spread * floor))
+    return sorted(out, key=lambda q: -q.explained)
+
+
+def untouched(count: int) -> NDArray[np.bool_]:
+    """Say which of a number of touches (or samples) take no part in any choice: every fifth."""
+    return np.asarray(np.arange(count) % 5 == 2)
+

@@ -1,0 +1,167 @@
+"""Fit the switched-on effects of a sensor model to rows of data; rows come in views (kinds of evidence)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.reconcile.sensors.effect import Array, Quantity, SensorModel
+
+BASE = "base"
+_STEP = 2e-3
+
+
+class Data(Protocol):
+    """Rows of one subject. Pure: no method changes anything.
+
+    Attributes:
+        view: number of the view of each row, shape (n,).
+        views: names of the views.
+        block: block of each row, rising from 0, shape (n,); blocks are what is held out.
+        element: element that a row belongs to, -1 for rows that mix elements, shape (n,).
+    """
+
+    @property
+    def view(self) -> NDArray[np.int64]: ...
+    @property
+    def views(self) -> tuple[str, ...]: ...
+    @property
+    def block(self) -> NDArray[np.int64]: ...
+    @property
+    def element(self) -> NDArray[np.int64]: ...
+
+    def predict(self, model: SensorModel) -> Array:
+        """Return what the model says, in the units of the rows, shape (n,)."""
+        ...
+
+    def miss(self, predicted: Array) -> Array:
+        """Return predicted less measured in units of the floor, nuisances projected out, shape (n,)."""
+        ...
+
+    def whiten(self, change: Array) -> Array:
+        """Return a change of the prediction as ``miss`` sees it, shape (n,) or (n, k)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Free:
+    """One free number."""
+
+    effect: str
+    quantity: Quantity
+    index: int
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A fitted model: residual (n,) in units of the floor, Jacobian (n, k) per natural size."""
+
+    model: SensorModel
+    free: tuple[Free, ...]
+    residual: Array
+    jacobian: Array
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares."""
+        return float(self.residual @ self.residual)
+
+
+def free_numbers(model: SensorModel, frozen: Sequence[str] = ()) -> tuple[Free, ...]:
+    """List the free numbers of a model."""
+    out = [Free(BASE, q, 0) for q in model.refine]
+    for name in model.effects:
+        if name not in frozen:
+            for q in model.library[name].parameters:
+                out += [Free(name, q, i) for i in range(model.count if q.each else 1)]
+    return tuple(out)
+
+
+def get(model: SensorModel, free: Sequence[Free]) -> Array:
+    """Read the free numbers."""
+    return np.array([getattr(model.base, f.quantity.symbol) if f.effect == BASE
+                     else model.effects[f.effect][f.quantity.symbol][f.index] for f in free], dtype=np.float64)
+
+
+def put(model: SensorModel, free: Sequence[Free], values: Array) -> SensorModel:
+    """Return the model with the free numbers set; phases are wrapped to (-pi, pi]."""
+    effects = {k: {s: v.copy() for s, v in given.items()} for k, given in model.effects.items()}
+    base: dict[str, float] = {}
+    for f, value in zip(free, values, strict=True):
+        v = float(np.angle(np.exp(1j * value))) if f.quantity.phase else float(value)
+        if f.effect == BASE:
+            base[f.quantity.symbol] = v
+        else:
+            effects[f.effect][f.quantity.symbol][f.index] = v
+    return replace(model, effects=effects, base=replace(model.base, **base) if base else model.base)
+
+
+def slopes(data: Data, model: SensorModel, free: Sequence[Free], at: Array) -> Array:
+    """Return d miss / d (number / size) by differences, shape (n, k).
+
+    Numbers of one quantity that every element has its own of are moved together: each row feels that of its
+    own element only.
+    """
+    base = data.predict(put(model, free, at))
+    raw = np.zeros((len(base), len(free)))
+    groups: dict[tuple[str, str], list[int]] = {}
+    for i, f in enumerate(free):
+        groups.setdefault((f.effect, f.quantity.symbol), []).append(i)
+    for places in groups.values():
+        q = free[places[0]].quantity
+        step = np.where(at[places] + _STEP * q.size > q.upper, -_STEP, _STEP)
+        moved = at.copy()
+        moved[places] += step * q.size
+        change = data.predict(put(model, free, moved)) - base
+        if q.each:
+            for i, h in zip(places, step, strict=True):
+                mine = data.element == free[i].index
+                raw[mine, i] = change[mine] / h
+        else:
+            raw[:, places[0]] = change / step[0]
+    return data.whiten(raw)
+
+
+def refit(data: Data, model: SensorModel, weights: Array, frozen: Sequence[str] = (), iterations: int = 8,
+          tolerance: float = 1e-4) -> Fit:
+    """Fit all free numbers by bounded Levenberg-Marquardt.
+
+    Args:
+        weights: of the rows, shape (n,): views far from the floor are brought on one footing.
+    """
+    free = free_numbers(model, frozen)
+    at = get(model, free)
+    r = weights * data.miss(data.predict(model))
+    if not free:
+        return Fit(model, free, r, np.empty((len(r), 0)))
+    size = np.array([f.quantity.size for f in free])
+    lower, upper = (np.array([getattr(f.quantity, n) for f in free]) for n in ("lower", "upper"))
+    wraps = np.array([f.quantity.phase for f in free])
+    lower, upper = np.where(wraps, -np.inf, lower), np.where(wraps, np.inf, upper)
+    damping, cost = 1e-4, float(r @ r)
+    j = weights[:, None] * slopes(data, model, free, at)
+    for _ in range(iterations):
+        h, g = j.T @ j, j.T @ r
+        gained = False
+        for _ in range(5):
+            step = np.linalg.lstsq(h + damping * np.diag(np.diag(h) + 1e-9 * np.trace(h) + 1e-30), -g, rcond=1e-12)[0]
+            trial = np.clip(at + np.clip(step, -3.0, 3.0) * size, lower, upper)
+            rt = weights * data.miss(data.predict(put(model, free, trial)))
+            ct = float(rt @ rt)
+            if ct < cost:
+                gained = True
+                break
+            damping = max(damping, 1e-4) * 10.0
+        if not gained:
+            break
+        done = cost - ct < tolerance * cost
+        at, r, cost = trial, rt, ct
+        damping = max(damping * 0.1, 1e-8)
+        j = weights[:, None] * slopes(data, model, free, at)
+        if done:
+            break
+    return Fit(put(model, free, at), free, r, j)

@@ -1,0 +1,60 @@
+"""Refusal for sensors: could anything that depends on the state explain what is left, or does it come in bursts?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sioms.reconcile.refuse import RIDGES
+from sioms.reconcile.sensors.effect import Array
+from sioms.reconcile.sensors.fit import Data, Fit
+
+FOLDS = 5
+
+
+def smoother_share(data: Data, fit: Fit, weights: Array, features: Mapping[int, Array]) -> tuple[float, str]:
+    """Share of a view's residual that a generic smoother explains on blocks it has not seen.
+
+    Args:
+        features: columns of the state for the rows of a view, shape (rows, k), by the number of the view.
+
+    Returns:
+        The largest share over the views, and the name of that view.
+    """
+    best, where = 0.0, ""
+    for view, columns in features.items():
+        mine = data.view == view
+        r = fit.residual[mine] / weights[mine]
+        size = np.sqrt(np.mean(columns**2, axis=0))
+        f = columns[:, size > 1e-12] / size[size > 1e-12]
+        fold = data.block[mine] % FOLDS
+        share = _explained(f, r, fold)
+        if share > best:
+            best, where = share, data.views[view]
+    return best, where
+
+
+def _explained(f: Array, r: Array, fold: Array) -> float:
+    total = float(r @ r)
+    if f.shape[1] == 0 or total == 0.0:
+        return 0.0
+    grams = [(f[fold == i].T @ f[fold == i], f[fold == i].T @ r[fold == i]) for i in range(FOLDS)]
+    best = 0.0
+    for ridge in RIDGES:
+        left = 0.0
+        for i in range(FOLDS):
+            h = sum((g[0] for k, g in enumerate(grams) if k != i), np.zeros_like(grams[0][0]))
+            y = sum((g[1] for k, g in enumerate(grams) if k != i), np.zeros_like(grams[0][1]))
+            c = np.linalg.solve(h + ridge * len(r) * 1e-2 * np.eye(len(h)), y)
+            left += float(np.sum((r[fold == i] - f[fold == i] @ c) ** 2))
+        best = max(best, 1.0 - left / total)
+    return best
+
+
+def burst_share(residual: Array, groups: Array) -> float:
+    """Share of the energy above the quiet level that the loudest tenth of the groups (touches, samples) holds."""
+    energy = np.bincount(groups, weights=residual**2) / np.maximum(np.bincount(groups), 1)
+    above = np.clip(energy - np.median(energy), 0.0, None)
+    top = np.sort(above)[-max(len(above) // 10, 1) :]
+    return float(top.sum() / max(above.sum(), 1e-300))

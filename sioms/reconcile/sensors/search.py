@@ -1,0 +1,380 @@
+"""Search for the missing effects of a sensor: screen, refit nested, let earlier ones leave again.
+
+The rules are those of the axis (``sioms.reconcile.search``); evidence comes in views (touches, courses in
+time, untouched frames ...), every view is brought to the floor on one footing, and an effect is judged in the
+view where it shows most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import product
+
+import numpy as np
+
+from sioms.reconcile.blocks import better, heldout
+from sioms.reconcile.search import DOUBTFUL, FLOOR, GAIN, NEARLY, SPECIFIC, SURE, negligible
+from sioms.reconcile.sensors.effect import Array, SensorEffect, SensorModel, Values
+from sioms.reconcile.sensors.fit import Data, Fit, Free, refit, slopes
+
+TRIES = 5
+STEPS = 8
+AMBIGUOUS = 0.05
+_SCREEN = 1e-3  # step of the screening difference, in natural sizes
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """A screened candidate: values to start from and the share of the view's squares it would save."""
+
+    effect: str
+    values: Values
+    gain: float
+
+
+@dataclass(frozen=True, slots=True)
+class Saving:
+    """What one model saves against another: share and standard errors in its best view, and share of all."""
+
+    share: float
+    errors: float
+    view: str
+    total: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rung:
+    """One step of the search."""
+
+    action: str
+    effect: str
+    ratio: float
+    saved: float
+    model: SensorModel
+    rivals: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Rival:
+    """A look-alike refitted in the place of a named effect; see ``sioms.reconcile.ambiguity.Rival``."""
+
+    effect: str
+    rival: str
+    missed: float
+    errors: float
+    excess: float
+    fit: Fit
+
+    @property
+    def open(self) -> bool:
+        """True where the data do not rule the rival out."""
+        return self.missed < AMBIGUOUS or (self.errors < 1.0 and self.excess < DOUBTFUL)
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Result of a search."""
+
+    fit: Fit
+    losses: Array
+    ladder: tuple[Rung, ...]
+
+
+@dataclass(slots=True)
+class Searcher:
+    """Search over one set of data. Not thread-safe."""
+
+    data: Data
+    names: tuple[str, ...]
+    frozen: tuple[str, ...] = ()
+    progress: Callable[[str], None] = lambda text: None
+    weights: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.weights = np.ones(len(self.data.view))
+
+    # -- fits and losses
+
+    def fit(self, model: SensorModel, iterations: int = 6) -> Fit:
+        """Refit all free numbers."""
+        return refit(self.data, model, self.weights, self.frozen, iterations)
+
+    def loss(self, fit: Fit) -> Array:
+        """Held-out loss per block."""
+        return heldout(fit, self.data.block)
+
+    def level(self, model: SensorModel) -> Array:
+        """Bring every view that is far from the floor down to it; return root mean squares per view."""
+        ratios = self.ratios(model)
+        self.weights = 1.0 / np.maximum(ratios, 1.0)[self.data.view]
+        return ratios
+
+    def ratios(self, model: SensorModel) -> Array:
+        """Return the root mean square of each view in units of its floor."""
+        e = self.data.miss(self.data.predict(model))
+        count = np.maximum(np.bincount(self.data.view, minlength=len(self.data.views)), 1)
+        return np.asarray(np.sqrt(np.bincount(self.data.view, weights=e**2, minlength=len(self.data.views)) / count))
+
+    def saving(self, new: Array, old: Array) -> Saving:
+        """Compare held-out losses by view."""
+        of_block = np.zeros(len(new), dtype=np.int64)
+        of_block[self.data.block] = self.data.view
+        best = Saving(-np.inf, 0.0, "", float((old - new).sum() / old.sum()))
+        for i, view in enumerate(self.data.views):
+            mine = of_block == i
+            if np.count_nonzero(mine) < 2:
+                continue
+            share, errors = better(new[mine], old[mine])
+            if min(share, 1.0) * min(errors, 10.0) > best.share * min(best.errors, 10.0) or best.view == "":
+                best = Saving(share, errors, view, best.total)
+        return best
+
+    def lost(self, worse: Array, good: Array) -> Saving:
+        """Return what a worse model gives away, in the view where it gives away most."""
+        return self.saving(good, worse)
+
+    # -- search
+
+    def run(self, start: SensorModel) -> Found:
+        """Search from a model."""
+        fit = self._levelled(start)
+        losses = self.loss(fit)
+        ladder = [Rung("start", "", self._ratio(fit), 0.0, fit.model)]
+        for _ in range(STEPS):
+            if np.all(self.ratios(fit.model) <= FLOOR):
+                break
+            step = self._add(fit, losses)
+            if step is None:
+                break
+            ladder.append(step)
+            fit = self._levelled(step.model)
+            losses = self.loss(fit)
+            self.progress(f"{step.action} {step.effect}: residual {self._ratio(fit):.2f} of the floor")
+            fit, losses = self._simplify(fit, losses, ladder)
+            fit, losses = self._eliminate(fit, losses, ladder)
+        return Found(fit, losses, tuple(ladder))
+
+    def _levelled(self, model: SensorModel) -> Fit:
+        """Fit, bring the views to one footing, and fit again."""
+        self.level(model)
+        fit = self.fit(model)
+        self.level(fit.model)
+        return self.fit(fit.model)
+
+    def _ratio(self, fit: Fit) -> float:
+        """Root mean square over all rows, in units of the floor."""
+        return float(np.sqrt(np.mean((fit.residual / self.weights) ** 2)))
+
+    def _add(self, fit: Fit, losses: Array) -> Rung | None:
+        """Refit the best candidates and take the simplest of those that save most."""
+        tried: dict[str, tuple[Fit, Array, Saving]] = {}
+        for start in self.candidates(fit):
+            effect = fit.model.library[start.effect]
+            model = without(fit.model, effect.replaces).with_effect(start.effect, start.values)
+            new = self.fit(model)
+            loss = self.loss(new)
+            tried[start.effect] = (new, loss, self.saving(loss, losses))
+        good = {n: t for n, t in tried.items()
+                if t[2].share >= GAIN and t[2].errors >= SURE and t[2].total > 0.0 and physical(t[0].model, n)}
+        if not good:
+            return None
+        name = self._simplest(good)
+        new, _, saved = good[name]
+        others = {n: t[2].share for n, t in tried.items() if n != name}
+        if saved.share < SPECIFIC and any(
+                t[2].share > NEARLY * saved.share and t[2].view == saved.view and n not in family(new.model, name)
+                for n, t in tried.items() if n != name):
+            return None
+        return Rung("add", name, self._ratio(new), saved.share, new.model, others)
+
+    def _simplest(self, good: dict[str, tuple[Fit, Array, Saving]]) -> str:
+        """Of those within one standard error and ``GAIN`` of the best, the one with the fewest numbers."""
+        best = max(good, key=lambda n: good[n][2].total)
+        near = []
+        for n, (_, loss, _) in good.items():
+            gap = self.lost(loss, good[best][1])
+            if negligible(gap.share, gap.errors):
+                near.append(n)
+        model = good[best][0].model
+        return min(near or [best], key=lambda n: (n.startswith("term_"), model.library[n].size(model.count), -good[n][2].total))
+
+    def _eliminate(self, fit: Fit, losses: Array, ladder: list[Rung]) -> tuple[Fit, Array]:
+        """Let effects leave that no longer save their share."""
+        for name in [n for n in fit.model.effects if n not in self.frozen]:
+            if len(fit.model.effects) < 2:
+                break
+            bare = self.fit(fit.model.without_effect(name))
+            loss = self.loss(bare)
+            gap = self.lost(loss, losses)
+            if negligible(gap.share, gap.errors):
+                fit, losses = bare, loss
+                ladder.append(Rung("leave", name, self._ratio(fit), -gap.share, fit.model))
+        return fit, losses
+
+    def _simplify(self, fit: Fit, losses: Array, ladder: list[Rung]) -> tuple[Fit, Array]:
+        """Put a simpler look-alike in the place of a richer effect where it does as well."""
+        for name in [n for n in fit.model.effects if n not in self.frozen]:
+            lib, count = fit.model.library, fit.model.count
+            for other in lib[name].lookalikes:
+                if other not in self.names or other in fit.model.effects or lib[other].size(count) >= lib[name].size(count):
+                    continue
+                bare = self.fit(fit.model.without_effect(name), 3)
+                start = next(iter(screen(self.data, bare, self.weights, lib[other], self.frozen)), None)
+                if start is None:
+                    continue
+                new = self.fit(bare.model.with_effect(other, start.values))
+                loss = self.loss(new)
+                gap = self.lost(loss, losses)
+                if negligible(gap.share, gap.errors) and physical(new.model, other):
+                    fit, losses = new, loss
+                    ladder.append(Rung("simplify", f"{name} to {other}", self._ratio(fit), -gap.share, fit.model))
+                    break
+        return fit, losses
+
+    def candidates(self, fit: Fit) -> list[Start]:
+        """Screen every effect that is not in the model; the best few, look-alikes of the best among them."""
+        found: list[Start] = []
+        for name in self.names:
+            if name in fit.model.effects or name in self.frozen:
+                continue
+            if any(name in fit.model.library[n].replaces for n in fit.model.effects):
+                continue
+            starts = screen(self.data, fit, self.weights, fit.model.library[name], self.frozen)
+            found += [max(starts, key=lambda s: s.gain)] if starts else []
+        found = sorted((s for s in found if s.gain > 0.5 * GAIN), key=lambda s: -s.gain)
+        chosen = found[:TRIES]
+        if chosen:
+            alike = family(fit.model, chosen[0].effect)
+            chosen += [s for s in found[TRIES:] if s.effect in alike]
+        return chosen
+
+    def rivals(self, found: Found) -> list[Rival]:
+        """Refit with each look-alike in the place of each named effect."""
+        out = []
+        lib, count = found.fit.model.library, found.fit.model.count
+        for name in [n for n in found.fit.model.effects if n not in self.frozen and not n.startswith("term_")]:
+            bare = self.fit(found.fit.model.without_effect(name), 4)
+            contribution = bare.cost - found.fit.cost
+            if contribution <= 0.0:
+                continue
+            for other in alike(lib, name, count):
+                if other not in self.names or other in found.fit.model.effects:
+                    continue
+                for start in screen(self.data, bare, self.weights, lib[other], self.frozen)[:2]:
+                    fit = self.fit(without(bare.model, lib[other].replaces).with_effect(other, start.values))
+                    if physical(fit.model, other):
+                        _, errors = better(found.losses, self.loss(fit))
+                        out.append(Rival(name, other, (fit.cost - found.fit.cost) / contribution, errors,
+                                         fit.cost / found.fit.cost - 1.0, fit))
+        best: dict[tuple[str, str], Rival] = {}
+        for r in out:
+            if (r.effect, r.rival) not in best or r.missed < best[r.effect, r.rival].missed:
+                best[r.effect, r.rival] = r
+        return sorted(best.values(), key=lambda r: r.missed)
+
+
+def alike(lib: Mapping[str, SensorEffect], name: str, count: int) -> list[str]:
+    """Look-alikes in either direction that are not much richer, and the twins whatever their size."""
+    own = lib[name]
+    both = [n for n in lib if n in own.lookalikes or name in lib[n].lookalikes]
+    return [n for n in both if n not in own.replaces
+            and (lib[n].size(count) <= own.size(count) + 1 or n in own.twins)]
+
+
+def family(model: SensorModel, name: str) -> set[str]:
+    """An effect, its look-alikes in either direction and what it replaces."""
+    lib = model.library
+    return {name, *lib[name].lookalikes, *lib[name].replaces, *(n for n in lib if name in lib[n].lookalikes)}
+
+
+def without(model: SensorModel, names: tuple[str, ...]) -> SensorModel:
+    """Switch some effects off."""
+    for name in names:
+        model = model.without_effect(name) if name in model.effects else model
+    return model
+
+
+def physical(model: SensorModel, name: str) -> bool:
+    """Say whether the first parameter lies inside its bounds and away from doing nothing."""
+    effect, q = model.library[name], model.library[name].primary
+    value = model.effects[name][q.symbol]
+    if q.each:
+        return True
+    span = 1e-6 * (q.upper - q.lower)
+    return bool(q.lower + span < value[0] < q.upper - span and abs(value[0] - effect.neutral) > 1e-3 * q.size)
+
+
+def screen(data: Data, fit: Fit, weights: Array, effect: SensorEffect, frozen: tuple[str, ...] = ()) -> list[Start]:
+    """Regress the residual on what a little of the effect would change; one start per trial shape, best first."""
+    out = []
+    known, r = fit.jacobian, fit.residual
+    for shape in _shapes(fit.model, effect):
+        columns = [weights[:, None] * _columns(data, fit.model, effect, values) for values in shape]
+        full = np.concatenate([known, *columns], axis=1)
+        size = np.sqrt(np.einsum("ij,ij->j", full, full))
+        live = size > 1e-9
+        if not live[known.shape[1]:].any():
+            continue
+        scaled = full[:, live] / size[live]
+        h = scaled.T @ scaled
+        d = np.zeros(len(size))
+        d[live] = np.linalg.lstsq(h + 1e-9 * np.eye(len(h)), -scaled.T @ r, rcond=1e-10)[0] / size[live]
+        values = _settled(effect, shape, d[known.shape[1]:], fit.model.count)
+        if values is not None:
+            out.append(Start(effect.name, values, _gain(data, r, r + full @ d)))
+    return sorted(out, key=lambda s: -s.gain)
+
+
+def _gain(data: Data, before: Array, after: Array) -> float:
+    """Share of squares saved in the view where it is most."""
+    count = len(data.views)
+    old = np.bincount(data.view, weights=before**2, minlength=count)
+    new = np.bincount(data.view, weights=after**2, minlength=count)
+    return float(np.max(np.where(old > 0.0, 1.0 - new / np.where(old > 0.0, old, 1.0), 0.0)))
+
+
+def _shapes(model: SensorModel, effect: SensorEffect) -> Iterator[list[dict[str, Array]]]:
+    """Yield trial shapes: one set of values, or a pair a quarter turn apart where a phase is free."""
+    searched = [q for q in effect.parameters[1:] if len(q.starts) > 1]
+    phase = next((q for q in effect.parameters if q.phase), None)
+    for picks in product(*(q.starts for q in searched)):
+        values = model.plain(effect.name)
+        for q, pick in zip(searched, picks, strict=True):
+            values[q.symbol] = np.full_like(values[q.symbol], pick)
+        if phase is None:
+            yield [values]
+        else:
+            yield [{**values, phase.symbol: np.array([turn])} for turn in (0.0, 0.5 * np.pi)]
+
+
+def screening_columns(data: Data, model: SensorModel, effect: SensorEffect) -> Array:
+    """Return what a natural size of the effect in its first shape changes, in units of the floor, shape (n, k)."""
+    return _columns(data, model, effect, next(_shapes(model, effect))[0])
+
+
+def _columns(data: Data, model: SensorModel, effect: SensorEffect, values: dict[str, Array]) -> Array:
+    """Return the whitened change per natural size of the first parameter."""
+    q = effect.primary
+    trial = model.with_effect(effect.name, values)
+    free = tuple(Free(effect.name, q, i) for i in range(model.count if q.each else 1))
+    return slopes(data, trial, free, np.full(len(free), effect.neutral))
+
+
+def _settled(effect: SensorEffect, shape: list[dict[str, Array]], amount: Array, count: int) -> dict[str, Array] | None:
+    """Turn regression coefficients into values to start from; None where the sign is not the effect's."""
+    q = effect.primary
+    values = dict(shape[0])
+    if len(shape) == 2:
+        phase = next(p for p in effect.parameters if p.phase)
+        a, b = amount * q.size
+        values[q.symbol] = np.array([np.clip(np.hypot(a, b), q.lower, q.upper)])
+        values[phase.symbol] = np.array([np.arctan2(b, a)])
+        return values
+    wanted = effect.neutral + amount * q.size
+    held = np.clip(wanted, q.lower, q.upper)
+    if not q.each and abs(held[0] - effect.neutral) < 0.2 * abs(wanted[0] - effect.neutral):
+        return None
+    values[q.symbol] = held
+    return values
+

@@ -1,0 +1,67 @@
+"""What the workflow says about a sensor, as data: report, JSON and terminal summary are made from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sioms.reconcile.locate import Place
+from sioms.reconcile.sensors.effect import Array, SensorModel
+from sioms.reconcile.sensors.search import Rung
+from sioms.reconcile.verdict import Gap, NamedEffect, Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """An experiment that would decide: what to do, and by how many times the noise the rivals then differ at best."""
+
+    name: str
+    text: str
+    separation: float
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """Curves for a picture: measured, and simulated before and after, over one variable."""
+
+    title: str
+    axis: str
+    unit: str
+    at: Array
+    measured: Array
+    before: Array
+    after: Array
+
+
+@dataclass(frozen=True, slots=True)
+class SensorVerdict:
+    """Everything the workflow found out about one sensor.
+
+    Attributes:
+        nominal, model: before and after; effects found by a channel of their own are in ``model`` as well.
+        floors: per view, residual of the final model in units of its noise floor.
+        missing: effects that the records did not excite, with the record that would.
+        pairs: effects that look the same in these records, with the share they have in common.
+        places: where the nominal model disagreed.
+    """
+
+    outcome: Outcome
+    nominal: SensorModel
+    model: SensorModel
+    effects: tuple[NamedEffect, ...]
+    alternatives: tuple[tuple[str, ...], ...]
+    symbolic: tuple[NamedEffect, ...]
+    gaps: tuple[Gap, ...]
+    ladder: tuple[Rung, ...]
+    floors: dict[str, float]
+    missing: dict[str, str]
+    pairs: tuple[tuple[str, str, float], ...]
+    places: tuple[Place, ...]
+    experiment: Proposal | None
+    ratio: float
+    smoother_share: float
+    burst_share: float
+    effective_samples: float
+    samples: int
+    notes: tuple[str, ...]
+    curves: tuple[Curve, ...]
+    rejected: tuple[str, ...] = ()

@@ -1,0 +1,132 @@
+"""``sioms reconcile force``: read recorded known loads and readings of a force/torque sensor, and analyse them.
+
+Column description (``columns.toml`` beside the data, or ``--columns``)::
+
+    files = ["up.csv", "down.npz"]     # optional; else every data file of the folder, by name
+    [columns]
+    time = { name = "t", unit = "s" }
+    temperature = { name = "temp", unit = "C" }     # may be missing
+    [load]                                          # known loads; a component that is missing was not loaded
+    fx = { name = "weight_x", unit = "N" }
+    [reading]
+    fx = { name = "sensor_x", unit = "mN", scale = 1.0 }
+
+A column that the data do not have, or a key that nobody reads, is an error.
+"""
+
+from __future__ import annotations
+
+import time
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.force.model_file import from_table
+from sioms.reconcile.force.subject import ForceRecords, unit_of
+from sioms.reconcile.sensors.effect import SensorModel
+from sioms.reconcile.sensors.verdict import SensorVerdict
+from sioms.tools.reconcile_input import SUFFIXES, load_columns
+
+UNITS = {"N": 1.0, "mN": 1e-3, "kN": 1e3, "kgf": 9.80665, "N m": 1.0, "mN m": 1e-3, "N mm": 1e-3, "N cm": 1e-2, "s": 1.0, "ms": 1e-3,
+         "us": 1e-6, "ns": 1e-9, "C": 1.0, "K": 1.0, "1": 1.0}
+FORCES, TORQUES = ("N", "mN", "kN", "kgf", "1"), ("N m", "mN m", "N mm", "N cm", "1")
+
+
+def reconcile_force(data: Path, model: Path, columns: Path | None = None, seed: int = 1,
+                    progress: Callable[[str], None] = lambda text: None) -> tuple[SensorVerdict, float]:
+    """Read, analyse and time one sensor.
+
+    Raises:
+        BadInputError: data or model cannot be used.
+    """
+    from sioms.reconcile.force.subject import reconcile
+    from sioms.reconcile.sensors.analyse import Options
+
+    start = time.monotonic()
+    nominal, names = read_model(model)
+    verdict = reconcile(read_loads(data, names, columns), nominal, Options(seed=seed, progress=progress))
+    return verdict, time.monotonic() - start
+
+
+def read_model(path: Path) -> tuple[SensorModel, tuple[str, ...]]:
+    """Read a sensor's model file.
+
+    Raises:
+        BadInputError: it is missing or makes no sense.
+    """
+    return from_table(_toml(path, "model"), str(path))
+
+
+def _toml(path: Path, what: str) -> dict[str, Any]:
+    if not path.exists():
+        raise BadInputError(f"read {what} {path}: no such file")
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
+        raise BadInputError(f"read {what} {path}: {e}") from e
+
+
+def read_loads(data: Path, names: tuple[str, ...], columns: Path | None = None) -> ForceRecords:
+    """Read all records.
+
+    Raises:
+        BadInputError: something is missing or not understood.
+    """
+    if not data.exists():
+        raise BadInputError(f"read {data}: no such file or folder")
+    folder = data if data.is_dir() else data.parent
+    description = columns or folder / "columns.toml"
+    table = _toml(description, "column description")
+    _only(table, ("files", "columns", "load", "reading"), str(description))
+    for part in ("load", "reading"):
+        _only(table.get(part, {}), names, f"{description}, [{part}]")
+    missing = [n for n in names if n not in table.get("reading", {})]
+    if missing:
+        raise BadInputError(f"read {description}: no reading of {', '.join(missing)}; every component of the model needs one")
+    files = [folder / n for n in table["files"]] if "files" in table else (
+        [data] if data.is_file() else sorted(p for p in data.iterdir() if p.suffix in SUFFIXES))
+    if not files:
+        raise BadInputError(f"read {data}: no data files; expects one of {', '.join(SUFFIXES)}")
+    parts = [_record(f, table, names) for f in files]
+    load, reading, clock, warm = (np.concatenate([p[i] for p in parts]) for i in range(4))
+    record = np.concatenate([np.full(len(p[2]), i) for i, p in enumerate(parts)])
+    return ForceRecords(names, load, reading, clock, warm, record)
+
+
+def _only(table: Mapping[str, Any], allowed: tuple[str, ...], where: str) -> None:
+    odd = sorted(set(table) - set(allowed))
+    if odd:
+        raise BadInputError(f"read {where}: nobody reads {', '.join(odd)}; known are {', '.join(allowed)}")
+
+
+def _record(path: Path, table: Mapping[str, Any], names: tuple[str, ...]) -> tuple[Any, Any, Any, Any]:
+    raw = load_columns(path)
+    own = table.get("columns", {})
+    _only(own, ("time", "temperature"), "the column description, [columns]")
+    count = len(next(iter(raw.values()))) if raw else 0
+    loads = [_column(raw, table.get("load", {}), n, path, count) for n in names]
+    readings = [_column(raw, table["reading"], n, path, count) for n in names]
+    clock = _column(raw, own, "time", path, count) if "time" in own else np.arange(count, dtype=np.float64)
+    warm = _column(raw, own, "temperature", path, count) if "temperature" in own else np.full(count, np.nan)
+    return np.stack(loads, axis=1), np.stack(readings, axis=1), clock, warm
+
+
+def _column(raw: Mapping[str, Any], specs: Mapping[str, Any], name: str, path: Path, count: int) -> Any:
+    if name not in specs:
+        return np.zeros(count)
+    spec = specs[name]
+    _only(spec, ("name", "unit", "scale", "offset"), f"column {name}")
+    if spec.get("name") not in raw:
+        raise BadInputError(f"read {path.name}: no column {spec.get('name')!r} for {name}; has {', '.join(sorted(raw))}")
+    unit = spec.get("unit", "1")
+    allowed = tuple(UNITS) if name in ("time", "temperature") else TORQUES if unit_of(name) == "N m" else FORCES
+    if unit not in allowed:
+        raise BadInputError(f"read column {name}: unit {unit!r} is not known; known are {', '.join(allowed)}")
+    values = raw[spec["name"]]
+    if len(values) != count:
+        raise BadInputError(f"read {path.name}: column {spec['name']} has {len(values)} rows, others {count}; needs the same number")
+    return (values * float(spec.get("scale", 1.0)) + float(spec.get("offset", 0.0))) * UNITS[unit]
