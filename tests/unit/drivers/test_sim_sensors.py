@@ -8,7 +8,7 @@ from sioms.drivers.sim_axes import SimAxes
 from sioms.drivers.sim_force import SimForce
 from sioms.drivers.sim_io import SimIo
 from sioms.drivers.sim_tactile import SimTactile
-from sioms.plant.finger import FingerShape, radial_strain
+from sioms.plant.finger import FingerShape, TactileArray
 from sioms.protocol.flags import AnalogStatus, ControlMode
 
 WALL = {"position": 0.01, "stiffness": 2e4, "damping": 100.0}
@@ -131,14 +131,14 @@ def test_finger_shows_the_pressed_object_where_it_is(bench):
     bench.write(mod, axis=0, control_mode=ControlMode.POSITION, position=0.03)
     bench.run(2.0)
     shape = FingerShape()
-    expected = -100 * radial_strain(shape, 1.6, 4.0 / shape.length_m, 6e-3)
+    expected = -100 * TactileArray(shape).strain(4.0 / shape.length_m, 1.6, 6e-3)
     np.testing.assert_allclose(finger.blocks[0].data, expected, atol=0.05)
     assert np.argmax(finger.blocks[0].data) == np.argmin(np.abs(np.array(shape.angles_rad) - 1.6))
 
 
 @pytest.mark.parametrize(
     "table, words",
-    [({"gain": [1.0]}, "gain: 1 numbers; want 16"), ({"indenter_radius_m": 0.0}, "positive radius")],
+    [({"gain": [1.0]}, "gain: 1 numbers; want 16"), ({"indenter_radius_m": -1.0}, "positive radius")],
 )
 def test_bad_finger_is_told_by_describe(table, words):
     with pytest.raises(ValueError, match=words):
