@@ -1,4 +1,4 @@
-"""`sioms tactile design|reproduce|calibrate|bench`: work with elastic cylindrical fingers from the shell.
+"""`sioms tactile design|reproduce|calibrate|score|bench`: work with elastic cylindrical fingers from the shell.
 
 Long work tells on stderr what it is doing; reports are single HTML pages.  Numerical and drawing libraries
 are imported when a subcommand runs, not before.
@@ -54,6 +54,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--edge-deg", type=float, default=45.0, help="half angle of the edge indenter (default 45)"
     )
 
+    score = commands.add_parser(
+        "score", help="calibrate on part of the touches, fit the rest, tabulate what is reached"
+    )
+    score.add_argument("data", type=Path, nargs="+", help="folders of recordings, or folders of such folders")
+    score.add_argument("--truth", type=Path, help="folder with the truth of generated data, NAME.json")
+    score.add_argument("--jobs", type=int, help="processes (default: one for each core)")
+    score.add_argument(
+        "--edge-deg", type=float, default=45.0, help="half angle of the edge indenter (default 45)"
+    )
+
     bench = commands.add_parser("bench", help="measure the speed and the errors of shape estimation")
     bench.add_argument("--frames", type=int, default=2000, help="frames for each figure (default 2000)")
     bench.add_argument("--finger", type=Path, help="a calibrated finger (default: the published one)")
@@ -75,6 +85,10 @@ def run(args: argparse.Namespace) -> int:
                 from sioms.tools.tactile_calibrate import calibrate
 
                 return calibrate(args)
+            case "score":
+                from sioms.tools.tactile_score import score
+
+                return score(args)
             case "bench":
                 from sioms.tools.tactile_bench import bench
 

@@ -70,6 +70,7 @@ class SignalChain:
         self._count = len(e.angle_rad)
         self._used = np.array(e.used)
         self._gain, self._quadratic = np.array(e.gain), np.array(e.quadratic)
+        self._mixing: Floats | None = None  # the gains as a matrix, if they are more than a diagonal
         self._noise = np.array(e.noise) ** 2
         self._settle = settle_frames
         self._last: Floats = np.full(self._count, np.nan)
@@ -92,24 +93,29 @@ class SignalChain:
         return self._baseline / self._signal.scale
 
     @property
-    def gain(self) -> Floats:
-        """Return strain per output of each element."""
-        return self._gain.copy()
+    def gains(self) -> Floats:
+        """Return strain per output, shape (ns, ns); a diagonal unless `set_gain` gave a matrix."""
+        return np.diag(self._gain) if self._mixing is None else self._mixing.copy()
 
     def set_gain(self, gain: ArrayLike) -> None:
-        """Replace the gains, one for each element.
+        """Replace the gains: one for each element, or a matrix for elements that feel each other's outputs.
 
         Raises:
-            ValueError: wrong number, or a gain that is not positive and finite.
+            ValueError: wrong shape, a value that is not finite, or a gain of an element that is not positive.
         """
         new = np.array(gain, dtype=np.float64)
-        if new.shape != (self._count,):
+        if new.shape not in ((self._count,), (self._count, self._count)):
             raise ValueError(
                 f"set gain: {new.size} gains in shape {new.shape}; the finger has {self._count} elements"
             )
-        if not (np.all(np.isfinite(new)) and np.all(new > 0.0)):
-            raise ValueError(f"set gain: gains {new.tolist()} hold one that is not positive and finite")
-        self._gain = new
+        own = new if new.ndim == 1 else np.diag(new)
+        if not (np.all(np.isfinite(new)) and np.all(own > 0.0)):
+            raise ValueError(
+                f"set gain: gains of the elements {own.tolist()} hold one that is not positive, or the matrix one "
+                "that is not finite"
+            )
+        self._gain = own.copy()
+        self._mixing = new if new.ndim == 2 and np.count_nonzero(new - np.diag(own)) else None
 
     def frame(self, raw: ArrayLike, stamp_ns: int) -> StrainFrame:
         """Process one frame.
@@ -146,7 +152,11 @@ class SignalChain:
         self._touch(strength, count, stamp_ns)
         if not self._touched and (self._hold_until_ns is None or stamp_ns >= self._hold_until_ns):
             self._follow(change, usable, elapsed_s)
-        strains = -self._gain * linearise(change, self._quadratic)
+        linear = linearise(change, self._quadratic)
+        if self._mixing is None:
+            strains = -self._gain * linear
+        else:
+            strains = -self._mixing @ np.where(usable, linear, 0.0)
         strains[~usable] = np.nan
         return StrainFrame(strains, usable, saturated, dead, self._touched, True, strength)
 

@@ -45,11 +45,19 @@ class Quality(Flag):
     FLAT_OR_HOLLOW = auto()  # R is not below rb: no convex indenter does that
     NOT_CONVERGED = auto()
     WRONG_SIGN = auto()  # the strains are those of a pull
+    IMPRECISE = auto()  # the place is known to no better than 2 degrees at four standard deviations
+    NO_BASELINE = auto()  # the readings without touch are not known yet: nothing is estimated
+    WITHOUT_LOAD = (
+        auto()
+    )  # the force sensor's load was not there, too old, or did not press: fitted without it
 
 
 _HUGE = 1e30  # variance of an element that must not count
 _PROXIMITY_PASSES = 3
-_NOTHING = Quality.NO_CONTACT | Quality.TOO_FEW_ELEMENTS | Quality.WRONG_SIGN
+_HOLD_PASSES = 3
+_SURE = math.radians(2.0) / 4.0  # standard deviation of the place above which IMPRECISE is set
+_NOTHING = Quality.NO_CONTACT | Quality.TOO_FEW_ELEMENTS | Quality.WRONG_SIGN | Quality.NO_BASELINE
+_DOUBT = Quality.POOR_FIT | Quality.OUT_OF_ARC | Quality.OVERLOAD | Quality.NOT_CONVERGED | Quality.IMPRECISE
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +109,17 @@ class ShapeEstimate:
         """Return whether anything was estimated."""
         return not self.quality & _NOTHING
 
+    @property
+    def doubtful(self) -> bool:
+        """Return whether a flag says not to rely on the numbers; an edge or a flat is no doubt."""
+        return bool(self.quality & (_NOTHING | _DOUBT))
+
 
 _BLANK = ((math.nan,) * 3,) * 3
 
 
-def _nothing(quality: Quality) -> ShapeEstimate:
+def nothing(quality: Quality) -> ShapeEstimate:
+    """Return an estimate that says why there is none."""
     n = math.nan
     return ShapeEstimate(n, n, n, n, n, n, n, n, _BLANK, quality, 0)
 
@@ -120,6 +134,8 @@ class Estimator:
         contact_sigma: how far above the noise the strains must be to count as a touch, in standard deviations
             of their chi square.
         conductor: what touches is a conductor; a finger calibrated with the proximity effect then undoes it.
+        most_hollow: largest R of an estimate, in units of rb: 1 is a flat, 1.5 a hollow of radius 3 rb. Without a
+            bound a light touch beside the last element can pass for a heavy, wide one further out.
     """
 
     def __init__(
@@ -129,7 +145,10 @@ class Estimator:
         poor_fit: float = 4.0,
         contact_sigma: float = 6.0,
         conductor: bool = True,
+        most_hollow: float = 1.5,
     ) -> None:
+        if not most_hollow >= 1.0:
+            raise ValueError(f"make estimator: most_hollow is {most_hollow}; need 1 (flats) or more")
         self.finger = finger
         self._table = finger.strain_table()
         self._widths = finger.width_table()
@@ -147,6 +166,7 @@ class Estimator:
         pitch = float(np.ptp(angles)) / max(angles.size - 1, 1)
         self._arc = float(angles.min()) - 0.5 * pitch, float(angles.max()) + 0.5 * pitch
         self._radius = finger.cylinder.outer_m
+        self._largest = most_hollow * self._radius
         table = self._table
         self._widest = float(table.half_widths[-1]) ** 2
         bank, places = self._templates()
@@ -212,21 +232,48 @@ class Estimator:
             quality, count = Quality.BAD_ELEMENTS, int(np.count_nonzero(good))
             y, noise = np.where(good, y, 0.0), np.where(good, noise, _HUGE)
         if count < 4:
-            return _nothing(quality | Quality.TOO_FEW_ELEMENTS)
+            return nothing(quality | Quality.TOO_FEW_ELEMENTS)
         value, weight = 0.0, 0.0
         if load is not None:
             value, weight = load.value, 1.0 / max(load.deviation, 1e-6 * load.value) ** 2
         least = count + self._contact_sigma * math.sqrt(2.0 * count)
         if self._drawn is not None:
             y = self._undrawn(self._drawn, y, noise, least, value, weight)
-        status, t, b, at, steps, total = self._solve(
-            *self._fixed, noise, self._share, least, y, value, weight
-        )
+        status, t, b, at, steps, total = self._search(noise, least, y, value, weight)
         if status == Status.NO_CONTACT:
-            return _nothing(quality | Quality.NO_CONTACT)
+            return nothing(quality | Quality.NO_CONTACT)
         if status == Status.WRONG_SIGN:
-            return _nothing(quality | Quality.WRONG_SIGN)
+            return nothing(quality | Quality.WRONG_SIGN)
         return self._describe(t, b, at, steps, value, weight, count, total, quality)
+
+    def _search(
+        self, noise: Floats, least: float, y: Floats, load: float, load_weight: float
+    ) -> tuple[int, float, float, Products, int, float]:
+        """Fit, and fit again no wider than the most hollow indenter while the fit is wider."""
+        top = self._widest
+        for _ in range(1 + _HOLD_PASSES):
+            found = self._solve(*self._fixed, noise, self._share, least, y, load, load_weight, top)
+            status, _, b, at, _, _ = found
+            if status != Status.FITTED:
+                break
+            p = (at[3] + load_weight * load) / (at[0] + load_weight)
+            if p <= 0.0:
+                return Status.WRONG_SIGN, *found[1:]
+            hold = self._hold(p, b)
+            if hold >= b:
+                break
+            top = hold
+        return found
+
+    def _hold(self, load: float, b: float) -> float:
+        """Return b, or the width of the most hollow indenter under this load if that is less."""
+        for _ in range(8):  # Newton; R is nearly straight in b
+            radius, slope = self._widths.radius(load, b)
+            excess = radius / self._largest - 1.0
+            if excess < 1e-3:
+                break
+            b = max(b - (radius - self._largest) / slope, 0.0)
+        return b
 
     def _undrawn(
         self, drawn: Proximity, y: Floats, noise: Floats, least: float, load: float, load_weight: float
@@ -247,9 +294,7 @@ class Estimator:
         score = np.maximum(np.sum(bank * clean / noise, axis=1), 0.0) ** 2 / np.sum(bank**2 / noise, axis=1)
         t = float(places[int(np.argmin(np.sum(clean**2 / noise, axis=1) - score)), 0])
         for _ in range(_PROXIMITY_PASSES):
-            status, found, *_ = self._solve(
-                *self._fixed, noise, self._share, 0.0, without(t), load, load_weight
-            )
+            status, found, *_ = self._search(noise, 0.0, without(t), load, load_weight)
             if status != Status.FITTED:
                 break
             t = found
@@ -262,13 +307,13 @@ class Estimator:
         ff, ft, fb, fy, tt, tb, _, bb, _, yy = at
         ff, fy = ff + load_weight, fy + load_weight * load
         p = fy / ff
-        if p <= 0.0:
-            return _nothing(quality | Quality.WRONG_SIGN)
         chi = max(yy + load_weight * load * load - fy * fy / ff, 0.0)
         misfit = chi / max(count + (load_weight > 0.0) - 3, 1)
         radius, slope = self._widths.radius(p, b)
         covariance = _covariance(p, (p * p * tt, p * ft, p * p * tb, ff, p * fb, p * p * bb), radius, slope)
         quality |= self._judge(t, b, p, radius, misfit, steps)
+        if not covariance[0][0] < _SURE**2:
+            quality |= Quality.IMPRECISE
         bend = 1.0 / radius if radius > 0.0 else math.inf
         own = bend - 1.0 / self._radius
         return ShapeEstimate(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Products = tuple[float, float, float, float, float, float, float, float, float, float]
-# fits (nodes, first, step, width_step, weights, y, load, load_weight, t, b) -> (t, b, ten products,
+# fits (nodes, first, step, width_step, weights, y, load, load_weight, t, b, widest b) -> (t, b, ten products,
 # iterations)
 Fit = Callable[..., tuple[float, float, Products, int]]
 # solves one frame, see `_solver` -> (status, t, b, ten products, iterations, sum of weights)
@@ -150,9 +150,10 @@ def _build(products: Callable[..., Products]) -> Fit:
         load_weight: float,
         t: float,
         b: float,
+        top_b: float,
     ) -> tuple[float, float, Products, int]:
         top_t = first + step * (nodes.shape[1] - 1)
-        top_b = (width_step * (nodes.shape[0] - 1)) ** 2
+        b = min(b, top_b)
         at = products(nodes, first, step, width_step, weights, y, t, b)
         ff, fy = at[0] + load_weight, at[3] + load_weight * load
         cost = -(max(fy, 0.0) ** 2) / ff
@@ -220,6 +221,7 @@ def _solver(fit: Fit) -> Solve:
         y: Floats,
         load: float,
         load_weight: float,
+        top_b: float,
     ) -> tuple[int, float, float, Products, int, float]:
         blank = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         square = y * y
@@ -241,6 +243,7 @@ def _solver(fit: Fit) -> Solve:
             load_weight,
             float(places[best, 0]),
             float(places[best, 1]),
+            top_b,
         )
         return 0, t, b, at, steps, weights.sum()
 

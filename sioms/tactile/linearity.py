@@ -46,13 +46,15 @@ def linearise(output: ArrayLike, quadratic: ArrayLike) -> Floats:
     return np.where(1.0 + 4.0 * q * d < 0.0, -0.5 / np.where(q == 0.0, 1.0, q), linear)
 
 
-def find_quadratic(touches: Touches, model: Floats) -> Quadratic | None:
+def find_quadratic(touches: Touches, model: Floats, drawn: bool = False) -> Quadratic | None:
     """Fit q to groups of touches that differ in load only.
 
     Args:
         touches: outputs as recorded.
         model: strain of every touch and element by the model [1], shape (nt, ns); only ratios within a group
             matter.
+        drawn: the outputs hold the pull of a conductor, which is the same for all loads at one place: an offset
+            of its own for each group takes it up; groups then need four loads.
 
     Returns:
         None if no group spans a factor of two in load with three loads or more.
@@ -62,6 +64,8 @@ def find_quadratic(touches: Touches, model: Floats) -> Quadratic | None:
         return None
     count = touches.output.shape[1]
     pairs = [_pairs(touches, model, groups, element) for element in range(count)]
+    if drawn:
+        pairs = [[_without_offset(*pair) for pair in own if pair[0].size >= 4] for own in pairs]
     everyone = [pair for own in pairs for pair in own]
     if not everyone:
         return None
@@ -96,14 +100,22 @@ def _jackknife(pairs: list[Pair]) -> float:
     return float(np.sqrt((len(pairs) - 1) * np.mean((without - without.mean()) ** 2)))
 
 
-def ramp_quadratic(output: Floats, model: Floats) -> float:
+def _without_offset(output: Floats, model: Floats) -> Pair:
+    """Take off what a group's outputs have in common, by output = s m + c m^2 + offset."""
+    base = np.stack([model, model**2 / model.max(), np.full(model.size, model.max())], axis=1)
+    answer = np.linalg.lstsq(base, output, rcond=None)[0]
+    return output - answer[2] * model.max(), model
+
+
+def ramp_quadratic(output: Floats, model: Floats, drawn: bool = False) -> float:
     """Return q of one element from a load ramp over it, creep included.
 
     Args:
         output: of the element, shape (frames,).
         model: its strain by the model at the same frames, negative; only the shape matters.
+        drawn: as in `find_quadratic`.
     """
-    return _fit([(output, -model)])
+    return _fit([_without_offset(output, -model) if drawn else (output, -model)])
 
 
 def with_ramps(ramps: Floats, series: Quadratic | None) -> Quadratic:

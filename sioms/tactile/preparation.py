@@ -28,34 +28,38 @@ def clean_outputs(
 ) -> tuple[Touches, TouchLoads, tuple[Quadratic | None, Proximity | None]]:  # fmt: skip
     """Take proximity and quadratic off the outputs; all the model needs for that is each element's depth.
 
-    Twice: how strain grows with load and falls with distance depends on the depth, which the first round
-        finds.
+    In rounds: how strain grows with load and falls with distance depends on the depth, which the first round
+    finds; with a conductor's pull beside the quadratic there is a third.
     """
     body, recorded = nominal.cylinder, touches
     loads = touch_loads(body, widths, touches, HIGHEST, edge_half_angle)
     fits = starts(body, np.array(nominal.angles_rad), np.array(nominal.elements.radius_m), touches)
     distance = np.array(nominal.angles_rad) - touches.angle_rad[:, None]
     ramped, quadratic, proximity = _Ramps(body, ramps, edge_half_angle), None, None
-    for last in (False, True):
+    for number in range(3):
         proximity = find_proximity(
             recorded.output, _expected(body, fits, recorded, loads, quadratic), distance
         )
         pull = 0.0 if proximity is None else proximity.output(distance)
         touches = recorded.with_output(recorded.output - pull)
-        if not last and _cell_is_better(nominal, touches, loads):
+        drawn = proximity is not None
+        last = number == (2 if drawn else 1)
+        if number == 0 and _cell_is_better(nominal, touches, loads):
             recorded = _cell_loads(recorded)
             touches = recorded.with_output(touches.output)
             loads = touch_loads(body, widths, recorded, HIGHEST, edge_half_angle)
             warnings.append(
                 "the outputs follow the load cell from touch to touch: its variation was used, at the commanded level"
             )
-        quadratic = ramped.join(fits, _quadratic(body, fits, touches, loads))
+        source = recorded if drawn else touches
+        quadratic = ramped.join(
+            fits, find_quadratic(source, _model(body, fits, touches, loads), drawn), drawn
+        )
         if quadratic is not None:
             touches = touches.with_output(linearise(touches.output, quadratic.value))
-        if not last:
-            fits = fit_elements(
-                body, fits, touches, loads, 0.0, Freedom(True, True), lambda: tick("first fit")
-            )
+        if last:
+            break
+        fits = fit_elements(body, fits, touches, loads, 0.0, Freedom(True, True), lambda: tick("first fit"))
     _tell(quadratic, proximity, bool(ramps), warnings)
     return touches, loads, (quadratic, proximity)
 
@@ -134,10 +138,6 @@ def _cell_loads(touches: Touches) -> Touches:
     return Touches(touches.output, touches.angle_rad, load, touches.radius_m, touches.force, touches.noise)
 
 
-def _quadratic(body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads) -> Quadratic | None:
-    return find_quadratic(touches, _model(body, fits, touches, loads))
-
-
 class _Ramps:
     """Hold the tractions of an edge over the range of the ramps' loads, to ask the model again with other depths."""
 
@@ -154,8 +154,8 @@ class _Ramps:
         widths = rigid_core_table(body)
         self._loads = touch_loads(body, widths, self._touches, HIGHEST, edge_half_angle)
 
-    def join(self, fits: Fits, series: Quadratic | None) -> Quadratic | None:
-        """Return the quadratic of load series and ramps together."""
+    def join(self, fits: Fits, series: Quadratic | None, drawn: bool) -> Quadratic | None:
+        """Return the quadratic of load series and ramps together; drawn: by a conductor."""
         found = np.full(len(fits), np.nan)
         for ramp in self._ramps:
             fit = fits[ramp.element]
@@ -165,6 +165,6 @@ class _Ramps:
                 )
                 # strain per load is nearly constant: interpolate that
                 found[ramp.element] = ramp_quadratic(
-                    ramp.output, ramp.load * np.interp(ramp.load, self._load, strain / self._load)
+                    ramp.output, ramp.load * np.interp(ramp.load, self._load, strain / self._load), drawn
                 )
         return with_ramps(found, series) if np.isfinite(found).any() else series

@@ -8,6 +8,7 @@ A recording is a table of frames with marks: which touch, and whether the frame 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -188,26 +189,27 @@ def touch_loads(
     """
     k = np.arange(highest + 1)
     normal, shear = np.empty((len(touches), highest + 1)), np.empty((len(touches), highest + 1))
-    edges: dict[int, tuple[Floats, float]] = {}
-    stuck = _AdhesionByWidth(cylinder, highest)
+    stuck = _adhesion_by_width(cylinder, highest)
     for number in range(len(touches)):
         load, radius = float(touches.load[number]), float(touches.radius_m[number])
         if radius == 0.0:
             # an edge's narrow width hardly matters: one solution for each four per cent of load, scaled
-            step = round(np.log(load) / 0.04)
-            if step not in edges:
-                solved = width_for_load(cylinder, Wedge(edge_half_angle), float(np.exp(0.04 * step)))
-                edges[step] = (
-                    solved.series(0.0, highest)[: 2 * highest + 1 : 2] / solved.load,
-                    solved.half_width,
-                )
-            p, half = load * edges[step][0], edges[step][1]
+            step = round(float(np.log(load)) / 0.04)
+            spectrum, half = _edge(cylinder, highest, edge_half_angle, step)
+            p = load * spectrum
         else:
             half = widths.half_width(load * closedform.equivalent_radius(cylinder, radius))
             p = -load / (np.pi * cylinder.outer_m) * closedform.ellipse_spectrum(k * half)
             p[0] *= 0.5
         normal[number], shear[number] = p, load * stuck.at(half)
     return TouchLoads(normal, shear)
+
+
+@lru_cache(maxsize=1000)
+def _edge(cylinder: Cylinder, highest: int, half_angle: float, step: int) -> tuple[Floats, float]:
+    """Return the cosine coefficients of p under an edge per unit load, and its half width, at the load exp(0.04 step)."""
+    solved = width_for_load(cylinder, Wedge(half_angle), float(np.exp(0.04 * step)))
+    return solved.series(0.0, highest)[: 2 * highest + 1 : 2] / solved.load, solved.half_width
 
 
 class _AdhesionByWidth:
@@ -228,3 +230,8 @@ class _AdhesionByWidth:
         part = (half_width - self._nodes[place]) / (self._nodes[place + 1] - self._nodes[place])
         blend: Floats = (1.0 - part) * self._rows[place] + part * self._rows[place + 1]
         return blend
+
+
+@lru_cache(maxsize=8)
+def _adhesion_by_width(cylinder: Cylinder, highest: int) -> _AdhesionByWidth:
+    return _AdhesionByWidth(cylinder, highest)

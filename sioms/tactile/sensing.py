@@ -1,0 +1,184 @@
+"""Sense shape from raw frames: signal chain and estimator as one object, for drivers and programs.
+
+    sensor = ShapeSensor(finger)
+    for stamp_ns, raw in frames:
+        sensed = sensor.frame(raw, stamp_ns)           # or frame(raw, stamp_ns, load) with a force sensor
+        if sensed.shape.quality is Quality.GOOD: print(sensed.shape.angle_rad)
+
+Pure: frames, stamps and loads go in, values come out.  `numbers` lays an estimate out as the row of numbers that
+a driver publishes, described by `CHANNELS`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sioms.tactile.chain import SETTLE_FRAMES, SignalChain, StrainFrame
+from sioms.tactile.estimator import Estimator, Load, Quality, ShapeEstimate, nothing
+from sioms.tactile.finger import Finger
+
+Floats = NDArray[np.float64]
+
+CHANNELS: tuple[tuple[str, str, str], ...] = (
+    ("touched", "", "1 while something touches"),
+    ("angle", "rad", "place of the contact"),
+    ("load", "N/m", "load P, 0 while untouched"),
+    ("radius", "m", "radius rc of the indenter, infinite for a flat"),
+    ("equivalent_radius", "m", "R, 1/R = 1/rb + 1/rc"),
+    ("curvature", "1/m", "1/R, which behaves for flats"),
+    ("width", "rad", "width of the contact"),
+    ("residual", "", "root mean square of strain less model"),
+    ("misfit", "", "chi square per degree of freedom, 1 when the model fits"),
+    ("var_angle", "rad^2", "variance of the angle"),
+    ("var_load", "N^2/m^2", "variance of the load"),
+    ("var_radius", "m^2", "variance of R"),
+    ("cov_angle_load", "rad*N/m", "covariance of angle and load"),
+    ("cov_angle_radius", "rad*m", "covariance of angle and R"),
+    ("cov_load_radius", "N", "covariance of load and R"),
+    ("quality", "", "sum of the flags of Quality, 0 when good"),
+)
+"""Name, unit and meaning of each of the numbers of an estimate."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sensed:
+    """Hold what one frame said: its strains and the shape that made them; immutable."""
+
+    strain: StrainFrame
+    shape: ShapeEstimate
+
+
+class LoadTare:
+    """Turn readings of a force sensor into loads: scale, and subtract what it reads while untouched.
+
+    One caller at a time.
+
+    Args:
+        scale: load [N/m] of one unit of the reading: one over the length of contact [1/m] for newtons, negative
+            if pressing lowers the reading.
+        deviation: standard deviation of the load [N/m], > 0.
+        time_s: time constant with which the reading without touch is followed.
+
+    Raises:
+        ValueError: a scale of zero, or a deviation or time that is not positive and finite.
+    """
+
+    def __init__(self, scale: float, deviation: float, time_s: float) -> None:
+        if not (math.isfinite(scale) and scale != 0.0):
+            raise ValueError(f"tare load: scale is {scale} N/m a unit; need a finite number, not 0")
+        for name, value in (("deviation", deviation), ("time", time_s)):
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"tare load: {name} is {value}; need a positive, finite number")
+        self._scale, self._deviation, self._time_s = scale, deviation, time_s
+        self._rest: float | None = None
+
+    def zero(self) -> None:
+        """Forget the reading without touch."""
+        self._rest = None
+
+    def load(self, reading: float, touched: bool, elapsed_s: float) -> Load | None:
+        """Take one reading; return the load under a touch.
+
+        Returns:
+            None while untouched, before the first reading without touch, and for a reading that is not finite or
+            does not press: a sensor that says so under a touch is not to be believed.
+        """
+        if not math.isfinite(reading):
+            return None
+        if not touched:
+            share = -math.expm1(-elapsed_s / self._time_s)
+            self._rest = reading if self._rest is None else self._rest + share * (reading - self._rest)
+            return None
+        if self._rest is None:
+            return None
+        value = self._scale * (reading - self._rest)
+        return Load(value, self._deviation) if value > 0.0 else None
+
+
+class ShapeSensor:
+    """Sense the shape of what touches one finger, frame by frame.  One caller at a time.
+
+    Args:
+        finger: the calibrated finger.
+        compiled: True demands numba, False plain numpy, None takes numba if it is installed.
+        conductor: see `Estimator`.
+        tare: of the force sensor, if there is one.
+        settle_frames: frames averaged for the baseline.
+    """
+
+    def __init__(
+        self,
+        finger: Finger,
+        *,
+        compiled: bool | None = False,
+        conductor: bool = True,
+        tare: LoadTare | None = None,
+        settle_frames: int = SETTLE_FRAMES,
+    ) -> None:
+        self.finger = finger
+        self._chain = SignalChain(finger, settle_frames)
+        self._estimator = Estimator(finger, compiled=compiled, conductor=conductor)
+        self._tare = tare
+        self._stamp_ns: int | None = None
+
+    def zero(self) -> None:
+        """Take a new baseline from the next frames; the finger must be untouched."""
+        self._chain.zero()
+        if self._tare is not None:
+            self._tare.zero()
+
+    @property
+    def gains(self) -> Floats:
+        """Return strain per output, shape (ns, ns): a diagonal unless `set_gains` gave more."""
+        return self._chain.gains
+
+    def set_gains(self, gains: ArrayLike) -> None:
+        """Replace the gains: one for each element, or a matrix with cross-talk.
+
+        Raises:
+            ValueError: wrong shape, a value that is not finite, a gain of an element that is not positive.
+        """
+        self._chain.set_gain(gains)
+
+    def frame(self, raw: ArrayLike, stamp_ns: int, reading: float | None = None) -> Sensed:
+        """Sense one frame.
+
+        Args:
+            raw: readings, shape (ns,); not finite where there is none.
+            stamp_ns: monotonic time of the frame.
+            reading: of the force sensor at that time; None if there is none to be had.
+
+        Raises:
+            ValueError: wrong number of readings, or a stamp before the last one.
+        """
+        strain = self._chain.frame(raw, stamp_ns)
+        elapsed_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
+        self._stamp_ns = stamp_ns
+        if not strain.settled:
+            return Sensed(strain, nothing(Quality.NO_BASELINE))
+        load = None
+        if self._tare is not None and reading is not None:
+            load = self._tare.load(reading, strain.touched, elapsed_s)
+        if not strain.touched:
+            return Sensed(strain, nothing(Quality.NO_CONTACT))
+        shape = self._estimator.frame(strain.strains, load, strain.usable)
+        if self._tare is not None and load is None:
+            shape = dataclasses.replace(shape, quality=shape.quality | Quality.WITHOUT_LOAD)
+        return Sensed(strain, shape)
+
+
+def numbers(sensed: Sensed) -> tuple[float, ...]:
+    """Return the estimate as numbers in the order of CHANNELS; nan for what is not known."""
+    shape = sensed.shape
+    (aa, ap, ar), (_, pp, pr), (_, _, rr) = shape.covariance
+    untouched = sensed.strain.settled and not sensed.strain.touched
+    return (
+        float(sensed.strain.touched), shape.angle_rad, 0.0 if untouched else shape.load_n_per_m, shape.radius_m,
+        shape.equivalent_radius_m, shape.equivalent_curvature_per_m, shape.width_rad, shape.residual, shape.misfit,
+        aa, pp, rr, ap, ar, pr, float(shape.quality.value),
+    )  # fmt: skip
