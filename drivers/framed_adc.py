@@ -10,6 +10,9 @@ the last. Each block carries the time at which it was sampled, by a running fit 
     rate_hz = 200
     scale = 0.0005
     unit = "N"
+
+The front end of a calibrated tactile finger has a table ``shape``, see ``tactile_nodes``: the strains and what touches the
+finger are then published with every block.
 """
 
 from __future__ import annotations
@@ -22,7 +25,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from sioms.protocol.flags import AnalogStatus, NodeClass
+from sioms.drivers import tactile_nodes
+from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
 from sioms.sdk.codec import sample_stream as stream
@@ -55,6 +59,7 @@ class FramedAdcSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
         stream: number of the stream.
         format: of the values, for the arithmetic of the line; the device must send it.
         history: snapshots kept for readers.
+        shape: of a tactile finger: shows its strains and the shape that touches it, too.
     """
 
     line: LineSettings
@@ -70,6 +75,7 @@ class FramedAdcSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     stream: int = 1
     format: str = "i16"
     history: int = 256
+    shape: tactile_nodes.ShapeSettings | None = None
 
 
 class FramedAdc(StreamDriver):
@@ -90,7 +96,13 @@ class FramedAdc(StreamDriver):
             ChannelInfo(each, settings.unit, settings.minimum, settings.maximum) for each in names
         )
         block = BlockSpec("", NodeClass.ANALOG, channels, history=settings.history)
-        return Description((block,), settings.rate_hz, lease_s=max(0.5, 10 / settings.rate_hz))
+        more = tactile_nodes.specs(settings.shape, settings.channels, settings.history)
+        return Description(
+            (block, *more),
+            settings.rate_hz,
+            tactile_nodes.inputs(settings.shape),
+            max(0.5, 10 / settings.rate_hz),
+        )
 
     @classmethod
     def golden(cls, settings: Any) -> Sequence[Golden]:
@@ -120,7 +132,9 @@ class FramedAdc(StreamDriver):
         super().__init__(name, settings, kit)
         self.line = settings.line
         self.silence_s = max(0.25, 20 / settings.rate_hz)
-        self._block = AnalogBlock(self.describe(name, settings).blocks[0])
+        first, *more = self.describe(name, settings).blocks
+        self._block = AnalogBlock(first)
+        self._finger = tactile_nodes.TactileNodes(settings.shape, more, kit) if settings.shape else None
         self._scale = np.broadcast_to(np.array(settings.scale, dtype=np.float64), settings.channels)
         self._offset = np.broadcast_to(np.array(settings.offset, dtype=np.float64), settings.channels)
         self._receiver = FrameReceiver()
@@ -130,8 +144,8 @@ class FramedAdc(StreamDriver):
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
-        """The channels."""
-        return (self._block,)
+        """The channels; of a finger its strains and shape, too."""
+        return (self._block,) if self._finger is None else (self._block, *self._finger.blocks)
 
     def open(self) -> Steps:
         """Ask the device what it is, compare, and start the stream."""
@@ -211,6 +225,16 @@ class FramedAdc(StreamDriver):
         self._block.flags[:] = flags | np.where(np.isfinite(data), 0, int(AnalogStatus.INVALID))
         self._block.stamp_ns = self._fit.to_host(block.t_us, now_ns)
         self.kit.publish(self._block, self._block.stamp_ns)
+        if self._finger is not None:
+            self._finger.take(data, self._block.flags, self._block.stamp_ns, now_ns)
+            for derived in self._finger.blocks:
+                self.kit.publish(derived, derived.stamp_ns)
+
+    def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
+        """Answer the requests of a finger's nodes."""
+        if self._finger is None or not block.name:
+            return super().ioctl(block, request, channels, argument)
+        return self._finger.ioctl(block, request, argument)
 
     def _not_this(self, what: str) -> DeviceError:
         return DeviceError(errno.ENODEV, f"identify {self.name} on {self.line}: the device {what}")

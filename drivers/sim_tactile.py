@@ -9,6 +9,8 @@ The driver knows the contact force and, where told, the contact angle from nodes
     angle_per_position = 78.7
     angle_rad = 1.29
     indenter_radius_m = 0.006
+
+With a table ``shape``, see ``tactile_nodes``, it shows strains and shape as a real finger does.
 """
 
 from __future__ import annotations
@@ -19,8 +21,9 @@ from typing import Any
 
 import msgspec
 
+from sioms.drivers import tactile_nodes
 from sioms.plant.finger import FingerShape, TactileArray
-from sioms.protocol.flags import AnalogStatus, NodeClass
+from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
 from sioms.sdk.driver import Kit, TickDriver
@@ -37,13 +40,14 @@ class SimTactileSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True
         angle_node: node of one channel that moves the contact along the finger; fixed when absent.
         angle_rad: contact angle, at position 0 of the angle node.
         angle_per_position: [rad/m or rad/rad].
-        indenter_radius_m: radius of the object, infinite for a flat.
-        finger: geometry and material.
+        indenter_radius_m: radius of the object, infinite for a flat, 0 for an edge.
+        finger: geometry, material and faults.
         gain, offset: of the elements [1, %]; one number for each.
         noise, resolution: of all [%].
         seed: of the noise.
         tick_hz: rate.
         history: snapshots kept for readers.
+        shape: shows strains and the shape that touches, too.
     """
 
     force_node: str = ""
@@ -59,6 +63,7 @@ class SimTactileSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     seed: int = 0
     tick_hz: float = 200.0
     history: int = 64
+    shape: tactile_nodes.ShapeSettings | None = None
 
 
 class SimTactile(TickDriver):
@@ -72,33 +77,50 @@ class SimTactile(TickDriver):
     @classmethod
     def describe(cls, name: str, settings: SimTactileSettings) -> Description:
         """Tell the elements and the nodes that are felt."""
-        elements = _array(settings).offset.size
+        elements = _check(settings)
         channels = tuple(
             ChannelInfo(f"e{index}", "%", description="radial compression") for index in range(elements)
         )
-        inputs = tuple(dict.fromkeys(node for node in (settings.force_node, settings.angle_node) if node))
+        felt = (settings.force_node, settings.angle_node, *tactile_nodes.inputs(settings.shape))
         return Description(
-            (BlockSpec("", NodeClass.ANALOG, channels, history=settings.history),), settings.tick_hz, inputs
+            (
+                BlockSpec("", NodeClass.ANALOG, channels, history=settings.history),
+                *tactile_nodes.specs(settings.shape, elements, settings.history),
+            ),
+            settings.tick_hz,
+            tuple(dict.fromkeys(node for node in felt if node)),
         )
 
     def __init__(self, name: str, settings: SimTactileSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
-        self._block = AnalogBlock(self.describe(name, settings).blocks[0])
+        first, *more = self.describe(name, settings).blocks
+        self._block = AnalogBlock(first)
+        self._finger = tactile_nodes.TactileNodes(settings.shape, more, kit) if settings.shape else None
         self._array = _array(settings)
+        self._array.mount(settings.indenter_radius_m)
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
-        """The elements."""
-        return (self._block,)
+        """The elements; their strains and shape, too, where that is asked for."""
+        return (self._block,) if self._finger is None else (self._block, *self._finger.blocks)
 
     def tick(self, now_ns: int) -> None:
         """Read force and angle; while a device is not there the reading is invalid."""
         settings = self.settings
         force, angle = self._value(settings.force_node, now_ns), self._value(settings.angle_node, now_ns)
         contact_rad = settings.angle_rad + settings.angle_per_position * (angle or 0.0)
-        self._array.read(force or 0.0, contact_rad, settings.indenter_radius_m, self._block.data)
+        radius_m = settings.indenter_radius_m
+        self._array.read(force or 0.0, contact_rad, radius_m, self._block.data, now_ns * 1e-9)
         missing = force is None or angle is None
         self._block.flags[:] = int(AnalogStatus.INVALID) if missing else 0
+        if self._finger is not None:
+            self._finger.take(self._block.data, self._block.flags, now_ns, now_ns)
+
+    def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
+        """Answer the requests of the finger's nodes."""
+        if self._finger is None or not block.name:
+            return super().ioctl(block, request, channels, argument)
+        return self._finger.ioctl(block, request, argument)
 
     def _value(self, node: str, now_ns: int) -> float | None:
         """Return a node's value, 0 for no node, None while its device is not there."""
@@ -108,24 +130,27 @@ class SimTactile(TickDriver):
         return None if reading is None else float(reading[0, 0])
 
 
-def _array(settings: SimTactileSettings) -> TactileArray:
-    """Make the array.
+def _check(settings: SimTactileSettings) -> int:
+    """Return the number of elements.
 
     Raises:
         ValueError: numbers of another length than the elements, or a radius that is no radius.
     """
-    shape = from_table(FingerShape, settings.finger)
-    elements = len(shape.angles_rad)
+    elements = len(from_table(FingerShape, settings.finger).angles_rad)
     for key, values in (("gain", settings.gain), ("offset", settings.offset)):
         if len(values) not in (0, elements):
             raise ValueError(f"{key}: {len(values)} numbers; want {elements}, one for each element")
-    if not (settings.indenter_radius_m > 0 and elements > 0 and math.isfinite(settings.angle_rad)):
+    if not (settings.indenter_radius_m >= 0 and math.isfinite(settings.angle_rad)):
         raise ValueError(
-            f"indenter_radius_m {settings.indenter_radius_m:g}, {elements} angles_rad, angle_rad "
-            f"{settings.angle_rad:g}; want a positive radius, one angle or more, a finite angle"
+            f"indenter_radius_m {settings.indenter_radius_m:g}, angle_rad {settings.angle_rad:g}; "
+            "want a positive radius or 0 for an edge, a finite angle"
         )
+    return elements
+
+
+def _array(settings: SimTactileSettings) -> TactileArray:
     return TactileArray(
-        shape,
+        from_table(FingerShape, settings.finger),
         settings.gain or 1.0,
         settings.offset or 0.0,
         settings.noise,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 import time
@@ -181,6 +182,7 @@ class _Show:
             self._cell.open("mod1.zaxis", "rw") as axis,
             self._cell.open("lord1") as sensor,
             self._cell.open("tactile0") as finger,
+            self._cell.open("tactile0.shape") as shape,
         ):
             sensor.zero(50)
             finger.zero(20)
@@ -195,6 +197,11 @@ class _Show:
             peak = max(abs(v) for v in snapshot.data) or 1.0
             for index, value in enumerate(snapshot.data):
                 _say(f"element {index:2} {value:+7.2f} %  {'#' * round(40 * abs(value) / peak)}")
+            felt = dict(zip((channel.name for channel in shape.info.channels), shape.read().data, strict=True))
+            _say(
+                f"shape: {math.degrees(felt['angle']):.2f} +- {math.degrees(felt['var_angle'] ** 0.5):.2f} deg, "
+                f"{felt['load']:.0f} N/m, radius {1e3 * felt['radius']:.1f} mm (it is 6 mm)"
+            )
             axis.wait_until_idle(2.0)
             axis.move(0.0)
             axis.wait_until_idle(5.0)

@@ -1,0 +1,224 @@
+"""The nodes ``strain`` and ``shape`` that a driver of a tactile finger shows beside its raw readings.
+
+No driver itself: drivers that deliver frames of a finger's elements compose it (decision 0043). Their table
+then has a table ``shape``:
+
+    [device.tactile0.shape]
+    finger_file = "finger.toml"          # from sioms tactile calibrate
+    load_node = "lord1.fz"               # optional: a force sensor under the finger
+    load_scale = 50.0                    # N/m for a newton: one over the length of contact in metres
+
+Requests on ``strain`` and ``shape``: ZERO_DEVICE takes a new baseline from the next frames, CALIBRATE_DEVICE with
+the text of a finger's file loads that finger; on ``strain`` SET_GAINS and GET_GAINS hold strain per output.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.protocol.flags import AnalogStatus, NodeClass, Request
+from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.sdk.blocks import AnalogBlock, BlockSpec
+from sioms.sdk.driver import Kit, Refusal
+from sioms.tactile.finger import Finger, from_toml
+from sioms.tactile.sensing import CHANNELS, LoadTare, ShapeSensor, numbers
+
+Array = NDArray[np.float64]
+
+STRAIN, SHAPE = "strain", "shape"
+
+
+class ShapeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Keys of the table ``shape``.
+
+    Attributes:
+        finger_file: the calibrated finger.
+        load_node: node of one channel that reads the force on the finger; none when empty.
+        load_scale: N/m for one unit of that node, negative when pressing lowers it.
+        load_deviation: standard deviation of the load [N/m].
+        load_age_s: how much older than the frame a reading may be; an older one is not used.
+        settle_frames: frames averaged for the baseline.
+        conductor: what touches is a conductor; undoes the proximity effect where the finger's file has it.
+        compiled: fit by numba: five times as fast, but seconds to start the first time on a machine.
+    """
+
+    finger_file: str
+    load_node: str = ""
+    load_scale: float = 1.0
+    load_deviation: float = 4.0
+    load_age_s: float = 0.05
+    settle_frames: int = 20
+    conductor: bool = True
+    compiled: bool = False
+
+
+def inputs(settings: ShapeSettings | None) -> tuple[str, ...]:
+    """Return the nodes of other devices that are read."""
+    return (settings.load_node,) if settings is not None and settings.load_node else ()
+
+
+def specs(settings: ShapeSettings | None, elements: int, history: int) -> tuple[BlockSpec, ...]:
+    """Return the blocks, none without settings; reads the finger's file, so that its mistakes show before the start.
+
+    Raises:
+        ValueError: a file that cannot be read or is no finger of so many elements, or a load that cannot be.
+    """
+    if settings is None:
+        return ()
+    _finger(settings, elements)
+    _tare(settings)
+    if not 0.0 < settings.load_age_s < math.inf:
+        raise ValueError(f"shape: load_age_s = {settings.load_age_s:g}; want a positive time in seconds")
+    if settings.settle_frames < 1:
+        raise ValueError(f"shape: settle_frames = {settings.settle_frames}; want 1 or more")
+    strains = tuple(
+        ChannelInfo(f"e{i}", "", description="radial strain, tension positive") for i in range(elements)
+    )
+    shape = tuple(ChannelInfo(name, unit, description=what) for name, unit, what in CHANNELS)
+    return (
+        BlockSpec(STRAIN, NodeClass.ANALOG, strains, history=history),
+        BlockSpec(SHAPE, NodeClass.ANALOG, shape, history=history),
+    )
+
+
+class TactileNodes:
+    """Fills the two nodes from raw frames.
+
+    Concurrency: the one thread of the driver process.
+
+    Args:
+        settings: checked by ``specs``.
+        blocks: what ``specs`` returned.
+        kit: services; reads the load node.
+    """
+
+    def __init__(self, settings: ShapeSettings, blocks: Sequence[BlockSpec], kit: Kit) -> None:
+        self._settings, self._kit = settings, kit
+        self.strain, self.shape = AnalogBlock(blocks[0]), AnalogBlock(blocks[1])
+        for block in self.blocks:
+            block.corrected_by_driver = True
+        self._sensor = self._make(_finger(settings, self.strain.n))
+        self._stamp_ns = 0
+
+    @property
+    def blocks(self) -> tuple[AnalogBlock, AnalogBlock]:
+        """Strain and shape."""
+        return self.strain, self.shape
+
+    def take(self, raw: Array, flags: NDArray[np.int64], stamp_ns: int, now_ns: int) -> None:
+        """Sense one frame and fill the blocks.
+
+        Args:
+            raw: readings in the finger's raw unit.
+            flags: AnalogStatus of each; what is INVALID is not used.
+            stamp_ns: time of the frame.
+            now_ns: present time, at which the load node is read.
+        """
+        readings = np.where(flags & int(AnalogStatus.INVALID), np.nan, raw)
+        # a device's clock that began anew may lie a little before the frames already sensed
+        self._stamp_ns = max(self._stamp_ns, stamp_ns)
+        sensed = self._sensor.frame(readings, self._stamp_ns, self._load(stamp_ns, now_ns))
+        lost = int(np.bitwise_or.reduce(flags)) & int(AnalogStatus.OVERRUN)
+        self.strain.data[:] = sensed.strain.strains
+        self.strain.flags[:] = lost | np.where(sensed.strain.saturated, int(AnalogStatus.SATURATED), 0)
+        self.shape.data[:] = numbers(sensed)
+        self.shape.flags[:] = lost
+        for block in self.blocks:
+            block.flags[np.isnan(block.data)] |= int(AnalogStatus.INVALID)
+            block.stamp_ns = stamp_ns
+
+    def ioctl(self, block: BlockSpec, request: Request, argument: Any) -> Any:
+        """Answer the requests named above.
+
+        Raises:
+            Refusal: another request, or an argument that makes no sense.
+        """
+        on_strain = block.name == STRAIN
+        try:
+            match request:
+                case Request.ZERO_DEVICE:
+                    self._sensor.zero()
+                    return [0.0] * len(block.channels)
+                case Request.CALIBRATE_DEVICE:
+                    return self._load_finger(argument)
+                case Request.GET_GAINS if on_strain:
+                    return self._sensor.gains.ravel().tolist()
+                case Request.SET_GAINS if on_strain:
+                    return self._set_gains(argument)
+        except ValueError as error:
+            raise Refusal(errno.EINVAL, str(error)) from None
+        raise Refusal(errno.ENOTTY, f"{request.name} is not a request {block.name} knows")
+
+    def _load_finger(self, text: Any) -> str:
+        if not isinstance(text, str):
+            raise Refusal(errno.EINVAL, f"{type(text).__name__} given; want the text of a finger's file")
+        finger = from_toml(text)
+        _check(finger, self.strain.n, "the finger given")
+        self._sensor = self._make(finger)
+        return finger.name
+
+    def _set_gains(self, argument: Any) -> None:
+        n = self.strain.n
+        given = np.array(argument, dtype=np.float64).ravel()
+        if given.size not in (n, n * n):
+            raise ValueError(f"{given.size} gains; want {n}, or {n} rows of {n}")
+        self._sensor.set_gains(given if given.size == n else given.reshape(n, n))
+
+    def _load(self, stamp_ns: int, now_ns: int) -> float | None:
+        """Return the load node's reading if it is there, valid and young enough."""
+        if not self._settings.load_node:
+            return None
+        node = self._kit.inputs[self._settings.load_node]
+        reading = node.read(now_ns)
+        if reading is None or stamp_ns - node.stamp_ns > self._settings.load_age_s * 1e9:
+            return None
+        if int(reading.view(np.int64)[1, 0]) & int(AnalogStatus.INVALID | AnalogStatus.SATURATED):
+            return None
+        return float(reading[0, 0])
+
+    def _make(self, finger: Finger) -> ShapeSensor:
+        settings = self._settings
+        return ShapeSensor(
+            finger,
+            compiled=settings.compiled,
+            conductor=settings.conductor,
+            tare=_tare(settings),
+            settle_frames=settings.settle_frames,
+        )
+
+
+def _tare(settings: ShapeSettings) -> LoadTare | None:
+    if not settings.load_node:
+        return None
+    try:
+        return LoadTare(settings.load_scale, settings.load_deviation, 2.0)
+    except ValueError as error:
+        raise ValueError(f"shape: {error}") from None
+
+
+def _finger(settings: ShapeSettings, elements: int) -> Finger:
+    path = Path(settings.finger_file)
+    try:
+        finger = from_toml(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(
+            f"shape: finger_file {path}: {error.strerror}; sioms tactile calibrate writes one"
+        ) from None
+    except ValueError as error:
+        raise ValueError(f"shape: finger_file {path}: {error}") from None
+    _check(finger, elements, f"shape: finger_file {path}")
+    return finger
+
+
+def _check(finger: Finger, elements: int, what: str) -> None:
+    count = len(finger.angles_rad)
+    if count != elements:
+        raise ValueError(f"{what}: finger {finger.name!r} has {count} elements; the device has {elements}")
