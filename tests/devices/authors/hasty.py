@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 from sioms.drivers.tmcl import Tmcl
 from sioms.sdk.driver import Kit
@@ -25,7 +25,7 @@ position_max = 1.0
 
 
 class Hasty(Tmcl):
-    rig = {"counterpart": ["tmcl"], "tables": TABLES}
+    rig: ClassVar = {"counterpart": ["tmcl"], "tables": TABLES}
 
     def __init__(self, name: str, settings: Any, kit: Kit) -> None:
         super().__init__(name, settings, kit)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 from sioms.drivers.tmcl import Tmcl, TmclUnit
 from sioms.sdk.driver import Kit
@@ -15,7 +15,7 @@ class RunawayUnit(TmclUnit):
 
 
 class Runaway(Tmcl):
-    rig = {
+    rig: ClassVar = {
         "counterpart": ["tmcl"],
         "tables": (
             '[device.runaway]\ndriver = "{driver}"\nmodule = 1140\npoll_hz = 50.0\n'

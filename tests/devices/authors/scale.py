@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import msgspec
 
 from sioms.protocol.flags import NodeClass
@@ -65,7 +67,7 @@ class ScaleUnit(LineUnit):
 
 class Scale(LineDriver):
     Settings = Settings
-    rig = {
+    rig: ClassVar = {
         "counterpart": ["scale_device.py"],
         "tables": '[device.scale]\ndriver = "{driver}"\nline = { serial = "{port}", baud = 9600 }\n',
         "analogs": ["scale"],
