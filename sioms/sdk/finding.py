@@ -62,8 +62,7 @@ def find_driver(name: str, folder: str) -> type[Driver]:
 
 def _from_file(path: str) -> type[Driver]:
     stem = os.path.splitext(os.path.basename(path))[0].replace("-", "_")
-    name = f"sioms_driver_{stem}_{zlib.crc32(os.path.abspath(path).encode()):08x}"
-    spec = importlib.util.spec_from_file_location(name, path)
+    spec = importlib.util.spec_from_file_location(f"sioms_driver_{stem}", path)
     if spec is None or spec.loader is None or not os.path.isfile(path):
         raise DriverNotFound(f"driver = {path}: no such file; want a Python file that defines DRIVER")
     module = importlib.util.module_from_spec(spec)
@@ -121,9 +120,7 @@ def _anchored(value: Any, folder: str, key: str = "") -> Any:
         return {k: _anchored(v, folder, k) for k, v in value.items()}
     if isinstance(value, list):
         return [_anchored(v, folder) for v in value]
-    return (
-        os.path.join(folder, value) if key.endswith("_file") and isinstance(value, str) and value else value
-    )
+    return os.path.join(folder, value) if key.endswith("_file") and isinstance(value, str) and value else value
 
 
 def describe(driver: type[Driver], name: str, settings: Any) -> tuple[list[object] | None, list[str]]:
