@@ -28,6 +28,7 @@ from sioms.sdk.datagram import split_address
 from sioms.sdk.driver import Kit, StreamDriver
 from sioms.sdk.exchange import Aside, DeviceError, LinkError, Pause, Send, Steps
 from sioms.sdk.force_torque import ForceBlock, Six, force_spec
+from sioms.sdk.golden import Golden
 from sioms.sdk.settings import LineSettings
 
 MARGIN_S = 0.1
@@ -89,6 +90,21 @@ class AtiRdt(StreamDriver):
         _check(settings)
         spec = force_spec(settings.full_scale, settings.history, "ATI force/torque sensor")
         return Description((spec,), settings.rate_hz, lease_s=max(0.5, 10 / settings.rate_hz))
+
+    @classmethod
+    def golden(cls, settings: Any) -> Sequence[Golden]:
+        """Return datagrams of the manual."""
+        record = rdt.Record(1, 1, 0, 1000000, -2000000, 3000000, 10000, -20000, 30000)
+        sent = "00 00 00 01 00 00 00 01 00 00 00 00 00 0f 42 40 ff e1 7b 80 00 2d c6 c0 00 00 27 10 ff ff b1 e0 00 00 75 30"
+        start = rdt.start(rdt.Command.REALTIME, MARGIN_S)
+        return (
+            Golden("start", start, "12 34 00 02 00 00 00 00"),
+            Golden(
+                "record", reply=sent, value=record, read=lambda data: start.decode(data[: rdt.RECORD_BYTES])
+            ),
+            Golden("stop", rdt.request(rdt.Command.STOP), "12 34 00 00 00 00 00 00"),
+            Golden("bias", rdt.request(rdt.Command.BIAS), "12 34 00 42 00 00 00 00"),
+        )
 
     def __init__(self, name: str, settings: AtiRdtSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)

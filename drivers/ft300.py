@@ -11,7 +11,7 @@ from __future__ import annotations
 import errno
 import time
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -24,6 +24,7 @@ from sioms.sdk.codec.modbus import RtuUnit, SerialLine
 from sioms.sdk.driver import Driver, Kit, LineDriver, LineUnit, StreamDriver
 from sioms.sdk.exchange import DeviceError, LinkError, Pause, Send, Steps
 from sioms.sdk.force_torque import ForceBlock, Six, force_spec
+from sioms.sdk.golden import Golden, Incomplete
 from sioms.sdk.settings import LineSettings
 
 STOP_PIECE = 50
@@ -84,6 +85,32 @@ class Ft300(StreamDriver):
         _check(settings)
         rate_hz = ft300.RATE_HZ if settings.mode == "stream" else settings.poll_hz
         return Description(_specs(settings), rate_hz, lease_s=max(0.5, 5 / rate_hz))
+
+    @classmethod
+    def golden(cls, settings: Any) -> Sequence[Golden]:
+        """Return frames of the instruction manual."""
+        unit = RtuUnit(ft300.SLAVE, LINE, TURNAROUND_S)
+
+        def first(data: bytes) -> tuple[int, ...]:
+            found = ft300.RecordReceiver().feed(data)
+            if not found:
+                raise Incomplete("no good record")
+            return found[0][0]
+
+        return (
+            Golden(
+                "read the forces", unit.read_holding(ft300.FORCES_AT, 6), "09 03 00 b4 00 06 84 a6",
+                "09 03 0c fe d8 fb 2e 16 2e 00 64 ff 38 01 2c 9d fc", (0xFED8, 0xFB2E, 0x162E, 0x0064, 0xFF38, 0x012C),
+            ),
+            Golden(
+                "start the stream", unit.write_registers(ft300.STREAM_AT, [ft300.START_STREAM]),
+                "09 10 01 9a 00 01 02 02 00 cd ca", "09 10 01 9a 00 01 21 52",
+            ),
+            Golden(
+                "record", reply="20 4e d8 fe 2e fb 2e 16 64 00 38 ff 2c 01 7d af", value=(-296, -1234, 5678, 100, -200, 300),
+                read=first,
+            ),
+        )  # fmt: skip
 
     def __init__(self, name: str, settings: Ft300Settings, kit: Kit) -> None:
         super().__init__(name, settings, kit)

@@ -24,6 +24,7 @@ from sioms.sdk.datagram import split_address
 from sioms.sdk.driver import Kit, Refusal, StreamDriver
 from sioms.sdk.exchange import Aside, DeviceError, Exchange, LinkError, Steps
 from sioms.sdk.force_torque import ForceBlock, Six, force_spec
+from sioms.sdk.golden import Golden, Incomplete
 from sioms.sdk.settings import LineSettings
 
 SILENCE_S = 3 / ifb.RATE_HZ + 0.1
@@ -68,6 +69,37 @@ class SchunkFt(StreamDriver):
         _check(settings)
         spec = force_spec(settings.full_scale, settings.history, "SCHUNK FTS force/torque sensor")
         return Description((spec,), ifb.RATE_HZ, lease_s=0.5)
+
+    @classmethod
+    def golden(cls, settings: Any) -> Sequence[Golden]:
+        """Return frames of the vendor's repository."""
+        sent = "ff ff 40 11 1d 00 40 01 00 00 00 55 50 02 3f f2 04 e6 be 01 98 7e bf 04 1b 20 bf 7c 2a a3 3e ad 43 78 3f"
+        values = (0.50904, -0.44926, -0.99451, -0.62541, 0.31868, 0.96978)
+
+        def read(data: bytes) -> tuple[int, int, int, tuple[float, ...]]:
+            record = ifb.parse(data[: ifb.RECORD_BYTES])
+            if record is None:
+                raise Incomplete("no record")
+            return (
+                record.counter,
+                record.packet,
+                record.status,
+                tuple(round(value, 5) for value in record.values),
+            )
+
+        return (
+            Golden(
+                "read the product's name", ifb.Commands().get(ifb.PRODUCT), "ff ff 01 00 04 00 f0 01 00 00",
+                "ff ff 01 00 08 00 f0 00 01 00 00 4b 4d 53", b"KMS",
+            ),
+            Golden(
+                "tare", ifb.Commands(last=2).act(Command.TARE), "ff ff 03 00 01 00 12", "ff ff 03 00 02 00 12 00",
+            ),
+            Golden(
+                "start", ifb.Commands(last=6).act(Command.START), "ff ff 07 00 01 00 40", "ff ff 07 00 02 00 40 00",
+            ),
+            Golden("record", reply=sent, value=(4416, 64, 1, values), read=read),
+        )  # fmt: skip
 
     def __init__(self, name: str, settings: SchunkFtSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)

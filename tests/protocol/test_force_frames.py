@@ -185,10 +185,9 @@ def test_schunk_commands() -> None:
     commands = ifb.Commands()
     first = commands.get(ifb.PRODUCT)
     assert first.data == request and first.repeatable
-    commands._last = 2
-    tare = commands.act(ifb.Command.TARE)
+    tare = ifb.Commands(last=2).act(ifb.Command.TARE)
     assert tare.data.hex(" ") == "ff ff 03 00 01 00 12" and not tare.repeatable
-    commands._last = 6
+    commands = ifb.Commands(last=6)
     start = commands.act(ifb.Command.START)
     assert start.data.hex(" ") == "ff ff 07 00 01 00 40"
     done = bytes.fromhex("ff ff 03 00 02 00 12 00"), bytes.fromhex("ff ff 07 00 02 00 40 00")
@@ -225,9 +224,7 @@ def test_schunk_refusals_and_other_protocols(reply: str, error: type[Exception],
 
 
 def test_schunk_numbers_go_round() -> None:
-    commands = ifb.Commands()
-    commands._last = 0xFFFF
-    assert commands.act(ifb.Command.STOP).data.hex(" ") == "ff ff 01 00 01 00 41"
+    assert ifb.Commands(last=0xFFFF).act(ifb.Command.STOP).data.hex(" ") == "ff ff 01 00 01 00 41"
 
 
 def test_schunk_record() -> None:

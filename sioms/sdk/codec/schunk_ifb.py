@@ -120,10 +120,15 @@ def status_text(status: int) -> str:
 
 
 class Commands:
-    """Numbers the commands and frames them; a reply with another number is an old one."""
+    """Numbers the commands and frames them; a reply with another number is an old one.
 
-    def __init__(self, timeout_s: float = 1.0) -> None:
-        self._last = 0
+    Args:
+        last: number of the command before the first.
+        timeout_s: longest time to an answer [s].
+    """
+
+    def __init__(self, last: int = 0, timeout_s: float = 1.0) -> None:
+        self._last = last
         self._timeout_s = timeout_s
 
     def act(self, command: Command, *arguments: int) -> Exchange:
