@@ -7,10 +7,10 @@ counted. Refusals by the device's host (ICMP port unreachable) still come, throu
 from __future__ import annotations
 
 import errno
-import ipaddress
 import os
 import socket
 from collections.abc import Callable
+from typing import Any
 
 MAX_DATAGRAM = 8192
 """Longest datagram that is taken whole [bytes]; no sensor here sends more than an Ethernet frame holds."""
@@ -48,7 +48,7 @@ class Datagrams:
         self._peer, self._stranger = peer, stranger
         host, port = split_address(peer)
         family, self._address = _resolve(host, port)
-        self._any_port = port == 0
+        self._host, self._any_port = _bare(self._address[0]), port == 0
         self._sock = socket.socket(family, socket.SOCK_DGRAM)
         try:
             self._sock.setblocking(False)
@@ -80,7 +80,7 @@ class Datagrams:
                 return b""
             except OSError as error:
                 raise self._gone(error) from None
-            if sender[0] != self._address[0] or not (self._any_port or sender[1] == self._address[1]):
+            if _bare(sender[0]) != self._host or not (self._any_port or sender[1] == self._address[1]):
                 self._stranger()
             elif data:
                 return data
@@ -110,11 +110,16 @@ class Datagrams:
         return OSError(number, f"datagrams of {self._peer}: {why}")
 
 
-def _resolve(host: str, port: int) -> tuple[int, tuple[str, int]]:
-    """Return family and address as the kernel spells it, so that senders can be compared with it."""
+def _resolve(host: str, port: int) -> tuple[int, tuple[Any, ...]]:
+    """Return family and address of a host; names are taken for IPv4, which is what sensors have."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+        found = socket.getaddrinfo(host, port, family, socket.SOCK_DGRAM)
     except socket.gaierror as error:
         raise OSError(errno.ENXIO, f"find the host {host}: {(error.strerror or '').lower()}") from None
-    family, _, _, _, address = found[0]
-    return family, (str(ipaddress.ip_address(address[0].partition("%")[0])), int(address[1]))
+    return family, found[0][4]
+
+
+def _bare(host: str) -> str:
+    """Return an address without the interface behind its %, in the kernel's spelling."""
+    return host.partition("%")[0]

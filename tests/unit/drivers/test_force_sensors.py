@@ -215,6 +215,17 @@ def test_ft300_another_device_is_refused(mode: str) -> None:
         silent.do(opened(silent))
 
 
+@pytest.mark.parametrize("line", [{"serial": "/x", "baud": 19200}, {"tcp": "10.0.0.1:4001"}])
+def test_ft300_the_stream_is_ended_by_half_a_second_of_ff(line: dict[str, Any]) -> None:
+    """On a serial line the bytes take that time; behind a serial server, where they leave at once, pauses do."""
+    rig = FtRig(line=line)
+    steps = list(rig.driver.close())
+    sent = b"".join(step.data for step in steps if isinstance(step, Send))
+    assert set(sent) == {0xFF} and len(sent) * 10 / 19200 >= 0.5
+    paused = sum(step.duration_s for step in steps if isinstance(step, Pause))
+    assert paused >= 0.5 if "tcp" in line else paused == 0
+
+
 @given(st.lists(st.binary(max_size=40), max_size=40))
 def test_ft300_any_bytes_are_taken(pieces: list[bytes]) -> None:
     rig = FtRig()

@@ -73,6 +73,24 @@ def test_any_port_of_the_host_and_no_other_host(device: socket.socket) -> None:
     line.close()
 
 
+def test_ipv6_and_names() -> None:
+    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as device:
+        try:
+            device.bind(("::1", 0))
+        except OSError:
+            pytest.skip("this machine has no IPv6")
+        line = Datagrams(f"[::1]:{device.getsockname()[1]}", "", lambda: pytest.fail("no stranger"))
+        line.write(b"six")
+        readable(device)
+        device.sendto(b"yes", device.recvfrom(100)[1])
+        readable(line)
+        assert line.read() == b"yes"
+        line.close()
+    named = Datagrams("localhost:9", "127.0.0.1:0", lambda: None)
+    assert named._host == "127.0.0.1"
+    named.close()
+
+
 def test_a_closed_port_a_taken_port_and_an_unknown_host() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
