@@ -56,7 +56,7 @@ def everything() -> Iterator[Daemon]:
             port = ""
             if rig.counterpart:
                 port = counterparts[rig.device].wait_line(r"^ready (\S+)$").group(1)
-            text += rig.tables.replace("{port}", port)
+            text += rig.configured(port, port)
         daemon = start(text)
         for rig in RIGS:
             daemon.wait_up(rig.device)

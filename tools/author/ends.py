@@ -206,7 +206,9 @@ class TcpDevice:
                 self._sock.send(data)
 
     def plug(self) -> None:
-        """Connect."""
+        """Connect, if there is a device."""
+        if not self.port:
+            return
         host, _, port = self.port.rpartition(":")
         with contextlib.suppress(OSError):
             self._sock = socket.create_connection((host, int(port)), 1.0)

@@ -192,7 +192,7 @@ class Station:
 
     def start_daemon(self) -> None:
         """Start a daemon with the device, and a session."""
-        text = self.rig.tables.replace("{port}", self.port)
+        text = self.rig.configured(self.port, self.counterpart.port if self.counterpart is not None else "")
         driver = self.rig.driver
         if driver.endswith(".py"):
             text = text.replace("{driver}", str((self._base / driver).resolve()))

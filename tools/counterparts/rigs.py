@@ -51,7 +51,8 @@ class Rig:
 
     Attributes:
         driver: registered name, or the path of a file.
-        tables: TOML of its device; ``{port}`` is the counterpart's port.
+        tables: TOML of its device; ``{port}`` is the counterpart's port, ``{device}`` too, but past any wire that a test
+            puts between: for a second connection to the device.
         counterpart: module of ``sioms.tools.counterparts`` or path of a Python file, and options; empty for a driver
             that needs none; with ``--link PATH`` left out, as it is added, unless ``tcp``.
         tcp: the counterpart chooses its own TCP or UDP port.
@@ -98,8 +99,12 @@ class Rig:
     def table(self) -> dict[str, Any]:
         """The device's table, without what the daemon reads of it, its port a place holder."""
         port = "127.0.0.1:1" if self.line in ("tcp", "udp") else "/dev/null"
-        device = tomllib.loads(self.tables.replace("{port}", port))["device"][self.device]
+        device = tomllib.loads(self.configured(port, "127.0.0.1:1"))["device"][self.device]
         return {key: value for key, value in device.items() if key != "driver"}
+
+    def configured(self, port: str, device: str) -> str:
+        """Return its tables for a port, and for the counterpart's own."""
+        return self.tables.replace("{port}", port).replace("{device}", device)
 
     def setting(self, key: str, default: float) -> float:
         """Return a number of the tables, e.g. ``baud`` or ``poll_hz``."""
@@ -215,6 +220,26 @@ RIGS: tuple[Rig, ...] = (
         '[device.iio]\ndriver = "iio"\ndevice = "iio_dummy_part_no"\nmode = "buffer"\ntrigger = "instance1"\n'
         'channels = ["voltage0", "accel_x"]\nrate_hz = 200.0\nsysfs = "{port}/sysfs"\ndev = "{port}/dev"\n',
         ("iio",), analogs=("iio",), checked=False,
+    ),
+    Rig(
+        "ft300",
+        '[device.ft300]\ndriver = "ft300"\nline = { serial = "{port}", baud = 19200 }\n',
+        ("ft300", "--baud", "19200"),
+        analogs=("ft300",),
+    ),
+    Rig(
+        "ati-rdt",
+        '[device.ati_rdt]\ndriver = "ati-rdt"\nrate_hz = 1000\nfull_scale = [400, 400, 400, 20, 20, 20]\n'
+        'line = { udp = "{port}" }\npage = "{device}"\n',
+        ("ati_rdt", "--port", "0"), tcp=True,
+        analogs=("ati_rdt",), checked=False,
+    ),
+    Rig(
+        "schunk-ft",
+        '[device.schunk_ft]\ndriver = "schunk-ft"\nfull_scale = [400, 400, 400, 15, 15, 15]\n'
+        'line = { tcp = "{port}" }\ndata = "{device}"\n',
+        ("schunk_ifb", "--port", "0", "--data-port", "0"), tcp=True,
+        analogs=("schunk_ft",), checked=False,
     ),
     Rig(
         "modbus-io",
