@@ -39,6 +39,19 @@ def add_parser(subparsers: Any) -> None:
     one.add_argument(
         "-j", "--jobs", metavar="N", type=int, default=1, help="drivers checked at the same time"
     )
+    one = actions.add_parser("trace", help="record what goes over a device's line")
+    one.add_argument("config", metavar="CONFIG", type=Path, help="configuration (TOML)")
+    one.add_argument("device", metavar="DEVICE", help="name of the device in it")
+    one.add_argument("-o", "--output", metavar="FILE", type=Path, help="where to; DEVICE.trace unless told")
+    one.add_argument("--seconds", metavar="N", type=float, help="for so long; until interrupted unless told")
+    one.add_argument(
+        "--socket", metavar="PATH", default="", help="where the daemon listens; a path of its own unless told"
+    )
+    one = actions.add_parser("replay", help="let a driver speak with a recorded trace")
+    one.add_argument("trace", metavar="TRACE", type=Path, help="file of sioms driver trace")
+    one.add_argument(
+        "--ignore", metavar="A:B,...", default="", help="bytes of a request that need not agree, e.g. 0:2"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -52,6 +65,14 @@ def run(args: argparse.Namespace) -> int:
             from .author.command import run_check
 
             return run_check(args)
+        case "trace":
+            from .author.trace_command import run_trace
+
+            return run_trace(args)
+        case "replay":
+            from .author.trace_command import run_replay
+
+            return run_replay(args)
     raise ValueError(f"sioms driver: no action {args.action}")
 
 

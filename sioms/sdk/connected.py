@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.flags import PageState
 
-from .connection import Connection
+from .connection import Connection, open_connection
 from .driver import LineDriver, StreamDriver
 from .exchange import DeviceError, Steps
 from .handles import LATER, Handle
@@ -49,7 +49,7 @@ class Connected:
             if self._connecting is None:
                 if now_ns < self._retry_ns:
                     return False
-                self._connecting = Connection(self._base.line, self._count_stranger)
+                self._connecting = open_connection(self._base.line, self._count_stranger)
                 self._limit_ns = now_ns + int(self._base.line.connect_timeout_s * 1e9)
             if not self._connecting.is_connected():
                 if now_ns > self._limit_ns:

@@ -151,3 +151,12 @@ class Connection:
             sock.close()
             raise OSError(result, f"connect to {settings}: {os.strerror(result).lower()}")
         self._sock = sock
+
+
+opened: Callable[..., Connection] = Connection
+"""What opens a line. A trace puts its own in place, so that nothing is spent on it otherwise."""
+
+
+def open_connection(settings: LineSettings, stranger: Callable[[], None] = lambda: None) -> Connection:
+    """Open a line; see ``Connection`` for what is given and raised."""
+    return opened(settings, stranger)

@@ -86,6 +86,10 @@ def _spawn(
         try:
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             sock.close()
+            if wanted := os.environ.get("SIOMS_TRACE"):
+                from . import trace
+
+                trace.begin(wanted, device, driver, table)
             status = run(found, device, settings, generation, options, fds)
         except BaseException:  # the process ends here whatever happened, and must not run the nursery's code
             traceback.print_exc()

@@ -11,7 +11,7 @@ from __future__ import annotations
 import errno
 from typing import Any
 
-from .connection import Connection
+from .connection import Connection, open_connection
 from .exchange import DeviceError, Exchange, LinkError
 from .settings import LineSettings
 
@@ -91,7 +91,7 @@ class SideConnection:
 
     def _transmit(self, exchange: Exchange, now_ns: int) -> None:
         if self._connection is None:
-            self._connection = Connection(self.settings)
+            self._connection = open_connection(self.settings)
         if self._connection.is_connected():
             self._connection.write(exchange.data)
             self._sent = True
