@@ -72,6 +72,31 @@ def test_moves_stops_homes_and_alarms(start: Callable[..., Any], short_folder: P
             both.command(force=1.0)
         with raises(22, "cannot do"):
             both.command(position=0.0, max_velocity=0.01, max_acceleration=0.1)
+    with cell.open("mod0.x", "rw") as x, cell.open("mod0.z", "rw") as z:
+        # what is stopped is one axis: the other brakes with it, and goes on to its target by itself
+        x.move(-0.05)
+        z.move(0.02)
+        wait_for(lambda: wire.state("velocity") > 50, "motion")
+        x.stop()
+        z.wait_until_idle(8.0)
+        assert z.read().position[0] == pytest.approx(0.02, abs=2e-6)
+        assert -0.04 < x.read().position[0] < 0.03
+        # and so does a velocity
+        x.command(velocity=-0.03)
+        wait_for(lambda: wire.state("velocity") > 28, "motion")
+        z.command(velocity=-0.04)
+        wait_for(lambda: wire.state("velocity") > 45, "both")
+        z.stop()
+        at_rest(z)
+        place = z.read().position[0]
+        wait_for(lambda: x.read().velocity[0] < -0.028, "going on", 2.0)
+        x.stop()
+        at_rest(x)
+        assert z.read().position[0] == pytest.approx(place, abs=1e-5)
+        for node, target in ((x, 0.03), (z, -0.06)):
+            assert not node.read().status[0] & AxisStatus.FAULT
+            node.move(target)
+            node.wait_until_idle(8.0)
     with cell.open("mod0.x", "rw") as x:
         # a velocity is a chain of jogs without gaps, and ends at the soft limit by itself
         x.move(-0.1)

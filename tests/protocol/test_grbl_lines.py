@@ -116,8 +116,8 @@ def test_the_simulated_controller_answers_as_the_documents_say() -> None:
     assert say(b"G0X1\n") == "error:9\r\n"  # locked while it jogs
     now = 1.05
     device.due()
-    assert 0 < device.position[0] < 10
+    assert 0 < device.planner.position[0] < 10
     said = say(b"\x18")
     assert said.startswith("ALARM:3") and "Grbl 1.1h" in said
     assert say(b"$J=G91X1F100\n") == "error:9\r\n"
-    assert device.slip[0] > 0
+    assert device.planner.slip[0] > 0

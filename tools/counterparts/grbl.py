@@ -9,7 +9,6 @@ motion. Commands on standard input, beside those of the line: ``state``, ``alarm
 from __future__ import annotations
 
 import asyncio
-import math
 import re
 import time
 from collections import deque
@@ -18,22 +17,11 @@ from dataclasses import dataclass, field
 
 from . import wire
 from .drive import Stepper
+from .grbl_planner import BLOCKS, Planner
 
 WORDS = re.compile(r"([A-Z])(-?\d+(?:\.\d*)?|-?\.\d+)")
-BLOCKS = 15
 RX_BYTES = 128
-SLIP_S = 0.03
-"""How long a rotor goes on after its pulses end at once."""
 REALTIME = set(b"?!~\x18\x84\x85") | set(range(0x90, 0xA2))
-
-
-@dataclass
-class Block:
-    """A straight line."""
-
-    target: list[float]
-    feed: float
-    is_jog: bool
 
 
 @dataclass
@@ -65,12 +53,8 @@ class Controller:
         }  # fmt: skip
         for i in range(axes):
             self.settings |= {100 + i: 250, 110 + i: 6000, 120 + i: 500, 130 + i: 200}
-        self.position = [0.0] * axes
-        self.slip = [0.0] * axes
-        self.blocks: deque[Block] = deque()
-        self.speed = 0.0
+        self.planner = Planner(axes, self.settings, self._admit)
         self.state = "Alarm" if homing else "Idle"
-        self.holding = self.cancelling = False
         self.modal = Modal(offset=[0.0] * axes)
         self.reports = 0
         self._line = bytearray()
@@ -78,96 +62,30 @@ class Controller:
         self._pending: list[bytes] = []
         self._homing_s = 0.0
         self._clock = clock
-        self.time = Stepper(self._step, lambda: not self.blocks and not self._homing_s, clock)
+        self.time = Stepper(self._step, lambda: not self.planner.blocks and not self._homing_s, clock)
 
     # -- motion ----------------------------------------------------------------------------------
-
-    def _way(self, block: Block) -> list[float]:
-        return [t - p for t, p in zip(block.target, self.position, strict=True)]
-
-    def _limits_along(self, way: list[float], length: float) -> tuple[float, float]:
-        """Return greatest speed and acceleration along a line, so that no axis passes its own."""
-        shares = [abs(w) / length for w in way]
-        speed = min(self.settings[110 + i] / 60 / s for i, s in enumerate(shares) if s > 1e-9)
-        rate = min(self.settings[120 + i] / s for i, s in enumerate(shares) if s > 1e-9)
-        return speed, rate
-
-    def _straight_ahead(self, way: list[float], length: float) -> float:
-        """Return how far it goes straight on, over this block and those behind it."""
-        total, unit, at = length, [w / length for w in way], self.blocks[0].target
-        for block in list(self.blocks)[1:]:
-            step = [t - a for t, a in zip(block.target, at, strict=True)]
-            size = math.hypot(*step)
-            if size < 1e-9:
-                continue
-            if sum(u * s for u, s in zip(unit, step, strict=True)) / size < 0.9999:
-                break
-            total, at = total + size, block.target
-        return total
 
     def _step(self, now_s: float, dt: float) -> None:
         if self._homing_s:
             if now_s >= self._homing_s:
                 self._end_homing()
-            return
-        if not self.blocks or self.state in ("Alarm", "Sleep"):
-            return
-        block = self.blocks[0]
-        way = self._way(block)
-        length = math.hypot(*way)
-        if length < 1e-7:
-            self._finish()
-            return
-        top, rate = self._limits_along(way, length)
-        if self.holding or self.cancelling:
-            wanted = 0.0
-        else:
-            half = rate * dt / 2
-            ahead = math.sqrt(half * half + 2 * rate * self._straight_ahead(way, length)) - half
-            wanted = min(block.feed / 60, top, max(ahead, rate * dt))
-        self.speed += max(-rate * dt, min(rate * dt, wanted - self.speed))
-        if self.speed <= 0.0:
-            self._rest()
-            return
-        share = min(1.0, self.speed * dt / length)
-        self.position = [p + w * share for p, w in zip(self.position, way, strict=True)]
-        if share == 1.0:
-            self.position = list(block.target)
-            self._finish()
-
-    def _finish(self) -> None:
-        self.blocks.popleft()
-        self._admit()
-        if not self.blocks:
-            self.speed = 0.0
-            if self.state in ("Run", "Jog"):
-                self.state = "Idle"
-
-    def _rest(self) -> None:
-        self.speed = 0.0
-        if self.cancelling:
-            self.cancelling = False
-            self.blocks.clear()
+        elif self.state not in ("Alarm", "Sleep") and self.planner.step(dt) and self.state in ("Run", "Jog"):
             self.state = "Idle"
 
     def _end_homing(self) -> None:
         self._homing_s = 0.0
-        self.position = [-self.settings[27]] * len(self.position)
-        self.slip = [0.0] * len(self.slip)
+        axes = len(self.letters)
+        self.planner.position, self.planner.slip = [-self.settings[27]] * axes, [0.0] * axes
         self.state = "Idle"
         self._say("ok")
         self._admit()
 
     def crash(self, number: int) -> None:
-        """End all motion at once: the rotors go on for a little, and nobody counts it."""
-        if self.blocks and self.speed:
-            way = self._way(self.blocks[0])
-            length = math.hypot(*way) or 1.0
-            self.slip = [s + w / length * self.speed * SLIP_S for s, w in zip(self.slip, way, strict=True)]
-        self.blocks.clear()
+        """End all motion at once, in alarm."""
+        self.planner.end_at_once()
         self._lines.clear()
-        self.speed, self._homing_s = 0.0, 0.0
-        self.holding = self.cancelling = False
+        self._homing_s = 0.0
         self.state = "Alarm"
         self._say(f"ALARM:{number}")
 
@@ -207,7 +125,7 @@ class Controller:
 
     def _admit(self) -> None:
         """Take lines while the planner has room; a full one lets the line wait for its ok."""
-        while self._lines and len(self.blocks) < BLOCKS and not self._homing_s:
+        while self._lines and len(self.planner.blocks) < BLOCKS and not self._homing_s:
             line = self._lines.popleft()
             error = self._obey(line.replace(" ", "").upper()) if len(line) < 80 else 11
             if not self._homing_s or error:
@@ -226,29 +144,28 @@ class Controller:
             case 0x18:
                 self._reset()
             case 0x85 if self.state == "Jog":
-                self.cancelling = True
+                self.planner.cancelling = True
             case 0x21 if self.state in ("Run", "Jog"):
                 if self.state == "Jog":
-                    self.cancelling = True
+                    self.planner.cancelling = True
                 else:
-                    self.state, self.holding = "Hold", True
+                    self.state, self.planner.holding = "Hold", True
             case 0x7E if self.state in ("Hold", "Door"):
-                self.holding = False
-                self.state = "Run" if self.blocks else "Idle"
+                self.planner.holding = False
+                self.state = "Run" if self.planner.blocks else "Idle"
             case 0x84 if self.state in ("Idle", "Run", "Jog"):
-                self.holding, self.state = True, "Door"
+                self.planner.holding, self.state = True, "Door"
 
     def _reset(self) -> None:
         if self._homing_s:
             self.crash(6)
-        elif self.speed > 0:
+        elif self.planner.speed > 0:
             self.crash(3)
         elif self.state not in ("Alarm", "Sleep"):
             self.state = "Idle"
-        self.blocks.clear()
+        self.planner.clear()
         self._lines.clear()
         self._line.clear()
-        self.holding = self.cancelling = False
         self.modal = Modal(offset=self.modal.offset)
         self._greet()
 
@@ -256,15 +173,17 @@ class Controller:
         """Return a status report."""
         state = self.state
         if state in ("Hold", "Door"):
-            state += ":1" if self.speed and state == "Hold" else ":0"
+            state += ":1" if self.planner.speed and state == "Hold" else ":0"
         scale = 25.4 if self.settings[13] else 1.0
         work = not int(self.settings[10]) & 1
         offset = self.modal.offset
-        shown = [(p - (o if work else 0.0)) / scale for p, o in zip(self.position, offset, strict=True)]
+        shown = [
+            (p - (o if work else 0.0)) / scale for p, o in zip(self.planner.position, offset, strict=True)
+        ]
         fields = [state, f"{'WPos' if work else 'MPos'}:" + ",".join(f"{v:.3f}" for v in shown)]
         if int(self.settings[10]) & 2:
-            fields.append(f"Bf:{BLOCKS - len(self.blocks)},{RX_BYTES}")
-        fields.append(f"FS:{self.speed * 60:.0f},0")
+            fields.append(f"Bf:{BLOCKS - len(self.planner.blocks)},{RX_BYTES}")
+        fields.append(f"FS:{self.planner.speed * 60:.0f},0")
         if self.reports % 10 == 0:
             fields.append("WCO:" + ",".join(f"{o / scale:.3f}" for o in offset))
         elif self.reports % 10 == 1:
@@ -313,7 +232,7 @@ class Controller:
                 if not self.settings[22]:
                     return 5
                 self.state = "Home"
-                way = max(abs(p) for p in self.position) + 10
+                way = max(abs(p) for p in self.planner.position) + 10
                 self._homing_s = self._clock() + way / (self.settings[25] / 60) + 0.3
             case "$SLP":
                 self.state = "Sleep"
@@ -361,13 +280,12 @@ class Controller:
         target = self._target(axes, scale, absolute, machine)
         if self.settings[20] and any(not -self.settings[130 + i] <= t <= 0 for i, t in enumerate(target)):
             return 15
-        self.cancelling = False if not self.blocks else self.cancelling
-        self.blocks.append(Block(target, feed, True))
+        self.planner.add(target, feed, jog=True)
         self.state = "Jog"
         return 0
 
     def _target(self, axes: dict[str, float], scale: float, absolute: bool, machine: bool) -> list[float]:
-        start = self.blocks[-1].target if self.blocks else self.position
+        start = self.planner.end
         target = list(start)
         for i, letter in enumerate(self.letters):
             if letter in axes:
@@ -402,7 +320,7 @@ class Controller:
             if modal.motion == 1 and modal.feed <= 0:
                 return 22
             feed = modal.feed if modal.motion == 1 else 1e9
-            self.blocks.append(Block(self._target(axes, modal.scale, modal.absolute, machine), feed, False))
+            self.planner.add(self._target(axes, modal.scale, modal.absolute, machine), feed, jog=False)
             self.state = "Run" if self.state == "Idle" else self.state
         return 0
 
@@ -411,10 +329,10 @@ class Controller:
 
         def state() -> dict[str, object]:
             self.time.catch_up()
-            real = [p + s for p, s in zip(self.position, self.slip, strict=True)]
+            real = [p + s for p, s in zip(self.planner.position, self.planner.slip, strict=True)]
             return {
-                "state": self.state, "position": self.position, "real": real, "velocity": self.speed,
-                "blocks": len(self.blocks),
+                "state": self.state, "position": self.planner.position, "real": real, "velocity": self.planner.speed,
+                "blocks": len(self.planner.blocks),
             }  # fmt: skip
 
         def alarm(number: str) -> None:
@@ -427,8 +345,8 @@ class Controller:
             self.settings[int(key)] = float(value)
 
         def reboot() -> None:
-            self.blocks.clear()
-            self.speed, self.state = 0.0, "Alarm" if self.settings[22] else "Idle"
+            self.planner.blocks.clear()
+            self.planner.speed, self.state = 0.0, "Alarm" if self.settings[22] else "Idle"
             self._greet()
 
         return {

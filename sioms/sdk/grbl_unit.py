@@ -1,0 +1,433 @@
+"""The axes of a Grbl controller: hooks that turn what the bank wants into jogs.
+
+The controller has one planner. Moves that are asked for together become one line; what one axis has cancelled brakes all, and
+those that nobody has stopped go on from where they came to rest.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from sioms.motion import ActionKind, AxisSettings, DriveAction
+from sioms.protocol.flags import ControlMode
+
+from .blocks import BlockSpec
+from .codec import grbl
+from .codec.grbl import Answer, Report
+from .codec.grbl_jog import JogChain, straight_jog
+from .codec.grbl_machine import INCHES, MachinePosition, compare_limits
+from .drive_axes import AxesUnit
+from .driver import Kit
+from .exchange import DeviceError, LinkError, Pause, Send, Steps
+
+TIMEOUT_S = 0.5
+RESET_S = 3.0
+HOLD_S = 5.0
+TOGETHER_S = 0.0005
+"""How long a start waits for the starts of other axes that go out with it."""
+AT_MM = 0.002
+"""So near to its target an axis has arrived [mm or degrees]; reports have three digits."""
+OFFSET_REPORTS = 35
+"""The work offset comes with every 30th report at the latest."""
+NOT_READY = {
+    "Hold": "feed hold; release it at the controller", "Door": "the safety door is open", "Sleep": "the controller sleeps",
+    "Check": "the controller is in check mode", "Run": "the controller runs a program of somebody else",
+}  # fmt: skip
+
+
+class Options(Protocol):
+    """What the unit reads of the device's settings."""
+
+    @property
+    def axis(self) -> Sequence[Any]:
+        """Its axes: letter, unit, acceleration_max."""
+
+    @property
+    def version(self) -> str:
+        """Text that its version must contain."""
+
+    @property
+    def homing(self) -> bool:
+        """$H may be used."""
+
+    @property
+    def homing_timeout_s(self) -> float:
+        """Longest time that homing may take [s]."""
+
+    @property
+    def quick_stop(self) -> str:
+        """The fastest stop: reset or cancel."""
+
+    @property
+    def poll_hz(self) -> float:
+        """Rate of status reports."""
+
+
+class GrblUnit(AxesUnit):
+    """One controller: all motion is jogs, which can be cancelled with the position kept.
+
+    Args:
+        name: for messages.
+        settings: of the device.
+        axes: its axes as the bank knows them.
+        spec: their block.
+        kit: services.
+        given: as of AxesUnit.
+
+    Concurrency: the one thread of the driver process.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        settings: Options,
+        axes: Sequence[AxisSettings],
+        spec: BlockSpec,
+        kit: Kit,
+        **given: Any,
+    ) -> None:
+        super().__init__(name, axes, spec, kit, **given)
+        self._settings = settings
+        n = len(settings.axis)
+        self._letters = [axis.letter for axis in settings.axis]
+        self._index = [grbl.LETTERS.index(letter) for letter in self._letters]
+        self._place = MachinePosition(self._index, name)
+        self._per_unit = np.array([1000.0 if axis.unit == "m" else 180 / math.pi for axis in settings.axis])
+        self._alarm = 0
+        self._state = ""
+        self._rest = b""
+        self._targets = np.full(n, np.nan)
+        self._speeds = np.zeros(n)
+        rates = np.array([axis.acceleration_max for axis in settings.axis]) * self._per_unit
+        self._chain = JogChain(self._letters, rates, settings.poll_hz)
+        self._interrupted = False
+        self._asked: dict[int, tuple[float, float]] = {}
+        self._refused: dict[int, DeviceError] = {}
+        self._homing_ns = 0
+        self._homing_end: str | None = None
+        self._last: tuple[int, Any] | None = None
+        self._replaces = [False] * n
+        self._clean = False
+
+    # --- hooks ----------------------------------------------------------------------------------
+
+    def open(self) -> Steps:
+        """Stop what moves, identify the controller, and compare its limits with the configuration."""
+        self._homing_ns, self._alarm, self._last = 0, 0, None
+        self._forget()
+        yield Send(b"\n" + grbl.JOG_CANCEL, "end a cut line, cancel jogs")
+        yield Pause(0.1)
+        try:
+            report, _ = yield grbl.status(TIMEOUT_S)
+        except LinkError:  # booting, or deaf because it homes: only a reset ends that
+            yield grbl.reset(RESET_S)
+            report, _ = yield grbl.status(TIMEOUT_S)
+        if report.state in ("Run", "Hold"):
+            yield from self._hold_and_reset()
+        answer: Answer = yield grbl.command("$I", TIMEOUT_S, repeatable=True)
+        version = answer.tagged("VER")
+        if not version or self._settings.version not in version:
+            text = f"identify {self.name}: version {version or 'not told'}; the configuration says "
+            raise DeviceError(errno.ENODEV, f"{text}{self._settings.version or 'a Grbl controller'}")
+        found: Answer = yield grbl.command("$$", TIMEOUT_S, repeatable=True)
+        self._compare(found.settings())
+        for _ in range(OFFSET_REPORTS):
+            self._state = report.state
+            if self._place.note(report):
+                break
+            report, _ = yield grbl.status(TIMEOUT_S)
+
+    def poll(self) -> Steps:
+        """Read the status, and keep velocities going."""
+        if self._homing_ns:  # the controller is deaf while it homes; its ok is overheard
+            if self._homing_end == "":
+                report, _ = yield grbl.status(TIMEOUT_S)
+                self._raw = self._positions(report)
+            self._report_homing()
+            return
+        report, lines = yield grbl.status(TIMEOUT_S)
+        self._hear(lines)
+        self._take(report)
+        if self._interrupted:
+            yield from self._go_on()
+        elif self._chain.wanted.any() and self._state in ("Idle", "Jog"):
+            yield from self._lengthen(report)
+
+    def act(self, action: DriveAction) -> Steps:
+        """Note a move that is asked for, so that those of other axes that go out now share its line."""
+        axis, command = action.axis, action.command
+        self._asked.pop(axis, None)
+        moves = command is not None and bool(command.control_mode & ControlMode.POSITION)
+        if action.kind is not ActionKind.RESET:
+            goes = (
+                self._state == "Jog"
+                and abs(self._raw[axis] * self._per_unit[axis] - self._targets[axis]) > AT_MM
+            )
+            self._replaces[axis] = goes or (moves and self._chain.wanted[axis] != 0)
+            self._targets[axis] = np.nan
+            if moves or command is None:
+                self._chain.wanted[axis] = 0.0
+        if action.kind is ActionKind.START and moves and command is not None:
+            self._asked[axis] = (command.position, action.velocity_max)
+        return super().act(action)
+
+    def start_position(self, axis: int, position: float, speed: float, action: DriveAction) -> Steps:
+        """Jog to a position, together with all axes whose moves were asked for at the same time."""
+        if axis in self._asked:
+            self._asked[axis] = (position, speed)
+            yield Pause(TOGETHER_S)
+            yield from self._end_replaced(axis)
+            together, self._asked = self._left() | self._asked, {}
+            self._interrupted = False
+            if together:
+                yield from self._jog_to(together)
+        if error := self._refused.pop(axis, None):
+            raise error
+
+    def start_velocity(self, axis: int, velocity: float, action: DriveAction) -> Steps:
+        """Begin, change or end a chain of jogs; polls keep it going."""
+        if velocity == 0:
+            self._chain.wanted[axis] = 0.0
+            yield self._cancel()
+            return
+        yield from self._end_replaced(axis)
+        per_unit = float(self._per_unit[axis])
+        self._chain.start(axis, velocity * per_unit, float(self._raw[axis]) * per_unit)
+        self._clean = False
+
+    def halt(self, axis: int, *, fastest: bool) -> Steps:
+        """Cancel jogs and keep the position; or reset, which is the fastest and the only end of homing."""
+        self._chain.wanted[axis], self._targets[axis] = 0.0, np.nan
+        if not self._homing_ns and not (fastest and self._settings.quick_stop == "reset"):
+            yield self._cancel()
+            return
+        self._forget()
+        if self._clean:
+            return  # nothing was started since the reset for another axis
+        lines = yield grbl.reset(RESET_S)
+        self._clean, self._homing_ns = True, 0
+        self._hear(lines)
+
+    def stop(self) -> Steps:
+        """Stop whatever goes on."""
+        self._clean = False
+        self._forget()
+        yield from super().stop()
+
+    def home(self, axis: int) -> Steps:
+        """Begin homing, of all axes; those that are told to home together home once."""
+        if self._homing_ns:
+            return
+        self._homing_ns, self._homing_end, self._clean = self.clock(), None, False
+        self._targets[:] = np.nan
+        yield Send(b"$H\n", "home all axes")
+
+    def reset(self, axis: int) -> Steps:
+        """Unlock the controller; a critical alarm needs a reset before."""
+        report, lines = yield grbl.status(TIMEOUT_S)
+        self._hear(lines)
+        if report.state in ("Alarm", "Sleep", "Hold", "Door"):
+            yield grbl.reset(RESET_S)
+            yield grbl.command("$X", TIMEOUT_S)
+        elif report.state == "Check":
+            yield grbl.command("$C", TIMEOUT_S)
+        self._alarm = 0
+
+    def overhear(self, data: bytes, now_ns: int) -> None:
+        """Take what the controller says unasked: alarms, the end of homing, the banner after a reset of its own."""
+        self._rest += data
+        lines = grbl.lines_of(self._rest)
+        self._rest = self._rest[self._rest.rfind(b"\n") + 1 :][-grbl.LINE_LIMIT :]
+        self._hear(lines)
+        if not self._homing_ns:
+            return
+        for line in lines:  # told to the bank by the next poll, which publishes it
+            if line == "ok":
+                self._homing_end = ""
+            elif line.startswith(("error:", "ALARM:")):
+                self._homing_end = grbl.alarm_text(self._alarm) if self._alarm else f"homing refused: {line}"
+
+    # --- inside ----------------------------------------------------------------------------------
+
+    def _forget(self) -> None:
+        self._targets[:], self._chain.wanted[:] = np.nan, 0.0
+        self._asked.clear()
+        self._refused.clear()
+        self._chain.cut()
+        self._interrupted = False
+
+    def _cancel(self) -> Send:
+        """Return what cancels the jogs of all axes; those that nobody has stopped go on after it."""
+        self._chain.cut()
+        self._interrupted = bool(np.isfinite(self._targets).any() or self._chain.wanted.any())
+        return Send(grbl.JOG_CANCEL, "cancel jogs")
+
+    def _left(self) -> dict[int, tuple[float, float]]:
+        """Return the moves that a stop of another axis has cut short: axis to target and top speed, in units of the axis."""
+        if not self._interrupted:
+            return {}
+        short = np.isfinite(self._targets) & ~self._arrived(self._raw)
+        return {
+            a: (self._targets[a] / self._per_unit[a], self._speeds[a]) for a in np.flatnonzero(short).tolist()
+        }
+
+    def _go_on(self) -> Steps:
+        """Let the axes that nobody has stopped go on, once all have come to rest."""
+        if self._state == "Jog":
+            return
+        if self._state == "Idle":
+            self._chain.restart(self._raw * self._per_unit)
+            if left := self._left():
+                yield from self._jog_to(left)
+            for axis in left:
+                if error := self._refused.pop(axis, None):
+                    self.bank.fault(
+                        [axis],
+                        f"{self.name}: could not go on after a stop of another axis: {error}",
+                        self.clock(),
+                    )
+        self._interrupted = False
+
+    def _arrived(self, position: Any) -> Any:
+        return np.abs(position * self._per_unit - self._targets) <= AT_MM
+
+    def _hold_and_reset(self) -> Steps:
+        """End a program with its position kept: hold, wait for rest, reset."""
+        yield Send(grbl.HOLD, "feed hold")
+        limit_ns = self.clock() + int(HOLD_S * 1e9)
+        while self.clock() < limit_ns:
+            yield Pause(0.05)
+            report, _ = yield grbl.status(TIMEOUT_S)
+            if (report.state, report.sub) == ("Hold", 0) or report.state == "Idle":
+                break
+        yield grbl.reset(RESET_S)
+
+    def _compare(self, found: dict[int, float]) -> None:
+        """Compare the controller's limits with the configured ones; FluidNC does not tell them by number."""
+        self._place.in_report = 25.4 if found.get(INCHES) else 1.0
+        for settings, index, per_unit in zip(self.bank.settings, self._index, self._per_unit, strict=True):
+            try:
+                told = compare_limits(
+                    found, index, float(per_unit), settings.velocity_max, settings.acceleration_max
+                )
+            except DeviceError as error:
+                raise DeviceError(error.errno, f"open {self.name}: axis {settings.name}: {error}") from None
+            if not told:
+                self._kit.log(
+                    "warning", f"{self.name} {settings.name}: the controller does not tell its limits"
+                )
+
+    def _hear(self, lines: Sequence[str]) -> None:
+        number = grbl.alarm_of(lines)
+        if number:
+            self._alarm = number
+            if number not in grbl.POSITION_KEPT:
+                self.bank.set_homed(range(self.bank.n), False)
+
+    def _take(self, report: Report) -> None:
+        """Tell the bank what a report says."""
+        now_ns = self.clock()
+        position = self._positions(report)
+        velocity = np.zeros(self.bank.n)
+        if self._last is not None and now_ns > self._last[0]:
+            velocity = (position - self._last[1]) / ((now_ns - self._last[0]) / 1e9)
+        self._last = now_ns, position
+        busy = report.state == "Jog" or (report.state == "Hold" and report.sub == 1)
+        if not busy and report.state != "Alarm":
+            velocity[:] = 0.0
+        arrived = self._arrived(position)
+        goes = np.isfinite(self._targets) | (self._chain.wanted != 0)
+        moving = ~arrived & (np.full(self.bank.n, busy) | (goes & self._interrupted))
+        fault = self._fault(report)
+        self.report(position, velocity, moving, arrived, [fault] * self.bank.n)
+
+    def _positions(self, report: Report) -> Any:
+        """Return the positions of our axes [unit], and keep what the report tells beside them."""
+        self._state = report.state
+        self._place.note(report)
+        return self._place.of(report) / self._per_unit
+
+    def _fault(self, report: Report) -> str:
+        if report.state != "Alarm":
+            return NOT_READY.get(report.state, "") if report.sub != 1 else ""
+        if self._alarm or report.sub > 0:
+            return grbl.alarm_text(self._alarm or report.sub)
+        return "" if self._settings.homing else "the controller is locked; RESET unlocks it"
+
+    def _end_replaced(self, axis: int) -> Steps:
+        """Cancel the jog that a command replaces, and wait for rest: the planner would finish it first."""
+        if not self._replaces[axis]:
+            return
+        self._replaces[axis] = False
+        yield self._cancel()
+        limit_ns = self.clock() + int(HOLD_S * 1e9)
+        while self.clock() < limit_ns:
+            yield Pause(0.02)
+            report, lines = yield grbl.status(TIMEOUT_S)
+            self._hear(lines)
+            self._take(report)
+            if report.state not in ("Jog", "Hold"):
+                return
+
+    def _jog_to(self, together: dict[int, tuple[float, float]]) -> Steps:
+        """Send one line for these axes, axis to position and top speed in units of the axis."""
+        moves = {
+            axis: (position * float(self._per_unit[axis]), speed * float(self._per_unit[axis]))
+            for axis, (position, speed) in together.items()
+        }
+        line = straight_jog(self._letters, self._raw * self._per_unit, moves)
+        self._clean = False
+        for axis, (position, speed) in together.items():
+            self._targets[axis], self._speeds[axis] = position * self._per_unit[axis], speed
+        try:
+            yield grbl.command(line, TIMEOUT_S)
+        except (DeviceError, ValueError) as error:
+            refusal = error if isinstance(error, DeviceError) else DeviceError(errno.EINVAL, str(error))
+            for axis in together:
+                self._targets[axis], self._refused[axis] = np.nan, refusal
+
+    def _lengthen(self, report: Report) -> Steps:
+        """Lengthen the chain of jogs until it reaches far enough ahead to run at full speed and to brake at its end."""
+        if 0 <= report.free_blocks < 2:
+            return
+        offset = self.bank.fields[0] - self._raw
+        low, high = self._soft_limits()
+        found = self._chain.next(
+            self.clock(), (low - offset) * self._per_unit, (high - offset) * self._per_unit
+        )
+        if found is None:
+            return
+        line, targets, until_ns = found
+        wanted = self._chain.wanted.copy()
+        yield grbl.command(line, TIMEOUT_S)
+        if (self._chain.wanted == wanted).all() and not self._interrupted:
+            self._chain.sent(targets, until_ns)
+
+    def _soft_limits(self) -> tuple[Any, Any]:
+        limits = self.bank.get_limits(range(self.bank.n))
+        low = np.array([-np.inf if v is None else v for v in limits["position_min"]])
+        high = np.array([np.inf if v is None else v for v in limits["position_max"]])
+        return low, high
+
+    def _report_homing(self) -> None:
+        """Tell the bank that it homes, or how that ended."""
+        n = self.bank.n
+        if (
+            self._homing_end is None
+            and self.clock() - self._homing_ns > self._settings.homing_timeout_s * 1e9
+        ):
+            self._homing_end = f"homing took longer than {self._settings.homing_timeout_s:g} s"
+        ended, fault = self._homing_end is not None, self._homing_end or ""
+        done = np.full(n, ended and not fault)
+        self.report(self._raw, np.zeros(n), np.full(n, not ended), done, [fault] * n)
+        if fault and self._alarm == 0:
+            return  # it may still search: the stop that the fault brings ends it by a reset
+        if ended:
+            self._homing_ns, self._last = 0, None
+        if ended and not fault:
+            self.bank.set_homed(range(n))
