@@ -177,6 +177,7 @@ class DriveBank:
         busy = chosen[~self._idle(chosen)]
         self._queue.emit(EventKind.DROPPED, busy, stamp, errno.EIO, text)
         self._halt(chosen, fastest=True)
+        self._taken[chosen] = False  # a faulty drive may let go of its axis
         self._queue.latch_fault(chosen, text, stamp)
 
     def fault_text(self, axis: int) -> str:
@@ -515,7 +516,7 @@ class DriveBank:
         self._queue.clear(axes)
         self._actions = [a for a in self._actions if a.axis not in axes or a.kind is ActionKind.RESET]
         self._queue.latched[axes] &= ~int(AxisStatus.HOMING)
-        self._homing[axes] = self._taken[axes] = False
+        self._homing[axes] = False
         for axis in axes.tolist():
             self._running[axis] = None
             if fastest or self._stops.get(axis) is not ActionKind.QUICK_STOP:

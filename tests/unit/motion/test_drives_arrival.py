@@ -103,6 +103,20 @@ def test_after_a_stop_the_next_move_takes_up_again():
     assert [p for p, _ in cell.starts_to][1:] == [round(here + 0.01 - D, 9), round(here + 0.01, 9)]
 
 
+@pytest.mark.parametrize(("verb", "goes_straight"), [("stop", True), ("fault", False)])
+def test_of_an_axis_that_stands_a_stop_keeps_the_play_taken_up_and_a_fault_does_not(verb, goes_straight):
+    cell = Watched(backlash=SLOW)
+    cell.write(mode=MODE.POSITION, position=0.5)
+    cell.run()
+    getattr(cell.bank, verb)([0], *([cell.now_ns] if verb == "stop" else ["broken"]))
+    cell.poll(5)
+    cell.bank.reset([0])
+    cell.poll(5)
+    cell.write(mode=MODE.POSITION, position=0.51)
+    cell.run()
+    assert [p for p, _ in cell.starts_to][1:] == ([0.51] if goes_straight else [0.41, 0.51])
+
+
 def test_a_target_replaced_in_flight_is_approached_from_its_side():
     cell = Watched(backlash=SLOW)
     cell.write(mode=MODE.POSITION, position=1.0)
