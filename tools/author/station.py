@@ -127,6 +127,7 @@ class Station:
     Args:
         rig: of the driver.
         paced: characters take the time of the configured line.
+        wired: put a wire between; without, the driver speaks with its counterpart directly.
         folder: where relative paths of the rig start: that of the driver's file.
 
     Attributes:
@@ -136,7 +137,9 @@ class Station:
         cell: the session.
     """
 
-    def __init__(self, rig: Rig, *, paced: bool = True, folder: Path | None = None) -> None:
+    def __init__(
+        self, rig: Rig, *, paced: bool = True, wired: bool = True, folder: Path | None = None
+    ) -> None:
         self.rig = rig
         self._base = folder or Path.cwd()
         self._folder = Path(tempfile.mkdtemp(prefix="sioms-check-"))
@@ -147,7 +150,7 @@ class Station:
         self.port = ""
         try:
             if rig.counterpart:
-                self._connect(paced)
+                self._connect(paced, wired)
             self.start_daemon()
             self.wait_good()
             self._look()
@@ -155,7 +158,7 @@ class Station:
             self.close()
             raise
 
-    def _connect(self, paced: bool) -> None:
+    def _connect(self, paced: bool, wired: bool) -> None:
         rig = self.rig
         name, *options = rig.counterpart
         program = ["-m", name if "." in name else f"sioms.tools.counterparts.{name}"]
@@ -164,6 +167,9 @@ class Station:
         link = [] if rig.tcp else ["--link", str(self._folder / "device")]
         command = [sys.executable, *program, *link, *options]
         self.counterpart = Peer(command, f"counterpart {name}", self._base)
+        self.port = self.counterpart.port
+        if not wired:
+            return
         speed = (
             ["--baud", str(self.baud), "--bits", str(rig.bits_per_character)] if paced and self.baud else []
         )

@@ -23,11 +23,13 @@ from .traces import BadTrace, Trace, read_trace
 SLOWER = 3.0
 """A replay may take so many times the trace's time before it is ended."""
 LEAST_S = 8.0
+START_S = 60.0
 
 
 def run_trace(args: argparse.Namespace) -> int:
     """Run a daemon with a configuration and record a device's line until interrupted; return the exit status."""
     out = args.output or Path(f"{args.device}.trace")
+    out.unlink(missing_ok=True)
     with tempfile.TemporaryDirectory(prefix="sioms-trace-") as folder:
         path = args.socket or str(Path(folder) / "siomsd.sock")
         environment = {**os.environ, "SIOMS_TRACE": f"{args.device}={out.resolve()}"}
@@ -36,6 +38,7 @@ def run_trace(args: argparse.Namespace) -> int:
         print(f"recording {args.device} to {out}; commands reach it with SIOMS_SOCKET={path}", flush=True)
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         with contextlib.suppress(KeyboardInterrupt, subprocess.TimeoutExpired):
+            wait_for(lambda: out.exists() or daemon.poll() is not None, START_S, 0.02)
             daemon.wait(args.seconds)
             return daemon.returncode or 1  # it ended by itself
         with contextlib.suppress(KeyboardInterrupt, subprocess.TimeoutExpired):

@@ -8,7 +8,7 @@ standard input, each answered by ``ok``, ``ok JSON`` or ``error`` with a sentenc
     babble RATE SECONDS     random bytes to the driver, so many a second
     unplug, plug            pull the cable, put it back
     log [COUNT]             the last messages: [time ns, direction, hex, what was done to it]
-    totals                  messages and bytes of both directions, messages bent
+    totals                  messages and bytes of both directions, messages bent, time that the device took to answer [ns]
 """
 
 from __future__ import annotations
@@ -46,6 +46,9 @@ class Wire:
         link: path of the driver's serial port.
         character_ns: time a character takes on the line [ns], 0 for none.
         seed: of the random numbers.
+
+    Attributes:
+        device_ns: time between requests that reached the device and what it said next, in all [ns].
     """
 
     def __init__(self, kind: str, device_port: str, link: Path, character_ns: float, seed: int) -> None:
@@ -54,6 +57,8 @@ class Wire:
         self.to_host = Way(character_ns, kind != "udp")
         self.bender = Bender(seed)
         self.log: deque[tuple[int, str, bytes, str]] = deque(maxlen=KEPT)
+        self.device_ns = 0
+        self._asked_ns = 0
         self._babble = (0, 0, 0.0)  # until [ns], next [ns], bytes a turn
 
     def handlers(self) -> dict[str, Any]:
@@ -87,7 +92,7 @@ class Wire:
         """Return what was carried."""
         return {
             "requests": self.to_device.messages, "request_bytes": self.to_device.characters,
-            "replies": self.to_host.messages, "reply_bytes": self.to_host.characters, "bent": self.bender.hits,
+            "replies": self.to_host.messages, "reply_bytes": self.to_host.characters, "bent": self.bender.hits, "device_ns": self.device_ns,
         }  # fmt: skip
 
     def turn(self) -> None:
@@ -120,7 +125,7 @@ class Wire:
         hears = self.bender.hears()
         self.log.append((now_ns, ">", data, "" if hears else "lost"))
         if hears:
-            self.to_device.send([Piece(data)], now_ns)
+            self._asked_ns = self.to_device.send([Piece(data)], now_ns)
 
     def _from_device(self, fd: int) -> None:
         data = self.device.read(fd)
@@ -128,8 +133,11 @@ class Wire:
             self.host.hang_up()
         if not data:
             return
+        now_ns = time.monotonic_ns()
+        if self._asked_ns:
+            self.device_ns, self._asked_ns = self.device_ns + max(0, now_ns - self._asked_ns), 0
         pieces, note = self.bender.bend(data)
-        at_ns = self.to_host.send(pieces, time.monotonic_ns())
+        at_ns = self.to_host.send(pieces, now_ns)
         if note and pieces:
             note += f"; the device sent {data.hex(' ')}"
         self.log.append((at_ns, "<", b"".join(piece.data for piece in pieces) if pieces else data, note))
