@@ -11,6 +11,12 @@ from typing import Any
 
 from .cell import table
 
+ABOUT = (
+    "check puts drivers to work under a daemon of its own, against the simulated device that their rig names, over a wire that "
+    "bends messages, loses them, is pulled and put back; it stops axes from every state and kills client, driver and "
+    "daemon in motion. trace records what goes over a device's line, replay lets its driver speak with such a record."
+)
+
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
@@ -25,7 +31,7 @@ def add_parser(subparsers: Any) -> None:
     one.add_argument(
         "--full", action="store_true", help="longer trials and all combinations: minutes a driver"
     )
-    one.add_argument("--only", metavar="TRIAL,...", default="", help="these trials alone; help names them")
+    one.add_argument("--only", metavar="TRIAL,...", default="", help="these trials alone; a name that is none lists all")
     one.add_argument(
         "--counterpart", metavar="COMMAND", default="", help="module or file of the device, and options"
     )

@@ -12,6 +12,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from . import driver
 from .front import COMMANDS, DESCRIPTION
 from .manual import DAEMON_OPTIONS, MANUALS, STATUS, VARIABLES, option_groups, shape
 from .options import TOOLS, Option
@@ -42,6 +43,7 @@ def files() -> dict[str, str]:
     """Return every generated file by its path in the tree."""
     made = {f"docs/man/{tool}.1": tool_page(tool) for tool in TOOLS}
     made["docs/man/sioms.1"] = front_page()
+    made["docs/man/sioms-driver.1"] = driver_page()
     made["docs/man/siomsd.8"] = daemon_page()
     made["etc/completion/sioms.bash"] = bash()
     made["etc/completion/_sioms"] = zsh()
@@ -83,7 +85,7 @@ def _options(options: list[Option]) -> list[str]:
 
 
 def _see_also(name: str) -> list[str]:
-    pages = [*[(tool, 1) for tool in TOOLS], ("sioms", 1), ("siomsd", 8)]
+    pages = [*[(tool, 1) for tool in TOOLS], ("sioms", 1), ("sioms-driver", 1), ("siomsd", 8)]
     return [", ".join(f"\\fB{page}\\fR({section})" for page, section in pages if page != name)]
 
 
@@ -93,7 +95,9 @@ def tool_page(tool: str) -> str:
     options: list[str] = []
     for title, group in option_groups(tool):
         options += [f".SS {roff(title[0].upper() + title[1:])}", *_options(group)]
-    examples = [line for what, command in manual.examples for line in (".TP", f".B {roff(command)}", roff(what))]
+    examples = [
+        line for what, command in manual.examples for line in (".TP", f".B {roff(command)}", roff(what))
+    ]
     return _page(
         tool, 1, manual.does, list(manual.synopsis),
         [
@@ -119,6 +123,49 @@ def front_page() -> str:
             ("see also", _see_also("sioms")),
         ],
     )  # fmt: skip
+
+
+def driver_actions() -> dict[str, tuple[str, argparse.ArgumentParser]]:
+    """Return the actions of ``sioms driver``: what each does, and its parser."""
+    top = argparse.ArgumentParser(prog="sioms").add_subparsers()
+    driver.add_parser(top)
+    inner = next(a for a in top.choices["driver"]._actions if isinstance(a, argparse._SubParsersAction))
+    texts = {action.dest: action.help or "" for action in inner._choices_actions}
+    return {name: (texts[name], parser) for name, parser in inner.choices.items()}
+
+
+def _arguments(parser: argparse.ArgumentParser) -> list[str]:
+    """Return the arguments and options of a parser as lines of roff."""
+    lines = []
+    for action in parser._actions:
+        names = ", ".join(action.option_strings)
+        value = "" if action.nargs == 0 else str(action.metavar or action.dest.upper())
+        lines += [".TP", f".B {roff(f'{names} {value}'.strip())}", roff(action.help or "")]
+    return lines
+
+
+def driver_page() -> str:
+    """Return the manual page of ``sioms driver``."""
+    actions = driver_actions()
+    synopsis = [
+        f"{name} {parser.format_usage().partition(name)[2].strip()}".strip()
+        for name, (_, parser) in actions.items()
+    ]
+    body = [
+        line
+        for name, (text, parser) in actions.items()
+        for line in (f".SS {name}", roff(text), *_arguments(parser))
+    ]
+    status = "0 when nothing failed, 1 when a trial or a replay failed, 2 for what cannot be done, with one line on standard error."
+    return _page(
+        "sioms-driver", 1, "list, check, record and replay drivers", [" ".join(usage.split()) for usage in synopsis],
+        [
+            ("description", _paragraphs([driver.ABOUT])),
+            ("actions", body),
+            ("exit status", [roff(status)]),
+            ("see also", _see_also("sioms-driver")),
+        ],
+    ).replace(".B sioms-driver\n", ".B sioms driver\n")  # fmt: skip
 
 
 def daemon_page() -> str:
@@ -167,6 +214,21 @@ def bash() -> str:
         '        mapfile -t COMPREPLY < <(compgen -W "$(_sioms_nodes)" -- "$word")',
         "    fi",
         "}",
+        "_sioms_driver() {",
+        '    local word=${COMP_WORDS[COMP_CWORD]} options=""',
+        "    if ((COMP_CWORD == 2)); then",
+        f"        mapfile -t COMPREPLY < <(compgen -W '{' '.join(driver_actions())}' -- \"$word\")",
+        "        return",
+        "    fi",
+        "    case ${COMP_WORDS[2]} in",
+        *[
+            f"    {name}) options='{_long_options(parser)}' ;;"
+            for name, (_, parser) in driver_actions().items()
+        ],
+        "    esac",
+        '    if [[ $word == -* ]]; then mapfile -t COMPREPLY < <(compgen -W "$options" -- "$word")',
+        '    else mapfile -t COMPREPLY < <(compgen -f -- "$word"); fi',
+        "}",
         "_sioms() {",
         "    local word=${COMP_WORDS[COMP_CWORD]}",
         "    if ((COMP_CWORD == 1)); then",
@@ -174,8 +236,8 @@ def bash() -> str:
         "        return",
         "    fi",
         "    case ${COMP_WORDS[1]} in",
-        f"    {' | '.join(_NODE_COMMANDS)}) mapfile -t COMPREPLY < <(compgen -W \"$(_sioms_nodes)\" -- \"$word\") ;;",
-        "    driver) mapfile -t COMPREPLY < <(compgen -W list -- \"$word\") ;;",
+        f'    {" | ".join(_NODE_COMMANDS)}) mapfile -t COMPREPLY < <(compgen -W "$(_sioms_nodes)" -- "$word") ;;',
+        "    driver) _sioms_driver ;;",
         '    *) mapfile -t COMPREPLY < <(compgen -f -- "$word") ;;',
         "    esac",
         "}",
@@ -183,6 +245,12 @@ def bash() -> str:
         "complete -F _sioms sioms",
     ]
     return "\n".join([*lines, ""])
+
+
+def _long_options(parser: argparse.ArgumentParser) -> str:
+    return " ".join(
+        word for action in parser._actions for word in action.option_strings if word.startswith("--")
+    )
 
 
 def _quoted(text: str) -> str:
@@ -194,7 +262,7 @@ def zsh() -> str:
     lines = [
         f"#compdef {' '.join(TOOLS)} sioms",
         "# Completion for zsh; node names come from the running daemon. Generated by sioms.tools.generate.",
-        "_sioms_nodes() { local -a nodes; nodes=(${(f)\"$(sioms list --names 2>/dev/null)\"}); compadd -a nodes }",
+        '_sioms_nodes() { local -a nodes; nodes=(${(f)"$(sioms list --names 2>/dev/null)"}); compadd -a nodes }',
         "case $service in",
     ]
     for tool in TOOLS:
@@ -206,14 +274,16 @@ def zsh() -> str:
                 value = f":{o.value}:" if o.value else ""
                 lines.append(f"        '*--{o.long}{glue}[{_quoted(o.text)}]{value}' \\")
                 if o.letter:
-                    lines.append(f"        '*-{o.letter}{'-' if o.value else ''}[{_quoted(o.text)}]{value}' \\")
+                    lines.append(
+                        f"        '*-{o.letter}{'-' if o.value else ''}[{_quoted(o.text)}]{value}' \\"
+                    )
         lines.append("        '*:marker:'" if tool == "smarkers" else "        '*:node:_sioms_nodes'")
         lines.append("    ;;")
     lines += ["sioms)", "    if ((CURRENT == 2)); then", "        local -a commands", "        commands=("]
     lines += [f"            '{name}:{_quoted(c.text)}'" for name, c in COMMANDS.items()]
     lines += [
         "        )", "        _describe command commands", "    else", "        case $words[2] in",
-        f"        {'|'.join(_NODE_COMMANDS)}) _sioms_nodes ;;", "        driver) compadd list ;;", "        *) _files ;;",
+        f"        {'|'.join(_NODE_COMMANDS)}) _sioms_nodes ;;", f"        driver) ((CURRENT == 3)) && compadd {' '.join(driver_actions())} || _files ;;", "        *) _files ;;",
         "        esac", "    fi", "    ;;", "esac", "",
     ]  # fmt: skip
     return "\n".join(lines)
@@ -221,20 +291,33 @@ def zsh() -> str:
 
 def fish() -> str:
     """Return the completion for fish."""
-    lines = ["# Completion for fish; node names come from the running daemon. Generated by sioms.tools.generate."]
+    lines = [
+        "# Completion for fish; node names come from the running daemon. Generated by sioms.tools.generate."
+    ]
     for tool in TOOLS:
         nodes = "" if tool == "smarkers" else " -a '(sioms list --names 2>/dev/null)'"
         lines.append(f"complete -c {tool} -f{nodes}")
         for _, group in option_groups(tool):
             for o in group:
                 short = f" -s {o.letter}" if o.letter else ""
-                lines.append(f"complete -c {tool}{short} -l {o.long}{' -x' if o.value else ''} -d '{_quoted(o.text)}'")
+                lines.append(
+                    f"complete -c {tool}{short} -l {o.long}{' -x' if o.value else ''} -d '{_quoted(o.text)}'"
+                )
     lines.append("complete -c sioms -n __fish_use_subcommand -f")
     for name, command in COMMANDS.items():
         lines.append(f"complete -c sioms -n __fish_use_subcommand -a {name} -d '{_quoted(command.text)}'")
     lines.append(
         f"complete -c sioms -n '__fish_seen_subcommand_from {' '.join(_NODE_COMMANDS)}' -f -a '(sioms list --names 2>/dev/null)'"
     )
+    lines.append(
+        "complete -c sioms -n 'test (count (commandline -opc)) -eq 2; and __fish_seen_subcommand_from driver' "
+        f"-f -a '{' '.join(driver_actions())}'"
+    )
+    for name, (_, parser) in driver_actions().items():
+        for option in _long_options(parser).split():
+            lines.append(
+                f"complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from {name}' -l {option[2:]}"
+            )
     return "\n".join([*lines, ""])
 
 

@@ -15,6 +15,21 @@ _sioms_tool() {
         mapfile -t COMPREPLY < <(compgen -W "$(_sioms_nodes)" -- "$word")
     fi
 }
+_sioms_driver() {
+    local word=${COMP_WORDS[COMP_CWORD]} options=""
+    if ((COMP_CWORD == 2)); then
+        mapfile -t COMPREPLY < <(compgen -W 'list check trace replay' -- "$word")
+        return
+    fi
+    case ${COMP_WORDS[2]} in
+    list) options='--help' ;;
+    check) options='--help --all --full --only --counterpart --config --report --json --jobs' ;;
+    trace) options='--help --output --seconds --socket' ;;
+    replay) options='--help --ignore' ;;
+    esac
+    if [[ $word == -* ]]; then mapfile -t COMPREPLY < <(compgen -W "$options" -- "$word")
+    else mapfile -t COMPREPLY < <(compgen -f -- "$word"); fi
+}
 _sioms() {
     local word=${COMP_WORDS[COMP_CWORD]}
     if ((COMP_CWORD == 1)); then
@@ -23,7 +38,7 @@ _sioms() {
     fi
     case ${COMP_WORDS[1]} in
     info | monitor | reset | stop) mapfile -t COMPREPLY < <(compgen -W "$(_sioms_nodes)" -- "$word") ;;
-    driver) mapfile -t COMPREPLY < <(compgen -W list -- "$word") ;;
+    driver) _sioms_driver ;;
     *) mapfile -t COMPREPLY < <(compgen -f -- "$word") ;;
     esac
 }

@@ -63,8 +63,25 @@ complete -c sioms -n __fish_use_subcommand -a stop -d 'emergency stop of a node 
 complete -c sioms -n __fish_use_subcommand -a reset -d 'clear a latched stop or fault'
 complete -c sioms -n __fish_use_subcommand -a reload -d 'have the daemon take up its configuration anew'
 complete -c sioms -n __fish_use_subcommand -a check -d 'check a configuration'
-complete -c sioms -n __fish_use_subcommand -a driver -d 'tell which drivers are installed'
+complete -c sioms -n __fish_use_subcommand -a driver -d 'list, check, trace and replay drivers'
 complete -c sioms -n __fish_use_subcommand -a bench -d 'measure latencies and throughput on this machine'
 complete -c sioms -n __fish_use_subcommand -a tactile -d 'design, calibrate and measure elastic fingers'
 complete -c sioms -n __fish_use_subcommand -a reconcile -d 'find where simulation and measurement disagree'
 complete -c sioms -n '__fish_seen_subcommand_from info monitor reset stop' -f -a '(sioms list --names 2>/dev/null)'
+complete -c sioms -n 'test (count (commandline -opc)) -eq 2; and __fish_seen_subcommand_from driver' -f -a 'list check trace replay'
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from list' -l help
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l help
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l all
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l full
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l only
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l counterpart
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l config
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l report
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l json
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l jobs
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from trace' -l help
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from trace' -l output
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from trace' -l seconds
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from trace' -l socket
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from replay' -l help
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from replay' -l ignore
