@@ -1,4 +1,4 @@
-"""`sioms tactile design|reproduce|calibrate|score|bench`: work with elastic cylindrical fingers from the shell.
+"""`sioms tactile design|reproduce|calibrate|score|experiment|bench`: work with elastic cylindrical fingers from the shell.
 
 Long work tells on stderr what it is doing; reports are single HTML pages.  Numerical and drawing libraries
 are imported when a subcommand runs, not before.
@@ -64,6 +64,22 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--edge-deg", type=float, default=45.0, help="half angle of the edge indenter (default 45)"
     )
 
+    experiment = commands.add_parser(
+        "experiment",
+        help="probe a simulated finger through the daemon, calibrate it, tabulate it beside the published one",
+    )
+    experiment.add_argument(
+        "-o", "--output", type=Path, default=Path("finger"), help="folder (default finger)"
+    )
+    experiment.add_argument("--quick", action="store_true", help="about a fifth of the touches")
+    experiment.add_argument(
+        "--finger",
+        help='fields of the simulated finger, "gain = 3.0; creep = 0.1" (default: faults as published)',
+    )
+    experiment.add_argument(
+        "--recorded", action="store_true", help="tabulate what is in the folder; probe nothing"
+    )
+
     bench = commands.add_parser("bench", help="measure the speed and the errors of shape estimation")
     bench.add_argument("--frames", type=int, default=2000, help="frames for each figure (default 2000)")
     bench.add_argument("--finger", type=Path, help="a calibrated finger (default: the published one)")
@@ -89,11 +105,15 @@ def run(args: argparse.Namespace) -> int:
                 from sioms.tools.tactile_score import score
 
                 return score(args)
+            case "experiment":
+                from sioms.tools.tactile_experiment import experiment
+
+                return experiment(args)
             case "bench":
                 from sioms.tools.tactile_bench import bench
 
                 return bench(args)
-    except (ValueError, OSError, KeyError) as error:
+    except (ValueError, OSError, KeyError, RuntimeError) as error:
         print(f"sioms tactile {args.tactile_command}: {error}", file=sys.stderr)
         return 1
     except ImportError as error:

@@ -77,7 +77,15 @@ class FingerShape:
     def __post_init__(self) -> None:
         if not (len(self.angles_rad) > 0 and np.all(np.isfinite(self.angles_rad))):
             raise ValueError(f"build finger: {len(self.angles_rad)} angles_rad; want one or more, all finite")
-        for name in ("length_m", "gain", "mains_hz", "drift_s", "creep_s", "proximity_range_rad", "strip_width_rad"):
+        for name in (
+            "length_m",
+            "gain",
+            "mains_hz",
+            "drift_s",
+            "creep_s",
+            "proximity_range_rad",
+            "strip_width_rad",
+        ):
             value = getattr(self, name)
             if not 0.0 < value < math.inf:
                 raise ValueError(f"build finger: {name} = {value}; want a positive, finite number")
@@ -194,7 +202,9 @@ class TactileArray:
             clearance_m: of an indenter that does not touch, for the pull of a conductor.
         """
         shape = self.shape
-        linear = self.strain(force / shape.length_m, angle_rad, indenter_radius_m) * (-100.0 / self.truth.gains)
+        linear = self.strain(force / shape.length_m, angle_rad, indenter_radius_m) * (
+            -100.0 / self.truth.gains
+        )
         if shape.creep:
             linear = self._crept(linear, time_s)
         np.multiply(linear, self._factor * (1.0 + shape.quadratic * linear), out=out)
@@ -202,7 +212,9 @@ class TactileArray:
         clear = 0.0 if force > 0.0 else clearance_m
         if shape.proximity and clear < 10 * _CLEARANCE_M:
             away = np.abs(np.remainder(self.truth.angles_rad - angle_rad + math.pi, math.tau) - math.pi)
-            out += shape.proximity * math.exp(-clear / _CLEARANCE_M) * np.exp(-away / shape.proximity_range_rad)
+            out += (
+                shape.proximity * math.exp(-clear / _CLEARANCE_M) * np.exp(-away / shape.proximity_range_rad)
+            )
         if shape.drift:
             out += shape.drift * math.sin(math.tau * time_s / shape.drift_s)
         if shape.mains:

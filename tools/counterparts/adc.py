@@ -16,9 +16,10 @@ import math
 import random
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 from .control import serve
 from .faults import Faults
@@ -236,10 +237,9 @@ def options_parser() -> argparse.ArgumentParser:
     return parser
 
 
-async def run() -> None:
-    """Serve until told to end."""
-    options = options_parser().parse_args()
-    device, faults = FrontEnd(options), Faults()
+async def run(device: FrontEnd, more: Mapping[str, Callable[..., object]] = MappingProxyType({})) -> None:
+    """Serve a device until told to end; ``more`` are further commands."""
+    options, faults = device.options, Faults()
     loop = asyncio.get_running_loop()
 
     def send(data: bytes) -> None:
@@ -285,9 +285,10 @@ async def run() -> None:
         "unplug": unplug,
         "plug": port.plug,
         "state": device.state,
+        **more,
     }
     await serve(str(options.link or port.name), handlers, close)
 
 
 if __name__ == "__main__":
-    asyncio.run(run())
+    asyncio.run(run(FrontEnd(options_parser().parse_args())))

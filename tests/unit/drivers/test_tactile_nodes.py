@@ -1,0 +1,156 @@
+"""The nodes of a tactile finger: the simulated finger senses what presses it, with a force sensor's help and without."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from sioms.drivers.framed_adc import FramedAdc
+from sioms.drivers.sim_tactile import SimTactile
+from sioms.protocol.flags import AnalogStatus, NodeClass, Request
+from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.sdk.blocks import AnalogBlock, BlockSpec, Description
+from sioms.sdk.driver import Refusal, TickDriver
+from sioms.tactile.estimator import Quality
+from sioms.tactile.sensing import CHANNELS
+
+FINGER = str(Path(__file__).parents[3] / "etc" / "finger.toml")
+NAMES = [name for name, _, _ in CHANNELS]
+
+
+class Hand(TickDriver):
+    """Presses: a node of a force [N]."""
+
+    class Settings(msgspec.Struct, frozen=True):
+        pass
+
+    @classmethod
+    def describe(cls, name, settings):
+        return Description((BlockSpec("", NodeClass.ANALOG, (ChannelInfo("force", "N"),)),), 200.0)
+
+    def __init__(self, name, settings, kit):
+        super().__init__(name, settings, kit)
+        self.force = 0.0
+        self._block = AnalogBlock(self.describe(name, settings).blocks[0])
+
+    @property
+    def blocks(self):
+        return (self._block,)
+
+    def tick(self, now_ns):
+        self._block.data[0] = self.force
+
+
+def table(**shape):
+    return {
+        "force_node": "hand.force", "angle_rad": 1.4, "noise": 0.023, "resolution": 0.01, "finger": {"gain": 3.0},
+        "shape": {"finger_file": FINGER, **shape},
+    }  # fmt: skip
+
+
+def sense(finger):
+    return dict(zip(NAMES, finger.blocks[2].data.tolist(), strict=True))
+
+
+@pytest.fixture
+def hand(bench):
+    return bench.make(Hand, "hand", {})
+
+
+def test_shape_is_published_beside_raw_and_strain(bench, hand):
+    finger = bench.make(SimTactile, "tactile0", table())
+    raw, strain, shape = finger.blocks
+    assert [block.spec.name for block in finger.blocks] == ["", "strain", "shape"]
+    bench.run(0.05)
+    assert sense(finger)["quality"] == Quality.NO_BASELINE.value and shape.flags[1] == int(
+        AnalogStatus.INVALID
+    )
+    bench.run(0.1)
+    assert sense(finger)["quality"] == Quality.NO_CONTACT.value and sense(finger)["load"] == 0.0
+    hand.force = 4.0  # on 20 mm: 200 N/m
+    bench.run(0.05)
+    felt = sense(finger)
+    assert felt["quality"] == Quality.GOOD.value and set(shape.flags) == {0}
+    assert felt["angle"] == pytest.approx(1.4, abs=3e-3)
+    assert felt["load"] == pytest.approx(200.0, rel=0.05)
+    assert felt["radius"] == pytest.approx(6e-3, rel=0.4)
+    np.testing.assert_allclose(strain.data, -0.03 * raw.data, atol=1.5e-3)
+
+
+def test_load_of_a_force_sensor_is_used_while_it_is_there(bench, hand):
+    finger = bench.make(
+        SimTactile, "tactile0", table(load_node="hand.force", load_scale=50.0, load_deviation=0.5)
+    )
+    bench.run(0.15)
+    hand.force = 4.0
+    bench.run(0.05)
+    felt = sense(finger)
+    assert felt["quality"] == Quality.GOOD.value
+    assert felt["var_load"] < 0.5**2 and felt["load"] == pytest.approx(200.0, abs=2.0)
+    bench._drivers = [entry for entry in bench._drivers if entry[0] is finger]  # the sensor's process hangs
+    bench.run(0.2)
+    felt = sense(finger)
+    assert felt["quality"] == Quality.WITHOUT_LOAD.value and felt["var_load"] > 0.5**2
+
+
+def test_requests_rebase_load_fingers_and_hold_gains(bench, hand):
+    finger = bench.make(SimTactile, "tactile0", table())
+    _, strain, shape = (block.spec for block in finger.blocks)
+    bench.run(0.15)
+    assert finger.ioctl(shape, Request.ZERO_DEVICE, [], 20) == [0.0] * len(CHANNELS)
+    bench.run(0.01)
+    assert sense(finger)["quality"] == Quality.NO_BASELINE.value
+    bench.run(0.15)
+    finger.ioctl(strain, Request.SET_GAINS, [], [6.0] * 16)
+    gains = np.array(finger.ioctl(strain, Request.GET_GAINS, [], None)).reshape(16, 16)
+    np.testing.assert_array_equal(gains, 6.0 * np.eye(16))
+    hand.force = 4.0
+    bench.run(0.05)
+    assert sense(finger)["load"] == pytest.approx(400.0, rel=0.05)  # twice the strain
+    assert finger.ioctl(shape, Request.CALIBRATE_DEVICE, [], Path(FINGER).read_text()) == "demo"
+    hand.force = 0.0
+    bench.run(0.15)
+    hand.force = 4.0
+    bench.run(0.05)
+    assert sense(finger)["load"] == pytest.approx(200.0, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    "node, request_, argument, words",
+    [
+        (1, Request.SET_GAINS, [1.0], "1 gains; want 16, or 16 rows of 16"),
+        (1, Request.SET_GAINS, [-1.0] * 16, "not positive"),
+        (2, Request.SET_GAINS, [1.0] * 16, "not a request shape knows"),
+        (2, Request.CALIBRATE_DEVICE, "x = 1", "unknown field `x`"),
+        (2, Request.CALIBRATE_DEVICE, [1.0], "want the text of a finger's file"),
+        (0, Request.CALIBRATE_DEVICE, "", "not a request this device knows"),
+    ],
+)
+def test_requests_that_make_no_sense_are_refused(bench, hand, node, request_, argument, words):
+    finger = bench.make(SimTactile, "tactile0", table())
+    with pytest.raises(Refusal, match=words):
+        finger.ioctl(finger.blocks[node].spec, request_, [], argument)
+
+
+@pytest.mark.parametrize(
+    "shape, words",
+    [
+        ({"finger_file": "/none/finger.toml"}, "No such file"),
+        ({"finger_file": __file__}, "load finger"),
+        ({"load_node": "force0.fz", "load_scale": 0.0}, "scale is 0.0"),
+        ({"load_age_s": 0.0}, "want a positive time"),
+        ({"settle_frames": 0}, "want 1 or more"),
+    ],
+)
+def test_settings_that_cannot_be_are_told_before_the_start(shape, words):
+    with pytest.raises(ValueError, match=words):
+        SimTactile.describe("tactile0", msgspec.convert(table(**shape), SimTactile.Settings))
+
+
+def test_a_finger_of_another_number_of_elements_is_told(tmp_path):
+    settings = {"line": {"serial": "/x", "baud": 921600}, "channels": 8, "shape": {"finger_file": FINGER}}
+    with pytest.raises(ValueError, match="has 16 elements; the device has 8"):
+        FramedAdc.describe("t0", msgspec.convert(settings, FramedAdc.Settings))
