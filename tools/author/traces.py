@@ -93,7 +93,7 @@ class Mismatch:
     """A request that the trace does not hold.
 
     Attributes:
-        place: number of the message in the trace that was next.
+        place: number of the message in the trace that was next, from 0.
         expected: request that was next, b'' at the end.
         got: what was asked.
     """
@@ -197,8 +197,9 @@ class Replay:
                     return i, again
         if any(m.way == ">" and self._same(m.data[: len(self._got)], self._got) for m in self._messages):
             return None
-        expected = next((m.data for m in self._messages[self._next :] if m.way == ">"), b"")
-        self.mismatch = Mismatch(self._next, expected, self._got)
+        place = next((i for i in indices if self._messages[i].way == ">"), len(self._messages))
+        expected = self._messages[place].data if place < len(self._messages) else b""
+        self.mismatch = Mismatch(place, expected, self._got)
         return None
 
     def _same(self, recorded: bytes, got: bytes) -> bool:
