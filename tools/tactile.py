@@ -1,4 +1,4 @@
-"""`sioms tactile design|reproduce|calibrate|score|experiment|bench`: work with elastic cylindrical fingers from the shell.
+"""`sioms tactile design|reproduce|calibrate|score|experiment`: work with elastic cylindrical fingers from the shell.
 
 Long work tells on stderr what it is doing; reports are single HTML pages.  Numerical and drawing libraries
 are imported when a subcommand runs, not before.
@@ -80,10 +80,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--recorded", action="store_true", help="tabulate what is in the folder; probe nothing"
     )
 
-    bench = commands.add_parser("bench", help="measure the speed and the errors of shape estimation")
-    bench.add_argument("--frames", type=int, default=2000, help="frames for each figure (default 2000)")
-    bench.add_argument("--finger", type=Path, help="a calibrated finger (default: the published one)")
-
 
 def run(args: argparse.Namespace) -> int:
     """Run the chosen subcommand; return the exit status, 1 with a message for what the user can mend."""
@@ -109,10 +105,6 @@ def run(args: argparse.Namespace) -> int:
                 from sioms.tools.tactile_experiment import experiment
 
                 return experiment(args)
-            case "bench":
-                from sioms.tools.tactile_bench import bench
-
-                return bench(args)
     except (ValueError, OSError, KeyError, RuntimeError) as error:
         print(f"sioms tactile {args.tactile_command}: {error}", file=sys.stderr)
         return 1

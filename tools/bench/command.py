@@ -27,6 +27,7 @@ BENCHES: dict[str, tuple[str, str]] = {
     "stop": ("stopping", "emergency stop to 16 axes in 4 processes acting on it, from Python and from the shell"),
     "pipe": ("pipes", "start of devin; devin piped into devout as a 1 kHz loop"),
     "drivers": ("drivers", "drivers: cycle against the line's speed, streams without loss, stop on a busy line"),
+    "tactile": ("tactile", "shape from strain: time of a frame, errors against theory, convergence"),
     "protocol": ("fuzzing", "malformed frames on the sockets of daemon and drivers"),
 }
 """Name of a sub-bench: the module that holds it, as a function of its name, and what it measures."""
