@@ -14,6 +14,9 @@ from .station import Station, wait_for
 from .trial import Failed, NotApplicable, Trial
 
 BACK_S = 12.0
+MORE_S = 6.0
+LEAST = 4
+"""Messages bent or readings seen, without which a disturbance goes on for up to MORE_S [s]."""
 LOST_S = 15.0
 LEAST_RECOVERY_S = 0.005
 LATE_TIMEOUT_S = 3.0
@@ -46,12 +49,21 @@ def disturbed(
     Returns:
         The watch over its readings.
     """
-    before = station.status()
+    before, bent = station.status(), station.totals()["bent"]
     with Calm(station) as calm:
         if babble:
             station.tell_wire(f"babble {babble:g} {seconds:g}")
         station.fault(**faults)
         calm.watch(seconds)
+        deadline = time.monotonic() + MORE_S
+        # a busy machine lets few messages pass: wait until the trial has tried something
+        while (
+            time.monotonic() < deadline
+            and not babble
+            and calm.count < LEAST
+            and _bent_since(station, bent) < LEAST
+        ):
+            calm.watch(0.1)
         station.fault()
         _check_alive(station, before)
         if judge and calm.wrong:
@@ -61,6 +73,10 @@ def disturbed(
             )
         _check_back(station)
     return calm
+
+
+def _bent_since(station: Station, before: int) -> int:
+    return station.totals()["bent"] - before
 
 
 def _check_alive(station: Station, before: dict[str, Any]) -> None:
@@ -190,7 +206,9 @@ def late(station: Station, full: bool) -> str:
     before = dict(station.totals())
     seconds = max((8.0 if full else 0.8), 4 * timeout_s)
     calm = disturbed(station, seconds, late=0.3, late_s=(low, high))
-    bent = station.totals()["bent"] - before["bent"]
+    bent = _bent_since(station, before["bent"])
+    if not bent:
+        raise NotApplicable("no message of the device passed meanwhile")
     return (
         f"{bent} replies up to {1e3 * (high - timeout_s):.1f} ms after the time-out of {1e3 * timeout_s:.0f} ms, "
         f"{calm.count} readings, none wrong"

@@ -23,7 +23,7 @@ def xor(data: bytes) -> int:
 
 
 def decode(reply: bytes) -> float:
-    """Return the load of ``+0012.340*2C``, CR LF [kg]."""
+    """Return the load of ``+0012.340*31``, CR LF [kg]."""
     text, star, check = reply.rstrip(b"\r\n").partition(b"*")
     try:
         if not star or int(check, 16) != xor(text) or reply[-2:] != b"\r\n" or len(check) != 2:
@@ -41,7 +41,7 @@ def want(got: bytes) -> int | None:
 
 
 def load() -> Exchange:
-    return Exchange(b"W\r", want, decode, 0.05, True, "read the load")
+    return Exchange(b"W\r", want, decode, 0.2, True, "read the load")
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -80,7 +80,7 @@ class Scale(LineDriver):
 
     @classmethod
     def golden(cls, settings):
-        return (Golden("load", load(), "57 0d", b"+0012.340*2C\r\n".hex(), 12.34),)
+        return (Golden("load", load(), "57 0d", b"+0012.340*31\r\n".hex(), 12.34),)
 
     def __init__(self, name, settings, kit):
         super().__init__(name, settings, kit)
