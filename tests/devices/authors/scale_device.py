@@ -12,13 +12,16 @@ tty.setraw(slave)
 link = sys.argv[sys.argv.index("--link") + 1]
 os.symlink(os.ttyname(slave), link)
 print(f"ready {link}", flush=True)
+heard = b""
 while True:
     ready, _, _ = select.select([0, master], [], [])
     if 0 in ready and not os.read(0, 1000):
         break
-    if master in ready and b"W\r" in os.read(master, 100):
-        text = b"+0012.340"
-        value = 0
-        for byte in text:
-            value ^= byte
-        os.write(master, text + b"*%02X\r\n" % value)
+    if master in ready:
+        heard = (heard + os.read(master, 100))[-20:]  # a line brings its characters one by one
+        if heard.endswith(b"W\r"):
+            text = b"+0012.340"
+            value = 0
+            for byte in text:
+                value ^= byte
+            os.write(master, text + b"*%02X\r\n" % value)
