@@ -27,7 +27,7 @@ from sioms.sdk.codec.sequence import SequenceWatch
 from sioms.sdk.datagram import split_address
 from sioms.sdk.driver import Kit, StreamDriver
 from sioms.sdk.exchange import Aside, DeviceError, LinkError, Pause, Send, Steps
-from sioms.sdk.force_torque import ForceBlock, Six, force_spec
+from sioms.sdk.force_torque import ForceBlock, Six, check_whole, force_spec
 from sioms.sdk.golden import Golden
 from sioms.sdk.settings import LineSettings
 
@@ -172,6 +172,7 @@ class AtiRdt(StreamDriver):
         """Let the sensor take the present load as its zero (bias), on CALIBRATE_DEVICE of the whole node."""
         if request is not Request.CALIBRATE_DEVICE:
             return super().ioctl(block, request, channels, argument)
+        check_whole(block, channels)
         return self._bias()
 
     def counters(self) -> Mapping[str, int | str]:

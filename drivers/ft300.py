@@ -174,6 +174,10 @@ class Ft300Registers(LineDriver):
         """The sensor."""
         return self._units
 
+    def counters(self) -> Mapping[str, int | str]:
+        """Return how often the sensor was overloaded; the rest stands in the link's counters."""
+        return {"saturated": self._units[0].force.saturated}
+
 
 class RegisterUnit(LineUnit):
     """Polls the forces, and the accelerations in the same message."""
@@ -181,14 +185,14 @@ class RegisterUnit(LineUnit):
     def __init__(self, name: str, settings: Ft300Settings, kit: Kit) -> None:
         self.name = name
         self._sensor = Sensor(name, settings, kit)
-        self._force = _force_block(name, settings, kit)
+        self.force = _force_block(name, settings, kit)
         specs = _specs(settings)
         self._acceleration = AnalogBlock(specs[1]) if settings.acceleration else None
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
         """The forces, and the accelerations if wanted."""
-        return (self._force,) if self._acceleration is None else (self._force, self._acceleration)
+        return (self.force,) if self._acceleration is None else (self.force, self._acceleration)
 
     def open(self) -> Steps:
         """End a stream that may still run, and identify the sensor."""
@@ -200,7 +204,7 @@ class RegisterUnit(LineUnit):
         words = yield self._sensor.unit.read_holding(ft300.FORCES_AT, last - ft300.FORCES_AT)
         counts = [word - 0x10000 if word & 0x8000 else word for word in words]
         now_ns = time.monotonic_ns()
-        self._force.fill(counts[:6], now_ns)
+        self.force.fill(counts[:6], now_ns)
         if self._acceleration is not None:
             self._acceleration.data[:] = np.multiply(counts[-3:], ft300.ACCELERATION_MS2)
             self._acceleration.stamp_ns = now_ns

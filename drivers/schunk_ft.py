@@ -23,7 +23,7 @@ from sioms.sdk.codec.sequence import SequenceWatch
 from sioms.sdk.datagram import split_address
 from sioms.sdk.driver import Kit, Refusal, StreamDriver
 from sioms.sdk.exchange import Aside, DeviceError, Exchange, LinkError, Steps
-from sioms.sdk.force_torque import ForceBlock, Six, force_spec
+from sioms.sdk.force_torque import ForceBlock, Six, check_whole, force_spec
 from sioms.sdk.golden import Golden, Incomplete
 from sioms.sdk.settings import LineSettings
 
@@ -161,6 +161,7 @@ class SchunkFt(StreamDriver):
         """Let the sensor tare itself on CALIBRATE_DEVICE; with the argument 0 it takes its tare back."""
         if request is not Request.CALIBRATE_DEVICE:
             return super().ioctl(block, request, channels, argument)
+        check_whole(block, channels)
         number = argument[0] if isinstance(argument, list) and len(argument) == 1 else argument
         if number not in (None, 0):
             raise Refusal(errno.EINVAL, f"{argument!r}; want nothing for a tare, or 0 to take it back")

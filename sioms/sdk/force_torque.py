@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 from collections.abc import Sequence
 
@@ -11,7 +12,7 @@ from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 
 from .blocks import AnalogBlock, BlockSpec
-from .driver import Kit
+from .driver import Kit, Refusal
 
 COMPONENTS = ("fx", "fy", "fz", "tx", "ty", "tz")
 UNITS = ("N", "N", "N", "N*m", "N*m", "N*m")
@@ -39,6 +40,15 @@ def force_spec(full_scale: Six | None, history: int, description: str) -> BlockS
         for name, unit, limit in zip(COMPONENTS, UNITS, limits, strict=True)
     )
     return BlockSpec("", NodeClass.ANALOG, channels, history=history)
+
+
+def check_whole(block: BlockSpec, channels: Sequence[int]) -> None:
+    """Raise Refusal when a request that holds for the whole sensor comes for a part of its channels."""
+    if len(channels) != len(block.channels):
+        names = ", ".join(block.channels[channel].name for channel in channels)
+        raise Refusal(
+            errno.EINVAL, f"{names} alone; the sensor's zero belongs to all its channels: open the whole node"
+        )
 
 
 class ForceBlock(AnalogBlock):

@@ -361,6 +361,8 @@ def test_ati_buffered_and_bias() -> None:
     for datagram in rig.collect(0.05):
         rig.arrive(datagram)
     assert rig.data == pytest.approx([0] * 6, abs=1e-5) and not block.offset.any()
+    with pytest.raises(Refusal, match="fx, fy alone; the sensor's zero belongs to all its channels"):
+        rig.driver.ioctl(block.spec, Request.CALIBRATE_DEVICE, (0, 1), None)
     with pytest.raises(Refusal, match="HOME"):
         rig.driver.ioctl(block.spec, Request.HOME, range(6), None)
 
