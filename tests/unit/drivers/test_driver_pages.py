@@ -12,8 +12,6 @@ import pytest
 
 from sioms.sdk import finding
 
-WITHOUT_PAGE = {"ati-rdt", "ft300", "schunk-ft"}
-"""Drivers whose facts stand in their docstrings alone, so far."""
 PAGES = Path(__file__).parents[3] / "docs" / "drivers"
 
 
@@ -40,7 +38,7 @@ def test_every_driver_and_every_register_map_has_a_page_with_an_example() -> Non
     devices = [table for _, text in TEXTS for table in tomllib.loads(text)["device"].values()]
     registered = {point.name for point in entry_points(group="sioms.drivers")}
     simulated = {name for name in registered if name.startswith("sim-")}
-    assert {table["driver"] for table in devices} >= registered - simulated - WITHOUT_PAGE
+    assert {table["driver"] for table in devices} >= registered - simulated
     maps = {path.stem for path in (PAGES.parents[1] / "drivers" / "maps").glob("*.toml")}
     assert {table["map"] for table in devices if "map" in table} == maps
 
