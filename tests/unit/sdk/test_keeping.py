@@ -43,6 +43,8 @@ def moved_to(path, position, rule, *, offset=0.25, homed=True, close=False, tick
     cell = Kept(path, axis(restore=rule))
     cell.rig.bank.calibrate([0], [offset])
     cell.rig.bank.set_homed([0], homed)
+    cell.rig.tick(102)
+    assert decode(path.read_bytes()).entries["x"].state & AT_REST
     cell.rig.write(mode=MODE.POSITION, position=position)
     if ticks is None:
         cell.rig.run()
