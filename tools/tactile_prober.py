@@ -215,7 +215,7 @@ class Prober:
             self._go(place, 0.0)
             out.add(*self._frames(FRAMES), number, 0)
             depth_m = load * LENGTH_M / self._stiffness
-            self._wait_move(SURFACE_M - 0.1e-3, 0.1)
+            self._move(SURFACE_M - 0.1e-3)
             self._axis.command(velocity=depth_m / seconds, replace=True)
             frames, stamps, force = self._frames(round(RATE_HZ * seconds))
             pressed = np.flatnonzero(force > 0.05 * force.max())
@@ -244,23 +244,21 @@ class Prober:
             self._mounted = radius_m
         for node in (self._axis, self._place):
             node.keepalive()
-        far = abs(self._place.read().position[0] - place)
-        self._place.command(position=place, time=max(0.05, 0.4 * far), replace=True)
+        self._place.command(position=place, replace=True)
         self._place.wait_until_idle(5.0)
         number = self._force.read().number
         self._force.wait_new(number + 50, 2.0)
         self._tare = float(np.mean([s.data[0] for s in self._force.history(number)]))
 
     def _press(self, depth_m: float) -> None:
-        self._wait_move(SURFACE_M + depth_m, 0.12)
+        self._move(SURFACE_M + depth_m)
         self._force.wait_new(self._force.read().number + 60, 2.0)
 
     def _clear(self) -> None:
-        self._wait_move(SURFACE_M - CLEAR_M, 0.1)
+        self._move(SURFACE_M - CLEAR_M)
 
-    def _wait_move(self, position: float, seconds: float) -> None:
-        far = abs(self._axis.read().position[0] - position)
-        self._axis.command(position=position, time=max(seconds, 30.0 * far), replace=True)
+    def _move(self, position: float) -> None:
+        self._axis.command(position=position, replace=True)
         self._axis.wait_until_idle(5.0)
 
     def _frames(self, count: int) -> tuple[Floats, Floats, Floats]:

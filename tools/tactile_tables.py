@@ -65,7 +65,7 @@ def calibrated(folder: Path, tell: Tell) -> tuple[Data, Calibration]:
 
 def tables(data: Data, result: Calibration, tell: Tell) -> Iterator[Table]:
     """Compute the tables in order."""
-    work = _Work(data, result)
+    work = Tables(data, result)
     for number, make in enumerate(
         (work.table_3_4, work.table_3_5, work.table_3_6, work.table_3_7, work.table_3_8, work.table_3_9, work.table_3_10,
          work.table_3_11, work.table_3_12), 4,
@@ -74,8 +74,8 @@ def tables(data: Data, result: Calibration, tell: Tell) -> Iterator[Table]:
         tell(f"table 3.{number}")
 
 
-class _Work:
-    """Fits that several tables share."""
+class Tables:
+    """The tables of one finger.  One caller at a time."""
 
     def __init__(self, data: Data, result: Calibration) -> None:
         self.data, self.result, self.peak = data, result, result.peak
