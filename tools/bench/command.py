@@ -10,6 +10,7 @@ from typing import Any
 
 from .figures import Report
 from .options import Options
+from .tables import markdown
 
 BENCHES: dict[str, tuple[str, str]] = {
     "read": ("reading", "read of 4 axes and of 48 analog channels, against a bare round trip"),
@@ -54,10 +55,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", type=int, metavar="N", help="frames of the sub-bench protocol")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of random frames")
     parser.add_argument("--json", metavar="FILE", help="write all figures to a file")
+    parser.add_argument("--tables", metavar="FILE", help="write them as Markdown tables")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the sub-benches; return 0, or 2 for a name that is none.
+    """Run the sub-benches; return 0, 1 when one of them could not be carried out, or 2 for a name that is none.
 
     A missed bar is reported and is no failure: the figures are this machine's, not the code's alone.
     """
@@ -69,15 +71,29 @@ def run(args: argparse.Namespace) -> int:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     options = Options(args.quick, args.trials, args.soak, args.frames, args.seed)
-    report = Report()
+    report, failed = Report(), []
     try:
         for name in args.names or BENCHES:
             module, text = BENCHES[name]
             report.begin(name, text)
-            getattr(importlib.import_module(f".{module}", __package__), f"bench_{name}")(options, report)
+            try:
+                getattr(importlib.import_module(f".{module}", __package__), f"bench_{name}")(options, report)
+            except (OSError, RuntimeError) as error:
+                failed.append(f"{name}: {error}")
+            _write(args, report)
     except KeyboardInterrupt:
         report.note("interrupted: what follows is not complete")
     report.summary()
+    _write(args, report)
+    for text in failed:
+        print(f"sioms bench: {text}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _write(args: argparse.Namespace, report: Report) -> None:
+    """Write what there is so far: a long run may be interrupted."""
     if args.json:
         report.write(args.json, quick=args.quick)
-    return 0
+    if args.tables:
+        with open(args.tables, "w", encoding="utf-8") as file:
+            file.write(markdown(report.figures))
