@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pytest
 from daemon_rig import wait_for
 
 import sioms
@@ -37,6 +40,70 @@ velocity_max = 0.1
 acceleration_max = 2.0
 """
 """One Leadshine drive that goes on to the end of its path by itself: only a stop that is sent can end it early."""
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """A device that a driver must refuse.
+
+    Attributes:
+        words: of the sentence that says why.
+        options: of the counterpart.
+        change: a command to it before the daemon starts.
+    """
+
+    words: str
+    options: tuple[str, ...] = ()
+    change: str = ""
+
+
+def check_misfits(
+    start: Callable[..., Any], folder: Path, name: str, config: str, misfits: Sequence[Misfit], *given: str
+) -> None:
+    """Give one daemon a device for each misfit, all of one configuration: each is refused with its sentence.
+
+    Args:
+        start: starts processes that end with the test.
+        folder: a short path.
+        name: of the counterpart's module.
+        config: table of the device, whatever its name; ``{port}`` is the counterpart's port.
+        misfits: to be tried, in parallel.
+        given: options of all counterparts.
+    """
+    commands = [
+        (
+            sys.executable,
+            "-m",
+            f"sioms.tools.counterparts.{name}",
+            "--link",
+            str(folder / f"p{i}"),
+            *given,
+            *misfit.options,
+        )
+        for i, misfit in enumerate(misfits)
+    ]
+    devices = [start(command) for command in commands]
+    device = re.findall(r"\[device\.(\w+)\]", config)[0]
+    text = '[workcell]\nname = "misfits"\n'
+    for i, (process, misfit) in enumerate(zip(devices, misfits, strict=True)):
+        process.wait_line("^ready ")
+        if misfit.change:
+            process.process.stdin.write(misfit.change + "\n")
+            process.process.stdin.flush()
+            process.wait_line("^ok")
+        text += config.replace("{port}", str(folder / f"p{i}")).replace(f"device.{device}", f"device.d{i}")
+    path, socket = folder / "misfits.toml", str(folder / "m")
+    path.write_text(text)
+    daemon = start([sys.executable, "-m", "sioms.daemon.main", "--config", str(path), "--socket", socket])
+    daemon.wait_line("event=ready", 40.0)
+    with sioms.Workcell(socket) as cell:
+        for i, misfit in enumerate(misfits):
+            wait_for(
+                lambda i=i, misfit=misfit: misfit.words in str(cell.status()["devices"][i]),
+                f"the sentence {misfit.words!r}; {cell.status()['devices'][i]}",
+            )
+            with pytest.raises(OSError, match=f"d{i}"), cell.open(f"d{i}.readonly") as opened:
+                opened.read()
 
 
 class Wire:

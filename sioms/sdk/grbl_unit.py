@@ -26,6 +26,8 @@ from .driver import Kit
 from .exchange import DeviceError, LinkError, Pause, Send, Steps
 
 TIMEOUT_S = 0.5
+STATUS_S = 0.2
+"""A status report comes within 5 to 20 ms; ten times that on a slow adapter."""
 RESET_S = 3.0
 HOLD_S = 5.0
 TOGETHER_S = 0.0005
@@ -146,11 +148,11 @@ class GrblUnit(AxesUnit):
         """Read the status, and keep velocities going."""
         if self._homing_ns:  # the controller is deaf while it homes; its ok is overheard
             if self._homing_end == "":
-                report, _ = yield grbl.status(TIMEOUT_S)
+                report, _ = yield grbl.status(STATUS_S)
                 self._raw = self._positions(report)
             self._report_homing()
             return
-        report, lines = yield grbl.status(TIMEOUT_S)
+        report, lines = yield grbl.status(STATUS_S)
         self._hear(lines)
         self._take(report)
         if self._interrupted:

@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from daemon_rig import wait_for
+from wire_rig import SLIDE, Wire
 
 import sioms
 from sioms.protocol.flags import AnalogStatus, AxisStatus
@@ -234,3 +236,44 @@ time.sleep(60)
         wait_until(lambda: inputs.read().data[0] == 0x55, what="the loop")
         client.process.kill()
         wait_until(lambda: inputs.read().data[0] == 0, 2.0, "the safe value")
+
+
+MOVE = """
+import sys, time, sioms
+node = sioms.Workcell(sys.argv[1]).open("slide0", "rw")
+node.move(float(sys.argv[2]))
+print("moving", flush=True)
+time.sleep(60)
+"""
+
+
+def test_the_driver_watches_over_moves_for_which_the_drive_has_no_dead_man(
+    start: Callable[..., Any], short_folder: Path
+) -> None:
+    """A position move of a Leadshine drive goes on to its target by itself: each death must end it by a stop that is sent."""
+    wire = Wire(start, short_folder, "leadshine", "--units", "1")
+    wire.serve(SLIDE)
+    wire.wait_up("slide0")
+
+    def run_to(position: float) -> Any:
+        client = start([sys.executable, "-c", MOVE, wire.socket, str(position)])
+        client.wait_line("moving")
+        wait_for(lambda: abs(wire.state("velocity")) > 40000, "motion")
+        return client
+
+    def rests(after: str) -> None:
+        wait_for(lambda: wire.state("velocity") == 0, f"rest after the death of the {after}", 2.0)
+
+    run_to(5.0).process.kill()
+    rests("client")
+    wait_for(lambda: wire.reads("slide0"), "the axis after its client's death")
+    client, driver = run_to(-5.0), wire.pid("slide0")
+    os.kill(driver, signal.SIGKILL)
+    rests("driver")
+    client.process.kill()
+    wait_for(lambda: wire.pid("slide0") not in (0, driver), "a new driver")
+    wire.wait_up("slide0")
+    assert wire.state("velocity") == 0, "motion must not resume"
+    run_to(5.0)
+    wire.daemon.process.kill()
+    rests("daemon")
