@@ -20,7 +20,7 @@ from __future__ import annotations
 import errno
 import math
 from collections.abc import Mapping, Sequence
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -32,6 +32,7 @@ from sioms.sdk.codec.ascii_line import MAX_LINE_BYTES, LineReceiver
 from sioms.sdk.codec.clock_fit import ClockFit
 from sioms.sdk.driver import Kit, StreamDriver
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Send, Steps
+from sioms.sdk.golden import Golden, Incomplete
 from sioms.sdk.settings import LineSettings
 
 T = TypeVar("T")
@@ -100,6 +101,21 @@ class AsciiStream(StreamDriver):
         )
         block = BlockSpec("", NodeClass.ANALOG, channels, history=settings.history)
         return Description((block,), settings.rate_hz, lease_s=max(0.5, 10 / settings.rate_hz))
+
+    @classmethod
+    def golden(cls, settings: Any) -> Sequence[Golden]:
+        """Return lines of the format's description, behind the cut one that every stream begins with."""
+
+        def first(data: bytes) -> tuple[float, ...]:
+            rows = LineReceiver(3, checked=True).feed(data)
+            if not rows:
+                raise Incomplete("no good line")
+            return rows[0]
+
+        return tuple(
+            Golden(what, reply=(b"\n" + line).hex(" "), value=(1.0, 2.0, 3.0), read=first)
+            for what, line in (("commas", b"1,2,3*30\n"), ("blanks, CR LF", b"1 2 3*30\r\n"))
+        )
 
     def __init__(self, name: str, settings: AsciiStreamSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)

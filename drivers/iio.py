@@ -18,7 +18,7 @@ from __future__ import annotations
 import errno
 import time
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -27,9 +27,10 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
-from sioms.sdk.codec.iio_scan import ElementType, ScanReceiver, kind_of, unit_of
+from sioms.sdk.codec.iio_scan import Element, ElementType, Layout, ScanReceiver, kind_of, parse_type, unit_of
 from sioms.sdk.driver import Driver, Kit, StreamDriver, TickDriver
 from sioms.sdk.exchange import LinkError, Steps
+from sioms.sdk.golden import Golden, Incomplete
 from sioms.sdk.iio_device import TIMESTAMP, IioDevice, find_device
 from sioms.sdk.settings import LineSettings
 
@@ -85,6 +86,21 @@ class Iio(StreamDriver):
     def describe(cls, name: str, settings: IioSettings) -> Description:
         """Tell the channels; raises ValueError for settings that cannot be."""
         return _describe(settings)
+
+    @classmethod
+    def golden(cls, settings: Any) -> Sequence[Golden]:
+        """Return a scan of the kernel's dummy device; scans carry no checksum."""
+        types = ("le:u13/16>>0", "le:s12/16>>0", "le:s11/16>>0", "le:s16/16>>0", "le:s64/64>>0")
+        layout = Layout([Element(f"c{i}", i, parse_type(text)) for i, text in enumerate(types)])
+
+        def first(data: bytes) -> tuple[int, ...]:
+            scan = ScanReceiver(layout.size).feed(data)
+            if not scan:
+                raise Incomplete("no whole scan")
+            return tuple(int(values[0]) for values in layout.decode(scan).values())
+
+        scan = "49 00 21 00 de 07 22 00 08 07 06 05 04 03 02 01"
+        return (Golden("scan", reply=scan, value=(73, 33, -34, 34, 0x0102030405060708), read=first),)
 
     def __init__(self, name: str, settings: IioSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
