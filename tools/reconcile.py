@@ -1,21 +1,27 @@
 """``sioms reconcile``: find where simulation and measurement disagree, name it, add it, show the gap shrink.
 
 ``add_parser`` and ``run`` are called by the ``sioms`` command; nothing heavy is imported before ``run``.
-Exit status: 0 named or nothing missing, 3 unexplained, 4 ambiguous, 2 bad input.
+Exit status: 0 named or nothing missing, 3 unexplained, 4 ambiguous, 2 bad input, 1 the experiment was stopped.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from sioms.tools.reconcile_sensors import add_parsers as add_sensors
+from sioms.tools.reconcile_sensors import run_sensor
 
 if TYPE_CHECKING:
     from sioms.reconcile.verdict import Verdict
 
-EXIT_BAD_INPUT = 2
+EXIT_BAD_INPUT, EXIT_STOPPED = 2, 1
+SUFFIXES = (".csv", ".npz", ".mat", ".txt")
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -23,19 +29,26 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "reconcile", help="find where simulation and measurement disagree and name the missing effect")
     kinds = parser.add_subparsers(dest="subject", required=True, metavar="SUBJECT")
-    axis = kinds.add_parser("axis", help="a motor axis, from recordings")
-    axis.add_argument("data", type=Path, metavar="DATA", help="file or folder of recordings")
+    axis = kinds.add_parser("axis", help="a motor axis, from recordings or live")
+    axis.add_argument("data", type=Path, metavar="DATA", help="file or folder of recordings, or the node of an axis")
     axis.add_argument("--model", type=Path, metavar="FILE", help="nominal model (TOML; default: DATA/nominal.json)")
     axis.add_argument("--columns", type=Path, metavar="FILE", help="column description (default: columns.toml beside DATA)")
     axis.add_argument("--out", type=Path, default=Path("report"), metavar="DIR", help="where the report goes")
     axis.add_argument("--seed", type=int, default=1, help="of permutations and bootstrap")
+    axis.add_argument("--jobs", type=int, default=0, help="cores to use (default: all)")
+    axis.add_argument("--resample", type=int, default=None, metavar="SEED", help="draw the blocks of time anew: does the verdict stand?")
     axis.add_argument("--quiet", action="store_true", help="no progress")
-    test = kinds.add_parser("selftest", help="blind test on generated axes with hidden effects")
-    test.add_argument("--axes", type=int, default=20, help="number of axes")
+    _live_arguments(axis)
+    add_sensors(kinds)
+    test = kinds.add_parser("selftest", help="blind test on generated axes or sensors with hidden effects")
+    test.add_argument("kind", nargs="?", choices=("axis", "tactile", "force"), default="axis", help="what is generated (default axis)")
+    test.add_argument("--axes", "--count", type=int, default=20, help="number of axes or sensors")
     test.add_argument("--seed", type=int, default=1, help="of the generator")
-    test.add_argument("--out", type=Path, default=None, metavar="DIR", help="keep axes and answers here")
+    test.add_argument("--out", type=Path, default=None, metavar="DIR", help="keep what was generated and the answers here")
     test.add_argument("--jobs", type=int, default=0, help="solvers at a time (default: one for each core)")
-    kinds.add_parser("effects", help="print the library of effects")
+    test.add_argument("--replicates", type=int, default=0, help="solve each so many times more with its blocks drawn anew")
+    effects = kinds.add_parser("effects", help="print the library of effects")
+    effects.add_argument("--out", type=Path, default=None, metavar="DIR", help="write page and pictures there instead")
     parser.set_defaults(run=run)
     return parser
 
@@ -43,34 +56,85 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 def run(args: argparse.Namespace) -> int:
     """Do what the command line asks; return the exit status."""
     if args.subject == "effects":
-        from sioms.tools.reconcile_effects import page
+        from sioms.tools import reconcile_effects
 
-        print(page(), end="")
+        if args.out is None:
+            print(reconcile_effects.page(), end="")
+        else:
+            reconcile_effects.write(args.out)
         return 0
     if args.subject == "selftest":
+        if args.kind != "axis":
+            from sioms.tools.reconcile_selftest_sensors import selftest as sensors
+
+            return sensors(args.kind, args.axes, args.seed, args.out, args.jobs)
         from sioms.tools.reconcile_selftest import selftest
 
-        return selftest(args.axes, args.seed, args.out, args.jobs)
+        return selftest(args.axes, args.seed, args.out, args.jobs, args.replicates)
+    if args.subject in ("tactile", "force"):
+        return run_sensor(args)
     return run_axis(args)
 
 
+def _live_arguments(axis: argparse.ArgumentParser) -> None:
+    group = axis.add_argument_group("with a node")
+    group.add_argument("--yes", action="store_true", help="move without asking")
+    group.add_argument("--travel", type=float, metavar="X", help="largest distance to either side of the present position")
+    group.add_argument("--lap", type=float, default=3.0, metavar="S", help="length of a lap of each experiment (default 3)")
+    group.add_argument("--first", choices=("full", "one_speed"), default="full", help="what is run before anything is decided")
+    group.add_argument("--install", type=Path, metavar="FILE", help="write the model there, for a simulated twin, and reload")
+    group.add_argument("--socket", metavar="PATH", help="the daemon's socket")
+
+
 def run_axis(args: argparse.Namespace) -> int:
-    """Reconcile one axis from recordings."""
+    """Reconcile one axis from recordings, or live."""
     from sioms.reconcile.verdict import EXIT, BadInputError
 
+    say = (lambda text: None) if args.quiet else _progress
     try:
-        verdict, seconds = reconcile_axis(args.data, args.model, args.columns, args.seed,
-                                          (lambda text: None) if args.quiet else _progress)
+        if args.data.exists() or args.data.suffix in SUFFIXES or len(args.data.parts) > 1:
+            with ThreadPoolExecutor(args.jobs or os.cpu_count() or 1) as pool:
+                options = {"seed": args.seed, "progress": say, "mapper": pool.map, "resample": args.resample}
+                verdict, seconds = reconcile_axis(args.data, args.model, args.columns, **options)
+            write(verdict, seconds, args.out)
+            return EXIT[verdict.outcome]
+        return run_node(args, say)
     except BadInputError as e:
         print(f"bad input: {e}", file=sys.stderr)
         return EXIT_BAD_INPUT
+
+
+def run_node(args: argparse.Namespace, say: Any) -> int:
+    """Reconcile the axis behind a node."""
+    from sioms.reconcile.verdict import EXIT, BadInputError
+    from sioms.tools.reconcile_input import read_model
+    from sioms.tools.reconcile_live import Live, install, live, save
+    from sioms.tools.reconcile_record import ExperimentStopped
+
+    node = str(args.data)
+    if args.model is None:
+        raise BadInputError(f"reconcile {node}: it is no file, and for a node --model is needed: the nominal model")
+    settings = Live(args.travel, args.lap, args.first, args.yes, args.socket, args.seed)
+    try:
+        verdict, session, seconds = live(node, read_model(args.model), settings, say)
+    except (ExperimentStopped, OSError) as e:
+        print(f"stopped: {getattr(e, 'strerror', None) or e}", file=sys.stderr)
+        return EXIT_STOPPED
+    except KeyboardInterrupt:
+        print(f"stopped: interrupted; {node} is halted", file=sys.stderr)
+        return EXIT_STOPPED
+    save(session, args.out / "records")
     write(verdict, seconds, args.out)
+    if args.install is not None:
+        print(install(verdict, args.install, args.socket))
     return EXIT[verdict.outcome]
 
 
-def reconcile_axis(data: Path, model: Path | None, columns: Path | None = None, seed: int = 1,
-                   progress: Any = lambda text: None) -> tuple[Verdict, float]:
+def reconcile_axis(data: Path, model: Path | None, columns: Path | None = None, **options: Any) -> tuple[Verdict, float]:
     """Read, analyse and time one axis.
+
+    Args:
+        options: of ``sioms.reconcile.axis.Options``.
 
     Returns:
         The verdict and the seconds it took.
@@ -85,7 +149,7 @@ def reconcile_axis(data: Path, model: Path | None, columns: Path | None = None, 
     nominal = read_model(model or data / "nominal.json")
     session = read_data(data, nominal, columns)
     nominal = with_resolution(nominal, session)
-    verdict = analyse(session, nominal, Options(seed=seed, progress=progress))
+    verdict = analyse(session, nominal, Options(**options))
     return verdict, time.monotonic() - start
 
 

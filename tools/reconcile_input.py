@@ -5,6 +5,7 @@ Column description (``columns.toml`` beside the data, or ``--columns``)::
     sample_time_s = 0.001            # or a time column
     files = ["run1.csv", "run2.npz"] # optional; else every data file of the folder, by name
     continuous = true                # heat carries over from file to file
+    final = ["run9.csv"]             # optional: whole records that only the final statement sees
     [columns]
     time           = { name = "t",    unit = "s" }
     position       = { name = "qm",   unit = "m" }       # m mm um rad deg turn count
@@ -63,12 +64,13 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
             table = tomllib.load(f)
         except tomllib.TOMLDecodeError as e:
             raise BadInputError(f"read {description}: {e}") from e
-    only(table, ("sample_time_s", "files", "continuous", "columns"), str(description))
-    files = [folder / n for n in table["files"]] if "files" in table else _files(data)
+    only(table, ("sample_time_s", "files", "continuous", "final", "columns"), str(description))
+    last = [folder / n for n in table.get("final", ())]
+    files = [folder / n for n in table["files"]] if "files" in table else [f for f in _files(data) if f not in last]
     if not files:
         raise BadInputError(f"read {data}: no data files; expects one of {', '.join(SUFFIXES)}")
-    records = tuple(_record(f, table.get("columns", {}), model) for f in files)
-    return Session(records, bool(table.get("continuous", True)))
+    records, final = (tuple(_record(f, table.get("columns", {}), model) for f in some) for some in (files, last))
+    return Session(records, bool(table.get("continuous", True)), final)
 
 
 def _files(data: Path) -> list[Path]:

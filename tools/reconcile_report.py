@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sioms.reconcile.effects import library
+from sioms.reconcile.session import knobs
 from sioms.reconcile.verdict import Gap, NamedEffect, Outcome, Verdict
 
 if TYPE_CHECKING:
@@ -89,13 +90,15 @@ def as_json(v: Verdict, seconds: float) -> str:
         "separating_experiment": v.experiment.text if v.experiment else "",
         "separation_in_noise": v.experiment.separation if v.experiment else None,
         "details": [effect(e) for e in v.effects], "symbolic": [effect(e) for e in v.symbolic],
-        "gaps": [{"channel": g.channel, "unit": g.unit, "before": g.before, "after": g.after, "floor": g.floor, "session": g.session,
+        "gaps": [{"channel": g.channel, "unit": g.unit, "before": g.before, "after": g.after, "floor": g.floor, "frozen_later_half": g.frozen,
+                  "session_later_half": g.session,
                   "closed": g.closed} for g in v.gaps],
         "ladder": [{"action": s.action, "effect": s.effect, "ratio": s.ratio, "saved": s.saved, "rivals": s.rivals,
                     "untouched_force_error": e} for s, e in zip(v.ladder, v.rungs, strict=True)],
         "not_excited": v.gate.missing, "same_in_these_records": [list(p) for p in v.gate.pairs],
         "located": [{"variable": p.variable, "explained": p.explained, "p": p.p} for p in v.places],
         "residual_over_floor": v.ratio, "smoother_share": v.smoother_share, "burst_share": v.burst_share,
+        "session": {name: {k: getattr(s, k) for k in knobs(v.model)} for name, s in v.states},
         "effective_samples": v.effective_samples, "samples": v.samples, "notes": list(v.notes), "seconds": seconds,
     }
     return json.dumps(table, indent=1, default=float) + "\n"
@@ -109,6 +112,7 @@ def page(v: Verdict, seconds: float) -> str:
              f"<p class='verdict {v.outcome.value}'><b>{v.outcome.value}</b> - {headline(v)}</p>"]
     parts.append(_what(v))
     parts.append("<h2>How far the gap shrank</h2><p>Root mean square on samples that took no part in any choice.</p>" + _gaps(v.gaps))
+    parts.append(_session(v))
     parts.append(pictures.get("gap", ""))
     parts.append("<h2>Where it disagreed</h2>" + _where(v) + pictures.get("places", "") + pictures.get("spectra", ""))
     parts.append("<h2>Why we believe it, and what else it could have been</h2>" + "".join(map(_why, (*v.effects, *v.symbolic))))
@@ -138,10 +142,26 @@ def _what(v: Verdict) -> str:
 
 def _gaps(gaps: Sequence[Gap]) -> str:
     rows = "".join(f"<tr><td>{g.channel}<td class=n>{number(g.before)}<td class=n>{number(g.after)}<td class=n>"
-                   f"{'-' if g.session is None else number(g.session)}<td class=n>{number(g.floor)}"
-                   f"<td>{g.unit}<td class=n>{100 * g.closed:.1f} %" for g in gaps)
-    return ("<table><tr><th>channel<th>before<th>after<th>after, session offset re-estimated<th>noise floor<th>unit<th>closed"
-            f"{rows}</table>")
+                   f"{number(g.floor)}<td>{g.unit}<td class=n>{100 * g.closed:.1f} %<td class=n>{_maybe(g.frozen)}"
+                   f"<td class=n>{_maybe(g.session)}" for g in gaps)
+    return ("<table><tr><th>channel<th>before<th>after<th>noise floor<th>unit<th>closed<th>later half, frozen"
+            f"<th>later half, session re-estimated{rows}</table>")
+
+
+def _maybe(value: float | None) -> str:
+    return "-" if value is None else number(value)
+
+
+def _session(v: Verdict) -> str:
+    """Say what the session parameters came to, where they matter."""
+    shown = knobs(v.model)
+    units = {"offset": v.model.force_unit, "dry": "", "viscous": "", "zero": v.model.position_unit, "heat": ""}
+    said = {"offset": "force offset", "dry": "dry friction, factor", "viscous": "viscous friction, factor", "zero": "encoder zero", "heat": "heat state at the start"}
+    rows = "".join(f"<tr><td>{html.escape(name)}" + "".join(f"<td class=n>{number(getattr(s, k))} {units[k]}" for k in shown)
+                   for name, s in v.states)
+    head = "".join(f"<th>{said[k]}" for k in shown)
+    return (f"<p>Session parameters, estimated on the first half of what is untouched of each record (no property of the axis, "
+            f"and no part of the model):</p><table><tr><th>record{head}{rows}</table>") if v.states else ""
 
 
 def _where(v: Verdict) -> str:

@@ -17,9 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from sioms.reconcile.model import AxisModel
+from sioms.reconcile.simulate import simulate
 from sioms.reconcile_selftest.draw import CONFOUNDED, NAMED, NAMELESS, SAMPLE_S, Axis, commands, draw_axis
 from sioms.reconcile_selftest.score import Scored, score, table
 from sioms.reconcile_selftest.world import Recording, World
+from sioms.tools.reconcile_input import read_model
 
 #: The mixture of kinds, repeated: out of twenty axes.
 MIXTURE = ("null", "single", "multi", "unknown", "single", "confounded", "multi", "single", "null", "multi",
@@ -51,13 +54,46 @@ def generate(count: int, seed: int) -> list[Axis]:
     return out
 
 
-def record_all(axes: list[Axis], seed: int, seconds: float = RECORD_S) -> list[list[Recording]]:
-    """Record all axes; per axis its four recordings."""
+def record_all(axes: list[Axis], seed: int, seconds: float = RECORD_S, heldout: bool = False) -> list[list[Recording]]:
+    """Record all axes.
+
+    Args:
+        heldout: go on with a fifth record of another command, and the same once more under other noise.
+
+    Returns:
+        Per axis its four recordings, or six.
+    """
     rng = np.random.default_rng([seed, 1])
     world = World(axes, rng, np.zeros(len(axes)))
     orders = [commands(a, seconds, rng) for a in axes]
     runs = [world.record([o[r] for o in orders]) for r in range(4)]
+    if heldout:
+        fresh, heat = [commands(a, seconds, rng)[1] for a in axes], world.heat.copy()
+        runs.append(world.record(fresh))
+        world.heat = heat
+        runs.append(world.record(fresh))
     return [[run[j] for run in runs] for j in range(len(axes))]
+
+
+def closed(folder: Path, records: list[Recording]) -> float | None:
+    """Measure the share of the gap in force that the model of an answer closes on the held-out command.
+
+    Returns:
+        (nominal - model)/(nominal - truth), the truth being what noise alone changes between two runs; None
+        where the gap is no larger than that.
+    """
+    measured, again = records[4].force[200:], records[5].force[200:]
+    truth = float(np.std(measured - again) / np.sqrt(2.0))
+    nominal, model = (_error(read_model(folder / f), records) for f in ("nominal.toml", "report/model.toml"))
+    return (nominal - model) / (nominal - truth) if nominal > 1.2 * truth else None
+
+
+def _error(model: AxisModel, records: list[Recording]) -> float:
+    heat = 0.0
+    for r in records[:4]:
+        heat = simulate(model, r.command, heat).end_temperature
+    run = simulate(model, records[4].command, heat)
+    return float(np.sqrt(np.mean(np.nan_to_num(run.force - records[4].force, nan=1e9)[200:] ** 2)))
 
 
 def write_public(axis: Axis, recordings: list[Recording], folder: Path) -> None:
@@ -74,12 +110,17 @@ def write_public(axis: Axis, recordings: list[Recording], folder: Path) -> None:
     (folder / "nominal.toml").write_text("\n".join(lines) + "\n")
 
 
-def solve(folder: Path) -> dict[str, Any]:
-    """Solve one axis in a process of its own; return its verdict."""
-    out = folder / "report"
-    done = subprocess.run([sys.executable, "-m", "sioms.tools.reconcile", "axis", str(folder), "--model",
-                           str(folder / "nominal.toml"), "--columns", str(folder / "columns.toml"), "--out", str(out), "--quiet"],
-                          capture_output=True, text=True, check=False)
+def solve(folder: Path, resample: int | None = None) -> dict[str, Any]:
+    """Solve one axis in a process of its own, on one core; return its verdict.
+
+    Args:
+        resample: seed with which the blocks of time are drawn anew.
+    """
+    out = folder / ("report" if resample is None else f"again{resample}")
+    options = ["--jobs", "1", "--quiet", *([] if resample is None else ["--resample", str(resample)])]
+    done = subprocess.run([sys.executable, "-m", "sioms.tools.reconcile", "axis", str(folder), "--model", str(folder / "nominal.toml"),
+                           "--columns", str(folder / "columns.toml"), "--out", str(out), *options],
+                          capture_output=True, text=True, check=False, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
     answer = out / "verdict.json"
     if not answer.exists():
         return {"verdict": f"error: exit {done.returncode}: {done.stderr.strip()[-300:]}", "effects": [], "alternatives": [],
@@ -88,29 +129,39 @@ def solve(folder: Path) -> dict[str, Any]:
     return found
 
 
-def selftest(count: int, seed: int, out: Path | None = None, jobs: int = 0) -> int:
+def selftest(count: int, seed: int, out: Path | None = None, jobs: int = 0, replicates: int = 0) -> int:
     """Run the blind test and print the table.
 
     Args:
         out: keep the axes and the answers here.
         jobs: solvers at a time; 0 takes one for each core.
+        replicates: solve every axis so many times more with its blocks of time drawn anew.
 
     Returns:
         0 when at least nine tenths of the axes were judged right, else 1.
     """
     axes = generate(count, seed)
     print(f"generating {count} axes", file=sys.stderr, flush=True)
-    recordings = record_all(axes, seed)
+    recordings = record_all(axes, seed, heldout=True)
     rows: list[Scored] = []
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(jobs or os.cpu_count() or 1) as pool:
         base = out if out is not None else Path(temporary)
         for axis, records in zip(axes, recordings, strict=True):
-            write_public(axis, records, base / axis.name)
-        for axis, answer in zip(axes, pool.map(solve, [base / a.name for a in axes]), strict=True):
-            row = score(axis, answer)
+            write_public(axis, records[:4], base / axis.name)
+        work = [pool.submit(_judge, axis, records, base / axis.name, replicates) for axis, records in zip(axes, recordings, strict=True)]
+        for future in work:
+            row = future.result()
             rows.append(row)
-            hidden = ", ".join((*axis.named, *axis.nameless)) or "nothing"
-            print(f"{axis.name} {axis.kind:10s} {'right' if row.right else 'WRONG'}  hidden {hidden} | {row.verdict}: "
+            drawn = row.axis
+            hidden = ", ".join((*drawn.named, *drawn.nameless)) or "nothing"
+            print(f"{drawn.name} {drawn.kind:10s} {'right' if row.right else 'WRONG'}  hidden {hidden} | {row.verdict}: "
                   f"{', '.join(row.got) or '-'} ({row.seconds:.0f} s)", flush=True)
     print(table(rows))
     return 0 if sum(r.right for r in rows) >= 0.9 * len(rows) else 1
+
+
+def _judge(axis: Axis, records: list[Recording], folder: Path, replicates: int) -> Scored:
+    answer = solve(folder)
+    again = [solve(folder, i) for i in range(replicates)]
+    share = closed(folder, records) if (folder / "report" / "model.toml").exists() else None
+    return score(axis, answer, share, again)

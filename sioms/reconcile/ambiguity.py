@@ -16,7 +16,7 @@ from sioms.reconcile.fit import Fit
 from sioms.reconcile.screen import screen
 from sioms.reconcile.search import DOUBTFUL, Found, Searcher, physical, size, without
 
-AMBIGUOUS = 0.05
+AMBIGUOUS = 0.015
 
 
 @dataclass(frozen=True, slots=True)

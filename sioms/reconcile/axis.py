@@ -15,12 +15,13 @@ from sioms.reconcile.ambiguity import Rival, rivals
 from sioms.reconcile.blocks import better, block_ids, bootstrap
 from sioms.reconcile.channels import Finding, drive, index_fit, index_scale, lattice
 from sioms.reconcile.checks import check, check_scale
+from sioms.reconcile.effect import Slot
 from sioms.reconcile.effects import known, library
 from sioms.reconcile.effects.terms import TERM_PREFIX, TERMS
 from sioms.reconcile.excitation import Gate, gate
-from sioms.reconcile.experiment import Experiment, separate
-from sioms.reconcile.fit import BASE, Fit, Problem, refit
-from sioms.reconcile.gaps import lap, measure, rungs
+from sioms.reconcile.experiment import Envelope, Experiment, separate
+from sioms.reconcile.fit import BASE, Fit, Mapper, Problem, refit
+from sioms.reconcile.gaps import lap, measure, rungs, session_states
 from sioms.reconcile.locate import Place, Spectrum, locate, spectra
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, effective_samples, observer, sensor_noise
@@ -36,12 +37,20 @@ UNTOUCHED = 0.2
 UNEXPLAINED = 0.2
 #: Loudest tenth of the time holds this share of the residual's energy: bursts.
 BURSTS = 0.8
+#: A residual beyond this multiple of the expected innovation is no noise, whatever it looks like. (The bounces in a gap leave more.)
+LARGE = 3.0
+#: Above this multiple, and with half of the disagreement left, nothing is named at all.
+HOPELESS = 5.0
 #: Below these multiples of the expected innovation nothing is called unexplained, or a burst.
 LEAST_ODD = 1.25
 QUIET = 1.6
 #: Bandwidth of the observer where no force was measured: with the colour of the drive noise unknown, what
 #: happens above it would drown the mechanics below.
 UNMEASURED_HZ = 20.0
+#: No model is asked to be nearer than this share of the rated force; below it lies the exactness of any simulation.
+LEAST_DRIVE = 1e-3
+#: The noise is taken again from what a search leaves, and the search repeated, when it fell below this share; so often.
+FELL, AGAIN = 0.7, 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,11 +61,17 @@ class Options:
         seed: of permutations and bootstrap.
         replicates: bootstrap replicates.
         pictures: keep curves and localisation for the report.
+        resample: seed with which the blocks of time are drawn anew, to see whether the verdict stands; None: as they are.
+        mapper: as of ``Problem``.
+        envelope: within which an experiment may be proposed; None takes it from the records.
     """
 
     seed: int = 1
     replicates: int = 200
     pictures: bool = True
+    resample: int | None = None
+    mapper: Mapper = map
+    envelope: Envelope | None = None
     progress: Callable[[str], None] = field(default=lambda text: None)
 
 
@@ -90,10 +105,8 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
     o.progress("excitation: what can these records show")
     excited = gate(ready.problem, ready.model, ready.names)
     names = tuple(n for n in ready.names if n not in excited.missing)
-    searcher = Searcher(ready.problem, tuple(f.effect for f in ready.findings), names, progress=o.progress)
-    found = searcher.run(ready.model)
+    ready, searcher, found = _search(ready, names, o)
     share = smoother_share(ready.problem, found.fit)
-    burst, _ = bursts(ready.problem, found.fit)
     rejected: tuple[str, ...] = ()
     odd = found.fit.ratio > LEAST_ODD and share > UNEXPLAINED
     if odd:
@@ -104,14 +117,41 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
         rejected = tuple(n for n in before.fit.model.effects if n not in found.fit.model.effects)
         share = smoother_share(ready.problem, found.fit)
         searcher.names = names
+    burst = bursts(ready.problem, found.fit)
+    hopeless = found.fit.ratio > HOPELESS and found.fit.cost > 0.5 * searcher.fit(ready.model).cost
+    if hopeless:
+        # Names given to half of nothing mislead: the model, or a column, belongs to something else.
+        fit = searcher.fit(ready.model)
+        found = replace(found, fit=fit, losses=searcher.loss(fit))
+        note = (f"whatever is added, {found.fit.ratio:.0f} times what noise would leave remains: the nominal model does not match these "
+                "data; are model, force and position of the same axis?")
+        ready = replace(ready, notes=(*ready.notes, note))
     o.progress("identifiability: look-alikes in the place of each effect")
     others = rivals(searcher, found)
     return _conclude(ready, nominal, o, excited, found, searcher, others, odd, share, burst, rejected)
 
 
+def _search(ready: Prepared, names: tuple[str, ...], o: Options) -> tuple[Prepared, Searcher, Found]:
+    """Search; where no force was measured, the noise may look smaller under a better model: then search on."""
+    start = ready.model
+    for turn in range(AGAIN + 1):
+        searcher = Searcher(ready.problem, tuple(f.effect for f in ready.findings), names, progress=o.progress)
+        found = searcher.run(start)
+        start = found.fit.model
+        anew = _calibrated(ready.problem, ready.problem.session, start)
+        if turn == AGAIN or anew.noise.drive > FELL * ready.problem.noise.drive:
+            break
+        o.progress(f"the noise is {anew.noise.drive / ready.problem.noise.drive:.2f} of what it seemed: searching on")
+        final = replace(anew, weights=None, session=ready.final.session, begin=ready.final.begin, end=ready.final.end)
+        ready = replace(ready, problem=anew, final=final)
+    return ready, searcher, found
+
+
 def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     """Check the input, read the noise floor and go through the channels."""
     notes = list(check(session, nominal))
+    if session.final:
+        check(Session(session.final), nominal)
     o.progress("channels: sensor, then drive")
     findings: list[Finding] = []
     model = nominal
@@ -126,7 +166,7 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     late = next((f.values["delay"] for f in driven if f.effect == "delay"), 0.0)
     noise = observer(nominal, sensor_noise(session, nominal.resolution * factor),
                      drive_noise(session, nominal.rated_force, round(late / nominal.sample_time_s)))
-    problem = Problem(session, noise, end=1.0 - UNTOUCHED)
+    problem = Problem(session, noise, end=1.0 if session.final else 1.0 - UNTOUCHED, mapper=o.mapper)
     check_scale(problem, nominal)
     problem = _calibrated(problem, session, model)
     excluded = {"encoder_quantisation"}
@@ -136,7 +176,19 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
         excluded |= {"delay", "lag", "saturation"}
     names = tuple(n for n, e in library().items() if e.rankable and nominal.applicable(e) and n not in excluded)
     final = replace(problem, begin=1.0 - UNTOUCHED, end=1.0)
+    if session.final:
+        final = replace(final, session=Session(session.final, continuous=False), begin=0.0)
+    if o.resample is not None:
+        problem = _resampled(problem, model, o.resample)
     return Prepared(model, problem, final, tuple(findings), names, tuple(notes))
+
+
+def _resampled(problem: Problem, model: AxisModel, seed: int) -> Problem:
+    """Draw the blocks of time anew with replacement, as weights."""
+    ids = block_ids(problem, model.sample_time_s)
+    count = int(ids.max()) + 1
+    times = np.bincount(np.random.default_rng(seed).integers(0, count, count), minlength=count)
+    return replace(problem, weights=np.sqrt(times.astype(np.float64))[ids])
 
 
 def _calibrated(problem: Problem, session: Session, model: AxisModel) -> Problem:
@@ -149,20 +201,25 @@ def _calibrated(problem: Problem, session: Session, model: AxisModel) -> Problem
         return problem
     laps = [lap(r, model.sample_time_s) for r in session.records]
     stiffness = model.inertia * (2.0 * np.pi * UNMEASURED_HZ) ** 2
-    sensor = problem.noise.sensor
+    coarse = model.effects.get("encoder_quantisation", {}).get("factor", 1.0)
+    sensor = sensor_noise(session, model.resolution * coarse)
     problem = replace(problem, noise=observer(model, max(sensor, problem.noise.drive / stiffness), problem.noise.drive))
     for _ in range(2):
         if any(laps):
-            runs = zip(problem.runs(model), laps, strict=True)
-            excess = float(np.median([np.std(r.innovation[p:] - r.innovation[:-p]) / np.sqrt(2.0) for r, p in runs if p]))
-            excess /= problem.noise.innovation
+            pairs = [(r.innovation[p:] - r.innovation[:-p]) / np.sqrt(2.0) for r, p in zip(problem.runs(model), laps, strict=True) if p]
+            noise = np.concatenate(pairs) / problem.noise.innovation
+            size = max(round(0.1 / model.sample_time_s), 1)
+            energy = np.mean(noise[: len(noise) // size * size].reshape(-1, size) ** 2, axis=1)
+            excess = float(np.sqrt(np.median(energy)))
         else:
             fit = refit(problem, model, iterations=3)
             ids = block_ids(problem, model.sample_time_s, 0.1)
             energy = np.bincount(ids, weights=fit.residual**2) / np.bincount(ids)
             excess = float(np.sqrt(np.quantile(energy, 0.25)))
-        drive = float(np.clip(problem.noise.drive * excess, 1e-5 * model.rated_force, None))
-        problem = replace(problem, noise=observer(model, max(sensor, drive / stiffness), drive))
+        least = LEAST_DRIVE * model.rated_force
+        drive = float(np.clip(problem.noise.drive * excess, least, None))
+        # A drive without noise has none whose colour is unknown: then the observer may be as fast as the sensor allows.
+        problem = replace(problem, noise=observer(model, sensor if drive < 2.0 * least else max(sensor, drive / stiffness), drive))
     return problem
 
 
@@ -170,24 +227,28 @@ def _conclude(ready: Prepared, nominal: AxisModel, o: Options, excited: Gate, fo
               others: Sequence[Rival], odd: bool, share: float, burst: float, rejected: tuple[str, ...]) -> Verdict:
     rng = np.random.default_rng(o.seed)
     o.progress("untouched samples: gap before and after")
-    gaps = measure(ready.final, nominal, found.fit.model)
-    whole = replace(ready.problem, end=1.0)
+    states = session_states(ready.final, found.fit.model)
+    gaps = measure(ready.final, nominal, found.fit.model, states)
+    whole = replace(ready.problem, end=1.0, weights=None)
     fit = refit(whole, found.fit.model, searcher.frozen, 12)
     if fit.cost > float(np.sum(whole.residual(found.fit.model) ** 2)):
         fit = replace(fit, model=found.fit.model)
     intervals = _intervals(whole, fit, o.replicates, rng)
     named, terms = _describe(ready, fit, found, searcher, others, intervals, rng)
     open_rivals = [r for r in others if r.open]
-    disturbance = found.fit.ratio > QUIET and burst > BURSTS and share < UNEXPLAINED and not any(
-        n == "backlash" for n in found.fit.model.effects)
-    outcome = _outcome(bool(named), bool(terms) or disturbance or (found.fit.ratio > LEAST_ODD and share > UNEXPLAINED),
+    rattles = any(known()[n].slot is Slot.BACKLASH for n in found.fit.model.effects)
+    disturbance = found.fit.ratio > QUIET and burst > BURSTS and share < UNEXPLAINED and not rattles
+    large = found.fit.ratio > LARGE and not rattles
+    outcome = _outcome(bool(named), bool(terms) or disturbance or large or (found.fit.ratio > LEAST_ODD and share > UNEXPLAINED),
                        bool(open_rivals))
     alternatives = tuple(_set(r, fit.model) for r in open_rivals) if outcome is Outcome.AMBIGUOUS else ()
-    plan = _plan(ready, nominal, fit.model, open_rivals) if outcome is Outcome.AMBIGUOUS else None
+    plan = _plan(ready, o, fit.model, open_rivals) if outcome is Outcome.AMBIGUOUS else None
     notes = list(ready.notes)
     if disturbance:
         notes.append(f"the residual comes in bursts ({100 * burst:.0f} % of its energy in a tenth of the time) that no state "
                      "of the axis orders: a disturbance from outside, not an effect")
+    elif large:
+        notes.append(f"what remains is {found.fit.ratio:.1f} times what noise would leave, and no state of the axis orders it")
     places: tuple[Place, ...] = ()
     spectrum: tuple[Spectrum, Spectrum] | None = None
     traces: tuple[Trace, ...] = ()
@@ -198,7 +259,8 @@ def _conclude(ready: Prepared, nominal: AxisModel, o: Options, excited: Gate, fo
         traces = _traces(whole, nominal, fit.model)
     return Verdict(outcome, nominal, fit.model, tuple(named), alternatives, tuple(terms), gaps,
                    found.ladder, rungs(ready.final, [s.model for s in found.ladder]), ready.findings, excited, places, spectrum, plan, found.fit.ratio, share, burst,
-                   effective_samples(found.fit.residual), len(found.fit.residual), tuple(notes), traces, rejected)
+                   effective_samples(found.fit.residual), len(found.fit.residual), tuple(notes), traces,
+                   tuple((r.name, s) for r, s in zip(ready.final.session.records, states, strict=True)), rejected)
 
 
 def _outcome(named: bool, unexplained: bool, ambiguous: bool) -> Outcome:
@@ -268,13 +330,17 @@ def _worth(found: Found, searcher: Searcher, name: str, rng: np.random.Generator
     return saved, errors, frequency
 
 
-def _plan(ready: Prepared, nominal: AxisModel, model: AxisModel, open_rivals: Sequence[Rival]) -> Experiment | None:
+def _plan(ready: Prepared, o: Options, model: AxisModel, open_rivals: Sequence[Rival]) -> Experiment | None:
     """Choose the experiment that separates the model from its open rivals."""
-    r = ready.problem.session.records
-    travel = max(float(np.max(np.abs(q.position - q.position[0]))) for q in r)
-    travel = max(travel, 1.1 * nominal.pitch) if nominal.rotary else travel
-    models = [model, *(q.fit.model for q in open_rivals)]
-    return separate(models, travel, ready.problem.noise.drive)
+    envelope = o.envelope or _seen(ready.problem.session, model)
+    return separate([model, *(q.fit.model for q in open_rivals)], envelope, ready.problem.noise.drive)
+
+
+def _seen(session: Session, model: AxisModel) -> Envelope:
+    """Take the travel that the records show, on a rotary axis one turn at least."""
+    centre = float(session.records[0].position[0])
+    reach = max(float(np.max(np.abs(r.position - centre))) for r in session.records)
+    return Envelope.of(model, centre, max(reach, 1.1 * model.pitch) if model.rotary else reach)
 
 
 def _traces(problem: Problem, nominal: AxisModel, model: AxisModel) -> tuple[Trace, ...]:

@@ -56,8 +56,10 @@ def _check_record(r: Record, model: AxisModel) -> None:
             raise BadInputError(f"{where}: {name} has {len(a)} samples, position {len(r)}; needs the same number")
         if not np.all(np.isfinite(a)):
             raise BadInputError(f"{where}: {name} has {int(np.sum(~np.isfinite(a)))} values that are no numbers")
-    if np.ptp(r.force) == 0.0:
-        raise BadInputError(f"{where}: force is constant at {r.force[0]:.6g} {model.force_unit}; needs the force that moved the axis")
+    for name, a, what in (("force", r.force, "the force that moved the axis"), ("force_measured", r.force_measured, "the drive's current"),
+                          ("command", r.command, "the command that was followed")):
+        if a is not None and np.ptp(a) == 0.0 and (name == "force" or np.ptp(r.position) >= LEAST_COUNTS * model.resolution):
+            raise BadInputError(f"{where}: {name} is constant at {a[0]:.6g}; needs {what}, or no such column")
     if r.time_s is not None:
         _check_time(r, r.time_s, model.sample_time_s)
     limit = model.controller.limit if model.controller is not None else float(np.max(np.abs(r.force)))

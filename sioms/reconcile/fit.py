@@ -7,20 +7,28 @@ happen, and it is smooth in the parameters where a free closed loop is not.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from sioms.reconcile.effect import Array, Parameter
+from sioms.reconcile.effect import Array, Parameter, Slot
 from sioms.reconcile.effects import known
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import Noise
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.simulate import Run, pack, track
 
+#: ``map``, or the like of an executor.
+Mapper = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 BASE = "base"
 SKIP_S = 0.05
+
+
+#: A model whose friction falls with speed has two speeds at which it agrees with a force. It has lost the measurement
+#: where the innovation stays this many times over the expected one, and over its own median, for so many samples.
+LOST, LOST_SHARE, LOST_SAMPLES = 10.0, 8.0, 50
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +49,8 @@ class Problem:
 
     Attributes:
         begin, end: share of each record that counts; the rest is simulated but not looked at.
+        weights: factor on each residual, shape (n,), for resampled blocks; None: all alike.
+        mapper: applies a function to many trials, in order, as ``map`` does; one that uses all cores may be given.
     """
 
     session: Session
@@ -48,6 +58,8 @@ class Problem:
     skip: int = 50
     begin: float = 0.0
     end: float = 1.0
+    weights: Array | None = None
+    mapper: Mapper = map
 
     def span(self, record: Record) -> slice:
         """Samples of a record that count: from ``begin`` to ``end`` of it, never the first ``skip``."""
@@ -56,22 +68,45 @@ class Problem:
 
     def runs(self, model: AxisModel) -> list[Run]:
         """Track every record; the heat state carries over."""
-        packed = pack(model)
+        packed, falling = pack(model), _falls(model)
         temperature, out = 0.0, []
         for r in self.session.records:
             run = track(model, r.position, r.force, self.noise.gain, temperature, packed)
+            if falling and (level := self._lost(run)) < np.inf:
+                run = track(model, r.position, r.force, self.noise.gain, temperature, packed, level)
             temperature = run.end_temperature if self.session.continuous else 0.0
             out.append(run)
         return out
 
+    def _lost(self, run: Run) -> float:
+        """Return the innovation beyond which a run has lost the measurement; infinite where it never has."""
+        size = np.abs(np.nan_to_num(run.innovation))
+        level = max(LOST * self.noise.innovation, LOST_SHARE * float(np.median(size)))
+        quiet = np.flatnonzero(np.concatenate([[True], size <= level, [True]]))
+        return level if np.max(np.diff(quiet)) > LOST_SAMPLES else np.inf
+
     def residual(self, model: AxisModel) -> Array:
         """Innovations over their expected standard deviation, all records in a row, without the starts."""
         e = self.join([r.innovation for r in self.runs(model)]) / self.noise.innovation
-        return np.clip(np.nan_to_num(e, nan=1e6, posinf=1e6, neginf=-1e6), -1e6, 1e6)
+        e = np.clip(np.nan_to_num(e, nan=1e6, posinf=1e6, neginf=-1e6), -1e6, 1e6)
+        return e if self.weights is None else e * self.weights
 
     def join(self, parts: Sequence[Array]) -> Array:
         """Lay per-record arrays out as ``residual`` does."""
         return np.concatenate([p[self.span(r)] for p, r in zip(parts, self.session.records, strict=True)])
+
+
+def _falls(model: AxisModel) -> bool:
+    """Say whether the friction of a model is lower at speed than near rest."""
+    zero = np.zeros(1)
+    for name, given in model.effects.items():
+        effect = known()[name]
+        if effect.slot is Slot.FRICTION:
+            row = effect.row(effect.values(given), model.pitch)
+            slow, fast = (effect.evaluate(zero, zero + share * model.max_speed, zero, zero, row) for share in (0.0, 0.5))
+            if slow[0] > 1.05 * fast[0]:
+                return True
+    return False
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,15 +180,15 @@ def put(model: AxisModel, free: Sequence[Free], values: Array) -> AxisModel:
 def jacobian(problem: Problem, model: AxisModel, free: Sequence[Free], at: Array, base: Array,
              step: float = 2e-3) -> Array:
     """Forward differences in the scaled parameters, stepping away from a bound."""
-    j = np.empty((len(base), len(free)))
-    for i, f in enumerate(free):
-        h = step * f.scale
-        if at[i] + h > f.upper:
-            h = -h
+
+    def column(i: int) -> Array:
+        f = free[i]
+        h = step * f.scale if at[i] + step * f.scale <= f.upper else -step * f.scale
         moved = at.copy()
         moved[i] += h
-        j[:, i] = (problem.residual(put(model, free, moved)) - base) * (f.scale / h)
-    return j
+        return (problem.residual(put(model, free, moved)) - base) * (f.scale / h)
+
+    return np.stack(list(problem.mapper(column, range(len(free)))), axis=1)
 
 
 def refit(problem: Problem, model: AxisModel, frozen: Sequence[str] = (), iterations: int = 8,

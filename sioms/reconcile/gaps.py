@@ -13,9 +13,10 @@ import numpy as np
 from sioms.reconcile.effect import Array
 from sioms.reconcile.fit import Problem
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.noise import Noise, response, rigid
+from sioms.reconcile.noise import Noise, rigid
 from sioms.reconcile.records import Record
-from sioms.reconcile.simulate import replay
+from sioms.reconcile.session import State, applied, estimate, half, heats
+from sioms.reconcile.simulate import replay, track
 from sioms.reconcile.verdict import Gap
 
 #: A lap repeats the command to this share of its range.
@@ -68,19 +69,48 @@ def loop_floor(model: AxisModel, noise: Noise) -> tuple[float, float]:
     return float(force), float(place)
 
 
-def measure(problem: Problem, nominal: AxisModel, model: AxisModel) -> tuple[Gap, ...]:
-    """Compare before and after on the samples of ``problem`` (the untouched ones)."""
+def measure(problem: Problem, nominal: AxisModel, model: AxisModel, states: Sequence[State] = ()) -> tuple[Gap, ...]:
+    """Compare before and after on the samples of ``problem`` (the untouched ones).
+
+    Args:
+        states: session parameters of each record, estimated on the first halves; the scores that use them, and
+            those of the frozen model to set beside them, are of the second halves.
+    """
     unit, k = nominal.force_unit, problem.noise.drive  # an expected innovation answers to one drive noise
-    before, after = problem.residual(nominal), problem.residual(model)
-    out = [Gap("force, short windows", unit, _rms(before) * k, _rms(after) * k, k, with_session(problem, model, after) * k)]
+    before, after = _rms(problem.residual(nominal)) * k, _rms(problem.residual(model)) * k
+    late = [_late_errors(problem, model, s) for s in ([], states)] if states else [(None,) * 3] * 2
+    frozen, session = late
+    out = [Gap("force, short windows", unit, before, after, k, frozen[0], session[0])]
     if nominal.controller is None or any(r.command is None for r in problem.session.records):
         return tuple(out)
     errors = [closed_errors(problem, m) for m in (nominal, model)]
     floors = [lap_floor(r, p) for r in problem.session.records if (p := lap(r, nominal.sample_time_s))]
     force, place = (float(np.median([f[i] for f in floors])) for i in (0, 1)) if floors else loop_floor(nominal, problem.noise)
-    out.append(Gap("force, closed loop", unit, errors[0][0], errors[1][0], force))
-    out.append(Gap("position, closed loop", nominal.position_unit, errors[0][1], errors[1][1], place))
+    out.append(Gap("force, closed loop", unit, errors[0][0], errors[1][0], force, frozen[1], session[1]))
+    out.append(Gap("position, closed loop", nominal.position_unit, errors[0][1], errors[1][1], place, frozen[2], session[2]))
     return tuple(out)
+
+
+def session_states(problem: Problem, model: AxisModel) -> tuple[State, ...]:
+    """Estimate the session parameters of every record on the first half of its samples in ``problem``."""
+    return tuple(estimate(problem, model, r, half(problem, r), heat)
+                 for r, heat in zip(problem.session.records, heats(problem, model), strict=True))
+
+
+def _late_errors(problem: Problem, model: AxisModel, states: Sequence[State]) -> tuple[float | None, ...]:
+    """Errors over the second halves: of short windows [{F}], and in closed loop of force and position."""
+    windows, force, place = [], [], []
+    unit = problem.noise.drive / problem.noise.innovation
+    for i, (r, heat) in enumerate(zip(problem.session.records, heats(problem, model), strict=True)):
+        m, seen = applied(model, r, states[i]) if states else (model, r)
+        start = states[i].heat if states else heat
+        part = slice(half(problem, r), problem.span(r).stop)
+        windows.append(track(m, seen.position, seen.force, problem.noise.gain, start).innovation[part] * unit)
+        if model.controller is not None and seen.command is not None:
+            run = replay(m, seen, start)
+            force.append(np.nan_to_num(run.force - seen.force, nan=1e9)[part])
+            place.append(np.nan_to_num(run.position - seen.position, nan=1e9)[part])
+    return tuple(_rms(np.concatenate(e)) if e else None for e in (windows, force, place))
 
 
 def rungs(problem: Problem, models: Sequence[AxisModel]) -> tuple[float, ...]:
@@ -99,26 +129,6 @@ def closed_errors(problem: Problem, model: AxisModel) -> tuple[float, float]:
         force.append(np.nan_to_num(run.force - r.force, nan=1e9))
         place.append(np.nan_to_num(run.position - r.position, nan=1e9))
     return _rms(problem.join(force)), _rms(problem.join(place))
-
-
-def with_session(problem: Problem, model: AxisModel, residual: Array) -> float:
-    """Residual after a session offset of force is re-estimated on the first half of each untouched part.
-
-    Returns:
-        Root mean square over the second halves, in units of the expected innovation.
-    """
-    ones = [response(model, problem.noise, np.ones(len(r))) for r in problem.session.records]
-    column = problem.join(ones) / problem.noise.innovation
-    left, at = [], 0
-    for r in problem.session.records:
-        n = len(range(len(r))[problem.span(r)])
-        e, c = residual[at : at + n], column[at : at + n]
-        half = n // 2
-        size = float(c[:half] @ c[:half])
-        offset = float(e[:half] @ c[:half]) / size if size > 0.0 else 0.0
-        left.append(e[half:] - offset * c[half:])
-        at += n
-    return _rms(np.concatenate(left))
 
 
 def _rms(x: Array) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import warnings
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
@@ -25,6 +26,8 @@ def numba() -> Any:
     """Return the module numba, None where it is not installed or SIOMS_PLAIN is set."""
     if os.environ.get("SIOMS_PLAIN") is not None:
         return None
+    # State functions are handed to the kernel as values, which numba calls experimental; the tests hold it to it.
+    warnings.filterwarnings("ignore", message="First-class function type feature is experimental")
     try:
         return import_module("numba")
     except ImportError:
@@ -40,7 +43,7 @@ def kernel(function: F) -> F:
     """Compile a loop over samples (cached on disk)."""
     if numba() is None:
         return function
-    done: F = numba().njit(cache=True)(function)
+    done: F = numba().njit(cache=True, nogil=True)(function)
     return done
 
 

@@ -31,6 +31,8 @@ CTL_K, CTL_KZ, CTL_KP, CTL_KB, CTL_OFFSET, CTL_MAX, CTL_ALPHA, CTL_MEAN, CTL_SIZ
 # Columns of the output.
 OUT_Y, OUT_FORCE, OUT_INNOVATION, OUT_X, OUT_V, OUT_APPLIED, OUT_T, OUT_SIZE = range(8)
 TINY_SPEED = 1e-12
+#: Samples for which a tracking model may be off before its speed is set anew, and over which speed is measured.
+PATIENCE, MEASURED = 20, 10
 #: A hot drive keeps at least this share of its force constant; keeps a wild trial value harmless.
 LEAST_GAIN = 0.05
 
@@ -116,11 +118,12 @@ def slide(x: float, v: float, a: float, level: float, mass: float, force: float,
 @kernel
 def march(closed: bool, command: Array, measured: Array, force_in: Array, ctl: Array, plant: Array,
           forces: Any, nf: int, pf: Array, levels: Any, nl: int, pl: Array, gains: Any, ng: int, pg: Array,
-          l1: float, l2: float, start: Array, sub: int, out: Array) -> None:
+          l1: float, l2: float, lost: float, start: Array, sub: int, out: Array) -> None:
     """Run the axis over one record.
 
     Args:
         command, measured, force_in: shape (n,); ``command`` is read when closed, the others when tracking.
+        lost: innovation at which, held for ``PATIENCE`` samples, the speed is taken from the measurement.
         start: x, v, temperature, and error and force of the controller at the sample before the first.
         out: shape (n, OUT_SIZE), filled.
     """
@@ -140,6 +143,7 @@ def march(closed: bool, command: Array, measured: Array, force_in: Array, ctl: A
     lagged = 0.0
     hyst = 0.0
     e_old, u_old, y_old, y_older, v_f = start[3], start[4], 0.0, 0.0, 0.0
+    off = 0
     u_all = np.zeros(n)
     for i in range(n):
         y = plant[GAIN_Y] * x + plant[ECC_AMP] * np.sin(plant[TURN_X] * x + plant[ECC_PHASE])
@@ -171,6 +175,11 @@ def march(closed: bool, command: Array, measured: Array, force_in: Array, ctl: A
                 dv = 0.0
             xl += dx
             vl += dv
+            off = off + 1 if np.abs(innovation) > lost else 0
+            if off >= PATIENCE and i >= MEASURED:
+                v = (measured[i] - measured[i - MEASURED]) / (MEASURED * dt * plant[GAIN_Y])
+                vl = v
+                off = 0
         u_all[i] = u
         out[i, OUT_Y] = y
         out[i, OUT_FORCE] = u

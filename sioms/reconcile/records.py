@@ -53,10 +53,13 @@ class Session:
 
     Attributes:
         continuous: the heat state carries over from each record to the next.
+        final: whole records that take no part in any choice, each of a session of its own; without them the
+            last part of every record is kept for the final statement.
     """
 
     records: tuple[Record, ...]
     continuous: bool = True
+    final: tuple[Record, ...] = ()
 
     @property
     def samples(self) -> int:

@@ -8,7 +8,6 @@ displacement since reversal. It names nothing; it only keeps the named model hon
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sioms.reconcile.blocks import block_ids
 from sioms.reconcile.effect import Array
@@ -20,7 +19,8 @@ from sioms.reconcile.screen import Motion, dead_band, direction, instrument_moti
 KNOTS = 14
 HARMONICS = 4
 RIDGES = (1e-4, 1e-2, 1.0)
-BURST_S = 0.1
+#: A block is loud above this multiple of the median energy; bursts are no third of the time.
+BURST_S, LOUD, MOST_LOUD = 0.1, 6.0, 0.34
 
 
 def hats(x: Array, knots: Array) -> Array:
@@ -95,17 +95,17 @@ def smoother_share(problem: Problem, fit: Fit, folds: int = 5) -> float:
     return best
 
 
-def bursts(problem: Problem, fit: Fit) -> tuple[float, NDArray[np.bool_]]:
+def bursts(problem: Problem, fit: Fit) -> float:
     """Measure how far the residual comes in bursts.
 
     Returns:
-        (share of the energy above the quiet level that the loudest tenth of the blocks holds,
-        True for the samples of loud blocks).
+        The share of the energy above the quiet level that lies in loud tenths of a second; 0 where more than a
+        third of the time is loud.
     """
     ids = block_ids(problem, fit.model.sample_time_s, BURST_S)
     energy = np.bincount(ids, weights=fit.residual**2) / np.bincount(ids)
     quiet = float(np.median(energy))
-    above = np.clip(energy - quiet, 0.0, None)
-    top = np.sort(above)[-max(len(above) // 10, 1) :]
-    share = float(top.sum() / max(above.sum(), 1e-300))
-    return share, np.asarray(energy > 6.0 * quiet)[ids]
+    above, loud = np.clip(energy - quiet, 0.0, None), energy > LOUD * quiet
+    if np.mean(loud) > MOST_LOUD:
+        return 0.0
+    return float(above[loud].sum() / max(above.sum(), 1e-300))

@@ -201,7 +201,7 @@ def _orthonormal(j: Array) -> Array:
 def _filtered(problem: Problem, model: AxisModel, columns: list[Array]) -> Array:
     """Pass force columns of every record into the domain of the residual, shape (n, k)."""
     e: Array = problem.join([response(model, problem.noise, c) for c in columns]) / problem.noise.innovation
-    return e
+    return e if problem.weights is None else e * problem.weights[:, None]
 
 
 def _screen_state(problem: Problem, fit: Fit, effect: Effect, motions: list[Motion], q: Array, rest: Array,
@@ -219,9 +219,17 @@ def _screen_state(problem: Problem, fit: Fit, effect: Effect, motions: list[Moti
         unit = f[:, keep] / size[keep]
         coefficient[keep] = np.linalg.lstsq(unit.T @ unit, unit.T @ rest, rcond=1e-8)[0] / size[keep]
         gain = 1.0 - float(np.sum((rest - f @ coefficient) ** 2)) / float(rest @ rest)
-        if best is None or gain > best.gain:
-            best = Start(effect.name, gain, _values(effect, fit.model, shape, coefficient, levels))
+        values = _values(effect, fit.model, shape, coefficient, levels)
+        if (best is None or gain > best.gain) and not _overtone(effect, values, largest):
+            best = Start(effect.name, gain, values)
     return best
+
+
+def _overtone(effect: Effect, values: Mapping[str, float], largest: int) -> bool:
+    """Say whether the second harmonic is the larger: then the wave is one of twice the order, which is tried too."""
+    order = next((p.symbol for p in effect.parameters if p.fixed), None)
+    waves = [a.symbol for a, phase in amplitudes(effect) if phase is not None]
+    return order is not None and len(waves) == 2 and values[waves[1]] > values[waves[0]] and 2 * values[order] <= largest
 
 
 def _values(effect: Effect, model: AxisModel, shape: dict[str, float], c: Array,
@@ -279,8 +287,9 @@ def _screen_trials(problem: Problem, fit: Fit, effect: Effect, q: Array, rest: A
     model = fit.model
     for name in effect.replaces:
         model = model.without_effect(name) if name in model.effects else model
-    for values in trial_values(effect, model, problem):
-        d = problem.residual(model.with_effect(effect.name, values)) - fit.residual
+    trials = list(trial_values(effect, model, problem))
+    for values, tried in zip(trials, problem.mapper(lambda v: problem.residual(model.with_effect(effect.name, v)), trials), strict=True):
+        d = tried - fit.residual
         d = d - q @ (q.T @ d)
         size = float(d @ d)
         if size <= 0.0:

@@ -32,6 +32,9 @@ NEARLY = 0.5
 DOUBTFUL = 0.2
 #: A step that saves this much needs no second look at the friction law.
 CLEAR = 0.5
+#: Two effects are tried at once only above this multiple of the expected innovation, so many firsts and seconds.
+PAIRED = 1.5
+PAIRS = 3
 PERIODIC_SURE = 3.0  # for effects whose order is searched over tens of values
 
 
@@ -69,7 +72,6 @@ class Searcher:
     problem: Problem
     frozen: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
-    keep: NDArray[np.bool_] | None = None
     progress: Callable[[str], None] = lambda text: None
     ids: NDArray[np.int64] = field(init=False)
 
@@ -89,7 +91,7 @@ class Searcher:
         if len(self.ids) != len(fit.residual):
             self.ids = block_ids(self.problem, fit.model.sample_time_s)
         losses = heldout(fit, self.ids)
-        return losses if self.keep is None else losses[self.keep]
+        return losses if self.problem.weights is None else losses[np.bincount(self.ids, weights=self.problem.weights) > 0.0]
 
     def run(self, start: AxisModel) -> Found:
         """Search from a model."""
@@ -99,7 +101,7 @@ class Searcher:
         for _ in range(STEPS):
             if fit.ratio <= FLOOR:
                 break
-            step = self._add(fit, losses)
+            step = self._add(fit, losses) or self._add_pair(fit, losses)
             if step is None:
                 break
             ladder.append(step[2])
@@ -158,6 +160,29 @@ class Searcher:
             return None
         rivals = {n: t[2] for n, t in tried.items() if n != name}
         return new, loss, Step("add", name, new.ratio, gain, new.model, rivals)
+
+    def _add_pair(self, fit: Fit, losses: Array) -> tuple[Fit, Array, Step] | None:
+        """Add two effects at once where neither saves enough alone: each hides what the other would save.
+
+        Both must be sure together, and each must earn its place beside the other.
+        """
+        best: tuple[Fit, Array, Step] | None = None
+        if fit.ratio < PAIRED:
+            return None
+        for first in self._candidates(fit)[:PAIRS]:
+            middle = self._with(fit, first, 5)
+            inner = self.loss(middle)
+            for second in [s for s in self._candidates(middle) if s.effect not in known()[first.effect].replaces][:PAIRS]:
+                new = self._with(middle, second, 8)
+                if first.effect not in new.model.effects:
+                    continue
+                loss = self.loss(new)
+                gain, sure = better(loss, losses)
+                more, surer = better(loss, inner)
+                good = gain >= SPECIFIC and sure >= SURE and more >= SPECIFIC and surer >= self._sure(second.effect)
+                if good and physical(new, first.effect) and physical(new, second.effect) and (best is None or new.cost < best[0].cost):
+                    best = new, loss, Step("add", f"{first.effect} and {second.effect}", new.ratio, gain, new.model)
+        return best
 
     def _with(self, fit: Fit, start: Start, iterations: int) -> Fit:
         """Switch a candidate on, what it replaces off, and refit."""
@@ -287,17 +312,14 @@ def polish(problem: Problem, model: AxisModel, frozen: Sequence[str]) -> Fit:
     name = next(n for n in model.effects if known()[n].slot is Slot.BACKLASH)
     best, cost = model, np.inf
     for spread in (0.25, 0.08, 0.025, 0.008):
-        trials = [best]
-        for symbol, width in (("gap", spread), ("load_fraction", spread), ("zeta", 2.0 * spread),
-                              ("f_contact", spread)):
+        for symbol, width in (("gap", spread), ("load_fraction", spread), ("zeta", 2.0 * spread), ("f_contact", spread)):
             here = best.effects[name]
-            for sign in (1.0, -1.0, 0.4, -0.4):
-                trials.append(best.with_effect(name, {**here, symbol: here[symbol] * (1.0 + width * sign)}))
-            for trial in trials:
-                c = float(np.sum(problem.residual(trial) ** 2)) if _inside(trial, name) else np.inf
-                if c < cost:
-                    best, cost = trial, c
-            trials = []
+            trials = [best] if cost == np.inf else []
+            trials += [best.with_effect(name, {**here, symbol: here[symbol] * (1.0 + width * sign)}) for sign in (1.0, -1.0, 0.4, -0.4)]
+            trials = [t for t in trials if _inside(t, name)]
+            costs = list(problem.mapper(lambda t: float(np.sum(problem.residual(t) ** 2)), trials))
+            if costs and min(costs) < cost:
+                best, cost = trials[int(np.argmin(costs))], min(costs)
     return refit(problem, best, frozen, 4)
 
 

@@ -154,12 +154,12 @@ def _couple(plant: Array, slot: Slot, p: Array) -> None:
 
 
 def _march(p: Packed, closed: bool, command: Array, measured: Array, force: Array, ctl: Array,
-           gain: tuple[float, float], start: Array) -> Run:
+           gain: tuple[float, float], start: Array, lost: float = np.inf) -> Run:
     out = np.zeros((len(command), k.OUT_SIZE))
     f, lv, g = Slot.FORCE, Slot.FRICTION, Slot.GAIN
     k.march(closed, command, measured, force, ctl, p.plant, p.functions[f], p.counts[f], p.rows[f],
             p.functions[lv], p.counts[lv], p.rows[lv], p.functions[g], p.counts[g], p.rows[g],
-            gain[0], gain[1], start, p.substeps, out)
+            gain[0], gain[1], lost, start, p.substeps, out)
     return Run(out[:, k.OUT_Y], out[:, k.OUT_FORCE], out[:, k.OUT_APPLIED], out[:, k.OUT_INNOVATION],
                out[:, k.OUT_X], out[:, k.OUT_V], out[:, k.OUT_T])
 
@@ -197,13 +197,14 @@ def replay(model: AxisModel, record: Record, temperature: float = 0.0) -> Run:
 
 
 def track(model: AxisModel, position: Array, force: Array, gain: tuple[float, float],
-          temperature: float = 0.0, packed: Packed | None = None) -> Run:
+          temperature: float = 0.0, packed: Packed | None = None, lost: float = np.inf) -> Run:
     """Drive the plant with a recorded force while an observer holds it on the recorded position.
 
     Args:
         position: measured, shape (n,), [{x}].
         force: command force, shape (n,), held over each sample, [{F}].
         gain: correction of position [1] and speed [1/s] by the innovation.
+        lost: innovation beyond which the model has lost the measurement and takes its speed from it, [{x}].
 
     Returns:
         The run; ``innovation`` is what the model could not predict.
@@ -212,4 +213,4 @@ def track(model: AxisModel, position: Array, force: Array, gain: tuple[float, fl
     u = np.ascontiguousarray(force, dtype=np.float64)
     p = packed or pack(model)
     start = np.array([y[0] / p.plant[k.GAIN_Y], 0.0, temperature, 0.0, 0.0])
-    return _march(p, False, y, y, u, np.zeros(k.CTL_SIZE), gain, start)
+    return _march(p, False, y, y, u, np.zeros(k.CTL_SIZE), gain, start, lost)

@@ -13,6 +13,7 @@ from sioms.reconcile.experiment import Experiment
 from sioms.reconcile.locate import Place, Spectrum
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.search import Step
+from sioms.reconcile.session import State
 
 __all__ = [
     "EXIT", "EXIT_BAD_INPUT", "BadInputError", "Estimate", "Gap", "NamedEffect", "Outcome", "Trace", "Verdict",
@@ -75,7 +76,8 @@ class Gap:
 
     Attributes:
         before, after, floor: root mean square, in ``unit``; frozen model parameters.
-        session: after re-estimating session parameters on the first part, or None where there are none.
+        frozen, session: on the later half of these samples only, frozen and with the session parameters
+            re-estimated on the earlier half; None where that was not done.
     """
 
     channel: str
@@ -83,6 +85,7 @@ class Gap:
     before: float
     after: float
     floor: float
+    frozen: float | None = None
     session: float | None = None
 
     @property
@@ -108,6 +111,7 @@ class Verdict:
     """Everything the workflow found out about one axis.
 
     Attributes:
+        states: session parameters of the untouched part of each record.
         rungs: force error on the untouched samples after each step of the ladder, in closed loop where it can be.
     """
 
@@ -132,4 +136,5 @@ class Verdict:
     samples: int
     notes: tuple[str, ...]
     traces: tuple[Trace, ...]
+    states: tuple[tuple[str, State], ...] = ()
     rejected: tuple[str, ...] = ()

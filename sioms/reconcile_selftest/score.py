@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from sioms.reconcile_selftest.draw import Axis
 
@@ -14,23 +14,48 @@ PRIMARY = {"viscous": "b_extra", "coulomb": "Fc", "stribeck": "Fc", "backlash": 
            "encoder_quantisation": "factor", "thermal_gain": "loss", "payload": "J_extra"}
 
 
+class Hidden(Protocol):
+    """What is scored: its kind, and the effects it hides."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def kind(self) -> str: ...
+    @property
+    def named(self) -> Mapping[str, Any]: ...
+    @property
+    def nameless(self) -> Mapping[str, Any]: ...
+
+
 @dataclass(frozen=True, slots=True)
 class Scored:
-    """One axis, scored. ``errors`` are relative errors of the leading parameters, ``inside`` whether the interval covers."""
+    """One axis or sensor, scored.
 
-    axis: Axis
+    Attributes:
+        errors: relative errors of the leading parameters; inside: whether the interval covers.
+        closed: share of the gap that the model closes on a held-out command, None where there is none.
+        stable: shares of resampled analyses with the same verdict, None where there were none.
+    """
+
+    axis: Hidden
     verdict: str
     got: tuple[str, ...]
     right: bool
     leading: bool
     errors: tuple[float, ...]
     inside: tuple[bool, ...]
-    closed: float
+    closed: float | None
+    stable: float | None
     seconds: float
 
 
-def score(axis: Axis, answer: Mapping[str, Any]) -> Scored:
-    """Score one verdict (the parsed verdict.json)."""
+def score(axis: Axis, answer: Mapping[str, Any], closed: float | None = None, again: Sequence[Mapping[str, Any]] = ()) -> Scored:
+    """Score one verdict (the parsed verdict.json).
+
+    Args:
+        closed: share of the gap closed on a held-out command.
+        again: verdicts of the same records with their blocks of time drawn anew.
+    """
     got, truth = tuple(answer["effects"]), set(axis.named)
     verdict = str(answer["verdict"])
     sets = [set(got), *(set(a) for a in answer["alternatives"])]
@@ -51,8 +76,10 @@ def score(axis: Axis, answer: Mapping[str, Any]) -> Scored:
             size = abs(true - 1.0) if name == "encoder_scale" else abs(true)
             errors.append(abs(p["value"] - true) / size)
             inside.append(bool(p["low"] <= true <= p["high"]))
-    closed = next((float(g["closed"]) for g in answer["gaps"] if g["channel"].startswith("force")), 0.0)
-    return Scored(axis, verdict, got, right, bool(got) and got[0] in truth, tuple(errors), tuple(inside), closed, float(answer["seconds"]))
+    same = [str(a["verdict"]) == verdict and set(a["effects"]) == set(got) for a in again]
+    stable = sum(same) / len(same) if same else None
+    return Scored(axis, verdict, got, right, bool(got) and got[0] in truth, tuple(errors), tuple(inside), closed, stable,
+                  float(answer["seconds"]))
 
 
 def table(rows: Sequence[Scored]) -> str:
@@ -66,7 +93,8 @@ def table(rows: Sequence[Scored]) -> str:
 
     errors = [e for r in rows for e in r.errors]
     inside = [i for r in rows for i in r.inside]
-    closed = [r.closed for r in rows if r.axis.kind in ("single", "multi")]
+    closed = [r.closed for r in rows if r.axis.kind in ("single", "multi") and r.closed is not None]
+    stable = [r.stable for r in rows if r.stable is not None]
     hits = sum(len(set(r.got) & set(r.axis.named)) for r in rows if r.axis.kind != "confounded")
     named = sum(len(r.got) for r in rows if r.axis.kind != "confounded")
     hidden = sum(len(r.axis.named) for r in rows if r.axis.kind != "confounded")
@@ -78,6 +106,8 @@ def table(rows: Sequence[Scored]) -> str:
         ("gap closed, median", quantile(closed, 0.5)), ("gap closed, tenth percentile", quantile(closed, 0.1)),
         ("parameter error, median", quantile(errors, 0.5)), ("parameter error, ninetieth percentile", quantile(errors, 0.9)),
         ("95 % intervals that cover", f"{sum(inside)}/{len(inside)}"),
-        ("seconds an axis, median", quantile([r.seconds for r in rows], 0.5)),
+        ("same verdict with the blocks drawn anew", f"{sum(stable) / len(stable):.3f}" if stable else "-"),
+        ("seconds an axis, largest", quantile([r.seconds for r in rows], 1.0)),
+        ("seconds each, median", quantile([r.seconds for r in rows], 0.5)),
     ]
     return "\n".join(f"{a:50s} {b}" for a, b in lines)

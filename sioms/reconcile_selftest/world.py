@@ -35,6 +35,15 @@ def _has(axes: list[Axis], effect: str) -> Array:
     return np.array([1.0 if effect in a.named or effect in a.nameless else 0.0 for a in axes])
 
 
+def _held(queue: Array, start: Array) -> Array:
+    """Mean over one step of commands that are held for a sample each; ``start`` in samples, shape (m,)."""
+    end = start + STEP_S / SAMPLE_S
+    first, last = np.floor(start + 1e-9).astype(int), np.floor(end - 1e-9).astype(int)
+    each = np.arange(queue.shape[1])
+    share = np.where(last > first, (end - last) / (end - start), 0.0)
+    return np.asarray((1.0 - share) * queue[first, each] + share * queue[last, each])
+
+
 @dataclass(slots=True)
 class World:
     """All axes side by side. Use from one thread."""
@@ -104,9 +113,9 @@ class World:
             passed = np.zeros(m, dtype=bool)
             mean = np.zeros(m)
             for s in range(sub):
-                back = i + 10 + (s * STEP_S - late) / SAMPLE_S + 1e-9
-                acting = np.clip(queue[np.floor(back).astype(int), np.arange(m)], -limit, limit)
-                mean += acting
+                mean += np.clip(_held(queue, i + 10 + (s * STEP_S - late) / SAMPLE_S), -limit, limit)
+                # Velocities live half a step after positions (leapfrog), so the force that moves them half a step before.
+                acting = np.clip(_held(queue, i + 10 + ((s - 0.5) * STEP_S - late) / SAMPLE_S), -limit, limit)
                 self.heat += STEP_S / tau * ((acting / rated) ** 2 - self.heat) * (loss > 0)
                 theta = turn * x
                 f = acting * (1.0 - loss * self.heat) * (1.0 + r_d * np.sin(r_n * theta + r_ph)) + disturbance + knock[i]

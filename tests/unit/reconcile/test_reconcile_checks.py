@@ -13,7 +13,7 @@ from sioms.reconcile.gaps import lap, lap_floor
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.simulate import simulate
-from sioms.reconcile.verdict import BadInputError
+from sioms.reconcile.verdict import BadInputError, Outcome
 
 AXIS = AxisModel(True, 1e-3, 2e-3, 1e-3, 2e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0))
 
@@ -43,6 +43,8 @@ BAD = {
     "too short": (lambda r: r.cut(0, 300), "too few"),
     "no motion": (lambda r: replace(r, position=np.zeros(len(r)), command=None), "no motion"),
     "constant force": (lambda r: replace(r, force=np.ones(len(r))), "force is constant"),
+    "constant command": (lambda r: replace(r, command=np.zeros(len(r))), "command is constant"),
+    "constant current": (lambda r: replace(r, force_measured=np.ones(len(r))), "force_measured is constant"),
     "not a number": (lambda r: replace(r, position=np.where(np.arange(len(r)) == 5, np.nan, r.position)), "no numbers"),
     "jumping time": (_jump, "time jumps"),
     "milliseconds as seconds": (lambda r: replace(r, time_s=r.time_s * 1000), "another unit"),
@@ -65,6 +67,22 @@ def test_force_in_wrong_units_is_recognised(factor: float, says: str) -> None:
     bad = replace(GOOD, force=GOOD.force * factor, force_measured=GOOD.force_measured * factor)  # type: ignore[operator]
     with pytest.raises(BadInputError, match=says):
         analyse(Session((bad,)), replace(AXIS, controller=limit), Options(pictures=False))
+
+
+def test_data_of_another_axis_get_no_name() -> None:
+    """Position of one motion, force of another: no library can explain that, and none is claimed to."""
+    rng = np.random.default_rng(5)
+    t = GOOD.time_s if GOOD.time_s is not None else np.zeros(0)
+    force = 0.3 * np.sin(2 * np.pi * 3.7 * t + 1.0) * np.sign(np.sin(2 * np.pi * 1.1 * t)) + 2e-3 * rng.standard_normal(len(t))
+    other = replace(GOOD, force=force, force_measured=force + 2e-3 * rng.standard_normal(len(t)))
+    try:
+        verdict = analyse(Session((other,)), AXIS, Options(pictures=False, replicates=10))
+    except BadInputError as error:
+        assert "inertia" in str(error)  # either answer is right
+        return
+    assert verdict.outcome is Outcome.UNEXPLAINED
+    assert not verdict.effects
+    assert any("does not match" in note for note in verdict.notes)
 
 
 def test_no_records_is_bad_input() -> None:

@@ -13,7 +13,7 @@ import pytest
 from sioms.reconcile.blocks import better, block_ids, bootstrap, heldout
 from sioms.reconcile.channels import drive, drive_output, index_fit, lattice
 from sioms.reconcile.excitation import common, gate
-from sioms.reconcile.experiment import catalogue, separate
+from sioms.reconcile.experiment import Envelope, catalogue, demands, one_speed, repeated, separate
 from sioms.reconcile.fit import Problem, refit
 from sioms.reconcile.locate import locate
 from sioms.reconcile.model import AxisModel, Controller
@@ -157,12 +157,27 @@ def test_the_residual_is_located_where_it_lives() -> None:
 
 def test_the_experiment_that_separates_is_the_one_that_excites() -> None:
     rivals = [AXIS.with_effect("coulomb", {"Fc": 0.06}), AXIS.with_effect("offset", {"off": -0.06})]
-    plan = separate(rivals, 6.0, 2e-3)
+    plan = separate(rivals, Envelope.of(AXIS, 0.0, 6.0), 2e-3)
     assert plan is not None
     assert plan.separation > 20.0
-    for _, _, command in catalogue(AXIS, 6.0):
-        assert np.max(np.abs(command)) <= 2.05 * 6.0
-        assert np.max(np.abs(np.diff(command))) / 1e-3 <= AXIS.max_speed
+
+
+@pytest.mark.parametrize("envelope", [
+    Envelope(0.3, 6.0, 12.0, 170.0, 17000.0), Envelope(-0.2, 0.04, 0.25, 3.0, 60.0), Envelope(0.0, 0.002, 0.5, 5.0, 1000.0)])
+@pytest.mark.parametrize("duration", [1.5, 5.0])
+def test_experiments_stay_within_their_envelope(envelope: Envelope, duration: float) -> None:
+    e = envelope
+    laps = [*catalogue(AXIS, e, duration), one_speed(AXIS, e, duration)]
+    assert len({x.name for x in laps}) == 5
+    for lap in laps:
+        x = repeated(lap, 2).command
+        speed, acceleration, jerk = demands(x, AXIS.sample_time_s)
+        assert np.max(np.abs(x - e.centre)) <= e.reach * 1.001, lap.name
+        assert np.max(np.abs(x - e.centre)) > 1e-4 * e.reach, lap.name
+        assert speed <= e.speed * 1.001, lap.name
+        assert acceleration <= e.acceleration * 1.02, lap.name
+        assert jerk <= e.jerk * 1.1, lap.name
+        assert np.abs(x[[0, -1, len(lap.command) - 1]] - e.centre).max() < 1e-9 * e.reach, lap.name
 
 
 def test_the_plain_path_gives_the_same_numbers() -> None:

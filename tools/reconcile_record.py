@@ -1,0 +1,186 @@
+"""Run a position command on an axis node and record it, tick by tick, through the daemon.
+
+The axis is moved by its own commands (timed passes through knots), so that its limits, its guard and the
+emergency stop hold as ever. Whatever ends an experiment early, the node is closed, and its driver halts the axis.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+import sioms
+from sioms.client.node import AxisNode
+from sioms.client.snapshot import AxisSnapshot
+from sioms.protocol.flags import AxisStatus
+from sioms.reconcile.effect import Array
+from sioms.reconcile.experiment import Envelope, Experiment
+from sioms.reconcile.records import Record
+
+#: Samples from knot to knot.
+KNOT = 10
+LEASE_S = 1.0
+POLL_S = 0.02
+#: The axis rests this long before a record, and the record begins this long before the motion.
+SETTLE_S, LEAD_S = 0.4, 0.1
+#: Commands written ahead of the motion.
+AHEAD = 400
+#: A record that lost ticks counts up to there if this share of it is left; else it is run again, so many times.
+ENOUGH, TRIES = 0.6, 3
+BROKEN = AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP | AxisStatus.FOLLOWING_ERROR | AxisStatus.STALLED
+
+
+class ExperimentStopped(RuntimeError):
+    """The experiment did not come to its end; the axis has been halted. The message says why."""
+
+
+def perform(
+    cell: sioms.Workcell,
+    node: str,
+    experiments: Sequence[Experiment],
+    envelope: Envelope,
+    say: Callable[[str], None],
+) -> list[Record]:
+    """Run experiments one after the other on a node, which is held for as long only.
+
+    Raises:
+        ExperimentStopped: one did not come to its end.
+        OSError: the node cannot be had.
+    """
+    with cell.open(node, "rw", lease=LEASE_S) as axis:
+        recorder, out = Recorder(axis, envelope), []
+        for e in experiments:
+            say(f"running {e.name} ({len(e.command) / axis.info.tick_hz:.0f} s)")
+            out.append(recorder.run(e))
+        return out
+
+
+@dataclass(slots=True)
+class Recorder:
+    """Runs experiments on one axis. Use from one thread.
+
+    Attributes:
+        node: open for reading and writing, of one axis.
+        envelope: what the axis may be asked; moves between experiments keep it, too.
+    """
+
+    node: AxisNode
+    envelope: Envelope
+
+    def run(self, experiment: Experiment) -> Record:
+        """Run one experiment from rest at its first position.
+
+        Returns:
+            Position, force and command of every tick, without a gap.
+
+        Raises:
+            ExperimentStopped: by a stop, a fault, a refusal, or because the machine loses ticks.
+        """
+        lost = 0
+        for _ in range(TRIES):
+            try:
+                self._go(float(experiment.command[0]))
+                seen = self._play(experiment.command)
+            except OSError as error:
+                raise ExperimentStopped(
+                    f"run {experiment.name} on {self.node.name}: {error.strerror or error}"
+                ) from error
+            kept = _gapless(seen)
+            if len(kept) >= ENOUGH * len(seen):
+                return _record(experiment.name, kept, self.node.info.tick_hz)
+            lost += 1
+        raise ExperimentStopped(
+            f"record {experiment.name} on {self.node.name}: ticks were missing in {lost} runs; the machine is too busy to "
+            "record at the rate of the axis"
+        )
+
+    def _go(self, position: float) -> None:
+        """Move to a position and let the axis come to rest."""
+        e, here = self.envelope, self.node.read()
+        self._check(here)
+        self.node.move(position, max_velocity=0.5 * e.speed, max_acceleration=0.5 * e.acceleration)
+        self.node.wait_until_idle(timeout=5.0 + 4.0 * abs(position - here.position[0]) / e.speed)
+        end = time.monotonic() + SETTLE_S
+        while time.monotonic() < end:
+            time.sleep(POLL_S)
+            self.node.keepalive()
+            self._check(self.node.read())
+
+    def _play(self, command: Array) -> list[AxisSnapshot]:
+        """Write the knots ahead of the motion and collect every snapshot until the axis rests again."""
+        limits = self.node.info.channels[0].limits
+        records = knots(command, 1.0 / self.node.info.tick_hz, limits["velocity"], limits["acceleration"])
+        last = self.node.read().number
+        deadline = time.monotonic() + 2.0 * len(command) / self.node.info.tick_hz + 5.0
+        seen: list[AxisSnapshot] = []
+        lead, taken = time.monotonic() + LEAD_S, 0
+        while True:
+            new = self.node.history(last)
+            for snapshot in new:
+                self._check(snapshot)
+            seen += new
+            last = new[-1].number if new else last
+            self.node.keepalive()
+            room = min(AHEAD, self.node.info.buffer_capacity) - self.node.read().buffered[0]
+            if time.monotonic() < lead:
+                time.sleep(POLL_S / 4)
+                continue
+            if records and room > 0:
+                taken = self.node.write(records[:room])
+                records = records[room:]
+                continue
+            if (
+                not records
+                and new
+                and new[-1].tick > taken
+                and not new[-1].in_motion[0]
+                and not new[-1].buffered[0]
+            ):
+                return seen
+            if time.monotonic() > deadline:
+                raise ExperimentStopped(f"run an experiment on {self.node.name}: it did not end in time")
+            time.sleep(POLL_S / 2)
+
+    def _check(self, snapshot: AxisSnapshot) -> None:
+        broken = AxisStatus(snapshot.status[0]) & BROKEN
+        if broken:
+            why = " and ".join(
+                str(flag.name).lower().replace("_", " ") for flag in AxisStatus if flag & broken
+            )
+            raise ExperimentStopped(f"run an experiment on {self.node.name}: {why}; the axis is halted")
+
+
+def knots(command: Array, dt: float, max_velocity: float, max_acceleration: float) -> list[bytes]:
+    """Turn a sampled command into timed passes through knots; the first and the last are at rest.
+
+    Args:
+        max_velocity, max_acceleration: the axis's own limits, in force from the first knot on.
+    """
+    v = np.gradient(command, dt)
+    a = np.gradient(v, dt)
+    v[[0, -1]] = a[[0, -1]] = 0.0
+    at = [*range(KNOT, len(command) - KNOT, KNOT), len(command) - 1]
+    words = [
+        {"position": command[i], "velocity": v[i], "acceleration": a[i], "time": n * dt}
+        for i, n in zip(at, np.diff([0, *at]).tolist(), strict=True)
+    ]
+    words[0] |= {"max_velocity": max_velocity, "max_acceleration": max_acceleration}
+    return [sioms.command(**w) for w in words]
+
+
+def _gapless(seen: list[AxisSnapshot]) -> list[AxisSnapshot]:
+    """Return what comes before the first tick that is missing."""
+    ticks = np.array([s.tick for s in seen])
+    gaps = np.flatnonzero(np.diff(ticks) != 1)
+    return seen[: int(gaps[0]) + 1] if len(gaps) else seen
+
+
+def _record(name: str, seen: list[AxisSnapshot], tick_hz: float) -> Record:
+    position, force, command = (
+        np.array([getattr(s, field)[0] for s in seen], dtype=np.float64)
+        for field in ("position", "force", "commanded_position")
+    )
+    return Record(name, position, force, command, time_s=np.arange(len(seen), dtype=np.float64) / tick_hz)
