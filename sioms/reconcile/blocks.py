@@ -9,13 +9,24 @@ H. R. Kuensch, "The jackknife and the bootstrap for general stationary observati
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
 from sioms.reconcile.effect import Array
-from sioms.reconcile.fit import Fit, Problem
+from sioms.reconcile.fit import Problem
 
 BLOCK_S = 0.5
+
+
+class Fitted(Protocol):
+    """A fit of any subject: residual (n,) in units of the floor, and its Jacobian (n, k)."""
+
+    @property
+    def residual(self) -> Array: ...
+    @property
+    def jacobian(self) -> Array: ...
 
 
 def block_ids(problem: Problem, sample_time_s: float, block_s: float = BLOCK_S) -> NDArray[np.int64]:
@@ -30,7 +41,7 @@ def block_ids(problem: Problem, sample_time_s: float, block_s: float = BLOCK_S) 
     return np.concatenate(out)
 
 
-def _normal(fit: Fit, ids: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+def _normal(fit: Fitted, ids: NDArray[np.int64]) -> tuple[Array, Array, Array]:
     """Per block: J'J (b, k, k), J'r (b, k), r'r (b,)."""
     b, k = int(ids.max()) + 1, fit.jacobian.shape[1]
     edges = np.searchsorted(ids, np.arange(b + 1))
@@ -41,7 +52,7 @@ def _normal(fit: Fit, ids: NDArray[np.int64]) -> tuple[Array, Array, Array]:
     return h, g, c
 
 
-def heldout(fit: Fit, ids: NDArray[np.int64], folds: int = 10) -> Array:
+def heldout(fit: Fitted, ids: NDArray[np.int64], folds: int = 10) -> Array:
     """Sum of squares of each block when the parameters come from the other folds, shape (blocks,)."""
     h, g, c = _normal(fit, ids)
     if fit.jacobian.shape[1] == 0:
@@ -58,7 +69,7 @@ def heldout(fit: Fit, ids: NDArray[np.int64], folds: int = 10) -> Array:
     return out
 
 
-def bootstrap(fit: Fit, ids: NDArray[np.int64], replicates: int, rng: np.random.Generator) -> Array:
+def bootstrap(fit: Fitted, ids: NDArray[np.int64], replicates: int, rng: np.random.Generator) -> Array:
     """Parameter changes, in units of their scale, over block bootstrap replicates, shape (replicates, k)."""
     h, g, _ = _normal(fit, ids)
     b, k = g.shape

@@ -17,8 +17,9 @@ from sioms.reconcile.finger import pressures
 from sioms.reconcile.finger.pressures import WAVES, Complex, Floats
 from sioms.tactile.cylinder import Cylinder, respond
 
-#: Poisson's ratios at which contacts are solved; between them series are interpolated by a parabola.
-_POISSON = (0.36, 0.42, 0.46, 0.4999)
+#: Poisson's ratios about the nominal one at which contacts are solved; between them series follow a parabola.
+_POISSON = (-0.07, 0.0, 0.035)
+_BELOW = (-0.08, -0.04, 0.0)  # where the nominal one is close to 1/2
 #: ``response(output, scene, parameters)`` returns the changed output, shape (touches, elements).
 Response = Callable[[Floats, "Scene", Floats], Floats]
 
@@ -64,6 +65,7 @@ class Belief:
         hertz, adhesion: shares of Hertz's widths and of full adhesion.
         friction: coefficient, positive where the indenter drags towards larger angles.
         apex: share of the apex's shift under sliding (0: the commanded place is the middle of contact).
+        around: Poisson's ratio about which contacts are solved, 0 for ``poisson`` itself.
         strip: half widths of contact vary by amplitude [1] and phase [rad] over a period of the place [rad].
         creep, creep_time: share of a step that comes late, and its time constant [s].
         cell: relative error of the load cell.
@@ -86,6 +88,7 @@ class Belief:
     adhesion: float = 0.0
     friction: float = 0.0
     apex: float = 0.0
+    around: float = 0.0
     strip: tuple[float, float, float] = (0.0, 0.0, 1.0)
     creep: float = 0.0
     creep_time: float = 1.0
@@ -116,6 +119,7 @@ class _Contact:
     adhesion: float
     friction: float
     apex: float
+    around: float
     strip: tuple[float, float, float]
 
     @property
@@ -126,9 +130,9 @@ class _Contact:
 @lru_cache(maxsize=24)
 def _tractions(c: _Contact, scene: Scene) -> tuple[Complex, Complex]:
     """Return p and q of every touch per unit load at the believed Poisson's ratio."""
-    nearest = sorted(sorted(_POISSON, key=lambda v: abs(v - c.poisson))[:3])
-    if min(abs(v - c.poisson) for v in nearest) < 1e-12:
-        nearest = [min(nearest, key=lambda v: abs(v - c.poisson))]
+    middle = c.around or c.poisson
+    nodes = [middle + d for d in (_POISSON if middle + _POISSON[2] < 0.5 else _BELOW)]
+    nearest = [c.poisson] if min(abs(v - c.poisson) for v in nodes) < 1e-9 else nodes
     p = q = np.zeros((len(scene.place), len(WAVES)), dtype=np.complex128)
     for v in nearest:
         weight = float(np.prod([(c.poisson - o) / (v - o) for o in nearest if o != v]))
@@ -142,7 +146,9 @@ def _tractions_at(c: _Contact, scene: Scene) -> tuple[Complex, Complex]:
     p = np.empty((len(scene.place), len(WAVES)), dtype=np.complex128)
     q = np.zeros_like(p)
     half = np.empty(len(scene.place))
-    argument = np.where(edge, scene.load, scene.load / (1.0 / c.outer + 1.0 / np.where(edge, 1.0, scene.radius)))
+    argument = np.where(
+        edge, scene.load, scene.load / (1.0 / c.outer + 1.0 / np.where(edge, 1.0, scene.radius))
+    )
     depth, phase, period = c.strip
     if depth:
         wider = 1.0 + depth * np.sin(2.0 * np.pi * scene.place / period + phase)
@@ -182,12 +188,14 @@ def _turn(scene: Scene) -> Complex:
 
 def strains(b: Belief, scene: Scene) -> Floats:
     """Return the strain of every element under every touch, shape (nt, ns)."""
-    contact = _Contact(b.core, b.outer, b.shear, b.poisson, b.hertz, b.adhesion, b.friction, b.apex, b.strip)
+    contact = _Contact(b.core, b.outer, b.shear, b.poisson, b.hertz, b.adhesion, b.friction, b.apex, b.around, b.strip)
     return _strains(contact, scene, b.angle.tobytes(), tuple(np.round(b.radius, 10)), b.extent, b.offset)
 
 
 @lru_cache(maxsize=48)
-def _strains(c: _Contact, scene: Scene, angles: bytes, radii: tuple[float, ...], extent: float, offset: float) -> Floats:
+def _strains(
+    c: _Contact, scene: Scene, angles: bytes, radii: tuple[float, ...], extent: float, offset: float
+) -> Floats:
     p, q = _tractions(c, scene)
     by_p, by_q = _factors(c.body, radii)
     turn = _turn(scene)

@@ -28,7 +28,9 @@ def check_raw(raw: Floats, elements: int, name: str) -> None:
         raise BadInputError(f"read {name}: raw holds no number; needs readings of {elements} elements")
     finite = np.where(np.isfinite(raw), raw, 0.0)
     if np.all(np.ptp(finite, axis=0) == 0.0):
-        raise BadInputError(f"read {name}: all {elements} elements are constant; needs frames of a living finger")
+        raise BadInputError(
+            f"read {name}: all {elements} elements are constant; needs frames of a living finger"
+        )
 
 
 def check_commands(place: Floats, load: Floats, radius: Floats, name: str) -> None:
@@ -39,19 +41,27 @@ def check_commands(place: Floats, load: Floats, radius: Floats, name: str) -> No
     """
     for what, values in (("cmd_theta", place), ("cmd_P", load)):
         if not np.isfinite(values).all():
-            raise BadInputError(f"read {name}: {what} has {int(np.sum(~np.isfinite(values)))} values that are no numbers")
+            raise BadInputError(
+                f"read {name}: {what} has {int(np.sum(~np.isfinite(values)))} values that are no numbers"
+            )
     if not np.all(load > 0.0):
         raise BadInputError(f"read {name}: cmd_P is {float(load.min()):g} N/m; pressing loads are positive")
     if np.isnan(radius).any() or np.any(radius < 0.0):
-        raise BadInputError(f"read {name}: cmd_rc holds negative values or no numbers; needs mm, 0 for an edge, inf for a flat")
+        raise BadInputError(
+            f"read {name}: cmd_rc holds negative values or no numbers; needs mm, 0 for an edge, inf for a flat"
+        )
     round_ = radius[(radius > 0.0) & np.isfinite(radius)]
     if len(round_) and (np.median(round_) > 1.0 or np.median(round_) < 2e-5):
         factor = 1000.0 if np.median(round_) > 1.0 else 0.001
-        raise BadInputError(f"read {name}: cmd_rc is about {1e3 * float(np.median(round_)):g} mm; a factor of {factor:g} too "
-                            "much: needs mm")
+        raise BadInputError(
+            f"read {name}: cmd_rc is about {1e3 * float(np.median(round_)):g} mm; a factor of {factor:g} too "
+            "much: needs mm"
+        )
     if np.ptp(place) > 4.0 * np.pi:
-        raise BadInputError(f"read {name}: cmd_theta spans {np.degrees(np.ptp(place)):.0f} deg, about {np.degrees(1.0):.1f} times a "
-                            "finger's arc; needs degrees")
+        raise BadInputError(
+            f"read {name}: cmd_theta spans {np.degrees(np.ptp(place)):.0f} deg, about {np.degrees(1.0):.1f} times a "
+            "finger's arc; needs degrees"
+        )
 
 
 def check_match(t: Touched, b: Belief, alive: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -68,23 +78,31 @@ def check_match(t: Touched, b: Belief, alive: NDArray[np.bool_]) -> NDArray[np.b
     like = _like(own[:, alive], expected[:, alive])
     if abs(like) < LEAST_LIKE:
         _raise_turned(t, b, own, alive, like)
-        raise BadInputError(f"compare touches with the finger: they agree to {100 * like:.0f} % (correlation) with what the nominal "
-                            "finger should feel; it is another finger, or places, loads and readings do not belong together")
+        raise BadInputError(
+            f"compare touches with the finger: they agree to {100 * like:.0f} % (correlation) with what the nominal "
+            "finger should feel; it is another finger, or places, loads and readings do not belong together"
+        )
     if like < 0.0:
-        raise BadInputError("compare touches with the finger: pressing lowers the outputs; compression must be positive: change "
-                            "the sign of raw")
+        raise BadInputError(
+            "compare touches with the finger: pressing lowers the outputs; compression must be positive: change "
+            "the sign of raw"
+        )
     e, m = expected[:, alive], own[:, alive]
     scale = float(np.sum(e * m) / np.sum(e * e))
     if scale > FACTOR or scale < 1.0 / FACTOR:
         near = 10.0 ** round(np.log10(scale))
-        raise BadInputError(f"compare touches with the finger: outputs are {scale:.4g} times what the nominal finger gives (about "
-                            f"{near:g}); check the units of raw (per cent), cmd_P (N/m) and the gains (a factor of 1000: N/mm, "
-                            "a factor of 100: fractions)")
+        raise BadInputError(
+            f"compare touches with the finger: outputs are {scale:.4g} times what the nominal finger gives (about "
+            f"{near:g}); check the units of raw (per cent), cmd_P (N/m) and the gains (a factor of 1000: N/mm, "
+            "a factor of 100: fractions)"
+        )
     if np.isfinite(t.cell).all():
         ratio = float(np.median(t.cell / t.load))
         if not 1.0 / FACTOR < ratio < FACTOR and np.ptp(t.cell) > 0.0:
-            raise BadInputError(f"compare load cell with command: force is {ratio:.4g} times cmd_P (about "
-                                f"{10.0 ** round(np.log10(abs(ratio) + 1e-12)):g}); needs both in N/m")
+            raise BadInputError(
+                f"compare load cell with command: force is {ratio:.4g} times cmd_P (about "
+                f"{10.0 ** round(np.log10(abs(ratio) + 1e-12)):g}); needs both in N/m"
+            )
     size = np.sum(expected**2, axis=0)
     answer = np.sum(expected * t.output, axis=0) / np.maximum(size, 1e-300)
     heard = size > 0.05 * np.median(size)
@@ -106,9 +124,11 @@ def _like(a: Floats, b: Floats) -> float:
 
 def _raise_turned(t: Touched, b: Belief, own: Floats, alive: NDArray[np.bool_], like: float) -> None:
     """Try what people mix up with the places."""
-    for factor, said in ((180.0 / np.pi, "cmd_theta looks like radians; needs degrees"),
-                         (1000.0, "cmd_theta looks a factor of 1000 too small; needs degrees"),
-                         (-1.0, "cmd_theta runs the other way round; change its sign")):
+    for factor, said in (
+        (180.0 / np.pi, "cmd_theta looks like radians; needs degrees"),
+        (1000.0, "cmd_theta looks a factor of 1000 too small; needs degrees"),
+        (-1.0, "cmd_theta runs the other way round; change its sign"),
+    ):
         if np.ptp(t.place * factor) > 4.0 * np.pi:
             continue
         again = outputs(b, scene_of(t.place * factor, t.load, t.radius))

@@ -21,7 +21,9 @@ from sioms.reconcile.sensors.effect import SensorModel
 VIEWS = ("touch", "course", "drift", "ramp", "cell")
 TOUCH, COURSE, DRIFT, RAMP, CELL = range(5)
 GROUP = 6  # touches in a block
-_CONTRASTS = np.array([[-3, -1, 1, 3], [1, -1, -1, 1], [-1, 3, -3, 1]]) / np.array([[20**0.5], [2.0], [20**0.5]])
+_CONTRASTS = np.array([[-3, -1, 1, 3], [1, -1, -1, 1], [-1, 3, -3, 1]]) / np.array(
+    [[20**0.5], [2.0], [20**0.5]]
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +37,7 @@ class FingerData:
     ramps: tuple[Ramped, ...]
     ramp_scene: Scene | None
     load_share: Floats  # relative standard deviation of each touch's load
-    cell_spread: float  # relative spread of the cell about the commanded load, nan without a cell
+    cell_spread: float  # spread of the cell about the commanded load [N/m], nan without a cell
     view: NDArray[np.int64]
     block: NDArray[np.int64]
     element: NDArray[np.int64]
@@ -53,7 +55,7 @@ class FingerData:
         rows.append(self._drift(b))
         rows.append(self._ramps(b))
         if np.isfinite(self.cell_spread):
-            rows.append(np.full(len(t), (1.0 + b.cell) / self.cell_spread))
+            rows.append(t.load * (1.0 + b.cell) / self.cell_spread)
         return np.concatenate(rows)
 
     def miss(self, predicted: Floats) -> Floats:
@@ -73,7 +75,7 @@ class FingerData:
             rows.append((self.untouched.output[:, self.alive] / self.untouched.noise[self.alive]).ravel())
         rows += [r.output / r.noise for r in self.ramps]
         if np.isfinite(self.cell_spread):
-            rows.append(t.cell / t.load / self.cell_spread)
+            rows.append(t.cell / self.cell_spread)
         return np.concatenate(rows)
 
     def whiten(self, change: Floats) -> Floats:
@@ -144,7 +146,9 @@ class FingerData:
             own = full[at : at + n, r.element]
             at += n
             if b.creep:
-                own = own - b.creep * b.creep_time * -np.expm1(-r.since / b.creep_time) * np.gradient(own, r.since)
+                own = own - b.creep * b.creep_time * -np.expm1(-r.since / b.creep_time) * np.gradient(
+                    own, r.since
+                )
             out.append(own / r.noise)
         return np.concatenate(out)
 
@@ -170,18 +174,32 @@ class FingerData:
         return out
 
 
-def lay_out(touched: Touched, alive: NDArray[np.intp], untouched: Untouched | None, ramps: tuple[Ramped, ...],
-            elements: Floats, load_share: Floats, load: Floats, cell_spread: float) -> FingerData:
+def lay_out(
+    touched: Touched,
+    alive: NDArray[np.intp],
+    untouched: Untouched | None,
+    ramps: tuple[Ramped, ...],
+    elements: Floats,
+    load_share: Floats,
+    load: Floats,
+    cell_spread: float,
+) -> FingerData:
     """Lay out the rows.
 
     Args:
         alive: elements that answer.
         elements: angles of the elements [rad]; ramps lie over them.
         load: best guess of each touch's load [N/m] and its relative standard deviation beside it.
-        cell_spread: relative spread of the cell about the commanded load, nan without a cell.
+        cell_spread: spread of the cell about the commanded load [N/m], nan without a cell.
     """
-    warm = np.nan_to_num(touched.temperature - np.nanmean(touched.temperature)) if warm_known(touched) else 0.0 * load
-    scene = Scene(touched.place, load, touched.radius, touched.since, touched.time - touched.time.mean(), warm)
+    warm = (
+        np.nan_to_num(touched.temperature - np.nanmean(touched.temperature))
+        if warm_known(touched)
+        else 0.0 * load
+    )
+    scene = Scene(
+        touched.place, load, touched.radius, touched.since, touched.time - touched.time.mean(), warm
+    )
     ramp_scene = None
     if ramps:
         place = np.concatenate([np.full(len(r.load), elements[r.element]) for r in ramps])
@@ -208,9 +226,18 @@ def lay_out(touched: Touched, alive: NDArray[np.intp], untouched: Untouched | No
         blocks.append(own + first)
         first += int(own.max()) + 1
     return FingerData(
-        touched, scene, alive, untouched, ramps, ramp_scene, load_share, cell_spread,
-        np.concatenate([np.full(len(own), v) for v, own, _ in parts]), np.concatenate(blocks),
-        np.concatenate([e for _, _, e in parts]).astype(np.int64))
+        touched,
+        scene,
+        alive,
+        untouched,
+        ramps,
+        ramp_scene,
+        load_share,
+        cell_spread,
+        np.concatenate([np.full(len(own), v) for v, own, _ in parts]),
+        np.concatenate(blocks),
+        np.concatenate([e for _, _, e in parts]).astype(np.int64),
+    )
 
 
 def warm_known(touched: Touched) -> bool:
@@ -226,5 +253,13 @@ def only(data: FingerData, which: NDArray[np.bool_], elements: Floats) -> Finger
         mine = (np.arange(len(u.temperature)) % 5 == 2) == few
         u = replace(u, output=u.output[mine], temperature=u.temperature[mine])
     ramps = tuple(r for i, r in enumerate(data.ramps) if (i % 5 == 2) == few)
-    return lay_out(data.touched.pick(which), data.alive, u, ramps, elements, data.load_share[which],
-                   data.scene.load[which], data.cell_spread)
+    return lay_out(
+        data.touched.pick(which),
+        data.alive,
+        u,
+        ramps,
+        elements,
+        data.load_share[which],
+        data.scene.load[which],
+        data.cell_spread,
+    )

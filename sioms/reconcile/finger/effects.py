@@ -88,7 +88,8 @@ def waved(output: Floats, scene: Scene, p: Floats) -> Floats:
 
 def _strip(b: Belief, v: Values) -> Belief:
     return replace(b, strip=(float(v["W"][0]), float(v["turn"][0]), float(v["period"][0]))).responding(
-        waved, np.concatenate([v["G"], v["phase"], v["period"]]))
+        waved, np.concatenate([v["G"], v["phase"], v["period"]])
+    )
 
 
 def leaked(output: Floats, scene: Scene, p: Floats) -> Floats:
@@ -111,7 +112,10 @@ def _nothing(b: Belief, v: Values) -> Belief:
 SENSOR, ACTUATOR, MECHANICS = Channel.SENSOR, Channel.ACTUATOR, Channel.MECHANICS
 
 GAIN = SensorEffect(
-    name="gain_scatter", title="gains that differ from the stated ones", channel=SENSOR, change=_gain,
+    name="gain_scatter",
+    title="gains that differ from the stated ones",
+    channel=SENSOR,
+    change=_gain,
     equation="gain_i = stated gain_i (1 + g_i)",
     parameters=(Quantity("g", "1", -0.9, 9.0, 0.1, "relative departure of each element's gain", each=True),),
     signature="output too large or too small in one proportion wherever and however it is touched, element by element",
@@ -120,7 +124,10 @@ GAIN = SensorEffect(
     twins=("depth_scatter", "strip_inhomogeneity"),
 )
 ANGLE = SensorEffect(
-    name="angle_scatter", title="elements away from their stated places", channel=SENSOR, change=_angle,
+    name="angle_scatter",
+    title="elements away from their stated places",
+    channel=SENSOR,
+    change=_angle,
     equation="t_i = stated t_i + dt_i",
     parameters=(Quantity("dt", "rad", -0.14, 0.14, 0.01, "departure of each element's angle", each=True),),
     signature="residual like the slope of the profile, of its own size and sign for each element",
@@ -128,7 +135,10 @@ ANGLE = SensorEffect(
     separate="edge touches every degree across each element",
 )
 DEPTH = SensorEffect(
-    name="depth_scatter", title="elements at other depths than stated", channel=SENSOR, change=_depth,
+    name="depth_scatter",
+    title="elements at other depths than stated",
+    channel=SENSOR,
+    change=_depth,
     equation="rs_i = stated rs_i + dr_i",
     parameters=(Quantity("dr", "m", -1.2e-3, 1.2e-3, 2e-4, "departure of each element's radius", each=True),),
     signature="profile higher and narrower, or lower and wider, element by element",
@@ -137,7 +147,10 @@ DEPTH = SensorEffect(
     twins=("gain_scatter",),
 )
 OFFSET = SensorEffect(
-    name="angle_offset", title="finger and fixture turned against each other", channel=ACTUATOR, change=_offset,
+    name="angle_offset",
+    title="finger and fixture turned against each other",
+    channel=ACTUATOR,
+    change=_offset,
     equation="place of touch = commanded place + off",
     parameters=(Quantity("off", "rad", -0.2, 0.2, 0.01, "how much further round every touch is"),),
     signature="residual like the slope of the profile, alike for all elements",
@@ -146,7 +159,10 @@ OFFSET = SensorEffect(
     session=("off",),
 )
 POISSON = SensorEffect(
-    name="poisson", title="another Poisson's ratio", channel=MECHANICS, change=_poisson,
+    name="poisson",
+    title="another Poisson's ratio",
+    channel=MECHANICS,
+    change=_poisson,
     equation="nu = stated nu + dnu",
     parameters=(Quantity("dnu", "1", -0.16, 0.04, 0.02, "departure of Poisson's ratio"),),
     signature="under the touch and beside it in another proportion, alike for all elements",
@@ -154,16 +170,26 @@ POISSON = SensorEffect(
     separate="the same places with an edge and with a flat: adhesion needs a wide contact, Poisson's ratio does not",
 )
 QUADRATIC = SensorEffect(
-    name="quadratic", title="quadratic response of the electronics", channel=SENSOR, change=_quadratic,
+    name="quadratic",
+    title="quadratic response of the electronics",
+    channel=SENSOR,
+    change=_quadratic,
     equation="d = l + q l^2, l the linear output",
-    parameters=(Quantity("q", "1", -20.0, 20.0, 2.0, "quadratic coefficient of each element, per unit of output", each=True),),
+    parameters=(
+        Quantity(
+            "q", "1", -20.0, 20.0, 2.0, "quadratic coefficient of each element, per unit of output", each=True
+        ),
+    ),
     signature="residual with the square of the output",
     lookalikes=("hertz", "gain_scatter", "creep", "quadratic_common"),
     separate="a decade of loads at one place with an edge and with a flat",
     twins=("hertz",),
 )
 TEMPERATURE = SensorEffect(
-    name="temperature_drift", title="drift with temperature, alike for all elements", channel=SENSOR, change=_temperature,
+    name="temperature_drift",
+    title="drift with temperature, alike for all elements",
+    channel=SENSOR,
+    change=_temperature,
     equation="d = d + k (T - T0)",
     parameters=(Quantity("k", "1/K", -0.5, 0.5, 2e-3, "drift of the output"),),
     signature="untouched outputs move together with the temperature",
@@ -172,48 +198,79 @@ TEMPERATURE = SensorEffect(
     session=("T0",),
 )
 TEMPERATURE_EACH = SensorEffect(
-    name="temperature_scatter", title="drift with temperature, element by element", channel=SENSOR, change=_temperature,
+    name="temperature_scatter",
+    title="drift with temperature, element by element",
+    channel=SENSOR,
+    change=_temperature,
     equation="d_i = d_i + k_i (T - T0)",
     parameters=(Quantity("k", "1/K", -0.5, 0.5, 2e-3, "drift of each element's output", each=True),),
     signature="untouched outputs move with the temperature, each in its own proportion",
     lookalikes=("creep", "temperature_drift"),
     separate="a temperature step of 2 K at zero load",
-    session=("T0",), replaces=("temperature_drift",),
+    session=("T0",),
+    replaces=("temperature_drift",),
 )
 CREEP = SensorEffect(
-    name="creep", title="creep (c > 0) or relaxation (c < 0)", channel=MECHANICS, change=_creep,
+    name="creep",
+    title="creep (c > 0) or relaxation (c < 0)",
+    channel=MECHANICS,
+    change=_creep,
     equation="d(t) = d (1 - c exp(-t/tau)), t since the load came on",
-    parameters=(Quantity("c", "1", -0.6, 0.6, 0.05, "share of a step that comes late"),
-                Quantity("tau", "s", 0.02, 300.0, 0.3, "time constant", starts=(0.1, 0.4, 1.0, 3.0, 12.0))),
+    parameters=(
+        Quantity("c", "1", -0.6, 0.6, 0.05, "share of a step that comes late"),
+        Quantity("tau", "s", 0.02, 300.0, 0.3, "time constant", starts=(0.1, 0.4, 1.0, 3.0, 12.0)),
+    ),
     signature="outputs go on rising (or fall) in one proportion while the load stays",
     lookalikes=("temperature_drift", "gain_scatter", "quadratic"),
     separate="one touch held for 30 s at constant temperature, and a temperature step at zero load",
 )
 PROXIMITY = SensorEffect(
-    name="proximity", title="pull of a conducting indenter on the elements' fields", channel=SENSOR, change=_proximity,
+    name="proximity",
+    title="pull of a conducting indenter on the elements' fields",
+    channel=SENSOR,
+    change=_proximity,
     equation="d_i = d_i + A exp(-|t_i - t_c| / range), A < 0",
-    parameters=(Quantity("A", "1", -0.5, 0.0, 5e-3, "output that the indenter draws at its own place"),
-                Quantity("range", "rad", 0.03, 2.0, 0.05, "angle over which it falls to 1/e", starts=(0.12, 0.25, 0.6))),
+    parameters=(
+        Quantity("A", "1", -0.5, 0.0, 5e-3, "output that the indenter draws at its own place"),
+        Quantity(
+            "range", "rad", 0.03, 2.0, 0.05, "angle over which it falls to 1/e", starts=(0.12, 0.25, 0.6)
+        ),
+    ),
     signature="output lowered wherever the indenter is near, whatever the load",
     lookalikes=("adhesion", "poisson"),
     separate="bring a grounded and an insulating indenter near before the touch",
 )
 STRIP = SensorEffect(
-    name="strip_inhomogeneity", title="copper strips make the layer uneven", channel=MECHANICS, change=_strip,
+    name="strip_inhomogeneity",
+    title="copper strips make the layer uneven",
+    channel=MECHANICS,
+    change=_strip,
     equation="d = d (1 + G sin(2 pi t_c/period + phase)), half width (1 + W sin(2 pi t_c/period + turn))",
-    parameters=(Quantity("G", "1", 0.0, 0.5, 0.02, "amplitude of the gain over the place of touch"),
-                Quantity("phase", "rad", -np.pi, np.pi, 0.3, "phase at angle zero", phase=True),
-                Quantity("period", "rad", 0.03, 1.2, 2e-3, "distance of the strips",
-                         starts=tuple(2.0 * np.pi / n for n in (*range(8, 22, 1), *range(22, 73, 1)))),
-                Quantity("W", "1", -0.5, 0.5, 0.02, "amplitude of the width of contact"),
-                Quantity("turn", "rad", -np.pi, np.pi, 0.3, "its phase at angle zero", phase=True)),
+    parameters=(
+        Quantity("G", "1", 0.0, 0.5, 0.02, "amplitude of the gain over the place of touch"),
+        Quantity("phase", "rad", -np.pi, np.pi, 0.3, "phase at angle zero", phase=True),
+        Quantity(
+            "period",
+            "rad",
+            0.03,
+            1.2,
+            2e-3,
+            "distance of the strips",
+            starts=tuple(2.0 * np.pi / n for n in (*range(8, 22, 1), *range(22, 73, 1))),
+        ),
+        Quantity("W", "1", -0.5, 0.5, 0.02, "amplitude of the width of contact"),
+        Quantity("turn", "rad", -np.pi, np.pi, 0.3, "its phase at angle zero", phase=True),
+    ),
     signature="all elements too loud and too quiet together, periodic in the place of touch",
     lookalikes=("gain_scatter",),
     separate="touches in steps of less than half a period over several periods",
     twins=("gain_scatter",),
 )
 ADHESION = SensorEffect(
-    name="adhesion", title="the indenter sticks to the skin", channel=MECHANICS, change=_adhesion,
+    name="adhesion",
+    title="the indenter sticks to the skin",
+    channel=MECHANICS,
+    change=_adhesion,
     equation="q = share * (tangential traction of full adhesion)",
     parameters=(Quantity("share", "1", 0.0, 1.4, 0.1, "share of full adhesion (edge resolved to a/256)"),),
     signature="profile narrower the wider the contact, alike for all elements",
@@ -221,7 +278,10 @@ ADHESION = SensorEffect(
     separate="the same places with an edge and with a flat: adhesion needs a wide contact, Poisson's ratio does not",
 )
 HERTZ = SensorEffect(
-    name="hertz", title="widths of contact as on a half plane", channel=MECHANICS, change=_hertz,
+    name="hertz",
+    title="widths of contact as on a half plane",
+    channel=MECHANICS,
+    change=_hertz,
     equation="p = (1 - share) p(rigid core) + share p(Hertz)",
     parameters=(Quantity("share", "1", -0.5, 1.5, 0.2, "1 is Hertz's half plane, 0 the rigid core"),),
     signature="profile under wide indenters too wide, more at higher loads",
@@ -229,17 +289,25 @@ HERTZ = SensorEffect(
     separate="flats over a decade of loads",
 )
 SLIDING = SensorEffect(
-    name="sliding_friction", title="the indenter drags over the skin", channel=MECHANICS, change=_sliding,
+    name="sliding_friction",
+    title="the indenter drags over the skin",
+    channel=MECHANICS,
+    change=_sliding,
     equation="q = f p; the apex leaves the middle of contact by ``apex`` of the exact shift",
-    parameters=(Quantity("f", "1", -2.0, 2.0, 0.1, "coefficient of friction, positive towards larger angles"),
-                Quantity("apex", "1", 0.0, 1.0, 0.3, "0: places are middles of contact, 1: apexes")),
+    parameters=(
+        Quantity("f", "1", -2.0, 2.0, 0.1, "coefficient of friction, positive towards larger angles"),
+        Quantity("apex", "1", 0.0, 1.0, 0.3, "0: places are middles of contact, 1: apexes"),
+    ),
     signature="profile lopsided, the same way for all elements",
     lookalikes=("angle_offset", "angle_scatter"),
     separate="the same touches while the indenter drags the other way",
     session=("apex",),
 )
 CROSSTALK = SensorEffect(
-    name="cross_talk", title="an element hears its neighbours", channel=SENSOR, change=_crosstalk,
+    name="cross_talk",
+    title="an element hears its neighbours",
+    channel=SENSOR,
+    change=_crosstalk,
     equation="d_i = d_i + x (d_(i-1) + d_(i+1))",
     parameters=(Quantity("x", "1", -0.4, 0.4, 0.02, "share of each neighbour"),),
     signature="a second profile one pitch away",
@@ -247,7 +315,10 @@ CROSSTALK = SensorEffect(
     separate="a calibration voltage on one element at a time",
 )
 CELL = SensorEffect(
-    name="force_gain", title="the load cell's scale is off", channel=SENSOR, change=_cell,
+    name="force_gain",
+    title="the load cell's scale is off",
+    channel=SENSOR,
+    change=_cell,
     equation="reading = P (1 + g)",
     parameters=(Quantity("g", "1", -0.8, 4.0, 0.02, "relative error of the load cell"),),
     signature="the load cell off in one proportion while the outputs agree with the commanded load",
@@ -255,21 +326,53 @@ CELL = SensorEffect(
     separate="hang a known weight on the load cell",
 )
 MAINS = SensorEffect(
-    name="mains_line", title="a line of the mains in the outputs", channel=SENSOR, change=_nothing,
+    name="mains_line",
+    title="a line of the mains in the outputs",
+    channel=SENSOR,
+    change=_nothing,
     equation="d = d + a sin(2 pi f t + phase)",
-    parameters=(Quantity("a", "1", 0.0, 0.5, 1e-3, "amplitude"), Quantity("f", "Hz", 0.0, 1e6, 1.0, "frequency")),
-    signature="a line in the spectrum of untouched frames", lookalikes=(), rankable=False,
+    parameters=(
+        Quantity("a", "1", 0.0, 0.5, 1e-3, "amplitude"),
+        Quantity("f", "Hz", 0.0, 1e6, 1.0, "frequency"),
+    ),
+    signature="a line in the spectrum of untouched frames",
+    lookalikes=(),
+    rankable=False,
     separate="untouched frames at full rate for 30 s",
 )
 DEAD = SensorEffect(
-    name="dead_element", title="an element that does not answer", channel=SENSOR, change=_nothing,
-    equation="d_i = const", parameters=(Quantity("index", "1", 0.0, 1e4, 1.0, "its number, from 0"),),
-    signature="a reading that neither noise nor touch moves", lookalikes=("gain_scatter",), rankable=False,
+    name="dead_element",
+    title="an element that does not answer",
+    channel=SENSOR,
+    change=_nothing,
+    equation="d_i = const",
+    parameters=(Quantity("index", "1", 0.0, 1e4, 1.0, "its number, from 0"),),
+    signature="a reading that neither noise nor touch moves",
+    lookalikes=("gain_scatter",),
+    rankable=False,
     separate="touch it",
 )
 
-BUILT_IN = (MAINS, DEAD, TEMPERATURE, TEMPERATURE_EACH, CELL, GAIN, QUADRATIC, CROSSTALK, PROXIMITY, ANGLE, OFFSET, DEPTH,
-            POISSON, HERTZ, ADHESION, SLIDING, CREEP, STRIP)
+BUILT_IN = (
+    MAINS,
+    DEAD,
+    TEMPERATURE,
+    TEMPERATURE_EACH,
+    CELL,
+    GAIN,
+    QUADRATIC,
+    CROSSTALK,
+    PROXIMITY,
+    ANGLE,
+    OFFSET,
+    DEPTH,
+    POISSON,
+    HERTZ,
+    ADHESION,
+    SLIDING,
+    CREEP,
+    STRIP,
+)
 
 
 def library() -> dict[str, SensorEffect]:

@@ -16,7 +16,17 @@ from sioms.reconcile.sensors.model_file import effects_from, effects_to_toml, nu
 from sioms.tactile.cylinder import Cylinder
 from sioms.tactile.finger import ContactModel, Finger, nominal_finger
 
-KEYS = ("name", "core_m", "outer_m", "shear_modulus_pa", "poisson", "angle_rad", "radius_m", "gain", "extent_rad")
+KEYS = (
+    "name",
+    "core_m",
+    "outer_m",
+    "shear_modulus_pa",
+    "poisson",
+    "angle_rad",
+    "radius_m",
+    "gain",
+    "extent_rad",
+)
 
 
 def belief_of(finger: Finger) -> Belief:
@@ -24,9 +34,19 @@ def belief_of(finger: Finger) -> Belief:
     g, e = finger.geometry, finger.elements
     ratio = float(np.mean(e.poisson))
     c = finger.contact
-    return Belief(g.core_m, g.outer_m, g.shear_modulus_pa, ratio, np.array(e.angle_rad), np.array(e.radius_m), np.array(e.gain),
-                  np.array(e.quadratic), np.zeros(len(e.angle_rad)), hertz=float(c.model == "hertz"),
-                  adhesion=c.adhesion if c.model == "adhering" else 0.0)
+    return Belief(
+        g.core_m,
+        g.outer_m,
+        g.shear_modulus_pa,
+        ratio,
+        np.array(e.angle_rad),
+        np.array(e.radius_m),
+        np.array(e.gain),
+        np.array(e.quadratic),
+        np.zeros(len(e.angle_rad)),
+        hertz=float(c.model == "hertz"),
+        adhesion=c.adhesion if c.model == "adhering" else 0.0,
+    )
 
 
 def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, bool]:
@@ -37,17 +57,31 @@ def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, bool]
     """
     odd = sorted(set(table) - {"finger", "effects"})
     if odd or "finger" not in table:
-        raise BadInputError(f"read model {where}: needs the tables finger and effects; got {', '.join(sorted(table)) or 'nothing'}")
+        raise BadInputError(
+            f"read model {where}: needs the tables finger and effects; got {', '.join(sorted(table)) or 'nothing'}"
+        )
     t = table["finger"]
     odd = sorted(set(t) - set(KEYS))
     if odd:
         raise BadInputError(f"read model {where}: nobody reads {', '.join(odd)}; known are {', '.join(KEYS)}")
     angle = numbers(t, "angle_rad", where)
     count = len(angle)
-    core, outer, shear, ratio = (float(numbers(t, k, where, 1)[0]) for k in ("core_m", "outer_m", "shear_modulus_pa", "poisson"))
+    core, outer, shear, ratio = (
+        float(numbers(t, k, where, 1)[0]) for k in ("core_m", "outer_m", "shear_modulus_pa", "poisson")
+    )
     extent = float(numbers(t, "extent_rad", where, 1)[0]) if "extent_rad" in t else 0.0
-    b = Belief(core, outer, shear, ratio, angle, numbers(t, "radius_m", where, count), numbers(t, "gain", where, count),
-               np.zeros(count), np.zeros(count), extent)
+    b = Belief(
+        core,
+        outer,
+        shear,
+        ratio,
+        angle,
+        numbers(t, "radius_m", where, count),
+        numbers(t, "gain", where, count),
+        np.zeros(count),
+        np.zeros(count),
+        extent,
+    )
     check(b, where)
     model = SensorModel(b, count, library(), {}, (), str(t.get("name", "finger")))
     return effects_from(model, table.get("effects", {}), where), "extent_rad" in t
@@ -60,13 +94,19 @@ def check(b: Belief, where: str) -> None:
         BadInputError: radii, gains or Poisson's ratio make no sense; factors of 1000 are recognised.
     """
     if not 0.0 < b.core < b.outer:
-        raise BadInputError(f"read model {where}: core {b.core:g} m and outer radius {b.outer:g} m; need 0 < core < outer")
+        raise BadInputError(
+            f"read model {where}: core {b.core:g} m and outer radius {b.outer:g} m; need 0 < core < outer"
+        )
     if b.outer > 1.0:
-        raise BadInputError(f"read model {where}: outer radius is {b.outer:g} m, a factor of 1000 too much for a finger; needs metres")
+        raise BadInputError(
+            f"read model {where}: outer radius is {b.outer:g} m, a factor of 1000 too much for a finger; needs metres"
+        )
     if not (np.all(b.radius > b.core) and np.all(b.radius < b.outer)):
         worst = float(b.radius[np.argmax(np.abs(b.radius - 0.5 * (b.core + b.outer)))])
         hint = " (a factor of 1000: mm?)" if worst > 100.0 * b.outer else ""
-        raise BadInputError(f"read model {where}: an element lies at {worst:g} m{hint}; need {b.core:g} < radius < {b.outer:g} m")
+        raise BadInputError(
+            f"read model {where}: an element lies at {worst:g} m{hint}; need {b.core:g} < radius < {b.outer:g} m"
+        )
     if not np.all(b.gain > 0.0):
         raise BadInputError(f"read model {where}: gain {float(b.gain.min()):g}; needs strain per output, > 0")
     if not 0.3 <= b.poisson <= 0.5:
@@ -76,9 +116,18 @@ def check(b: Belief, where: str) -> None:
 def to_toml(model: SensorModel) -> str:
     """Write a model: nominal finger and effects."""
     b: Belief = model.base
-    lines = ["[finger]", f'name = "{model.name}"', f"core_m = {b.core!r}", f"outer_m = {b.outer!r}", f"shear_modulus_pa = {b.shear!r}",
-             f"poisson = {b.poisson!r}", f"extent_rad = {b.extent!r}", f"angle_rad = {number_or_list(b.angle)}",
-             f"radius_m = {number_or_list(b.radius)}", f"gain = {number_or_list(b.gain)}"]
+    lines = [
+        "[finger]",
+        f'name = "{model.name}"',
+        f"core_m = {b.core!r}",
+        f"outer_m = {b.outer!r}",
+        f"shear_modulus_pa = {b.shear!r}",
+        f"poisson = {b.poisson!r}",
+        f"extent_rad = {b.extent!r}",
+        f"angle_rad = {number_or_list(b.angle)}",
+        f"radius_m = {number_or_list(b.radius)}",
+        f"gain = {number_or_list(b.gain)}",
+    ]
     return "\n".join(lines) + "\n" + effects_to_toml(model)
 
 
@@ -93,20 +142,44 @@ def corrected(model: SensorModel, nominal: Finger | None, dead: tuple[int, ...] 
         nominal = _plain(b, model.name)
     e = nominal.elements
     elements = msgspec.structs.replace(
-        e, angle_rad=tuple(b.angle.tolist()), radius_m=tuple(b.radius.tolist()), gain=tuple(b.gain.tolist()),
-        quadratic=tuple(b.quadratic.tolist()), poisson=(b.poisson,) * len(b.angle),
-        used=tuple(u and i not in dead for i, u in enumerate(e.used)))
+        e,
+        angle_rad=tuple(b.angle.tolist()),
+        radius_m=tuple(b.radius.tolist()),
+        gain=tuple(b.gain.tolist()),
+        quadratic=tuple(b.quadratic.tolist()),
+        poisson=(b.poisson,) * len(b.angle),
+        used=tuple(u and i not in dead for i, u in enumerate(e.used)),
+    )
     signal = nominal.signal
     if "proximity" in model.effects:
         v = model.effects["proximity"]
-        signal = msgspec.structs.replace(signal, proximity=float(v["A"][0]), proximity_range_rad=float(v["range"][0]))
-    contact = ContactModel("adhering" if b.adhesion > 0.0 else "hertz" if b.hertz > 0.5 else "frictionless",
-                           min(b.adhesion, 1.0), (), (), nominal.contact.most_load_n_per_m)
+        signal = msgspec.structs.replace(
+            signal, proximity=float(v["A"][0]), proximity_range_rad=float(v["range"][0])
+        )
+    contact = ContactModel(
+        "adhering" if b.adhesion > 0.0 else "hertz" if b.hertz > 0.5 else "frictionless",
+        min(b.adhesion, 1.0),
+        (),
+        (),
+        nominal.contact.most_load_n_per_m,
+    )
     geometry = msgspec.structs.replace(nominal.geometry, poisson=b.poisson)
-    return msgspec.structs.replace(nominal, elements=elements, signal=signal, contact=contact, geometry=geometry, identified=None,
-                                   notes={**nominal.notes, "map": "model"})
+    return msgspec.structs.replace(
+        nominal,
+        elements=elements,
+        signal=signal,
+        contact=contact,
+        geometry=geometry,
+        identified=None,
+        notes={**nominal.notes, "map": "model"},
+    )
 
 
 def _plain(b: Belief, name: str) -> Finger:
-    return nominal_finger(Cylinder(b.core, b.outer, b.poisson, b.shear), b.angle, float(b.radius[0]), float(b.gain[0]), name=name)
-
+    return nominal_finger(
+        Cylinder(b.core, b.outer, b.poisson, b.shear),
+        b.angle,
+        float(b.radius[0]),
+        float(b.gain[0]),
+        name=name,
+    )

@@ -28,7 +28,11 @@ def catalogue(b: Belief) -> Iterator[tuple[str, str, Scene]]:
         return scene_of(np.array(p), np.array(q), np.array(r))
 
     dense = np.arange(low, high, np.radians(1.0))
-    yield "profile", "edge touches every degree across each element at 200 N/m", at(dense, np.array(200.0), np.array(0.0))
+    yield (
+        "profile",
+        "edge touches every degree across each element at 200 N/m",
+        at(dense, np.array(200.0), np.array(0.0)),
+    )
     decade = np.geomspace(25.0, 300.0, 8)
     both = scene_of(np.full(16, middle), np.tile(decade, 2), np.repeat([0.0, np.inf], 8))
     yield "loads", "a decade of loads, 25 to 300 N/m, at one place with an edge and with a flat", both
@@ -36,8 +40,11 @@ def catalogue(b: Belief) -> Iterator[tuple[str, str, Scene]]:
     widths = scene_of(np.tile(few, 2), np.full(24, 200.0), np.repeat([0.0, np.inf], 12))
     yield "widths", "the same places with an edge and with a flat at 200 N/m", widths
     fine = np.arange(middle - 0.35, middle + 0.35, np.radians(0.5))
-    yield "steps", "touches every half degree over 40 degrees, less than half a period of the strips", at(
-        fine, np.array(200.0), np.array(0.0))
+    yield (
+        "steps",
+        "touches every half degree over 40 degrees, less than half a period of the strips",
+        at(fine, np.array(200.0), np.array(0.0)),
+    )
 
 
 def propose(beliefs: Sequence[Belief], noise: float) -> Proposal | None:
@@ -54,18 +61,39 @@ def propose(beliefs: Sequence[Belief], noise: float) -> Proposal | None:
         said = [outputs(b, scene) for b in beliefs]
         found.append(Proposal(name, text, _apart(said, sigma)))
     turned = [outputs(replace(b, friction=-b.friction), next(catalogue(b))[2]) for b in beliefs]
-    found.append(Proposal("reverse", "the same edge touches while the indenter drags the other way", _apart(turned, sigma)))
+    found.append(
+        Proposal(
+            "reverse", "the same edge touches while the indenter drags the other way", _apart(turned, sigma)
+        )
+    )
     step = [(_STEP_K * b.temperature)[None] for b in beliefs]
-    found.append(Proposal("warm", f"a temperature step of {_STEP_K:g} K at zero load", _apart(step, sigma, 0.0)))
+    found.append(
+        Proposal("warm", f"a temperature step of {_STEP_K:g} K at zero load", _apart(step, sigma, 0.0))
+    )
     peak = float(np.max(outputs(beliefs[0], next(catalogue(beliefs[0]))[2])))
     held = [peak * late(b, _HELD_S)[None] for b in beliefs]
-    found.append(Proposal("hold", "one touch held for 30 s at constant temperature", _apart([h - h[:, -1:] for h in held], sigma, 0.0)))
+    found.append(
+        Proposal(
+            "hold",
+            "one touch held for 30 s at constant temperature",
+            _apart([h - h[:, -1:] for h in held], sigma, 0.0),
+        )
+    )
     nothing = np.zeros((len(beliefs[0].angle), len(beliefs[0].angle)))
     near = []
     for b in beliefs:
-        scene = replace(scene_of(b.angle, np.ones(len(b.angle)), np.zeros(len(b.angle))), distance=b.angle - b.angle[:, None])
+        scene = replace(
+            scene_of(b.angle, np.ones(len(b.angle)), np.zeros(len(b.angle))),
+            distance=b.angle - b.angle[:, None],
+        )
         near.append(sum((r(nothing, scene, p) for r, p in b.responses if r is pulled), nothing))
-    found.append(Proposal("near", "a grounded and an insulating indenter brought near before the touch", _apart(near, sigma, 0.0)))
+    found.append(
+        Proposal(
+            "near",
+            "a grounded and an insulating indenter brought near before the touch",
+            _apart(near, sigma, 0.0),
+        )
+    )
     return max(found, key=lambda p: p.separation)
 
 

@@ -25,8 +25,8 @@ Complex = NDArray[np.complex128]
 HIGHEST = 60  # wave numbers; the peak of a line load misses 0.004 % at 10.3 of 12.7 mm
 WAVES = np.arange(HIGHEST + 1)
 EDGE = np.pi / 4.0  # half angle of the indenters with radius zero
-_ROUND_AT = (0.02, 0.06, 0.11, 0.17, 0.24, 0.32, 0.44)  # half widths at which contacts are solved [rad]
-_EDGE_AT = (0.005, 0.015, 0.03, 0.055, 0.09, 0.15)
+_ROUND_AT = (0.04, 0.1, 0.17, 0.24, 0.32, 0.44)  # half widths at which contacts are solved [rad]
+_EDGE_AT = (0.02, 0.05, 0.09, 0.15)
 _STUCK_AT = (0.06, 0.14, 0.24, 0.44)
 _FINE = 90
 SLIDING = 0.5  # coefficient of friction at which sliding is solved
@@ -47,7 +47,7 @@ class Sheet:
     def series(self, argument: Floats) -> tuple[Complex, Complex]:
         """Return normal and shear series, shape (n, HIGHEST + 1); the last contact solved beyond the table."""
         root = np.sqrt(np.clip(argument, 0.0, self.top))
-        return self.normal(root), self.shear(root)
+        return np.asarray(self.normal(root), dtype=np.complex128), np.asarray(self.shear(root), dtype=np.complex128)
 
     def width(self, argument: Floats) -> Floats:
         """Return half widths [rad]."""
@@ -58,8 +58,13 @@ class Sheet:
 def pack(solved: Contact) -> tuple[Complex, Complex]:
     """Return p and q of a solved contact as complex series per unit load about the apex."""
     p, q = np.split(solved.series(-solved.offset, HIGHEST) / solved.load, 2)
-    zero = np.zeros(1)
-    return p[::2] + 1j * np.concatenate([zero, p[1::2]]), q[::2] + 1j * np.concatenate([zero, q[1::2]])
+    return _complex(p), _complex(q)
+
+
+def _complex(series: Floats) -> Complex:
+    out = np.zeros(HIGHEST + 1, dtype=np.complex128)
+    out.real, out.imag[1:] = series[::2], series[1::2]
+    return out
 
 
 @lru_cache(maxsize=64)
@@ -85,20 +90,32 @@ def sheet(body: Cylinder, edge: bool, friction: float = 0.0) -> Sheet:
     for a in np.maximum(widths, 1e-9):
         c = shape(a)
         unit = 0.5 * np.pi * a * body.outer_m * float(c[0])
-        rows.append(pack(Contact(body, float(a), 1.0, float(offset(a) * a), c / unit, friction, np.zeros(order + 1))))
+        rows.append(
+            pack(Contact(body, float(a), 1.0, float(offset(a) * a), c / unit, friction, np.zeros(order + 1)))
+        )
     root = np.sqrt(argument)
-    return Sheet(float(argument[-1]), CubicSpline(root, np.array([r[0] for r in rows])),
-                 CubicSpline(root, np.array([r[1] for r in rows])), CubicSpline(root, widths))
+    return Sheet(
+        float(argument[-1]),
+        CubicSpline(root, np.array([r[0] for r in rows])),
+        CubicSpline(root, np.array([r[1] for r in rows])),
+        CubicSpline(root, widths),
+    )
 
 
 @lru_cache(maxsize=16)
 def hertz(body: Cylinder) -> Sheet:
     """Tabulate Hertz's round contact: the half plane's width, without the core."""
     widths = np.linspace(0.0, _ROUND_AT[-1], _FINE)
-    normal = -ellipse_spectrum(WAVES * widths[:, None]) / (np.pi * body.outer_m) * np.where(WAVES == 0, 0.5, 1.0)
+    normal = (
+        -ellipse_spectrum(WAVES * widths[:, None]) / (np.pi * body.outer_m) * np.where(WAVES == 0, 0.5, 1.0)
+    )
     root = np.sqrt(hertz_product(body, widths))
-    return Sheet(float(root[-1] ** 2), CubicSpline(root, normal + 0j), CubicSpline(root, 0j * normal),
-                 CubicSpline(root, widths))
+    return Sheet(
+        float(root[-1] ** 2),
+        CubicSpline(root, normal + 0j),
+        CubicSpline(root, 0j * normal),
+        CubicSpline(root, widths),
+    )
 
 
 @lru_cache(maxsize=8)

@@ -53,9 +53,27 @@ class Touched:
 
     def pick(self, which: NDArray[np.bool_]) -> Touched:
         """Return some of the touches."""
-        own = {n: getattr(self, n)[which] for n in ("place", "load", "radius", "cell", "cell_noise", "output", "part", "since",
-                                                    "level", "temperature", "temperature_noise", "time", "share")}
-        return Touched(name=tuple(n for n, w in zip(self.name, which, strict=True) if w), noise=self.noise, **own)
+        own = {
+            n: getattr(self, n)[which]
+            for n in (
+                "place",
+                "load",
+                "radius",
+                "cell",
+                "cell_noise",
+                "output",
+                "part",
+                "since",
+                "level",
+                "temperature",
+                "temperature_noise",
+                "time",
+                "share",
+            )
+        }
+        return Touched(
+            name=tuple(n for n, w in zip(self.name, which, strict=True) if w), noise=self.noise, **own
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +106,9 @@ class Line:
 
 
 def reduce_touches(
-    experiments: Sequence[tuple[str, Recording, Floats, Floats, Floats]], scale: float, dead: NDArray[np.bool_],
+    experiments: Sequence[tuple[str, Recording, Floats, Floats, Floats]],
+    scale: float,
+    dead: NDArray[np.bool_],
     lines: Sequence[Line] = (),
 ) -> tuple[Touched, list[str]]:
     """Average the touches of all experiments.
@@ -102,8 +122,25 @@ def reduce_touches(
     Returns:
         The touches, and notes on those left out.
     """
-    rows: dict[str, list[object]] = {k: [] for k in ("name", "place", "load", "radius", "cell", "cell_noise", "output", "part",
-                                                     "since", "level", "temperature", "temperature_noise", "time", "share")}
+    rows: dict[str, list[object]] = {
+        k: []
+        for k in (
+            "name",
+            "place",
+            "load",
+            "radius",
+            "cell",
+            "cell_noise",
+            "output",
+            "part",
+            "since",
+            "level",
+            "temperature",
+            "temperature_noise",
+            "time",
+            "share",
+        )
+    }
     variances: list[Floats] = []
     notes: list[str] = []
     for name, r, place, load, radius in experiments:
@@ -122,19 +159,34 @@ def reduce_touches(
             level = quiet.mean(0)
             variances.append(quiet.var(0, ddof=1))
             cell = r.force[under].mean() - r.force[before].mean()
-            spread = np.sqrt(np.var(r.force[under], ddof=1) / len(under) + np.var(r.force[before], ddof=1) / len(before))
-            values = (name, place[number], load[number], radius[number], cell, spread, loud.mean(0) - level,
-                      np.array([loud[p].mean(0) - level for p in parts]),
-                      np.array([r.time_s[under[p]].mean() - onset for p in parts]), level,
-                      r.temperature_c[before].mean(),
-                      np.std(r.temperature_c[before], ddof=1) / np.sqrt(len(before)), r.time_s[before].mean(), 1.0 / len(under) + 1.0 / len(before))
+            spread = np.sqrt(
+                np.var(r.force[under], ddof=1) / len(under) + np.var(r.force[before], ddof=1) / len(before)
+            )
+            values = (
+                name,
+                place[number],
+                load[number],
+                radius[number],
+                cell,
+                spread,
+                loud.mean(0) - level,
+                np.array([loud[p].mean(0) - level for p in parts]),
+                np.array([r.time_s[under[p]].mean() - onset for p in parts]),
+                level,
+                r.temperature_c[before].mean(),
+                np.std(r.temperature_c[before], ddof=1) / np.sqrt(len(before)),
+                r.time_s[before].mean(),
+                1.0 / len(under) + 1.0 / len(before),
+            )
             for key, value in zip(rows, values, strict=True):
                 rows[key].append(value)
         if left:
             notes.append(f"{name}: {left} of {len(place)} touches left out, frames are missing or no numbers")
     count = len(rows["place"])
     if count < LEAST_TOUCHES:
-        raise BadInputError(f"read touches: {count} complete touches are too few; record {LEAST_TOUCHES} or more over the arc")
+        raise BadInputError(
+            f"read touches: {count} complete touches are too few; record {LEAST_TOUCHES} or more over the arc"
+        )
     arrays = {k: np.array(v, dtype=np.float64) for k, v in rows.items() if k != "name"}
     noise = np.sqrt(np.mean(variances, axis=0))
     return Touched(name=tuple(str(n) for n in rows["name"]), noise=noise, **arrays), notes
@@ -162,10 +214,14 @@ def _without_lines(frames: Floats, time: Floats, lines: Sequence[Line]) -> Float
     return out
 
 
-def reduce_untouched(r: Recording, scale: float, skip_s: float = 10.0, after_s: float = -np.inf) -> Untouched | None:
+def reduce_untouched(
+    r: Recording, scale: float, skip_s: float = 10.0, after_s: float = -np.inf
+) -> Untouched | None:
     """Return untouched frames with their temperature; those whose time reaches back to a touch are left out."""
     step = float(np.median(np.diff(r.time_s))) if len(r.time_s) > 1 else 0.0
-    good = np.isfinite(r.temperature_c) & np.isfinite(r.raw).all(axis=1) & (r.time_s - step > after_s + skip_s)
+    good = (
+        np.isfinite(r.temperature_c) & np.isfinite(r.raw).all(axis=1) & (r.time_s - step > after_s + skip_s)
+    )
     if np.count_nonzero(good) < 8:
         return None
     output = r.raw[good] * scale
@@ -183,7 +239,10 @@ def reduce_ramps(r: Recording, scale: float, dead: NDArray[np.bool_]) -> list[Ra
     for number in np.unique(r.touch[r.touch >= 0]):
         n = int(number)
         mine = r.touch == number
-        before, under = np.flatnonzero(mine & (r.phase == BASELINE)), np.flatnonzero(mine & (r.phase == LOADED))
+        before, under = (
+            np.flatnonzero(mine & (r.phase == BASELINE)),
+            np.flatnonzero(mine & (r.phase == LOADED)),
+        )
         if len(under) < 2 * RAMP_BINS or len(before) < 2 or n >= r.raw.shape[1] or dead[n]:
             continue
         clock = r.time_s[under] - r.time_s[before[-1]]
@@ -196,8 +255,15 @@ def reduce_ramps(r: Recording, scale: float, dead: NDArray[np.bool_]) -> list[Ra
         if len(keep) < 4:
             continue
         noise = float(np.sqrt(np.mean(np.diff(output, 2) ** 2) / 6.0 / len(keep[0])))
-        out.append(Ramped(n, np.array([output[p].mean() for p in keep]), np.array([load[p].mean() for p in keep]),
-                          np.array([clock[p].mean() for p in keep]), noise))
+        out.append(
+            Ramped(
+                n,
+                np.array([output[p].mean() for p in keep]),
+                np.array([load[p].mean() for p in keep]),
+                np.array([clock[p].mean() for p in keep]),
+                noise,
+            )
+        )
     return out
 
 
@@ -229,5 +295,9 @@ def find_lines(r: Recording, scale: float, outstanding: float = 60.0) -> list[Li
         fine = float(np.sum(frequency[near] * power[near]) / np.sum(power[near]))
         angle = 2.0 * np.pi * fine * np.arange(frames) / r.rate_hz
         amplitude = np.hypot(np.cos(angle) @ raw, np.sin(angle) @ raw) * 2.0 / frames
-        out.append(Line(fine, float(np.sqrt(np.mean(amplitude**2))), float(np.std(amplitude) / np.sqrt(raw.shape[1]))))
+        out.append(
+            Line(
+                fine, float(np.sqrt(np.mean(amplitude**2))), float(np.std(amplitude) / np.sqrt(raw.shape[1]))
+            )
+        )
     return out[:4]

@@ -58,7 +58,9 @@ class FingerSubject:
     model: SensorModel
     settled: tuple[NamedEffect, ...]
     notes: tuple[str, ...]
-    names: tuple[str, ...] = field(default_factory=lambda: tuple(n for n, e in library().items() if e.rankable))
+    names: tuple[str, ...] = field(
+        default_factory=lambda: tuple(n for n, e in library().items() if e.rankable)
+    )
     terms: tuple[str, ...] = tuple(t.name for t in TERMS)
 
     def views(self) -> Mapping[str, View]:
@@ -66,12 +68,25 @@ class FingerSubject:
         d = self.whole
         noise = float(np.sqrt(np.mean(d.touched.noise[d.alive] ** 2)))
         share = float(np.median(d.touched.share))
-        drift = float(np.median(d.untouched.noise[d.alive])) if d.untouched is not None else noise * np.sqrt(0.5 * share)
+        drift = (
+            float(np.median(d.untouched.noise[d.alive]))
+            if d.untouched is not None
+            else noise * np.sqrt(0.5 * share)
+        )
         ramp = float(np.median([r.noise for r in d.ramps])) if d.ramps else noise
-        return dict(zip(VIEWS, (View("outputs under touch", "%", 100.0 * noise * np.sqrt(share)),
-                                View("course under constant load", "%", 100.0 * float(np.median(d.course_sigma))),
-                                View("untouched outputs", "%", 100.0 * drift), View("load ramps", "%", 100.0 * ramp),
-                                View("load cell", "%", 100.0 * d.cell_spread)), strict=True))
+        return dict(
+            zip(
+                VIEWS,
+                (
+                    View("outputs under touch", "%", 100.0 * noise * np.sqrt(share)),
+                    View("course under constant load", "%", 100.0 * float(np.median(d.course_sigma))),
+                    View("untouched outputs", "%", 100.0 * drift),
+                    View("load ramps", "%", 100.0 * ramp),
+                    View("load cell", "N/m", d.cell_spread),
+                ),
+                strict=True,
+            )
+        )
 
     def features(self) -> Mapping[int, Floats]:
         """Columns of the state, in units of the floor like the rows."""
@@ -99,14 +114,19 @@ class FingerSubject:
         touch[d.view == TOUCH] = np.concatenate(columns, axis=1) / sigma.ravel()[:, None]
         found = {TOUCH: d.whiten(touch)[d.view == TOUCH]}
         count = len(place)
-        course = np.concatenate([np.kron(hats(place, _knots(place, 8)), np.eye(3)), np.kron(hats(d.scene.load, _knots(d.scene.load, 4)),
-                                                                                       np.eye(3))], axis=1)
+        course = np.concatenate(
+            [
+                np.kron(hats(place, _knots(place, 8)), np.eye(3)),
+                np.kron(hats(d.scene.load, _knots(d.scene.load, 4)), np.eye(3)),
+            ],
+            axis=1,
+        )
         found[COURSE] = course / np.repeat(d.course_sigma, 3)[:, None]
         if np.any(d.view == DRIFT):
             found[DRIFT] = _drift_features(d, count)
         return found
 
-    def groups(self) -> Floats:
+    def groups(self) -> NDArray[np.int64]:
         """Touch of each row of the view of touches."""
         return np.repeat(np.arange(len(self.training.touched)), len(self.training.alive))
 
@@ -115,13 +135,19 @@ class FingerSubject:
         d = self.whole
         b: Belief = self.model.base
         ns, t = len(d.alive), d.touched
-        per = {"place of touch": ("deg", np.degrees(t.place)), "load": ("N/m", t.load),
-               "indenter radius": ("mm", 1e3 * np.minimum(t.radius, 0.1)), "time": ("s", t.time)}
+        per = {
+            "place of touch": ("deg", np.degrees(t.place)),
+            "load": ("N/m", t.load),
+            "indenter radius": ("mm", 1e3 * np.minimum(t.radius, 0.1)),
+            "time": ("s", t.time),
+        }
         x = np.degrees(b.angle[d.alive] - t.place[:, None]).ravel()
         out: list[tuple[str, str, int, Floats]] = [
-            ("angle from the touch", "deg", TOUCH, x), ("distance from the touch", "deg", TOUCH, np.abs(x)),
+            ("angle from the touch", "deg", TOUCH, x),
+            ("distance from the touch", "deg", TOUCH, np.abs(x)),
             ("output", "%", TOUCH, 100.0 * t.output[:, d.alive].ravel()),
-            ("element", "1", TOUCH, np.tile(d.alive.astype(np.float64), len(t)))]
+            ("element", "1", TOUCH, np.tile(d.alive.astype(np.float64), len(t))),
+        ]
         out += [(name, unit, TOUCH, np.repeat(v, ns)) for name, (unit, v) in per.items()]
         out.append(("time under load", "1", COURSE, np.tile(np.arange(3.0), len(t))))
         if warm_known(t):
@@ -134,7 +160,10 @@ class FingerSubject:
 
     def propose(self, models: Sequence[SensorModel]) -> Proposal | None:
         """See ``finger.plan``."""
-        return propose([m.belief() for m in models], float(np.sqrt(np.mean(self.whole.touched.noise[self.whole.alive] ** 2))))
+        return propose(
+            [m.belief() for m in models],
+            float(np.sqrt(np.mean(self.whole.touched.noise[self.whole.alive] ** 2))),
+        )
 
     def curves(self, before: SensorModel, after: SensorModel) -> tuple[Curve, ...]:
         """Outputs of the element that disagreed most, over the place of touch, one curve per indenter."""
@@ -151,9 +180,20 @@ class FingerSubject:
             if np.count_nonzero(mine) < 6:
                 continue
             order = np.flatnonzero(mine)[np.argsort(d.touched.place[mine])]
-            kind = "edge" if radius == 0.0 else "flat" if np.isinf(radius) else f"radius {1e3 * radius:.2f} mm"
-            found.append(Curve(f"{name}, {kind}: element {worst}", "place of touch, deg", "output, %", np.degrees(d.touched.place[order]),
-                               100.0 * d.touched.output[order, worst], 100.0 * old[order, worst], 100.0 * new[order, worst]))
+            kind = (
+                "edge" if radius == 0.0 else "flat" if np.isinf(radius) else f"radius {1e3 * radius:.2f} mm"
+            )
+            found.append(
+                Curve(
+                    f"{name}, {kind}: element {worst}",
+                    "place of touch, deg",
+                    "output, %",
+                    np.degrees(d.touched.place[order]),
+                    100.0 * d.touched.output[order, worst],
+                    100.0 * old[order, worst],
+                    100.0 * new[order, worst],
+                )
+            )
         return tuple(found[:1] + found[-2:]) if len(found) > 3 else tuple(found)
 
     def unit(self, effect: str, symbol: str) -> str:
@@ -169,18 +209,33 @@ def _knots(values: Floats, count: int) -> Floats:
 def _drift_features(d: FingerData, count: int) -> Floats:
     rows = []
     if warm_known(d.touched):
-        rows.append(np.concatenate([hats(d.touched.time, _knots(d.touched.time, 8)),
-                                    hats(d.touched.temperature, _knots(d.touched.temperature, 6)), np.zeros((count, 6))], axis=1))
+        rows.append(
+            np.concatenate(
+                [
+                    hats(d.touched.time, _knots(d.touched.time, 8)),
+                    hats(d.touched.temperature, _knots(d.touched.temperature, 6)),
+                    np.zeros((count, 6)),
+                ],
+                axis=1,
+            )
+        )
     if d.untouched is not None:
         t = d.untouched.temperature
-        own = np.concatenate([np.zeros((len(t), rows[0].shape[1] - 6 if rows else 0)), hats(t, _knots(t, 6))], axis=1)
+        own = np.concatenate(
+            [np.zeros((len(t), rows[0].shape[1] - 6 if rows else 0)), hats(t, _knots(t, 6))], axis=1
+        )
         rows.append(np.repeat(own, len(d.alive), axis=0))
     widest = max(r.shape[1] for r in rows)
     return np.concatenate([np.pad(r, ((0, 0), (0, widest - r.shape[1]))) for r in rows])
 
 
-def prepare(experiments: Sequence[Experiment], nominal: Belief, name: str, scale: float = 0.01,
-            refine_extent: bool = True) -> FingerSubject:
+def prepare(
+    experiments: Sequence[Experiment],
+    nominal: Belief,
+    name: str,
+    scale: float = 0.01,
+    refine_extent: bool = True,
+) -> FingerSubject:
     """Check the recordings and lay them out.
 
     Args:
@@ -195,14 +250,18 @@ def prepare(experiments: Sequence[Experiment], nominal: Belief, name: str, scale
     count = len(nominal.angle)
     touches = [e for e in experiments if e.touches is not None]
     if not touches:
-        raise BadInputError("read recordings: none holds touches (cmd_theta, cmd_P, cmd_rc); record some first")
+        raise BadInputError(
+            "read recordings: none holds touches (cmd_theta, cmd_P, cmd_rc); record some first"
+        )
     for e in experiments:
         check_raw(e.recording.raw, count, e.name)
         if e.touches is not None:
             check_commands(*e.touches, e.name)
     dead = _stuck([e.recording for e in touches])
     if np.count_nonzero(~dead) < 2:
-        raise BadInputError(f"read recordings: {int(dead.sum())} of {count} elements are stuck or hold no numbers; needs 2 living ones")
+        raise BadInputError(
+            f"read recordings: {int(dead.sum())} of {count} elements are stuck or hold no numbers; needs 2 living ones"
+        )
     by_name = {e.name: e.recording for e in experiments}
     lines = find_lines(by_name["noise"], scale) if "noise" in by_name else []
     told = [(e.name, e.recording, *e.touches) for e in touches if e.touches is not None]
@@ -211,14 +270,16 @@ def prepare(experiments: Sequence[Experiment], nominal: Belief, name: str, scale
     after = max(float(e.recording.time_s[-1]) for e in experiments if e.name not in ("thermal", "noise"))
     still = reduce_untouched(by_name["thermal"], scale, after_s=after) if "thermal" in by_name else None
     ramps = tuple(reduce_ramps(by_name["ramp"], scale, ~alive)) if "ramp" in by_name else ()
-    base = replace(nominal, angle=np.ascontiguousarray(nominal.angle))
+    base = replace(nominal, angle=np.ascontiguousarray(nominal.angle), around=nominal.poisson)
     library_ = {**library(), **{t.name: t for t in TERMS}}
     model = SensorModel(base, count, library_, {}, (EXTENT,) if refine_extent else (), name)
     model, settled = _settle(model, lines, alive)
     whole = _rows(touched, np.flatnonzero(alive), still, ramps, base, notes)
     notes += _missing(by_name, touched, refine_extent)
     mine = untouched(len(touched))
-    return FingerSubject(whole, only(whole, ~mine, base.angle), only(whole, mine, base.angle), model, settled, tuple(notes))
+    return FingerSubject(
+        whole, only(whole, ~mine, base.angle), only(whole, mine, base.angle), model, settled, tuple(notes)
+    )
 
 
 def _stuck(recordings: Sequence[Recording]) -> NDArray[np.bool_]:
@@ -232,34 +293,75 @@ def _stuck(recordings: Sequence[Recording]) -> NDArray[np.bool_]:
     return out
 
 
-def _settle(model: SensorModel, lines: Sequence[Line], alive: NDArray[np.bool_]) -> tuple[SensorModel, tuple[NamedEffect, ...]]:
+def _settle(
+    model: SensorModel, lines: Sequence[Line], alive: NDArray[np.bool_]
+) -> tuple[SensorModel, tuple[NamedEffect, ...]]:
     """Name what channels of their own have shown."""
     settled: list[NamedEffect] = []
     if lines:
         line = lines[0]
         effect = model.library["mains_line"]
-        model = model.with_effect("mains_line", {"a": np.array([line.amplitude]), "f": np.array([line.frequency])})
+        model = model.with_effect(
+            "mains_line", {"a": np.array([line.amplitude]), "f": np.array([line.frequency])}
+        )
         e = 1.96 * line.deviation
         told = [f"{100 * q.amplitude:.3g} % at {q.frequency:.3f} Hz" for q in lines]
-        settled.append(_named(effect, (Estimate("a", line.amplitude, line.amplitude - e, line.amplitude + e, "1", "amplitude"),
-                                       Estimate("f", line.frequency, line.frequency, line.frequency, "Hz", "frequency")),
-                              f"stands out of the spectrum of untouched frames: {', '.join(told)}; taken off every touch"))
+        settled.append(
+            _named(
+                effect,
+                (
+                    Estimate("a", line.amplitude, line.amplitude - e, line.amplitude + e, "1", "amplitude"),
+                    Estimate("f", line.frequency, line.frequency, line.frequency, "Hz", "frequency"),
+                ),
+                f"stands out of the spectrum of untouched frames: {', '.join(told)}; taken off every touch",
+            )
+        )
     lost = np.flatnonzero(~alive)
     if len(lost):
         effect = model.library["dead_element"]
         model = model.with_effect("dead_element", {"index": np.array([float(lost[0])])})
-        settled.append(_named(effect, tuple(Estimate(f"index[{i}]" if len(lost) > 1 else "index", float(n), float(n), float(n), "1",
-                                                     "its number, from 0") for i, n in enumerate(lost)),
-                              f"element {', '.join(map(str, lost))}: touches that should be felt there change nothing"))
+        settled.append(
+            _named(
+                effect,
+                tuple(
+                    Estimate(
+                        f"index[{i}]" if len(lost) > 1 else "index",
+                        float(n),
+                        float(n),
+                        float(n),
+                        "1",
+                        "its number, from 0",
+                    )
+                    for i, n in enumerate(lost)
+                ),
+                f"element {', '.join(map(str, lost))}: touches that should be felt there change nothing",
+            )
+        )
     return model, tuple(settled)
 
 
 def _named(effect: SensorEffect, estimates: tuple[Estimate, ...], evidence: str) -> NamedEffect:
-    return NamedEffect(effect.name, effect.title, effect.equation, effect.channel.value, estimates, 1.0, np.inf, 1.0, (evidence,))
+    return NamedEffect(
+        effect.name,
+        effect.title,
+        effect.equation,
+        effect.channel.value,
+        estimates,
+        1.0,
+        np.inf,
+        1.0,
+        (evidence,),
+    )
 
 
-def _rows(t: Touched, alive: NDArray[np.intp], still: Untouched | None, ramps: tuple[Ramped, ...], base: Belief,
-          notes: list[str]) -> FingerData:
+def _rows(
+    t: Touched,
+    alive: NDArray[np.intp],
+    still: Untouched | None,
+    ramps: tuple[Ramped, ...],
+    base: Belief,
+    notes: list[str],
+) -> FingerData:
     """Lay out the rows with the best guess of each touch's load: the load cell at the commanded level if outputs follow it."""
     count = len(t)
     told = bool(np.isfinite(t.cell).all() and np.ptp(t.cell) > 0.0 and np.all(t.cell > 0.0))
@@ -267,13 +369,17 @@ def _rows(t: Touched, alive: NDArray[np.intp], still: Untouched | None, ramps: t
     if told:
         level = float(np.median(t.cell / t.load))
         ratio = t.cell / t.load / level
-        spread = float(max(1.4826 * np.median(np.abs(ratio - 1.0)), np.median(t.cell_noise / t.load)) * max(level, 1e-9) / level)
+        spread = float(max(1.4826 * np.median(np.abs(t.cell - level * t.load)), np.median(t.cell_noise)))
         if _follows(t, ratio, base, alive):
             load, share = t.cell / level, LOAD_MARGIN * t.cell_noise / t.cell
         else:
-            notes.append("the outputs do not follow the load cell from touch to touch: the commanded load was used")
+            notes.append(
+                "the outputs do not follow the load cell from touch to touch: the commanded load was used"
+            )
     else:
-        notes.append(f"no load cell: the commanded load was used, {100 * LOAD_SPREAD:.0f} % of it taken as uncertain")
+        notes.append(
+            f"no load cell: the commanded load was used, {100 * LOAD_SPREAD:.0f} % of it taken as uncertain"
+        )
     return lay_out(t, alive, still, ramps, base.angle, share, load, spread)
 
 
@@ -309,8 +415,14 @@ def _missing(by_name: Mapping[str, Recording], t: Touched, refine: bool) -> list
     return out
 
 
-def reconcile(experiments: Sequence[Experiment], nominal: Belief, name: str, options: Options | None = None, scale: float = 0.01,
-              refine_extent: bool = True) -> SensorVerdict:
+def reconcile(
+    experiments: Sequence[Experiment],
+    nominal: Belief,
+    name: str,
+    options: Options | None = None,
+    scale: float = 0.01,
+    refine_extent: bool = True,
+) -> SensorVerdict:
     """Prepare and analyse one finger.
 
     Raises:

@@ -36,7 +36,8 @@ def warming(output: Floats, scene: Scene, p: Floats) -> Floats:
 
 def lifted(output: Floats, scene: Scene, p: Floats) -> Floats:
     """Add k, wherever the touch is."""
-    return output + p[0]
+    out: Floats = output + p[0]
+    return out
 
 
 def stiffening(output: Floats, scene: Scene, p: Floats) -> Floats:
@@ -62,24 +63,63 @@ def rippled(output: Floats, scene: Scene, p: Floats) -> Floats:
     return out
 
 
-def _term(name: str, equation: str, response: Response, *parameters: Quantity, lookalikes: tuple[str, ...] = ()) -> SensorEffect:
+def _term(
+    name: str, equation: str, response: Response, *parameters: Quantity, lookalikes: tuple[str, ...] = ()
+) -> SensorEffect:
     def change(b: Belief, v: Values) -> Belief:
         return b.responding(response, np.concatenate([v[q.symbol] for q in parameters]))
 
-    return SensorEffect(name=TERM_PREFIX + name, title=equation, channel=Channel.SENSOR, equation=equation, change=change,
-                        parameters=parameters, signature="", lookalikes=lookalikes, separate="")
+    return SensorEffect(
+        name=TERM_PREFIX + name,
+        title=equation,
+        channel=Channel.SENSOR,
+        equation=equation,
+        change=change,
+        parameters=parameters,
+        signature="",
+        lookalikes=lookalikes,
+        separate="",
+    )
 
 
 TERMS = (
-    _term("cube", "d = l + k l^3", cubed, Quantity("k", "1", -500.0, 500.0, 20.0, "size"), lookalikes=("quadratic",)),
+    _term(
+        "cube",
+        "d = l + k l^3",
+        cubed,
+        Quantity("k", "1", -500.0, 500.0, 20.0, "size"),
+        lookalikes=("quadratic",),
+    ),
     _term("time", "d = l (1 + k (t - mean t))", fading, Quantity("k", "1/s", -0.1, 0.1, 1e-5, "size")),
     _term("warmth", "d = l (1 + k (T - mean T))", warming, Quantity("k", "1/K", -1.0, 1.0, 0.01, "size")),
-    _term("offset", "d = l + k under any touch", lifted, Quantity("k", "1", -0.3, 0.3, 1e-3, "size"), lookalikes=("proximity",)),
-    _term("load", "d = l (P / 200 N/m)^k", stiffening, Quantity("k", "1", -1.0, 1.0, 0.02, "exponent"),
-          lookalikes=("quadratic", "hertz")),
-    _term("lopsided", "d = l + k x/w exp(-|x|/w), x from the touch", lopsided, Quantity("k", "1", -0.3, 0.3, 2e-3, "size"),
-          Quantity("w", "rad", 0.02, 1.0, 0.05, "reach", starts=(0.05, 0.15, 0.4)), lookalikes=("sliding_friction", "angle_offset")),
-    _term("ripple", "d = l + k sin(n t_i + phase) under any touch", rippled, Quantity("k", "1", 0.0, 0.3, 1e-3, "size"),
-          Quantity("phase", "rad", -np.pi, np.pi, 0.3, "phase", phase=True),
-          Quantity("n", "1", 0.5, 20.0, 0.3, "order", starts=(1.0, 2.0, 4.0, 8.0))),
+    _term(
+        "offset",
+        "d = l + k under any touch",
+        lifted,
+        Quantity("k", "1", -0.3, 0.3, 1e-3, "size"),
+        lookalikes=("proximity",),
+    ),
+    _term(
+        "load",
+        "d = l (P / 200 N/m)^k",
+        stiffening,
+        Quantity("k", "1", -1.0, 1.0, 0.02, "exponent"),
+        lookalikes=("quadratic", "hertz"),
+    ),
+    _term(
+        "lopsided",
+        "d = l + k x/w exp(-|x|/w), x from the touch",
+        lopsided,
+        Quantity("k", "1", -0.3, 0.3, 2e-3, "size"),
+        Quantity("w", "rad", 0.02, 1.0, 0.05, "reach", starts=(0.05, 0.15, 0.4)),
+        lookalikes=("sliding_friction", "angle_offset"),
+    ),
+    _term(
+        "ripple",
+        "d = l + k sin(n t_i + phase) under any touch",
+        rippled,
+        Quantity("k", "1", 0.0, 0.3, 1e-3, "size"),
+        Quantity("phase", "rad", -np.pi, np.pi, 0.3, "phase", phase=True),
+        Quantity("n", "1", 0.5, 20.0, 0.3, "order", starts=(1.0, 2.0, 4.0, 8.0)),
+    ),
 )

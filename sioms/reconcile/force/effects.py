@@ -61,48 +61,79 @@ def _response(response: Response, *symbols: str) -> Callable[[Any, Values], Any]
 
 
 GAIN = SensorEffect(
-    name="gain", title="gains that differ from the stated ones", channel=SENSOR, change=_gain,
+    name="gain",
+    title="gains that differ from the stated ones",
+    channel=SENSOR,
+    change=_gain,
     equation="reading_i = (1 + g_i) (stated reading_i)",
-    parameters=(Quantity("g", "1", -0.9, 9.0, 0.02, "relative departure of each component's gain", each=True),),
-    signature="reading off in proportion to its own load", lookalikes=("cross_talk", "quadratic", "hysteresis"),
-    separate="load each component alone, in both directions", twins=("cross_talk",),
+    parameters=(
+        Quantity("g", "1", -0.9, 9.0, 0.02, "relative departure of each component's gain", each=True),
+    ),
+    signature="reading off in proportion to its own load",
+    lookalikes=("cross_talk", "quadratic", "hysteresis"),
+    separate="load each component alone, in both directions",
+    twins=("cross_talk",),
 )
 QUADRATIC = SensorEffect(
-    name="quadratic", title="quadratic terms", channel=SENSOR, change=_response(squared, "q"),
+    name="quadratic",
+    title="quadratic terms",
+    channel=SENSOR,
+    change=_response(squared, "q"),
     equation="reading_i = l_i + q_i l_i^2",
     parameters=(Quantity("q", "1", -1.0, 1.0, 0.01, "at full range, of each component", each=True),),
-    signature="off alike for both signs of the load, with its square", lookalikes=("gain", "hysteresis"),
+    signature="off alike for both signs of the load, with its square",
+    lookalikes=("gain", "hysteresis"),
     separate="each component alone in five steps or more, in both directions",
 )
 DRIFT = SensorEffect(
-    name="offset_drift", title="zero that drifts with time", channel=SENSOR,
+    name="offset_drift",
+    title="zero that drifts with time",
+    channel=SENSOR,
     change=_response(drifting, "d"),
     equation="reading_i = l_i + d_i t",
     parameters=(Quantity("d", "1/s", -1.0, 1.0, 1e-5, "of each component", each=True),),
-    signature="off in proportion to time, whatever the load", lookalikes=("temperature",),
-    separate="ten minutes at zero load at constant temperature, then a temperature step", session=("d",),
+    signature="off in proportion to time, whatever the load",
+    lookalikes=("temperature",),
+    separate="ten minutes at zero load at constant temperature, then a temperature step",
+    session=("d",),
 )
 TEMPERATURE = SensorEffect(
-    name="temperature", title="zero that follows the temperature", channel=SENSOR,
+    name="temperature",
+    title="zero that follows the temperature",
+    channel=SENSOR,
     change=_response(warming, "k"),
     equation="reading_i = l_i + k_i (T - T0)",
     parameters=(Quantity("k", "1/K", -1.0, 1.0, 1e-3, "of each component", each=True),),
-    signature="off with the temperature, whatever the load", lookalikes=("offset_drift", "temperature_gain"),
-    separate="ten minutes at zero load at constant temperature, then a temperature step", session=("T0",),
+    signature="off with the temperature, whatever the load",
+    lookalikes=("offset_drift", "temperature_gain"),
+    separate="ten minutes at zero load at constant temperature, then a temperature step",
+    session=("T0",),
 )
 TEMPERATURE_GAIN = SensorEffect(
-    name="temperature_gain", title="gain that follows the temperature", channel=SENSOR,
+    name="temperature_gain",
+    title="gain that follows the temperature",
+    channel=SENSOR,
     change=_response(softening, "k"),
     equation="reading = l (1 + k (T - T0))",
     parameters=(Quantity("k", "1/K", -0.2, 0.2, 2e-3, "relative, alike for all components"),),
-    signature="off with load times temperature", lookalikes=("temperature", "gain"), separate="the same loads cold and warm",
+    signature="off with load times temperature",
+    lookalikes=("temperature", "gain"),
+    separate="the same loads cold and warm",
 )
 HYSTERESIS = SensorEffect(
-    name="hysteresis", title="hysteresis", channel=MECHANICS, change=_response(lagging, "b", "r"),
+    name="hysteresis",
+    title="hysteresis",
+    channel=MECHANICS,
+    change=_response(lagging, "b", "r"),
     equation="reading_i = l_i + b_i (z_i - l_i)/r, z_i the play of width r about l_i",
-    parameters=(Quantity("b", "1", 0.0, 0.5, 5e-3, "half width of the loop, of each component", each=True),
-                Quantity("r", "1", 5e-3, 1.0, 0.05, "change of load over which it turns round", starts=(0.03, 0.1, 0.3))),
-    signature="off one way while the load rises and the other way while it falls", lookalikes=("quadratic", "gain"),
+    parameters=(
+        Quantity("b", "1", 0.0, 0.5, 5e-3, "half width of the loop, of each component", each=True),
+        Quantity(
+            "r", "1", 5e-3, 1.0, 0.05, "change of load over which it turns round", starts=(0.03, 0.1, 0.3)
+        ),
+    ),
+    signature="off one way while the load rises and the other way while it falls",
+    lookalikes=("quadratic", "gain"),
     separate="each component alone up and down in steps, in both directions",
 )
 
@@ -116,12 +147,21 @@ def _cross(names: tuple[str, ...]) -> SensorEffect:
         return replace(b, matrix=b.matrix + extra)
 
     return SensorEffect(
-        name="cross_talk", title="cross-talk between components", channel=SENSOR, change=change,
+        name="cross_talk",
+        title="cross-talk between components",
+        channel=SENSOR,
+        change=change,
         equation="reading_i = l_i + sum over j of x_ij l_j, j not i",
-        parameters=tuple(Quantity(f"from_{n}", "1", -2.0, 2.0, 0.01, f"reading of each component per load of {n}", each=True)
-                         for n in names),
-        signature="off in proportion to the load of another component", lookalikes=("gain",),
-        separate="load each component alone, in both directions", twins=("gain",),
+        parameters=tuple(
+            Quantity(
+                f"from_{n}", "1", -2.0, 2.0, 0.01, f"reading of each component per load of {n}", each=True
+            )
+            for n in names
+        ),
+        signature="off in proportion to the load of another component",
+        lookalikes=("gain",),
+        separate="load each component alone, in both directions",
+        twins=("gain",),
     )
 
 
@@ -138,7 +178,8 @@ def fading(reading: Floats, loads: Loads, p: Floats) -> Floats:
 
 def settling(reading: Floats, loads: Loads, p: Floats) -> Floats:
     """Add d (1 - exp(-t/tau))."""
-    return reading - p[:-1] * np.expm1(-loads.time / p[-1])[:, None]
+    out: Floats = reading - p[:-1] * np.expm1(-loads.time / p[-1])[:, None]
+    return out
 
 
 def coupled(reading: Floats, loads: Loads, p: Floats) -> Floats:
@@ -146,19 +187,45 @@ def coupled(reading: Floats, loads: Loads, p: Floats) -> Floats:
     return reading + p * loads.load * loads.load[:, :1]
 
 
-def _term(name: str, equation: str, response: Response, *parameters: Quantity, lookalikes: tuple[str, ...] = ()) -> SensorEffect:
+def _term(
+    name: str, equation: str, response: Response, *parameters: Quantity, lookalikes: tuple[str, ...] = ()
+) -> SensorEffect:
     change = _response(response, *(q.symbol for q in parameters))
-    return SensorEffect(name=TERM_PREFIX + name, title=equation, channel=SENSOR, equation=equation,
-                        change=change, parameters=parameters,
-                        signature="", lookalikes=lookalikes, separate="")
+    return SensorEffect(
+        name=TERM_PREFIX + name,
+        title=equation,
+        channel=SENSOR,
+        equation=equation,
+        change=change,
+        parameters=parameters,
+        signature="",
+        lookalikes=lookalikes,
+        separate="",
+    )
 
 
 TERMS = (
-    _term("cube", "reading_i = l_i + k_i l_i^3", cubed, Quantity("k", "1", -2.0, 2.0, 0.01, "at full range", each=True)),
+    _term(
+        "cube",
+        "reading_i = l_i + k_i l_i^3",
+        cubed,
+        Quantity("k", "1", -2.0, 2.0, 0.01, "at full range", each=True),
+    ),
     _term("time", "reading = l (1 + k t)", fading, Quantity("k", "1/s", -0.1, 0.1, 1e-5, "size")),
-    _term("settling", "reading_i = l_i + d_i (1 - exp(-t/tau))", settling, Quantity("d", "1", -1.0, 1.0, 0.01, "at last", each=True),
-          Quantity("tau", "s", 0.1, 1e5, 20.0, "time constant", starts=(5.0, 20.0, 60.0, 200.0)), lookalikes=("offset_drift",)),
-    _term("coupled", "reading_i = l_i + k_i l_i l_1", coupled, Quantity("k", "1", -2.0, 2.0, 0.01, "at full range", each=True)),
+    _term(
+        "settling",
+        "reading_i = l_i + d_i (1 - exp(-t/tau))",
+        settling,
+        Quantity("d", "1", -1.0, 1.0, 0.01, "at last", each=True),
+        Quantity("tau", "s", 0.1, 1e5, 20.0, "time constant", starts=(5.0, 20.0, 60.0, 200.0)),
+        lookalikes=("offset_drift",),
+    ),
+    _term(
+        "coupled",
+        "reading_i = l_i + k_i l_i l_1",
+        coupled,
+        Quantity("k", "1", -2.0, 2.0, 0.01, "at full range", each=True),
+    ),
 )
 BUILT_IN = (DRIFT, TEMPERATURE, TEMPERATURE_GAIN, GAIN, QUADRATIC, HYSTERESIS)
 

@@ -1,10 +1,10 @@
 """Force/torque sensor models as TOML text.
 
-    [sensor]
-    name = "wrist"
-    components = ["fx", "fy", "fz", "tx", "ty", "tz"]
-    full_range = [100.0, 100.0, 200.0, 8.0, 8.0, 8.0]   # N, N m
-    matrix = [[1.0, 0.0, ...], ...]                     # reading per load; default: the identity
+[sensor]
+name = "wrist"
+components = ["fx", "fy", "fz", "tx", "ty", "tz"]
+full_range = [100.0, 100.0, 200.0, 8.0, 8.0, 8.0]   # N, N m
+matrix = [[1.0, 0.0, ...], ...]                     # reading per load; default: the identity
 """
 
 from __future__ import annotations
@@ -30,26 +30,36 @@ def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, tuple
         BadInputError: a key is missing, unknown or makes no sense.
     """
     if set(table) - {"sensor", "effects"} or "sensor" not in table:
-        raise BadInputError(f"read model {where}: needs the tables sensor and effects; got {', '.join(sorted(table)) or 'nothing'}")
+        raise BadInputError(
+            f"read model {where}: needs the tables sensor and effects; got {', '.join(sorted(table)) or 'nothing'}"
+        )
     t = table["sensor"]
     odd = sorted(set(t) - set(KEYS))
     if odd:
         raise BadInputError(f"read model {where}: nobody reads {', '.join(odd)}; known are {', '.join(KEYS)}")
     names = tuple(t.get("components", ()))
     if not names or not all(isinstance(n, str) for n in names) or len(set(names)) != len(names):
-        raise BadInputError(f"read model {where}: components is {t.get('components')!r}; needs a list of different names")
+        raise BadInputError(
+            f"read model {where}: components is {t.get('components')!r}; needs a list of different names"
+        )
     count = len(names)
     full = numbers(t, "full_range", where, count)
     if not np.all(full > 0.0):
-        raise BadInputError(f"read model {where}: full_range holds {float(full.min()):g}; needs N and N m, > 0")
+        raise BadInputError(
+            f"read model {where}: full_range holds {float(full.min()):g}; needs N and N m, > 0"
+        )
     matrix = np.eye(count)
     if "matrix" in t:
         try:
             matrix = np.asarray(t["matrix"], dtype=np.float64)
         except ValueError as e:
-            raise BadInputError(f"read model {where}: matrix holds what is no number, or rows of different lengths") from e
+            raise BadInputError(
+                f"read model {where}: matrix holds what is no number, or rows of different lengths"
+            ) from e
         if matrix.shape != (count, count) or not np.isfinite(matrix).all():
-            raise BadInputError(f"read model {where}: matrix has shape {matrix.shape}; needs ({count}, {count}), finite")
+            raise BadInputError(
+                f"read model {where}: matrix has shape {matrix.shape}; needs ({count}, {count}), finite"
+            )
     belief = ForceBelief(full, matrix * full[None, :] / full[:, None])
     model = SensorModel(belief, count, library(names), {}, (), str(t.get("name", "sensor")))
     return effects_from(model, table.get("effects", {}), where), names
@@ -58,9 +68,18 @@ def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, tuple
 def to_toml(model: SensorModel) -> str:
     """Write a model: nominal sensor and effects."""
     b: ForceBelief = model.base
-    names = [q.symbol.removeprefix("from_") for q in model.library["cross_talk"].parameters] if model.count > 1 else ["fz"]
+    names = (
+        [q.symbol.removeprefix("from_") for q in model.library["cross_talk"].parameters]
+        if model.count > 1
+        else ["fz"]
+    )
     matrix = b.matrix * b.full[:, None] / b.full[None, :]
     rows = ",\n".join("  [" + ", ".join(repr(float(v)) for v in row) + "]" for row in matrix)
-    lines = ["[sensor]", f'name = "{model.name}"', "components = [" + ", ".join(f'"{n}"' for n in names) + "]",
-             "full_range = [" + ", ".join(repr(float(v)) for v in b.full) + "]", f"matrix = [\n{rows},\n]"]
+    lines = [
+        "[sensor]",
+        f'name = "{model.name}"',
+        "components = [" + ", ".join(f'"{n}"' for n in names) + "]",
+        "full_range = [" + ", ".join(repr(float(v)) for v in b.full) + "]",
+        f"matrix = [\n{rows},\n]",
+    ]
     return "\n".join(lines) + "\n" + effects_to_toml(model)

@@ -113,8 +113,10 @@ class ForceSubject:
     def views(self) -> Mapping[str, View]:
         """Readings in their own units."""
         full = self.model.base.full
-        return {n: View(f"reading {n}", unit_of(n), float(s * f)) for n, s, f in
-                zip(self.whole.views, self.whole.sigma, full, strict=True)}
+        return {
+            n: View(f"reading {n}", unit_of(n), float(s * f))
+            for n, s, f in zip(self.whole.views, self.whole.sigma, full, strict=True)
+        }
 
     def features(self) -> Mapping[int, Floats]:
         """Columns of the state, the same for every component."""
@@ -126,15 +128,19 @@ class ForceSubject:
             if np.ptp(own) == 0.0:
                 continue
             way = np.sign(np.gradient(own))
-            columns += [hats(own, _knots(own, 10)), hats(own, _knots(own, 6)) * way[:, None],
-                        own[:, None] * hats(loads.time, _knots(loads.time, 6)), (own * loads.warmth)[:, None]]
+            columns += [
+                hats(own, _knots(own, 10)),
+                hats(own, _knots(own, 6)) * way[:, None],
+                own[:, None] * hats(loads.time, _knots(loads.time, 6)),
+                (own * loads.warmth)[:, None],
+            ]
             columns += [(own * loads.load[:, j])[:, None] for j in range(i)]
         columns.append(hats(loads.warmth, _knots(loads.warmth, 6)))
         full = np.concatenate(columns, axis=1)[mine]
         full = full - full.mean(0)
         return {i: full / s for i, s in enumerate(d.sigma)}
 
-    def groups(self) -> Floats:
+    def groups(self) -> NDArray[np.int64]:
         """Row of time of each row of the first component."""
         return np.arange(int(self.training.which.sum()))
 
@@ -170,8 +176,17 @@ class ForceSubject:
         out = []
         for i in np.argsort(-size)[:3]:
             shift = [np.mean(r.reading[:, i] - v[:, i]) for v in (old, new)]
-            out.append(Curve(f"{r.names[i]}: reading less load", "time, s", unit_of(r.names[i]), r.time - r.time[0],
-                             r.reading[:, i] - r.load[:, i], old[:, i] + shift[0] - r.load[:, i], new[:, i] + shift[1] - r.load[:, i]))
+            out.append(
+                Curve(
+                    f"{r.names[i]}: reading less load",
+                    "time, s",
+                    unit_of(r.names[i]),
+                    r.time - r.time[0],
+                    r.reading[:, i] - r.load[:, i],
+                    old[:, i] + shift[0] - r.load[:, i],
+                    new[:, i] + shift[1] - r.load[:, i],
+                )
+            )
         return tuple(out)
 
     def unit(self, effect: str, symbol: str) -> str:
@@ -197,11 +212,31 @@ def catalogue(count: int) -> Sequence[tuple[str, str, Loads]]:
     still, rest = np.zeros((60, count)), 10.0 * np.arange(60, dtype=np.float64)
     one = np.zeros(len(alone), dtype=np.int64)
     return (
-        ("alone", "load each component alone in steps up and down, in both directions", Loads(alone, 0 * seconds, 0 * seconds, one)),
-        ("rest", "ten minutes at zero load at constant temperature", Loads(still, rest, 0 * rest, one[:1].repeat(60))),
-        ("warm", "a temperature step of 5 K at zero load", Loads(still, 0 * rest, 5.0 * (rest > 300.0), one[:1].repeat(60))),
-        ("cold and warm", "each component alone, cold and 10 K warmer",
-         Loads(np.concatenate([alone, alone]), np.zeros(2 * len(alone)), np.repeat([-5.0, 5.0], len(alone)), one.repeat(2))),
+        (
+            "alone",
+            "load each component alone in steps up and down, in both directions",
+            Loads(alone, 0 * seconds, 0 * seconds, one),
+        ),
+        (
+            "rest",
+            "ten minutes at zero load at constant temperature",
+            Loads(still, rest, 0 * rest, one[:1].repeat(60)),
+        ),
+        (
+            "warm",
+            "a temperature step of 5 K at zero load",
+            Loads(still, 0 * rest, np.where(rest > 300.0, 5.0, 0.0), one[:1].repeat(60)),
+        ),
+        (
+            "cold and warm",
+            "each component alone, cold and 10 K warmer",
+            Loads(
+                np.concatenate([alone, alone]),
+                np.zeros(2 * len(alone)),
+                np.repeat([-5.0, 5.0], len(alone)),
+                one.repeat(2),
+            ),
+        ),
     )
 
 
@@ -216,8 +251,15 @@ def prepare(records: ForceRecords, model: SensorModel) -> ForceSubject:
     t = records.temperature
     known = bool(np.isfinite(t).all() and np.ptp(t) > 0.0)
     if not known:
-        notes.append("temperature was not recorded, or is constant: what follows the temperature is not judged")
-    loads = Loads(records.load / full, records.time - records.time[0], t - t.mean() if known else np.zeros(len(t)), records.record)
+        notes.append(
+            "temperature was not recorded, or is constant: what follows the temperature is not judged"
+        )
+    loads = Loads(
+        records.load / full,
+        records.time - records.time[0],
+        t - t.mean() if known else np.zeros(len(t)),
+        records.record,
+    )
     measured = records.reading / full
     sigma = noise_of(loads, measured)
     block = blocks_of(len(measured))
@@ -232,7 +274,14 @@ def prepare(records: ForceRecords, model: SensorModel) -> ForceSubject:
 def noise_of(loads: Loads, measured: Floats) -> Floats:
     """Return the noise of each component: what no smooth function of load, time and temperature explains, row to row."""
     n = len(measured)
-    columns = [np.ones((n, 1)), loads.load, loads.load**2, loads.load**3, loads.time[:, None], loads.warmth[:, None]]
+    columns = [
+        np.ones((n, 1)),
+        loads.load,
+        loads.load**2,
+        loads.load**3,
+        loads.time[:, None],
+        loads.warmth[:, None],
+    ]
     way = np.sign(np.gradient(loads.load, axis=0))
     a = np.concatenate([*columns, way], axis=1)
     size = np.linalg.norm(a, axis=0)
@@ -242,7 +291,8 @@ def noise_of(loads: Loads, measured: Floats) -> Floats:
     noise = 1.4826 * np.median(np.abs(second), axis=0) / np.sqrt(6.0)
     steps = [np.diff(np.unique(np.round(measured[:, i], 12))) for i in range(measured.shape[1])]
     floor = np.array([float(s.min()) / np.sqrt(12.0) if len(s) and len(s) < n // 2 else 0.0 for s in steps])
-    return np.maximum(np.maximum(noise, floor), 1e-9)
+    out: Floats = np.maximum(np.maximum(noise, floor), 1e-9)
+    return out
 
 
 def check(r: ForceRecords, model: SensorModel) -> list[str]:
@@ -258,7 +308,9 @@ def check(r: ForceRecords, model: SensorModel) -> list[str]:
         if bad.any():
             column = int(np.flatnonzero(bad.any(0))[0])
             name = what if what == "time" else f"{what} {r.names[column]}"
-            raise BadInputError(f"read loads: {name} has {int(bad[:, column].sum())} values that are no numbers")
+            raise BadInputError(
+                f"read loads: {name} has {int(bad[:, column].sum())} values that are no numbers"
+            )
     if np.any(np.diff(r.time)[np.diff(r.record) == 0] < 0.0):
         raise BadInputError("read loads: time does not rise; needs seconds in the order of recording")
     notes: list[str] = []
@@ -270,8 +322,10 @@ def check(r: ForceRecords, model: SensorModel) -> list[str]:
             notes.append(f"{n} was never loaded: its gain and what it gives to others are not judged")
     for i, n in enumerate(r.names):
         if np.ptp(r.reading[:, i]) == 0.0:
-            raise BadInputError(f"read loads: reading {n} is constant at {r.reading[0, i]:g} {unit_of(n)}; the component is dead or "
-                                "the wrong column was named")
+            raise BadInputError(
+                f"read loads: reading {n} is constant at {r.reading[0, i]:g} {unit_of(n)}; the component is dead or "
+                "the wrong column was named"
+            )
     _check_match(r, model, moved)
     return notes
 
@@ -289,13 +343,19 @@ def _check_match(r: ForceRecords, model: SensorModel, moved: NDArray[np.bool_]) 
             continue
         scale = float(s @ g / (s @ s))
         if scale < 0.0:
-            raise BadInputError(f"compare readings with loads: {n} falls when its load rises; the sign of one of them is turned round")
+            raise BadInputError(
+                f"compare readings with loads: {n} falls when its load rises; the sign of one of them is turned round"
+            )
         if not 1.0 / FACTOR < scale < FACTOR:
-            raise BadInputError(f"compare readings with loads: {n} reads {scale:.4g} times its load (about "
-                                f"{10.0 ** round(np.log10(scale)):g}); check the units (N against mN or kN, N m against N mm)")
+            raise BadInputError(
+                f"compare readings with loads: {n} reads {scale:.4g} times its load (about "
+                f"{10.0 ** round(np.log10(scale)):g}); check the units (N against mN or kN, N m against N mm)"
+            )
     if np.median(like) < LEAST_LIKE:
-        raise BadInputError(f"compare readings with loads: they agree to {100 * float(np.median(like)):.0f} % (correlation); it is "
-                            "another sensor, or columns are exchanged")
+        raise BadInputError(
+            f"compare readings with loads: they agree to {100 * float(np.median(like)):.0f} % (correlation); it is "
+            "another sensor, or columns are exchanged"
+        )
 
 
 def reconcile(records: ForceRecords, model: SensorModel, options: Options | None = None) -> SensorVerdict:

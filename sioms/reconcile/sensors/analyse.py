@@ -87,7 +87,7 @@ class Subject(Protocol):
         """Return columns of the state for the generic smoother, per view of ``training``."""
         ...
 
-    def groups(self) -> Array:
+    def groups(self) -> NDArray[np.int64]:
         """Return the number of the touch or sample of each row of view 0 of ``training``."""
         ...
 
@@ -123,7 +123,9 @@ def analyse(subject: Subject, options: Options | None = None) -> SensorVerdict:
     rejected: tuple[str, ...] = ()
     odd = share > UNEXPLAINED and _loud(searcher, found, where)
     if odd:
-        o.progress(f"a smoother explains {100 * share:.0f} % of what remains of {where}: searching for a term")
+        o.progress(
+            f"a smoother explains {100 * share:.0f} % of what remains of {where}: searching for a term"
+        )
         before = found
         searcher.names = names + subject.terms
         found = searcher.run(subject.model)
@@ -146,7 +148,11 @@ def gate(subject: Subject) -> tuple[dict[str, str], tuple[tuple[str, str, float]
     for i, a in enumerate(shown):
         for b in shown[i + 1 :]:
             own, other = model.library[a], model.library[b]
-            alike = (b in own.lookalikes or a in other.lookalikes) and b not in own.replaces and a not in other.replaces
+            alike = (
+                (b in own.lookalikes or a in other.lookalikes)
+                and b not in own.replaces
+                and a not in other.replaces
+            )
             if alike and columns[a].shape[1] == columns[b].shape[1] == 1:
                 same = common(columns[a], columns[b])
                 if same > SAME:
@@ -166,9 +172,19 @@ def _bursts(subject: Subject, searcher: Searcher, found: Found) -> float:
     return burst_share(found.fit.residual[mine], subject.groups()) if ratio > QUIET else 0.0
 
 
-def _conclude(subject: Subject, o: Options, searcher: Searcher, found: Found, others: Sequence[Rival], missing: dict[str, str],
-              pairs: tuple[tuple[str, str, float], ...], share: float, left: bool, bursts: float,
-              rejected: tuple[str, ...]) -> SensorVerdict:
+def _conclude(
+    subject: Subject,
+    o: Options,
+    searcher: Searcher,
+    found: Found,
+    others: Sequence[Rival],
+    missing: dict[str, str],
+    pairs: tuple[tuple[str, str, float], ...],
+    share: float,
+    left: bool,
+    bursts: float,
+    rejected: tuple[str, ...],
+) -> SensorVerdict:
     rng = np.random.default_rng(o.seed)
     o.progress("untouched rows: gap before and after")
     start = found.ladder[0].model
@@ -180,29 +196,62 @@ def _conclude(subject: Subject, o: Options, searcher: Searcher, found: Found, ot
     disturbed = bursts > BURSTS and share < UNEXPLAINED
     unexplained = bool(terms) or left or disturbed
     ambiguous = bool(open_rivals)
-    outcome = (Outcome.UNEXPLAINED if unexplained else Outcome.AMBIGUOUS if ambiguous
-               else Outcome.NAMED if named else Outcome.NONE)
+    outcome = (
+        Outcome.UNEXPLAINED
+        if unexplained
+        else Outcome.AMBIGUOUS
+        if ambiguous
+        else Outcome.NAMED
+        if named
+        else Outcome.NONE
+    )
     alternatives: tuple[tuple[str, ...], ...] = ()
     plan = None
     if outcome is Outcome.AMBIGUOUS:
-        alternatives = tuple(tuple(r.rival if n == r.effect else n for n in fit.model.effects) for r in open_rivals)
+        alternatives = tuple(
+            tuple(r.rival if n == r.effect else n for n in fit.model.effects) for r in open_rivals
+        )
         plan = subject.propose([fit.model, *(r.fit.model for r in open_rivals)])
     notes = list(subject.notes)
     if disturbed:
-        notes.append(f"the residual comes in bursts ({100 * bursts:.0f} % of its energy in a tenth of the touches) that no state "
-                     "orders: a disturbance from outside, not an effect")
+        notes.append(
+            f"the residual comes in bursts ({100 * bursts:.0f} % of its energy in a tenth of the touches) that no state "
+            "orders: a disturbance from outside, not an effect"
+        )
     places: tuple[Place, ...] = ()
     curves: tuple[Curve, ...] = ()
     if o.pictures:
         o.progress("locating the disagreement")
         places = tuple(locate(subject, start, rng))
         curves = subject.curves(start, fit.model)
-    floors = dict(zip(subject.whole.views, (float(v) for v in _ratios(subject.whole, fit.model)), strict=True))
+    floors = dict(
+        zip(subject.whole.views, (float(v) for v in _ratios(subject.whole, fit.model)), strict=True)
+    )
     mine = subject.whole.view == 0
     e = subject.whole.miss(subject.whole.predict(fit.model))
-    return SensorVerdict(outcome, subject.model, fit.model, tuple(named), alternatives, tuple(terms), gaps, found.ladder, floors,
-                         missing, pairs, places, plan, max(floors.values()), share, bursts, effective_samples(e[mine]), len(e),
-                         tuple(notes), curves, rejected)
+    return SensorVerdict(
+        outcome,
+        subject.model,
+        fit.model,
+        tuple(named),
+        alternatives,
+        tuple(terms),
+        gaps,
+        found.ladder,
+        floors,
+        missing,
+        pairs,
+        places,
+        plan,
+        max(floors.values()),
+        share,
+        bursts,
+        effective_samples(e[mine]),
+        len(e),
+        tuple(notes),
+        curves,
+        rejected,
+    )
 
 
 def _ratios(data: Data, model: SensorModel) -> Array:
@@ -217,16 +266,31 @@ def _gaps(subject: Subject, before: SensorModel, after: SensorModel) -> tuple[Ga
     old, new = _ratios(subject.final, before), _ratios(subject.final, after)
     told = subject.views()
     present = np.bincount(subject.final.view, minlength=len(subject.final.views)) > 0
-    return tuple(Gap(told[v].title, told[v].unit, float(b) * told[v].floor, float(a) * told[v].floor, told[v].floor)
-                 for v, b, a, here in zip(subject.final.views, old, new, present, strict=True) if here)
+    return tuple(
+        Gap(told[v].title, told[v].unit, float(b) * told[v].floor, float(a) * told[v].floor, told[v].floor)
+        for v, b, a, here in zip(subject.final.views, old, new, present, strict=True)
+        if here
+    )
 
 
-def _describe(subject: Subject, fit: Fit, found: Found, searcher: Searcher, others: Sequence[Rival], replicates: int,
-              rng: np.random.Generator) -> tuple[list[NamedEffect], list[NamedEffect]]:
+def _describe(
+    subject: Subject,
+    fit: Fit,
+    found: Found,
+    searcher: Searcher,
+    others: Sequence[Rival],
+    replicates: int,
+    rng: np.random.Generator,
+) -> tuple[list[NamedEffect], list[NamedEffect]]:
     """Describe every effect, the largest first; terms apart."""
-    moves = bootstrap(fit, subject.whole.block, replicates, rng) * np.array([f.quantity.size for f in fit.free])[None, :]
-    spread = {(f.effect, f.quantity.symbol, f.index): 1.96 * float(s)
-              for f, s in zip(fit.free, np.std(moves, axis=0) if len(fit.free) else (), strict=True)}
+    moves = (
+        bootstrap(fit, subject.whole.block, replicates, rng)
+        * np.array([f.quantity.size for f in fit.free])[None, :]
+    )
+    spread = {
+        (f.effect, f.quantity.symbol, f.index): 1.96 * float(s)
+        for f, s in zip(fit.free, np.std(moves, axis=0) if len(fit.free) else (), strict=True)
+    }
     out: list[tuple[float, NamedEffect]] = [(np.inf, e) for e in subject.settled]
     for name in [n for n in fit.model.effects if n not in searcher.frozen]:
         effect = fit.model.library[name]
@@ -235,31 +299,69 @@ def _describe(subject: Subject, fit: Fit, found: Found, searcher: Searcher, othe
         gap = searcher.saving(found.losses, loss)
         frequency = _frequency(searcher, found.losses, loss, gap.view, rng)
         estimates = _estimates(subject, effect, fit.model, spread)
-        evidence = [f"without it {100 * gap.share:.1f} % of the squares of {gap.view} would come back ({gap.errors:.1f} standard errors)"]
-        ruled = {r.rival: f"reproduces all but {100 * r.missed:.1f} % of it, {r.errors:.1f} standard errors worse"
-                 for r in others if r.effect == name and not r.open}
-        ruled.update({n: f"saved {100 * g:.0f} % where this saved {100 * s.saved:.0f} %" for s in found.ladder
-                      if s.effect == name for n, g in s.rivals.items()
-                      if n in effect.lookalikes and n not in ruled and n not in fit.model.effects})
-        still = {r.rival: f"leaves only {100 * r.missed:.1f} % of it unexplained" for r in others if r.effect == name and r.open}
+        evidence = [
+            f"without it {100 * gap.share:.1f} % of the squares of {gap.view} would come back ({gap.errors:.1f} standard errors)"
+        ]
+        ruled = {
+            r.rival: f"reproduces all but {100 * r.missed:.1f} % of it, {r.errors:.1f} standard errors worse"
+            for r in others
+            if r.effect == name and not r.open
+        }
+        ruled.update(
+            {
+                n: f"saved {100 * g:.0f} % where this saved {100 * s.saved:.0f} %"
+                for s in found.ladder
+                if s.effect == name
+                for n, g in s.rivals.items()
+                if n in effect.lookalikes and n not in ruled and n not in fit.model.effects
+            }
+        )
+        still = {
+            r.rival: f"leaves only {100 * r.missed:.1f} % of it unexplained"
+            for r in others
+            if r.effect == name and r.open
+        }
         ruled = {k: v for k, v in ruled.items() if k not in still}
-        out.append((bare.cost - found.fit.cost, NamedEffect(
-            name, effect.title, effect.equation, effect.channel.value, estimates, gap.share, gap.errors, frequency,
-            tuple(evidence), ruled, still)))
+        out.append(
+            (
+                bare.cost - found.fit.cost,
+                NamedEffect(
+                    name,
+                    effect.title,
+                    effect.equation,
+                    effect.channel.value,
+                    estimates,
+                    gap.share,
+                    gap.errors,
+                    frequency,
+                    tuple(evidence),
+                    ruled,
+                    still,
+                ),
+            )
+        )
     out.sort(key=lambda e: -e[0])
     ordered = [e for _, e in out]
-    return ([e for e in ordered if not e.name.startswith(TERM_PREFIX)], [e for e in ordered if e.name.startswith(TERM_PREFIX)])
+    return (
+        [e for e in ordered if not e.name.startswith(TERM_PREFIX)],
+        [e for e in ordered if e.name.startswith(TERM_PREFIX)],
+    )
 
 
-def _estimates(subject: Subject, effect: SensorEffect, model: SensorModel,
-               spread: Mapping[tuple[str, str, int], float]) -> tuple[Estimate, ...]:
+def _estimates(
+    subject: Subject, effect: SensorEffect, model: SensorModel, spread: Mapping[tuple[str, str, int], float]
+) -> tuple[Estimate, ...]:
     out = []
     for q in effect.parameters:
         values = model.effects[effect.name][q.symbol]
         for i, v in enumerate(values):
             s = spread.get((effect.name, q.symbol, i), 0.0)
             symbol = f"{q.symbol}[{i}]" if len(values) > 1 else q.symbol
-            out.append(Estimate(symbol, float(v), float(v) - s, float(v) + s, subject.unit(effect.name, q.symbol), q.text))
+            out.append(
+                Estimate(
+                    symbol, float(v), float(v) - s, float(v) + s, subject.unit(effect.name, q.symbol), q.text
+                )
+            )
     return tuple(out)
 
 
@@ -292,12 +394,20 @@ def locate(subject: Subject, model: SensorModel, rng: np.random.Generator, shift
         floor = told[data.views[view]].floor
         mean = np.bincount(bins, weights=r) / count
         spread = np.sqrt(np.maximum(np.bincount(bins, weights=r**2) / count - mean**2, 0.0))
-        out.append(Place(f"{name} ({told[data.views[view]].title})", unit, share, p, np.bincount(bins, weights=values) / count,
-                         mean * floor, spread * floor))
+        out.append(
+            Place(
+                f"{name} ({told[data.views[view]].title})",
+                unit,
+                share,
+                p,
+                np.bincount(bins, weights=values) / count,
+                mean * floor,
+                spread * floor,
+            )
+        )
     return sorted(out, key=lambda q: -q.explained)
 
 
 def untouched(count: int) -> NDArray[np.bool_]:
     """Say which of a number of touches (or samples) take no part in any choice: every fifth."""
     return np.asarray(np.arange(count) % 5 == 2)
-

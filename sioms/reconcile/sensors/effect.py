@@ -89,13 +89,17 @@ class SensorEffect:
         known = [q.symbol for q in self.parameters]
         if set(values) != set(known):
             odd = sorted(set(values) ^ set(known))
-            raise ValueError(f"read effect {self.name}: parameters {odd} are unknown or missing; needs {known}")
+            raise ValueError(
+                f"read effect {self.name}: parameters {odd} are unknown or missing; needs {known}"
+            )
         out = {}
         for q in self.parameters:
             value = np.atleast_1d(np.asarray(values[q.symbol], dtype=np.float64))
             need = count if q.each else 1
             if value.shape != (need,):
-                raise ValueError(f"read effect {self.name}: {q.symbol} holds {value.size} numbers; needs {need}")
+                raise ValueError(
+                    f"read effect {self.name}: {q.symbol} holds {value.size} numbers; needs {need}"
+                )
             out[q.symbol] = value
         return out
 

@@ -83,8 +83,15 @@ def free_numbers(model: SensorModel, frozen: Sequence[str] = ()) -> tuple[Free, 
 
 def get(model: SensorModel, free: Sequence[Free]) -> Array:
     """Read the free numbers."""
-    return np.array([getattr(model.base, f.quantity.symbol) if f.effect == BASE
-                     else model.effects[f.effect][f.quantity.symbol][f.index] for f in free], dtype=np.float64)
+    return np.array(
+        [
+            getattr(model.base, f.quantity.symbol)
+            if f.effect == BASE
+            else model.effects[f.effect][f.quantity.symbol][f.index]
+            for f in free
+        ],
+        dtype=np.float64,
+    )
 
 
 def put(model: SensorModel, free: Sequence[Free], values: Array) -> SensorModel:
@@ -126,8 +133,14 @@ def slopes(data: Data, model: SensorModel, free: Sequence[Free], at: Array) -> A
     return data.whiten(raw)
 
 
-def refit(data: Data, model: SensorModel, weights: Array, frozen: Sequence[str] = (), iterations: int = 8,
-          tolerance: float = 1e-4) -> Fit:
+def refit(
+    data: Data,
+    model: SensorModel,
+    weights: Array,
+    frozen: Sequence[str] = (),
+    iterations: int = 8,
+    tolerance: float = 1e-4,
+) -> Fit:
     """Fit all free numbers by bounded Levenberg-Marquardt.
 
     Args:
@@ -148,7 +161,9 @@ def refit(data: Data, model: SensorModel, weights: Array, frozen: Sequence[str] 
         h, g = j.T @ j, j.T @ r
         gained = False
         for _ in range(5):
-            step = np.linalg.lstsq(h + damping * np.diag(np.diag(h) + 1e-9 * np.trace(h) + 1e-30), -g, rcond=1e-12)[0]
+            step = np.linalg.lstsq(
+                h + damping * np.diag(np.diag(h) + 1e-9 * np.trace(h) + 1e-30), -g, rcond=1e-12
+            )[0]
             trial = np.clip(at + np.clip(step, -3.0, 3.0) * size, lower, upper)
             rt = weights * data.miss(data.predict(put(model, free, trial)))
             ct = float(rt @ rt)

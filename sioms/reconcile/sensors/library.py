@@ -20,8 +20,12 @@ def collect(group: str, built_in: tuple[SensorEffect, ...]) -> dict[str, SensorE
         given = point.load()
         for effect in given if isinstance(given, tuple) else (given,):
             if not isinstance(effect, SensorEffect):
-                raise ValueError(f"load effect {point.name}: got {type(effect).__name__}; needs a SensorEffect")
+                raise ValueError(
+                    f"load effect {point.name}: got {type(effect).__name__}; needs a SensorEffect"
+                )
             if effect.name in found:
-                raise ValueError(f"load effect {point.name}: the name {effect.name} is in use; choose another")
+                raise ValueError(
+                    f"load effect {point.name}: the name {effect.name} is in use; choose another"
+                )
             found[effect.name] = effect
     return found

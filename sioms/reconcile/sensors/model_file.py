@@ -30,7 +30,9 @@ def effects_from(model: SensorModel, table: Mapping[str, Any], where: str) -> Se
     """
     for name, given in table.items():
         if name not in model.library:
-            raise BadInputError(f"read model {where}: effect {name!r} is not known; known are {', '.join(sorted(model.library))}")
+            raise BadInputError(
+                f"read model {where}: effect {name!r} is not known; known are {', '.join(sorted(model.library))}"
+            )
         if not given.get("on", True):
             continue
         values = {k: np.atleast_1d(np.asarray(v, dtype=np.float64)) for k, v in given.items() if k != "on"}
@@ -43,10 +45,14 @@ def effects_from(model: SensorModel, table: Mapping[str, Any], where: str) -> Se
 
 def number_or_list(values: np.ndarray[Any, np.dtype[np.float64]]) -> str:
     """Write one number plainly, several as a list; exact."""
-    return repr(float(values[0])) if len(values) == 1 else "[" + ", ".join(repr(float(v)) for v in values) + "]"
+    return (
+        repr(float(values[0])) if len(values) == 1 else "[" + ", ".join(repr(float(v)) for v in values) + "]"
+    )
 
 
-def numbers(table: Mapping[str, Any], key: str, where: str, count: int | None = None) -> np.ndarray[Any, np.dtype[np.float64]]:
+def numbers(
+    table: Mapping[str, Any], key: str, where: str, count: int | None = None
+) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Read a number or a list of numbers.
 
     Raises:
@@ -57,9 +63,13 @@ def numbers(table: Mapping[str, Any], key: str, where: str, count: int | None = 
     try:
         out = np.atleast_1d(np.asarray(table[key], dtype=np.float64))
     except (TypeError, ValueError) as e:
-        raise BadInputError(f"read model {where}: {key} is {table[key]!r}; needs a number or a list of numbers") from e
+        raise BadInputError(
+            f"read model {where}: {key} is {table[key]!r}; needs a number or a list of numbers"
+        ) from e
     if count is not None and out.size == 1:
         out = np.full(count, out[0])
     if (count is not None and out.shape != (count,)) or not np.isfinite(out).all():
-        raise BadInputError(f"read model {where}: {key} has {out.size} numbers or some that are not finite; needs {count or 1}")
+        raise BadInputError(
+            f"read model {where}: {key} has {out.size} numbers or some that are not finite; needs {count or 1}"
+        )
     return out

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sioms.reconcile.refuse import RIDGES
 from sioms.reconcile.sensors.effect import Array
@@ -35,7 +36,7 @@ def smoother_share(data: Data, fit: Fit, weights: Array, features: Mapping[int, 
     return best, where
 
 
-def _explained(f: Array, r: Array, fold: Array) -> float:
+def _explained(f: Array, r: Array, fold: NDArray[np.int64]) -> float:
     total = float(r @ r)
     if f.shape[1] == 0 or total == 0.0:
         return 0.0
@@ -52,7 +53,7 @@ def _explained(f: Array, r: Array, fold: Array) -> float:
     return best
 
 
-def burst_share(residual: Array, groups: Array) -> float:
+def burst_share(residual: Array, groups: NDArray[np.int64]) -> float:
     """Share of the energy above the quiet level that the loudest tenth of the groups (touches, samples) holds."""
     energy = np.bincount(groups, weights=residual**2) / np.maximum(np.bincount(groups), 1)
     above = np.clip(energy - np.median(energy), 0.0, None)

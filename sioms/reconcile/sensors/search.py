@@ -114,7 +114,9 @@ class Searcher:
         """Return the root mean square of each view in units of its floor."""
         e = self.data.miss(self.data.predict(model))
         count = np.maximum(np.bincount(self.data.view, minlength=len(self.data.views)), 1)
-        return np.asarray(np.sqrt(np.bincount(self.data.view, weights=e**2, minlength=len(self.data.views)) / count))
+        return np.asarray(
+            np.sqrt(np.bincount(self.data.view, weights=e**2, minlength=len(self.data.views)) / count)
+        )
 
     def saving(self, new: Array, old: Array) -> Saving:
         """Compare held-out losses by view."""
@@ -175,16 +177,21 @@ class Searcher:
             new = self.fit(model)
             loss = self.loss(new)
             tried[start.effect] = (new, loss, self.saving(loss, losses))
-        good = {n: t for n, t in tried.items()
-                if t[2].share >= GAIN and t[2].errors >= SURE and t[2].total > 0.0 and physical(t[0].model, n)}
+        good = {
+            n: t
+            for n, t in tried.items()
+            if t[2].share >= GAIN and t[2].errors >= SURE and t[2].total > 0.0 and physical(t[0].model, n)
+        }
         if not good:
             return None
         name = self._simplest(good)
         new, _, saved = good[name]
         others = {n: t[2].share for n, t in tried.items() if n != name}
         if saved.share < SPECIFIC and any(
-                t[2].share > NEARLY * saved.share and t[2].view == saved.view and n not in family(new.model, name)
-                for n, t in tried.items() if n != name):
+            t[2].share > NEARLY * saved.share and t[2].view == saved.view and n not in family(new.model, name)
+            for n, t in tried.items()
+            if n != name
+        ):
             return None
         return Rung("add", name, self._ratio(new), saved.share, new.model, others)
 
@@ -197,7 +204,10 @@ class Searcher:
             if negligible(gap.share, gap.errors):
                 near.append(n)
         model = good[best][0].model
-        return min(near or [best], key=lambda n: (n.startswith("term_"), model.library[n].size(model.count), -good[n][2].total))
+        return min(
+            near or [best],
+            key=lambda n: (n.startswith("term_"), model.library[n].size(model.count), -good[n][2].total),
+        )
 
     def _eliminate(self, fit: Fit, losses: Array, ladder: list[Rung]) -> tuple[Fit, Array]:
         """Let effects leave that no longer save their share."""
@@ -217,7 +227,11 @@ class Searcher:
         for name in [n for n in fit.model.effects if n not in self.frozen]:
             lib, count = fit.model.library, fit.model.count
             for other in lib[name].lookalikes:
-                if other not in self.names or other in fit.model.effects or lib[other].size(count) >= lib[name].size(count):
+                if (
+                    other not in self.names
+                    or other in fit.model.effects
+                    or lib[other].size(count) >= lib[name].size(count)
+                ):
                     continue
                 bare = self.fit(fit.model.without_effect(name), 3)
                 start = next(iter(screen(self.data, bare, self.weights, lib[other], self.frozen)), None)
@@ -228,7 +242,9 @@ class Searcher:
                 gap = self.lost(loss, losses)
                 if negligible(gap.share, gap.errors) and physical(new.model, other):
                     fit, losses = new, loss
-                    ladder.append(Rung("simplify", f"{name} to {other}", self._ratio(fit), -gap.share, fit.model))
+                    ladder.append(
+                        Rung("simplify", f"{name} to {other}", self._ratio(fit), -gap.share, fit.model)
+                    )
                     break
         return fit, losses
 
@@ -253,7 +269,9 @@ class Searcher:
         """Refit with each look-alike in the place of each named effect."""
         out = []
         lib, count = found.fit.model.library, found.fit.model.count
-        for name in [n for n in found.fit.model.effects if n not in self.frozen and not n.startswith("term_")]:
+        for name in [
+            n for n in found.fit.model.effects if n not in self.frozen and not n.startswith("term_")
+        ]:
             bare = self.fit(found.fit.model.without_effect(name), 4)
             contribution = bare.cost - found.fit.cost
             if contribution <= 0.0:
@@ -265,8 +283,16 @@ class Searcher:
                     fit = self.fit(without(bare.model, lib[other].replaces).with_effect(other, start.values))
                     if physical(fit.model, other):
                         _, errors = better(found.losses, self.loss(fit))
-                        out.append(Rival(name, other, (fit.cost - found.fit.cost) / contribution, errors,
-                                         fit.cost / found.fit.cost - 1.0, fit))
+                        out.append(
+                            Rival(
+                                name,
+                                other,
+                                (fit.cost - found.fit.cost) / contribution,
+                                errors,
+                                fit.cost / found.fit.cost - 1.0,
+                                fit,
+                            )
+                        )
         best: dict[tuple[str, str], Rival] = {}
         for r in out:
             if (r.effect, r.rival) not in best or r.missed < best[r.effect, r.rival].missed:
@@ -278,8 +304,11 @@ def alike(lib: Mapping[str, SensorEffect], name: str, count: int) -> list[str]:
     """Look-alikes in either direction that are not much richer, and the twins whatever their size."""
     own = lib[name]
     both = [n for n in lib if n in own.lookalikes or name in lib[n].lookalikes]
-    return [n for n in both if n not in own.replaces
-            and (lib[n].size(count) <= own.size(count) + 1 or n in own.twins)]
+    return [
+        n
+        for n in both
+        if n not in own.replaces and (lib[n].size(count) <= own.size(count) + 1 or n in own.twins)
+    ]
 
 
 def family(model: SensorModel, name: str) -> set[str]:
@@ -305,7 +334,9 @@ def physical(model: SensorModel, name: str) -> bool:
     return bool(q.lower + span < value[0] < q.upper - span and abs(value[0] - effect.neutral) > 1e-3 * q.size)
 
 
-def screen(data: Data, fit: Fit, weights: Array, effect: SensorEffect, frozen: tuple[str, ...] = ()) -> list[Start]:
+def screen(
+    data: Data, fit: Fit, weights: Array, effect: SensorEffect, frozen: tuple[str, ...] = ()
+) -> list[Start]:
     """Regress the residual on what a little of the effect would change; one start per trial shape, best first."""
     out = []
     known, r = fit.jacobian, fit.residual
@@ -314,13 +345,13 @@ def screen(data: Data, fit: Fit, weights: Array, effect: SensorEffect, frozen: t
         full = np.concatenate([known, *columns], axis=1)
         size = np.sqrt(np.einsum("ij,ij->j", full, full))
         live = size > 1e-9
-        if not live[known.shape[1]:].any():
+        if not live[known.shape[1] :].any():
             continue
         scaled = full[:, live] / size[live]
         h = scaled.T @ scaled
         d = np.zeros(len(size))
         d[live] = np.linalg.lstsq(h + 1e-9 * np.eye(len(h)), -scaled.T @ r, rcond=1e-10)[0] / size[live]
-        values = _settled(effect, shape, d[known.shape[1]:], fit.model.count)
+        values = _settled(effect, shape, d[known.shape[1] :], fit.model.count)
         if values is not None:
             out.append(Start(effect.name, values, _gain(data, r, r + full @ d)))
     return sorted(out, key=lambda s: -s.gain)
@@ -348,9 +379,12 @@ def _shapes(model: SensorModel, effect: SensorEffect) -> Iterator[list[dict[str,
             yield [{**values, phase.symbol: np.array([turn])} for turn in (0.0, 0.5 * np.pi)]
 
 
-def screening_columns(data: Data, model: SensorModel, effect: SensorEffect) -> Array:
-    """Return what a natural size of the effect in its first shape changes, in units of the floor, shape (n, k)."""
-    return _columns(data, model, effect, next(_shapes(model, effect))[0])
+def screening_columns(data: Data, model: SensorModel, effect: SensorEffect, tries: int = 5) -> Array:
+    """Return what a natural size of the effect changes at most, of a few of its shapes, in units of the floor, shape (n, k)."""
+    shapes = list(_shapes(model, effect))
+    step = max(len(shapes) // tries, 1)
+    found = [_columns(data, model, effect, shape[0]) for shape in shapes[::step]]
+    return max(found, key=lambda c: float(np.linalg.norm(c)))
 
 
 def _columns(data: Data, model: SensorModel, effect: SensorEffect, values: dict[str, Array]) -> Array:
@@ -361,7 +395,9 @@ def _columns(data: Data, model: SensorModel, effect: SensorEffect, values: dict[
     return slopes(data, trial, free, np.full(len(free), effect.neutral))
 
 
-def _settled(effect: SensorEffect, shape: list[dict[str, Array]], amount: Array, count: int) -> dict[str, Array] | None:
+def _settled(
+    effect: SensorEffect, shape: list[dict[str, Array]], amount: Array, count: int
+) -> dict[str, Array] | None:
     """Turn regression coefficients into values to start from; None where the sign is not the effect's."""
     q = effect.primary
     values = dict(shape[0])
@@ -377,4 +413,3 @@ def _settled(effect: SensorEffect, shape: list[dict[str, Array]], amount: Array,
         return None
     values[q.symbol] = held
     return values
-
