@@ -157,6 +157,8 @@ def unplugged(station: Station, full: bool) -> str:
 
 
 def _cut_off(station: Station, cut: Any, mend: Any, what: str) -> str:
+    if "{device}" in station.rig.tables and station.rig.line == "tcp":
+        raise NotApplicable("its samples come on a second connection, past the wire")
     before = station.status()
     with Calm(station) as calm:
         cut()
