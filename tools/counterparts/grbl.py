@@ -13,26 +13,14 @@ import re
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 from . import wire
 from .drive import Stepper
+from .grbl_gcode import Parser
 from .grbl_planner import BLOCKS, Planner
 
-WORDS = re.compile(r"([A-Z])(-?\d+(?:\.\d*)?|-?\.\d+)")
 RX_BYTES = 128
 REALTIME = set(b"?!~\x18\x84\x85") | set(range(0x90, 0xA2))
-
-
-@dataclass
-class Modal:
-    """Modal state of the G-code parser."""
-
-    absolute: bool = True
-    scale: float = 1.0
-    motion: int = 0
-    feed: float = 0.0
-    offset: list[float] = field(default_factory=list)
 
 
 class Controller:
@@ -55,7 +43,7 @@ class Controller:
             self.settings |= {100 + i: 250, 110 + i: 6000, 120 + i: 500, 130 + i: 200}
         self.planner = Planner(axes, self.settings, self._admit)
         self.state = "Alarm" if homing else "Idle"
-        self.modal = Modal(offset=[0.0] * axes)
+        self.parser = Parser(self.letters)
         self.reports = 0
         self._line = bytearray()
         self._lines: deque[str] = deque()
@@ -166,7 +154,7 @@ class Controller:
         self.planner.clear()
         self._lines.clear()
         self._line.clear()
-        self.modal = Modal(offset=self.modal.offset)
+        self.parser.reset()
         self._greet()
 
     def report(self) -> str:
@@ -176,7 +164,7 @@ class Controller:
             state += ":1" if self.planner.speed and state == "Hold" else ":0"
         scale = 25.4 if self.settings[13] else 1.0
         work = not int(self.settings[10]) & 1
-        offset = self.modal.offset
+        offset = self.parser.offset
         shown = [
             (p - (o if work else 0.0)) / scale for p, o in zip(self.planner.position, offset, strict=True)
         ]
@@ -249,79 +237,24 @@ class Controller:
         self.settings[int(match[1])] = float(match[2])
         return 0
 
-    def _words(self, text: str) -> list[tuple[str, float]] | int:
-        found = WORDS.findall(text)
-        if "".join(letter + value for letter, value in found) != text:
-            return 1 if not text[:1].isalpha() else 2
-        values = [letter for letter, _ in found if letter not in "G"]
-        return 25 if len(set(values)) < len(values) else [(letter, float(value)) for letter, value in found]
-
     def _jog(self, text: str) -> int:
-        words = self._words(text)
-        if isinstance(words, int):
-            return words
-        absolute, scale, machine, feed = self.modal.absolute, self.modal.scale, False, 0.0
-        axes = {letter: value for letter, value in words if letter in self.letters}
-        for letter, value in words:
-            if letter == "G":
-                if value not in (20, 21, 53, 90, 91):
-                    return 16
-                absolute = value == 90 if value in (90, 91) else absolute
-                scale = {20: 25.4, 21: 1.0}.get(int(value), scale)
-                machine = machine or value == 53
-            elif letter == "F":
-                feed = value * scale
-            elif letter not in self.letters:
-                return 16
-        if not axes:
-            return 26
-        if feed <= 0:
-            return 22
-        target = self._target(axes, scale, absolute, machine)
-        if self.settings[20] and any(not -self.settings[130 + i] <= t <= 0 for i, t in enumerate(target)):
+        found = self.parser.jog(text, self.planner.end)
+        if isinstance(found, int):
+            return found
+        if self.settings[20] and any(
+            not -self.settings[130 + i] <= t <= 0 for i, t in enumerate(found.target)
+        ):
             return 15
-        self.planner.add(target, feed, jog=True)
+        self.planner.add(found.target, found.feed, jog=True)
         self.state = "Jog"
         return 0
 
-    def _target(self, axes: dict[str, float], scale: float, absolute: bool, machine: bool) -> list[float]:
-        start = self.planner.end
-        target = list(start)
-        for i, letter in enumerate(self.letters):
-            if letter in axes:
-                value = axes[letter] * scale
-                offset = 0.0 if machine else self.modal.offset[i]
-                target[i] = value + offset if absolute or machine else start[i] + value
-        return target
-
     def _gcode(self, line: str) -> int:
-        words = self._words(line)
-        if isinstance(words, int):
-            return words
-        machine, modal = False, self.modal
-        axes = {letter: value for letter, value in words if letter in self.letters}
-        for letter, value in words:
-            if letter == "G":
-                if value in (0, 1):
-                    modal.motion = int(value)
-                elif value in (20, 21):
-                    modal.scale = 25.4 if value == 20 else 1.0
-                elif value in (90, 91):
-                    modal.absolute = value == 90
-                elif value == 53:
-                    machine = True
-                elif value not in (4, 17, 54, 94):
-                    return 20
-            elif letter == "F":
-                modal.feed = value * modal.scale
-            elif letter not in self.letters and letter not in "PMST":
-                return 20
-        if axes:
-            if modal.motion == 1 and modal.feed <= 0:
-                return 22
-            feed = modal.feed if modal.motion == 1 else 1e9
-            self.planner.add(self._target(axes, modal.scale, modal.absolute, machine), feed, jog=False)
-            self.state = "Run" if self.state == "Idle" else self.state
+        found = self.parser.line(line, self.planner.end)
+        if isinstance(found, int):
+            return found
+        self.planner.add(found.target, found.feed, jog=False)
+        self.state = "Run" if self.state == "Idle" else self.state
         return 0
 
     def handlers(self) -> dict[str, Callable[..., object]]:
