@@ -355,7 +355,11 @@ class Node(NodeCore):
             return
         if self._channel.keepalive_s:
             self.keepalive()
-        self._page.check(monotonic_ns()) if self._map is not None else None
+        if self._map is not None:
+            try:
+                self._page.check(monotonic_ns())
+            except NotReadable as error:
+                raise self._unreadable(error) from None
 
 
 class AxisNode(Node):
