@@ -173,13 +173,7 @@ class Gpio(TickDriver):
 
     def tick(self, now_ns: int) -> None:
         """Publish the edges since the last tick one by one; the kit publishes the last."""
-        if self._inputs is None:
-            return
-        edges = []
-        while self._inputs.wait_edge_events(0):
-            edges += [
-                self._edge(event) for event in self._inputs.read_edge_events(self.settings.event_buffer)
-            ]
+        edges = self._fetch()
         if not edges:
             return
         block = self._blocks[-1]
@@ -211,7 +205,10 @@ class Gpio(TickDriver):
     def close(self) -> None:
         """Set the safe levels, then let go: after that the level is not ours to say."""
         if self._outputs is not None:
-            self.write_outputs(self._blocks[0].spec, [0], [self._safe()])
+            try:
+                self.write_outputs(self._blocks[0].spec, [0], [self._safe()])
+            except Refusal as error:  # unplugged: nobody can set them any more
+                self.kit.log("error", f"{self.name}: safe outputs could not be set: {error}")
         self._release()
 
     # --- inside ----------------------------------------------------------------------------------
@@ -243,6 +240,23 @@ class Gpio(TickDriver):
     def _edge(self, event: Any) -> Edge:
         rising = event.event_type is event.Type.RISING_EDGE
         return Edge(self._bits[event.line_offset], rising, event.timestamp_ns, event.global_seqno)
+
+    def _fetch(self) -> list[Edge]:
+        """Return the edges that the kernel has kept.
+
+        Raises:
+            LinkError: the chip is gone.
+        """
+        edges: list[Edge] = []
+        try:
+            while self._inputs is not None and self._inputs.wait_edge_events(0):
+                events = self._inputs.read_edge_events(self.settings.event_buffer)
+                edges += map(self._edge, events)
+        except OSError as error:
+            raise LinkError(
+                f"read lines of {self.settings.chip}: {(error.strerror or str(error)).lower()}"
+            ) from None
+        return edges
 
     def _levels(self) -> int:
         values = self._inputs.get_values(list(self._bits))

@@ -237,3 +237,23 @@ def test_a_level_that_cannot_be_set_is_refused(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(chip.Request, "set_values", gone)
     with pytest.raises(Refusal, match="set lines of /dev/gpiochip0: No such device"):
         rig.driver.write_outputs(rig.driver.blocks[0].spec, [0], [1])
+    rig.driver.close()
+    assert "safe outputs could not be set" in rig.said[0] and not chip.requests
+
+
+def test_a_chip_that_goes_away_is_a_loss_and_is_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig()
+    rig.driver.open()
+
+    def gone(self: Any, max_events: int) -> None:
+        raise OSError(errno.ENODEV, "No such device")
+
+    chip.set_level(8, 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(chip.Request, "read_edge_events", gone)
+        with pytest.raises(LinkError, match="read lines of /dev/gpiochip0: no such device"):
+            rig.driver.tick(0)
+    rig.driver.open()
+    assert len(chip.requests) == 2, "what was held is let go first"
+    rig.tick()
+    assert rig.published[-1][0] & 1
