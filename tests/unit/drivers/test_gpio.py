@@ -248,7 +248,7 @@ def test_a_chip_that_goes_away_is_a_loss_and_is_opened_again(monkeypatch: pytest
     def gone(self: Any, max_events: int) -> None:
         raise OSError(errno.ENODEV, "No such device")
 
-    chip.set_level(8, 1)
+    chip.set_level(8, 0)
     with monkeypatch.context() as patch:
         patch.setattr(chip.Request, "read_edge_events", gone)
         with pytest.raises(LinkError, match="read lines of /dev/gpiochip0: no such device"):
