@@ -30,6 +30,8 @@ from ..counterparts.rigs import Axis, Output, Rig
 ANSWER_S = 5.0
 START_S = 30.0
 UP_S = 15.0
+PRIORITY = 15
+"""Of counterparts and wires, where real-time priorities are allowed; the drivers' lies above."""
 
 
 class Unanswered(RuntimeError):
@@ -63,6 +65,8 @@ class Peer:
                 f"start {what}: no line 'ready PORT' ({error}); it said: {said.strip()}"
             ) from None
         self.port = line.split(maxsplit=1)[1]
+        with contextlib.suppress(OSError):  # a real device waits for nobody
+            os.sched_setscheduler(self._process.pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
 
     def tell(self, line: str) -> Any:
         """Send a command; return its answer's value.

@@ -57,7 +57,7 @@ CASES = (
     Case("leadshine", 19200, 200.0, modbus=True),
     Case("leadshine", 115200, 500.0, modbus=True, stops=True),
     Case("oriental_az", 230400, 500.0, modbus=True, stops=True),
-    Case("odrive", 115200, 500.0, stops=True),
+    Case("odrive", 115200, 400.0, stops=True),
     Case("grbl", 115200, 50.0, stops=True),
 )
 QUICK = {
