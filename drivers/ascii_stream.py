@@ -278,6 +278,8 @@ def _check(settings: AsciiStreamSettings) -> None:
         if not getattr(settings, key).isascii():
             raise ValueError(f"{key} = {getattr(settings, key)!r}; want ASCII characters")
     line = settings.line
+    if line.serial is None and line.tcp is None:
+        raise ValueError("line: lines of numbers come on serial and tcp; want one of these")
     if line.serial is not None:
         shortest = 2 * _columns(settings) + 3 * settings.checksum
         top_hz = LINE_SHARE * line.baud / line.bits_per_character / shortest

@@ -169,6 +169,7 @@ def test_any_bytes_are_taken_and_stamps_rise(pieces: list[bytes]) -> None:
         ({"low": 5.0, "high": 5.0}, "want low below high"),
         ({"start": "é"}, "want ASCII"),
         ({"open_s": 0.0}, "open_s = 0"),
+        ({"line": {"udp": "127.0.0.1:5000"}}, "come on serial and tcp"),
     ],
 )
 def test_bad_configurations(table: dict[str, Any], words: str) -> None:
