@@ -34,15 +34,22 @@ if TYPE_CHECKING:
 
 #: Arrays, the unit they come in, and what other units are worth in it.
 ARRAYS: dict[str, tuple[str, dict[str, float]]] = {
-    "raw": ("%", {"%": 1.0, "1": 100.0}), "time": ("s", {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}), "touch": ("1", {"1": 1.0}),
-    "phase": ("1", {"1": 1.0}), "force": ("N/m", {"N/m": 1.0, "N/mm": 1e3, "N/cm": 1e2}), "temperature": ("C", {"C": 1.0, "K": 1.0}),
-    "cmd_theta": ("deg", {"deg": 1.0, "rad": 180.0 / np.pi}), "cmd_P": ("N/m", {"N/m": 1.0, "N/mm": 1e3, "N/cm": 1e2}),
-    "cmd_rc": ("mm", {"mm": 1.0, "m": 1e3}), "fs": ("Hz", {"Hz": 1.0, "kHz": 1e3}),
+    "raw": ("%", {"%": 1.0, "1": 100.0}),
+    "time": ("s", {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}),
+    "touch": ("1", {"1": 1.0}),
+    "phase": ("1", {"1": 1.0}),
+    "force": ("N/m", {"N/m": 1.0, "N/mm": 1e3, "N/cm": 1e2}),
+    "temperature": ("C", {"C": 1.0, "K": 1.0}),
+    "cmd_theta": ("deg", {"deg": 1.0, "rad": 180.0 / np.pi}),
+    "cmd_P": ("N/m", {"N/m": 1.0, "N/mm": 1e3, "N/cm": 1e2}),
+    "cmd_rc": ("mm", {"mm": 1.0, "m": 1e3}),
+    "fs": ("Hz", {"Hz": 1.0, "kHz": 1e3}),
 }
 
 
-def reconcile_tactile(data: Path, model: Path | None, seed: int = 1,
-                      progress: Callable[[str], None] = lambda text: None) -> tuple[SensorVerdict, float]:
+def reconcile_tactile(
+    data: Path, model: Path | None, seed: int = 1, progress: Callable[[str], None] = lambda text: None
+) -> tuple[SensorVerdict, float]:
     """Read, analyse and time one finger.
 
     Raises:
@@ -105,7 +112,11 @@ def read_experiments(data: Path) -> list[Experiment]:
     for path in sorted(data.glob("*.npz")):
         try:
             with np.load(path, allow_pickle=False) as file:
-                arrays = {k: np.asarray(file[k], dtype=np.float64) for k in file.files if file[k].dtype.kind in "fiub"}
+                arrays = {
+                    k: np.asarray(file[k], dtype=np.float64)
+                    for k in file.files
+                    if file[k].dtype.kind in "fiub"
+                }
         except (OSError, ValueError) as e:
             raise BadInputError(f"read {path}: {e}") from e
         got = _named(arrays, columns, path.name)
@@ -136,7 +147,9 @@ def _named(arrays: Mapping[str, Any], columns: Mapping[str, Any], where: str) ->
         given, factors = spec.get("name", name), ARRAYS[name][1]
         unit = spec.get("unit", ARRAYS[name][0])
         if unit not in factors:
-            raise BadInputError(f"read {where}: unit {unit!r} of {name} is not known; known are {', '.join(factors)}")
+            raise BadInputError(
+                f"read {where}: unit {unit!r} of {name} is not known; known are {', '.join(factors)}"
+            )
         if given in arrays:
             out[name] = arrays[given] * factors[unit]
     return out
@@ -145,7 +158,9 @@ def _named(arrays: Mapping[str, Any], columns: Mapping[str, Any], where: str) ->
 def _recording(got: Mapping[str, Any], where: str) -> Recording:
     for name in ("raw", "time"):
         if name not in got:
-            raise BadInputError(f"read {where}: no array {name}; has {', '.join(sorted(got)) or 'none that is known'}")
+            raise BadInputError(
+                f"read {where}: no array {name}; has {', '.join(sorted(got)) or 'none that is known'}"
+            )
     raw = got["raw"]
     frames = len(raw)
 
@@ -154,15 +169,25 @@ def _recording(got: Mapping[str, Any], where: str) -> Recording:
 
     clock = got["time"]
     if len(clock) != frames or np.any(np.diff(clock) < 0.0) or not np.isfinite(clock).all():
-        raise BadInputError(f"read {where}: time has {len(clock)} stamps for {frames} frames or does not rise; needs one for each frame")
+        raise BadInputError(
+            f"read {where}: time has {len(clock)} stamps for {frames} frames or does not rise; needs one for each frame"
+        )
     step = float(np.median(np.diff(clock))) if frames > 1 else 0.0
     rate = float(got["fs"]) if "fs" in got else 1.0 / step if step > 0.0 else 1.0
     if step > 0.0 and "touch" in got and np.any(got["touch"] >= 0) and not 0.5 < step * rate < 2.0:
-        raise BadInputError(f"read {where}: time steps are {step:g} s at fs {rate:g} Hz, a factor of {step * rate:.4g}; needs seconds")
+        raise BadInputError(
+            f"read {where}: time steps are {step:g} s at fs {rate:g} Hz, a factor of {step * rate:.4g}; needs seconds"
+        )
     try:
-        return Recording(raw, clock, np.nan_to_num(column("touch", -1.0), nan=-1.0).astype(np.int64),
-                         np.nan_to_num(column("phase", 2.0), nan=2.0).astype(np.int64), column("force", np.nan),
-                         column("temperature", np.nan), rate)
+        return Recording(
+            raw,
+            clock,
+            np.nan_to_num(column("touch", -1.0), nan=-1.0).astype(np.int64),
+            np.nan_to_num(column("phase", 2.0), nan=2.0).astype(np.int64),
+            column("force", np.nan),
+            column("temperature", np.nan),
+            rate,
+        )
     except ValueError as e:
         raise BadInputError(f"read {where}: {e}") from e
 
@@ -172,10 +197,14 @@ def _touches(got: Mapping[str, Any], where: str) -> tuple[Any, Any, Any] | None:
         return None
     for name in ("cmd_P", "cmd_rc", "touch", "phase"):
         if name not in got:
-            raise BadInputError(f"read {where}: no array {name} beside cmd_theta; touches need cmd_theta, cmd_P, cmd_rc, touch, phase")
+            raise BadInputError(
+                f"read {where}: no array {name} beside cmd_theta; touches need cmd_theta, cmd_P, cmd_rc, touch, phase"
+            )
     place, load, radius = np.radians(got["cmd_theta"]), got["cmd_P"], 1e-3 * got["cmd_rc"]
     if not len(place) == len(load) == len(radius):
-        raise BadInputError(f"read {where}: {len(place)} places, {len(load)} loads, {len(radius)} radii; needs one of each per touch")
+        raise BadInputError(
+            f"read {where}: {len(place)} places, {len(load)} loads, {len(radius)} radii; needs one of each per touch"
+        )
     return place, load, radius
 
 
@@ -196,4 +225,3 @@ def _named_only(model: SensorModel) -> SensorModel:
     for name in [n for n in model.effects if n.startswith("term_")]:
         model = model.without_effect(name)
     return model
-

@@ -31,13 +31,33 @@ from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.verdict import SensorVerdict
 from sioms.tools.reconcile_input import SUFFIXES, load_columns
 
-UNITS = {"N": 1.0, "mN": 1e-3, "kN": 1e3, "kgf": 9.80665, "N m": 1.0, "mN m": 1e-3, "N mm": 1e-3, "N cm": 1e-2, "s": 1.0, "ms": 1e-3,
-         "us": 1e-6, "ns": 1e-9, "C": 1.0, "K": 1.0, "1": 1.0}
+UNITS = {
+    "N": 1.0,
+    "mN": 1e-3,
+    "kN": 1e3,
+    "kgf": 9.80665,
+    "N m": 1.0,
+    "mN m": 1e-3,
+    "N mm": 1e-3,
+    "N cm": 1e-2,
+    "s": 1.0,
+    "ms": 1e-3,
+    "us": 1e-6,
+    "ns": 1e-9,
+    "C": 1.0,
+    "K": 1.0,
+    "1": 1.0,
+}
 FORCES, TORQUES = ("N", "mN", "kN", "kgf", "1"), ("N m", "mN m", "N mm", "N cm", "1")
 
 
-def reconcile_force(data: Path, model: Path, columns: Path | None = None, seed: int = 1,
-                    progress: Callable[[str], None] = lambda text: None) -> tuple[SensorVerdict, float]:
+def reconcile_force(
+    data: Path,
+    model: Path,
+    columns: Path | None = None,
+    seed: int = 1,
+    progress: Callable[[str], None] = lambda text: None,
+) -> tuple[SensorVerdict, float]:
     """Read, analyse and time one sensor.
 
     Raises:
@@ -86,9 +106,14 @@ def read_loads(data: Path, names: tuple[str, ...], columns: Path | None = None) 
         _only(table.get(part, {}), names, f"{description}, [{part}]")
     missing = [n for n in names if n not in table.get("reading", {})]
     if missing:
-        raise BadInputError(f"read {description}: no reading of {', '.join(missing)}; every component of the model needs one")
-    files = [folder / n for n in table["files"]] if "files" in table else (
-        [data] if data.is_file() else sorted(p for p in data.iterdir() if p.suffix in SUFFIXES))
+        raise BadInputError(
+            f"read {description}: no reading of {', '.join(missing)}; every component of the model needs one"
+        )
+    files = (
+        [folder / n for n in table["files"]]
+        if "files" in table
+        else ([data] if data.is_file() else sorted(p for p in data.iterdir() if p.suffix in SUFFIXES))
+    )
     if not files:
         raise BadInputError(f"read {data}: no data files; expects one of {', '.join(SUFFIXES)}")
     parts = [_record(f, table, names) for f in files]
@@ -121,12 +146,18 @@ def _column(raw: Mapping[str, Any], specs: Mapping[str, Any], name: str, path: P
     spec = specs[name]
     _only(spec, ("name", "unit", "scale", "offset"), f"column {name}")
     if spec.get("name") not in raw:
-        raise BadInputError(f"read {path.name}: no column {spec.get('name')!r} for {name}; has {', '.join(sorted(raw))}")
+        raise BadInputError(
+            f"read {path.name}: no column {spec.get('name')!r} for {name}; has {', '.join(sorted(raw))}"
+        )
     unit = spec.get("unit", "1")
-    allowed = tuple(UNITS) if name in ("time", "temperature") else TORQUES if unit_of(name) == "N m" else FORCES
+    allowed = (
+        tuple(UNITS) if name in ("time", "temperature") else TORQUES if unit_of(name) == "N m" else FORCES
+    )
     if unit not in allowed:
         raise BadInputError(f"read column {name}: unit {unit!r} is not known; known are {', '.join(allowed)}")
     values = raw[spec["name"]]
     if len(values) != count:
-        raise BadInputError(f"read {path.name}: column {spec['name']} has {len(values)} rows, others {count}; needs the same number")
+        raise BadInputError(
+            f"read {path.name}: column {spec['name']} has {len(values)} rows, others {count}; needs the same number"
+        )
     return (values * float(spec.get("scale", 1.0)) + float(spec.get("offset", 0.0))) * UNITS[unit]

@@ -16,14 +16,24 @@ EXIT_BAD_INPUT = 2
 def add_parsers(kinds: Any) -> None:
     """Add the subjects to ``sioms reconcile``."""
     tactile = kinds.add_parser("tactile", help="a tactile finger, from recorded touches")
-    tactile.add_argument("data", type=Path, metavar="DATA", help="folder with one npz for each experiment (docs/tactile.md)")
-    tactile.add_argument("--model", type=Path, metavar="FILE", help="nominal finger (TOML; default: nominal.json in DATA)")
+    tactile.add_argument(
+        "data", type=Path, metavar="DATA", help="folder with one npz for each experiment (docs/tactile.md)"
+    )
+    tactile.add_argument(
+        "--model", type=Path, metavar="FILE", help="nominal finger (TOML; default: nominal.json in DATA)"
+    )
     force = kinds.add_parser("force", help="a force/torque sensor, from recorded known loads")
-    force.add_argument("data", type=Path, metavar="DATA", help="file or folder of recordings, columns.toml beside them")
+    force.add_argument(
+        "data", type=Path, metavar="DATA", help="file or folder of recordings, columns.toml beside them"
+    )
     force.add_argument("--model", type=Path, metavar="FILE", required=True, help="nominal sensor (TOML)")
-    force.add_argument("--columns", type=Path, metavar="FILE", help="column description (default: columns.toml beside DATA)")
+    force.add_argument(
+        "--columns", type=Path, metavar="FILE", help="column description (default: columns.toml beside DATA)"
+    )
     for parser in (tactile, force):
-        parser.add_argument("--out", type=Path, default=Path("report"), metavar="DIR", help="where the report goes")
+        parser.add_argument(
+            "--out", type=Path, default=Path("report"), metavar="DIR", help="where the report goes"
+        )
         parser.add_argument("--seed", type=int, default=1, help="of permutations and bootstrap")
         parser.add_argument("--quiet", action="store_true", help="no progress")
 

@@ -1,0 +1,313 @@
+"""Bad input of ``sioms reconcile tactile``, and the parts of its model, each by a fact that does not use it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.finger.belief import Belief, late, outputs, scene_of
+from sioms.reconcile.finger.effects import library
+from sioms.reconcile.finger.model_file import from_table, to_toml
+from sioms.reconcile.finger.plan import propose
+from sioms.reconcile.finger.pressures import WAVES, hertz, sheet
+from sioms.reconcile.finger.records import find_lines
+from sioms.reconcile.sensors.effect import SensorModel
+from sioms.reconcile_selftest.finger_draw import HiddenFinger, draw_finger
+from sioms.reconcile_selftest.finger_world import FingerWorld
+from sioms.reconcile_selftest.layer import Body, Indenters, strain_factors
+from sioms.tactile.contact import frictionless
+from sioms.tactile.cylinder import FINGER_B
+from sioms.tactile.indenter import FLAT, Round, Wedge
+from sioms.tactile.touches import Recording
+from sioms.tools import reconcile
+from sioms.tools.reconcile_finger import read_experiments, read_model
+
+ANGLES = np.radians(143.0 - 9.22 * np.arange(16))
+
+
+def believed(**change: object) -> Belief:
+    b = FINGER_B
+    given = {
+        "core": b.core_m, "outer": b.outer_m, "shear": b.shear_pa, "poisson": b.poisson, "angle": ANGLES,
+        "radius": np.full(16, 10.3e-3), "gain": np.full(16, 3.0), "quadratic": np.zeros(16), "temperature": np.zeros(16),
+    }  # fmt: skip
+    return Belief(**{**given, **change})  # type: ignore[arg-type]
+
+
+def edge(place_deg: float, load: float = 200.0, radius: float = 0.0) -> np.ndarray:
+    scene = scene_of(np.radians([place_deg]), np.array([load]), np.array([radius]))
+    return outputs(believed(), scene)[0]
+
+
+def test_tabulated_contacts_are_those_of_the_solver() -> None:
+    for radius, indenter, half in (
+        (6e-3, Round(6e-3), 0.13),
+        (np.inf, FLAT, 0.2),
+        (0.0, Wedge(np.pi / 4.0), 0.035),
+    ):
+        solved = frictionless(FINGER_B, indenter, half)
+        exact = solved.series(0.0, len(WAVES) - 1)[: 2 * len(WAVES) - 1 : 2] / solved.load
+        table = sheet(FINGER_B, radius == 0.0)
+        argument = solved.load if radius == 0.0 else solved.load / (1.0 / FINGER_B.outer_m + 1.0 / radius)
+        found = table.series(np.array([argument]))[0][0]
+        assert np.max(np.abs(found - exact)) < 2e-3 * abs(exact[1])
+        assert table.width(np.array([argument]))[0] == pytest.approx(solved.half_width, rel=5e-3)
+
+
+def test_a_hertz_contact_is_wider_than_one_over_the_core() -> None:
+    argument = np.array([2.0])
+    assert hertz(FINGER_B).width(argument)[0] > 1.02 * sheet(FINGER_B, False).width(argument)[0]
+
+
+def test_outputs_are_even_about_a_touch_and_drag_makes_them_lopsided() -> None:
+    middle = 0.5 * (ANGLES[7] + ANGLES[8])
+    scene = scene_of(np.array([middle]), np.array([150.0]), np.array([8e-3]))
+    still = outputs(believed(), scene)[0]
+    assert np.allclose(still, still[::-1], atol=1e-9)
+    dragged = outputs(believed(friction=0.4), scene)[0]
+    assert not np.allclose(dragged, dragged[::-1], atol=1e-3)
+    assert np.allclose(dragged + dragged[::-1], 2.0 * still, atol=1e-9)
+
+
+def test_finite_elements_and_pressed_points_agree_with_the_series() -> None:
+    body = Body(FINGER_B.core_m, FINGER_B.outer_m, FINGER_B.shear_pa, FINGER_B.poisson)
+    factors, indenters = strain_factors(body, 10.3e-3)[:, 0], Indenters(body)
+    for radius in (0.0, 6.01e-3, np.inf):
+        strain = float(indenters.touch(200.0, radius)[0] @ factors)
+        place = np.degrees(ANGLES[6])
+        assert -strain / 3.0 == pytest.approx(edge(place, 200.0, radius)[6], rel=3e-3)
+
+
+def test_what_comes_late_is_there_at_last() -> None:
+    b = believed(creep=0.2, creep_time=0.5)
+    assert late(b, np.array([0.0]))[0] == pytest.approx(0.8)
+    assert late(b, np.array([20.0]))[0] == pytest.approx(1.0)
+
+
+def test_every_effect_does_nothing_at_its_neutral_value_and_something_beside_it() -> None:
+    model = SensorModel(believed(), 16, library())
+    scene = scene_of(np.radians([60.0, 72.5]), np.array([120.0, 200.0]), np.array([0.0, np.inf]))
+    before = outputs(model.belief(), scene)
+    for name, effect in library().items():
+        if not effect.rankable:
+            continue
+        plain = model.plain(name)
+        assert np.allclose(outputs(model.with_effect(name, plain).belief(), scene), before, atol=1e-12), name
+        moved = {
+            **plain,
+            effect.primary.symbol: plain[effect.primary.symbol]
+            + (-effect.primary.size if effect.primary.upper <= 0.0 else effect.primary.size),
+        }
+        b = model.with_effect(name, moved).belief()
+        changed = not np.allclose(outputs(b, scene), before, atol=1e-7)
+        assert changed or b.creep or b.cell or b.temperature.any(), name
+
+
+def test_look_alikes_are_effects_of_the_library() -> None:
+    names = set(library()) | {"gain_drift", "quadratic_common"}
+    for effect in library().values():
+        assert {*effect.lookalikes, *effect.replaces, *effect.twins} <= names
+
+
+def test_a_model_file_reads_back_exactly_and_effects_can_be_switched_off() -> None:
+    model = SensorModel(believed(extent=0.04), 16, library(), name="x")
+    model = model.with_effect("poisson", {"dnu": np.array([-0.03])}).with_effect(
+        "gain_scatter", {"g": 0.01 * np.arange(16.0)}
+    )
+    import tomllib
+
+    text = to_toml(model)
+    again, stated = from_table(tomllib.loads(text), "x")
+    assert stated
+    assert np.array_equal(again.belief().gain, model.belief().gain)
+    assert again.belief().poisson == model.belief().poisson
+    off, _ = from_table(tomllib.loads(text.replace("on = true", "on = false", 1)), "x")
+    assert set(off.effects) == set(model.effects) - {next(iter(model.effects))}
+
+
+def test_the_experiment_fits_the_pair() -> None:
+    creep = believed(creep=0.15, creep_time=1.0)
+    warm = believed(temperature=np.full(16, 3e-3))
+    assert propose([believed(), creep], 5e-4).name == "hold"  # type: ignore[union-attr]
+    assert propose([believed(), warm], 5e-4).name == "warm"  # type: ignore[union-attr]
+
+
+def test_a_line_is_found_in_noise_and_none_where_there_is_none() -> None:
+    rng = np.random.default_rng(1)
+    time = np.arange(4000) / 400.0
+    noise = 0.05 * rng.standard_normal((4000, 4))
+    nothing = np.full(4000, -1, dtype=np.int64)
+
+    def recording(raw: np.ndarray) -> Recording:
+        return Recording(raw, time, nothing, nothing + 3, np.zeros(4000), np.full(4000, 20.0), 400.0)
+
+    assert find_lines(recording(noise), 0.01) == []
+    (line,) = find_lines(recording(noise + 0.1 * np.sin(2 * np.pi * 50.02 * time)[:, None]), 0.01)
+    assert line.frequency == pytest.approx(50.02, abs=0.05)
+    assert line.amplitude == pytest.approx(1e-3, rel=0.05)
+
+
+@lru_cache(maxsize=1)
+def _hidden() -> tuple[HiddenFinger, dict[str, dict[str, np.ndarray]]]:
+    finger = draw_finger("f", "null", np.random.default_rng(3))
+    world = FingerWorld(finger, np.random.default_rng(4))
+    places = np.radians(np.arange(20.0, 130.0, 4.0))
+    return finger, {"edge": world.touches(places, np.full(len(places), 200.0), np.zeros(len(places)))}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    finger, session = _hidden()
+    data = tmp_path / "data"
+    data.mkdir()
+    for name, arrays in session.items():
+        np.savez(data / f"{name}.npz", **arrays)  # type: ignore[arg-type]
+    (data / "nominal.toml").write_text(finger.public())
+    return data
+
+
+def spoil(folder: Path, change: Callable[[dict[str, np.ndarray]], None]) -> None:
+    with np.load(folder / "edge.npz") as file:
+        arrays = {k: file[k].copy() for k in file.files}
+    change(arrays)
+    np.savez(folder / "edge.npz", **arrays)  # type: ignore[arg-type]
+
+
+def run(folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    out = folder.parent / "report"
+    status = reconcile.main(
+        ["tactile", str(folder), "--model", str(folder / "nominal.toml"), "--out", str(out), "--quiet"]
+    )
+    assert status == 2
+    assert not (out / "verdict.json").exists()
+    return capsys.readouterr().err
+
+
+def _set(name: str, value: object) -> Callable[[dict[str, np.ndarray]], None]:
+    def change(a: dict[str, np.ndarray]) -> None:
+        a[name] = np.asarray(value(a[name])) if callable(value) else np.asarray(value)
+
+    return change
+
+
+def _only(count: int) -> Callable[[dict[str, np.ndarray]], None]:
+    def change(a: dict[str, np.ndarray]) -> None:
+        for name in ("cmd_theta", "cmd_P", "cmd_rc"):
+            a[name] = a[name][:count]
+
+    return change
+
+
+def _shuffled(a: dict[str, np.ndarray]) -> None:
+    a["cmd_theta"] = np.random.default_rng(2).permutation(a["cmd_theta"])
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    (lambda a: a.pop("raw"), "no array raw"),
+    (lambda a: a.pop("cmd_P"), "no array cmd_P"),
+    (_set("raw", lambda r: r[:, :5]), "columns; the finger has"),
+    (_set("raw", lambda r: 0.0 * r + 1.0), "are constant"),
+    (_set("raw", lambda r: np.nan * r), "holds no number"),
+    (_set("raw", lambda r: r / 1000.0), "about 0.001"),
+    (_set("raw", lambda r: -r), "change the sign of raw"),
+    (_set("cmd_P", lambda p: 1000.0 * p), "about 0.001"),
+    (_set("cmd_P", lambda p: np.nan * p), "are no numbers"),
+    (_set("cmd_P", lambda p: -p), "pressing loads are positive"),
+    (_set("cmd_rc", lambda r: r + 5000.0), "a factor of 1000"),
+    (_set("cmd_theta", np.radians), "radians"),
+    (_set("cmd_theta", lambda t: 1000.0 * t), "needs degrees"),
+    (_set("force", lambda f: f / 1000.0), "times cmd_P (about 0.001)"),
+    (_set("time", lambda t: t[::-1]), "does not rise"),
+    (_set("time", lambda t: 1000.0 * t), "a factor of 1000"),
+    (_only(10), "touches are too few"),
+    (_shuffled, "it is another finger"),
+])  # fmt: skip
+def test_what_cannot_be_used_is_refused_with_a_reason(
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    change: Callable[[dict[str, np.ndarray]], None],
+    said: str,
+) -> None:
+    spoil(folder, change)
+    assert said in run(folder, capsys)
+
+
+@pytest.mark.parametrize(("old", "new", "said"), [
+    ("outer_m = 0.0", "outer_m = 12", "a factor of 1000"),
+    ("radius_m = 0.0", "radius_m = 10", "mm?"),
+    ("poisson = 0.4", "poisson = 4", "Poisson's ratio"),
+    ("gain = ", "gain = -", "strain per output"),
+    ("core_m", "cor_m", "nobody reads cor_m"),
+    ("[finger]", "[sensor]", "unknown field `sensor`"),
+])  # fmt: skip
+def test_a_model_that_makes_no_sense_is_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, said: str
+) -> None:
+    path = folder / "nominal.toml"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    assert said in run(folder, capsys)
+
+
+def test_an_empty_folder_and_a_missing_model_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "data").mkdir()
+    assert "no such file" in run(tmp_path / "data", capsys)
+
+
+def test_other_names_and_units_are_read(folder: Path) -> None:
+    before = read_experiments(folder)[0]
+
+    def rename(a: dict[str, np.ndarray]) -> None:
+        a["dc"], a["place"] = 0.01 * a.pop("raw"), np.radians(a.pop("cmd_theta"))
+
+    spoil(folder, rename)
+    (folder / "columns.toml").write_text(
+        '[columns]\nraw = { name = "dc", unit = "1" }\ncmd_theta = { name = "place", unit = "rad" }\n'
+    )
+    after = read_experiments(folder)[0]
+    assert np.allclose(after.recording.raw, before.recording.raw)
+    assert after.touches is not None and before.touches is not None
+    assert np.allclose(after.touches[0], before.touches[0])
+    (folder / "columns.toml").write_text('[columns]\nrow = { name = "dc" }\n')
+    with pytest.raises(BadInputError, match="nobody reads row"):
+        read_experiments(folder)
+
+
+def test_a_dead_element_and_missing_frames_are_said_and_do_no_harm(folder: Path) -> None:
+    def change(a: dict[str, np.ndarray]) -> None:
+        a["raw"][:, 4] = 0.0
+        a["raw"][a["touch"] == 3, 7] = np.nan
+
+    spoil(folder, change)
+    out = folder.parent / "report"
+    status = reconcile.main(
+        ["tactile", str(folder), "--model", str(folder / "nominal.toml"), "--out", str(out), "--quiet"]
+    )
+    found = json.loads((out / "verdict.json").read_text())
+    assert status == 0
+    assert found["effects"] == ["dead_element"]
+    assert found["parameters"]["dead_element"] == {"index": 4.0}
+    assert any("1 of" in n and "left out" in n for n in found["notes"])
+    assert "used = [true, true, true, true, false" in (out / "finger.toml").read_text()
+    shutil.rmtree(out)
+
+
+def test_the_nominal_finger_may_be_a_calibrated_one(folder: Path) -> None:
+    from sioms.tactile.finger import nominal_finger
+    from sioms.tactile.finger import to_toml as finger_toml
+
+    path = folder / "finger.toml"
+    path.write_text(finger_toml(nominal_finger(FINGER_B, ANGLES, 10.3e-3, 3.0)))
+    belief, _, stated = read_model(path, folder)
+    assert not stated
+    assert np.allclose(belief.gain, 3.0)
