@@ -29,7 +29,7 @@ body{font:16px/1.5 system-ui,sans-serif;max-width:66rem;margin:2rem auto;padding
 h1{font-size:1.5rem;margin-bottom:.2rem} h2{font-size:1.15rem;margin-top:2rem;border-bottom:1px solid #cfd8e0}
 .verdict{padding:.8rem 1rem;border-left:6px solid #2a7;background:#eef8f3} .unexplained{border-color:#c50;background:#fdf2ea}
 .ambiguous{border-color:#c90;background:#fdf8e6} table{border-collapse:collapse;margin:.6rem 0} td,th{padding:.2rem .7rem;
-border-bottom:1px solid #dde4ea;text-align:left} td.n{text-align:right;font-variant-numeric:tabular-nums}
+border-bottom:1px solid #dde4ea;text-align:left} td.n{text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums}
 code{background:#eef2f5;padding:0 .3em} img{max-width:100%} .small{font-size:.85rem;color:#52606d}
 """
 

@@ -15,7 +15,7 @@ from sioms.reconcile.ambiguity import Rival, rivals
 from sioms.reconcile.blocks import better, block_ids, bootstrap
 from sioms.reconcile.channels import Finding, drive, index_fit, index_scale, lattice
 from sioms.reconcile.checks import check, check_scale
-from sioms.reconcile.effect import Slot
+from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import known, library
 from sioms.reconcile.effects.terms import TERM_PREFIX, TERMS
 from sioms.reconcile.excitation import Gate, gate
@@ -41,6 +41,8 @@ BURSTS = 0.8
 LARGE = 3.0
 #: Above this multiple, and with half of the disagreement left, nothing is named at all.
 HOPELESS = 5.0
+#: Multiples of a parameter of the bounces in a gap that are tried for its interval.
+ROUGH_GRID = tuple(float(x) for x in np.linspace(0.9, 1.1, 17))
 #: Below these multiples of the expected innovation nothing is called unexplained, or a burst.
 LEAST_ODD = 1.25
 QUIET = 1.6
@@ -283,8 +285,27 @@ def _intervals(problem: Problem, fit: Fit, replicates: int, rng: np.random.Gener
     out = {}
     for f, s in zip(fit.free, spread, strict=True):
         value = getattr(fit.model, f.symbol) if f.effect == BASE else fit.model.effects[f.effect][f.symbol]
+        if f.effect != BASE and known()[f.effect].slot is Slot.BACKLASH:
+            s = max(float(s), value * _rough_spread(problem, fit, f.effect, f.symbol, replicates, rng))
         out[f.effect, f.symbol] = (value - float(s), value + float(s))
     return out
+
+
+def _rough_spread(problem: Problem, fit: Fit, name: str, symbol: str, replicates: int, rng: np.random.Generator) -> float:
+    """95 % half-width, relative, of a parameter whose cost is rough: where the best of a grid falls, over bootstrap replicates."""
+    here = fit.model.effects[name]
+    ids = block_ids(problem, fit.model.sample_time_s)
+    count = int(ids.max()) + 1
+
+    def energy(factor: float) -> Array:
+        e = problem.residual(fit.model.with_effect(name, {**here, symbol: here[symbol] * factor}))
+        return np.asarray(np.bincount(ids, weights=e**2, minlength=count), dtype=np.float64)
+
+    costs = np.stack(list(problem.mapper(energy, ROUGH_GRID)))
+    draws = rng.multinomial(count, np.full(count, 1.0 / count), size=replicates)
+    best = np.asarray(ROUGH_GRID)[np.argmin(draws @ costs.T, axis=1)]
+    step = ROUGH_GRID[1] - ROUGH_GRID[0]
+    return float(1.96 * np.sqrt(np.mean((best - 1.0) ** 2) + step**2 / 12.0))
 
 
 def _describe(ready: Prepared, fit: Fit, found: Found, searcher: Searcher, others: Sequence[Rival],

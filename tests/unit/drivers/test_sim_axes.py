@@ -177,6 +177,50 @@ def test_hidden_effects_file(bench, tmp_path):
     assert plain.blocks[1].data[0] > 0.005
 
 
+MODEL = """[axis]
+name = "x"
+kind = "linear"
+sample_time_s = 0.001
+inertia = 2.0
+viscous = 4.0
+resolution = 1e-6
+pitch = 0.02
+rated_force = 30.0
+max_speed = 0.5
+[effects.offset]
+off = 5.0
+[effects.coulomb]
+on = {on}
+Fc = 9.0
+"""
+
+
+def test_an_axis_with_a_model_file_is_the_twin_of_the_model(bench, tmp_path):
+    moved, sums = [], []
+    for name, on in (("mod0", "true"), ("mod1", "false")):
+        file = tmp_path / f"{name}.toml"
+        file.write_text(MODEL.replace("{on}", on))
+        device = bench.make(SimAxes, name, {"axis": [SERVO | {"k": 0.0, "model_file": str(file)}]})
+        bench.run(0.2)
+        moved.append(device.blocks[1].data[0])
+        (block,) = [b for b in SimAxes.describe(name, device.settings).blocks if b.name == "plant"]
+        sums.append(block.channels[0].description)
+    # 5 N do not overcome 9 N of friction; without it they move 2 kg by 5 N/2 kg (0.2 s)^2/2, less what 4 N s/m take.
+    assert moved[0] == 0.0
+    assert moved[1] == pytest.approx(0.05 * (1 - 4 / 2 * 0.2 / 3), rel=0.05)
+    assert "model" in sums[0]
+    assert sums[0] != sums[1]
+
+
+def test_a_model_of_another_kind_of_axis_is_refused(tmp_path):
+    file = tmp_path / "m.toml"
+    file.write_text(MODEL.replace("{on}", "true").replace("linear", "rotary"))
+    for path, words in ((file, "of a rotary axis"), (tmp_path / "none.toml", "No such file")):
+        table = {"axis": [SERVO | {"model_file": str(path)}]}
+        with pytest.raises(ValueError, match=words):
+            SimAxes.describe("mod0", msgspec.convert(table, SimAxes.Settings))
+
+
 @pytest.mark.parametrize(
     "table, words",
     [
