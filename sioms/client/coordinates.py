@@ -71,7 +71,9 @@ class UserAxis:
         ends = [None if end is None else self.to_user(end) for end in (low, high)]
         return (ends[0], ends[1]) if self.direction > 0 else (ends[1], ends[0])
 
-    def move(self, position: float, *, replace: bool = False, timeout: float | None = 0.0, **words: Any) -> int:
+    def move(
+        self, position: float, *, replace: bool = False, timeout: float | None = 0.0, **words: Any
+    ) -> int:
         """Append a command to a user position; the words of ``sioms.command`` in user coordinates."""
         place = self.direction * position if words.get("relative") else self.to_node(position)
         return self.node.move(place, self.axis, replace=replace, timeout=timeout, **self._turned(words))

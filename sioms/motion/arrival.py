@@ -137,7 +137,8 @@ def plan_point(
     straight = approach.is_straight(target, state[0], taken and at_rest)
     if not straight or (approach.distance and not at_rest and planner.overshoots(target, approach.distance)):
         slow = bounds._replace(
-            velocity=min(bounds.velocity, approach.velocity), acceleration=min(bounds.acceleration, approach.acceleration)
+            velocity=min(bounds.velocity, approach.velocity),
+            acceleration=min(bounds.acceleration, approach.acceleration),
         )
         parts = [planner.reach(begin, state, bounds), planner.reach(target, (begin, 0.0, 0.0), slow)]
     segments = [segment for part in parts for segment in part.segments]

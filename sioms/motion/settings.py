@@ -220,9 +220,13 @@ class AxisSettings:
             if value is not None and not value > 0:
                 raise ValueError(f"axis {self.name}: {name} {value:g}; want a positive number")
         if not self.velocity_filter_s >= 0:
-            raise ValueError(f"axis {self.name}: velocity_filter_s {self.velocity_filter_s:g}; want 0 or more")
+            raise ValueError(
+                f"axis {self.name}: velocity_filter_s {self.velocity_filter_s:g}; want 0 or more"
+            )
         if not -1 < self.kp < 1:
-            raise ValueError(f"axis {self.name}: kp {self.kp:g} makes the law unstable; want between -1 and 1")
+            raise ValueError(
+                f"axis {self.name}: kp {self.kp:g} makes the law unstable; want between -1 and 1"
+            )
         if not 0 <= self.ki < float("inf"):
             raise ValueError(f"axis {self.name}: ki {self.ki:g}; want 0 or more")
         self._check_arrival()
@@ -247,7 +251,9 @@ class AxisSettings:
                 f"axis {self.name}: arrival: retries {self.arrival.retries}; want 0: the loop of a servo tries all the time"
             )
         if self.start_velocity:
-            raise ValueError(f"axis {self.name}: start_velocity {self.start_velocity:g}; want 0: only a stepper has one")
+            raise ValueError(
+                f"axis {self.name}: start_velocity {self.start_velocity:g}; want 0: only a stepper has one"
+            )
 
     @property
     def force_unit(self) -> str:

@@ -57,7 +57,9 @@ def encode(contents: Contents) -> bytes:
     """Return the bytes of a file: header, names, then the columns state, raw and position."""
     names = "\n".join(contents.entries).encode()
     names += b"\n" * (-len(names) % 8)
-    header = HEADER.pack(MAGIC, len(contents.entries), len(names), int(contents.closed), contents.boot.encode())
+    header = HEADER.pack(
+        MAGIC, len(contents.entries), len(names), int(contents.closed), contents.boot.encode()
+    )
     state = np.array([entry.state for entry in contents.entries.values()], dtype="<i8")
     places = np.array([entry[1:] for entry in contents.entries.values()], dtype="<f8").reshape(-1, 2)
     return header + names + state.tobytes() + places.T.tobytes()
@@ -80,7 +82,9 @@ def decode(data: bytes) -> Contents:
     except UnicodeDecodeError:
         raise ValueError("its names are no text") from None
     state = np.frombuffer(data, "<i8", count, HEADER.size + length).tolist()
-    raw, position = np.frombuffer(data, "<f8", 2 * count, HEADER.size + length + 8 * count).reshape(2, count).tolist()
+    raw, position = (
+        np.frombuffer(data, "<f8", 2 * count, HEADER.size + length + 8 * count).reshape(2, count).tolist()
+    )
     entries = {name: Entry(*entry) for name, *entry in zip(names, state, raw, position, strict=True)}
     return Contents(entries, bool(closed), written_in)
 
@@ -103,7 +107,10 @@ def offset_of(entry: Entry, settings: AxisSettings, raw: float) -> tuple[float |
     if rule.when == "always":
         return entry.position - raw, ""
     if not abs(raw - entry.raw) <= rule.tolerance:
-        return None, f"its device reads {raw:g} {unit} and read {entry.raw:g} {unit}; at most {rule.tolerance:g} apart"
+        return (
+            None,
+            f"its device reads {raw:g} {unit} and read {entry.raw:g} {unit}; at most {rule.tolerance:g} apart",
+        )
     return entry.position - entry.raw, ""
 
 
@@ -239,7 +246,9 @@ def keep_positions(folder: str, device: str, blocks: Sequence[AnyBlock], log: Lo
             log("warning", f"{name}: positions are not kept: give [workcell] a state_folder")
             continue
         try:
-            file = PositionFile(os.path.join(folder, f"{name}.positions"), block.bank.settings, boot_id(), log)
+            file = PositionFile(
+                os.path.join(folder, f"{name}.positions"), block.bank.settings, boot_id(), log
+            )
         except OSError as error:
             log("error", f"{name}: positions are not kept: {error}")
             continue

@@ -68,7 +68,9 @@ high = 5.0
 def port(tmp_path: Path) -> Iterator[str]:
     """A drive that lives on when its driver dies."""
     link = ["--link", str(tmp_path / "port")]
-    drive = Running([sys.executable, "-m", "sioms.tools.counterparts.leadshine", *link, "--units", "1"], {}, None)
+    drive = Running(
+        [sys.executable, "-m", "sioms.tools.counterparts.leadshine", *link, "--units", "1"], {}, None
+    )
     try:
         yield drive.wait_line(r"^ready (\S+)$").group(1)
     finally:
@@ -78,7 +80,9 @@ def port(tmp_path: Path) -> Iterator[str]:
 def kept_at_rest(folder: Path, device: str) -> None:
     """Wait until the file of a device says that it is at rest."""
     path = folder / f"{device}.positions"
-    wait_for(lambda: all(e.state & AT_REST for e in decode(path.read_bytes()).entries.values()), "noted at rest")
+    wait_for(
+        lambda: all(e.state & AT_REST for e in decode(path.read_bytes()).entries.values()), "noted at rest"
+    )
 
 
 def kill(daemon: Daemon, device: str) -> None:
@@ -164,6 +168,8 @@ def test_alarms_show_and_a_wrong_one_is_told(start_daemon: Callable[..., Daemon]
         flags = [sioms.AnalogStatus(f) for f in reading.flags]
         assert reading.data[:2] == (pytest.approx(1.0), pytest.approx(2.0))
         assert (flags[0], flags[1], flags[0].severity) == (sioms.AnalogStatus.HIGH, 0, 1)
-    daemon.config.write_text(text.replace("hihi = 2.0", "hihi = 1.0").replace("node = \"force0.fy\"", "node = \"io0\""))
+    daemon.config.write_text(
+        text.replace("hihi = 2.0", "hihi = 1.0").replace('node = "force0.fy"', 'node = "io0"')
+    )
     with daemon.cell() as cell, raises(errno.EINVAL, "[[alarm]]: node = io0"):
         cell.reload()

@@ -107,7 +107,9 @@ def test_every_tweak_of_a_chain_arrives_with_its_play_taken_up(steps, backlash):
 
 @settings(max_examples=15)
 @given(
-    st.lists(st.floats(-0.05, 0.05), min_size=1, max_size=12), st.integers(0, 4), st.lists(position, min_size=1, max_size=3)
+    st.lists(st.floats(-0.05, 0.05), min_size=1, max_size=12),
+    st.integers(0, 4),
+    st.lists(position, min_size=1, max_size=3),
 )
 def test_a_stepper_is_where_its_encoder_says_or_says_that_it_is_not(losses, retries, places):
     """Steps are lost whenever it comes to rest, any number of times."""
@@ -120,7 +122,11 @@ def test_a_stepper_is_where_its_encoder_says_or_says_that_it_is_not(losses, retr
         state["last"], state["moved"] = float(output[0]), moved
         return output - state["lost"]
 
-    rig = Rig([axis(kind=AxisKind.STEPPER, k=None, arrival=Arrival(0.01, 1e-3, retries))], plant=plant, tick_ns=TICK_NS)
+    rig = Rig(
+        [axis(kind=AxisKind.STEPPER, k=None, arrival=Arrival(0.01, 1e-3, retries))],
+        plant=plant,
+        tick_ns=TICK_NS,
+    )
     for place in places:
         rig.write(mode=MODE.POSITION, position=place)
         rig.run()

@@ -21,7 +21,9 @@ class Written:
     """Takes what an open node would send."""
 
     def move(self, position: float, axis: int, *, replace: bool, timeout: float | None, **words: Any) -> int:
-        self.record = dict(zip(NAMES, AXIS_WRITE.unpack(command(axis, position=position, **words)), strict=True))
+        self.record = dict(
+            zip(NAMES, AXIS_WRITE.unpack(command(axis, position=position, **words)), strict=True)
+        )
         return 0
 
     def limits(self) -> dict[str, list[float | None]]:
@@ -36,7 +38,12 @@ def test_there_and_back(user: float, offset: float, sign: int) -> None:
 
 
 def test_limits_change_their_places_with_the_direction() -> None:
-    for axis, sign, expected in ((0, 1, (-0.5, 2.5)), (0, -1, (-1.5, 1.5)), (1, 1, (None, 5.5)), (1, -1, (-4.5, None))):
+    for axis, sign, expected in (
+        (0, 1, (-0.5, 2.5)),
+        (0, -1, (-1.5, 1.5)),
+        (1, 1, (None, 5.5)),
+        (1, -1, (-4.5, None)),
+    ):
         assert UserAxis(Written(), axis, 0.5, sign).limits() == expected  # type: ignore[arg-type]
 
 
@@ -45,7 +52,9 @@ def test_what_has_a_direction_turns_and_what_is_a_size_does_not() -> None:
     axis = UserAxis(node, 1, 0.5, -1)  # type: ignore[arg-type]
     axis.move(0.2, velocity=0.1, max_velocity=1.0, max_acceleration=2.0, time=3.0)
     wanted = {"axis": 1, "velocity": -0.1, "max_velocity": 1.0, "max_acceleration": 2.0, "time": 3.0}
-    assert {name: node.record[name] for name in wanted} == wanted and node.record["position"] == pytest.approx(0.3)
+    assert {name: node.record[name] for name in wanted} == wanted and node.record[
+        "position"
+    ] == pytest.approx(0.3)
     axis.move(0.2, relative=True)
     assert node.record["position"] == -0.2
     with pytest.raises(ValueError, match="direction 0"):

@@ -204,7 +204,9 @@ def test_retries_are_bounded_and_a_miss_is_told(retries):
 
 def test_the_same_target_again_corrects_what_has_slipped_at_rest():
     slip = [0.0]
-    rig = Rig([stepper(arrival=Arrival(0.0, TOLERANCE, retries=1))], plant=lambda output, dt: output - slip[0])
+    rig = Rig(
+        [stepper(arrival=Arrival(0.0, TOLERANCE, retries=1))], plant=lambda output, dt: output - slip[0]
+    )
     rig.write(mode=MODE.POSITION, position=0.5)
     rig.run()
     slip[0] = 0.05
@@ -252,7 +254,10 @@ def test_many_axes_settle_and_try_again_each_for_itself():
     n, missing = 40, 7
     lost = np.zeros(n)
     lost[::missing] = 0.01
-    rig = Rig([stepper(arrival=Arrival(0.02, TOLERANCE, 2)) for _ in range(n)], plant=lambda output, dt: output - lost)
+    rig = Rig(
+        [stepper(arrival=Arrival(0.02, TOLERANCE, 2)) for _ in range(n)],
+        plant=lambda output, dt: output - lost,
+    )
     rig.tick(2)
     rig.write(mode=[MODE.POSITION] * n, axis=list(range(n)), position=np.linspace(-1, 1, n))
     rig.run()
@@ -276,7 +281,9 @@ def test_a_jog_takes_its_own_acceleration_and_leaves_that_of_the_axis():
     rig.write(mode=MODE.VELOCITY | MODE.ACCELERATION, velocity=-0.5, acceleration=1.0)
     rig.tick(600)
     v = rig.trace("commanded_velocity")
-    assert v[-1] == pytest.approx(-0.5) and np.interp(0.25, -v, np.arange(len(v)) * 1e-3) == pytest.approx(0.25, abs=3e-3)
+    assert v[-1] == pytest.approx(-0.5) and np.interp(0.25, -v, np.arange(len(v)) * 1e-3) == pytest.approx(
+        0.25, abs=3e-3
+    )
     rig.write(mode=MODE.VELOCITY, velocity=0.5)
     rig.tick(300)
     assert np.diff(rig.trace("commanded_velocity")).max() == pytest.approx(5e-3, rel=1e-3)
@@ -299,7 +306,9 @@ def test_a_stepper_takes_its_start_velocity_at_once_and_no_more():
     assert v.max() == pytest.approx(top, rel=1e-2)
     steps = np.abs(np.diff(v))
     assert steps.max() <= jump + 2 * 5.0 * 1e-3
-    assert (np.minimum(np.abs(v[1:]), np.abs(v[:-1]))[steps > 0.02] <= jump + 0.02).all(), "jumps only from or to slow"
+    assert (np.minimum(np.abs(v[1:]), np.abs(v[:-1]))[steps > 0.02] <= jump + 0.02).all(), (
+        "jumps only from or to slow"
+    )
     assert not any(int(h[11].view(np.int64)[0]) & S.SATURATED for h in quick.history)
 
 

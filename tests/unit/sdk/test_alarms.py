@@ -43,7 +43,12 @@ def test_what_is_published_is_watched_and_joins_the_drivers_flags():
 def test_a_limit_is_left_by_more_than_the_hysteresis(values, hysteresis):
     alarms = Alarms(1)
     alarms.watch([0], -2.0, -1.0, 1.0, 2.0, hysteresis)
-    limits = {A.LOLO: lambda v: -2.0 - v, A.LOW: lambda v: -1.0 - v, A.HIGH: lambda v: v - 1.0, A.HIHI: lambda v: v - 2.0}
+    limits = {
+        A.LOLO: lambda v: -2.0 - v,
+        A.LOW: lambda v: -1.0 - v,
+        A.HIGH: lambda v: v - 1.0,
+        A.HIHI: lambda v: v - 2.0,
+    }
     was = dict.fromkeys(limits, False)
     for value in values:
         bits = int(alarms.look(np.array([value]))[0])
@@ -57,7 +62,12 @@ def test_a_limit_is_left_by_more_than_the_hysteresis(values, hysteresis):
 def test_severities():
     assert [A(0).severity, A.HIGH.severity, A.HIHI.severity, A.INVALID.severity] == [0, 1, 2, 2]
     assert (A.HIGH | A.HIHI).severity == 2
-    assert [S(0).severity, (S.MOVING | S.HOMED).severity, S.MISSED_TARGET.severity, S.LIMIT_PLUS.severity] == [0, 0, 1, 1]
+    assert [
+        S(0).severity,
+        (S.MOVING | S.HOMED).severity,
+        S.MISSED_TARGET.severity,
+        S.LIMIT_PLUS.severity,
+    ] == [0, 0, 1, 1]
     assert [S.FAULT.severity, (S.STALLED | S.SATURATED).severity, S.EMERGENCY_STOP.severity] == [2, 2, 2]
 
 
