@@ -31,7 +31,9 @@ def add_parser(subparsers: Any) -> None:
     one.add_argument(
         "--full", action="store_true", help="longer trials and all combinations: minutes a driver"
     )
-    one.add_argument("--only", metavar="TRIAL,...", default="", help="these trials alone; a name that is none lists all")
+    one.add_argument(
+        "--only", metavar="TRIAL,...", default="", help="these trials alone; a name that is none lists all"
+    )
     one.add_argument(
         "--counterpart", metavar="COMMAND", default="", help="module or file of the device, and options"
     )

@@ -258,6 +258,21 @@ def test_a_stop_between_the_messages_of_a_jog(make: Callable[..., Rig] = leadshi
     assert rig.drive.state()["velocity"] == 0
 
 
+def test_a_stop_that_overtakes_a_reset_does_not_make_it_void() -> None:
+    rig = leadshine_rig()
+    rig.drive.raise_alarm(0x40)
+    rig.go(0.1)
+    rig.bank.reset([0])
+    (reset,) = [action for action in rig.bank.take_actions() if not action.is_stop]
+    waiting = rig.unit.act(reset)
+    rig.bus.run(rig.unit.stop())
+    rig.bus.run(waiting)
+    assert bytes.fromhex("18011111") in b"".join(data[2:6] for data in rig.bus.sent)
+    rig.bank.action_done(reset, rig.bus.clock_ns())
+    rig.go(0.2)
+    assert rig.drive.state()["alarm"] == 0 and rig.bank.is_idle([0])
+
+
 @RIGS
 def test_homing(make: Callable[..., Rig]) -> None:
     rig = make()
