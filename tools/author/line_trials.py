@@ -224,6 +224,10 @@ def _timeout(station: Station) -> tuple[float, float]:
         if not gaps:
             raise NotApplicable("no request was answered")
         answer_s = gaps[len(gaps) // 2] / 1e9
+        replies = node.statistics(1)["link"]["replies"]
+        wait_for(
+            lambda: node.statistics(1)["link"]["replies"] > replies + LEAST, MORE_S, 0.01
+        )  # nothing is owed
         before = node.statistics(1)["link"]["timeouts"]
         began_ns = time.monotonic_ns()
         station.fault(lose=1.0, count=1)

@@ -274,4 +274,11 @@ MAP_RIGS: tuple[Rig, ...] = (
         ("moxa", "--model", "E1212"), tcp=True,
         inputs=("moxa_e1200",), outputs=(Output("moxa_e1200.do", 8, 0),), name="moxa_e1200",
     ),
+    Rig(
+        "modbus-io",
+        '[device.wago_750]\ndriver = "modbus-io"\nmap = "wago_750"\nchannels = { di = 8, do = 8, ai = 2, ao = 2 }\n'
+        'safe = { do = 0 }\nmain = "di"\nline = { tcp = "{port}" }\n',
+        ("wago", "--inputs", "8", "--outputs", "8", "--analogs", "2"), tcp=True,
+        inputs=("wago_750",), outputs=(Output("wago_750.do", 8, 0),), analogs=("wago_750.ai",), name="wago_750",
+    ),
 )  # fmt: skip
