@@ -48,6 +48,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     test.add_argument("--jobs", type=int, default=0, help="solvers at a time (default: one for each core)")
     test.add_argument("--replicates", type=int, default=0, help="solve each so many times more with its blocks drawn anew")
     effects = kinds.add_parser("effects", help="print the library of effects")
+    effects.add_argument("of", nargs="?", choices=("axis", "sensors"), default="axis", help="whose (default axis)")
     effects.add_argument("--out", type=Path, default=None, metavar="DIR", help="write page and pictures there instead")
     parser.set_defaults(run=run)
     return parser
@@ -57,6 +58,12 @@ def run(args: argparse.Namespace) -> int:
     """Do what the command line asks; return the exit status."""
     if args.subject == "effects":
         from sioms.tools import reconcile_effects
+
+        if args.of == "sensors":
+            from sioms.tools.reconcile_effects_sensors import page
+
+            print(page(), end="")
+            return 0
 
         if args.out is None:
             print(reconcile_effects.page(), end="")
@@ -71,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         from sioms.tools.reconcile_selftest import selftest
 
         return selftest(args.axes, args.seed, args.out, args.jobs, args.replicates)
-    if args.subject in ("tactile", "force"):
+    if args.subject in ("tactile", "force", "score"):
         return run_sensor(args)
     return run_axis(args)
 

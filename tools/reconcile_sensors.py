@@ -36,10 +36,17 @@ def add_parsers(kinds: Any) -> None:
         )
         parser.add_argument("--seed", type=int, default=1, help="of permutations and bootstrap")
         parser.add_argument("--quiet", action="store_true", help="no progress")
+    score = kinds.add_parser("score", help="solve a folder of fingers whose truth is known")
+    score.add_argument("data", type=Path, metavar="PUBLIC", help="one folder for each finger")
+    score.add_argument("truth", type=Path, metavar="TRUTH", help="NAME.json for each finger")
 
 
 def run_sensor(args: argparse.Namespace) -> int:
-    """Reconcile one sensor from recordings; return the exit status."""
+    """Reconcile one sensor from recordings, or score many; return the exit status."""
+    if args.subject == "score":
+        from sioms.tools.reconcile_score import score
+
+        return score(args.data, args.truth)
     from sioms.reconcile.errors import BadInputError
     from sioms.reconcile.verdict import EXIT
 

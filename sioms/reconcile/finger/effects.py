@@ -119,7 +119,7 @@ GAIN = SensorEffect(
     equation="gain_i = stated gain_i (1 + g_i)",
     parameters=(Quantity("g", "1", -0.9, 9.0, 0.1, "relative departure of each element's gain", each=True),),
     signature="output too large or too small in one proportion wherever and however it is touched, element by element",
-    lookalikes=("depth_scatter", "poisson", "strip_inhomogeneity", "gain_drift"),
+    lookalikes=("depth_scatter", "poisson", "strip_inhomogeneity"),
     separate="edge touches every degree across each element: depth changes the width of the profile, gain does not",
     twins=("depth_scatter", "strip_inhomogeneity"),
 )
@@ -181,7 +181,7 @@ QUADRATIC = SensorEffect(
         ),
     ),
     signature="residual with the square of the output",
-    lookalikes=("hertz", "gain_scatter", "creep", "quadratic_common"),
+    lookalikes=("hertz", "gain_scatter", "creep"),
     separate="a decade of loads at one place with an edge and with a flat",
     twins=("hertz",),
 )

@@ -111,7 +111,7 @@ def test_every_effect_does_nothing_at_its_neutral_value_and_something_beside_it(
 
 
 def test_look_alikes_are_effects_of_the_library() -> None:
-    names = set(library()) | {"gain_drift", "quadratic_common"}
+    names = set(library())
     for effect in library().values():
         assert {*effect.lookalikes, *effect.replaces, *effect.twins} <= names
 
