@@ -216,3 +216,25 @@ def test_nobody_beside_the_line(device: socket.socket, server: socket.socket) ->
     rig = Beside(LineSettings(tcp=place), name_of(device))
     assert f"ask b'a': connect to {place}: connection refused" in str(rig.run(word(b"a")))
     rig.line.close()
+
+
+def test_what_was_given_up_is_not_answered_later(server: socket.socket) -> None:
+    side = SideConnection(LineSettings(tcp=name_of(server), connect_timeout_s=100.0))
+
+    def until_asked(exchange: Exchange) -> socket.socket:
+        side.begin(exchange, 0)
+        assert side.advance(1) is None
+        made = server.accept()[0]
+        while not select.select([made], [], [], 0.001)[0]:
+            assert side.advance(2) is None
+        assert made.recv(100) == exchange.data
+        return made
+
+    with until_asked(word(b"a", 100.0)) as first:
+        first.sendall(b"late")
+        with until_asked(word(b"b", 100.0)) as second:
+            second.sendall(b"good")
+            while (found := side.advance(3)) is None:
+                pass
+            assert found == (b"good",)
+    side.close()
