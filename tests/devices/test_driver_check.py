@@ -15,6 +15,8 @@ from device_rigs import RIGS
 
 from sioms.tools.counterparts.rigs import MAP_RIGS
 
+pytestmark = pytest.mark.timeout(300)
+
 AUTHORS = Path(__file__).parent / "authors"
 WIRED = [rig.title for rig in RIGS if rig.line]
 BY_MAP = {rig.driver for rig in MAP_RIGS}
@@ -27,14 +29,14 @@ def run(*words: str) -> tuple[int, list[dict[str, Any]], str]:
     with TemporaryDirectory() as folder:
         out = Path(folder) / "out.json"
         command = [sys.executable, "-m", "sioms.tools.front", "driver", "check", *words, "--json", str(out)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=110)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=280)
         reports = json.loads(out.read_text()) if out.exists() else []
         return done.returncode, reports, done.stdout + done.stderr
 
 
 @cache
 def shipped() -> tuple[dict[str, dict[str, Any]], str]:
-    _, reports, said = run(*SHIPPED, "-j", "4")
+    _, reports, said = run(*SHIPPED, "-j", "5")
     return {report["driver"]: report for report in reports}, said
 
 
