@@ -17,14 +17,17 @@ import pytest
 from daemon_rig import wait_for
 
 import sioms
+from sioms.protocol.flags import AxisStatus
 
 RUNNER = """
-import sys, time, sioms
-node = sioms.Workcell(sys.argv[1]).open(sys.argv[2], "rw")
-node.command(velocity=float(sys.argv[3]))
-print("moving", flush=True)
-time.sleep(60)
+import sys, sioms
+cell = sioms.Workcell(sys.argv[1])
+for line in sys.stdin:
+    node = cell.open(sys.argv[2], "rw")
+    node.command(velocity=float(sys.argv[3]))
+    print("moving", line.strip(), flush=True)
 """
+"""A client that runs an axis each time it is told a number."""
 
 SLIDE = """
 [device.slide0]
@@ -50,11 +53,13 @@ class Misfit:
         words: of the sentence that says why.
         options: of the counterpart.
         change: a command to it before the daemon starts.
+        axis: that is in fault with these words, in a device that is up otherwise.
     """
 
     words: str
     options: tuple[str, ...] = ()
     change: str = ""
+    axis: str = ""
 
 
 def check_misfits(
@@ -98,12 +103,21 @@ def check_misfits(
     daemon.wait_line("event=ready", 40.0)
     with sioms.Workcell(socket) as cell:
         for i, misfit in enumerate(misfits):
-            wait_for(
-                lambda i=i, misfit=misfit: misfit.words in str(cell.status()["devices"][i]),
-                f"the sentence {misfit.words!r}; {cell.status()['devices'][i]}",
-            )
-            with pytest.raises(OSError, match=f"d{i}"), cell.open(f"d{i}.readonly") as opened:
-                opened.read()
+            _check_misfit(cell, i, misfit)
+
+
+def _check_misfit(cell: sioms.Workcell, i: int, misfit: Misfit) -> None:
+    told = lambda: str(cell.status()["devices"][i])  # noqa: E731
+    if not misfit.axis:
+        wait_for(lambda: misfit.words in told(), f"the sentence {misfit.words!r}; {told()}")
+        with pytest.raises(OSError, match=f"d{i}"), cell.open(f"d{i}.readonly") as opened:
+            opened.read()
+        return
+    wait_for(lambda: "'link': 'good'" in told(), f"d{i} up")
+    with cell.open(f"d{i}.{misfit.axis}", "rw") as node:
+        wait_for(lambda: node.read().status[0] & AxisStatus.FAULT, "the fault")
+        with pytest.raises(OSError, match=misfit.words):
+            node.command(position=1.0)
 
 
 class Wire:
@@ -173,12 +187,16 @@ class Wire:
             next(each for each in self.client.status()["devices"] if each["name"] == device)["pid"] or 0
         )
 
-    def run_client(self, node: str, velocity: float, moving: Callable[[], bool]) -> Any:
-        """Let a client of its own run an axis."""
-        client = self._start([sys.executable, "-c", RUNNER, self.socket, node, str(velocity)])
-        client.wait_line("moving")
-        wait_for(moving, f"{node} moving")
-        return client
+    def run_client(self, node: str, velocity: float) -> Any:
+        """Start a client of its own that can run an axis."""
+        return self._start([sys.executable, "-c", RUNNER, self.socket, node, str(velocity)])
+
+    def run(self, client: Any, number: int, moving: Callable[[], bool]) -> None:
+        """Let a client run its axis."""
+        client.process.stdin.write(f"{number}\n")
+        client.process.stdin.flush()
+        client.wait_line(f"moving {number}")
+        wait_for(moving, "motion")
 
     def check_deaths(
         self, node: str, velocity: float, speed: Callable[[], float], fast: float, rest_s: float
@@ -199,18 +217,18 @@ class Wire:
             wait_for(lambda: speed() == 0, f"rest after the death of the {after}", rest_s)
             print(f"{node}: at rest {time.monotonic() - began:.3f} s after the death of the {after}")
 
-        client = self.run_client(node, velocity, lambda: abs(speed()) > fast)
-        client.process.kill()
+        clients = [self.run_client(node, velocity) for _ in range(2)]
+        self.run(clients[0], 1, lambda: abs(speed()) > fast)
+        clients[0].process.kill()
         rests("client")
         wait_for(lambda: self.reads(node), "the axis after its client's death")
-        client = self.run_client(node, velocity, lambda: abs(speed()) > fast)
+        self.run(clients[1], 1, lambda: abs(speed()) > fast)
         driver = self.pid(device)
         os.kill(driver, signal.SIGKILL)
         rests("driver")
-        client.process.kill()
         wait_for(lambda: self.pid(device) not in (0, driver), "a new driver")
         self.wait_up(node)
         assert speed() == 0, "motion must not resume"
-        self.run_client(node, velocity, lambda: abs(speed()) > fast)
+        self.run(clients[1], 2, lambda: abs(speed()) > fast)
         self.daemon.process.kill()
         rests("daemon")

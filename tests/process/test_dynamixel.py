@@ -42,12 +42,24 @@ velocity_max = 6.0
 acceleration_max = 20.0
 """
 
+OTHER = """
+[[device.arm0.axis]]
+name = "other"
+id = 3
+model = 1030
+unit = "rad"
+velocity_max = 6.0
+acceleration_max = 20.0
+"""
+
 
 def test_modes_stops_and_shutdown(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "dynamixel", "--ids", "1,2")
-    cell = wire.serve(CONFIG)
+    wire = Wire(start, short_folder, "dynamixel", "--ids", "1,2,3")
+    cell = wire.serve(CONFIG + OTHER)
     wire.wait_up("arm0.a")
     wire.wait_up("arm0.b")
+    wire.daemon.wait_line("model 1020")  # of the third, which should be another
+    assert not wire.reads("arm0.other")
     assert (wire.state("mode", 1), wire.state("mode", 2), wire.state("watchdog", 1)) == (4, 1, 50)
     with cell.open("arm0.b", "rw") as b:
         b.command(velocity=3.0)
@@ -102,13 +114,6 @@ def test_watchdog_and_deaths(start: Callable[..., Any], short_folder: Path) -> N
         b.reset()
         wait_for(lambda: not b.read().status[0] & AxisStatus.FAULT, "the reset")
     wire.check_deaths("arm0.b", 3.0, lambda: float(wire.state("velocity", 2)), 1000, 2.0)
-
-
-def test_another_model_is_refused(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "dynamixel", "--ids", "1", "--model", "1030")
-    wire.serve(CONFIG)
-    wait_for(lambda: any("model 1030" in line for line in wire.daemon.lines), "the sentence")
-    assert not wire.reads("arm0.a")
 
 
 def test_the_vendors_client_agrees_with_the_counterpart(

@@ -181,13 +181,17 @@ def test_line_faults_and_deaths_on_tcp(start: Callable[..., Any], short_folder: 
         wire.tell("unplug")
         wait_for(lambda: not wire.reads("mod0.x"), "the loss")
         wire.tell("program 100 600")
+        wire.tell("set 13 1")  # and it tells inches and work positions from now on
+        wire.tell("set 10 0")
         wire.tell("plug")
         wire.wait_up("mod0.x")
         wait_for(lambda: wire.state("state") == "Idle", "the program's end")
         assert wire.state("position") == wire.state("real")
         x.reset()
-        x.move(0.0)
+        x.move(0.0254)
         x.wait_until_idle(10.0)
+        assert wire.state("position")[0] == pytest.approx(25.4)
+        assert x.read().position[0] == pytest.approx(0.0254, abs=3e-5)
         # rebooted in motion
         x.command(velocity=0.05)
         wait_for(lambda: wire.state("velocity") > 40, "motion")
@@ -204,16 +208,3 @@ def test_limits_that_differ(start: Callable[..., Any], short_folder: Path) -> No
         Misfit("acceleration_max = 0.5, but $122 of the controller is 0.1", change="set 122 100"),
     )
     check_misfits(start, short_folder, "grbl", CONFIG, misfits)
-
-
-def test_inches_and_work_positions(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "grbl", "--no-homing")
-    wire.tell("set 13 1")
-    wire.tell("set 10 0")
-    cell = wire.serve(CONFIG)
-    wire.wait_up("mod0.x")
-    with cell.open("mod0.x", "rw") as x:
-        x.move(0.0254)
-        x.wait_until_idle(8.0)
-        assert wire.state("position")[0] == pytest.approx(25.4)
-        assert x.read().position[0] == pytest.approx(0.0254, abs=3e-5)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -133,15 +132,6 @@ def test_boards_that_do_not_fit(start: Callable[..., Any], short_folder: Path) -
     misfits = (
         Misfit("counts positions in encoder counts", ("--version", "0.4.12")),
         Misfit("vel_limit is 2", change="set axis1.controller.config.vel_limit 2"),
+        Misfit("encoder failed", change="error 0x100 1", axis="j"),
     )
     check_misfits(start, short_folder, "odrive", CONFIG, misfits)
-
-
-def test_an_error_that_was_there_before(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "odrive")
-    wire.tell("error 0x100 1")
-    cell = wire.serve(CONFIG)
-    wire.wait_up("mod0.j")
-    with cell.open("mod0.j", "rw") as j, raises(5, "encoder failed"):
-        wait_for(lambda: j.read().status[0] & AxisStatus.FAULT, "the fault")
-        j.move(math.pi)
