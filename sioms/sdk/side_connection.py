@@ -53,7 +53,11 @@ class SideConnection:
         if exchange is None:
             raise RuntimeError("nothing was asked")
         try:
-            found = self._transmit(exchange, now_ns) if not self._sent else self._receive(exchange)
+            found = None
+            if self._sent:
+                found = self._receive(exchange)
+            else:
+                self._transmit(exchange, now_ns)
         except OSError as error:
             self.close()
             raise LinkError(f"{exchange.what}: {error.strerror or error}") from None
