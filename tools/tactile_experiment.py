@@ -42,6 +42,7 @@ def plan(quick: bool) -> dict[str, list[Touch]]:
 
 def probe(folder: Path, finger: str, quick: bool, progress: Progress) -> None:
     """Run the workcell with a simulated finger, touch it by plan, write the recordings."""
+    write_nominal(folder / "nominal.json", np.radians(ANGLES_DEG))
     if "length_m" not in finger:
         finger += f"; length_m = {LENGTH_M}"
     with (
@@ -60,7 +61,6 @@ def probe(folder: Path, finger: str, quick: bool, progress: Progress) -> None:
             prober.ramps(np.radians(ANGLES_DEG).tolist(), 250.0, seconds, progress).save(folder / "ramp.npz")
         finally:
             prober.close()
-    write_nominal(folder / "nominal.json", np.radians(ANGLES_DEG))
 
 
 def experiment(args: argparse.Namespace) -> int:

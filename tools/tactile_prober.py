@@ -6,6 +6,7 @@ The workcell is that of etc/prober.toml: axes ``prober.place`` and ``prober.radi
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -18,7 +19,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,8 @@ from numpy.typing import NDArray
 import sioms
 
 Floats = NDArray[np.float64]
+Frames = tuple[Floats, Floats, Floats]  # raw (n, ns), time [s], force [N/m]
+T = TypeVar("T")
 
 SURFACE_M = 0.010  # depth of the finger's surface
 CLEAR_M = 2e-3  # distance of the indenter between touches
@@ -33,6 +36,7 @@ LENGTH_M = 0.012  # of the indenters: N to N/m
 FRAMES = 20  # averaged before and under each touch
 RATE_HZ = 400.0
 START_S = 180.0
+ATTEMPTS = 5  # at a touch whose frames did not come
 FINGER = (
     "length_m = 0.012; gain = 3.0; gain_scatter = 0.1; depth_scatter_m = 2e-4; angle_scatter_rad = 0.007; quadratic = 0.03; "
     "adhesion = 0.3; creep = 0.05; drift = 0.3; drift_s = 300.0; mains = 0.03; strip_gain = 0.02; seed = 1"
@@ -63,7 +67,11 @@ class Counterpart:
     def end(self) -> None:
         """End it."""
         self._process.terminate()
-        self._process.wait(5.0)
+        try:
+            self._process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
 
     def _wait(self, word: str) -> None:
         said: list[str] = []
@@ -103,7 +111,7 @@ def simulated(
         process = daemon(str(config), str(socket))
         stack.callback(process.end)
         try:
-            _wait_links()
+            wait_links()
             yield lambda radius_m: device.tell(f"indenter {radius_m}")
         finally:
             if before is None:
@@ -112,7 +120,12 @@ def simulated(
                 os.environ["SIOMS_SOCKET"] = before
 
 
-def _wait_links() -> None:
+def wait_links() -> None:
+    """Wait until all devices of the workcell answer.
+
+    Raises:
+        RuntimeError: one does not.
+    """
     with sioms.Workcell(name="prober") as cell:
         deadline = time.monotonic() + START_S
         while any(device["link"] != "good" for device in cell.status()["devices"]):
@@ -171,8 +184,8 @@ class Prober:
     def __init__(self, cell: sioms.Workcell, mount: Callable[[float], None]) -> None:
         self._mount = mount
         self._mounted = math.nan
-        self._axis: Any = cell.open("prober.radial", "rw", lease=2.0)
-        self._place: Any = cell.open("prober.place", "rw", lease=2.0)
+        self._axis: Any = cell.open("prober.radial", "rw", lease=10.0)
+        self._place: Any = cell.open("prober.place", "rw", lease=10.0)
         self._finger: Any = cell.open("tactile0")
         self._force: Any = cell.open("force0.fz")
         self._stiffness = 0.0
@@ -181,13 +194,16 @@ class Prober:
 
     def prepare(self, radius_m: float, middle: float) -> None:
         """Learn how deep the axis must go for a force: one press in the middle of the finger."""
-        self._stiffness = 4000.0
-        self._go(middle, radius_m)
         depth_m = 0.5e-3
-        self._press(depth_m)
-        _, _, force = self._frames(FRAMES)
-        self._stiffness = float(np.mean(force)) * LENGTH_M / depth_m
-        self._clear()
+
+        def press() -> float:
+            self._go(middle, radius_m)
+            self._press(depth_m)
+            _, _, force = self._frames(FRAMES)
+            self._clear()
+            return float(np.mean(force))
+
+        self._stiffness = self._again(press, lambda what: None) * LENGTH_M / depth_m
         if not self._stiffness > 0.0:
             raise RuntimeError(
                 f"probe finger: pressing {1e3 * depth_m:g} mm deep gave no force; see to force0 and the prober"
@@ -197,14 +213,33 @@ class Prober:
         """Carry out a plan, touch by touch."""
         out = Recorder()
         for number, touch in enumerate(plan):
-            self._go(touch.place, touch.radius_m)
-            out.add(*self._frames(FRAMES), number, 0)
-            self._press(touch.load * LENGTH_M / self._stiffness)
-            out.add(*self._frames(FRAMES), number, 1)
-            self._clear()
+            before, under = self._again(lambda: self._touch(touch), tell)  # noqa: B023 - called at once
+            out.add(*before, number, 0)
+            out.add(*under, number, 1)
             out.touches.append(touch)
             tell(f"{what}: touch {number + 1} of {len(plan)}")
         return out
+
+    def _touch(self, touch: Touch) -> tuple[Frames, Frames]:
+        self._go(touch.place, touch.radius_m)
+        before = self._frames(FRAMES)
+        self._press(touch.load * LENGTH_M / self._stiffness)
+        under = self._frames(FRAMES)
+        self._clear()
+        return before, under
+
+    def _again(self, work: Callable[[], T], tell: Callable[[str], None]) -> T:
+        """Repeat what a break of the finger's link has spoilt."""
+        for attempt in range(ATTEMPTS):
+            try:
+                return work()
+            except OSError as error:
+                if error.errno != errno.EIO or attempt == ATTEMPTS - 1:
+                    raise
+                tell(f"{error.strerror}: once more")
+                wait_links()
+                self._clear()
+        raise AssertionError("unreachable")
 
     def ramps(
         self, places: Sequence[float], load: float, seconds: float, tell: Callable[[str], None]
@@ -212,24 +247,29 @@ class Prober:
         """Press an edge over each element with a force that grows evenly."""
         out = Recorder()
         for number, place in enumerate(places):
-            self._go(place, 0.0)
-            out.add(*self._frames(FRAMES), number, 0)
-            depth_m = load * LENGTH_M / self._stiffness
-            self._move(SURFACE_M - 0.1e-3)
-            self._axis.command(velocity=depth_m / seconds, replace=True)
-            frames, stamps, force = self._frames(round(RATE_HZ * seconds))
-            pressed = np.flatnonzero(force > 0.05 * force.max())
-            rise = slice(int(pressed[0]), int(np.argmax(force)) + 1)
-            out.add(frames[rise], stamps[rise], force[rise], number, 1)
-            self._clear()
+            before, under = self._again(lambda: self._ramp(place, load, seconds), tell)  # noqa: B023 - called at once
+            out.add(*before, number, 0)
+            out.add(*under, number, 1)
             tell(f"ramp over element {number}")
         return out
+
+    def _ramp(self, place: float, load: float, seconds: float) -> tuple[Frames, Frames]:
+        self._go(place, 0.0)
+        before = self._frames(FRAMES)
+        depth_m = load * LENGTH_M / self._stiffness
+        self._move(SURFACE_M - 0.1e-3)
+        self._axis.command(velocity=depth_m / seconds, replace=True)
+        frames, stamps, force = self._frames(round(RATE_HZ * seconds))
+        self._clear()
+        pressed = np.flatnonzero(force > 0.05 * force.max())
+        rise = slice(int(pressed[0]), int(np.argmax(force)) + 1)
+        return before, (frames[rise], stamps[rise], force[rise])
 
     def quiet(self, frames: int) -> Recorder:
         """Record the untouched finger."""
         out = Recorder()
         for _ in range(math.ceil(frames / 200)):  # the page holds 512
-            out.add(*self._frames(200), -1, 2)
+            out.add(*self._again(lambda: self._frames(200), lambda what: None), -1, 2)
         return out
 
     def close(self) -> None:
@@ -261,7 +301,7 @@ class Prober:
         self._axis.command(position=position, replace=True)
         self._axis.wait_until_idle(5.0)
 
-    def _frames(self, count: int) -> tuple[Floats, Floats, Floats]:
+    def _frames(self, count: int) -> Frames:
         """Return the next frames, shape (count, ns), their times [s] and the forces at them [N/m]."""
         last, force_last = self._finger.read().number, self._force.read().number
         snaps: list[Any] = []

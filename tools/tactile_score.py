@@ -1,4 +1,4 @@
-"""Score calibration and estimation on folders of recordings: every third touch is kept from the calibration and fitted.
+"""Score calibration and estimation on folders of recordings: every fourth touch is kept from the calibration and fitted.
 
 One row for each finger.  A finger whose truth is known (``--truth FOLDER`` with NAME.json, as a generator of
 such data writes it) also gets the errors of its parameters.
@@ -29,7 +29,7 @@ from sioms.tools.tactile import Progress
 from sioms.tools.tactile_data import read_folder
 
 Floats = NDArray[np.float64]
-KEPT = 3  # every third touch is kept from the calibration
+KEPT = 4  # every fourth touch is kept from the calibration
 LEAST_LOAD = 100.0  # N/m, of the touches that are scored: below, R is hardly told
 
 
@@ -63,7 +63,7 @@ class Score:
 
 
 def score_folder(folder: Path, truth: Path | None, edge_half_angle: float) -> Score:
-    """Calibrate on two thirds of the touches of a folder and fit the rest."""
+    """Calibrate on three quarters of the touches of a folder and fit the rest."""
     data = read_folder(folder)
     ramp = data.recordings.get("ramp")
     ramps = [] if ramp is None else ramps_of(ramp, data.nominal.signal.scale)
@@ -137,6 +137,8 @@ def score(args: argparse.Namespace) -> int:
         for folder in args.data
         for child in ([folder] if _is_data(folder) else sorted(folder.iterdir()))
     ]
+    if not folders:
+        raise ValueError(f"score fingers: {args.data[0]} is empty; give folders of recordings")
     if bad := [str(folder) for folder in folders if not _is_data(folder)]:
         raise ValueError(f"score fingers: {', '.join(bad)} holds no *.npz; give folders of recordings")
     if args.truth is not None and not args.truth.is_dir():

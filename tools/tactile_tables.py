@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -93,19 +93,19 @@ class Tables:
 
     def fits(
         self, which: NDArray[np.bool_], share: float, loads: TouchLoads | None = None
-    ) -> list[ElementFit]:
-        """Fit place, depth, Poisson's ratio and gain of every element."""
+    ) -> dict[int, ElementFit]:
+        """Fit place, depth, Poisson's ratio and gain of every element with touches enough; by its number."""
         found = fit_elements(self.body, self.begin, *self.part(which, loads), share, Freedom(True, True))
-        return [one for one in found if one is not None]
+        return {number: one for number, one in enumerate(found) if one is not None}
 
     def error(self, one: ElementFit) -> float:
         """Return an element's standard error in per cent of peak."""
         return 100.0 * one.residual * one.gain / self.peak
 
-    def noise(self, fits: Sequence[ElementFit]) -> list[float]:
+    def noise(self, fits: Mapping[int, ElementFit]) -> list[float]:
         """Return the noise of one frame, of peak."""
         own = self.result.touches.noise
-        return [100.0 * float(own[n]) * one.gain / self.peak for n, one in enumerate(fits)]
+        return [100.0 * float(own[n]) * one.gain / self.peak for n, one in fits.items()]
 
     def table_3_4(self) -> Table:
         """First seven elements."""
@@ -113,7 +113,11 @@ class Tables:
                      (115.3, 41.4, 10.43, 0.45, 2.26), (105.9, 35.6, 10.36, 0.43, 2.23), (97.4, 42.3, 9.91, 0.46, 2.05),
                      (87.7, 44.0, 10.22, 0.47, 1.62))  # fmt: skip
         rows = []
-        for one, other in zip(self.fits(self.edge, 0.0), published, strict=False):
+        fits = self.fits(self.edge, 0.0)
+        for number, other in enumerate(published):
+            if number not in fits:
+                continue
+            one = fits[number]
             mine = (
                 math.degrees(one.angle_rad),
                 one.gain / self.peak,
@@ -130,8 +134,9 @@ class Tables:
     def table_3_5(self) -> Table:
         """Model fits to edges."""
         fits = self.fits(self.edge, 0.0)
-        mine = ("this finger", _three([o.poisson for o in fits], 2), _three([1e3 * o.radius_m for o in fits], 1),
-                _three([self.error(o) for o in fits], 2), _three(self.noise(fits), 2))  # fmt: skip
+        mine = ("this finger", _three([o.poisson for o in fits.values()], 2),
+                _three([1e3 * o.radius_m for o in fits.values()], 1),
+                _three([self.error(o) for o in fits.values()], 2), _three(self.noise(fits), 2))  # fmt: skip
         rows = [mine, ("published 0", "0.41 0.46 0.48", "9.8 10.3 10.7", "1.28 2.16 3.95", "0.95 1.72 2.87"),
                 ("published 4", "0.36 0.43 0.48", "9.8 10.1 10.7", "1.04 2.46 4.29", "0.42 0.97 1.50"),
                 ("published 6", "0.38 0.46 0.50", "10.7 10.9 11.1", "1.91 3.62 5.99", "0.88 2.38 4.39")]  # fmt: skip
@@ -148,7 +153,7 @@ class Tables:
     def table_3_6(self) -> Table:
         """Model fits to flat and edge by contact model."""
         mine = [
-            _three([self.error(o) for o in self.fits(self.both, share, loads)], 2)
+            _three([self.error(o) for o in self.fits(self.both, share, loads).values()], 2)
             for _, loads, share in self.by_contact()
         ]
         rows = [("this finger", *mine), ("published 0", "3.44 4.24 5.73", "1.75 2.25 3.60", "2.17 2.77 4.08"),
@@ -159,8 +164,8 @@ class Tables:
     def table_3_7(self) -> Table:
         """Uniform fits."""
         places, (depth, nu), _ = fit_uniform(self.body, self.begin, *self.part(self.edge), 0.0)
-        fits = [one for one in places if one is not None]
-        rows = [("this finger", f"{nu:.2f}", f"{1e3 * depth:.1f}", _three([self.error(o) for o in fits], 2),
+        fits = {number: one for number, one in enumerate(places) if one is not None}
+        rows = [("this finger", f"{nu:.2f}", f"{1e3 * depth:.1f}", _three([self.error(o) for o in fits.values()], 2),
                  _three(self.noise(fits), 2)),
                 ("published 0", "0.45", "10.3", "1.86 3.18 5.07", "0.95 1.73 2.80"),
                 ("published 4", "0.43", "10.1", "3.17 5.61 8.13", "0.39 0.96 1.50"),
