@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from .client.node import AnalogNode as AnalogNode
     from .client.node import AxisNode as AxisNode
     from .client.node import BinaryNode as BinaryNode
-    from .client.node import Event as Event
     from .client.node import Node as Node
     from .client.node import select as select
+    from .client.node_core import Event as Event
     from .client.workcell import Marker as Marker
     from .client.workcell import Workcell as Workcell
     from .protocol.flags import AnalogStatus as AnalogStatus
@@ -34,7 +34,7 @@ _HOME = {
     "AxisNode": "client.node",
     "AnalogNode": "client.node",
     "BinaryNode": "client.node",
-    "Event": "client.node",
+    "Event": "client.node_core",
     "select": "client.node",
     "command": "client.command",
     "ControlMode": "protocol.flags",

@@ -5,7 +5,7 @@
             await mod0.write(sioms.command(0, position=0.1))
             await mod0.wait_until_idle()
 
-Requests are the same values that the blocking face sends (``sioms.client.node``); only the waiting
+Requests are the same values that the blocking face sends (``sioms.client.node_core``); only the waiting
 differs. Reading needs no waiting: ``read`` is an ordinary call.
 
 Concurrency: one event loop, any number of its tasks. Cancelling a task cancels its request.
@@ -30,11 +30,11 @@ from sioms.protocol.socketpath import socket_path
 from .client.channel import Answer, Call, Channel
 from .client.channel import connect as connect_socket
 from .client.command import command
-from .client.node import Event, NodeCore
+from .client.node_core import Event, NodeCore
 from .client.workcell import node_parts, open_call
 
 if TYPE_CHECKING:
-    from .client.node import Records
+    from .client.node_core import Records
 
 
 class _Requests:

@@ -11,7 +11,8 @@ from select import POLLIN, poll
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from .channel import Call
-    from .node import Node, Records
+    from .node import Node
+    from .node_core import Records
 
 AHEAD = 64
 """Writes under way at most; beyond it a write waits for the oldest: back-pressure by the command buffer."""

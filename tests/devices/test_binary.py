@@ -9,6 +9,7 @@ from daemon_rig import Daemon, raises, wait_for
 from device_rigs import RIGS, Output
 
 import sioms
+from sioms.protocol.records import BINARY_WRITE
 
 OUTPUTS = [output for rig in RIGS for output in rig.outputs]
 INPUTS = [name for rig in RIGS for name in rig.inputs]
@@ -16,7 +17,9 @@ every_output = pytest.mark.parametrize("output", OUTPUTS, ids=lambda output: out
 
 
 def shows(node: sioms.BinaryNode, value: int) -> None:
-    wait_for(lambda: node.read().data[0] == value, f"{node.name} shows {value:#x}, not {node.read().data[0]:#x}")
+    wait_for(
+        lambda: node.read().data[0] == value, f"{node.name} shows {value:#x}, not {node.read().data[0]:#x}"
+    )
 
 
 @every_output
@@ -41,7 +44,7 @@ def test_values_beyond_its_width_are_refused(cell: sioms.Workcell, output: Outpu
             with raises(errno.EINVAL, f"data {value}"):
                 node.set(value)
         with raises(errno.EINVAL, "channel 1"):
-            node.write([*(sioms.client.node.BINARY_WRITE.pack(i, 0, 0, 0) for i in (0, 1))])
+            node.write([*(BINARY_WRITE.pack(i, 0, 0, 0) for i in (0, 1))])
         assert node.read().data[0] == 1, "nothing of a refused write was taken"
 
 

@@ -18,6 +18,7 @@ from daemon_rig import Client, Daemon, raises, wait_for
 import sioms
 import sioms.aio
 from sioms.protocol.flags import Request
+from sioms.protocol.records import BINARY_WRITE
 
 
 def test_all_channels_carry_one_tick_under_a_hasty_reader(cell: sioms.Workcell) -> None:
@@ -266,8 +267,8 @@ def test_values_of_outputs_are_checked(cell: sioms.Workcell) -> None:
         with raises(errno.EINVAL, "2 values; want 1"):
             port.set(1, 2)
         with raises(errno.EINVAL, "channel 3"):
-            port.write(sioms.client.node.BINARY_WRITE.pack(3, 0, 1, 0))
-        port.write(sioms.client.node.BINARY_WRITE.pack(0, 0, 0b0101, 0b0011))  # under a mask
+            port.write(BINARY_WRITE.pack(3, 0, 1, 0))
+        port.write(BINARY_WRITE.pack(0, 0, 0b0101, 0b0011))  # under a mask
         wait_for(lambda: seen.read().data[0] == 0b1001, "the masked bits alone")
     wait_for(lambda: _data(cell) == 0, "safe after the close")
     with cell.open("io0.bit2", "rw") as bit, raises(errno.EINVAL, "data 2", "0 or 1"):

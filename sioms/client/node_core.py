@@ -1,0 +1,225 @@
+"""What an open node is, without any waiting: reading out of shared memory, and requests as values.
+
+Concurrency: that of the faces, ``node`` and ``sioms.aio``.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from mmap import PROT_READ, mmap
+from time import monotonic_ns
+
+from sioms.protocol.flags import NodeClass, PageState, Request, WriteFlag
+from sioms.protocol.messages import MAX_INLINE, MAX_WRITE, HandleVerb
+from sioms.protocol.nodeinfo import NodeInfo
+from sioms.protocol.page import NotReadable, PageReader
+from sioms.protocol.records import ANALOG_WRITE, BINARY_WRITE
+
+from .channel import KEEPALIVE, Call, Channel
+from .snapshot import SNAPSHOT, BinarySnapshot, Layout
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from typing import Any, TypeAlias
+
+    Records: TypeAlias = bytes | bytearray | memoryview | Iterable[bytes]
+
+_WAKES = 4096
+"""Bytes taken out of the wake pipe in one go, one a publication."""
+_JUDGED_S = 0.1
+"""What a driver may take to judge a packet of records, in pieces between its ticks [s]."""
+
+
+class Event:
+    """An edge on a binary node: the states before and after, and when.
+
+    Attributes:
+        initial, final: data when waiting began, and after the edge.
+        stamp_ns: time of the edge as the device gave it [ns, CLOCK_MONOTONIC].
+        number: snapshot that showed it; pass the event to the next wait and none is lost.
+    """
+
+    __slots__ = ("final", "initial", "number", "stamp_ns")
+
+    def __init__(self, initial: int, final: int, stamp_ns: int, number: int) -> None:
+        self.initial = initial
+        self.final = final
+        self.stamp_ns = stamp_ns
+        self.number = number
+
+    def __repr__(self) -> str:
+        return f"Event(initial={self.initial:#x}, final={self.final:#x}, stamp_ns={self.stamp_ns})"
+
+
+class NodeCore:
+    """What the blocking and the asyncio face of an open node share; no waiting in it.
+
+    Attributes:
+        info: what the node is (GET_IO_STRUCT_INFO).
+        name: node name.
+    """
+
+    def __init__(
+        self, info: NodeInfo, handle: int, fds: list[int], channels: list[int], bit: int, channel: Channel
+    ) -> None:
+        self.info = info
+        self.name = info.name
+        self.handle = handle
+        self._channel = channel
+        self._event = fds[1]
+        size = os.fstat(fds[0]).st_size
+        self._map: mmap | None = mmap(fds[0], size, prot=PROT_READ)
+        os.close(fds[0])
+        self._page = PageReader(self._map)
+        self._layout = Layout(info.node_class, self._page.channels, channels, bit)
+        self._snapshot = SNAPSHOT[info.node_class]
+        self._latest = self._page.latest
+        self._subscribed = 0
+
+    @property
+    def closed(self) -> bool:
+        """Whether it has been closed."""
+        return self._map is None
+
+    def read(self) -> Any:
+        """Return the newest snapshot of all channels: a copy of memory, no system call.
+
+        Raises:
+            OSError: EIO, the device is starting, lost, hung or in fault, with the reason; never old
+                data as new. EBADF, the node is closed.
+        """
+        try:
+            raw = self._latest(monotonic_ns())
+        except (NotReadable, ValueError) as error:
+            raise self._unreadable(error) from None
+        if self._subscribed:
+            self._drain()
+        return self._snapshot(raw, self._layout)
+
+    def history(self, after: int, *, gone: bool = False) -> list[Any]:
+        """Return the snapshots after a given number that the page still holds, oldest first.
+
+        Args:
+            after: number of the last snapshot seen; 0 for all.
+            gone: also of a device that is lost, hung or gone, to look at what happened to it.
+        """
+        if not gone:
+            self.read()
+        page = self._page
+        first = max(after + 1, page.head - page.slots + 2, 1)
+        raws = [page.numbered(number) for number in range(first, page.head + 1)]
+        return [self._snapshot(raw, self._layout) for raw in raws if raw is not None]
+
+    def fileno(self) -> int:
+        """Return a descriptor that is readable when there is new data, for selectors and asyncio.
+
+        The first call subscribes; ``read`` makes it unreadable until the next publication.
+        """
+        if not self._subscribed:
+            self.subscribe(1)
+        return self._event
+
+    def subscribe(self, every: int) -> None:
+        """Have ``fileno`` become readable with every n-th publication, -1: with edges only, 0: not at all."""
+        raise NotImplementedError
+
+    def keepalive(self) -> None:
+        """Tell the driver that this client is alive, for nodes opened with a lease; any request does, too."""
+        self._channel.notice(KEEPALIVE)
+
+    def room(self) -> int:
+        """Return how many commands the fullest of the node's command buffers still takes."""
+        fullest: int = max(self.read().buffered)
+        return self.info.buffer_capacity - fullest
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.name}{' closed' if self.closed else ''}>"
+
+    # --- requests as values ----------------------------------------------------------------------
+
+    def _ioctl(self, request: Request, argument: object = None, timeout: float | None = 0.0) -> Call:
+        what = f"{request.name} on {self.name}"
+        return Call(what, HandleVerb.IOCTL, int(request), argument, timeout, limit_s=timeout)
+
+    def _write(self, records: Records, timeout: float | None, replace: bool) -> Call:
+        data = records if isinstance(records, bytes) else _join(records)
+        flags = WriteFlag.REPLACE if replace else WriteFlag.APPEND
+        what = f"write {self.name}"
+        if len(data) <= MAX_INLINE:
+            return Call(what, HandleVerb.WRITE, int(flags), timeout, data, limit_s=timeout)
+        if len(data) > MAX_WRITE:
+            raise OSError(errno.EMSGSIZE, f"{what}: {len(data)} bytes of records; at most {MAX_WRITE}")
+        parts = [data[i : i + MAX_INLINE] for i in range(0, len(data), MAX_INLINE)]
+        limit_s = None if timeout is None else timeout + _JUDGED_S * len(parts)
+        ahead = tuple(parts[:-1])
+        return Call(what, HandleVerb.WRITE, int(flags), timeout, parts[-1], ahead=ahead, limit_s=limit_s)
+
+    def _outputs(self, values: Sequence[float]) -> bytes:
+        count = len(self.info.channels)
+        if len(values) != count:
+            raise OSError(errno.EINVAL, f"write {self.name}: {len(values)} values; want {count}")
+        if self.info.node_class is NodeClass.BINARY:
+            return b"".join([BINARY_WRITE.pack(i, 0, int(value), 0) for i, value in enumerate(values)])
+        return b"".join([ANALOG_WRITE.pack(i, 0, value) for i, value in enumerate(values)])
+
+    def _find_event(self, mask: int, state: int, after: int) -> Event | None:
+        """Look through the snapshots after a number for a change of the masked bits."""
+        self.read()
+        page = self._page
+        for number in range(max(after + 1, page.head - page.slots + 2, 1), page.head + 1):
+            raw = page.numbered(number)  # one by one: who is far behind pays for one edge at a time
+            if raw is None:
+                continue
+            snapshot: Any = self._snapshot(raw, self._layout)
+            final = snapshot.data[0]
+            if (final ^ state) & mask:
+                return Event(state, final, snapshot.changed_ns[0], snapshot.number)
+        return None
+
+    def _start_of(self, last: Event | BinarySnapshot | None) -> tuple[int, int]:
+        """Return (state, number) from which a wait for an event begins."""
+        if self.info.node_class is not NodeClass.BINARY or len(self.info.channels) != 1:
+            raise OSError(
+                errno.EINVAL, f"wait for an event on {self.name}: want a node of one binary channel"
+            )
+        if isinstance(last, Event):
+            return last.final, last.number
+        start: BinarySnapshot = last if last is not None else self.read()
+        return start.data[0], start.number
+
+    def _drain(self) -> None:
+        try:
+            os.read(self._event, _WAKES)
+        except BlockingIOError:
+            return
+
+    def _unreadable(self, error: Exception) -> OSError:
+        if self._map is None:
+            return OSError(errno.EBADF, f"read {self.name}: it is closed")
+        if isinstance(error, NotReadable):
+            why = error.reason or "no reason given"
+            state = {
+                PageState.STALE: "its driver is gone or hung",
+                PageState.STARTING: "its device is starting",
+            }
+            what = state.get(error.state, f"its device is in {error.state.name.lower().replace('_', ' ')}")
+            return OSError(errno.EIO, f"read {self.name}: {what}: {why}")
+        raise error
+
+    def release(self) -> None:
+        """Let go of memory and descriptors; the driver ends the handle at the end of file."""
+        if self._map is None:
+            return
+        self._channel.close()
+        self._page.release()
+        self._map.close()
+        self._map = None
+        os.close(self._event)
+
+
+def _join(records: Any) -> bytes:
+    if hasattr(records, "tobytes"):
+        return bytes(records.tobytes())
+    return bytes(records) if isinstance(records, bytearray) else b"".join(records)
