@@ -221,7 +221,7 @@ class Tables:
         self, finger: Finger, touches: Touches, radius_m: float, load: bool = False
     ) -> tuple[float, float]:
         """Return mean and deviation of rc [mm] of one indenter; the mean by way of R, which behaves for flats."""
-        mine = touches.pick(touches.radius_m == radius_m)
+        mine = touches.pick(np.isclose(touches.radius_m, radius_m, atol=1e-9))
         found = np.array([r for _, _, r in fitted(finger, mine, load)])
         rc = np.array(
             [indenter_radius(finger.cylinder, min(r, 0.999 * finger.cylinder.outer_m)) for r in found]
@@ -237,7 +237,7 @@ class Tables:
         model, mapped = without_map(self.result.finger), with_map(self.result)
         fingers = [hertzian(model), hertzian(mapped), model, mapped]
         for rc, published in PUBLISHED_3_10.items():
-            if np.any(touches.radius_m == 1e-3 * rc):
+            if np.any(np.isclose(touches.radius_m, 1e-3 * rc, atol=1e-9)):
                 mine = [self.mean_rc(one, touches, 1e-3 * rc)[0] for one in fingers]
                 rows.append(
                     (f"{rc:g}", *(f"{a:.2f} ({b:.2f})" for a, b in zip(mine, published, strict=True)))
@@ -263,7 +263,7 @@ class Tables:
         """Radii without and with load information."""
         touches, finger, rows = self.indenters(), with_map(self.result), []
         for rc, published in PUBLISHED_3_12.items():
-            if np.any(touches.radius_m == 1e-3 * rc):
+            if np.any(np.isclose(touches.radius_m, 1e-3 * rc, atol=1e-9)):
                 free, loaded = (self.mean_rc(finger, touches, 1e-3 * rc, load) for load in (False, True))
                 mine = (free[0], loaded[0], free[1], loaded[1])
                 rows.append(

@@ -54,7 +54,7 @@ class Quality(Flag):
 
 _HUGE = 1e30  # variance of an element that must not count
 _PROXIMITY_PASSES = 3
-_HOLD_PASSES = 3
+_HOLD_PASSES = 8
 _SURE = math.radians(2.0) / 4.0  # standard deviation of the place above which IMPRECISE is set
 _NOTHING = Quality.NO_CONTACT | Quality.TOO_FEW_ELEMENTS | Quality.WRONG_SIGN | Quality.NO_BASELINE
 _DOUBT = Quality.POOR_FIT | Quality.OUT_OF_ARC | Quality.OVERLOAD | Quality.NOT_CONVERGED | Quality.IMPRECISE

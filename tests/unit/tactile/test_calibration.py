@@ -205,3 +205,20 @@ def test_pull_of_a_conductor_is_found_and_undone(start: Finger, made) -> None:  
     assert undone.load_n_per_m == pytest.approx(200.0, rel=0.05)
     assert math.degrees(undone.angle_rad) == pytest.approx(77.0, abs=0.3)
     assert abs(left.load_n_per_m - 200.0) > 4.0 * abs(undone.load_n_per_m - 200.0)
+
+
+def test_a_conductors_pull_is_no_quadratic(made) -> None:  # type: ignore[no-untyped-def]
+    """The pull is the same for all loads at one place: with an offset of its own a series gives the true quadratic."""
+    touches = made.touches()
+    distance = made.angles - touches.angle_rad[:, None]
+    pulled = touches.with_output(touches.output + Proximity(-0.03, 0.25).output(distance))
+    series = touches.radius_m == 1.6e-3
+    model = np.array(
+        [made._strains(t, p, rc) for t, p, rc in zip(
+            touches.angle_rad[series], touches.load[series], touches.radius_m[series], strict=True)]
+    )  # fmt: skip
+    plain = find_quadratic(pulled.pick(series), model)
+    parted = find_quadratic(pulled.pick(series), model, drawn=True)
+    assert plain is not None and parted is not None
+    assert parted.common == pytest.approx(made.quadratic, abs=0.6)
+    assert abs(plain.common - made.quadratic) > 1.5

@@ -197,3 +197,27 @@ def test_batch_tells_progress(nominal: Finger, estimator: Estimator) -> None:
     frames = [strains(nominal, math.radians(75.0), 200.0, 6e-3)] * 3
     assert len(list(estimator.batch(frames, progress=told.append))) == 3
     assert told == [1, 2, 3]
+
+
+def test_a_light_touch_beside_the_last_element_is_no_heavy_one_further_out(nominal: Finger, touch) -> None:  # type: ignore[no-untyped-def]
+    """Without the bound on hollows the frame fits a contact a third of a radian wide, twice as heavy, degrees away."""
+    place, strains = np.radians(8.1), touch(np.radians(8.1), 43.0, 3.9e-3)
+    frames = strains + 1e-3 * np.random.default_rng(8).normal(size=(400, 16))
+    fits = [Estimator(nominal, compiled=False, most_hollow=most) for most in (1e3, 1.5)]
+    free, held = ([fit.frame(y) for y in frames] for fit in fits)
+    for shape in held:
+        assert shape.equivalent_radius_m < 1.55 * nominal.cylinder.outer_m
+    worst_free, worst_held = (max(abs(s.angle_rad - place) for s in shapes) for shapes in (free, held))
+    assert worst_held < 0.8 * worst_free
+    # where the bound changes a place at all, it was the fit without it that had left the convex
+    far = [f for s, f in zip(held, free, strict=True) if abs(s.angle_rad - f.angle_rad) > np.radians(0.5)]
+    assert far and all(Quality.FLAT_OR_HOLLOW in shape.quality for shape in far)
+    with pytest.raises(ValueError, match="need 1"):
+        Estimator(nominal, most_hollow=0.5)
+
+
+def test_a_place_that_is_hardly_known_is_flagged(nominal: Finger, estimator: Estimator, touch) -> None:  # type: ignore[no-untyped-def]
+    light_at_the_end = estimator.frame(touch(np.radians(6.0), 30.0, np.inf))
+    in_the_middle = estimator.frame(touch(np.radians(75.0), 30.0, np.inf))
+    assert light_at_the_end.deviations[0] > np.radians(0.5) and Quality.IMPRECISE in light_at_the_end.quality
+    assert in_the_middle.deviations[0] < np.radians(0.5) and Quality.IMPRECISE not in in_the_middle.quality

@@ -16,6 +16,8 @@ from sioms.tactile.finger import from_toml
 from sioms.tactile.series import line_load
 from sioms.tools import tactile
 from sioms.tools.report_page import Page
+from sioms.tools.tactile_experiment import RADII_M, plan
+from sioms.tools.tactile_tables import Tables, calibrated
 
 ANGLES = 143.0 - 9.22 * np.arange(16)
 
@@ -75,6 +77,48 @@ def test_calibrate_writes_a_finger_and_a_report(folder: Path, capsys: pytest.Cap
     told = capsys.readouterr()
     assert "quadratic not fitted" in told.out
     assert "contact model frictionless" in told.err
+
+
+def test_score_fits_touches_that_calibration_has_not_seen(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / f"{folder.name}.json").write_text(
+        json.dumps({"parameters": {"creep": 0.0}, "elements": {"theta_deg": ANGLES.tolist()}})
+    )
+    assert command("score", str(folder), "--truth", str(folder), "--jobs", "1") == 0
+    row = capsys.readouterr().out.splitlines()[-1].split("|")
+    assert row[1].strip() == folder.name
+    model, _, place, load = (float(cell) for cell in row[2:6])
+    assert 0.0 < model < 3.0 and 0.0 < place < 0.2 and 0.0 < load < 10.0
+    assert "truth: creep 0" in row[-2] and "angles" in row[-2]
+
+
+def test_score_names_what_it_cannot_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command("score", str(tmp_path)) == 1
+    assert "give folders of recordings" in capsys.readouterr().err
+    np.savez(tmp_path / "x.npz", raw=np.zeros((3, 16)), time=np.zeros(3), fs=33.0)
+    assert command("score", str(tmp_path), "--truth", str(tmp_path / "none")) == 1
+    assert "is no folder" in capsys.readouterr().err
+
+
+def test_tables_of_edges_agree_with_the_finger(folder: Path) -> None:
+    data, result = calibrated(folder, lambda what: None)
+    work = Tables(data, result)
+    first = work.table_3_4().rows[0]
+    place, published = first[0].split()  # the outermost element has too few touches near it
+    assert abs(float(place) - 133.78) < 0.2 and published == "(132.9)"
+    for table, column in ((work.table_3_5(), 3), (work.table_3_7(), 3), (work.table_3_8(), 1)):
+        least, mean, most = (float(word) for word in table.rows[0][column].split())
+        assert 0.0 < least <= mean <= most < 3.0, table.title
+        assert len({len(row) for row in table.rows} | {len(table.head)}) == 1
+
+
+def test_experiment_plans_edges_flats_all_indenters_and_loads() -> None:
+    full = plan(quick=False)
+    assert len(full["edge"]) == 151 and {touch.load for touch in full["edge"]} == {200.0}
+    assert {touch.radius_m for touch in full["indenters"]} == set(RADII_M) and len(RADII_M) == 11
+    series = [touch for touch in full["loads"] if touch.place == full["loads"][0].place]
+    assert {touch.load for touch in series} == {50.0, 100.0, 150.0, 250.0}
 
 
 def test_calibrate_names_what_is_wrong(
