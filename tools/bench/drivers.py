@@ -17,6 +17,7 @@ from typing import Any
 
 from ..author.motion_trials import run, wait_moving
 from ..author.station import Station, wait_for
+from ..author.trial import Failed
 from ..counterparts.rigs import Rig, find_rig
 from .figures import Bar, Report
 from .options import Options
@@ -93,7 +94,7 @@ def bench_drivers(options: Options, report: Report) -> None:
 def _guarded(name: str, report: Report, work: Callable[[], None]) -> None:
     try:
         work()
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, Failed) as error:
         report.note(f"{name}: {error}")
 
 
