@@ -20,7 +20,9 @@ are shares of each component's full range. Outside its bounds it is not that eff
 def page() -> str:
     """Write both libraries as Markdown."""
     force = (e for e in of_force_sensors(("fx", "fy")).values() if not e.name.startswith(TERM_PREFIX))
-    return "\n".join([HEAD, *_part("Tactile finger", of_fingers().values()), *_part("Force/torque sensor", force)])
+    return "\n".join(
+        [HEAD, *_part("Tactile finger", of_fingers().values()), *_part("Force/torque sensor", force)]
+    )
 
 
 def _part(title: str, effects: Iterable[SensorEffect]) -> list[str]:
@@ -33,7 +35,9 @@ def section(effect: SensorEffect) -> str:
              "| parameter | unit | bounds | typical | meaning |", "| --- | --- | --- | --- | --- |"]  # fmt: skip
     for q in effect.parameters:
         bounds = "any" if q.phase else f"{q.lower:g} to {q.upper:g}"
-        lines.append(f"| {q.symbol}{' (each)' if q.each else ''} | {q.unit} | {bounds} | {q.size:g} | {q.text} |")
+        lines.append(
+            f"| {q.symbol}{' (each)' if q.each else ''} | {q.unit} | {bounds} | {q.size:g} | {q.text} |"
+        )
     lines += ["", f"Where its residual is: {effect.signature}."]
     if effect.lookalikes:
         lines.append(f"Confused with: {', '.join(effect.lookalikes)}. Told apart by: {effect.separate}.")

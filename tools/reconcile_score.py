@@ -121,4 +121,8 @@ def table(rows: list[Row]) -> str:
 
 
 def _quantiles(values: list[float], *shares: float) -> str:
-    return ", ".join(f"{values[min(int(s * len(values)), len(values) - 1)]:.3f}" for s in shares) if values else "-"
+    return (
+        ", ".join(f"{values[min(int(s * len(values)), len(values) - 1)]:.3f}" for s in shares)
+        if values
+        else "-"
+    )

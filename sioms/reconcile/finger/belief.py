@@ -188,7 +188,9 @@ def _turn(scene: Scene) -> Complex:
 
 def strains(b: Belief, scene: Scene) -> Floats:
     """Return the strain of every element under every touch, shape (nt, ns)."""
-    contact = _Contact(b.core, b.outer, b.shear, b.poisson, b.hertz, b.adhesion, b.friction, b.apex, b.around, b.strip)
+    contact = _Contact(
+        b.core, b.outer, b.shear, b.poisson, b.hertz, b.adhesion, b.friction, b.apex, b.around, b.strip
+    )
     return _strains(contact, scene, b.angle.tobytes(), tuple(np.round(b.radius, 10)), b.extent, b.offset)
 
 

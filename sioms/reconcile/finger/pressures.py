@@ -47,7 +47,9 @@ class Sheet:
     def series(self, argument: Floats) -> tuple[Complex, Complex]:
         """Return normal and shear series, shape (n, HIGHEST + 1); the last contact solved beyond the table."""
         root = np.sqrt(np.clip(argument, 0.0, self.top))
-        return np.asarray(self.normal(root), dtype=np.complex128), np.asarray(self.shear(root), dtype=np.complex128)
+        return np.asarray(self.normal(root), dtype=np.complex128), np.asarray(
+            self.shear(root), dtype=np.complex128
+        )
 
     def width(self, argument: Floats) -> Floats:
         """Return half widths [rad]."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.reconcile.errors import BadInputError
-from sioms.reconcile.finger.belief import Belief
+from sioms.reconcile.finger.belief import Belief, outputs, scene_of
 from sioms.reconcile.finger.checks import check_commands, check_match, check_raw
 from sioms.reconcile.finger.data import COURSE, DRIFT, TOUCH, VIEWS, FingerData, lay_out, only, warm_known
 from sioms.reconcile.finger.effects import library
@@ -167,8 +167,6 @@ class FingerSubject:
 
     def curves(self, before: SensorModel, after: SensorModel) -> tuple[Curve, ...]:
         """Outputs of the element that disagreed most, over the place of touch, one curve per indenter."""
-        from sioms.reconcile.finger.belief import outputs
-
         d = self.whole
         old, new = outputs(before.belief(), d.scene), outputs(after.belief(), d.scene)
         worst = d.alive[int(np.argmax(np.sum((old - d.touched.output)[:, d.alive] ** 2, axis=0)))]
@@ -384,22 +382,32 @@ def _rows(
 
 
 def _follows(t: Touched, ratio: Floats, base: Belief, alive: NDArray[np.intp]) -> bool:
-    """Say whether the strength of touches goes with the load cell beyond the commanded load."""
+    """Say whether the strength of touches goes with the load cell beyond the commanded load.
+
+    Every element gets its own gain first, and what repeats from element to element is taken off, or scatter and width of
+    the elements hide the loads.
+    """
+    expected = outputs(base, scene_of(t.place, t.load, t.radius))[:, alive]
+    own = t.output[:, alive]
+    expected = expected * (np.sum(own * expected, axis=0) / (np.sum(expected**2, axis=0) + 1e-30))
+    strength = np.sum(own * expected, axis=1) / (np.sum(expected**2, axis=1) + 1e-30)
+    pitch = float(np.median(np.abs(np.diff(np.sort(base.angle))))) if len(base.angle) > 1 else 1.0
+    turn = 2.0 * np.pi * (t.place - base.angle[alive[0]])[:, None] / pitch * np.arange(1.0, 4.0)
+    waves = np.concatenate([np.ones((len(t), 1)), np.cos(turn), np.sin(turn)], axis=1)
     inside = (t.place > base.angle[alive].min()) & (t.place < base.angle[alive].max())
-    loud = t.output[:, alive].max(1) - t.output[:, alive].min(1)
-    told, heard = [], []
+    told: list[Floats] = []
+    heard: list[Floats] = []
     for kind in {(p, r) for p, r in zip(t.load[inside], t.radius[inside], strict=True)}:
         mine = np.flatnonzero(inside & (t.load == kind[0]) & (t.radius == kind[1]))
-        if len(mine) < 4:
+        if len(mine) < 16:
             continue
-        order = mine[np.argsort(t.place[mine])]
-        # how loud a touch is beside its neighbours: elements are not alike, places vary slowly
-        told.append(np.diff(np.log(np.maximum(ratio[order], 1e-3)), 2))
-        heard.append(np.diff(np.log(np.maximum(loud[order], 1e-9)), 2))
+        for values, into in ((ratio[mine], told), (strength[mine], heard)):
+            rest = values - waves[mine] @ np.linalg.lstsq(waves[mine], values, rcond=1e-8)[0]
+            into.append(rest / max(float(np.mean(np.abs(values))), 1e-9))
     if not told:
         return True
     x, y = np.concatenate(told), np.concatenate(heard)
-    return bool(x @ y > 0.5 * FOLLOWS * np.sqrt((x @ x) * (y @ y)))
+    return bool(x @ y > FOLLOWS * np.sqrt((x @ x) * (y @ y)))
 
 
 def _missing(by_name: Mapping[str, Recording], t: Touched, refine: bool) -> list[str]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +56,14 @@ def readings(b: ForceBelief, loads: Loads) -> Floats:
     out: Floats = loads.load @ b.matrix.T
     for response, parameters in b.responses:
         out = response(out, loads, parameters)
+    return out
+
+
+@lru_cache(maxsize=32)
+def played(loads: Loads, width: float) -> Floats:
+    """Return the play of known loads; the search asks for the same widths again and again."""
+    out = play(loads.load, width, loads.record)
+    out.setflags(write=False)
     return out
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sioms.reconcile.effect import Channel
-from sioms.reconcile.force.belief import Floats, ForceBelief, Loads, Response, play
+from sioms.reconcile.force.belief import Floats, ForceBelief, Loads, Response, played
 from sioms.reconcile.sensors.effect import Quantity, SensorEffect, Values
 from sioms.reconcile.sensors.library import collect
 
@@ -50,7 +50,7 @@ def softening(reading: Floats, loads: Loads, p: Floats) -> Floats:
 def lagging(reading: Floats, loads: Loads, p: Floats) -> Floats:
     """Add b (play - load)/r of each component's own load; b per component, r last."""
     width = float(p[-1])
-    return reading + p[:-1] * (play(loads.load, width, loads.record) - loads.load) / width
+    return reading + p[:-1] * (played(loads, width) - loads.load) / width
 
 
 def _response(response: Response, *symbols: str) -> Callable[[Any, Values], Any]:
