@@ -76,8 +76,8 @@ def test_moves_torques_homes_and_faults(start: Callable[..., Any], short_folder:
         x.move(0.02)
         x.wait_until_idle(8.0)
         # emergency stop lets go; after a reset it moves again
-        x.command(velocity=0.03)
-        wait_for(lambda: wire.state("velocity") > 2, "motion")
+        x.command(velocity=0.01)
+        wait_for(lambda: wire.state("velocity") > 0.7, "motion")
         x.stop_all()
         wait_for(lambda: wire.state("state") == 1, "idle", 1.0)
         with raises(1, "RESET"):
