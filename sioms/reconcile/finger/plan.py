@@ -98,7 +98,7 @@ def propose(beliefs: Sequence[Belief], noise: float) -> Proposal | None:
 
 
 def _apart(said: Sequence[Floats], sigma: float, load: float = LOAD_KNOWN) -> float:
-    """Norm of the difference of the closest pair in units of noise, the load of each touch free within ``load``."""
+    """Return by how many times the noise the closest pair differs in a touch (rms), its load free within ``load``."""
     least = np.inf
     for i, a in enumerate(said):
         for b in said[i + 1 :]:
@@ -106,5 +106,5 @@ def _apart(said: Sequence[Floats], sigma: float, load: float = LOAD_KNOWN) -> fl
             n = np.sum(u * u, axis=1)
             factor = (1.0 - 1.0 / np.sqrt(1.0 + n * load**2)) / np.maximum(n, 1e-12)
             d = d - (factor * np.sum(d * u, axis=1))[:, None] * u
-            least = min(least, float(np.linalg.norm(d)))
+            least = min(least, float(np.sqrt(np.mean(np.sum(d**2, axis=1)))))
     return least

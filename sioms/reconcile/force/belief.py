@@ -38,13 +38,22 @@ class ForceBelief:
 
     Attributes:
         full: full range of each component [N, N m]; only for reports.
-        matrix: reading per load, both in shares of full range, shape (components, components).
+        matrix: reading per load as stated, both in shares of full range, shape (components, components).
+        gain, cross: relative departures of its rows and what is added to it; None for none.
         responses: further changes of the reading with their parameters, in order.
     """
 
     full: Floats
     matrix: Floats
+    gain: Floats | None = None
+    cross: Floats | None = None
     responses: tuple[tuple[Response, Floats], ...] = field(default=())
+
+    @property
+    def total(self) -> Floats:
+        """Reading per load."""
+        out = self.matrix if self.gain is None else self.matrix * (1.0 + self.gain)[:, None]
+        return out if self.cross is None else out + self.cross
 
     def responding(self, response: Response, parameters: Floats) -> ForceBelief:
         """Return the belief with one more response."""
@@ -53,7 +62,7 @@ class ForceBelief:
 
 def readings(b: ForceBelief, loads: Loads) -> Floats:
     """Return the readings without their zero, shape (n, components)."""
-    out: Floats = loads.load @ b.matrix.T
+    out: Floats = loads.load @ b.total.T
     for response, parameters in b.responses:
         out = response(out, loads, parameters)
     return out

@@ -23,7 +23,7 @@ SENSOR, MECHANICS = Channel.SENSOR, Channel.MECHANICS
 
 
 def _gain(b: ForceBelief, v: Values) -> ForceBelief:
-    return replace(b, matrix=b.matrix * (1.0 + v["g"])[:, None])
+    return replace(b, gain=v["g"])
 
 
 def squared(reading: Floats, loads: Loads, p: Floats) -> Floats:
@@ -144,7 +144,7 @@ def _cross(names: tuple[str, ...]) -> SensorEffect:
     def change(b: ForceBelief, v: Values) -> ForceBelief:
         extra = np.stack([v[f"from_{n}"] for n in names], axis=1)
         np.fill_diagonal(extra, 0.0)
-        return replace(b, matrix=b.matrix + extra)
+        return replace(b, cross=extra)
 
     return SensorEffect(
         name="cross_talk",

@@ -47,7 +47,7 @@ def test_a_matrix_is_in_newtons_and_reads_back() -> None:
     assert np.allclose(newtons, [50.0 + 2.0 * 1.0, 0.01 * 50.0 + 0.9 * 1.0])
     changed = model.with_effect("gain", {"g": np.array([0.01, -0.02])})
     again, _ = from_table(tomllib.loads(to_toml(changed)), "x")
-    assert np.allclose(again.belief().matrix, changed.belief().matrix)
+    assert np.allclose(again.belief().total, changed.belief().total)
 
 
 @pytest.fixture
