@@ -54,6 +54,8 @@ class Quality(Flag):
 
 _HUGE = 1e30  # variance of an element that must not count
 _PROXIMITY_PASSES = 3
+_PROXIMITY_STARTS = 3
+_APART = math.radians(6.0)
 _HOLD_PASSES = 8
 _SURE = math.radians(2.0) / 4.0  # standard deviation of the place above which IMPRECISE is set
 _NOTHING = Quality.NO_CONTACT | Quality.TOO_FEW_ELEMENTS | Quality.WRONG_SIGN | Quality.NO_BASELINE
@@ -292,13 +294,30 @@ class Estimator:
         bank, places = self._fixed[4], self._fixed[6]
         clean = without(places[:, :1])
         score = np.maximum(np.sum(bank * clean / noise, axis=1), 0.0) ** 2 / np.sum(bank**2 / noise, axis=1)
-        t = float(places[int(np.argmin(np.sum(clean**2 / noise, axis=1) - score)), 0])
+        cost = np.sum(clean**2 / noise, axis=1) - score
+        best, least_cost = float(places[int(np.argmin(cost)), 0]), math.inf
+        for _ in range(_PROXIMITY_STARTS):
+            start = int(np.argmin(cost))
+            t = float(places[start, 0])
+            cost[np.abs(places[:, 0] - t) < _APART] = math.inf
+            t, left = self._settle(t, noise, without, load, load_weight)
+            if left < least_cost:
+                best, least_cost = t, left
+        return without(best)
+
+    def _settle(
+        self, t: float, noise: Floats, without: Callable[[float], Floats], load: float, load_weight: float
+    ) -> tuple[float, float]:
+        """Fit in turn the touch without the pull at its place, and its place; return it and the chi square left."""
+        left = math.inf
         for _ in range(_PROXIMITY_PASSES):
-            status, found, *_ = self._search(noise, 0.0, without(t), load, load_weight)
+            status, found, _, at, _, _ = self._search(noise, 0.0, without(t), load, load_weight)
             if status != Status.FITTED:
                 break
             t = found
-        return without(t)
+            ff, fy = at[0] + load_weight, at[3] + load_weight * load
+            left = at[9] + load_weight * load * load - fy * fy / ff
+        return t, left
 
     def _describe(
         self, t: float, b: float, at: Products, steps: int, load: float, load_weight: float, count: int, total: float,

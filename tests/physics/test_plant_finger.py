@@ -33,7 +33,9 @@ def test_surface_compliance_is_the_known_one_and_joins_the_half_planes(rubber):
     assert rubber.compliance[0, 2] == pytest.approx(4.76088e-9, rel=1e-4)
     assert rubber.compliance[3, 8] == pytest.approx(9.67449e-9, rel=1e-4)
     # the mesh ends at 160: what follows is the half plane's limit
-    np.testing.assert_allclose(rubber.compliance[0, 155:160] * np.arange(155, 160), rubber.compliance[0, 170] * 170, rtol=2e-3)
+    np.testing.assert_allclose(
+        rubber.compliance[0, 155:160] * np.arange(155, 160), rubber.compliance[0, 170] * 170, rtol=2e-3
+    )
 
 
 def test_flat_is_as_wide_as_the_bounded_solution_says(rubber):
@@ -115,7 +117,9 @@ def test_the_faults_are_as_large_as_asked_for(perfect):
     assert pulled.min() == pytest.approx(-3.0, rel=0.4) and pulled.argmin() == quiet.argmax()
     stripped = read(strip_gain=0.05) / quiet
     assert 1.0 < stripped.max() <= 1.05 and stripped.min() == pytest.approx(1.0, abs=1e-3)
-    scatter = TactileArray(FingerShape(gain=3.0, gain_scatter=0.1, depth_scatter_m=2e-4, angle_scatter_rad=0.01, seed=4)).truth
+    scatter = TactileArray(
+        FingerShape(gain=3.0, gain_scatter=0.1, depth_scatter_m=2e-4, angle_scatter_rad=0.01, seed=4)
+    ).truth
     assert 0.05 < np.std(np.log(scatter.gains)) < 0.2
     assert np.ptp(scatter.radii_m) > 1e-4 and np.ptp(scatter.angles_rad - perfect.truth.angles_rad) > 0.005
     late = TactileArray(FingerShape(creep=0.2, creep_s=0.25))

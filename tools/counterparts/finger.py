@@ -113,7 +113,11 @@ def finger_parser() -> argparse.ArgumentParser:
     parser.add_argument("--surface", type=float, default=0.010, help="depth of the finger's surface [m]")
     parser.add_argument("--indenter", type=float, default=0.0, help="radius [m], 0 an edge")
     parser.add_argument(
-        "--mount", type=float, nargs="*", default=[], help="radii tabulated beforehand, to be changed to in no time"
+        "--mount",
+        type=float,
+        nargs="*",
+        default=[],
+        help="radii tabulated beforehand, to be changed to in no time",
     )
     parser.add_argument("--noise-percent", type=float, default=0.05, help="standard deviation of the outputs")
     parser.add_argument(
