@@ -55,6 +55,13 @@ def test_a_shipped_driver_passes(name: str) -> None:
     assert past or {"mute", "unplugged"} <= passed
 
 
+def test_the_example_passes() -> None:
+    example = Path(__file__).parents[2] / "examples" / "drivers" / "bench_supply.py"
+    status, reports, said = run(str(example), "--only", "golden,chopped,kill driver")
+    assert status == 0, said
+    assert {t["verdict"] for t in reports[0]["trials"]} == {"passed"}, said
+
+
 @cache
 def broken() -> dict[str, tuple[int, dict[str, dict[str, Any]], str]]:
     found = {}

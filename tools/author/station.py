@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import select
 import shutil
 import signal
@@ -203,9 +204,14 @@ class Station:
     def start_daemon(self) -> None:
         """Start a daemon with the device, and a session."""
         text = self.rig.configured(self.port, self.counterpart.port if self.counterpart is not None else "")
-        driver = self.rig.driver
-        if driver.endswith(".py"):
-            text = text.replace("{driver}", str((self._base / driver).resolve()))
+        driver = str(self._base / self.rig.driver)
+        text = re.sub(r'(driver\s*=\s*")\{driver\}"', lambda found: f'{found[1]}{driver}"', text)
+        # relative paths hold where the driver's file is, not in the daemon's folder
+        text = re.sub(
+            r'(driver\s*=\s*")(\.[^"]*\.py)"',
+            lambda found: f'{found[1]}{(self._base / found[2]).resolve()}"',
+            text,
+        )
         self.daemon = Daemon('[workcell]\nname = "check"\n' + text)
         self.cell = self.daemon.cell("check")
 
