@@ -16,6 +16,8 @@ from .station import Client, Station, wait_for
 from .trial import Failed, NotApplicable, Trial
 
 GONE_S = 5.0
+KILLS = 3
+"""Of the driver; the daemon puts a device in fault after five deaths a minute."""
 BRAKE_S = 0.1
 """From the last command to rest, and a poll to read it [s]."""
 RUN = """
@@ -84,7 +86,7 @@ def _outputs_of_killed(station: Station) -> list[str]:
 
 def driver_killed(station: Station, full: bool) -> str:
     """SIGKILL of the driver: a new one comes, the device rests, nothing resumes."""
-    return ", ".join(_kill_driver(station) for _ in range(5 if full else 1))
+    return ", ".join(_kill_driver(station) for _ in range(KILLS if full else 1))
 
 
 def _kill_driver(station: Station) -> str:
