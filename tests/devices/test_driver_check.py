@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -64,16 +65,17 @@ def test_the_example_passes() -> None:
 
 @cache
 def broken() -> dict[str, tuple[int, dict[str, dict[str, Any]], str]]:
-    found = {}
-    for name, only in (
-        ("scale", "golden,chopped,noisy,late,random"),
-        ("brittle", "golden,noisy"),
-        ("hasty", "late"),
-        ("runaway", "stop running,kill client"),
-    ):
-        status, reports, said = run(str(AUTHORS / f"{name}.py"), "--only", only)
-        found[name] = status, {t["name"]: t for t in reports[0]["trials"]} if reports else {}, said
-    return found
+    trials_of = {
+        "scale": "golden,chopped,noisy,late,random", "brittle": "golden,noisy", "hasty": "late",
+        "runaway": "stop running,kill client",
+    }  # fmt: skip
+
+    def one(name: str) -> tuple[int, dict[str, dict[str, Any]], str]:
+        status, reports, said = run(str(AUTHORS / f"{name}.py"), "--only", trials_of[name])
+        return status, {t["name"]: t for t in reports[0]["trials"]} if reports else {}, said
+
+    with ThreadPoolExecutor(len(trials_of)) as pool:
+        return dict(zip(trials_of, pool.map(one, trials_of), strict=True))
 
 
 def test_a_file_with_its_own_counterpart_passes() -> None:
