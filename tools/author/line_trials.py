@@ -203,7 +203,7 @@ def late(station: Station, full: bool) -> str:
     most_s = max(LEAST_RECOVERY_S, 2 * answer_s)
     low, high = timeout_s + 0.1 * most_s, timeout_s + 0.9 * most_s
     before = dict(station.totals())
-    seconds = max((8.0 if full else 0.8), 4 * timeout_s)
+    seconds = max((8.0 if full else 1.5), 4 * timeout_s)
     calm = disturbed(station, seconds, late=0.3, late_s=(low, high))
     bent = _bent_since(station, before["bent"])
     if not bent:
