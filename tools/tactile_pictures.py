@@ -165,7 +165,8 @@ def adhesion(body: Cylinder, radius_m: float) -> Figure:
     for name, solved in (("frictionless", free), ("adhesion", stuck)):
         strain = matrix @ solved.series(0.0, 100)
         right.plot(theta, strain / np.abs(strain).max(), label=name)
-    left.set(xlabel="rad", ylabel="kPa", ylim=(-30, 30))
+    top = 1.25e-3 * float(np.max(free.pressure(t)))  # q is singular at the edges
+    left.set(xlabel="rad", ylabel="kPa", ylim=(-top, top))
     right.set(xlabel="rad", ylabel="e_rr over its peak")
     left.legend(fontsize=7)
     right.legend(fontsize=7)
