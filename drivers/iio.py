@@ -155,7 +155,7 @@ class Iio(StreamDriver):
         for index, (channel, scaling) in enumerate(zip(self.settings.channels, self._scaling, strict=True)):
             values[:, index] = scaling.to_si(raw[channel])
             flags[:, index] = _saturated(raw[channel], self._types[channel])
-        stamps = self._stamps(raw, scans, now_ns)
+        stamps, taken = self._stamps(raw, scans, now_ns), 0
         for row, flag, stamp_ns in zip(values, flags, stamps, strict=True):
             if stamp_ns < self._began_ns:
                 continue  # left over from before: the driver was killed with the buffer on
@@ -163,8 +163,9 @@ class Iio(StreamDriver):
             self._block.flags[:] = flag | self._overrun(stamp_ns)
             self._stamp_ns = self._block.stamp_ns = max(stamp_ns, self._stamp_ns + 1)
             self.kit.publish(self._block, self._block.stamp_ns)
-        self._scans += scans
-        return scans
+            taken += 1
+        self._scans += taken
+        return taken
 
     def counters(self) -> Mapping[str, int | str]:
         """Return how many scans came, and how many are missing between them."""

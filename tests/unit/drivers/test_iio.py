@@ -84,7 +84,8 @@ def test_scans_without_a_clock_of_ours_are_mapped(tmp_path: Path) -> None:
             assert list(driver.open()) == []
             began_s = time.monotonic()
             scans = [dummy._scan(began_s + (i - 1) / 100) for i in range(6)]
-            driver.feed(b"".join(scans[not stamped :]), round((began_s + 1) * 1e9))
+            taken = driver.feed(b"".join(scans[not stamped :]), round((began_s + 1) * 1e9))
+            assert taken == 5, "the kit calls the link good by what was published"
             stamps = [stamp for stamp, _, _ in kit.published]
             wanted = began_s if stamped else began_s + 0.96  # the scan from before the opening is not taken
             assert stamps == pytest.approx([(wanted + i / 100) * 1e9 for i in range(5)], abs=2e6)
