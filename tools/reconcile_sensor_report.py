@@ -303,7 +303,8 @@ def _place_picture(figure: Figure, v: SensorVerdict) -> Figure:
             p.centres[order], p.means[order], p.spread[order], fmt=".-", color="#c50", ecolor="#e9c5ae", lw=1
         )
         ax.axhline(0.0, color="#888", lw=0.6)
-        ax.set_xlabel(f"{p.variable}, {p.unit}", fontsize=8)
+        name, view = p.variable.split(" (")
+        ax.set_xlabel(f"{name}, {p.unit}\n({view}", fontsize=8)
         ax.set_title(f"orders {100 * p.explained:.0f} %, p = {p.p:.2f}", fontsize=9)
     figure.axes[0].set_ylabel("measured - simulated, in the view's unit")
     return figure

@@ -388,7 +388,7 @@ def locate(subject: Subject, model: SensorModel, rng: np.random.Generator, shift
             continue
         bins = bins_of(values)
         share = explained(r, bins)
-        chance = [explained(np.roll(r, int(s)), bins) for s in rng.integers(len(r) // 20 + 1, len(r), shifts)]
+        chance = [explained(_shuffled(r, data.block[mine], rng), bins) for _ in range(shifts)]
         p = (1 + sum(c >= share for c in chance)) / (shifts + 1)
         count = np.maximum(np.bincount(bins), 1)
         floor = told[data.views[view]].floor
@@ -406,6 +406,14 @@ def locate(subject: Subject, model: SensorModel, rng: np.random.Generator, shift
             )
         )
     return sorted(out, key=lambda q: -q.explained)
+
+
+def _shuffled(r: Array, block: NDArray[np.int64], rng: np.random.Generator) -> Array:
+    """Lay the blocks in another order, each turned within itself: neighbours stay neighbours, and nothing keeps its place."""
+    parts = np.split(r, np.flatnonzero(np.diff(block)) + 1)
+    return np.concatenate(
+        [np.roll(parts[i], int(rng.integers(len(parts[i])))) for i in rng.permutation(len(parts))]
+    )
 
 
 def untouched(count: int) -> NDArray[np.bool_]:
