@@ -28,7 +28,9 @@ POLL_S = 0.02
 SETTLE_S, LEAD_S = 0.4, 0.1
 #: Commands written ahead of the motion.
 AHEAD = 400
-#: A record that lost ticks counts up to there if this share of it is left; else it is run again, so many times.
+#: So many periods without a tick are filled in; a record that lost more counts up to there if this share of it is left, else
+#: it is run again, so many times.
+MOST_FILLED = 4
 ENOUGH, TRIES = 0.6, 3
 BROKEN = AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP | AxisStatus.FOLLOWING_ERROR | AxisStatus.STALLED
 
@@ -74,7 +76,7 @@ class Recorder:
         """Run one experiment from rest at its first position.
 
         Returns:
-            Position, force and command of every tick, without a gap.
+            Position, force and command at the rate of the axis, without a gap.
 
         Raises:
             ExperimentStopped: by a stop, a fault, a refusal, or because the machine loses ticks.
@@ -88,9 +90,9 @@ class Recorder:
                 raise ExperimentStopped(
                     f"run {experiment.name} on {self.node.name}: {error.strerror or error}"
                 ) from error
-            kept = _gapless(seen)
-            if len(kept) >= ENOUGH * len(seen):
-                return _record(experiment.name, kept, self.node.info.tick_hz)
+            record = uniform(experiment.name, seen, 1.0 / self.node.info.tick_hz)
+            if len(record) >= ENOUGH * len(experiment.command):
+                return record
             lost += 1
         raise ExperimentStopped(
             f"record {experiment.name} on {self.node.name}: ticks were missing in {lost} runs; the machine is too busy to "
@@ -171,16 +173,28 @@ def knots(command: Array, dt: float, max_velocity: float, max_acceleration: floa
     return [sioms.command(**w) for w in words]
 
 
-def _gapless(seen: list[AxisSnapshot]) -> list[AxisSnapshot]:
-    """Return what comes before the first tick that is missing."""
-    ticks = np.array([s.tick for s in seen])
-    gaps = np.flatnonzero(np.diff(ticks) != 1)
-    return seen[: int(gaps[0]) + 1] if len(gaps) else seen
+def uniform(name: str, seen: Sequence[AxisSnapshot], dt: float) -> Record:
+    """Lay snapshots on the grid of the axis's rate, by their time stamps.
 
-
-def _record(name: str, seen: list[AxisSnapshot], tick_hz: float) -> Record:
+    On a busy machine a tick comes late and the next one early. Of two in one period the later counts, a period
+    without one is filled in (its force is the one that was held), and a longer hole ends the record.
+    """
+    periods = np.rint(np.diff([s.stamp_ns for s in seen]) * 1e-9 / dt).astype(np.int64)
+    holes = np.flatnonzero(periods > MOST_FILLED)
+    count = int(holes[0]) + 1 if len(holes) else len(seen)
+    at = np.concatenate([[0], np.cumsum(periods[: count - 1])])
+    last = np.flatnonzero(np.diff(at, append=at[-1] + 1) > 0)
+    at, kept = at[last], [seen[i] for i in last.tolist()]
+    grid = np.arange(at[-1] + 1)
     position, force, command = (
-        np.array([getattr(s, field)[0] for s in seen], dtype=np.float64)
+        np.array([getattr(s, field)[0] for s in kept], dtype=np.float64)
         for field in ("position", "force", "commanded_position")
     )
-    return Record(name, position, force, command, time_s=np.arange(len(seen), dtype=np.float64) / tick_hz)
+    held = force[np.searchsorted(at, grid, side="right") - 1]
+    return Record(
+        name,
+        np.interp(grid, at, position),
+        held,
+        np.interp(grid, at, command),
+        time_s=grid.astype(np.float64) * dt,
+    )

@@ -39,8 +39,8 @@ UNEXPLAINED = 0.2
 BURSTS = 0.8
 #: A residual beyond this multiple of the expected innovation is no noise, whatever it looks like. (The bounces in a gap leave more.)
 LARGE = 3.0
-#: Above this multiple, and with half of the disagreement left, nothing is named at all.
-HOPELESS = 5.0
+#: Above this multiple, and with this share of the disagreement left, nothing is named at all.
+HOPELESS, HALF = 5.0, 0.33
 #: Multiples of a parameter of the bounces in a gap that are tried for its interval.
 ROUGH_GRID = tuple(float(x) for x in np.linspace(0.9, 1.1, 17))
 #: Below these multiples of the expected innovation nothing is called unexplained, or a burst.
@@ -120,7 +120,7 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
         share = smoother_share(ready.problem, found.fit)
         searcher.names = names
     burst = bursts(ready.problem, found.fit)
-    hopeless = found.fit.ratio > HOPELESS and found.fit.cost > 0.5 * searcher.fit(ready.model).cost
+    hopeless = found.fit.ratio > HOPELESS and found.fit.cost > HALF * searcher.fit(ready.model).cost
     if hopeless:
         # Names given to half of nothing mislead: the model, or a column, belongs to something else.
         fit = searcher.fit(ready.model)
