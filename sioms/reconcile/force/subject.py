@@ -164,7 +164,9 @@ class ForceSubject:
         for name, text, loads in catalogue(len(self.records.names)):
             said = [readings(m.belief(), loads) / self.whole.sigma for m in models]
             said = [s - s.mean(0) for s in said]
-            apart = min(float(np.sqrt(np.mean((a - b) ** 2))) for i, a in enumerate(said) for b in said[i + 1 :])
+            apart = min(
+                float(np.sqrt(np.mean((a - b) ** 2))) for i, a in enumerate(said) for b in said[i + 1 :]
+            )
             found.append(Proposal(name, text, apart))
         return max(found, key=lambda p: p.separation)
 
