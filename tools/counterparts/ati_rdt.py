@@ -18,7 +18,7 @@ from collections.abc import Callable
 from .control import number, serve
 from .faults import Faults
 from .load import Load
-from .udp import Address, UdpPort, stream
+from .udp import Address, UdpPort, missed, stream
 
 MAX_COUNT = 2**32
 SATURATED = {"net": 0x80020000, "axia": 0xC0000000}
@@ -73,6 +73,10 @@ class Sensor:
     def due(self, send: Callable[[bytes, Address], None]) -> None:
         """Send the records sampled until now."""
         now_s, period_s = self.clock(), 1 / self.options.rate
+        if self.next_s:
+            count = missed(self.next_s, now_s, self.options.rate)
+            self.next_s += count * period_s
+            self.sequence = (self.sequence + count) % MAX_COUNT
         while self.host is not None and self.next_s <= now_s:
             self.pending.append(self._record(self.next_s))
             self.next_s += period_s

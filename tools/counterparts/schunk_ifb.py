@@ -17,7 +17,7 @@ from collections.abc import Callable
 from .control import serve
 from .faults import Faults
 from .load import Load
-from .udp import Address, UdpPort, stream
+from .udp import Address, UdpPort, missed, stream
 
 DATA_PORT = 54843
 READY, MECHANICAL_RANGE = 0x01, 0x10
@@ -98,12 +98,16 @@ class Sensor:
 
     def due(self, send: Callable[[bytes], None]) -> None:
         """Send the records sampled until now."""
-        now_s = self.clock()
+        now_s, rate_hz = self.clock(), self.options.rate * (1 + self.options.clock_ppm * 1e-6)
+        if self.streaming:
+            count = missed(self.next_s, now_s, rate_hz)
+            self.next_s += count / rate_hz
+            self.counter = (self.counter + count) % 0x10000
         while self.streaming and self.next_s <= now_s:
             values, clipped = self.load.measured(self.next_s)
             status = READY | self.extra_status | (MECHANICAL_RANGE if clipped else 0)
             self.counter = (self.counter + 1) % 0x10000
-            self.next_s += 1 / (self.options.rate * (1 + self.options.clock_ppm * 1e-6))
+            self.next_s += 1 / rate_hz
             if not self.stalled:
                 send(struct.pack("<2sHHBI6f", b"\xff\xff", self.counter, 29, 0x40, status, *values))
 

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from .faults import Faults
 
 Address = tuple[str, int]
+HELD_UP_S = 0.25
+"""Records older than this are not sent: no sensor lags behind its own clock."""
 
 
 class UdpPort(asyncio.DatagramProtocol):
@@ -65,6 +67,11 @@ class UdpPort(asyncio.DatagramProtocol):
         if self._transport is not None and not self._transport.is_closing():
             self._transport.sendto(data, to)
             self.sent += 1
+
+
+def missed(next_s: float, now_s: float, rate_hz: float) -> int:
+    """Return how many records a sensor's time has passed by while its process was held up; a sensor does not make up for them."""
+    return int((now_s - next_s) * rate_hz) if now_s - next_s > HELD_UP_S else 0
 
 
 async def stream(due: Callable[[], None], next_s: Callable[[], float], clock: Callable[[], float]) -> None:

@@ -553,6 +553,24 @@ def test_schunk_another_sensor_is_refused() -> None:
         rig.do(rig.driver.open())
 
 
+def test_simulated_sensors_do_not_lag_behind_their_clock() -> None:
+    """A process that was held up for a minute sends what is measured now; what was missed counts as lost."""
+    rig = SchunkRig()
+    rig.do(rig.driver.open())
+    rig.go(0.05)
+    rig.now_s += 20.0
+    rig.go(0.05)
+    assert -1e-6 <= rig.now_s + rig.delay_s - rig.published[-1][0] * 1e-9 < 5e-3
+    assert rig.driver.counters()["lost"] == pytest.approx(20000, abs=300)
+    ati = AtiRig()
+    ati.do(ati.driver.open())
+    ati.go(0.05)
+    ati.now_s += 60.0
+    ati.go(0.05)
+    assert -1e-6 <= ati.now_s + ati.delay_s - ati.published[-1][0] * 1e-9 < 5e-3
+    assert ati.driver.counters()["lost"] == pytest.approx(60000, abs=300)
+
+
 # --- settings -------------------------------------------------------------------------------------
 
 
