@@ -8,7 +8,7 @@ from __future__ import annotations
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from daemon_rig import Daemon, daemons
 from sioms.tools.counterparts.rigs import RIGS as SHIPPED
 from sioms.tools.counterparts.rigs import Axis, Output, Rig
 
-__all__ = ["RIGS", "Axis", "Output", "Rig", "everything"]
+__all__ = ["GROUPS", "RIGS", "Axis", "Output", "Rig", "at_work", "group_of"]
 
 LIMITS = "position_min = -1.0\nposition_max = 1.0\n"
 
@@ -37,14 +37,28 @@ RIGS = (
 )  # fmt: skip
 
 
+TOGETHER = 4
+"""Devices of one workcell: all at once would keep the processors of a small machine busy by themselves."""
+GROUPS = tuple(RIGS[i : i + TOGETHER] for i in range(0, len(RIGS), TOGETHER))
+
+
+def group_of(what: object) -> int | None:
+    """Return the number of the group that holds a rig, an axis, an output or a node; None when none does."""
+    name = what.device if isinstance(what, Rig) else what.node if isinstance(what, Axis | Output) else what
+    if not isinstance(name, str):
+        return None
+    device = name.split(".")[0]
+    return next((i for i, group in enumerate(GROUPS) if any(rig.device == device for rig in group)), None)
+
+
 @contextmanager
-def everything() -> Iterator[Daemon]:
-    """Run all rigs in one workcell, each driver up and its link good."""
+def at_work(rigs: Sequence[Rig]) -> Iterator[Daemon]:
+    """Run some rigs in one workcell, each driver up and its link good."""
     with ExitStack() as stack:
         start = stack.enter_context(daemons())
         counterparts: dict[str, Running] = {}
         folder = Path(stack.enter_context(_folder()))
-        for rig in RIGS:  # all start at the same time
+        for rig in rigs:  # all start at the same time
             if rig.counterpart:
                 name, *options = rig.counterpart
                 link = [] if rig.tcp else ["--link", str(folder / rig.device)]
@@ -52,13 +66,13 @@ def everything() -> Iterator[Daemon]:
                 counterparts[rig.device] = Running(command, {}, None)
                 stack.callback(counterparts[rig.device].end)
         text = '[workcell]\nname = "all"\n'
-        for rig in RIGS:
+        for rig in rigs:
             port = ""
             if rig.counterpart:
                 port = counterparts[rig.device].wait_line(r"^ready (\S+)$").group(1)
             text += rig.configured(port, port)
         daemon = start(text)
-        for rig in RIGS:
+        for rig in rigs:
             daemon.wait_up(rig.device)
         yield daemon
 

@@ -1,27 +1,68 @@
-"""One workcell with every registered driver, for all suites."""
+"""Workcells of some registered drivers at a time, for all suites; the tests run in the order of these workcells."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 
 import pytest
 from daemon_rig import Daemon
-from device_rigs import RIGS, everything
+from device_rigs import GROUPS, at_work, group_of
 
 import sioms
 
 
+def _group(item: pytest.Item) -> int | None:
+    """Return the group that a test is about; None when it needs no workcell of these."""
+    callspec = getattr(item, "callspec", None)
+    if callspec is None or "cell" not in getattr(item, "fixturenames", ()):
+        return None
+    found = [group_of(value) for value in callspec.params.values()]
+    return next((number for number in found if number is not None), 0)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the tests of one workcell together; those that need none come last."""
+    order = {item: _group(item) for item in items}
+    items.sort(key=lambda item: len(GROUPS) if order[item] is None else order[item])
+
+
+class Workcells:
+    """Has one workcell at work at a time."""
+
+    def __init__(self) -> None:
+        self._number: int | None = None
+        self._daemon: Daemon | None = None
+        self._stack = ExitStack()
+
+    def at(self, number: int | None) -> Daemon | None:
+        """Return the daemon of a group, started if another was at work; None ends what is at work."""
+        if number != self._number:
+            self._stack.close()
+            self._stack = ExitStack()
+            self._number = number
+            self._daemon = None if number is None else self._stack.enter_context(at_work(GROUPS[number]))
+        return self._daemon
+
+
 @pytest.fixture(scope="session")
-def workcell() -> Iterator[Daemon]:
-    with everything() as daemon:
-        yield daemon
+def workcells() -> Iterator[Workcells]:
+    held = Workcells()
+    yield held
+    held.at(None)
+
+
+@pytest.fixture(autouse=True)
+def workcell(request: pytest.FixtureRequest, workcells: Workcells) -> Daemon | None:
+    """The workcell that the test is about."""
+    return workcells.at(_group(request.node))
 
 
 @pytest.fixture
-def cell(workcell: Daemon) -> Iterator[sioms.Workcell]:
+def cell(request: pytest.FixtureRequest, workcell: Daemon) -> Iterator[sioms.Workcell]:
     """A session; nothing is stopped, and every device is up."""
     with workcell.cell("suite") as opened:
         opened.reset()
-        for rig in RIGS:
+        for rig in GROUPS[_group(request.node) or 0]:
             workcell.wait_up(rig.device)
         yield opened

@@ -11,7 +11,7 @@ from importlib.metadata import entry_points
 
 import pytest
 from daemon_rig import Daemon, raises, wait_for
-from device_rigs import RIGS, Rig
+from device_rigs import GROUPS, RIGS, Rig, group_of
 
 import sioms
 
@@ -74,7 +74,7 @@ def test_statistics_are_told(cell: sioms.Workcell, rig: Rig) -> None:
 @every_rig
 def test_a_killed_driver_is_refused_and_comes_back(workcell: Daemon, cell: sioms.Workcell, rig: Rig) -> None:
     before = workcell.device(rig.device)
-    others = {r.device: workcell.device(r.device)["pid"] for r in RIGS if r is not rig}
+    others = {r.device: workcell.device(r.device)["pid"] for r in GROUPS[group_of(rig) or 0] if r is not rig}
     with _reader(cell, rig.nodes[0]) as node:
         node.read()
         os.kill(before["pid"], signal.SIGKILL)
