@@ -107,9 +107,10 @@ def test_tables_of_edges_agree_with_the_finger(folder: Path) -> None:
     first = work.table_3_4().rows[0]
     place, published = first[0].split()  # the outermost element has too few touches near it
     assert abs(float(place) - 133.78) < 0.2 and published == "(132.9)"
-    for table, column in ((work.table_3_5(), 3), (work.table_3_7(), 3), (work.table_3_8(), 1)):
+    # these touches are clean and few: the identified map of table 3.8 may meet them exactly
+    for table, column, above in ((work.table_3_5(), 3, 0.0), (work.table_3_7(), 3, 0.0), (work.table_3_8(), 1, -1.0)):
         least, mean, most = (float(word) for word in table.rows[0][column].split())
-        assert 0.0 <= least <= mean <= most < 3.0 and mean > 0.0, table.title
+        assert above < least <= mean <= most < 3.0, table.title
         assert len({len(row) for row in table.rows} | {len(table.head)}) == 1
 
 
