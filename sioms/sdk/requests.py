@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .runtime import Runtime
 
 FEW_TICKS = 1000
-"""Ticks that statistics are told of when nobody asks for more: sorting thousands would delay the next tick."""
+"""Ticks that statistics are told of when nobody asks for more."""
 
 
 def _refuse(errno_: int, text: str) -> OSError:
