@@ -84,19 +84,19 @@ def _check(rate: int, seconds: float, report: Report) -> Load | None:
 
 def _search(rate: int, seconds: float, report: Report) -> Load | None:
     """Return the largest load found that is carried: double or halve, then halve the interval four times."""
-    low, high, best, n = 0, MOST, None, FIRST_GUESS[rate]
+    low, high, best, n = 0, MOST + 1, None, FIRST_GUESS[rate]
     for _ in range(7):
         try:
             load = _measure(n, rate, seconds)
-        except OSError as error:  # a driver that is late by a multiple of its period stops its axes
-            report.note(f"{n:6} axes at {rate} Hz: {error.strerror}: too many")
+        except (OSError, RuntimeError) as error:  # a driver that is late by many periods stops its axes
+            report.note(f"{n:6} axes at {rate} Hz: {str(error):.120}: too many")
             high = n
         else:
             _tell(load, report)
             low, high, best = (n, high, load) if load.carried else (low, n, best)
         if high - low <= max(10, high // 20):
             break
-        n = (low + high) // 2 if high < MOST else min(2 * n, MOST)
+        n = (low + high) // 2 if high <= MOST else min(2 * n, MOST)
     return best
 
 
