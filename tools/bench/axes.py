@@ -89,7 +89,7 @@ def _search(rate: int, seconds: float, report: Report) -> Load | None:
         try:
             load = _measure(n, rate, seconds)
         except (OSError, RuntimeError) as error:  # a driver that is late by many periods stops its axes
-            report.note(f"{n:6} axes at {rate} Hz: {str(error):.120}: too many")
+            report.note(f"{n:6} axes at {rate} Hz: {error!s:.120}: too many")
             high = n
         else:
             _tell(load, report)
