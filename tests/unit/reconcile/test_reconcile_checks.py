@@ -69,7 +69,6 @@ def test_force_in_wrong_units_is_recognised(factor: float, says: str) -> None:
         analyse(Session((bad,)), replace(AXIS, controller=limit), Options(pictures=False))
 
 
-@pytest.mark.xfail(reason="named payload at a share of 0.42 left; the threshold is 0.33 since, not yet run", strict=False)
 def test_data_of_another_axis_get_no_name() -> None:
     """Position of one motion, force of another: no library can explain that, and none is claimed to."""
     rng = np.random.default_rng(5)
