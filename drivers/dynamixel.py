@@ -198,10 +198,16 @@ class ServoUnit(AxesUnit):
         elif self._axis.mode == "current":
             yield self._write(GOAL_CURRENT, 0, 2, repeatable=True)
         else:
-            now: Status = yield self._bus.read(self._id, PRESENT_VELOCITY, 8)
-            speed, place = signed(now.data, 0, 4) / self._speed, signed(now.data, 4, 4)
-            way = speed * abs(speed) / (2 * self.bank.settings[0].acceleration_max) * abs(self._per_unit)
-            yield self._write(GOAL_POSITION, place + (0 if fastest else round(way)), 4, repeatable=True)
+            yield from self._brake()
+
+    def _brake(self) -> Steps:
+        """Set the goal where braking ends: with the place of now as the goal the servo would overshoot it and come back."""
+        highest = self.bank.settings[0].acceleration_max
+        yield from self._ramp(PROFILE_ACCELERATION, self._count(highest * self._rate))
+        now: Status = yield self._bus.read(self._id, PRESENT_VELOCITY, 8)
+        speed, place = signed(now.data, 0, 4) / self._speed, signed(now.data, 4, 4)
+        way = speed * abs(speed) / (2 * highest) * abs(self._per_unit)
+        yield self._write(GOAL_POSITION, place + round(way), 4, repeatable=True)
 
     def reset(self, axis: int) -> Steps:
         """Restart a servo that has shut down; else renew its watchdog."""
@@ -253,6 +259,10 @@ class ServoUnit(AxesUnit):
         """Switch the torque on, unless it is; the goal of before must not be taken up."""
         if self._torque:
             return
+        torque: Status = yield self._bus.read(self._id, TORQUE, 1)
+        if torque.data[0]:  # it was stopped and holds, or brakes yet
+            self._torque = True
+            return
         if self._axis.mode in ("position", "extended_position"):
             now: Status = yield self._bus.read(self._id, PRESENT_VELOCITY, 8)
             yield self._write(GOAL_POSITION, signed(now.data, 4, 4), 4)
@@ -266,7 +276,7 @@ class ServoUnit(AxesUnit):
     def _ramp(self, address: int, value: int) -> Steps:
         if self._ramps.get(address) != value:
             self._ramps.pop(address, None)
-            yield self._write(address, value, 4)
+            yield self._write(address, value, 4, repeatable=True)
             self._ramps[address] = value
 
     def _judge(self, alert: bool) -> Steps:

@@ -116,7 +116,7 @@ def test_slider_moves_with_the_arrow_keys(socket_path: str) -> None:
 
 def test_every_example_is_tested() -> None:
     files = {path.name for path in EXAMPLES.iterdir() if path.suffix in (".py", ".sh")}
-    assert files == {*EXPECTED, "slider.py"}
+    assert files == {*EXPECTED, "slider.py", "damper.sh"}
     for path in EXAMPLES.iterdir():
         if path.suffix in (".py", ".sh"):
             assert 5 <= len(path.read_text().splitlines()) <= 60, path.name
