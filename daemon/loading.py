@@ -20,6 +20,7 @@ from .config import Config, parse
 from .loop import Loop
 from .names import DeviceInfo, NameTable
 from .nursery import Nursery
+from .nursery_process import NurseryProcess
 
 TIMEOUT_S = 30.0
 
@@ -48,16 +49,18 @@ class Loader:
         path: of the configuration.
         done: called with the plan (None when there are errors) and the errors.
         nursery_died: passed on to the nursery.
+        process: for the nursery, already started; None: start one.
     """
 
     def __init__(
         self, loop: Loop, path: str, done: Callable[[Plan | None, list[str]], None],
-        nursery_died: Callable[[Nursery], None],
+        nursery_died: Callable[[Nursery], None], process: NurseryProcess | None = None,
     ) -> None:  # fmt: skip
         self._loop = loop
         self._path = path
         self._done = done
         self._died = nursery_died
+        self._process = process
         self._infos: dict[str, DeviceInfo] = {}
         self._errors: list[str] = []
 
@@ -76,7 +79,7 @@ class Loader:
             return
         self._config = config
         self._waiting = set(config.devices)
-        self._nursery = Nursery(self._loop, self._died)
+        self._nursery = Nursery(self._loop, self._died, self._process)
         self._timer = self._loop.after(TIMEOUT_S, self._late)
         for name, device in config.devices.items():
             self._nursery.describe(

@@ -3,25 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import errno
-import grp
-import os
-import signal
-import socket
-import stat
 import sys
 
-from sioms.protocol.socketpath import socket_path
-
-from .config import Config, parse
-from .loading import Loader, Plan
-from .log import Log
-from .loop import Loop
-from .nursery import Nursery
-from .server import Server
-
-PRIORITY = 10
-"""SCHED_FIFO priority of the daemon; that of a driver is 50 unless configured otherwise."""
+from .nursery_process import start_nursery
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -37,125 +21,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--check", action="store_true", help="check the configuration and exit")
     parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
     options = parser.parse_args(argv)
-    log = Log(
-        journal="JOURNAL_STREAM" in os.environ and "NOTIFY_SOCKET" in os.environ, level=options.log_level
-    )
-    loop = Loop()
+    nursery = start_nursery()
+    from .service import check, serve  # while the nursery imports numpy and the motion core
+
     if options.check:
-        return _check(loop, options.config)
-    try:
-        listener, path = _listen(options.config, options.socket)
-    except OSError as error:
-        print(f"siomsd: listen: {error.strerror or error}", file=sys.stderr)
-        return 1
-    _become_prompt(log)
-    server = Server(loop, listener, options.config, log)
-    _take_signals(loop, server)
-
-    def loaded(errors: list[str]) -> None:
-        if errors:
-            server.exit_status = 2
-            server.shutdown()
-
-    server.load(loaded)
-    try:
-        loop.run()
-    finally:
-        if os.path.exists(path):
-            os.unlink(path)
-    return server.exit_status
-
-
-def _become_prompt(log: Log) -> None:
-    """Run before all ordinary processes, where allowed, and behind the drivers; what we start does not inherit it.
-
-    Not for work but for the end: a killed process closes its sockets only when it gets a processor, and by
-    that the drivers see that we are gone. Also an emergency stop through us then waits for nobody.
-    """
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
-    except OSError as error:
-        log("debug", "runs without SCHED_FIFO", why=error.strerror)
-
-
-def _check(loop: Loop, path: str) -> int:
-    result: list[str] = []
-
-    def loaded(plan: Plan | None, errors: list[str]) -> None:
-        result.extend(errors)
-        loop.running = False
-        if plan is not None:
-            plan.nursery.close()
-            kinds = len(plan.names.nodes)
-            print(f"{path}: good; {len(plan.config.devices)} devices, {kinds} nodes")
-
-    def died(nursery: Nursery) -> None:
-        """Nothing to do: the loader's requests have been answered with the death."""
-
-    Loader(loop, path, loaded, died).start()
-    if loop.running and not result:
-        loop.run()
-    for error in result:
-        print(f"{path}: {error}", file=sys.stderr)
-    return 2 if result else 0
-
-
-def _listen(config_path: str, given: str | None) -> tuple[socket.socket, str]:
-    """Bind the listening socket; refuse when another daemon answers on it."""
-    config: Config | None = None
-    try:
-        with open(config_path, encoding="utf-8") as file:
-            config, _ = parse(file.read(), os.path.dirname(config_path))
-    except (OSError, UnicodeDecodeError):
-        pass  # the loader will report it, with all other errors
-    table = config.workcell if config else None
-    path = given or (table.socket if table else "") or socket_path()
-    os.makedirs(os.path.dirname(path) or ".", mode=0o755, exist_ok=True)
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    if os.path.exists(path):
-        if not stat.S_ISSOCK(os.stat(path).st_mode):
-            raise OSError(errno.EEXIST, f"{path} is there and is no socket; remove it or choose another path")
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
-            if probe.connect_ex(path) == 0:
-                raise OSError(
-                    errno.EADDRINUSE, f"another daemon answers at {path}; stop it or choose another path"
-                )
-        os.unlink(path)
-    mode = int(table.socket_mode, 8) if table else 0o660
-    mask = os.umask(0o777 & ~mode)
-    try:
-        listener.bind(path)
-    except OSError as error:
-        raise OSError(error.errno, f"{path}: {error.strerror}") from None
-    finally:
-        os.umask(mask)
-    if table and table.socket_group:
-        try:
-            os.chown(path, -1, grp.getgrnam(table.socket_group).gr_gid)
-        except (KeyError, OSError) as error:
-            raise OSError(errno.EPERM, f"give {path} to group {table.socket_group}: {error}") from None
-    listener.listen(128)
-    return listener, path
-
-
-def _take_signals(loop: Loop, server: Server) -> None:
-    ours, theirs = socket.socketpair()
-    ours.setblocking(False)
-    theirs.setblocking(False)
-    signal.set_wakeup_fd(theirs.fileno())
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, lambda *_: None)
-    signal.signal(signal.SIGPIPE, signal.SIG_IGN)
-
-    def take() -> None:
-        for number in ours.recv(64):
-            if number == signal.SIGHUP:
-                server.load(lambda errors: server.log("info", "reload", errors=len(errors)))
-            elif number in (signal.SIGTERM, signal.SIGINT):
-                server.shutdown()
-
-    take.sockets = (ours, theirs)  # type: ignore[attr-defined]  # keep them open
-    loop.watch(ours.fileno(), take)
+        return check(options.config, nursery)
+    return serve(options.config, options.socket, options.log_level, nursery)
 
 
 if __name__ == "__main__":

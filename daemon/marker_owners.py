@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-import secrets
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -33,6 +33,11 @@ class Reservation:
     owner: object | None
 
 
+def _random_key() -> int:
+    """Return a key that nobody guesses; the module secrets would take a tenth of the daemon's start."""
+    return int.from_bytes(os.urandom(8), "little") % (1 << KEY_BITS) or 1
+
+
 class MarkerOwners:
     """The daemon's side of the marker table.
 
@@ -41,9 +46,7 @@ class MarkerOwners:
         random_key: source of keys; replaced in tests.
     """
 
-    def __init__(
-        self, table: MarkerTable, random_key: Callable[[], int] = lambda: secrets.randbits(KEY_BITS) or 1
-    ) -> None:
+    def __init__(self, table: MarkerTable, random_key: Callable[[], int] = _random_key) -> None:
         self._table = table
         self._key = random_key
         self._reserved: dict[int, Reservation] = {}

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import os
 import socket
-import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from sioms.protocol.messages import MAX_PACKET, MalformedMessage, NurseryVerb, decode, encode
 
 from .loop import Loop
+from .nursery_process import NurseryProcess, start_nursery
 
 Answer = Callable[[Any, int, str, list[int]], None]
 """Called with (value, errno, text, descriptors)."""
@@ -27,22 +27,18 @@ class Nursery:
     Args:
         loop: the daemon's loop.
         died: called when the process has gone.
+        process: one that has just been started; None: start one.
     """
 
-    def __init__(self, loop: Loop, died: Callable[[Nursery], None]) -> None:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    def __init__(
+        self, loop: Loop, died: Callable[[Nursery], None], process: NurseryProcess | None = None
+    ) -> None:
         self._loop = loop
         self._died = died
-        ours.setblocking(False)  # a nursery that is stuck in a driver's import must not hold up the daemon
-        self._sock = ours
+        self._sock, self.pid = process or start_nursery()
         self._answers: dict[int, Answer] = {}
         self._number = 0
-        theirs.set_inheritable(True)
-        environment = dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", PYTHONFAULTHANDLER="1")
-        arguments = [sys.executable, "-m", "sioms.sdk.nursery", str(theirs.fileno())]
-        self.pid = os.posix_spawn(sys.executable, arguments, environment)
-        theirs.close()
-        loop.watch(ours.fileno(), self._receive)
+        loop.watch(self._sock.fileno(), self._receive)
 
     def describe(
         self, device: str, driver: str, settings: dict[str, Any], folder: str, answer: Answer

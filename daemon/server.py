@@ -25,6 +25,7 @@ from .loop import Loop
 from .names import NameTable
 from .notify import ServiceManager
 from .nursery import Nursery
+from .nursery_process import NurseryProcess
 from .rights import Rights
 from .shared import Shared
 
@@ -39,9 +40,13 @@ class Server:
         listener: the listening SOCK_SEQPACKET socket.
         config_path: where the configuration is read from, again at every reload.
         log: its log.
+        process: the nursery for the first configuration, already started; None: start one.
     """
 
-    def __init__(self, loop: Loop, listener: socket.socket, config_path: str, log: Log) -> None:
+    def __init__(
+        self, loop: Loop, listener: socket.socket, config_path: str, log: Log,
+        process: NurseryProcess | None = None,
+    ) -> None:  # fmt: skip
         self.loop = loop
         self.log = log
         self.shared = Shared()
@@ -52,6 +57,7 @@ class Server:
         self.exit_status = 0
         self._path = config_path
         self._nursery: Nursery | None = None
+        self._first_process = process
         self._stop_sources: dict[str, list[list[int]]] = {}
         self._alarms: dict[str, list[list[Any]]] = {}
         self._leaving: dict[str, DriverProcess] = {}
@@ -86,7 +92,8 @@ class Server:
                 self._manager.tell("READY=1")
             done(errors)
 
-        self._loader = Loader(self.loop, self._path, loaded, self._nursery_died)
+        process, self._first_process = self._first_process, None
+        self._loader = Loader(self.loop, self._path, loaded, self._nursery_died, process)
         self._loader.start()
 
     def shutdown(self) -> None:

@@ -134,6 +134,43 @@ class AsyncNode(NodeCore):
         """Append one command; see ``sioms.command`` for the words."""
         return await self.write(command(axis, **words), timeout, replace=replace)
 
+    async def move(
+        self,
+        position: float,
+        axis: int = 0,
+        *,
+        timeout: float | None = 0.0,
+        replace: bool = False,
+        **words: Any,
+    ) -> int:
+        """Append a position command; see ``AxisNode.move``."""
+        return await self.command(axis, position=position, timeout=timeout, replace=replace, **words)
+
+    async def jog(self, velocity: float, axis: int = 0, *, acceleration: float | None = None) -> int:
+        """Go over to a velocity at once, until told otherwise; see ``AxisNode.jog``."""
+        words = {} if acceleration is None else {"acceleration": acceleration}
+        return await self.command(axis, velocity=velocity, replace=True, **words)
+
+    async def tweak(self, step: float, axis: int = 0, **words: Any) -> int:
+        """Append a step from where the preceding command ends; see ``AxisNode.tweak``."""
+        return await self.command(axis, position=step, relative=True, **words)
+
+    async def stop(self) -> None:
+        """Stop at maximum deceleration and empty the buffers; not latched."""
+        await self.ioctl(Request.STOP)
+
+    async def stop_all(self) -> None:
+        """Emergency stop of this node, latched until ``reset``."""
+        await self.ioctl(Request.EMERGENCY_STOP)
+
+    async def reset(self) -> None:
+        """Clear a latched stop or fault of this node. Nothing resumes."""
+        await self.ioctl(Request.RESET)
+
+    async def home(self) -> None:
+        """Start homing; ``wait_until_idle`` waits for its end."""
+        await self.ioctl(Request.HOME)
+
     async def set(self, *values: float) -> int:
         """Write all channels of a binary or analog output."""
         return await self.write(self._outputs(values))

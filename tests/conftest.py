@@ -21,8 +21,10 @@ from typing import IO
 import pytest
 from hypothesis import HealthCheck, settings
 
-# A loaded machine is no fault of the code under test: examples are counted, not timed.
-settings.register_profile("sioms", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# A loaded machine is no fault of the code under test: examples are counted, not timed. They are the same each
+# time; --hypothesis-profile=search looks for new ones.
+settings.register_profile("search", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("sioms", settings.get_profile("search"), derandomize=True)
 settings.load_profile("sioms")
 
 MARKERS = {

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gc
 import os
+import select
 import signal
 import socket
 import sys
@@ -34,7 +35,11 @@ def main(fd: int) -> None:
     ):  # what these mean is for the daemon to decide
         signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel reaps; the daemon watches by pidfd
+    asked = select.poll()
+    asked.register(sock, select.POLLIN)
     while True:
+        if not asked.poll(0):
+            from . import runtime  # noqa: F401  # what forking needs, while the daemon is not ready to ask
         packet, fds, _, _ = socket.recv_fds(sock, 1 << 20, 8)
         if not packet:
             return
@@ -72,7 +77,7 @@ def _spawn(
     sock: socket.socket, number: int, fds: list[int], device: str, driver: str, table: dict[str, Any],
     generation: int, options: dict[str, Any],
 ) -> None:  # fmt: skip
-    from .runtime import run  # numpy and the motion core: not needed to check a configuration
+    from .runtime import run  # not needed to check a configuration
 
     found = find_driver(driver, options["folder"])
     settings, errors = read_settings(found, table, options["folder"])

@@ -157,7 +157,8 @@ def test_asyncio_face(daemon: Daemon, cell: sioms.Workcell) -> None:
                             break
                     return count
 
-                await axis.command(position=0.02)
+                await axis.move(0.01)
+                await axis.tweak(0.01)
                 await axis.write(sioms.command(0, position=0.0))
                 idle, watched = await asyncio.gather(axis.wait_until_idle(5.0), watch())
                 assert idle is None and watched == 5
@@ -171,7 +172,7 @@ def test_asyncio_face(daemon: Daemon, cell: sioms.Workcell) -> None:
                 await asyncio.sleep(0)
                 await mine.signal_marker(token)
                 assert await asyncio.wait_for(waiting, 5.0) > 0
-                await axis.command(velocity=0.01)
+                await axis.jog(0.01)
                 idle_task = asyncio.create_task(axis.wait_until_idle())
                 await asyncio.sleep(0.02)
                 idle_task.cancel()

@@ -57,9 +57,11 @@ def test_axes_move_as_they_do_by_the_general_way(commands):
         for rig in rigs:
             outcome(rig, records(mode=mode, axis=index, **fields), replace)
             rig.tick(ticks)
+    by_force = any(mode in (MODE.FORCE, MODE.FORCE_VELOCITY) for mode, *_ in commands)
     for i in range(2):
         difference = rigs[0].trace("commanded_position", i) - rigs[1].trace("commanded_position", i)
-        assert np.abs(difference).max(initial=0.0) <= 1e-12
+        # What follows a force begins at the measured position, and a tick has measured in between: at most its motion.
+        assert np.abs(difference).max(initial=0.0) <= (1e-3 if by_force else 1e-12)
 
 
 def test_a_stop_drops_a_write_that_no_tick_has_seen():

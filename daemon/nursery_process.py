@@ -1,0 +1,35 @@
+"""The nursery's process, which a daemon starts first of all: it imports its libraries while the daemon imports its own."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from typing import NamedTuple
+
+
+class NurseryProcess(NamedTuple):
+    """A running nursery.
+
+    Args:
+        sock: non-blocking socket to it; the nursery ends when this closes.
+        pid: its process.
+    """
+
+    sock: socket.socket
+    pid: int
+
+
+def start_nursery() -> NurseryProcess:
+    """Start a nursery.
+
+    Raises:
+        OSError: no process or no descriptor is left.
+    """
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.setblocking(False)  # a nursery that is stuck in a driver's import must not hold up the daemon
+    with theirs:
+        theirs.set_inheritable(True)
+        environment = dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", PYTHONFAULTHANDLER="1")
+        arguments = [sys.executable, "-m", "sioms.sdk.nursery", str(theirs.fileno())]
+        return NurseryProcess(ours, os.posix_spawn(sys.executable, arguments, environment))
