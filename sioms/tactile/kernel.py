@@ -28,7 +28,7 @@ Fit = Callable[..., tuple[float, float, Products, int]]
 # solves one frame, see `_solver` -> (status, t, b, ten products, iterations, sum of weights)
 Solve = Callable[..., tuple[int, float, float, Products, int, float]]
 
-MOST_STEPS = 40
+MOST_STEPS = 100
 _TOLERANCE = 1e-7  # stop when a step gains less than this much chi square: 3e-4 standard deviations
 
 
@@ -167,30 +167,32 @@ def _build(products: Callable[..., Products]) -> Fit:
             gain_t, gain_b = p * (at[6] - p * at[1]), p * (at[8] - p * at[2])
             tt, bb = p * p * (at[4] - at[1] ** 2 / ff), p * p * (at[7] - at[2] ** 2 / ff)
             tb = p * p * (at[5] - at[1] * at[2] / ff)
-            held = (b <= 0.0 and gain_b < 0.0) or (b >= top_b and gain_b > 0.0)
             lt, lb = tt * (1.0 + damping) + 1e-30, bb * (1.0 + damping) + 1e-30
-            if held:
-                move_t, move_b = gain_t / lt, 0.0
-            else:
-                det = lt * lb - tb * tb
-                move_t, move_b = (lb * gain_t - tb * gain_b) / det, (lt * gain_b - tb * gain_t) / det
-            # one pitch at most: the model turns over within about that distance
-            move_t = min(max(move_t, -0.1), 0.1)
-            new_t = min(max(t + move_t, first), top_t)
-            new_b = min(max(b + move_b, 0.0), top_b)
+            det = lt * lb - tb * tb
+            move_t, move_b = (lb * gain_t - tb * gain_b) / det, (lt * gain_b - tb * gain_t) / det
+            if b + move_b < 0.0 or b + move_b > top_b:
+                # the least of the quadratic lies on the bound, and there at another t
+                move_b = min(max(move_b, -b), top_b - b)
+                move_t = (gain_t - tb * move_b) / lt
+            # one pitch at most, because the model turns over within about that distance, and not off the table;
+            # the whole step is shortened: a part of it need not lead downhill
+            room = min(0.1, top_t - t if move_t > 0.0 else t - first)
+            share = min(1.0, room / max(abs(move_t), 1e-30))
+            new_t, new_b = t + share * move_t, min(max(b + share * move_b, 0.0), top_b)
             promised = (new_t - t) * gain_t + (new_b - b) * gain_b
             try_at = products(nodes, first, step, width_step, weights, y, new_t, new_b)
             try_ff, try_fy = try_at[0] + load_weight, try_at[3] + load_weight * load
             try_cost = -(max(try_fy, 0.0) ** 2) / try_ff
-            if try_cost <= cost + 1e-12 * abs(cost):
+            gained = cost - try_cost
+            if gained >= -1e-12 * abs(cost):
                 t, b, at, ff, fy, cost = new_t, new_b, try_at, try_ff, try_fy, try_cost
-                damping = max(0.1 * damping, 1e-9)
-                if promised < _TOLERANCE:
-                    break
-            else:
-                if promised < _TOLERANCE:
-                    break
+            if promised < _TOLERANCE:
+                break
+            # at the ends of the arc the model bends so that undamped steps leap to and fro across a narrow valley
+            if gained < 0.3 * promised:
                 damping = max(10.0 * damping, 1e-3)
+            elif gained > 0.7 * promised:
+                damping = max(0.1 * damping, 1e-9)
         return t, b, at, steps
 
     return fit

@@ -221,3 +221,21 @@ def test_a_place_that_is_hardly_known_is_flagged(nominal: Finger, estimator: Est
     in_the_middle = estimator.frame(touch(np.radians(75.0), 30.0, np.inf))
     assert light_at_the_end.deviations[0] > np.radians(0.5) and Quality.IMPRECISE in light_at_the_end.quality
     assert in_the_middle.deviations[0] < np.radians(0.5) and Quality.IMPRECISE not in in_the_middle.quality
+
+
+def test_no_touch_of_the_table_fits_better_than_the_estimate(nominal: Finger) -> None:
+    """Light touches at the arc's ends have several minima and flat valleys; every node of the table is a rival."""
+    random, estimator = np.random.default_rng(12), Estimator(nominal, compiled=None)
+    table, widths = nominal.strain_table(), nominal.width_table()
+    bank = table.nodes[:, :, 0].reshape(-1, 16)
+    square = np.repeat(table.half_widths**2, table.nodes.shape[1])
+    for _ in range(500):
+        place = float(random.choice([4.7, 143.0])) + float(random.uniform(-5.0, 5.0))
+        load, rc = random.uniform(25.0, 120.0), float(random.choice([0.5e-3, 6e-3, math.inf]))
+        frame = strains(nominal, math.radians(place), load, rc) + 1e-3 * random.normal(size=16)
+        shape = estimator.frame(frame)
+        assert not shape.quality & Quality.NOT_CONVERGED
+        p = bank @ frame / np.einsum("ne,ne->n", bank, bank)
+        allowed = (p > 0.0) & (widths.product(square) <= 1.5 * FINGER_B.outer_m * p)
+        rival = np.sum((frame - p[:, None] * bank) ** 2, axis=1)[allowed].min() / 1e-6
+        assert 13.0 * shape.misfit < rival + 0.5  # less is no difference
