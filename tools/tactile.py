@@ -1,4 +1,4 @@
-"""`sioms tactile design|reproduce|calibrate|score|experiment`: work with elastic cylindrical fingers from the shell.
+"""`sioms tactile design|reproduce|calibrate|score|shape|experiment`: work with elastic cylindrical fingers from the shell.
 
 Long work tells on stderr what it is doing; reports are single HTML pages.  Numerical and drawing libraries
 are imported when a subcommand runs, not before.
@@ -64,6 +64,28 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--edge-deg", type=float, default=45.0, help="half angle of the edge indenter (default 45)"
     )
 
+    shape = commands.add_parser("shape", help="fit recorded frames on all cores: a table of what touched")
+    shape.add_argument(
+        "data", type=Path, nargs="+", help="recordings (*.npz with raw and time), or folders of them"
+    )
+    shape.add_argument("--finger", type=Path, required=True, help="calibrated finger (from calibrate)")
+    shape.add_argument(
+        "-o", "--output", type=Path, default=Path("shapes.csv"), help="table (default shapes.csv)"
+    )
+    shape.add_argument("--jobs", type=int, help="processes (default: one for each core)")
+    shape.add_argument(
+        "--settle", type=int, default=20, help="frames averaged for the baseline, untouched (default 20)"
+    )
+    shape.add_argument(
+        "--load-deviation",
+        type=float,
+        metavar="N/M",
+        help="use the recorded force, known to this deviation in N/m",
+    )
+    shape.add_argument(
+        "--plain", action="store_true", help="fit in plain numpy even where numba is installed"
+    )
+
     experiment = commands.add_parser(
         "experiment",
         help="probe a simulated finger through the daemon, calibrate it, tabulate it beside the published one",
@@ -101,6 +123,10 @@ def run(args: argparse.Namespace) -> int:
                 from sioms.tools.tactile_score import score
 
                 return score(args)
+            case "shape":
+                from sioms.tools.tactile_shape import shape
+
+                return shape(args)
             case "experiment":
                 from sioms.tools.tactile_experiment import experiment
 

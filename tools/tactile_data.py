@@ -56,6 +56,20 @@ def read_folder(folder: Path) -> Data:
     return Data(nominal, touches, recordings)
 
 
+def read_recording(path: Path) -> Recording:
+    """Read the frames of one npz.
+
+    Raises:
+        ValueError: a file that makes no sense; the message names it.
+        OSError: the file cannot be read.
+    """
+    try:
+        with np.load(path) as file:
+            return _recording(file)
+    except (ValueError, KeyError, EOFError) as error:
+        raise ValueError(f"read {path}: {error}") from error
+
+
 def _recording(file: Any) -> Recording:
     raw = np.asarray(file["raw"], dtype=np.float64)
     frames = raw.shape[0]

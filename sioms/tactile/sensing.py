@@ -156,20 +156,30 @@ class ShapeSensor:
         Raises:
             ValueError: wrong number of readings, or a stamp before the last one.
         """
+        strain, load = self.strain(raw, stamp_ns, reading)
+        return Sensed(strain, self.shape(strain, load))
+
+    def strain(
+        self, raw: ArrayLike, stamp_ns: int, reading: float | None = None
+    ) -> tuple[StrainFrame, Load | None]:
+        """Do the part of `frame` that needs the frames in order: return the strains, and the load under a touch."""
         strain = self._chain.frame(raw, stamp_ns)
         elapsed_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
         self._stamp_ns = stamp_ns
+        if not strain.settled or self._tare is None or reading is None:
+            return strain, None
+        return strain, self._tare.load(reading, strain.touched, elapsed_s)
+
+    def shape(self, strain: StrainFrame, load: Load | None = None) -> ShapeEstimate:
+        """Do the rest of `frame`: estimate; remembers nothing, so another sensor of the same finger may do it."""
         if not strain.settled:
-            return Sensed(strain, nothing(Quality.NO_BASELINE))
-        load = None
-        if self._tare is not None and reading is not None:
-            load = self._tare.load(reading, strain.touched, elapsed_s)
+            return nothing(Quality.NO_BASELINE)
         if not strain.touched:
-            return Sensed(strain, nothing(Quality.NO_CONTACT))
+            return nothing(Quality.NO_CONTACT)
         shape = self._estimator.frame(strain.strains, load, strain.usable)
         if self._tare is not None and load is None:
             shape = dataclasses.replace(shape, quality=shape.quality | Quality.WITHOUT_LOAD)
-        return Sensed(strain, shape)
+        return shape
 
 
 def numbers(sensed: Sensed) -> tuple[float, ...]:

@@ -13,6 +13,7 @@ from sioms.tactile.cylinder import FINGER_B
 from sioms.tactile.emap import e_map
 from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import from_toml
+from sioms.tactile.sensing import CHANNELS, LoadTare, ShapeSensor, numbers
 from sioms.tactile.series import line_load
 from sioms.tools import tactile
 from sioms.tools.report_page import Page
@@ -108,7 +109,11 @@ def test_tables_of_edges_agree_with_the_finger(folder: Path) -> None:
     place, published = first[0].split()  # the outermost element has too few touches near it
     assert abs(float(place) - 133.78) < 0.2 and published == "(132.9)"
     # these touches are clean and few: the identified map of table 3.8 may meet them exactly
-    for table, column, above in ((work.table_3_5(), 3, 0.0), (work.table_3_7(), 3, 0.0), (work.table_3_8(), 1, -1.0)):
+    for table, column, above in (
+        (work.table_3_5(), 3, 0.0),
+        (work.table_3_7(), 3, 0.0),
+        (work.table_3_8(), 1, -1.0),
+    ):
         least, mean, most = (float(word) for word in table.rows[0][column].split())
         assert above < least <= mean <= most < 3.0, table.title
         assert len({len(row) for row in table.rows} | {len(table.head)}) == 1
@@ -157,3 +162,82 @@ def test_page_escapes_and_colours(tmp_path: Path) -> None:
     assert "<h1>a &lt; b</h1>" in text
     assert '<td class="good">yes</td>' in text
     assert '<td class="bad">&lt;no&gt;</td>' in text
+
+
+def moving_touch(path: Path, frames: int = 2500) -> tuple[np.ndarray, np.ndarray]:
+    """Record frames at 400 Hz: untouched, then an edge of 150 N/m that slides from 40 to 110 degrees; return its places."""
+    random = np.random.default_rng(8)
+    place = np.radians(np.linspace(40.0, 110.0, frames))
+    touched = np.arange(frames) >= 200
+    matrix = e_map(FINGER_B, np.radians(ANGLES), 10.3e-3, 60)[:, :121]
+    strain = np.array([matrix @ line_load(FINGER_B, -150.0, t, 60) for t in place]) * touched[:, None]
+    raw = -100.0 * strain / 3.0 + 0.02 * random.normal(size=(frames, 16))
+    raw[700, 3] = np.nan
+    np.savez(path, raw=raw, time=np.arange(frames) / 400.0, force=152.0 * touched + 2.0, fs=400.0)
+    return place, touched
+
+
+def test_shape_fits_frames_on_many_processes_as_one_sensor_would(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    finger, recording, out = (
+        Path(__file__).parents[3] / "etc" / "finger.toml",
+        tmp_path / "slide.npz",
+        tmp_path / "s.csv",
+    )
+    place, touched = moving_touch(recording)
+    words = [
+        "shape",
+        str(tmp_path),
+        "--finger",
+        str(finger),
+        "--jobs",
+        "2",
+        "--plain",
+        "--load-deviation",
+        "3",
+    ]
+    assert command(*words, "-o", str(out)) == 0
+    told = capsys.readouterr()
+    assert "2500 frames, 2300 touched" in told.out and "1 BAD_ELEMENTS" in told.out
+    assert "slide: 1000 of 2500 frames" in told.err and "slide: 2500 of 2500 frames" in told.err
+    table = np.genfromtxt(out, delimiter=",", names=True, dtype=None, encoding="utf-8")
+    assert list(table["frame"]) == list(range(2500)) and set(table["recording"]) == {"slide"}
+    np.testing.assert_array_equal(table["touched"] == 1.0, touched)
+    assert np.degrees(np.abs(table["angle"] - place)[touched]).max() < 1.0
+    assert np.mean(table["load"][touched]) == pytest.approx(152.0, rel=0.02)  # drawn to the force sensor's
+    sensor = ShapeSensor(from_toml(finger.read_text()), tare=LoadTare(1.0, 3.0, 2.0))
+    with np.load(recording) as file:
+        for number in range(1300):
+            row = numbers(
+                sensor.frame(file["raw"][number], round(file["time"][number] * 1e9), file["force"][number])
+            )
+    found = [table[name][1299] for name, _, _ in CHANNELS]
+    np.testing.assert_allclose(found, row, rtol=1e-6)
+
+
+def test_shape_names_what_it_cannot_fit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    finger = str(Path(__file__).parents[3] / "etc" / "finger.toml")
+    out = tmp_path / "s.csv"
+
+    def refusal(*words: str) -> str:
+        assert command("shape", *words, "-o", str(out)) == 1 and not out.exists()
+        return capsys.readouterr().err
+
+    assert "holds no *.npz" in refusal(str(tmp_path), "--finger", finger)
+    np.savez(tmp_path / "x.npz", raw=np.zeros((30, 8)), time=np.arange(30.0), fs=33.0)
+    assert "x.npz: frames of 8 readings; finger 'demo' has 16" in refusal(str(tmp_path), "--finger", finger)
+    phase = np.arange(30) >= 5
+    np.savez(
+        tmp_path / "x.npz",
+        raw=np.zeros((30, 16)),
+        time=np.arange(30.0),
+        fs=33.0,
+        phase=phase,
+        touch=phase - 1,
+    )
+    assert "frame 5 is under touch 0, but the first 20" in refusal(str(tmp_path), "--finger", finger)
+    (tmp_path / "x.npz").write_text("nothing")
+    assert f"read {tmp_path / 'x.npz'}" in refusal(str(tmp_path), "--finger", finger)
+    assert "No such file" in refusal(str(tmp_path), "--finger", "/none/finger.toml")
+    assert "deviation is -1" in refusal(str(tmp_path), "--finger", finger, "--load-deviation", "-1")
