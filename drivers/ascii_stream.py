@@ -13,6 +13,9 @@ at which the line's last byte arrived.
     scale = 0.0098
     rate_hz = 80.0
     time = "ms"
+
+A finger that prints its elements' readings has a table ``shape``, see ``tactile_nodes``: strains and what touches it are then
+published with every line.
 """
 
 from __future__ import annotations
@@ -25,7 +28,8 @@ from typing import Any, Literal, TypeVar
 import msgspec
 import numpy as np
 
-from sioms.protocol.flags import AnalogStatus, NodeClass
+from sioms.drivers import tactile_nodes
+from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
 from sioms.sdk.codec.ascii_line import MAX_LINE_BYTES, LineReceiver
@@ -61,6 +65,7 @@ class AsciiStreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
         low, high: numbers at which the converter is at its end: at or beyond them a sample is SATURATED.
         minimum, maximum: range of the values [unit].
         history: snapshots kept for readers.
+        shape: of a tactile finger: shows its strains and the shape that touches it, too.
     """
 
     line: LineSettings
@@ -80,6 +85,7 @@ class AsciiStreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     minimum: float | None = None
     maximum: float | None = None
     history: int = 256
+    shape: tactile_nodes.ShapeSettings | None = None
 
 
 class AsciiStream(StreamDriver):
@@ -100,7 +106,9 @@ class AsciiStream(StreamDriver):
             for column, unit in zip(settings.columns, units, strict=True)
         )
         block = BlockSpec("", NodeClass.ANALOG, channels, history=settings.history)
-        return Description((block,), settings.rate_hz, lease_s=max(0.5, 10 / settings.rate_hz))
+        more = tactile_nodes.specs(settings.shape, len(settings.columns), settings.history)
+        felt = tactile_nodes.inputs(settings.shape)
+        return Description((block, *more), settings.rate_hz, felt, max(0.5, 10 / settings.rate_hz))
 
     @classmethod
     def golden(cls, settings: Any) -> Sequence[Golden]:
@@ -121,7 +129,9 @@ class AsciiStream(StreamDriver):
         super().__init__(name, settings, kit)
         self.line = settings.line
         self.silence_s = max(0.25, 20 / settings.rate_hz)
-        self._block = AnalogBlock(self.describe(name, settings).blocks[0])
+        first, *more = self.describe(name, settings).blocks
+        self._block = AnalogBlock(first)
+        self._finger = tactile_nodes.TactileNodes(settings.shape, more, kit) if settings.shape else None
         n = self._block.n
         self._scale = np.array(_each(settings.scale, n), dtype=np.float64)
         self._offset = np.array(_each(settings.offset, n), dtype=np.float64)
@@ -136,8 +146,8 @@ class AsciiStream(StreamDriver):
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
-        """The channels."""
-        return (self._block,)
+        """The channels; of a finger its strains and shape, too."""
+        return (self._block,) if self._finger is None else (self._block, *self._finger.blocks)
 
     def open(self) -> Steps:
         """Wait for the greeting and a good line; tell what is wrong with the lines when none comes."""
@@ -178,7 +188,14 @@ class AsciiStream(StreamDriver):
         if self.settings.stop:
             yield Send(self.settings.stop.encode("ascii"), "stop")
 
+    def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
+        """Answer the requests of a finger's nodes."""
+        if self._finger is None or not block.name:
+            return super().ioctl(block, request, channels, argument)
+        return self._finger.ioctl(block, request, argument)
+
     def _take(self, row: tuple[float, ...], now_ns: int) -> None:
+        arrived_ns = now_ns
         if self._fit is not None:
             now_ns = self._fit.to_host(round(row[0] * CLOCKS[self.settings.time][0]), now_ns)
             row = row[1:]
@@ -193,6 +210,10 @@ class AsciiStream(StreamDriver):
         self._block.flags[:] = flags
         self._stamp_ns = self._block.stamp_ns = max(now_ns, self._stamp_ns + 1)
         self.kit.publish(self._block, self._block.stamp_ns)
+        if self._finger is not None:
+            self._finger.take(self._block.data, self._block.flags, self._block.stamp_ns, arrived_ns)
+            for derived in self._finger.blocks:
+                self.kit.publish(derived, derived.stamp_ns)
 
 
 class Inspection:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -11,8 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sioms.drivers.ascii_stream import AsciiStream, Inspection
-from sioms.protocol.flags import AnalogStatus
+from sioms.protocol.flags import AnalogStatus, Request
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError
+from sioms.tactile.cylinder import FINGER_B
+from sioms.tactile.emap import e_map
+from sioms.tactile.estimator import Quality
+from sioms.tactile.series import line_load
 from sioms.tools.counterparts import ascii_stream as counterpart
 
 
@@ -176,3 +181,34 @@ def test_bad_configurations(table: dict[str, Any], words: str) -> None:
     settings = {"line": {"serial": "/x"}, "columns": ["a", "b"], "rate_hz": 80.0, **table}
     with pytest.raises(ValueError, match=words):
         AsciiStream.describe("t0", msgspec.convert(settings, AsciiStream.Settings))
+
+
+def test_a_finger_that_prints_its_elements_is_felt() -> None:
+    """Lines of 16 readings in per cent, as an edge of 150 N/m at 60 degrees would give them, 3 % strain for 1 %."""
+    angles = np.radians(143.0 - 9.22 * np.arange(16))
+    edge = e_map(FINGER_B, angles, 10.3e-3, 60)[:, :121] @ line_load(FINGER_B, -150.0, np.radians(60.0), 60)
+    columns, finger = [f"e{i}" for i in range(16)], str(Path(__file__).parents[3] / "etc" / "finger.toml")
+    rig = Rig(columns=columns, unit="%", low=-90.0, high=90.0, shape={"finger_file": finger})
+    random = np.random.default_rng(1)
+
+    def line(strain: Any) -> bytes:
+        return (
+            ",".join(f"{r:.3f}" for r in -100.0 * strain / 3.0 + 0.02 * random.normal(size=16)) + "\n"
+        ).encode()
+
+    rig.driver.feed(b"cut\n", 10**9)
+    for number in range(30):
+        rig.driver.feed(line(0.0 * edge), (2 + number) * 10**9)
+    raw, strain, shape = rig.driver.blocks
+    names = [channel.name for channel in shape.spec.channels]
+    assert dict(zip(names, shape.data, strict=True))["quality"] == Quality.NO_CONTACT.value
+    rig.driver.feed(line(edge), 33 * 10**9)
+    felt = dict(zip(names, shape.data, strict=True))
+    assert np.degrees(felt["angle"]) == pytest.approx(60.0, abs=0.3) and felt["load"] == pytest.approx(
+        150.0, rel=0.05
+    )
+    np.testing.assert_allclose(strain.data, edge, atol=3e-3)
+    assert {block.stamp_ns for block in (raw, strain, shape)} == {33 * 10**9}
+    assert len(rig.driver.ioctl(strain.spec, Request.GET_GAINS, [], None)) == 256
+    with pytest.raises(ValueError, match="has 16 elements; the device has 2"):
+        Rig(shape={"finger_file": finger})
