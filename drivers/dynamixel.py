@@ -49,6 +49,8 @@ REBOOT_S = 0.5
 HARDWARE_ERRORS = {1: "input voltage", 4: "overheating", 8: "encoder", 16: "electrical shock", 32: "overload"}
 """Bits of register 70 as the e-Manual numbers them for the X series."""
 WATCHDOG_TICK_S, WATCHDOG_EXPIRED = 0.02, 0xFF
+BRAKE_CHARACTERS, WAKE_S = 35, 0.001
+"""Between the reading of place and speed and the arrival of the goal made of them: reply and request, and the host."""
 DRIVE_MODE, OPERATING_MODE, VELOCITY_LIMIT, TORQUE, RETURN_LEVEL, HARDWARE_ERROR = 10, 11, 44, 64, 68, 70
 WATCHDOG, GOAL_CURRENT, GOAL_VELOCITY, PROFILE_ACCELERATION, PROFILE_VELOCITY = 98, 102, 104, 108, 112
 GOAL_POSITION, MOVING, PRESENT_VELOCITY = 116, 122, 128
@@ -112,6 +114,7 @@ class ServoUnit(AxesUnit):
         line = settings.line
         character_s = line.bits_per_character / line.baud if line.serial else 0.0
         self._bus = Bus(character_s, settings.turnaround_s)
+        self._stop_s = BRAKE_CHARACTERS * character_s + WAKE_S
         self._per_unit = axis.steps_per_turn / axis.travel_per_turn
         self._speed = 60 / abs(axis.travel_per_turn) / axis.speed_unit_rpm
         self._rate = 3600 / abs(axis.travel_per_turn) / axis.acceleration_unit_rpm2
@@ -201,13 +204,16 @@ class ServoUnit(AxesUnit):
             yield from self._brake()
 
     def _brake(self) -> Steps:
-        """Set the goal where braking ends: with the place of now as the goal the servo would overshoot it and come back."""
+        """Set the goal where braking ends: one nearer, as the place of now, the servo would overshoot and come back to."""
         highest = self.bank.settings[0].acceleration_max
         yield from self._ramp(PROFILE_ACCELERATION, self._count(highest * self._rate))
         now: Status = yield self._bus.read(self._id, PRESENT_VELOCITY, 8)
         speed, place = signed(now.data, 0, 4) / self._speed, signed(now.data, 4, 4)
-        way = speed * abs(speed) / (2 * highest) * abs(self._per_unit)
-        yield self._write(GOAL_POSITION, place + round(way), 4, repeatable=True)
+        way = speed * (self._stop_s + abs(speed) / (2 * highest)) * abs(self._per_unit)
+        goal = place + round(way)
+        if self._axis.mode == "position":  # beyond its one turn the servo would refuse the goal, and go on
+            goal = min(max(goal, 0), self._axis.steps_per_turn - 1)
+        yield self._write(GOAL_POSITION, goal, 4, repeatable=True)
 
     def reset(self, axis: int) -> Steps:
         """Restart a servo that has shut down; else renew its watchdog."""
@@ -264,8 +270,7 @@ class ServoUnit(AxesUnit):
             self._torque = True
             return
         if self._axis.mode in ("position", "extended_position"):
-            now: Status = yield self._bus.read(self._id, PRESENT_VELOCITY, 8)
-            yield self._write(GOAL_POSITION, signed(now.data, 4, 4), 4)
+            yield from self._brake()  # it may coast yet
         elif self._axis.mode == "velocity":
             yield self._write(GOAL_VELOCITY, 0, 4)
         else:

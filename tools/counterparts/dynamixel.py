@@ -21,6 +21,8 @@ STEPS, RPM, RPM2, REBOOT_S = 4096, 0.229, 214.577, 0.3
 EEPROM_END = 64
 READ_ONLY = {*range(0, 7), 70, *range(120, 147)} - {68}
 RESULT, INSTRUCTION, RANGE, LENGTH, ACCESS = 1, 2, 4, 5, 7
+COAST = 12_000.0
+"""What friction takes from a servo without torque [steps/s^2]."""
 GOALS = {100, 102, 104, 108, 112, 116}
 
 
@@ -42,7 +44,7 @@ class Servo:
         self.table = bytearray(147)
         for address, value, size in (
             (0, model, 2), (6, 45, 1), (7, id_, 1), (8, 1, 1), (9, 250, 1), (11, 3, 1), (36, 885, 2), (38, 1193, 2),
-            (44, 400, 4), (48, 4095, 4), (63, 52, 1), (68, 2, 1), (144, 120, 2), (146, 30, 1),
+            (44, 400, 4), (48, 4095, 4), (63, 52, 1), (68, 2, 1), (116, 2048, 4), (144, 120, 2), (146, 30, 1),
         ):  # fmt: skip
             self.put(address, value, size)
         self.mover = Mover(position=2048.0)
@@ -113,14 +115,14 @@ class Servo:
     def _effect(self, address: int, value: int) -> None:
         mover = self.mover
         if address == 64 and not value:
-            mover.halt()
+            mover.stop(COAST)
             self.current_ma = 0.0
         if not self.table[64]:
             return
         mode = self.get(11, 1)
-        if address == 116 and mode in (3, 4):
+        if address in (64, 116) and mode in (3, 4):  # switched on it takes up the goal that it has
             speed = (self.get(112, 4) or 400) * RPM / 60 * STEPS
-            mover.go_to(float(value), speed, self.rate, self.rate)
+            mover.go_to(float(self.get(116, 4, signed=True)), speed, self.rate, self.rate)
         elif address == 104 and mode == 1:
             mover.run(value * RPM / 60 * STEPS, self.rate, self.rate)
         elif address == 102 and mode == 0:
@@ -130,12 +132,13 @@ class Servo:
         """Go into a hardware error: torque off until it is restarted."""
         self.table[70] = bits
         self.table[64] = 0
-        self.mover.halt()
+        self.mover.stop(COAST)
 
     def reboot(self) -> None:
         """Restart: RAM as after power-up, deaf meanwhile."""
         self.table[64:] = bytes(len(self.table) - 64)
         self.put(68, 2, 1)
+        self.put(116, round(self.mover.position), 4)
         self.mover.halt()
         self.current_ma = 0.0
         self.back_s = self._clock() + REBOOT_S
