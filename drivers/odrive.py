@@ -249,12 +249,14 @@ class OdriveUnit(AxesUnit):
             yield from self._close_loop(axis)
 
     def _close_loop(self, axis: int) -> Steps:
-        """Switch an axis on; it holds where it is."""
+        """Switch an axis on; it holds where it is, and one that turns yet brakes: to hold it would be to turn it back."""
         if not self._settings.axis[axis].enable:
             return
         number = self._numbers[axis]
         feeds = [f"u {each}" for each in self._numbers]
-        sets = [*feeds, f"w axis{number}.requested_state {CLOSED_LOOP}"]
+        ((_, speed),) = yield odrive.exchange(feeds, [f"f {number}"], self._timeout_s, repeatable=True)
+        brake = [f"v {number} 0"] if abs(speed) > self._standstill[axis] else []
+        sets = [*feeds, *brake, f"w axis{number}.requested_state {CLOSED_LOOP}"]
         for _ in range(SWITCH_ON_PAUSES):
             yield odrive.exchange(sets, [f"f {number}"], self._timeout_s)
             yield Pause(SWITCH_ON_S / SWITCH_ON_PAUSES)

@@ -19,6 +19,8 @@ from .control import number
 from .drive import Stepper
 
 MAX_LINE = 256
+DRY = 0.05
+"""Dry friction [Nm]: what is pushed less than that sticks."""
 IDLE, CLOSED_LOOP, HOMING = 1, 8, 11
 WATCHDOG, NO_SWITCH = 1 << 11, 1 << 17
 
@@ -86,11 +88,10 @@ class Axis:
             torque = 0.0
         limit = p["motor.config.torque_lim"]
         torque = max(-limit, min(limit, torque))
-        drag = self.friction * self.velocity + (
-            0.05 if self.velocity > 0 else -0.05 if self.velocity < 0 else 0.0
-        )
+        way = self.velocity or torque  # dry friction is against the motion, at rest against what pushes
+        drag = self.friction * self.velocity + math.copysign(DRY, way)
         change = (torque - drag) / self.inertia / (2 * math.pi) * dt
-        stops = torque == 0.0 and abs(self.velocity) <= abs(change)
+        stops = abs(torque) <= DRY and abs(self.velocity) <= abs(change)
         self.velocity = 0.0 if stops else self.velocity + change
         self.position += self.velocity * dt
 
