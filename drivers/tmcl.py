@@ -81,7 +81,8 @@ class TmclSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         clock_hz: of a TMC428/429.
         heartbeat_s: time without a request after which the module stops its motors [s]; 0 = none.
         turnaround_s: longest time that the module needs to answer [s].
-        recovery_s: silence after a bad or missing reply [s]; 0 takes 50 ms below 19200 baud, else 10 ms.
+        recovery_s: silence after a bad or missing reply [s]: a reply tells its command but not which parameter it is
+            of, so one that comes later than that would be taken for another.
         poll_hz: rate at which the module is read.
         capacity: commands that each axis buffers.
         history: snapshots kept for readers.
@@ -96,7 +97,7 @@ class TmclSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     clock_hz: float = 16e6
     heartbeat_s: float = 0.5
     turnaround_s: float = 0.05
-    recovery_s: float = 0.0
+    recovery_s: float = 0.05
     poll_hz: float = 20.0
     capacity: int = 4096
     history: int = 64
@@ -200,6 +201,7 @@ class TmclUnit(AxesUnit):
             raise DeviceError(
                 errno.ENODEV, f"{text}configuration says {settings.module}; check address and wiring"
             )
+        yield from self._end_searches()
         yield from self.stop()
         wanted = round(settings.heartbeat_s * 1000)
         try:
@@ -265,6 +267,14 @@ class TmclUnit(AxesUnit):
         yield from self._read_faults()
         if self._faults[axis]:
             raise DeviceError(errno.EIO, self._faults[axis])
+
+    def _end_searches(self) -> Steps:
+        """End reference searches that a process before this one began: MST stops the motor, the search may start it again."""
+        for motor in self._motors:
+            try:
+                yield self._module.exchange(Op.RFS, 1, motor)
+            except DeviceError:
+                return  # a module without reference search
 
     def _ramp(self, axis: int, parameter: Axis, value: int) -> Steps:
         """Set a parameter of the ramp unless the module has it."""
@@ -335,7 +345,7 @@ class Tmcl(LineDriver):
     def __init__(self, name: str, settings: TmclSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
         self.line = settings.line
-        self.recovery_s = settings.recovery_s or (0.05 if settings.line.baud < 19200 else 0.01)
+        self.recovery_s = settings.recovery_s
         self._units = (TmclUnit(name, settings, self.describe(name, settings).blocks[0], kit),)
 
     @property
