@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import errno
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,11 +19,13 @@ from sioms.protocol.flags import ControlMode
 from .blocks import BlockSpec
 from .codec import grbl
 from .codec.grbl import Answer, Report
+from .codec.grbl_homing import GrblHoming
 from .codec.grbl_jog import JogChain, straight_jog
 from .codec.grbl_machine import INCHES, MachinePosition, compare_limits
+from .codec.grbl_moves import GrblMoves, Moves
 from .drive_axes import AxesUnit
 from .driver import Kit
-from .exchange import DeviceError, LinkError, Pause, Send, Steps
+from .exchange import DeviceError, LinkError, Pause, Send, Step, Steps
 
 TIMEOUT_S = 0.5
 STATUS_S = 0.2
@@ -32,8 +34,6 @@ RESET_S = 3.0
 HOLD_S = 5.0
 TOGETHER_S = 0.0005
 """How long a start waits for the starts of other axes that go out with it."""
-AT_MM = 0.002
-"""So near to its target an axis has arrived [mm or degrees]; reports have three digits."""
 OFFSET_REPORTS = 35
 """The work offset comes with every 30th report at the latest."""
 NOT_READY = {
@@ -103,15 +103,10 @@ class GrblUnit(AxesUnit):
         self._alarm = 0
         self._state = ""
         self._rest = b""
-        self._targets = np.full(n, np.nan)
-        self._speeds = np.zeros(n)
+        self._moves = GrblMoves(self._per_unit)
         rates = np.array([axis.acceleration_max for axis in settings.axis]) * self._per_unit
         self._chain = JogChain(self._letters, rates, settings.poll_hz)
-        self._interrupted = False
-        self._asked: dict[int, tuple[float, float]] = {}
-        self._refused: dict[int, DeviceError] = {}
-        self._homing_ns = 0
-        self._homing_end: str | None = None
+        self._homing = GrblHoming()
         self._last: tuple[int, Any] | None = None
         self._replaces = [False] * n
         self._clean = False
@@ -120,7 +115,8 @@ class GrblUnit(AxesUnit):
 
     def open(self) -> Steps:
         """Stop what moves, identify the controller, and compare its limits with the configuration."""
-        self._homing_ns, self._alarm, self._last = 0, 0, None
+        self._alarm, self._last = 0, None
+        self._homing.forget()
         self._forget()
         yield Send(b"\n" + grbl.JOG_CANCEL, "end a cut line, cancel jogs")
         yield Pause(0.1)
@@ -131,6 +127,8 @@ class GrblUnit(AxesUnit):
             report, _ = yield grbl.status(TIMEOUT_S)
         if report.state in ("Run", "Hold"):
             yield from self._hold_and_reset()
+        elif report.state == "Jog":  # it brakes; what is asked next it would refuse
+            report = yield from self._until_rest()
         answer: Answer = yield grbl.command("$I", TIMEOUT_S, repeatable=True)
         version = answer.tagged("VER")
         if not version or self._settings.version not in version:
@@ -146,8 +144,8 @@ class GrblUnit(AxesUnit):
 
     def poll(self) -> Steps:
         """Read the status, and keep velocities going."""
-        if self._homing_ns:  # the controller is deaf while it homes; its ok is overheard
-            if self._homing_end == "":
+        if self._homing.is_on:  # the controller is deaf while it homes; its ok is overheard
+            if self._homing.failure == "":
                 report, _ = yield grbl.status(STATUS_S)
                 self._raw = self._positions(report)
             self._report_homing()
@@ -155,7 +153,7 @@ class GrblUnit(AxesUnit):
         report, lines = yield grbl.status(STATUS_S)
         self._hear(lines)
         self._take(report)
-        if self._interrupted:
+        if self._moves.interrupted:
             yield from self._go_on()
         elif self._chain.wanted.any() and self._state in ("Idle", "Jog"):
             yield from self._lengthen(report)
@@ -163,32 +161,27 @@ class GrblUnit(AxesUnit):
     def act(self, action: DriveAction) -> Steps:
         """Note a move that is asked for, so that those of other axes that go out now share its line."""
         axis, command = action.axis, action.command
-        self._asked.pop(axis, None)
+        self._moves.asked.pop(axis, None)
         moves = command is not None and bool(command.control_mode & ControlMode.POSITION)
         if action.kind is not ActionKind.RESET:
-            goes = (
-                self._state == "Jog"
-                and abs(self._raw[axis] * self._per_unit[axis] - self._targets[axis]) > AT_MM
-            )
+            goes = self._state == "Jog" and self._moves.is_on_its_way(axis, self._raw[axis])
             self._replaces[axis] = goes or (moves and self._chain.wanted[axis] != 0)
-            self._targets[axis] = np.nan
+            self._moves.drop(axis)
             if moves or command is None:
                 self._chain.wanted[axis] = 0.0
         if action.kind is ActionKind.START and moves and command is not None:
-            self._asked[axis] = (command.position, action.velocity_max)
+            self._moves.asked[axis] = (command.position, action.velocity_max)
         return super().act(action)
 
     def start_position(self, axis: int, position: float, speed: float, action: DriveAction) -> Steps:
         """Jog to a position, together with all axes whose moves were asked for at the same time."""
-        if axis in self._asked:
-            self._asked[axis] = (position, speed)
+        if axis in self._moves.asked:
+            self._moves.asked[axis] = (position, speed)
             yield Pause(TOGETHER_S)
             yield from self._end_replaced(axis)
-            together, self._asked = self._left() | self._asked, {}
-            self._interrupted = False
-            if together:
+            if together := self._moves.take(self._raw):
                 yield from self._jog_to(together)
-        if error := self._refused.pop(axis, None):
+        if error := self._moves.refused.pop(axis, None):
             raise error
 
     def start_velocity(self, axis: int, velocity: float, action: DriveAction) -> Steps:
@@ -204,15 +197,17 @@ class GrblUnit(AxesUnit):
 
     def halt(self, axis: int, *, fastest: bool) -> Steps:
         """Cancel jogs and keep the position; or reset, which is the fastest and the only end of homing."""
-        self._chain.wanted[axis], self._targets[axis] = 0.0, np.nan
-        if not self._homing_ns and not (fastest and self._settings.quick_stop == "reset"):
+        self._chain.wanted[axis] = 0.0
+        self._moves.drop(axis)
+        if not self._homing.is_on and not (fastest and self._settings.quick_stop == "reset"):
             yield self._cancel()
             return
         self._forget()
         if self._clean:
             return  # nothing was started since the reset for another axis
         lines = yield grbl.reset(RESET_S)
-        self._clean, self._homing_ns = True, 0
+        self._clean = True
+        self._homing.forget()
         self._hear(lines)
 
     def stop(self) -> Steps:
@@ -223,10 +218,12 @@ class GrblUnit(AxesUnit):
 
     def home(self, axis: int) -> Steps:
         """Begin homing, of all axes; those that are told to home together home once."""
-        if self._homing_ns:
+        if self._homing.is_on:
             return
-        self._homing_ns, self._homing_end, self._clean = self.clock(), None, False
-        self._targets[:] = np.nan
+        self._homing.begin(self.clock())
+        self._clean = False
+        for each in range(self.bank.n):
+            self._moves.drop(each)
         yield Send(b"$H\n", "home all axes")
 
     def reset(self, axis: int) -> Steps:
@@ -246,37 +243,21 @@ class GrblUnit(AxesUnit):
         lines = grbl.lines_of(self._rest)
         self._rest = self._rest[self._rest.rfind(b"\n") + 1 :][-grbl.LINE_LIMIT :]
         self._hear(lines)
-        if not self._homing_ns:
-            return
-        for line in lines:  # told to the bank by the next poll, which publishes it
-            if line == "ok":
-                self._homing_end = ""
-            elif line.startswith(("error:", "ALARM:")):
-                self._homing_end = grbl.alarm_text(self._alarm) if self._alarm else f"homing refused: {line}"
+        if self._homing.is_on:  # told to the bank by the next poll, which publishes it
+            self._homing.hear(lines, self._alarm)
 
     # --- inside ----------------------------------------------------------------------------------
 
     def _forget(self) -> None:
-        self._targets[:], self._chain.wanted[:] = np.nan, 0.0
-        self._asked.clear()
-        self._refused.clear()
+        self._moves.forget()
+        self._chain.wanted[:] = 0.0
         self._chain.cut()
-        self._interrupted = False
 
     def _cancel(self) -> Send:
         """Return what cancels the jogs of all axes; those that nobody has stopped go on after it."""
         self._chain.cut()
-        self._interrupted = bool(np.isfinite(self._targets).any() or self._chain.wanted.any())
+        self._moves.interrupted = bool(self._moves.bound.any() or self._chain.wanted.any())
         return Send(grbl.JOG_CANCEL, "cancel jogs")
-
-    def _left(self) -> dict[int, tuple[float, float]]:
-        """Return the moves that a stop of another axis has cut short: axis to target and top speed, in units of the axis."""
-        if not self._interrupted:
-            return {}
-        short = np.isfinite(self._targets) & ~self._arrived(self._raw)
-        return {
-            a: (self._targets[a] / self._per_unit[a], self._speeds[a]) for a in np.flatnonzero(short).tolist()
-        }
 
     def _go_on(self) -> Steps:
         """Let the axes that nobody has stopped go on, once all have come to rest."""
@@ -284,19 +265,16 @@ class GrblUnit(AxesUnit):
             return
         if self._state == "Idle":
             self._chain.restart(self._raw * self._per_unit)
-            if left := self._left():
+            if left := self._moves.left(self._raw):
                 yield from self._jog_to(left)
             for axis in left:
-                if error := self._refused.pop(axis, None):
+                if error := self._moves.refused.pop(axis, None):
                     self.bank.fault(
                         [axis],
                         f"{self.name}: could not go on after a stop of another axis: {error}",
                         self.clock(),
                     )
-        self._interrupted = False
-
-    def _arrived(self, position: Any) -> Any:
-        return np.abs(position * self._per_unit - self._targets) <= AT_MM
+        self._moves.interrupted = False
 
     def _hold_and_reset(self) -> Steps:
         """End a program with its position kept: hold, wait for rest, reset."""
@@ -342,9 +320,9 @@ class GrblUnit(AxesUnit):
         busy = report.state == "Jog" or (report.state == "Hold" and report.sub == 1)
         if not busy and report.state != "Alarm":
             velocity[:] = 0.0
-        arrived = self._arrived(position)
-        goes = np.isfinite(self._targets) | (self._chain.wanted != 0)
-        moving = ~arrived & (np.full(self.bank.n, busy) | (goes & self._interrupted))
+        arrived = self._moves.arrived(position)
+        goes = self._moves.bound | (self._chain.wanted != 0)
+        moving = ~arrived & (np.full(self.bank.n, busy) | (goes & self._moves.interrupted))
         fault = self._fault(report)
         self.report(position, velocity, moving, arrived, [fault] * self.bank.n)
 
@@ -367,31 +345,29 @@ class GrblUnit(AxesUnit):
             return
         self._replaces[axis] = False
         yield self._cancel()
+        yield from self._until_rest(self._take)
+
+    def _until_rest(self, taken: Callable[[Report], None] = lambda report: None) -> Generator[Step, Any, Report]:
+        """Wait until cancelled jogs have come to rest; return the last report, and give each to ``taken``."""
         limit_ns = self.clock() + int(HOLD_S * 1e9)
-        while self.clock() < limit_ns:
+        while True:
             yield Pause(0.02)
+            report: Report
             report, lines = yield grbl.status(TIMEOUT_S)
             self._hear(lines)
-            self._take(report)
-            if report.state not in ("Jog", "Hold"):
-                return
+            taken(report)
+            if report.state not in ("Jog", "Hold") or self.clock() >= limit_ns:
+                return report
 
-    def _jog_to(self, together: dict[int, tuple[float, float]]) -> Steps:
-        """Send one line for these axes, axis to position and top speed in units of the axis."""
-        moves = {
-            axis: (position * float(self._per_unit[axis]), speed * float(self._per_unit[axis]))
-            for axis, (position, speed) in together.items()
-        }
-        line = straight_jog(self._letters, self._raw * self._per_unit, moves)
+    def _jog_to(self, together: Moves) -> Steps:
+        """Send one line for these axes."""
+        line = straight_jog(self._letters, self._raw * self._per_unit, self._moves.begin(together))
         self._clean = False
-        for axis, (position, speed) in together.items():
-            self._targets[axis], self._speeds[axis] = position * self._per_unit[axis], speed
         try:
             yield grbl.command(line, TIMEOUT_S)
         except (DeviceError, ValueError) as error:
             refusal = error if isinstance(error, DeviceError) else DeviceError(errno.EINVAL, str(error))
-            for axis in together:
-                self._targets[axis], self._refused[axis] = np.nan, refusal
+            self._moves.refuse(together, refusal)
 
     def _lengthen(self, report: Report) -> Steps:
         """Lengthen the chain of jogs until it reaches far enough ahead to run at full speed and to brake at its end."""
@@ -407,7 +383,7 @@ class GrblUnit(AxesUnit):
         line, targets, until_ns = found
         wanted = self._chain.wanted.copy()
         yield grbl.command(line, TIMEOUT_S)
-        if (self._chain.wanted == wanted).all() and not self._interrupted:
+        if (self._chain.wanted == wanted).all() and not self._moves.interrupted:
             self._chain.sent(targets, until_ns)
 
     def _soft_limits(self) -> tuple[Any, Any]:
@@ -419,17 +395,14 @@ class GrblUnit(AxesUnit):
     def _report_homing(self) -> None:
         """Tell the bank that it homes, or how that ended."""
         n = self.bank.n
-        if (
-            self._homing_end is None
-            and self.clock() - self._homing_ns > self._settings.homing_timeout_s * 1e9
-        ):
-            self._homing_end = f"homing took longer than {self._settings.homing_timeout_s:g} s"
-        ended, fault = self._homing_end is not None, self._homing_end or ""
+        self._homing.watch(self.clock(), self._settings.homing_timeout_s)
+        ended, fault = self._homing.failure is not None, self._homing.failure or ""
         done = np.full(n, ended and not fault)
         self.report(self._raw, np.zeros(n), np.full(n, not ended), done, [fault] * n)
         if fault and self._alarm == 0:
             return  # it may still search: the stop that the fault brings ends it by a reset
         if ended:
-            self._homing_ns, self._last = 0, None
+            self._last = None
+            self._homing.forget()
         if ended and not fault:
             self.bank.set_homed(range(n))
