@@ -1,0 +1,88 @@
+"""A driver's unit of axes and its simulated device, on an invented clock and without a line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from sioms.protocol.markers import TABLE_SIZE, MarkerTable
+from sioms.sdk.driver import LineDriver
+from sioms.sdk.exchange import DeviceError, LinkError, Pause, Send, Steps
+from sioms.sdk.markers import Markers
+
+LIMITS = {"velocity_max": 0.1, "acceleration_max": 1.0}
+CHARACTER_S = 10 / 115200
+
+
+class Joined:
+    """Both, and what was sent.
+
+    Args:
+        driver: its class.
+        table: of the device, without the line.
+        make: makes the simulated device on a clock [s].
+
+    Attributes:
+        device: the simulated device; it outlives the driver.
+        unit: of the present driver.
+        sent: messages to the device.
+    """
+
+    def __init__(
+        self, driver: type[LineDriver], table: dict[str, Any], make: Callable[[Callable[[], float]], Any]
+    ) -> None:
+        self.now_s = 50.0
+        self.device = make(lambda: self.now_s)
+        self.sent: list[bytes] = []
+        self.markers = Markers(MarkerTable(memoryview(bytearray(TABLE_SIZE))), lambda number: None)
+        self._driver, self._table = driver, {"line": {"serial": "/x", "baud": 115200}, **table}
+        self.begin()
+
+    def begin(self) -> None:
+        """Make a new driver: the one before was killed, the device goes on."""
+        settings = msgspec.convert(self._table, self._driver.Settings)
+        self.unit: Any = self._driver("mod0", settings, self).units[0]  # type: ignore[arg-type]
+        self.unit.clock = lambda: round(self.now_s * 1e9)
+
+    def log(self, level: str, text: str) -> None:
+        """Take what the driver says."""
+
+    def wait(self, seconds: float, look: Callable[[], object] = lambda: None) -> None:
+        """Let time pass, and look at each millisecond."""
+        for _ in range(round(seconds * 1000)):
+            self.now_s += 0.001
+            self.device.due()
+            look()
+
+    def do(self, steps: Steps, look: Callable[[], object] = lambda: None) -> None:
+        """Carry out a hook as the kit does; characters take their time."""
+        value: Any = None
+        failure: Exception | None = None
+        while True:
+            try:
+                step = steps.throw(failure) if failure else steps.send(value)
+            except StopIteration:
+                return
+            value, failure = None, None
+            match step:
+                case Pause(duration_s):
+                    self.wait(duration_s, look)
+                case Send(data) | data:
+                    data = getattr(data, "data", data)
+                    self.sent.append(data)
+                    self.wait(max(0.001, len(data) * CHARACTER_S), look)
+                    reply = b"".join(self.device.take(data))
+                    self.wait(len(reply) * CHARACTER_S, look)
+                    if not isinstance(step, Send):
+                        try:
+                            value = self._decoded(step, reply)
+                        except (LinkError, DeviceError) as error:
+                            failure = error
+
+    def _decoded(self, exchange: Any, reply: bytes) -> Any:
+        size = exchange.want(reply)
+        if size is None or size > len(reply):
+            raise LinkError("no reply")
+        return exchange.decode(reply[:size])
