@@ -10,6 +10,9 @@ then has a table ``shape``:
 
 Requests on ``strain`` and ``shape``: ZERO_DEVICE takes a new baseline from the next frames, CALIBRATE_DEVICE with
 the text of a finger's file loads that finger; on ``strain`` SET_GAINS and GET_GAINS hold strain per output.
+
+The physics is imported when there is a finger: it brings scipy, which takes a second, and drivers of many other sensors have
+this part, too.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ import errno
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -28,8 +31,10 @@ from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, BlockSpec
 from sioms.sdk.driver import Kit, Refusal
-from sioms.tactile.finger import Finger, from_toml
-from sioms.tactile.sensing import CHANNELS, LoadTare, ShapeSensor, numbers
+
+if TYPE_CHECKING:
+    from sioms.tactile.finger import Finger
+    from sioms.tactile.sensing import LoadTare, ShapeSensor
 
 Array = NDArray[np.float64]
 
@@ -73,6 +78,8 @@ def specs(settings: ShapeSettings | None, elements: int, history: int) -> tuple[
     """
     if settings is None:
         return ()
+    from sioms.tactile.sensing import CHANNELS
+
     _finger(settings, elements)
     _tare(settings)
     if not 0.0 < settings.load_age_s < math.inf:
@@ -101,7 +108,9 @@ class TactileNodes:
     """
 
     def __init__(self, settings: ShapeSettings, blocks: Sequence[BlockSpec], kit: Kit) -> None:
-        self._settings, self._kit = settings, kit
+        from sioms.tactile.sensing import numbers
+
+        self._settings, self._kit, self._numbers = settings, kit, numbers
         self.strain, self.shape = AnalogBlock(blocks[0]), AnalogBlock(blocks[1])
         for block in self.blocks:
             block.corrected_by_driver = True
@@ -129,7 +138,7 @@ class TactileNodes:
         lost = int(np.bitwise_or.reduce(flags)) & int(AnalogStatus.OVERRUN)
         self.strain.data[:] = sensed.strain.strains
         self.strain.flags[:] = lost | np.where(sensed.strain.saturated, int(AnalogStatus.SATURATED), 0)
-        self.shape.data[:] = numbers(sensed)
+        self.shape.data[:] = self._numbers(sensed)
         self.shape.flags[:] = lost
         for block in self.blocks:
             block.flags[np.isnan(block.data)] |= int(AnalogStatus.INVALID)
@@ -160,6 +169,8 @@ class TactileNodes:
     def _load_finger(self, text: Any) -> str:
         if not isinstance(text, str):
             raise Refusal(errno.EINVAL, f"{type(text).__name__} given; want the text of a finger's file")
+        from sioms.tactile.finger import from_toml
+
         finger = from_toml(text)
         _check(finger, self.strain.n, "the finger given")
         self._sensor = self._make(finger)
@@ -185,6 +196,8 @@ class TactileNodes:
         return float(reading[0, 0])
 
     def _make(self, finger: Finger) -> ShapeSensor:
+        from sioms.tactile.sensing import ShapeSensor
+
         settings = self._settings
         return ShapeSensor(
             finger,
@@ -198,6 +211,8 @@ class TactileNodes:
 def _tare(settings: ShapeSettings) -> LoadTare | None:
     if not settings.load_node:
         return None
+    from sioms.tactile.sensing import LoadTare
+
     try:
         return LoadTare(settings.load_scale, settings.load_deviation, 2.0)
     except ValueError as error:
@@ -205,6 +220,8 @@ def _tare(settings: ShapeSettings) -> LoadTare | None:
 
 
 def _finger(settings: ShapeSettings, elements: int) -> Finger:
+    from sioms.tactile.finger import from_toml
+
     path = Path(settings.finger_file)
     try:
         finger = from_toml(path.read_text(encoding="utf-8"))
