@@ -235,7 +235,8 @@ class OdriveUnit(AxesUnit):
                 (f"{path}.config.watchdog_timeout", settings.watchdog_s),
             ]
         yield confirmed(sets, back, self._timeout_s)
-        (bits,) = (yield odrive.read([f"{path}.error"], self._timeout_s))[0]
+        # the last host's watchdog may have run out since the state was read
+        (bits,), (state,) = yield odrive.read([f"{path}.error", f"{path}.current_state"], self._timeout_s)
         if int(bits) == odrive.WATCHDOG_EXPIRED:  # what the last host left behind when it died
             yield odrive.exchange([f"u {table.number}", "sc"], [f"f {table.number}"], self._timeout_s)
             bits = 0

@@ -140,6 +140,19 @@ def test_a_motor_that_coasts_is_not_turned_back_when_its_loop_is_closed(switched
     assert watch.back < 2e-3, "turns"
 
 
+def test_a_watchdog_that_runs_out_while_the_board_is_opened_leaves_no_idle_axis() -> None:
+    axis = {"name": "x", "number": 0, "travel_per_turn": 0.01, **LIMITS}
+    rig = Joined(Odrive, {"axis": [axis]}, lambda clock: odrive.Board(clock=clock))
+    for left_s in (0.001, 0.006, 0.012, 0.018, 0.024):
+        rig.begin()
+        rig.do(rig.unit.open())
+        rig.wait(rig.device.axes[0].fed_s + 0.5 - left_s - rig.now_s)
+        rig.begin()
+        rig.do(rig.unit.open())
+        assert rig.device.axes[0].p["current_state"] == odrive.CLOSED_LOOP, left_s
+        assert rig.device.axes[0].p["error"] == 0
+
+
 # --- Grbl -----------------------------------------------------------------------------------------
 
 
