@@ -302,15 +302,18 @@ class Prober:
         self._axis.wait_until_idle(5.0)
 
     def _frames(self, count: int) -> Frames:
-        """Return the next frames, shape (count, ns), their times [s] and the forces at them [N/m]."""
+        """Return frames of now on, shape (count, ns), their times [s] and the forces at them [N/m]."""
+        begin_ns = time.monotonic_ns()
         last, force_last = self._finger.read().number, self._force.read().number
         snaps: list[Any] = []
         forces: list[Any] = []
         while len(snaps) < count:
             self._finger.wait_new(last + min(count - len(snaps), 100) - 1, 2.0)  # the pages hold 512
-            snaps += self._finger.history(last)
+            news = self._finger.history(last)
+            # what comes late from a busy device or line was felt before the press that led here
+            snaps += [snap for snap in news if snap.stamp_ns >= begin_ns]
             forces += self._force.history(force_last)
-            last, force_last = snaps[-1].number, forces[-1].number
+            last, force_last = news[-1].number, forces[-1].number
             self._axis.keepalive()
             self._place.keepalive()
         snaps = snaps[:count]
