@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 
 from .nursery_process import start_nursery
@@ -10,6 +9,9 @@ from .nursery_process import start_nursery
 
 def main(argv: list[str] | None = None) -> int:
     """Run the daemon, or check a configuration; return the exit status."""
+    nursery = start_nursery()  # it imports numpy and the motion core while we import; it ends when we do
+    import argparse
+
     parser = argparse.ArgumentParser(
         prog="siomsd",
         description="SIOMS device daemon: shows the devices of a workcell as nodes of class axis, analog and binary.",
@@ -21,8 +23,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--check", action="store_true", help="check the configuration and exit")
     parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
     options = parser.parse_args(argv)
-    nursery = start_nursery()
-    from .service import check, serve  # while the nursery imports numpy and the motion core
+    from .service import check, serve
 
     if options.check:
         return check(options.config, nursery)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import AxisStatus
 from sioms.protocol.records import AXIS_READ_FIELDS
 
+from .commands import WIRE_DTYPE
 from .guard import LimitGuard
 from .homing import HomingRuns
 from .law import ControlLaw
@@ -109,15 +110,27 @@ class AxisBank:
             CommandError: EINVAL, ERANGE (outside limits, or known to be infeasible), EAGAIN (no
                 room), EPERM (emergency stop, home required), EIO (fault), EBUSY (homing).
         """
-        # A short write is acknowledged first and worked in by the next tick or verb, at its own instant: see _take().
-        if not self._seen:
-            raise CommandError(errno.EIO, "write: no position has been measured yet; wait for the first tick")
-        waiting = sum([len(write.commands) for write in self._inbox])
-        plain = self._queue.admit_plain(records, axes, waiting, replace=replace)
-        if plain is not None:
-            self._take(Taken(plain, frozenset([c.axis for c in plain]), replace, now_ns))
-            return
-        self.take(verdict(self.judge(records, axes, now_ns, replace=replace)), now_ns)
+        short = len(records) <= MOST and records.dtype == WIRE_DTYPE
+        if not (short and self.offer(records.tolist(), axes, now_ns, replace=replace)):
+            self.take(verdict(self.judge(records, axes, now_ns, replace=replace)), now_ns)
+
+    def offer(
+        self, records: Sequence[tuple[Any, ...]], axes: AxesLike, now_ns: int, *, replace: bool = False
+    ) -> bool:
+        """Take a short write at once; False, and nothing taken, when append() has to judge it.
+
+        It is worked in by the next tick or verb, at its own instant: see _take().
+
+        Args:
+            records: up to MOST, each as a tuple of the fields of table F.3.
+            axes, now_ns, replace: as append().
+        """
+        waiting = sum([len(write.commands) for write in self._inbox]) if self._inbox else 0
+        plain = self._queue.admit_plain(records, axes, waiting, replace=replace) if self._seen else None
+        if plain is None:
+            return False
+        self._take(Taken(plain, frozenset([command.axis for command in plain]), replace, now_ns))
+        return True
 
     def judge(
         self, records: NDArray[Any], axes: AxesLike, now_ns: int, *, replace: bool = False

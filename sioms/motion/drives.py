@@ -102,6 +102,12 @@ class DriveBank:
         """Append written records, all or none; see AxisBank.append()."""
         self.take(verdict(self.judge(records, axes, now_ns, replace=replace)), now_ns)
 
+    def offer(
+        self, records: Sequence[tuple[Any, ...]], axes: AxesLike, now_ns: int, *, replace: bool = False
+    ) -> bool:
+        """Never take a write at once: what a drive is told cannot be worked in later at the instant of the write."""
+        return False
+
     def judge(
         self, records: NDArray[Any], axes: AxesLike, now_ns: int, *, replace: bool = False
     ) -> Judgement:

@@ -76,13 +76,11 @@ class PlainCheck:
             return None
         for column, bound, positive in checks:
             value = record[column]
-            most = GREATEST if bound is None else min(bound[axis], GREATEST)
-            if not -most <= value <= most or (positive and value <= 0):
+            most = GREATEST if bound is None else bound.item(axis)
+            if not -most <= value <= most or not -GREATEST <= value <= GREATEST or (positive and value <= 0):
                 return None
-        if mode & modes.POSITION:
-            position = record[4]
-            low = max(self._minimum[axis] + self._below[axis], -GREATEST)  # all plain ones are point moves
-            high = min(self._maximum[axis] - self._above[axis], GREATEST)
-            if not low <= position <= high:
+        if mode & modes.POSITION:  # all plain ones are point moves
+            low, high = self._minimum.item(axis) + self._below[axis], self._maximum.item(axis) - self._above[axis]
+            if not low <= record[4] <= high:
                 return None
         return Command._make((axis, mode, 0, 0, *record[4:], 0, 0))

@@ -172,25 +172,25 @@ class CommandQueue:
         return known
 
     def admit_plain(
-        self, records: NDArray[Any], axes: AxesLike, waiting: int, *, replace: bool
+        self, records: Sequence[tuple[Any, ...]], axes: AxesLike, waiting: int, *, replace: bool
     ) -> list[Command] | None:
         """Check a short write one by one; None when the general way has to judge it.
 
         Args:
-            records: as written.
+            records: as written, each as a tuple of the fields of table F.3.
             axes: bank axis of each node-local index.
             waiting: how many commands have been admitted but not appended.
             replace: the buffers of these axes will be emptied first.
         """
         count = len(records)
-        if not 0 < count <= min(MOST, self.capacity) or records.dtype != WIRE_DTYPE:
+        if not 0 < count <= MOST or count > self.capacity:
             return None
-        commands = []
-        for record in records.tolist():
-            if not 0 <= record[0] < len(axes):
+        most, known, commands = self.capacity - 1 - waiting - count, len(axes), []
+        for record in records:
+            if not 0 <= record[0] < known:
                 return None
             axis = int(axes[record[0]])
-            full = not replace and int(self._buffers.count[axis]) + 1 + waiting + count > self.capacity
+            full = not replace and self._buffers.count.item(axis) > most
             command = None if full or self.is_barred(axis) else self._plain.command(record, axis)
             if command is None:
                 return None
@@ -199,8 +199,8 @@ class CommandQueue:
 
     def is_barred(self, axis: int) -> bool:
         """Tell whether an axis takes no commands now; see _check_latches()."""
-        latched = int(self.latched[axis])
-        return bool(latched & BARRED) or bool(self.home_required[axis] and not latched & HOMED)
+        latched: int = self.latched.item(axis)
+        return latched & BARRED != 0 or (self.home_required.item(axis) and not latched & HOMED)
 
     def append_plain(self, commands: Sequence[Command]) -> NDArray[np.int64]:
         """Take plain commands; return the axes touched, each of which now has a head."""

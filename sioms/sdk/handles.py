@@ -51,6 +51,7 @@ class Handle:
         ahead: number of a write that is to follow, and the records that have come ahead of it.
         waits: unanswered requests by message number; each has a way to be ended.
         writes: whether it may write.
+        axes: ``channels`` as plain integers.
     """
 
     number: int
@@ -74,9 +75,11 @@ class Handle:
     writing: list[AxesWrite] = field(default_factory=list)
     ahead: tuple[int, list[bytes]] = (0, [])
     writes: bool = field(init=False)
+    axes: list[int] = field(init=False)
 
     def __post_init__(self) -> None:
         self.writes = self.exclusive and bool(self.access & Access.WRITE)
+        self.axes = self.channels.tolist()
 
     def answer(self, number: int, value: object = None) -> None:
         """Reply to a request; a client that does not read is found dead later, by its socket or its lease."""

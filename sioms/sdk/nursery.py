@@ -26,6 +26,7 @@ from .finding import DriverNotFound, describe, find_driver, read_settings
 
 def main(fd: int) -> None:
     """Serve the daemon until it closes the socket."""
+    gc.disable()  # until the first fork: what is imported stays, and is not looked through again and again
     sock = socket.socket(fileno=fd)
     os.set_inheritable(fd, False)
     for number in (
@@ -83,8 +84,9 @@ def _spawn(
     settings, errors = read_settings(found, table, options["folder"])
     if errors:
         raise ValueError("; ".join(errors))
-    gc.collect()
-    gc.freeze()
+    if not gc.isenabled():
+        gc.freeze()
+        gc.enable()
     pid = os.fork()
     if pid == 0:
         status = 1
