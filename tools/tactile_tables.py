@@ -218,24 +218,23 @@ class Tables:
         return all_of.pick(middle & (np.abs(all_of.load / 200.0 - 1.0) < 0.2))
 
     def mean_rc(
-        self, finger: Finger, touches: Touches, radius_m: float, load: bool = False
+        self, estimator: Estimator, touches: Touches, radius_m: float, load: bool = False
     ) -> tuple[float, float]:
         """Return mean and deviation of rc [mm] of one indenter; the mean by way of R, which behaves for flats."""
         mine = touches.pick(np.isclose(touches.radius_m, radius_m, atol=1e-9))
-        found = np.array([r for _, _, r in fitted(finger, mine, load)])
-        rc = np.array(
-            [indenter_radius(finger.cylinder, min(r, 0.999 * finger.cylinder.outer_m)) for r in found]
-        )
-        mean = indenter_radius(
-            finger.cylinder, min(float(np.nanmean(found)), 0.999 * finger.cylinder.outer_m)
-        )
+        found = np.array([r for _, _, r in fitted(estimator, mine, load)])
+        body = estimator.finger.cylinder
+        rc = np.array([indenter_radius(body, min(r, 0.999 * body.outer_m)) for r in found])
+        mean = indenter_radius(body, min(float(np.nanmean(found)), 0.999 * body.outer_m))
         return 1e3 * mean, 1e3 * float(np.nanstd(rc))
 
     def table_3_10(self) -> Table:
         """Mean radii by contact model and map."""
         touches, rows = self.indenters(), []
         model, mapped = without_map(self.result.finger), with_map(self.result)
-        fingers = [hertzian(model), hertzian(mapped), model, mapped]
+        fingers = [
+            Estimator(one, compiled=None) for one in (hertzian(model), hertzian(mapped), model, mapped)
+        ]
         for rc, published in PUBLISHED_3_10.items():
             if np.any(np.isclose(touches.radius_m, 1e-3 * rc, atol=1e-9)):
                 mine = [self.mean_rc(one, touches, 1e-3 * rc)[0] for one in fingers]
@@ -261,10 +260,11 @@ class Tables:
 
     def table_3_12(self) -> Table:
         """Radii without and with load information."""
-        touches, finger, rows = self.indenters(), with_map(self.result), []
+        touches, rows = self.indenters(), []
+        estimator = Estimator(with_map(self.result), compiled=None)
         for rc, published in PUBLISHED_3_12.items():
             if np.any(np.isclose(touches.radius_m, 1e-3 * rc, atol=1e-9)):
-                free, loaded = (self.mean_rc(finger, touches, 1e-3 * rc, load) for load in (False, True))
+                free, loaded = (self.mean_rc(estimator, touches, 1e-3 * rc, load) for load in (False, True))
                 mine = (free[0], loaded[0], free[1], loaded[1])
                 rows.append(
                     (f"{rc:g}", *(f"{a:.2f} ({b:.2f})" for a, b in zip(mine, published, strict=True)))
@@ -273,10 +273,9 @@ class Tables:
                      ("rc", "mean, no load", "mean, with load", "deviation, no load", "deviation, with load"), rows)  # fmt: skip
 
 
-def fitted(finger: Finger, touches: Touches, with_load: bool) -> list[tuple[float, float, float]]:
+def fitted(estimator: Estimator, touches: Touches, with_load: bool) -> list[tuple[float, float, float]]:
     """Fit touches with linear outputs; return place [rad], load [N/m] and R [m] of each, nan for none."""
-    estimator = Estimator(finger, compiled=None)
-    strains = -np.array(finger.elements.gain) * touches.output
+    strains = -np.array(estimator.finger.elements.gain) * touches.output
     loads = [Load(float(p), 4.0) if with_load and p > 0.0 else None for p in touches.load]
     shapes = [estimator.frame(y, p) for y, p in zip(strains, loads, strict=True)]
     return [(s.angle_rad, s.load_n_per_m, s.equivalent_radius_m) for s in shapes]
@@ -290,6 +289,7 @@ def scatter(data: Data, result: Calibration, finger: Finger) -> tuple[Floats, Fl
         touches.radius_m, radii[np.linspace(0, radii.size - 1, min(NOISY, radii.size)).round().astype(int)]
     )
     quadratic, scale = np.array(finger.elements.quadratic), finger.signal.scale
+    estimator = Estimator(finger, compiled=None)
     by_place, frames = [], []
     for number in np.flatnonzero(chosen):
         mine = recording.touch == number
@@ -301,7 +301,7 @@ def scatter(data: Data, result: Calibration, finger: Finger) -> tuple[Floats, Fl
                          np.full(count, touches.radius_m[number]), np.full(count, np.nan), touches.noise)  # fmt: skip
         truth = np.array([math.degrees(touches.angle_rad[number]), touches.load[number],
                           1e3 * equivalent_radius(finger.cylinder, float(touches.radius_m[number]))])  # fmt: skip
-        found = np.array(fitted(finger, copies, False)) * [180.0 / math.pi, 1.0, 1e3] - truth
+        found = np.array(fitted(estimator, copies, False)) * [180.0 / math.pi, 1.0, 1e3] - truth
         by_place.append(found[0])
         frames.append(found[1:])
     means, every = np.array(by_place), np.concatenate(frames)
