@@ -34,10 +34,10 @@ from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import BlockSpec, Description
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
 from sioms.sdk.golden import Golden
-from sioms.sdk.mapped import MappedUnit, golden_of, unit_on
+from sioms.sdk.mapped import MappedUnit, Misfit, golden_of, unit_on
 from sioms.sdk.mapped_drive import DriveUnit
 from sioms.sdk.registers import Gearing
-from sioms.sdk.regmap import RegisterMap, load_map
+from sioms.sdk.regmap import RegisterMap, named_map
 from sioms.sdk.settings import LineSettings
 from sioms.sdk.tables import from_table, table_type
 
@@ -50,6 +50,13 @@ ALWAYS_MODES = (
     | ControlMode.SPECIFIED_SIGNAL_MARKER
 )
 """What the bank adds to the modes that a drive has."""
+KEY_OF = {
+    "speed": "velocity_max",
+    "velocity": "velocity_max",
+    "acceleration": "acceleration_max",
+    "deceleration": "acceleration_max",
+}
+"""Quantity of a command: key of the axis that limits it."""
 DEAD_MAN_SHARE = 0.75
 """Part of a device's dead-man time that a round of polls may take."""
 
@@ -135,7 +142,7 @@ class ModbusAxis(LineDriver):
     @classmethod
     def golden(cls, settings: Any) -> Sequence[Golden]:
         """Return the golden frames of the register map."""
-        return golden_of(load_map(_map_path(settings.map))) if settings is not None else ()
+        return golden_of(named_map(settings.map, MAPS)) if settings is not None else ()
 
     def __init__(self, name: str, settings: ModbusAxisSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
@@ -174,10 +181,11 @@ class _Drive:
         self.axis = axis
         try:
             gearing = Gearing(axis.travel_per_turn, axis.pulses_per_turn)
-            rmap = load_map(_map_path(settings.map), axis.override)
+            rmap = named_map(settings.map, MAPS, axis.override)
             unit = unit_on(settings.line, axis.address, rmap.turnaround_s)
         except ValueError as error:
-            raise ValueError(f"axis {axis.name}: {error}") from None
+            lines = str(error).splitlines()  # a map tells all that is wrong with it
+            raise ValueError("\n".join(f"axis {axis.name}: {line}" for line in lines)) from None
         if rmap.axis is None:
             raise ValueError(f"map = {settings.map}: describes no axis; want a map of a drive")
         self.mapped = MappedUnit(rmap, unit, gearing, f"{axis.name} (address {axis.address})")
@@ -192,9 +200,9 @@ class _Drive:
 
     def _check_limits(self, rmap: RegisterMap) -> None:
         axis = self.axis
-        for position in (axis.position_min or 0.0, axis.position_max or 0.0):
+        for end in ("position_min", "position_max"):
             quantities = {
-                "position": position,
+                "position": getattr(axis, end) or 0.0,
                 "speed": axis.velocity_max,
                 "velocity": axis.velocity_max,
                 "acceleration": axis.acceleration_max,
@@ -205,8 +213,8 @@ class _Drive:
                     continue
                 try:
                     self.mapped.check(rmap.commands[name], quantities)
-                except ValueError as error:
-                    raise ValueError(f"axis {axis.name}: {error}") from None
+                except Misfit as error:
+                    raise ValueError(f"axis {axis.name}: {KEY_OF.get(error.source, end)}: {error}") from None
 
     def settings(self) -> AxisSettings:
         """Return the axis as the bank knows it."""
@@ -242,11 +250,6 @@ class _Drive:
         per_character = line.bits_per_character / line.baud if line.serial else 0.0
         silence_s = max(0.00175 if line.serial else 0.0, self.mapped.rmap.gap_s)
         return characters * per_character + messages * 2 * silence_s
-
-
-def _map_path(name: str) -> Path:
-    path = Path(name)
-    return path if path.suffix == ".toml" else MAPS / f"{name}.toml"
 
 
 def _check_dead_man(settings: ModbusAxisSettings, drives: Sequence[_Drive]) -> None:

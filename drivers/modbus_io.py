@@ -31,7 +31,7 @@ from sioms.sdk.exchange import DeviceError, Steps
 from sioms.sdk.golden import Golden
 from sioms.sdk.mapped import MappedUnit, golden_of, unit_on
 from sioms.sdk.registers import UNITS, to_words, width
-from sioms.sdk.regmap import Port, RegisterMap, Signal, load_map
+from sioms.sdk.regmap import Port, RegisterMap, Signal, named_map
 from sioms.sdk.settings import LineSettings
 from sioms.wording import did_you_mean
 
@@ -121,8 +121,7 @@ class ModbusIo(LineDriver):
 
 
 def _load(settings: ModbusIoSettings) -> RegisterMap:
-    path = Path(settings.map)
-    rmap = load_map(path if path.suffix == ".toml" else MAPS / f"{settings.map}.toml", settings.override)
+    rmap = named_map(settings.map, MAPS, settings.override)
     if not rmap.ports:
         raise ValueError(f"map = {settings.map}: describes no ports; want a map of an I/O block")
     if settings.watchdog_s and "watchdog" not in rmap.commands:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from typing import Literal, get_origin
 
 import msgspec
 
@@ -22,13 +23,19 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f"; there are: {', '.join(known)}" if 0 < len(known) <= 12 else ""
 
 
-def explain(where: str, error: msgspec.ValidationError, known: Iterable[str]) -> str:
+def explain(
+    where: str,
+    error: msgspec.ValidationError,
+    known: Iterable[str],
+    words: Mapping[str, Sequence[object]] | None = None,
+) -> str:
     """Turn a validation error into a sentence that names the table and the key that was meant.
 
     Args:
         where: the table, e.g. ``[device.mod0]``.
         error: what msgspec found.
         known: keys that the table may have.
+        words: key to the words that it may be, of keys that take certain words alone.
     """
     text, _, path = str(error).partition(" - at `$")
     path = path.rstrip("`")
@@ -38,12 +45,29 @@ def explain(where: str, error: msgspec.ValidationError, known: Iterable[str]) ->
         return f"{where}: unknown key {key}{did_you_mean(key, known)}"
     if "missing required field" in text:
         return f"{where}: key {text.split('`')[1]} is missing"
+    if "enum value" in text and (may := (words or {}).get(path.rpartition(".")[2])):
+        return f"{where} = {text.split()[-1]}: want one of {', '.join(map(repr, may))}"
     return f"{where}: {text[0].lower() + text[1:]}"
+
+
+def choices(kind: type[msgspec.Struct]) -> dict[str, tuple[object, ...]]:
+    """Return the keys of a table, and of the tables in it, that take certain words alone, with these words."""
+    return {field.encode_name: words for field in _fields(kind) if (words := _literals(field.type))}
+
+
+def _literals(annotation: object) -> tuple[object, ...]:
+    inner = getattr(annotation, "__args__", ())
+    if get_origin(annotation) is Literal:
+        return tuple(inner)
+    return tuple(word for each in inner for word in _literals(each))
 
 
 def field_names(kind: type[msgspec.Struct]) -> list[str]:
     """Return the keys of a table, those of the tables in it too."""
-    names: list[str] = []
+    return [field.encode_name for field in _fields(kind)]
+
+
+def _fields(kind: type[msgspec.Struct]) -> Iterator[msgspec.structs.FieldInfo]:
     pending: list[object] = [kind]
     seen: set[object] = set()
     while pending:
@@ -53,8 +77,7 @@ def field_names(kind: type[msgspec.Struct]) -> list[str]:
         seen.add(each)
         if isinstance(each, type) and issubclass(each, msgspec.Struct):
             for field in msgspec.structs.fields(each):
-                names.append(field.encode_name)
+                yield field
                 pending.append(field.type)
         else:
             pending.extend(getattr(each, "__args__", ()))
-    return names

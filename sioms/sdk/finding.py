@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from sioms.protocol.flags import NodeClass
-from sioms.wording import did_you_mean, explain, field_names
+from sioms.wording import choices, did_you_mean, explain, field_names
 
 from .driver import Driver, LineDriver, StreamDriver, TickDriver
 
@@ -93,7 +93,7 @@ def read_settings(driver: type[Driver], table: Mapping[str, Any], folder: str) -
         driver: the driver's class.
         table: the keys of the device that the daemon does not read itself.
         folder: of the configuration, for settings that name files: a key ``..._file`` that is a
-            relative path is taken from there.
+            relative path is taken from there, and so is a ``map`` that is a file.
 
     Returns:
         The settings (None with errors) and the errors, each beginning with ``.key`` or ``: ``.
@@ -110,7 +110,7 @@ def read_settings(driver: type[Driver], table: Mapping[str, Any], folder: str) -
     try:
         return msgspec.convert(table, kind), errors
     except msgspec.ValidationError as error:
-        errors.append(explain("", error, known))
+        errors.append(explain("", error, known, choices(kind)))
         return None, errors
 
 
@@ -120,7 +120,10 @@ def _anchored(value: Any, folder: str, key: str = "") -> Any:
         return {k: _anchored(v, folder, k) for k, v in value.items()}
     if isinstance(value, list):
         return [_anchored(v, folder) for v in value]
-    return os.path.join(folder, value) if key.endswith("_file") and isinstance(value, str) and value else value
+    if not isinstance(value, str) or not value:
+        return value
+    is_file = key.endswith("_file") or (key == "map" and value.endswith(".toml"))
+    return os.path.join(folder, value) if is_file else value
 
 
 def describe(driver: type[Driver], name: str, settings: Any) -> tuple[list[object] | None, list[str]]:
@@ -128,7 +131,7 @@ def describe(driver: type[Driver], name: str, settings: Any) -> tuple[list[objec
     try:
         description = driver.describe(name, settings)
     except ValueError as error:
-        return None, [f": {error}"]
+        return None, [f": {line}" for line in str(error).splitlines()]
     errors = _block_errors(description.blocks)
     if not 0.1 <= description.tick_hz <= 20_000:
         errors.append(f": rate {description.tick_hz:g} Hz; want 0.1 to 20000")

@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 
 from .codec import modbus_pdu as pdus
-from .codec.modbus import RtuUnit, SerialLine, TcpUnit, Unit
+from .codec.modbus import UNIT_IN_HEADER, RtuUnit, SerialLine, TcpUnit, Unit
 from .codec.modbus_pdu import MAX_READ_BITS, MAX_READ_REGISTERS, Pdu
 from .exchange import DeviceError, Exchange, Pause, Steps
 from .golden import Golden, Incomplete
@@ -35,6 +35,18 @@ _READ = {
     "holding": pdus.READ_HOLDING,
     "input": pdus.READ_INPUT,
 }
+
+
+class Misfit(ValueError):
+    """A quantity of a command does not fit its register.
+
+    Attributes:
+        source: the quantity.
+    """
+
+    def __init__(self, source: str, text: str) -> None:
+        super().__init__(text)
+        self.source = source
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +122,7 @@ class MappedUnit:
                 yield Pause(pause_s)
 
     def check(self, command: Command, quantities: Mapping[str, float]) -> None:
-        """Raise ValueError when a quantity does not fit its register."""
+        """Raise Misfit when a quantity does not fit its register."""
         for write in command.writes:
             self.encode(write, quantities)
 
@@ -200,7 +212,7 @@ class MappedUnit:
             low = low if item.minimum is None else item.minimum
             high = high if item.maximum is None else item.maximum
             if not low <= raw <= high:
-                raise ValueError(self._misfit(item, source, si, raw, low, high))
+                raise Misfit(source, self._misfit(item, source, si, raw, low, high))
         return to_words(raw, item.type, self.rmap.word_order)
 
     def _misfit(self, item: Item, source: str, si: float, raw: float, low: int, high: int) -> str:
@@ -228,13 +240,17 @@ def unit_on(line: LineSettings, address: int, turnaround_s: float) -> Unit:
 
 
 def golden_of(rmap: RegisterMap) -> list[Golden]:
-    """Return the golden frames of a map, on a serial line of 115200 baud."""
+    """Return the golden frames of a map, on a serial line of 115200 baud or on TCP."""
     return [golden for frame in rmap.golden for golden in _golden(rmap, frame)]
 
 
 def _golden(rmap: RegisterMap, frame: GoldenFrame) -> list[Golden]:
-    address = bytes.fromhex(frame.requests[0])[0]
-    unit = RtuUnit(address, SerialLine(115200), rmap.turnaround_s)
+    first = bytes.fromhex(frame.requests[0])
+    unit: Unit = (
+        TcpUnit(first[UNIT_IN_HEADER], rmap.turnaround_s)
+        if frame.transport == "tcp"
+        else RtuUnit(first[0], SerialLine(115200), rmap.turnaround_s)
+    )
     mapped = MappedUnit(rmap, unit, Gearing(1.0, frame.pulses_per_turn))
     if frame.signals:
         plan = mapped.plan(frame.signals)
@@ -251,9 +267,8 @@ def _golden(rmap: RegisterMap, frame: GoldenFrame) -> list[Golden]:
                 name: mapped._value(signal, at, reply) for name, signal, at in plan[0].parts if name in wanted
             }
 
-        first = Golden(what, exchanges[0], frame.requests[0], frame.reply, wanted, read)
         return [
-            first,
+            Golden(what, exchanges[0], frame.requests[0], frame.reply, wanted, read),
             *(Golden(what, e, text) for e, text in zip(exchanges[1:], frame.requests[1:], strict=True)),
         ]
     steps = [step for step in mapped.command(frame.command, **frame.quantities) if isinstance(step, Exchange)]

@@ -17,6 +17,8 @@ from typing import Any, Literal
 
 import msgspec
 
+from sioms.wording import did_you_mean
+
 from . import regmap_check
 from .registers import Rounding, TypeName, WordOrder, width
 
@@ -197,10 +199,11 @@ class Port(Schema, frozen=True):
 
 
 class GoldenFrame(Schema, frozen=True):
-    """Messages of the vendor's manual as Modbus RTU, which the map must make or read.
+    """Messages out of the vendor's manual, which the map must make or read.
 
     Args:
         requests: what is sent, in hex, one a message.
+        transport: what frames them: "rtu", with address and CRC; "tcp", with a header whose transactions count from 1.
         command: that sends them, with its ``quantities``; lengths in turns of the motor, else in SI.
         quantities: by name.
         signals: or what is read by them.
@@ -210,11 +213,12 @@ class GoldenFrame(Schema, frozen=True):
     """
 
     requests: tuple[str, ...]
+    transport: Literal["rtu", "tcp"] = "rtu"
     command: str = ""
     quantities: dict[str, float] = {}
     signals: tuple[str, ...] = ()
     reply: str = ""
-    values: dict[str, float] = {}
+    values: dict[str, float | str | list[float]] = {}
     pulses_per_turn: float = 10000.0
 
 
@@ -271,6 +275,26 @@ def parse_map(document: Mapping[str, Any], where: str) -> RegisterMap:
     raise RegisterMapError(where, problems)
 
 
+def named_map(name: str, shipped: Path, overrides: Mapping[str, Any] | None = None) -> RegisterMap:
+    """Return a shipped map by its name, or one of the user's by the path of its file, which ends in .toml.
+
+    Args:
+        name: as configured.
+        shipped: folder of the shipped maps.
+        overrides: as of ``load_map``.
+
+    Raises:
+        RegisterMapError: there is no such map, or it is wrong.
+    """
+    if name.endswith(".toml"):
+        return load_map(Path(name), overrides)
+    known = sorted(path.stem for path in shipped.glob("*.toml"))
+    if name not in known:
+        problem = f"no shipped map has this name{did_you_mean(name, known)}; one of your own is a path that ends in .toml"
+        raise RegisterMapError(name, [problem])
+    return load_map(shipped / f"{name}.toml", overrides)
+
+
 def load_map(path: Path, overrides: Mapping[str, Any] | None = None) -> RegisterMap:
     """Return the map in a TOML file, with the keys of ``overrides`` put over it.
 
@@ -279,8 +303,10 @@ def load_map(path: Path, overrides: Mapping[str, Any] | None = None) -> Register
     """
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise RegisterMapError(str(path), [str(error)]) from None
+    except OSError as error:
+        raise RegisterMapError(str(path), [(error.strerror or str(error)).lower()]) from None
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise RegisterMapError(str(path), [f"no TOML: {error}"]) from None
     return parse_map(_merged(document, overrides or {}), str(path))
 
 

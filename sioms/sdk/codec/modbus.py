@@ -21,6 +21,8 @@ from .checksum import crc16_modbus
 from .modbus_pdu import Pdu
 
 MAX_MBAP_BYTES = 260
+UNIT_IN_HEADER = 6
+"""Place of the unit in a message on TCP: behind transaction, protocol and length."""
 _MAX_STALE_BYTES = 16 * MAX_MBAP_BYTES
 """More old replies than this in front of the awaited one mean that the stream is not Modbus."""
 

@@ -357,7 +357,8 @@ def test_the_drive_cannot_pass_a_position() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"map": "leadshin"}, "leadshin.toml"),
+        ({"map": "leadshin"}, "no shipped map has this name; did you mean leadshine"),
+        ({"map": "/nowhere/leadshine.toml"}, "read register map /nowhere/leadshine.toml: no such file"),
         ({"map": "moxa_e1200"}, "describes no axis"),
         ({"line": {"udp": "h:1"}}, "Modbus runs on serial and tcp"),
         (
@@ -370,8 +371,8 @@ def test_the_drive_cannot_pass_a_position() -> None:
         ),
         ({"axis": []}, "axis: none given"),
         ({"axis": [{"name": "a"}, {"name": "b"}]}, "2 drives have address 1"),
-        ({"axis": [{"name": "a", "velocity_max": 1e3}]}, "axis a: speed 1000 is .* in the register"),
-        ({"axis": [{"name": "a", "position_max": 1e7}]}, "axis a: position 1e.07"),
+        ({"axis": [{"name": "a", "velocity_max": 1e3}]}, "axis a: velocity_max: speed 1000 is .* in the register"),
+        ({"axis": [{"name": "a", "position_max": 1e7}]}, "axis a: position_max: position 1e.07"),
         ({"axis": [{"name": "a", "address": 300}]}, "address of a unit is 300"),
         ({"axis": [{"name": "a", "travel_per_turn": 0.0}]}, "axis a: travel_per_turn is 0"),
         (

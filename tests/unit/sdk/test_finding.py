@@ -59,3 +59,14 @@ def test_files_that_are_no_driver(tmp_path: Path, text: str | None, words: str) 
         (tmp_path / "own.py").write_text(text)
     with pytest.raises(DriverNotFound, match=words):
         find_driver("./own.py", str(tmp_path))
+
+
+def test_a_word_that_is_none_of_the_right_ones_and_a_map_beside_the_configuration() -> None:
+    driver = find_driver("modbus-axis", "/")
+    axis = {"name": "x", "velocity_by": "job"}
+    line = {"serial": "/dev/ttyUSB0"}
+    settings, errors = read_settings(driver, {"map": "mine.toml", "line": line, "axis": [axis]}, "/etc/sioms")
+    assert settings is None and errors == [".axis[0].velocity_by = 'job': want one of 'jog', 'path'"]
+    table = {"map": "mine.toml", "line": line, "axis": [{"name": "x"}]}
+    assert read_settings(driver, table, "/etc/sioms")[0].map == "/etc/sioms/mine.toml"
+    assert read_settings(driver, {**table, "map": "leadshine"}, "/etc/sioms")[0].map == "leadshine"

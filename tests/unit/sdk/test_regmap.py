@@ -112,8 +112,8 @@ def test_overrides_and_unreadable_files(tmp_path: Path) -> None:
     changed = load_map(MAPS / "leadshine.toml", {"signals": {"alarm": {"address": 0x2204}}})
     assert changed.signals["alarm"].address == 0x2204
     assert changed.signals["status"].address == 0x1003
-    with pytest.raises(RegisterMapError, match="No such file"):
+    with pytest.raises(RegisterMapError, match="no such file"):
         load_map(tmp_path / "none.toml")
     (tmp_path / "bad.toml").write_text("family = ")
-    with pytest.raises(RegisterMapError, match="Invalid value"):
+    with pytest.raises(RegisterMapError, match="no TOML: Invalid value"):
         load_map(tmp_path / "bad.toml")
