@@ -48,6 +48,7 @@ class LineEngine(Connected):
         self._units = [_UnitState(unit) for unit in driver.units]
         self._by_block = {id(block): state for state in self._units for block in state.unit.blocks}
         self._voids: Counter[tuple[int, int]] = Counter()
+        self._closed = False
         self.publishes = False
 
     def unsolicited(self) -> Any:
@@ -64,7 +65,7 @@ class LineEngine(Connected):
 
     def tick(self, now_ns: int) -> None:
         """Start the polls and opens that are due."""
-        if not self.connect(now_ns):
+        if self._closed or not self.connect(now_ns):
             return
         for state in self._units:
             if state.is_up:
@@ -75,7 +76,7 @@ class LineEngine(Connected):
 
     def _start(self, state: _UnitState, now_ns: int) -> None:
         line = self.line
-        if line is None:
+        if line is None or self._closed:
             return
         state.busy = True
         if state.is_up:
@@ -247,7 +248,8 @@ class LineEngine(Connected):
         return self.line is None or self.line.is_free
 
     def close(self) -> None:
-        """Let every unit leave its device safe; the runtime runs the loop until it is quiet."""
+        """Let every unit leave its device safe; the runtime runs the loop until it is quiet, so no poll begins any more."""
+        self._closed = True
         line, now_ns = self.line, self._runtime.now_ns()
         if line is None:
             return

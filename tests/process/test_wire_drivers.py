@@ -250,9 +250,12 @@ time.sleep(60)
 def test_the_driver_watches_over_moves_for_which_the_drive_has_no_dead_man(
     start: Callable[..., Any], short_folder: Path
 ) -> None:
-    """A position move of a Leadshine drive goes on to its target by itself: each death must end it by a stop that is sent."""
+    """A position move of a Leadshine drive goes on to its target by itself: each death must end it by a stop that is sent.
+
+    The line has polls on it back to back, which must not keep the driver from ending.
+    """
     wire = Wire(start, short_folder, "leadshine", "--units", "1")
-    wire.serve(SLIDE)
+    wire.serve(SLIDE.replace("[[", "poll_hz = 1000.0\n[["))
     wire.wait_up("slide0")
 
     def run_to(position: float) -> Any:
@@ -275,5 +278,7 @@ def test_the_driver_watches_over_moves_for_which_the_drive_has_no_dead_man(
     wire.wait_up("slide0")
     assert wire.state("velocity") == 0, "motion must not resume"
     run_to(5.0)
+    driver = wire.pid("slide0")
     wire.daemon.process.kill()
     rests("daemon")
+    wait_for(lambda: not Path(f"/proc/{driver}").exists(), "the driver gone with its daemon", 1.5)
