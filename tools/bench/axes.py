@@ -3,12 +3,17 @@
 One driver process of n simulated servo axes; half of them carry out random profiles out of filled
 buffers, the others hold. A tick is everything: stops and leases looked at, physics advanced and
 measured, plans, limits, control law, watching, publication of all readings.
+
+Two counts a rate. As table F.8 has it: the usual tick, from its schedule to its end, fits into the period. And in
+time: so do 99 of 100 ticks, and at most one of a thousand is left out; that is a question of the machine and its
+other guests as much as of the driver.
 """
 
 from __future__ import annotations
 
 import random
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +31,7 @@ FIRST_GUESS = {1000: 2500, 2000: 1000, 3000: 500, 5000: 200}
 MOST = 10_000
 GROUP = 20
 MOVES = 40
-SKIPPED = 0.001
+SKIPPED, MANY_SKIPPED = 0.001, 0.05
 PRIORITY = 90
 """Above other drivers on the machine: what one core carries is asked, not what is left of it."""
 
@@ -54,58 +59,84 @@ class Load:
 
     @property
     def carried(self) -> bool:
-        """Whether the ticks fit into the period; a late start alone does not make the next one late."""
+        """Whether the usual tick, from its schedule to its end, fits into the period."""
+        return float(self.phases["total_ns"]["50.0"]) * self.rate < 1e9 and self.skipped <= MANY_SKIPPED
+
+    @property
+    def in_time(self) -> bool:
+        """Whether 99 of 100 ticks do; a late start alone does not make the next one late."""
         return self.p99_us() < 1e6 / self.rate and self.skipped <= SKIPPED
 
 
 def bench_axes(options: Options, report: Report) -> None:
     """Search the most axes at each rate; quick: only look whether the wanted numbers are carried."""
     seconds = options.count(1, 3)
-    best: dict[int, Load] = {}
+    best: list[Load] = []
     for rate in [1000, 5000] if options.quick else [1000, 2000, 3000, 5000]:
-        found = _check(rate, seconds, report) if options.quick else _search(rate, seconds, report)
-        if found is not None:
-            best[rate] = found
+        loads = _Loads(rate, seconds, report)
+        if options.quick:
+            found = loads.at(WANTED[rate])
+            carried, in_time = (found if found and each(found) else None for each in CRITERIA)
+        else:
+            carried, in_time = (loads.search(each) for each in CRITERIA)
         bars = [Bar("value", WANTED[rate], True)] if rate in WANTED else []
-        notes = f"the 486DX2 of table F.8: {ORIGINAL[rate]}"
-        if found is not None:
-            notes += f"; p99 {found.p99_us():.0f} us of {1e6 / rate:.0f} us, core {found.share:.0%}"
-        count = found.axes if found is not None else 0
-        report.value(f"axes carried at {rate} Hz", count, "", bars=bars, notes=notes)
-    for load in [_measure(12, 1000, seconds), *best.values()]:
+        report.value(
+            f"axes carried at {rate} Hz", carried.axes if carried else 0, "", bars=bars,
+            notes=f"the 486DX2 of table F.8: {ORIGINAL[rate]}{_notes(carried)}",
+        )  # fmt: skip
+        report.value(
+            f"axes in time at {rate} Hz", in_time.axes if in_time else 0, "", notes=_notes(in_time)[2:]
+        )
+        best += [carried] if carried else []
+    for load in [_measure(12, 1000, seconds), *best]:
         _break_down(load, report)
 
 
-def _check(rate: int, seconds: float, report: Report) -> Load | None:
-    load = _measure(WANTED[rate], rate, seconds)
-    _tell(load, report)
-    return load if load.carried else None
+CRITERIA: tuple[Callable[[Load], bool], ...] = (lambda load: load.carried, lambda load: load.in_time)
 
 
-def _search(rate: int, seconds: float, report: Report) -> Load | None:
-    """Return the largest load found that is carried: double or halve, then halve the interval four times."""
-    low, high, best, n = 0, MOST + 1, None, FIRST_GUESS[rate]
-    for _ in range(7):
-        try:
-            load = _measure(n, rate, seconds)
-        except (OSError, RuntimeError) as error:  # a driver that is late by many periods stops its axes
-            report.note(f"{n:6} axes at {rate} Hz: {error!s:.120}: too many")
-            high = n
-        else:
-            _tell(load, report)
-            low, high, best = (n, high, load) if load.carried else (low, n, best)
-        if high - low <= max(10, high // 20):
-            break
-        n = (low + high) // 2 if high <= MOST else min(2 * n, MOST)
-    return best
-
-
-def _tell(load: Load, report: Report) -> None:
-    word = "carried" if load.carried else "too many"
-    report.note(
-        f"{load.axes:6} axes at {load.rate} Hz: p50 {load.phases['busy_ns']['50.0'] * 1e-3:7.0f} us, p99 {load.p99_us():7.0f} us, "
-        f"{load.skipped:.2%} of ticks left out, core {load.share:.0%}: {word}"
+def _notes(load: Load | None) -> str:
+    if load is None:
+        return ""
+    median = load.phases["total_ns"]["50.0"] * 1e-3
+    return (
+        f"; tick p50 {median:.0f} us, p99 {load.p99_us('total_ns'):.0f} us of {1e6 / load.rate:.0f} us, "
+        f"{load.skipped:.2%} left out, core {load.share:.0%}"
     )
+
+
+class _Loads:
+    """Loads at one rate, each measured once.
+
+    Concurrency: one thread.
+    """
+
+    def __init__(self, rate: int, seconds: float, report: Report) -> None:
+        self._rate, self._seconds, self._report = rate, seconds, report
+        self._known: dict[int, Load | None] = {}
+
+    def at(self, axes: int) -> Load | None:
+        """Return what a number of axes takes; None when the driver stops them because it is late by many periods."""
+        if axes not in self._known:
+            try:
+                self._known[axes] = load = _measure(axes, self._rate, self._seconds)
+            except (OSError, RuntimeError) as error:
+                self._known[axes] = None
+                self._report.note(f"{axes:6} axes at {self._rate} Hz: {error!s:.120}: too many")
+            else:
+                self._report.note(f"{axes:6} axes at {self._rate} Hz{_notes(load)}")
+        return self._known[axes]
+
+    def search(self, suits: Callable[[Load], bool]) -> Load | None:
+        """Return the largest load found that suits: double or halve, then halve the interval four times."""
+        low, high, best, n = 0, MOST + 1, None, FIRST_GUESS[self._rate]
+        for _ in range(7):
+            load = self.at(n)
+            low, high, best = (n, high, load) if load is not None and suits(load) else (low, n, best)
+            if high - low <= max(10, high // 20):
+                break
+            n = (low + high) // 2 if high <= MOST else min(2 * n, MOST)
+        return best
 
 
 def _measure(axes: int, rate: int, seconds: float) -> Load:
