@@ -1,4 +1,4 @@
-"""Give the contacts that have a closed solution: Hertz, wedge and flat-ended punch on a half plane (appendix
+"""Give the contacts that have a closed solution: Hertz, wedge, rounded wedge and flat-ended punch on a half plane (appendix
 C).
 
 Half plane of shear modulus mu and Poisson's ratio nu, no friction, no core: the contact widths are wrong on a
@@ -52,6 +52,56 @@ def wedge_width(cylinder: Cylinder, load: float, half_angle: float) -> float:
     return float(
         load * (1.0 - cylinder.poisson) * np.tan(half_angle) / (cylinder.shear_pa * cylinder.outer_m)
     )
+
+
+def rounded_wedge_load(cylinder: Cylinder, half_width: float, half_angle: float, radius_m: float) -> float:
+    """Return P [N/m] of a wedge whose edge is rounded with radius rc, at the half width a [rad].
+
+    The half plane's load is E* times the integral of x h'(x)/sqrt(a^2 - x^2) over 0 to a, E* = 2 mu/(1 - nu), with the slope
+    h' = x/rc up to b = rc cot(tp) and cot(tp) beyond. The finger is taken for flat as for the wedge; answers add, so
+    that Hertz's load of R = rb is its own curvature's share.
+
+    Args:
+        cylinder: the finger.
+        half_width: a [rad], > 0.
+        half_angle: tp [rad] of the wedge, 0 to pi/2.
+        radius_m: rc [m], > 0.
+    """
+    a, b = half_width * cylinder.outer_m, _rounded_to(cylinder, half_width, half_angle, radius_m)
+    own = a**2 * np.arcsin(b / a) + b * np.sqrt(a**2 - b**2)
+    return float(cylinder.shear_pa / (1.0 - cylinder.poisson) / radius_m * own)
+
+
+def rounded_wedge_pressure(
+    cylinder: Cylinder, half_width: float, half_angle: float, radius_m: float, t: ArrayLike
+) -> Floats:
+    """Return the pressure [Pa], compression positive, at angles t [rad] from the apex; arguments as `rounded_wedge_load`.
+
+    The sum of arccosh(a/|x - s|)-like pressures of kinks spread evenly over the round edge, |s| < b.
+    """
+    a, b = half_width * cylinder.outer_m, _rounded_to(cylinder, half_width, half_angle, radius_m)
+    x = np.clip(np.asarray(t, dtype=np.float64) * cylinder.outer_m, -a, a)
+    arc = np.sqrt(a**2 - x**2)
+
+    def kink(s: float) -> Floats:
+        """(s - x) ln |(a^2 - x s + sqrt((a^2 - x^2)(a^2 - s^2)))/(a (x - s))|, which is 0 at x = s."""
+        away = np.where(x == s, 1.0, np.abs(x - s))
+        inside: Floats = (s - x) * np.log((a**2 - x * s + arc * np.sqrt(a**2 - s**2)) / (a * away))
+        return inside
+
+    scale = cylinder.shear_pa / (1.0 - cylinder.poisson) / (np.pi * radius_m)
+    pressure: Floats = scale * (2.0 * np.arcsin(b / a) * arc + kink(b) - kink(-b))
+    return pressure
+
+
+def _rounded_to(cylinder: Cylinder, half_width: float, half_angle: float, radius_m: float) -> float:
+    """Return how far from the apex [m] the slope is the round one's, at most the half width."""
+    if not (half_width > 0.0 and 0.0 < half_angle < 0.5 * np.pi and radius_m > 0.0):
+        raise ValueError(
+            f"press rounded wedge: half width {half_width} rad, half angle {half_angle} rad, radius {radius_m} m; "
+            "need all above 0, the angle below pi/2"
+        )
+    return min(radius_m / float(np.tan(half_angle)), half_width * cylinder.outer_m)
 
 
 def equivalent_wedge(cylinder: Cylinder, load: float, equivalent_m: float) -> float:

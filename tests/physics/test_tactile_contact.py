@@ -125,6 +125,33 @@ def test_narrow_sharp_wedge_is_the_closed_form() -> None:
     assert got[[200, 600]] / got[0] / 2 == pytest.approx(shape, rel=0.002)
 
 
+def test_closed_rounded_wedge_bends_a_half_plane_as_it_is_shaped() -> None:
+    """A half plane's slope is the Hilbert transform of the pressure, (1 - nu)/(pi mu) PV int p(s)/(x - s) ds."""
+    half, tip, angle = 0.1, 0.8e-3, np.radians(65.0)
+    a, b = half * FINGER_B.outer_m, tip / np.tan(angle)
+    n = 4000
+    s = a * np.cos(np.pi * (np.arange(n) + 0.5) / n)
+    p = closedform.rounded_wedge_pressure(FINGER_B, half, angle, tip, s / FINGER_B.outer_m)
+    assert b < 0.5 * a and p.min() > 0.0
+    weight = np.pi / n * np.sqrt(a**2 - s**2)
+    load = float(weight @ p)
+    assert closedform.rounded_wedge_load(FINGER_B, half, angle, tip) == pytest.approx(load, rel=1e-6)
+    # halfway between nodes the sum is the principal value
+    x = a * np.cos(np.pi * np.arange(1, n, 97) / n)
+    slope = (1 - FINGER_B.poisson) / (np.pi * FINGER_B.shear_pa) * ((weight * p) / (x[:, None] - s)).sum(1)
+    wanted = np.clip(x / tip, -1 / np.tan(angle), 1 / np.tan(angle))
+    assert slope == pytest.approx(wanted, abs=2e-3)
+    # a tip wider than the contact is a cylinder, a tip of no width a wedge
+    hertz = float(closedform.hertz_product(FINGER_B, half)) / 0.1
+    assert closedform.rounded_wedge_load(FINGER_B, half, angle, 0.1) == pytest.approx(hertz, rel=1e-12)
+    sharp = closedform.rounded_wedge_load(FINGER_B, half, angle, 1e-9)
+    assert closedform.wedge_width(FINGER_B, sharp, angle) == pytest.approx(2 * half, rel=1e-6)
+    outside = closedform.rounded_wedge_pressure(FINGER_B, half, angle, tip, [-2 * half, half])
+    assert outside == pytest.approx(0.0, abs=1e-9 * p.max())
+    with pytest.raises(ValueError, match="radius 0"):
+        closedform.rounded_wedge_load(FINGER_B, half, angle, 0.0)
+
+
 def test_closed_spectra_are_fourier_integrals() -> None:
     angle = np.pi * (np.arange(2000) + 0.5) / 2000
     x = np.cos(angle)
