@@ -3,11 +3,13 @@
 For every named effect the look-alikes take its place and everything is refitted. ``missed`` is the share of
 the effect's contribution that the look-alike cannot reproduce; below ``AMBIGUOUS`` (or within one standard
 error on held-out blocks) these data do not tell the two apart, however small the formal intervals are:
-what separates them then is a transient or two, where unmodelled effects live.
+what separates them then is a transient or two, where unmodelled effects live. Where the gate has found, before any
+fit, that two effects leave one and the same trace, more than that is needed: ``ALIKE``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sioms.reconcile.blocks import better
@@ -17,6 +19,8 @@ from sioms.reconcile.screen import screen
 from sioms.reconcile.search import DOUBTFUL, Found, Searcher, physical, size, without
 
 AMBIGUOUS = 0.015
+#: What a look-alike must miss whose trace has this share of its energy in common with that of the named effect.
+ALIKE, SAME_TRACE = 0.05, 0.98
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +29,7 @@ class Rival:
 
     Attributes:
         missed: share of the contribution of ``effect`` that it cannot reproduce.
+        allowed: share below which it is not ruled out.
         errors: by how many standard errors it is worse on held-out blocks.
         excess: by how much more than the named model it leaves, as a share of what that leaves.
     """
@@ -32,6 +37,7 @@ class Rival:
     effect: str
     rival: str
     missed: float
+    allowed: float
     errors: float
     excess: float
     fit: Fit
@@ -39,12 +45,17 @@ class Rival:
     @property
     def open(self) -> bool:
         """True where the data do not rule the rival out."""
-        return self.missed < AMBIGUOUS or (self.errors < 1.0 and self.excess < DOUBTFUL)
+        return self.missed < self.allowed or (self.errors < 1.0 and self.excess < DOUBTFUL)
 
 
-def rivals(searcher: Searcher, found: Found) -> list[Rival]:
-    """Refit with each look-alike in the place of each named effect, those not decided by a channel."""
+def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]] = ()) -> list[Rival]:
+    """Refit with each look-alike in the place of each named effect, those not decided by a channel.
+
+    Args:
+        pairs: effects that leave the same trace, with the share in common, as of ``excitation.Gate``.
+    """
     out = []
+    same = {frozenset(p[:2]) for p in pairs if p[2] > SAME_TRACE}
     lib = library()
     for name in [n for n in found.fit.model.effects if n not in searcher.frozen and n in lib]:
         names = [n for n in _alike(name) if n in searcher.names and n not in found.fit.model.effects]
@@ -62,7 +73,8 @@ def rivals(searcher: Searcher, found: Found) -> list[Rival]:
             if not physical(fit, start.effect):
                 continue
             _, errors = better(found.losses, searcher.loss(fit))
-            out.append(Rival(name, start.effect, (fit.cost - found.fit.cost) / contribution, errors,
+            allowed = ALIKE if frozenset((name, start.effect)) in same else AMBIGUOUS
+            out.append(Rival(name, start.effect, (fit.cost - found.fit.cost) / contribution, allowed, errors,
                              fit.cost / found.fit.cost - 1.0, fit))
     best: dict[tuple[str, str], Rival] = {}
     for r in out:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sioms.reconcile.ambiguity import Rival, rivals
-from sioms.reconcile.blocks import better, block_ids, bootstrap
+from sioms.reconcile.blocks import better, block_ids, intervals
 from sioms.reconcile.channels import Finding, drive, index_fit, index_scale, lattice
 from sioms.reconcile.checks import check, check_scale
 from sioms.reconcile.effect import Array, Slot
@@ -129,7 +129,7 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
                 "data; are model, force and position of the same axis?")
         ready = replace(ready, notes=(*ready.notes, note))
     o.progress("identifiability: look-alikes in the place of each effect")
-    others = rivals(searcher, found)
+    others = rivals(searcher, found, excited.pairs)
     return _conclude(ready, nominal, o, excited, found, searcher, others, odd, share, burst, rejected)
 
 
@@ -235,8 +235,8 @@ def _conclude(ready: Prepared, nominal: AxisModel, o: Options, excited: Gate, fo
     fit = refit(whole, found.fit.model, searcher.frozen, 12)
     if fit.cost > float(np.sum(whole.residual(found.fit.model) ** 2)):
         fit = replace(fit, model=found.fit.model)
-    intervals = _intervals(whole, fit, o.replicates, rng)
-    named, terms = _describe(ready, fit, found, searcher, others, intervals, rng)
+    spans = _intervals(whole, fit, o.replicates, rng)
+    named, terms = _describe(ready, fit, found, searcher, others, spans, rng)
     open_rivals = [r for r in others if r.open]
     rattles = any(known()[n].slot is Slot.BACKLASH for n in found.fit.model.effects)
     disturbance = found.fit.ratio > QUIET and burst > BURSTS and share < UNEXPLAINED and not rattles
@@ -278,16 +278,14 @@ def _set(r: Rival, model: AxisModel) -> tuple[str, ...]:
 
 
 def _intervals(problem: Problem, fit: Fit, replicates: int, rng: np.random.Generator) -> dict[tuple[str, str], tuple[float, float]]:
-    """95 % intervals per (effect, symbol), by block bootstrap."""
-    ids = block_ids(problem, fit.model.sample_time_s)
-    moves = bootstrap(fit, ids, replicates, rng) * np.array([f.scale for f in fit.free])[None, :]
-    spread = 1.96 * np.std(moves, axis=0) if len(fit.free) else np.zeros(0)
+    """95 % intervals per (effect, symbol), by leaving out each block of time, within the bounds of the parameters."""
+    spread = intervals(fit, block_ids(problem, fit.model.sample_time_s)) * np.array([f.scale for f in fit.free])
     out = {}
     for f, s in zip(fit.free, spread, strict=True):
         value = getattr(fit.model, f.symbol) if f.effect == BASE else fit.model.effects[f.effect][f.symbol]
         if f.effect != BASE and known()[f.effect].slot is Slot.BACKLASH:
             s = max(float(s), value * _rough_spread(problem, fit, f.effect, f.symbol, replicates, rng))
-        out[f.effect, f.symbol] = (value - float(s), value + float(s))
+        out[f.effect, f.symbol] = (max(value - float(s), min(f.lower, value)), min(value + float(s), max(f.upper, value)))
     return out
 
 
@@ -309,7 +307,7 @@ def _rough_spread(problem: Problem, fit: Fit, name: str, symbol: str, replicates
 
 
 def _describe(ready: Prepared, fit: Fit, found: Found, searcher: Searcher, others: Sequence[Rival],
-              intervals: dict[tuple[str, str], tuple[float, float]],
+              given: dict[tuple[str, str], tuple[float, float]],
               rng: np.random.Generator) -> tuple[list[NamedEffect], list[NamedEffect]]:
     """Describe every effect of the model, the largest first; terms apart."""
     named: list[NamedEffect] = []
@@ -317,7 +315,7 @@ def _describe(ready: Prepared, fit: Fit, found: Found, searcher: Searcher, other
         saved, errors, frequency = _worth(found, searcher, name, rng)
         effect = known()[name]
         finding = next((f for f in ready.findings if f.effect == name), None)
-        spans = dict(intervals)
+        spans = dict(given)
         if finding is not None:
             spans.update({(name, s): (finding.values[s] - 1.96 * e, finding.values[s] + 1.96 * e)
                           for s, e in finding.errors.items()})

@@ -7,7 +7,7 @@ the place of a richer one. The search stops when nothing saves ``GAIN`` of what 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -36,6 +36,8 @@ CLEAR = 0.5
 PAIRED = 1.5
 PAIRS = 3
 PERIODIC_SURE = 3.0  # for effects whose order is searched over tens of values
+#: Fits are kept in memory up to this size: a second search, with terms beside the library, retraces the first.
+KEPT_BYTES = 128_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,13 +76,32 @@ class Searcher:
     names: tuple[str, ...] = ()
     progress: Callable[[str], None] = lambda text: None
     ids: NDArray[np.int64] = field(init=False)
+    _fits: dict[Hashable, Fit] = field(init=False, default_factory=dict)
+    _starts: dict[Hashable, list[Start]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         """Number the blocks."""
         self.ids = np.empty(0, dtype=np.int64)
 
     def fit(self, model: AxisModel, iterations: int = 8) -> Fit:
-        """Refit with the channel effects frozen."""
+        """Refit with the channel effects frozen; what was fitted before is looked up."""
+        key = (values_of(model), iterations)
+        if key not in self._fits:
+            self._fits[key] = fit = self._fit(model, iterations)
+            most = KEPT_BYTES // (8 * len(fit.residual) * (len(fit.free) + 1))
+            while len(self._fits) > max(most, 1):
+                del self._fits[next(iter(self._fits))]
+        return self._fits[key]
+
+    def screen(self, fit: Fit, names: Sequence[str], levels: Mapping[str, float] | None = None) -> list[Start]:
+        """Screen as ``sioms.reconcile.screen.screen`` does; what was screened before is looked up."""
+        key = (values_of(fit.model), tuple(sorted((levels or {}).items())))
+        fresh = [n for n in names if (key, n) not in self._starts]
+        found = screen(self.problem, fit, fresh, levels) if fresh else []
+        self._starts.update({(key, n): [s for s in found if s.effect == n] for n in fresh})
+        return sorted((s for n in names for s in self._starts[key, n]), key=lambda s: -s.gain)
+
+    def _fit(self, model: AxisModel, iterations: int) -> Fit:
         effect = next((known()[n] for n in model.effects if known()[n].slot is Slot.BACKLASH), None)
         if effect is not None and iterations > 4:
             return polish(self.problem, model, self.frozen)
@@ -115,7 +136,7 @@ class Searcher:
         names = [n for n in self.names if n not in fit.model.effects and n not in self.frozen
                  and not any(f in known()[n].replaces for f in self.frozen)]
         fresh = [n for n in names if not replaced(fit.model, n) and not self._enrichment(n)]
-        starts = [s for s in screen(self.problem, fit, fresh) if s.gain > 0.5 * GAIN]
+        starts = [s for s in self.screen(fit, fresh) if s.gain > 0.5 * GAIN]
         starts += self._upgrades(fit, [n for n in names if replaced(fit.model, n)])
         starts.sort(key=lambda s: -s.gain)
         chosen = starts[:TRIES]
@@ -136,7 +157,7 @@ class Searcher:
             old = next(n for n in known()[name].replaces if n in fit.model.effects)
             level = next(iter(fit.model.effects[old].values()))
             levels = {p.symbol: level for p in known()[name].parameters if p.symbol in ("Fc", "Fs", "f")}
-            out += screen(self.problem, fit, [name], levels)
+            out += self.screen(fit, [name], levels)
         return out
 
     def _add(self, fit: Fit, losses: Array) -> tuple[Fit, Array, Step] | None:
@@ -238,6 +259,11 @@ class Searcher:
                     ladder.append(Step("simplify", f"{name} to {other}", fit.ratio, -lost, fit.model))
                     break
         return fit, losses
+
+
+def values_of(model: AxisModel) -> Hashable:
+    """Return all that a search may change of a model, to look it up by."""
+    return (tuple(getattr(model, symbol) for symbol in model.refine), tuple((n, *v.items()) for n, v in model.effects.items()))
 
 
 def plainer(name: str, names: Sequence[str]) -> list[str]:
