@@ -132,7 +132,7 @@ class Attachments:
         if number == 0 or number in handle.waits:
             raise MalformedMessage(f"message number {number} is zero or in use")
         # Nothing is taken after a stop, or refused after its reset, because no tick has come in between.
-        self._runtime.heed_latch()
+        self._runtime.stops.heed()
         try:
             match verb:
                 case HandleVerb.WRITE:
@@ -197,7 +197,7 @@ class Attachments:
         """Give the outputs of a handle their safe values; of a bit only that bit."""
         block = handle.block
         if handle.bit < 0 or not block.spec.safe or block.spec.safe[int(handle.channels[0])] is None:
-            self._runtime.make_safe(block, handle.channels)
+            self._runtime.stops.make_safe(block, handle.channels)
             return
         channel = int(handle.channels[0])
         mask = 1 << handle.bit

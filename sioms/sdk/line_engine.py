@@ -97,7 +97,7 @@ class LineEngine(Connected):
             state.fresh = True
             return
         kind = PageState.FAULT if isinstance(error, DeviceError) else PageState.LINK_LOST
-        self._runtime.set_link(state.unit.blocks, kind, f"{state.unit.name}: {error}")
+        self._runtime.set_link(state.unit.blocks, kind, self._told(state.unit, error))
         state.due_ns = now_ns + state.pause_ns
         state.pause_ns = min(2 * state.pause_ns, LONGEST_PAUSE_NS)
 
@@ -107,14 +107,16 @@ class LineEngine(Connected):
         if error is not None:
             state.misses += 1
             if state.misses >= state.unit.misses:
-                self._lose_unit(state, f"{state.unit.name}: {error}", now_ns)
+                self._lose_unit(state, self._told(state.unit, error), now_ns)
             return
         state.misses = 0
         if state.fresh:
             state.fresh = False
             self._runtime.set_link(state.unit.blocks, PageState.GOOD, "")
             for block in state.unit.blocks:
-                self._runtime.make_safe(block, self._unowned(block))  # who wrote them may have gone meanwhile
+                self._runtime.stops.make_safe(
+                    block, self._unowned(block)
+                )  # who wrote them may have gone meanwhile
         for block in state.unit.blocks:
             self._runtime.publish(block, block.stamp_ns or now_ns)
             if isinstance(block, AxisBlock):
@@ -122,6 +124,21 @@ class LineEngine(Connected):
         self._runtime.after_publication(now_ns)
         if state.due_ns <= now_ns and self.line is not None and not state.busy and self._runtime.running:
             self._start(state, now_ns)  # the line is slower than the rate asked for: poll back to back
+
+    def _told(self, unit: LineUnit, error: Exception) -> str:
+        """Return what failed of which unit, and what to look at unless the driver has said so."""
+        text, line = str(error), self._driver.line
+        text = text if unit.name in text else f"{unit.name}: {text}"
+        if not isinstance(error, LinkError) or "look at" in text:
+            return text
+        if line.serial is None:
+            where = "what answers there" if error.heard else "the device, and who else is connected to it"
+            return f"{text}; look at {where}"
+        if error.heard:
+            return (
+                f"{text}; look at wiring and speed ({line.speed}), and whether two devices have one address"
+            )
+        return f"{text}; look at power, wiring, address and speed ({line.speed})"
 
     def _lose_unit(self, state: _UnitState, reason: str, now_ns: int) -> None:
         state.is_up = False
@@ -233,7 +250,7 @@ class LineEngine(Connected):
 
     def _unowned(self, block: AnyBlock) -> list[int]:
         """Return the channels whose outputs no client holds; a stopped workcell holds none."""
-        holders = [] if self._runtime.stopped else self._runtime.clients.handles.values()
+        holders = [] if self._runtime.stops.stopped else self._runtime.clients.handles.values()
         held = {int(c) for h in holders if h.exclusive and h.block is block for c in h.channels}
         return [c for c in range(block.n) if c not in held]
 

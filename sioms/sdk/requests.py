@@ -71,9 +71,9 @@ def ioctl(
         raise _refuse(errno.EPERM, f"{what}: the user has no right to do that; ask for a [[grant]]")
     match request:
         case Request.EMERGENCY_STOP:
-            return runtime.stop_node(handle.block, handle.channels, f"{handle.who} on {handle.node}")
+            return runtime.stops.stop_node(handle.block, handle.channels, f"{handle.who} on {handle.node}")
         case Request.RESET:
-            return runtime.reset_node(handle.block, handle.channels, what)
+            return runtime.stops.reset_node(handle.block, handle.channels, what)
         case Request.CANCEL_WAITS:
             ours = {int(c) for c in handle.channels}
             return runtime.waits.end_where(

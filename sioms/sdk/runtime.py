@@ -32,7 +32,7 @@ from sioms.protocol.messages import (
 )
 
 from .attachments import Attachments
-from .blocks import AnyBlock, AxisBlock, BinaryBlock, set_alarms
+from .blocks import AnyBlock, AxisBlock, set_alarms
 from .driver import Driver, LineDriver, StreamDriver, TickDriver
 from .engine import Engine
 from .handles import Waits
@@ -43,6 +43,7 @@ from .markers import Markers
 from .pages import Pages
 from .rt import TimerFd, become_realtime, name_process
 from .statistics import TickStatistics
+from .stops import Stops
 from .stream_engine import StreamEngine
 from .tick_engine import TickEngine
 
@@ -89,17 +90,14 @@ class Runtime:
         self.device = device
         self.tick = 0
         self.running = True
-        self.stopped = False
         self.waits = Waits()
         self.outputs: dict[tuple[int, int], float] = {}
-        self.latched_outputs: dict[tuple[int, int], str] = {}
-        """Output channels (block, channel) under an emergency stop of their node, and by whom."""
         self.statistics = TickStatistics()
         self.line_due: Callable[[], None] = lambda: None
         self._control = socket.socket(fileno=fds[0])
         self._control.setblocking(False)
         self.latch = Latch(memoryview(mmap.mmap(fds[1], LATCH_SIZE)))
-        self._request = StopRequest(memoryview(mmap.mmap(fds[2], REQUEST_SIZE)))
+        request = StopRequest(memoryview(mmap.mmap(fds[2], REQUEST_SIZE)))
         table = MarkerTable(memoryview(mmap.mmap(fds[3], TABLE_SIZE)))
         self.markers = Markers(table, lambda number: self.tell(DriverVerb.MARKER_SIGNALLED, number))
         description = driver.describe(device, settings)
@@ -109,7 +107,7 @@ class Runtime:
         self._callbacks: dict[int, Callable[[], None]] = {}
         self._timer = TimerFd()
         self._line_timer = TimerFd()
-        self._stop_sources = [tuple(source) for source in options["stop_sources"]]
+        self.stops = Stops(self, self.latch, request, options["stop_sources"])
         self._phase = float(options["phase"])
         self._daemon_lease_ns = int(float(options["daemon_lease_s"]) * 1e9)
         self._daemon_late = False
@@ -124,7 +122,6 @@ class Runtime:
         self.engine = self._make_engine()
         self.period_ns = int(1e9 / self.engine.tick_hz)
         self._spare_until_ns = 0
-        self._seen_stop = (0, self.latch.resets, self._request.word)
 
     # --- services to the driver (Kit) ------------------------------------------------------------
 
@@ -134,9 +131,7 @@ class Runtime:
 
     def emergency_stop(self, source: str) -> None:
         """Stop the whole workcell."""
-        if self.latch.stop(time.monotonic_ns(), source):
-            self.tell(DriverVerb.STOPPED, source)
-        self._look_at_latch()
+        self.stops.stop_workcell(source)
 
     def publish(self, block: AnyBlock, stamp_ns: int) -> None:
         """Publish a block and wake who subscribed to it."""
@@ -190,26 +185,15 @@ class Runtime:
             if isinstance(block, AxisBlock):
                 block.bank.fault(np.arange(block.n), reason, now_ns)
         self.set_link(blocks, PageState.LINK_LOST, reason)
-        self._take_events()
+        self.take_events()
         ours = {id(block) for block in blocks}
         self.waits.end_where(lambda w: id(w.handle.block) in ours, errno.EIO, reason)
 
     def after_publication(self, now_ns: int) -> None:
         """Look at what a publication may have brought about."""
-        self._take_events()
+        self.take_events()
         self.waits.check(now_ns)
-        for block, channel, bit, active in self._stop_sources:
-            port = self.blocks[block]
-            if (
-                isinstance(port, BinaryBlock)
-                and self.pages.number(port)  # before the first reading there is nothing to judge
-                and (int(port.data[channel]) >> bit & 1) == active
-                and not self.stopped
-            ):
-                name = port.spec.channels[channel].name
-                self.emergency_stop(
-                    f"input {self.device} {port.spec.name} {name} bit {bit} reads {active}".replace("  ", " ")
-                )
+        self.stops.look_at_inputs()
 
     def end_axis_waits(self, block: AnyBlock, axes: Any, errno_: int, text: str) -> None:
         """End the waits for motion of some axes."""
@@ -222,32 +206,6 @@ class Runtime:
             lambda w: w.handle.block is block and w.cancelled is not None and not ours.isdisjoint(int(c) for c in w.handle.channels),
             errno_, text,
         )  # fmt: skip
-
-    def stop_node(self, block: AnyBlock, channels: Any, source: str) -> None:
-        """Emergency stop of some channels: latched until reset."""
-        if isinstance(block, AxisBlock):
-            block.bank.emergency_stop(channels, time.monotonic_ns())
-            self.engine.stop([block])
-            self.end_axis_waits(block, channels, errno.ECANCELED, f"emergency stop by {source}")
-        else:
-            self.latched_outputs.update({(id(block), int(channel)): source for channel in channels})
-            self.make_safe(block, channels)
-
-    def reset_node(self, block: AnyBlock, channels: Any, what: str) -> None:
-        """Clear the latched stop and faults of some channels."""
-        if self.stopped:
-            raise OSError(
-                errno.EPERM, f"{what}: the whole workcell is stopped ({self.latch.source}); reset that"
-            )
-        if isinstance(block, AxisBlock):
-            self._reset_axes(block, channels)
-        else:
-            for channel in channels:
-                self.latched_outputs.pop((id(block), int(channel)), None)
-
-    def _reset_axes(self, block: AxisBlock, channels: Any) -> None:
-        block.bank.reset(np.array(channels, dtype=np.intp))
-        self.engine.commands_written(block)
 
     def statistics_report(self, last: int) -> dict[str, object]:
         """Return what GET_STATISTICS tells: times of the last ticks, link counters, handles."""
@@ -278,7 +236,7 @@ class Runtime:
         self._timer.set(self._scheduled_ns + 2 * self.period_ns, self.period_ns)
         status = 0
         try:
-            self._look_at_latch()
+            self.stops.look()
             self._tick_and_publish(self._scheduled_ns)  # who opens a node at once finds readings
             self._scheduled_ns += self.period_ns
             self._tell_ready()
@@ -305,7 +263,7 @@ class Runtime:
         self.statistics.skipped += expired - 1
         scheduled_ns = self._scheduled_ns
         self.tick += 1
-        self.heed_latch()
+        self.stops.heed()
         if began_ns - self.latch.daemon_alive_ns > self._daemon_lease_ns:
             self._miss_daemon()
         elif self._daemon_late:
@@ -348,7 +306,7 @@ class Runtime:
                     block.bank.emergency_stop(np.arange(block.n), now_ns)
             self.engine.stop(self.blocks)
             for block in self.blocks:
-                self.make_safe(block, range(block.n))
+                self.stops.make_safe(block, range(block.n))
             self.engine.close()
             self._run_line(now_ns + FAIL_GRACE_NS)
         except Exception as second:  # nothing may keep the failure from being reported
@@ -379,7 +337,7 @@ class Runtime:
                 block.bank.stop(np.arange(block.n), self._ending_ns)
                 self.engine.commands_written(block)
         for block in self.blocks:
-            self.make_safe(block, range(block.n))
+            self.stops.make_safe(block, range(block.n))
         self._end_reason = reason
         self._closing = False
 
@@ -410,7 +368,8 @@ class Runtime:
             return StreamEngine(self, self.driver)
         raise TypeError(f"{type(self.driver).__name__} is no TickDriver, LineDriver or StreamDriver")
 
-    def _take_events(self) -> None:
+    def take_events(self) -> None:
+        """End the waits that events of the axes end, and report faults."""
         for block in self.blocks:
             if not isinstance(block, AxisBlock):
                 continue
@@ -420,61 +379,6 @@ class Runtime:
                     if event.kind is EventKind.FAULT:
                         names = ", ".join(block.spec.channels[a].name for a in event.axes[:4])
                         self.log("error", f"fault of {names}: {event.text}")
-
-    # --- stops -----------------------------------------------------------------------------------
-
-    def heed_latch(self) -> None:
-        """Look whether the emergency stop, or its reset, has come since the last look; cheap."""
-        latch = self.latch
-        if (latch.stopped_ns, latch.resets, self._request.word) != self._seen_stop:
-            self._look_at_latch()
-
-    def _look_at_latch(self) -> None:
-        latch, (seen_stop, seen_resets, seen_request) = self.latch, self._seen_stop
-        word = self._request.word
-        fresh = word not in (seen_request, latch.answered_request)
-        if fresh and latch.stop(time.monotonic_ns(), self._request.source):
-            self.tell(DriverVerb.STOPPED, latch.source)
-        stopped_ns, resets = latch.stopped_ns, latch.resets
-        self._seen_stop = (stopped_ns, resets, word)
-        if (stopped_ns and stopped_ns != seen_stop) or resets != seen_resets:
-            self._stop_all()
-        if not stopped_ns and self.stopped:
-            self.stopped = False
-            self.latched_outputs.clear()
-            for block in self.blocks:
-                if isinstance(block, AxisBlock):
-                    self._reset_axes(block, range(block.n))
-
-    def _stop_all(self) -> None:
-        self.stopped = True
-        now_ns = time.monotonic_ns()
-        for block in self.blocks:
-            if isinstance(block, AxisBlock):
-                block.bank.emergency_stop(np.arange(block.n), now_ns)
-        self.engine.stop(self.blocks)
-        for block in self.blocks:
-            self.make_safe(block, range(block.n))
-        self.waits.end_where(  # before the events of the banks would: these know who stopped
-            lambda w: isinstance(w.handle.block, AxisBlock),
-            errno.ECANCELED,
-            f"emergency stop by {self.latch.source}",
-        )
-        self._take_events()
-
-    def make_safe(self, block: AnyBlock, channels: Any) -> None:
-        """Give output channels their safe values; those without one keep the last."""
-        if isinstance(block, AxisBlock) or not block.spec.writable or not block.spec.safe:
-            return
-        safe = [(int(c), value) for c in channels if (value := block.spec.safe[int(c)]) is not None]
-        if not safe:
-            return
-        try:
-            self.engine.write_outputs(None, 0, block, [c for c, _ in safe], [v for _, v in safe])
-        except OSError as error:
-            self.log(
-                "error", f"safe outputs of {self.device}.{block.spec.name} could not be set: {error.strerror}"
-            )
 
     def _miss_daemon(self) -> None:
         if self._daemon_late or self._ending_ns:
@@ -518,17 +422,17 @@ class Runtime:
             case DriverVerb.DETACH:
                 self.clients.detach(*arguments)
             case DriverVerb.STOP_CHANGED:
-                self._look_at_latch()
+                self.stops.look()
             case DriverVerb.SHUTDOWN:
                 self.end("the device was taken out of service")
             case DriverVerb.INPUT:
                 name, channels, bit = arguments
                 self.inputs[name].attach(fds[0], channels, bit)
             case DriverVerb.NODE_STOP:
-                self.stop_node(self.blocks[arguments[0]], arguments[1], arguments[2])
+                self.stops.stop_node(self.blocks[arguments[0]], arguments[1], arguments[2])
             case DriverVerb.NODE_RESET:
                 try:
-                    self.reset_node(self.blocks[arguments[0]], arguments[1], "reset")
+                    self.stops.reset_node(self.blocks[arguments[0]], arguments[1], "reset")
                 except (OSError, CommandError) as error:
                     self.log("warning", str(error))
             case _:

@@ -58,8 +58,8 @@ def write(
     size = record.size
     if not data or len(data) % size:
         raise OSError(errno.EINVAL, f"{what}: {len(data)} bytes; want whole records of {size} bytes")
-    if runtime.stopped:
-        raise OSError(errno.EPERM, f"{what}: stopped by emergency stop ({runtime.latch.source}); reset first")
+    if runtime.stops.stopped:
+        raise OSError(errno.EPERM, f"{what}: stopped by emergency stop ({runtime.stops.source}); reset first")
     check_link(runtime, handle, what)
     if isinstance(block, AxisBlock):
         # One or a few records need no array; behind an earlier write that is not taken yet they wait their turn.
@@ -72,7 +72,7 @@ def write(
     records = np.frombuffer(data, _DTYPE[node_class])
     channels, values = _output_values(runtime, handle, records, what)
     for channel in channels:
-        source = runtime.latched_outputs.get((id(block), channel))
+        source = runtime.stops.latched_outputs.get((id(block), channel))
         if source is not None:
             raise OSError(errno.EPERM, f"{what}: stopped by emergency stop ({source}); reset the node first")
     return runtime.engine.write_outputs(handle, number, block, channels, values)

@@ -1,0 +1,161 @@
+"""Stops in a driver process: the workcell's emergency stop, that of a node, and what outputs do when their writer goes.
+
+Concurrency: the one thread of the driver process.
+"""
+
+from __future__ import annotations
+
+import errno
+import time
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sioms.protocol.latch import Latch, StopRequest
+from sioms.protocol.messages import DriverVerb
+
+from .blocks import AnyBlock, AxisBlock, BinaryBlock
+
+if TYPE_CHECKING:
+    from .runtime import Runtime
+
+
+class Stops:
+    """What is stopped, and by whom.
+
+    Args:
+        runtime: the driver process.
+        latch: the workcell's emergency-stop latch.
+        request: page on which any client asks for an emergency stop.
+        sources: inputs of this device that stop the workcell, each (block, channel, bit, active level).
+
+    Attributes:
+        stopped: whether the workcell is stopped.
+        latched_outputs: output channels (block, channel) under an emergency stop of their node, and by whom.
+    """
+
+    def __init__(
+        self, runtime: Runtime, latch: Latch, request: StopRequest, sources: Iterable[Sequence[int]]
+    ) -> None:
+        self.stopped = False
+        self.latched_outputs: dict[tuple[int, int], str] = {}
+        self._runtime = runtime
+        self._latch = latch
+        self._request = request
+        self._sources = [tuple(source) for source in sources]
+        self._seen = (0, latch.resets, request.word)
+
+    @property
+    def source(self) -> str:
+        """Who has stopped the workcell, and why."""
+        return self._latch.source
+
+    # --- the workcell ----------------------------------------------------------------------------
+
+    def stop_workcell(self, source: str) -> None:
+        """Stop the whole workcell."""
+        if self._latch.stop(time.monotonic_ns(), source):
+            self._runtime.tell(DriverVerb.STOPPED, source)
+        self.look()
+
+    def heed(self) -> None:
+        """Look whether the emergency stop, or its reset, has come since the last look; cheap."""
+        latch = self._latch
+        if (latch.stopped_ns, latch.resets, self._request.word) != self._seen:
+            self.look()
+
+    def look(self) -> None:
+        """Do what the latch and the request page say."""
+        latch, (seen_stop, seen_resets, seen_request) = self._latch, self._seen
+        word = self._request.word
+        fresh = word not in (seen_request, latch.answered_request)
+        if fresh and latch.stop(time.monotonic_ns(), self._request.source):
+            self._runtime.tell(DriverVerb.STOPPED, latch.source)
+        stopped_ns, resets = latch.stopped_ns, latch.resets
+        self._seen = (stopped_ns, resets, word)
+        if (stopped_ns and stopped_ns != seen_stop) or resets != seen_resets:
+            self._stop_all()
+        if not stopped_ns and self.stopped:
+            self.stopped = False
+            self.latched_outputs.clear()
+            for block in self._runtime.blocks:
+                if isinstance(block, AxisBlock):
+                    self._reset_axes(block, range(block.n))
+
+    def look_at_inputs(self) -> None:
+        """Stop the workcell when an input that is to stop it reads so."""
+        runtime = self._runtime
+        for block, channel, bit, active in self._sources:
+            port = runtime.blocks[block]
+            if (
+                isinstance(port, BinaryBlock)
+                and runtime.pages.number(port)  # before the first reading there is nothing to judge
+                and (int(port.data[channel]) >> bit & 1) == active
+                and not self.stopped
+            ):
+                name = f"{runtime.device} {port.spec.name} {port.spec.channels[channel].name}".replace(
+                    "  ", " "
+                )
+                self.stop_workcell(f"input {name} bit {bit} reads {active}")
+
+    def _stop_all(self) -> None:
+        self.stopped = True
+        runtime, now_ns = self._runtime, time.monotonic_ns()
+        for block in runtime.blocks:
+            if isinstance(block, AxisBlock):
+                block.bank.emergency_stop(np.arange(block.n), now_ns)
+        runtime.engine.stop(runtime.blocks)
+        for block in runtime.blocks:
+            self.make_safe(block, range(block.n))
+        runtime.waits.end_where(  # before the events of the banks would: these know who stopped
+            lambda w: isinstance(w.handle.block, AxisBlock),
+            errno.ECANCELED,
+            f"emergency stop by {self.source}",
+        )
+        runtime.take_events()
+
+    # --- nodes -----------------------------------------------------------------------------------
+
+    def stop_node(self, block: AnyBlock, channels: Any, source: str) -> None:
+        """Emergency stop of some channels: latched until reset."""
+        runtime = self._runtime
+        if isinstance(block, AxisBlock):
+            block.bank.emergency_stop(channels, time.monotonic_ns())
+            runtime.engine.stop([block])
+            runtime.end_axis_waits(block, channels, errno.ECANCELED, f"emergency stop by {source}")
+        else:
+            self.latched_outputs.update({(id(block), int(channel)): source for channel in channels})
+            self.make_safe(block, channels)
+
+    def reset_node(self, block: AnyBlock, channels: Any, what: str) -> None:
+        """Clear the latched stop and faults of some channels.
+
+        Raises:
+            OSError: EPERM, the whole workcell is stopped.
+        """
+        if self.stopped:
+            raise OSError(errno.EPERM, f"{what}: the whole workcell is stopped ({self.source}); reset that")
+        if isinstance(block, AxisBlock):
+            self._reset_axes(block, channels)
+        else:
+            for channel in channels:
+                self.latched_outputs.pop((id(block), int(channel)), None)
+
+    def make_safe(self, block: AnyBlock, channels: Any) -> None:
+        """Give output channels their safe values; those without one keep the last."""
+        if isinstance(block, AxisBlock) or not block.spec.writable or not block.spec.safe:
+            return
+        safe = [(int(c), value) for c in channels if (value := block.spec.safe[int(c)]) is not None]
+        if not safe:
+            return
+        runtime = self._runtime
+        try:
+            runtime.engine.write_outputs(None, 0, block, [c for c, _ in safe], [v for _, v in safe])
+        except OSError as error:
+            name = f"{runtime.device}.{block.spec.name}"
+            runtime.log("error", f"safe outputs of {name} could not be set: {error.strerror}")
+
+    def _reset_axes(self, block: AxisBlock, channels: Any) -> None:
+        block.bank.reset(np.array(channels, dtype=np.intp))
+        self._runtime.engine.commands_written(block)
