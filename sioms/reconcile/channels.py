@@ -147,7 +147,7 @@ def drive(session: Session, model: AxisModel) -> list[Finding]:
     n = sum(len(r) - 20 for r in records)
     found = []
     if at_limit:
-        found.append(Finding("saturation", {"limit": limit}, {"limit": noise / np.sqrt(at_limit)},
+        found.append(Finding("saturation", {"limit": limit}, {"limit": noise * np.sqrt(0.5 * np.pi / at_limit)},
                              f"measured force stays at {limit:.4g} {model.force_unit} in {at_limit} samples "
                              "while the command goes on"))
     none = misfit(0.0, 0.0)

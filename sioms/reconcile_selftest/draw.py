@@ -130,7 +130,7 @@ def _effect(name: str, base: dict[str, object], rng: np.random.Generator) -> dic
         "gravity": {"amp": f * float(u(0.08, 0.3)), "phase": phase},
         "offset": {"off": f * float(u(0.04, 0.12)) * float(rng.choice([-1, 1]))},
         "delay": {"delay": float(u(1.5e-3, 5e-3))},
-        "saturation": {"limit": f * float(u(0.45, 0.7))},
+        "saturation": {"limit": f * float(u(0.4, 0.52))},  # the commands ask for 0.55 and more
         "elastic": {"f_res": float(u(14, 28)), "load_fraction": float(u(0.35, 0.6)), "zeta": float(u(0.03, 0.08))},
         "encoder_scale": {"gain": 1.0 + float(u(0.012, 0.03)) * float(rng.choice([-1, 1]))},
         "encoder_quantisation": {"factor": float(rng.choice([16, 32, 64]))},
