@@ -120,8 +120,8 @@ def simulated(
                 os.environ["SIOMS_SOCKET"] = before
 
 
-def wait_links() -> None:
-    """Wait until all devices of the workcell answer.
+def wait_links(meanwhile: Callable[[], None] = lambda: None) -> None:
+    """Wait until all devices of the workcell answer; call `meanwhile` again and again.
 
     Raises:
         RuntimeError: one does not.
@@ -131,6 +131,7 @@ def wait_links() -> None:
         while any(device["link"] != "good" for device in cell.status()["devices"]):
             if time.monotonic() > deadline:
                 raise RuntimeError(f"start prober: a link did not come up: {cell.status()['devices']}")
+            meanwhile()
             time.sleep(0.05)
 
 
@@ -237,9 +238,13 @@ class Prober:
                 if error.errno != errno.EIO or attempt == ATTEMPTS - 1:
                     raise
                 tell(f"{error.strerror}: once more")
-                wait_links()
+                wait_links(self._keep_alive)
                 self._clear()
         raise AssertionError("unreachable")
+
+    def _keep_alive(self) -> None:
+        for node in (self._axis, self._place):
+            node.keepalive()
 
     def ramps(
         self, places: Sequence[float], load: float, seconds: float, tell: Callable[[str], None]
@@ -282,8 +287,7 @@ class Prober:
         if radius_m != self._mounted:
             self._mount(radius_m)
             self._mounted = radius_m
-        for node in (self._axis, self._place):
-            node.keepalive()
+        self._keep_alive()
         self._place.command(position=place, replace=True)
         self._place.wait_until_idle(5.0)
         number = self._force.read().number
@@ -314,8 +318,7 @@ class Prober:
             snaps += [snap for snap in news if snap.stamp_ns >= begin_ns]
             forces += self._force.history(force_last)
             last, force_last = news[-1].number, forces[-1].number
-            self._axis.keepalive()
-            self._place.keepalive()
+            self._keep_alive()
         snaps = snaps[:count]
         stamps = np.array([s.stamp_ns for s in snaps])
         at = np.searchsorted([s.stamp_ns for s in forces], stamps, side="right") - 1
