@@ -74,7 +74,7 @@ def bench_tactile(options: Options, report: Report) -> None:
     count = options.count(300, 5000)
     _frames(report, finger_of(16), count)
     _many_elements(report, finger_of(48), count)
-    _worth(report, options.count(400, 10_000))
+    _worth(report, finger_of(16), options.count(400, 10_000))
 
 
 def _kinds() -> list[tuple[str, bool, float]]:
@@ -154,7 +154,7 @@ def _times(work: Callable[[Floats], object], frames: Floats, count: int) -> list
     return times
 
 
-def _worth(report: Report, count: int) -> None:
+def _worth(report: Report, finger: Finger, count: int) -> None:
     """Fit frames on all cores, in shares, with progress."""
     cores = max(len(os.sched_getaffinity(0)), 1)
     rows: list[Floats] = []
@@ -164,10 +164,11 @@ def _worth(report: Report, count: int) -> None:
             report.progress(f"convergence: {sum(map(len, rows))} of {count} frames on {cores} cores")
     found = np.concatenate(rows)
     angle, error, sure = np.degrees(found[:, 0]), np.abs(found[:, 1]), found[:, 2] == 0.0
-    pitch = 9.22
-    inner = (angle > angle.min() + pitch) & (angle < angle.max() - pitch)
-    report.value(f"worst place of {int(inner.sum())}, a pitch inside the outer elements", float(np.nanmax(error[inner])),
-                 "deg", bars=[Bar("value", 2.0)])  # fmt: skip
+    low, high = np.degrees([min(finger.angles_rad), max(finger.angles_rad)])
+    half_pitch = 0.5 * (high - low) / (len(finger.angles_rad) - 1)
+    inner = (angle > low + half_pitch) & (angle < high - half_pitch)
+    report.value(f"worst place of {int(inner.sum())}, half a pitch inside the outer elements",
+                 float(np.nanmax(error[inner])), "deg", bars=[Bar("value", 2.0)])  # fmt: skip
     report.value(f"worst place of {int(sure.sum())} without a flag, whole arc", float(np.nanmax(error[sure])), "deg",
                  bars=[Bar("value", 2.0)], notes=f"{100 * np.mean(~sure):.1f} % flagged")  # fmt: skip
     report.value(f"worst place of all {len(error)}", float(np.nanmax(error)), "deg")
