@@ -20,12 +20,12 @@ from sioms.protocol.records import AXIS_READ_FIELDS
 from .commands import WIRE_DTYPE
 from .guard import LimitGuard
 from .homing import HomingRuns
+from .inbox import Inbox
 from .law import ControlLaw
-from .plain import MOST, Taken
+from .plain import MOST
 from .queue import AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
 from .sequencer import FORCE, HOLD, STOP, Sequencer
 from .settings import SWITCH_MINUS, SWITCH_PLUS, AxisSettings
-from .store import NEVER_NS
 from .types import CommandError, Event, EventKind, Keeper, MarkerPort
 
 Axes = NDArray[np.int64]
@@ -91,7 +91,7 @@ class AxisBank:
         self._late_ns = int(late_max_s * 1e9)
         self._last_ns = 0
         self._seen = False
-        self._inbox: list[Taken] = []
+        self._inbox = Inbox(self._queue, self._sequencer, self._instant)
         self.keeper: Keeper | None = None
 
     # -- writing ------------------------------------------------------------------------------
@@ -119,18 +119,13 @@ class AxisBank:
     ) -> bool:
         """Take a short write at once; False, and nothing taken, when append() has to judge it.
 
-        It is worked in by the next tick or verb, at its own instant: see _take().
+        It is worked in by the next tick or verb, at its own instant.
 
         Args:
             records: up to MOST, each as a tuple of the fields of table F.3.
             axes, now_ns, replace: as append().
         """
-        waiting = sum([len(write.commands) for write in self._inbox]) if self._inbox else 0
-        plain = self._queue.admit_plain(records, axes, waiting, replace=replace) if self._seen else None
-        if plain is None:
-            return False
-        self._take(Taken(plain, frozenset([command.axis for command in plain]), replace, now_ns))
-        return True
+        return self._seen and self._inbox.offer(records, axes, now_ns, replace=replace)
 
     def judge(
         self, records: NDArray[Any], axes: AxesLike, now_ns: int, *, replace: bool = False
@@ -160,57 +155,19 @@ class AxisBank:
         return True
 
     def _rest_positions(self, now_ns: int) -> NDArray[np.float64]:
-        self._work_in()
+        self._inbox.work_in()
         self._sequencer.advance(self._instant(now_ns))
         return self._sequencer.rest_positions()
 
-    def _take(self, write: Taken) -> None:
-        """Keep a plain write for the next tick or verb, which carries it out at its own instant.
-
-        The writer has its acknowledgement sooner, and set-points that are replaced before any tick
-        has seen them are never planned.
-        """
-        if write.replace:
-            self._inbox = [older for older in self._inbox if not older.axes <= write.axes]
-        self._inbox.append(write)
-        if len(self._inbox) > MOST:
-            self._work_in()
-
-    def _work_in(self, latest_ns: int = NEVER_NS) -> None:
-        """Carry out the plain writes since the last tick, each at its own instant, or at latest_ns."""
-        if not self._inbox:
-            return
-        writes, self._inbox = self._inbox, []
-        for write in writes:
-            at_ns = self._instant(min(write.now_ns, latest_ns))
-            self._sequencer.advance(at_ns)
-            # Working in an earlier one may have ended in a fault.
-            commands = [c for c in write.commands if not self._queue.is_barred(c.axis)]
-            if not commands:
-                continue
-            if write.replace:
-                self._sequencer.drop(np.unique([c.axis for c in commands]).astype(np.int64))
-                self._sequencer.replaced(self._queue.append_plain(commands), at_ns)
-            else:
-                self._sequencer.appended(self._queue.append_plain(commands), at_ns)
-
-    def _forget(self, axes: Axes) -> None:
-        """Drop the plain writes of these axes that are not worked in yet."""
-        if not self._inbox:
-            return
-        dropped = frozenset(axes.tolist())
-        left = [(write, [c for c in write.commands if c.axis not in dropped]) for write in self._inbox]
-        self._inbox = [write._replace(commands=cs, axes=write.axes - dropped) for write, cs in left if cs]
-
     def room(self, axes: AxesLike) -> int:
         """Return how many further commands fit into the fullest buffer of these axes."""
-        self._work_in()
+        self._inbox.work_in()
         return int(self._queue.room_of_all()[np.asarray(axes)].min())
 
     def flush(self, axes: AxesLike) -> None:
         """Empty the buffers; the running command goes on to its end."""
         chosen = np.asarray(axes, dtype=np.int64)
-        self._forget(chosen)
+        self._inbox.forget(chosen)
         waited = chosen[~self._sequencer.is_idle(chosen)]
         self._sequencer.drop(chosen)
         self._queue.emit(EventKind.IDLE, waited[self._sequencer.is_idle(waited)], self._last_ns)
@@ -226,7 +183,7 @@ class AxisBank:
         Returns:
             the axes released.
         """
-        self._work_in()
+        self._inbox.work_in()
         self._sequencer.advance(self._instant(now_ns))
         chosen = np.asarray(axes, dtype=np.int64)
         chosen = chosen[self._queue.gated_synch[chosen] & self._sequencer.is_open_ended(chosen)]
@@ -252,7 +209,7 @@ class AxisBank:
     def stop(self, axes: AxesLike, now_ns: int) -> None:
         """Empty the buffers and stop at maximum deceleration; force mode goes over to holding."""
         chosen = np.asarray(axes, dtype=np.int64)
-        self._forget(chosen)
+        self._inbox.forget(chosen)
         now_ns = self._instant(now_ns)
         self._sequencer.advance(now_ns)
         self._homing.cancel(chosen)
@@ -307,7 +264,7 @@ class AxisBank:
 
     def _abandon(self, axes: Axes, now_ns: int, errno_: int, text: str) -> None:
         """Stop axes for a reason that is not their writer's, and tell those who wait for them."""
-        self._forget(axes)
+        self._inbox.forget(axes)
         self._queue.emit(EventKind.DROPPED, axes[~self._sequencer.is_idle(axes)], now_ns, errno_, text)
         self._homing.cancel(axes)
         self._sequencer.halt(axes, self._instant(now_ns))
@@ -335,7 +292,7 @@ class AxisBank:
             CommandError: EBUSY while an axis moves, ERANGE outside its soft limits, EINVAL when not finite.
         """
         chosen, wanted = np.asarray(axes, dtype=np.int64), np.asarray(positions, dtype=np.float64)
-        self._work_in()
+        self._inbox.work_in()
         self._queue.check_calibration(chosen, wanted, self._sequencer.is_idle(chosen))
         for axis, position in zip(chosen.tolist(), wanted.tolist(), strict=True):
             self.shift(axis, position - float(self._position[axis]))
@@ -366,7 +323,7 @@ class AxisBank:
             CommandError: EINVAL without homing, EBUSY while moving, EPERM or EIO when latched.
         """
         chosen = np.asarray(axes, dtype=np.int64)
-        self._work_in()
+        self._inbox.work_in()
         now_ns = self._instant(now_ns)
         self._sequencer.advance(now_ns)
         self._homing.begin(chosen, self._sequencer.is_idle(chosen), now_ns)
@@ -425,7 +382,7 @@ class AxisBank:
         if now_ns - last_ns > self._late_ns:
             self._stop_late(last_ns, now_ns)
         self._measure(position, dt, now_ns)
-        self._work_in(now_ns)
+        self._inbox.work_in(now_ns)
         if self._queue.waits_for_markers:
             self._poll_markers(now_ns)
         sequencer = self._sequencer
@@ -572,7 +529,7 @@ class AxisBank:
 
     def is_idle(self, axes: AxesLike) -> bool:
         """Tell whether these axes hold still, have no commands and are not homing."""
-        self._work_in()
+        self._inbox.work_in()
         return bool(self._sequencer.is_idle(np.asarray(axes, dtype=np.int64)).all())
 
     def particulars(self, axes: AxesLike) -> dict[str, list[float]]:
@@ -587,5 +544,5 @@ class AxisBank:
 
     def take_events(self) -> list[Event]:
         """Return what happened since the last call, oldest first."""
-        self._work_in()
+        self._inbox.work_in()
         return self._queue.take_events()

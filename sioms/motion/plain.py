@@ -9,7 +9,7 @@ the general way, which is also the only one that refuses: every message has one 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,22 +28,6 @@ _COLUMN = {name: i for i, name in enumerate(WIRE_DTYPE.names or ())}
 
 Check = tuple[int, NDArray[np.float64] | None, bool]
 """Column of a value, the array (n,) of its bound or None, and whether it must be above zero."""
-
-
-class Taken(NamedTuple):
-    """A plain write that has been acknowledged and waits to be worked in.
-
-    Args:
-        commands: in order.
-        axes: the bank axes they are for.
-        replace: whether they replace what the axes do.
-        now_ns: instant of the write.
-    """
-
-    commands: list[Command]
-    axes: frozenset[int]
-    replace: bool
-    now_ns: int
 
 
 class PlainCheck:
