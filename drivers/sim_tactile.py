@@ -10,14 +10,20 @@ The driver knows the contact force and, where told, the contact angle from nodes
     angle_rad = 1.29
     indenter_radius_m = 0.006
 
-With a table ``shape``, see ``tactile_nodes``, it shows strains and shape as a real finger does.
+With a table ``shape``, see ``tactile_nodes``, it shows strains and shape as a real finger does. With a ``model_file`` (as ``sioms
+reconcile tactile`` writes it) it is the twin of the finger that the model was found for: elements, body and all effects come
+from the file, the length of contact from ``finger``. A check sum of the model shows in the channels' description, so that a reload takes up
+a changed file.
 """
 
 from __future__ import annotations
 
 import math
+import tomllib
+import zlib
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -28,6 +34,10 @@ from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
 from sioms.sdk.driver import Kit, TickDriver
 from sioms.sdk.tables import from_table, table_type
+
+if TYPE_CHECKING:
+    from sioms.reconcile.finger.twin import FingerTwin
+    from sioms.reconcile.sensors.effect import SensorModel
 
 FingerTable: Any = table_type(FingerShape)
 
@@ -42,6 +52,7 @@ class SimTactileSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True
         angle_per_position: [rad/m or rad/rad].
         indenter_radius_m: radius of the object, infinite for a flat, 0 for an edge.
         finger: geometry, material and faults.
+        model_file: finger and effects from a model instead; only the length of contact is still ``finger``'s.
         gain, offset: of the elements [1, %]; one number for each.
         noise, resolution: of all [%].
         seed: of the noise.
@@ -56,6 +67,7 @@ class SimTactileSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     angle_per_position: float = 0.0
     indenter_radius_m: float = 6e-3
     finger: FingerTable = FingerTable()
+    model_file: str = ""
     gain: list[float] = []
     offset: list[float] = []
     noise: float = 0.02
@@ -78,9 +90,10 @@ class SimTactile(TickDriver):
     def describe(cls, name: str, settings: SimTactileSettings) -> Description:
         """Tell the elements and the nodes that are felt."""
         elements = _check(settings)
-        channels = tuple(
-            ChannelInfo(f"e{index}", "%", description="radial compression") for index in range(elements)
-        )
+        what = "radial compression"
+        if settings.model_file:
+            what += f", model {zlib.crc32(Path(settings.model_file).read_bytes()):08x}"
+        channels = tuple(ChannelInfo(f"e{index}", "%", description=what) for index in range(elements))
         felt = (settings.force_node, settings.angle_node, *tactile_nodes.inputs(settings.shape))
         return Description(
             (
@@ -96,7 +109,7 @@ class SimTactile(TickDriver):
         first, *more = self.describe(name, settings).blocks
         self._block = AnalogBlock(first)
         self._finger = tactile_nodes.TactileNodes(settings.shape, more, kit) if settings.shape else None
-        self._array = _array(settings)
+        self._array = _twin(settings) if settings.model_file else _array(settings)
         self._array.mount(settings.indenter_radius_m)
 
     @property
@@ -134,9 +147,10 @@ def _check(settings: SimTactileSettings) -> int:
     """Return the number of elements.
 
     Raises:
-        ValueError: numbers of another length than the elements, or a radius that is no radius.
+        ValueError: numbers of another length than the elements, a radius that is no radius, or a model that cannot be read.
     """
-    elements = len(from_table(FingerShape, settings.finger).angles_rad)
+    shape = from_table(FingerShape, settings.finger)
+    elements = _model(settings.model_file).count if settings.model_file else len(shape.angles_rad)
     for key, values in (("gain", settings.gain), ("offset", settings.offset)):
         if len(values) not in (0, elements):
             raise ValueError(f"{key}: {len(values)} numbers; want {elements}, one for each element")
@@ -146,6 +160,25 @@ def _check(settings: SimTactileSettings) -> int:
             "want a positive radius or 0 for an edge, a finite angle"
         )
     return elements
+
+
+def _model(path: str) -> SensorModel:
+    from sioms.reconcile.finger.model_file import from_table as model_from  # heavy, and for twins only
+
+    try:
+        return model_from(tomllib.loads(Path(path).read_text(encoding="utf-8")), path)[0]
+    except OSError as error:
+        raise ValueError(f"model_file {path}: {error.strerror}; sioms reconcile tactile writes one") from None
+    except ValueError as error:
+        raise ValueError(f"model_file {path}: {error}") from None
+
+
+def _twin(settings: SimTactileSettings) -> FingerTwin:
+    from sioms.reconcile.finger.twin import FingerTwin
+
+    length_m = from_table(FingerShape, settings.finger).length_m
+    noise = (settings.noise, settings.resolution, settings.seed)
+    return FingerTwin(_model(settings.model_file), length_m, *noise)
 
 
 def _array(settings: SimTactileSettings) -> TactileArray:

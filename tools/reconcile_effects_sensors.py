@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from sioms.reconcile.finger.effects import library as of_fingers
-from sioms.reconcile.force.effects import TERM_PREFIX
 from sioms.reconcile.force.effects import library as of_force_sensors
-from sioms.reconcile.sensors.effect import SensorEffect
+from sioms.reconcile.sensors.effect import TERM_PREFIX, SensorEffect
 
 HEAD = """# The libraries of sensor effects
 

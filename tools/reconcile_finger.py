@@ -29,6 +29,7 @@ from sioms.tactile.touches import Recording
 from sioms.tools.tactile_data import read_nominal
 
 if TYPE_CHECKING:
+    from sioms.reconcile.finger.plan import Bench
     from sioms.reconcile.finger.subject import Experiment
     from sioms.reconcile.sensors.verdict import SensorVerdict
 
@@ -48,9 +49,16 @@ ARRAYS: dict[str, tuple[str, dict[str, float]]] = {
 
 
 def reconcile_tactile(
-    data: Path, model: Path | None, seed: int = 1, progress: Callable[[str], None] = lambda text: None
+    data: Path,
+    model: Path | None,
+    seed: int = 1,
+    progress: Callable[[str], None] = lambda text: None,
+    bench: Bench | None = None,
 ) -> tuple[SensorVerdict, float]:
     """Read, analyse and time one finger.
+
+    Args:
+        bench: what touches can be made to decide between look-alikes.
 
     Raises:
         BadInputError: data or model cannot be used.
@@ -60,7 +68,7 @@ def reconcile_tactile(
 
     start = time.monotonic()
     nominal, name, stated = read_model(model or data, data)
-    subject = prepare(read_experiments(data), nominal, name, refine_extent=not stated)
+    subject = prepare(read_experiments(data), nominal, name, refine_extent=not stated, bench=bench)
     return analyse(subject, Options(seed=seed, progress=progress)), time.monotonic() - start
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.verdict import SensorVerdict
-from sioms.reconcile.verdict import NamedEffect, Outcome
+from sioms.reconcile.verdict import Estimate, NamedEffect, Outcome
 from sioms.tools.reconcile_report import HEAD, STYLE, _image, number
 
 if TYPE_CHECKING:
@@ -139,11 +139,13 @@ def page(v: SensorVerdict, seconds: float) -> str:
         f"<h1>{name}: simulation against measurement</h1>",
         f"<p class='verdict {v.outcome.value}'><b>{v.outcome.value}</b> - {headline(v)}</p>",
         _what(v),
+        pictures.get("each", ""),
         "<h2>How far the gap shrank</h2><p>Root mean square on touches or loads that took no part in any choice (every fifth). The "
         "numbers of the model are frozen; zero, true load of a touch and level of a ramp are the session's own and are free in "
         "all columns.</p>",
         _gaps(v),
         pictures.get("gap", ""),
+        pictures.get("curves", ""),
         "<h2>Where it disagreed</h2>",
         _where(v),
         pictures.get("places", ""),
@@ -166,27 +168,48 @@ def page(v: SensorVerdict, seconds: float) -> str:
 def _what(v: SensorVerdict) -> str:
     if not v.effects and not v.symbolic:
         return ""
-    rows = []
+    rows, lists = [], []
     for e in (*v.effects, *v.symbolic):
         label = html.escape(e.title) if e in v.effects else "nameless term"
-        for i, p in enumerate(e.parameters):
-            first = (
-                (
-                    f"<td rowspan={len(e.parameters)}><b>{label}</b><td rowspan={len(e.parameters)}><code>"
-                    f"{html.escape(e.equation)}</code>"
-                )
-                if i == 0
-                else ""
-            )
-            rows.append(
-                f"<tr>{first}<td>{p.symbol}<td class=n>{number(p.value)}<td class=n>{number(p.low)} to {number(p.high)}"
-                f"<td>{html.escape(p.unit)}<td>{html.escape(p.text)}"
-            )
-    return (
-        "<h2>What was missing</h2><table><tr><th>effect<th>equation<th>parameter<th>value<th>95 % interval<th>unit<th>"
-        + "".join(rows)
-        + "</table>"
+        groups = _groups(e)
+        for i, mine in enumerate(groups.values()):
+            span = f"<td rowspan={len(groups)}>"
+            first = f"{span}<b>{label}</b>{span}<code>{html.escape(e.equation)}</code>" if i == 0 else ""
+            rows.append(f"<tr>{first}{_row(mine)}")
+        lists += [p for mine in groups.values() if len(mine) > 1 for p in mine]
+    head = "<table><tr><th>effect<th>equation<th>parameter<th>value<th>95 % interval<th>unit<th>"
+    every = "".join(
+        f"<tr><td>{p.symbol}<td class=n>{number(p.value)}<td class=n>{number(p.low)} to {number(p.high)}<td>{html.escape(p.unit)}"
+        for p in lists
     )
+    more = (
+        f"<details><summary>every one of the numbers</summary><table><tr><th>parameter<th>value<th>95 % interval<th>unit"
+        f"{every}</table></details>"
+        if lists
+        else ""
+    )
+    return f"<h2>What was missing</h2>{head}{''.join(rows)}</table>{more}"
+
+
+def _groups(e: NamedEffect) -> dict[str, list[Estimate]]:
+    """Return the estimates by quantity; one that every element has of its own comes with all its numbers."""
+    out: dict[str, list[Estimate]] = {}
+    for p in e.parameters:
+        out.setdefault(p.symbol.split("[")[0], []).append(p)
+    return out
+
+
+def _row(mine: list[Estimate]) -> str:
+    """Lay one quantity out: its value, or from where to where the values of the elements go."""
+    p = mine[0]
+    if len(mine) == 1:
+        value, interval, symbol = number(p.value), f"{number(p.low)} to {number(p.high)}", p.symbol
+    else:
+        values = [q.value for q in mine]
+        value = f"{number(min(values))} to {number(max(values))}"
+        interval = f"each within {number(float(np.median([0.5 * (q.high - q.low) for q in mine])))}"
+        symbol = f"{len(mine)} of {p.symbol.split('[')[0]}"
+    return f"<td>{symbol}<td class=n>{value}<td class=n>{interval}<td>{html.escape(p.unit)}<td>{html.escape(p.text)}"
 
 
 def _gaps(v: SensorVerdict) -> str:
@@ -199,7 +222,7 @@ def _gaps(v: SensorVerdict) -> str:
 
 
 def _closed(before: float, floor: float, closed: float) -> str:
-    return f"{100 * closed:.1f} %" if before > 1.15 * floor else "no gap"
+    return f"{100 * min(closed, 1.0):.1f} %" if before > 1.15 * floor else "no gap"
 
 
 def _where(v: SensorVerdict) -> str:
@@ -207,10 +230,12 @@ def _where(v: SensorVerdict) -> str:
     if not shown:
         return "<p>No variable orders the residual of the old model (permutation p &gt; 0.05).</p>"
     text = "; ".join(
-        f"<b>{html.escape(p.variable)}</b> orders {100 * p.explained:.0f} % of it (p = {p.p:.2f})"
-        for p in shown
+        f"<b>{html.escape(p.variable)}</b> {100 * p.explained:.0f} % (p = {p.p:.2f})" for p in shown
     )
-    return f"<p>Residual of the old model: {text}.</p>"
+    return (
+        "<p>What the residual of the old model goes with, as the share of its squares that lies in its means over the values "
+        f"of one variable (bars: spread about them; p: how often chance does as well): {text}.</p>"
+    )
 
 
 def _why(e: NamedEffect, model: SensorModel) -> str:
@@ -270,28 +295,81 @@ def _pictures(v: SensorVerdict) -> dict[str, str]:
         from matplotlib.figure import Figure
     except ImportError:
         return {"gap": "<p class=small>Pictures need matplotlib (the extra <code>report</code>).</p>"}
-    out = {}
+    out = {
+        "gap": _image(_gap_picture(Figure(figsize=(11, 0.6 + 0.35 * len(v.gaps)), layout="constrained"), v))
+    }
+    each = [
+        (e.title, mine)
+        for e in v.effects
+        for mine in _groups(e).values()
+        if len(mine) > 1 and e.name != "dead_element"
+    ]
+    if each:
+        out["each"] = _image(_each_picture(Figure(figsize=(11, 2.6), layout="constrained"), each[:3]))
     if v.curves:
-        out["gap"] = _image(_curve_picture(Figure(figsize=(11, 3.4), layout="constrained"), v))
+        out["curves"] = _image(_curve_picture(Figure(figsize=(11, 3.6), layout="constrained"), v))
     if v.places:
         out["places"] = _image(_place_picture(Figure(figsize=(11, 3.2), layout="constrained"), v))
     return out
 
 
+def _gap_picture(figure: Figure, v: SensorVerdict) -> Figure:
+    """Draw every channel's gap before and after in units of its noise floor."""
+    ax = figure.subplots()
+    for i, g in enumerate(reversed(v.gaps)):
+        ax.plot(
+            [g.before / g.floor, g.after / g.floor],
+            [i, i],
+            color="#cfd8e0",
+            lw=6,
+            solid_capstyle="butt",
+            zorder=1,
+        )
+        ax.plot(g.before / g.floor, i, "o", color="#c50", label="before" if i == 0 else None)
+        ax.plot(g.after / g.floor, i, "o", color="#08a", label="after" if i == 0 else None)
+    ax.axvline(1.0, color="#1c2733", lw=1, ls="--", label="noise floor")
+    ax.set_xscale("log")
+    ax.set_xlim(0.5, 2.0 * max(2.0, *(g.before / g.floor for g in v.gaps)))
+    ax.set_yticks(range(len(v.gaps)), [g.channel for g in reversed(v.gaps)], fontsize=8)
+    ax.set_ylim(-0.6, len(v.gaps) - 0.4)
+    ax.set_xlabel("simulated - measured over the noise floor, on what took no part", fontsize=8)
+    figure.legend(loc="outside right upper", fontsize=8)
+    return figure
+
+
+def _each_picture(figure: Figure, each: list[tuple[str, list[Estimate]]]) -> Figure:
+    """Draw the numbers that every element (or component) has of its own, with their intervals."""
+    for ax, (title, mine) in zip(figure.subplots(1, len(each), squeeze=False)[0], each, strict=True):
+        at = np.arange(len(mine))
+        value = np.array([p.value for p in mine])
+        ax.bar(at, value, color="#9cc9d8")
+        ax.errorbar(at, value, [0.5 * (p.high - p.low) for p in mine], fmt="none", ecolor="#1c2733", lw=1)
+        ax.axhline(0.0, color="#888", lw=0.6)
+        ax.set_title(title, fontsize=9, loc="left")
+        ax.set_xlabel("element or component", fontsize=8)
+        unit = f", {mine[0].unit}" if mine[0].unit != "1" else ""
+        ax.set_ylabel(mine[0].symbol.split("[")[0] + unit, fontsize=8)
+    return figure
+
+
 def _curve_picture(figure: Figure, v: SensorVerdict) -> Figure:
     top, bottom = figure.subplots(2, len(v.curves), squeeze=False, sharex="col", height_ratios=(2, 1))
     for upper, lower, c in zip(top, bottom, v.curves, strict=True):
-        upper.plot(c.at, c.measured, ".", color="#1c2733", ms=4, label="measured")
         upper.plot(c.at, c.before, color="#c50", lw=1, label="simulated, before")
-        upper.plot(c.at, c.after, color="#08a", lw=1, label="after")
+        upper.plot(c.at, c.after, color="#08a", lw=1, label="simulated, after")
+        used = ~c.apart
+        upper.plot(c.at[used], c.measured[used], ".", color="#9aa6b1", ms=3, label="measured, used")
+        upper.plot(
+            c.at[c.apart], c.measured[c.apart], ".", color="#1c2733", ms=5, label="measured, took no part"
+        )
         upper.set_title(c.title, fontsize=9, loc="left")
         lower.plot(c.at, c.before - c.measured, color="#c50", lw=0.8)
         lower.plot(c.at, c.after - c.measured, color="#08a", lw=0.8)
         lower.axhline(0.0, color="#888", lw=0.6)
         lower.set_xlabel(c.axis)
         upper.set_ylabel(c.unit)
-        lower.set_ylabel("sim. - meas.")
-    top[0].legend(fontsize=8)
+    bottom[0].set_ylabel("sim. - meas.")
+    figure.legend(*top[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize=8)
     return figure
 
 
@@ -303,8 +381,9 @@ def _place_picture(figure: Figure, v: SensorVerdict) -> Figure:
             p.centres[order], p.means[order], p.spread[order], fmt=".-", color="#c50", ecolor="#e9c5ae", lw=1
         )
         ax.axhline(0.0, color="#888", lw=0.6)
-        name, view = p.variable.split(" (")
-        ax.set_xlabel(f"{name}, {p.unit}\n({view}", fontsize=8)
-        ax.set_title(f"orders {100 * p.explained:.0f} %, p = {p.p:.2f}", fontsize=9)
-    figure.axes[0].set_ylabel("measured - simulated, in the view's unit")
+        name, view = p.variable.removesuffix(")").split(" (")
+        ax.set_xlabel(f"{name}, {p.unit}".removesuffix(", 1"), fontsize=8)
+        ax.set_title(f"{view}: {100 * p.explained:.0f} %, p = {p.p:.2f}", fontsize=8)
+        unit = next((g.unit for g in v.gaps if g.channel == view), "")
+        ax.set_ylabel(f"measured - simulated, {unit}", fontsize=8)
     return figure

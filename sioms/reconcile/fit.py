@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from sioms.reconcile.descent import descend
 from sioms.reconcile.effect import Array, Parameter, Slot
 from sioms.reconcile.effects import known
 from sioms.reconcile.model import AxisModel
@@ -204,33 +205,11 @@ def refit(problem: Problem, model: AxisModel, frozen: Sequence[str] = (), iterat
         The fit at the best point found.
     """
     free = free_parameters(model, frozen)
-    at = get(model, free)
-    r = problem.residual(model)
     if not free:
+        r = problem.residual(model)
         return Fit(model, free, r, np.empty((len(r), 0)))
     scale = np.array([f.scale for f in free])
     lower, upper = np.array([f.lower for f in free]), np.array([f.upper for f in free])
-    damping, cost = 1e-3, float(r @ r)
-    j = jacobian(problem, model, free, at, r)
-    for _ in range(iterations):
-        h, g = j.T @ j, j.T @ r
-        gained = False
-        for _ in range(5):
-            step = np.linalg.lstsq(h + damping * np.diag(np.diag(h) + 1e-12 * np.trace(h) + 1e-30), -g,
-                                   rcond=1e-12)[0]
-            trial = np.clip(at + np.clip(step, -3.0, 3.0) * scale, lower, upper)
-            rt = problem.residual(put(model, free, trial))
-            ct = float(rt @ rt)
-            if ct < cost:
-                gained = True
-                break
-            damping = max(damping, 1e-4) * 8.0
-        if not gained:
-            break
-        done = cost - ct < tolerance * cost
-        at, r, cost = trial, rt, ct
-        damping = max(damping * 0.2, 1e-7)
-        j = jacobian(problem, model, free, at, r)
-        if done:
-            break
+    at, r, j = descend(lambda x: problem.residual(put(model, free, x)), lambda x, r: jacobian(problem, model, free, x, r),
+                       get(model, free), scale, lower, upper, iterations, tolerance)
     return Fit(put(model, free, at), free, r, j)

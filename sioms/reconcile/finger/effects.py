@@ -6,6 +6,7 @@ A user's package lists a ``SensorEffect`` (or a tuple of them) under the entry-p
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,59 +14,43 @@ import numpy as np
 from sioms.reconcile.effect import Channel
 from sioms.reconcile.finger.belief import Belief, Scene
 from sioms.reconcile.finger.pressures import Floats
-from sioms.reconcile.sensors.effect import Quantity, SensorEffect, Values
+from sioms.reconcile.sensors.effect import Quantity, SensorEffect, Values, responding
 from sioms.reconcile.sensors.library import collect
 
 GROUP = "sioms.effects.tactile"
 DEG = np.pi / 180.0
 
 
+def _added(field: str, symbol: str) -> Callable[[Belief, Values], Belief]:
+    """Return the change that adds a parameter to a number of the belief, or to that of every element."""
+
+    def change(b: Belief, v: Values) -> Belief:
+        old = getattr(b, field)
+        new = old + v[symbol] if isinstance(old, np.ndarray) else old + float(v[symbol][0])
+        changed: Belief = replace(b, **{field: new})  # type: ignore[arg-type]
+        return changed
+
+    return change
+
+
 def _gain(b: Belief, v: Values) -> Belief:
     return replace(b, gain=b.gain * (1.0 + v["g"]))
-
-
-def _angle(b: Belief, v: Values) -> Belief:
-    return replace(b, angle=b.angle + v["dt"])
 
 
 def _depth(b: Belief, v: Values) -> Belief:
     return replace(b, radius=np.clip(b.radius + v["dr"], b.core + 1e-5, b.outer - 1e-5))
 
 
-def _offset(b: Belief, v: Values) -> Belief:
-    return replace(b, offset=b.offset + float(v["off"][0]))
-
-
 def _poisson(b: Belief, v: Values) -> Belief:
     return replace(b, poisson=float(np.clip(b.poisson + v["dnu"][0], 0.0, 0.5)))
-
-
-def _quadratic(b: Belief, v: Values) -> Belief:
-    return replace(b, quadratic=b.quadratic + v["q"])
-
-
-def _temperature(b: Belief, v: Values) -> Belief:
-    return replace(b, temperature=b.temperature + v["k"])
 
 
 def _creep(b: Belief, v: Values) -> Belief:
     return replace(b, creep=float(v["c"][0]), creep_time=float(v["tau"][0]))
 
 
-def _adhesion(b: Belief, v: Values) -> Belief:
-    return replace(b, adhesion=b.adhesion + float(v["share"][0]))
-
-
-def _hertz(b: Belief, v: Values) -> Belief:
-    return replace(b, hertz=b.hertz + float(v["share"][0]))
-
-
 def _sliding(b: Belief, v: Values) -> Belief:
     return replace(b, friction=b.friction + float(v["f"][0]), apex=float(v["apex"][0]))
-
-
-def _cell(b: Belief, v: Values) -> Belief:
-    return replace(b, cell=b.cell + float(v["g"][0]))
 
 
 def pulled(output: Floats, scene: Scene, p: Floats) -> Floats:
@@ -74,10 +59,6 @@ def pulled(output: Floats, scene: Scene, p: Floats) -> Floats:
         return output
     out: Floats = output + p[0] * np.exp(-np.abs(scene.distance) / p[1])
     return out
-
-
-def _proximity(b: Belief, v: Values) -> Belief:
-    return b.responding(pulled, np.concatenate([v["A"], v["range"]]))
 
 
 def waved(output: Floats, scene: Scene, p: Floats) -> Floats:
@@ -98,10 +79,6 @@ def leaked(output: Floats, scene: Scene, p: Floats) -> Floats:
     out[:, 1:] += p[0] * output[:, :-1]
     out[:, :-1] += p[0] * output[:, 1:]
     return out
-
-
-def _crosstalk(b: Belief, v: Values) -> Belief:
-    return b.responding(leaked, v["x"])
 
 
 def _nothing(b: Belief, v: Values) -> Belief:
@@ -127,7 +104,7 @@ ANGLE = SensorEffect(
     name="angle_scatter",
     title="elements away from their stated places",
     channel=SENSOR,
-    change=_angle,
+    change=_added("angle", "dt"),
     equation="t_i = stated t_i + dt_i",
     parameters=(Quantity("dt", "rad", -0.14, 0.14, 0.01, "departure of each element's angle", each=True),),
     signature="residual like the slope of the profile, of its own size and sign for each element",
@@ -150,7 +127,7 @@ OFFSET = SensorEffect(
     name="angle_offset",
     title="finger and fixture turned against each other",
     channel=ACTUATOR,
-    change=_offset,
+    change=_added("offset", "off"),
     equation="place of touch = commanded place + off",
     parameters=(Quantity("off", "rad", -0.2, 0.2, 0.01, "how much further round every touch is"),),
     signature="residual like the slope of the profile, alike for all elements",
@@ -173,7 +150,7 @@ QUADRATIC = SensorEffect(
     name="quadratic",
     title="quadratic response of the electronics",
     channel=SENSOR,
-    change=_quadratic,
+    change=_added("quadratic", "q"),
     equation="d = l + q l^2, l the linear output",
     parameters=(
         Quantity(
@@ -189,7 +166,7 @@ TEMPERATURE = SensorEffect(
     name="temperature_drift",
     title="drift with temperature, alike for all elements",
     channel=SENSOR,
-    change=_temperature,
+    change=_added("temperature", "k"),
     equation="d = d + k (T - T0)",
     parameters=(Quantity("k", "1/K", -0.5, 0.5, 2e-3, "drift of the output"),),
     signature="untouched outputs move together with the temperature",
@@ -201,7 +178,7 @@ TEMPERATURE_EACH = SensorEffect(
     name="temperature_scatter",
     title="drift with temperature, element by element",
     channel=SENSOR,
-    change=_temperature,
+    change=_added("temperature", "k"),
     equation="d_i = d_i + k_i (T - T0)",
     parameters=(Quantity("k", "1/K", -0.5, 0.5, 2e-3, "drift of each element's output", each=True),),
     signature="untouched outputs move with the temperature, each in its own proportion",
@@ -228,7 +205,7 @@ PROXIMITY = SensorEffect(
     name="proximity",
     title="pull of a conducting indenter on the elements' fields",
     channel=SENSOR,
-    change=_proximity,
+    change=responding(pulled, "A", "range"),
     equation="d_i = d_i + A exp(-|t_i - t_c| / range), A < 0",
     parameters=(
         Quantity("A", "1", -0.5, 0.0, 5e-3, "output that the indenter draws at its own place"),
@@ -270,7 +247,7 @@ ADHESION = SensorEffect(
     name="adhesion",
     title="the indenter sticks to the skin",
     channel=MECHANICS,
-    change=_adhesion,
+    change=_added("adhesion", "share"),
     equation="q = share * (tangential traction of full adhesion)",
     parameters=(Quantity("share", "1", 0.0, 1.4, 0.1, "share of full adhesion (edge resolved to a/256)"),),
     signature="profile narrower the wider the contact, alike for all elements",
@@ -281,7 +258,7 @@ HERTZ = SensorEffect(
     name="hertz",
     title="widths of contact as on a half plane",
     channel=MECHANICS,
-    change=_hertz,
+    change=_added("hertz", "share"),
     equation="p = (1 - share) p(rigid core) + share p(Hertz)",
     parameters=(Quantity("share", "1", -0.5, 1.5, 0.2, "1 is Hertz's half plane, 0 the rigid core"),),
     signature="profile under wide indenters too wide, more at higher loads",
@@ -307,7 +284,7 @@ CROSSTALK = SensorEffect(
     name="cross_talk",
     title="an element hears its neighbours",
     channel=SENSOR,
-    change=_crosstalk,
+    change=responding(leaked, "x"),
     equation="d_i = d_i + x (d_(i-1) + d_(i+1))",
     parameters=(Quantity("x", "1", -0.4, 0.4, 0.02, "share of each neighbour"),),
     signature="a second profile one pitch away",
@@ -318,7 +295,7 @@ CELL = SensorEffect(
     name="force_gain",
     title="the load cell's scale is off",
     channel=SENSOR,
-    change=_cell,
+    change=_added("cell", "g"),
     equation="reading = P (1 + g)",
     parameters=(Quantity("g", "1", -0.8, 4.0, 0.02, "relative error of the load cell"),),
     signature="the load cell off in one proportion while the outputs agree with the commanded load",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,27 +53,13 @@ class Touched:
 
     def pick(self, which: NDArray[np.bool_]) -> Touched:
         """Return some of the touches."""
-        own = {
-            n: getattr(self, n)[which]
-            for n in (
-                "place",
-                "load",
-                "radius",
-                "cell",
-                "cell_noise",
-                "output",
-                "part",
-                "since",
-                "level",
-                "temperature",
-                "temperature_noise",
-                "time",
-                "share",
-            )
-        }
-        return Touched(
-            name=tuple(n for n, w in zip(self.name, which, strict=True) if w), noise=self.noise, **own
-        )
+        own = {n: getattr(self, n)[which] for n in _columns()}
+        return replace(self, name=tuple(n for n, w in zip(self.name, which, strict=True) if w), **own)
+
+
+def _columns() -> tuple[str, ...]:
+    """Names of the arrays with a row for each touch, in the order of ``Touched``."""
+    return tuple(f.name for f in fields(Touched) if f.name not in ("name", "noise"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,25 +108,7 @@ def reduce_touches(
     Returns:
         The touches, and notes on those left out.
     """
-    rows: dict[str, list[object]] = {
-        k: []
-        for k in (
-            "name",
-            "place",
-            "load",
-            "radius",
-            "cell",
-            "cell_noise",
-            "output",
-            "part",
-            "since",
-            "level",
-            "temperature",
-            "temperature_noise",
-            "time",
-            "share",
-        )
-    }
+    rows: dict[str, list[object]] = {k: [] for k in ("name", *_columns())}
     variances: list[Floats] = []
     notes: list[str] = []
     for name, r, place, load, radius in experiments:

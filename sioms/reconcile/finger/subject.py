@@ -13,7 +13,7 @@ from sioms.reconcile.finger.belief import Belief, outputs, scene_of
 from sioms.reconcile.finger.checks import check_commands, check_match, check_raw
 from sioms.reconcile.finger.data import COURSE, DRIFT, TOUCH, VIEWS, FingerData, lay_out, only, warm_known
 from sioms.reconcile.finger.effects import library
-from sioms.reconcile.finger.plan import propose
+from sioms.reconcile.finger.plan import Bench, indenter, propose
 from sioms.reconcile.finger.pressures import Floats
 from sioms.reconcile.finger.records import (
     Line,
@@ -27,8 +27,9 @@ from sioms.reconcile.finger.records import (
 )
 from sioms.reconcile.finger.terms import TERMS
 from sioms.reconcile.refuse import hats
-from sioms.reconcile.sensors.analyse import Options, View, analyse, untouched
+from sioms.reconcile.sensors.analyse import Options, Variable, View, analyse, untouched
 from sioms.reconcile.sensors.effect import Quantity, SensorEffect, SensorModel
+from sioms.reconcile.sensors.refuse import knots
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
 from sioms.reconcile.verdict import Estimate, NamedEffect
 from sioms.tactile.touches import Recording
@@ -36,6 +37,7 @@ from sioms.tactile.touches import Recording
 EXTENT = Quantity("extent", "rad", 0.0, 0.16, 0.01, "half angle that an element averages over")
 LOAD_MARGIN = 1.15  # the load cell's noise during a touch is a little more than its frames say
 LOAD_SPREAD = 0.02  # of a touch's load where no load cell tells it
+NEAR_DEG, ACROSS = 24.0, 8  # from a touch: where an element answers, and bins across it
 FOLLOWS = 0.3  # correlation of outputs and load cell from touch to touch above which the cell is believed
 
 
@@ -62,6 +64,7 @@ class FingerSubject:
         default_factory=lambda: tuple(n for n, e in library().items() if e.rankable)
     )
     terms: tuple[str, ...] = tuple(t.name for t in TERMS)
+    bench: Bench = field(default_factory=Bench)
 
     def views(self) -> Mapping[str, View]:
         """Outputs in per cent."""
@@ -96,8 +99,8 @@ class FingerSubject:
         x = (b.angle[d.alive] - place[:, None]).ravel()
         out = d.touched.output[:, d.alive].ravel()
         load = np.repeat(np.log(d.scene.load / np.median(d.scene.load)), ns)
-        near, level = hats(x, np.radians(np.linspace(-32.0, 32.0, 33))), hats(out, _knots(out, 16))
-        per_touch = [hats(place, _knots(place, 30)), hats(d.scene.time, _knots(d.scene.time, 16))]
+        near, level = hats(x, np.radians(np.linspace(-32.0, 32.0, 33))), hats(out, knots(out, 16))
+        per_touch = [hats(place, knots(place, 30)), hats(d.scene.time, knots(d.scene.time, 16))]
         round_ = np.minimum(d.scene.radius, 1.0)
         kinds = [np.asarray(round_ == v, dtype=np.float64) for v in np.unique(round_)][:12]
         columns = [near, level, near * load[:, None], out[:, None] * np.stack([load, load**2], axis=1)]
@@ -116,8 +119,8 @@ class FingerSubject:
         count = len(place)
         course = np.concatenate(
             [
-                np.kron(hats(place, _knots(place, 8)), np.eye(3)),
-                np.kron(hats(d.scene.load, _knots(d.scene.load, 4)), np.eye(3)),
+                np.kron(hats(place, knots(place, 8)), np.eye(3)),
+                np.kron(hats(d.scene.load, knots(d.scene.load, 4)), np.eye(3)),
             ],
             axis=1,
         )
@@ -130,7 +133,7 @@ class FingerSubject:
         """Touch of each row of the view of touches."""
         return np.repeat(np.arange(len(self.training.touched)), len(self.training.alive))
 
-    def variables(self) -> Sequence[tuple[str, str, int, Floats]]:
+    def variables(self) -> Sequence[Variable]:
         """What the disagreement is located by."""
         d = self.whole
         b: Belief = self.model.base
@@ -146,8 +149,14 @@ class FingerSubject:
             ("angle from the touch", "deg", TOUCH, x),
             ("distance from the touch", "deg", TOUCH, np.abs(x)),
             ("output", "%", TOUCH, 100.0 * t.output[:, d.alive].ravel()),
-            ("element", "1", TOUCH, np.tile(d.alive.astype(np.float64), len(t))),
         ]
+        # bins across every element, as far as a profile reaches
+        near = np.clip(np.floor((x + NEAR_DEG) / (2 * NEAR_DEG) * ACROSS), 0, ACROSS - 1).astype(np.int64)
+        which = ACROSS * np.tile(np.arange(ns), len(t)) + near
+        where = np.tile(d.alive.astype(np.float64), len(t)) + near / ACROSS
+        across = Variable(
+            "element, from one side to the other", "1", TOUCH, where, np.unique(which, return_inverse=True)[1]
+        )
         out += [(name, unit, TOUCH, np.repeat(v, ns)) for name, (unit, v) in per.items()]
         out.append(("time under load", "1", COURSE, np.tile(np.arange(3.0), len(t))))
         if warm_known(t):
@@ -156,14 +165,12 @@ class FingerSubject:
             if d.untouched is not None:
                 warm.append(np.repeat(d.untouched.temperature, ns))
             out.append(("temperature", "K", DRIFT, np.concatenate(warm)))
-        return out
+        return [across, *(Variable(*v) for v in out)]
 
-    def propose(self, models: Sequence[SensorModel]) -> Proposal | None:
+    def propose(self, models: Sequence[SensorModel]) -> tuple[Proposal, ...]:
         """See ``finger.plan``."""
-        return propose(
-            [m.belief() for m in models],
-            float(np.sqrt(np.mean(self.whole.touched.noise[self.whole.alive] ** 2))),
-        )
+        noise = float(np.sqrt(np.mean(self.whole.touched.noise[self.whole.alive] ** 2)))
+        return propose([m.belief() for m in models], noise, self.bench)
 
     def curves(self, before: SensorModel, after: SensorModel) -> tuple[Curve, ...]:
         """Outputs of the element that disagreed most, over the place of touch, one curve per indenter."""
@@ -174,22 +181,21 @@ class FingerSubject:
         kinds = sorted({(n, float(r)) for n, r in zip(d.touched.name, d.touched.radius, strict=True)})
         for name, radius in kinds:
             mine = np.array([n == name for n in d.touched.name]) & (d.touched.radius == radius)
-            mine &= np.abs(d.touched.load - np.median(d.touched.load[mine])) < 1.0
+            usual = np.median(d.touched.load[mine])
+            mine &= np.abs(d.touched.load - usual) < 0.05 * usual
             if np.count_nonzero(mine) < 6:
                 continue
             order = np.flatnonzero(mine)[np.argsort(d.touched.place[mine])]
-            kind = (
-                "edge" if radius == 0.0 else "flat" if np.isinf(radius) else f"radius {1e3 * radius:.2f} mm"
-            )
             found.append(
                 Curve(
-                    f"{name}, {kind}: element {worst}",
+                    f"element {worst} under the {indenter(radius)} (recording {name})",
                     "place of touch, deg",
                     "output, %",
                     np.degrees(d.touched.place[order]),
                     100.0 * d.touched.output[order, worst],
                     100.0 * old[order, worst],
                     100.0 * new[order, worst],
+                    untouched(len(d.touched))[order],
                 )
             )
         return tuple(found[:1] + found[-2:]) if len(found) > 3 else tuple(found)
@@ -199,19 +205,14 @@ class FingerSubject:
         return next(q.unit for q in self.model.library[effect].parameters if q.symbol == symbol)
 
 
-def _knots(values: Floats, count: int) -> Floats:
-    q = np.unique(np.quantile(values, np.linspace(0.0, 1.0, count)))
-    return q if len(q) > 1 else np.array([q[0], q[0] + 1.0])
-
-
 def _drift_features(d: FingerData, count: int) -> Floats:
     rows = []
     if warm_known(d.touched):
         rows.append(
             np.concatenate(
                 [
-                    hats(d.touched.time, _knots(d.touched.time, 8)),
-                    hats(d.touched.temperature, _knots(d.touched.temperature, 6)),
+                    hats(d.touched.time, knots(d.touched.time, 8)),
+                    hats(d.touched.temperature, knots(d.touched.temperature, 6)),
                     np.zeros((count, 6)),
                 ],
                 axis=1,
@@ -220,7 +221,7 @@ def _drift_features(d: FingerData, count: int) -> Floats:
     if d.untouched is not None:
         t = d.untouched.temperature
         own = np.concatenate(
-            [np.zeros((len(t), rows[0].shape[1] - 6 if rows else 0)), hats(t, _knots(t, 6))], axis=1
+            [np.zeros((len(t), rows[0].shape[1] - 6 if rows else 0)), hats(t, knots(t, 6))], axis=1
         )
         rows.append(np.repeat(own, len(d.alive), axis=0))
     widest = max(r.shape[1] for r in rows)
@@ -233,6 +234,7 @@ def prepare(
     name: str,
     scale: float = 0.01,
     refine_extent: bool = True,
+    bench: Bench | None = None,
 ) -> FingerSubject:
     """Check the recordings and lay them out.
 
@@ -241,6 +243,7 @@ def prepare(
         nominal: the finger as the simulation has it.
         scale: output per raw unit.
         refine_extent: the elements' width is not known and fitted along.
+        bench: what touches can be made to decide between look-alikes.
 
     Raises:
         BadInputError: the recordings cannot be used; the message says why.
@@ -275,9 +278,8 @@ def prepare(
     whole = _rows(touched, np.flatnonzero(alive), still, ramps, base, notes)
     notes += _missing(by_name, touched, refine_extent)
     mine = untouched(len(touched))
-    return FingerSubject(
-        whole, only(whole, ~mine, base.angle), only(whole, mine, base.angle), model, settled, tuple(notes)
-    )
+    parts = (whole, only(whole, ~mine, base.angle), only(whole, mine, base.angle))
+    return FingerSubject(*parts, model, settled, tuple(notes), bench=bench or Bench())
 
 
 def _stuck(recordings: Sequence[Recording]) -> NDArray[np.bool_]:

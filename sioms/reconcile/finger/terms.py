@@ -1,18 +1,13 @@
-"""Nameless terms: what a refusal may offer for a finger when no effect of the library explains the touches.
-
-A term describes the residual in symbols; it claims no cause and is kept out of the list of named effects.
-"""
+"""Nameless terms: what a refusal may offer for a finger when no effect of the library explains the touches."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from sioms.reconcile.effect import Channel
-from sioms.reconcile.finger.belief import Belief, Response, Scene
+from sioms.reconcile.finger.belief import Scene
 from sioms.reconcile.finger.pressures import Floats
-from sioms.reconcile.sensors.effect import Quantity, SensorEffect, Values
+from sioms.reconcile.sensors.effect import Quantity, term
 
-TERM_PREFIX = "term_"
 _LOAD = 200.0
 
 
@@ -63,50 +58,31 @@ def rippled(output: Floats, scene: Scene, p: Floats) -> Floats:
     return out
 
 
-def _term(
-    name: str, equation: str, response: Response, *parameters: Quantity, lookalikes: tuple[str, ...] = ()
-) -> SensorEffect:
-    def change(b: Belief, v: Values) -> Belief:
-        return b.responding(response, np.concatenate([v[q.symbol] for q in parameters]))
-
-    return SensorEffect(
-        name=TERM_PREFIX + name,
-        title=equation,
-        channel=Channel.SENSOR,
-        equation=equation,
-        change=change,
-        parameters=parameters,
-        signature="",
-        lookalikes=lookalikes,
-        separate="",
-    )
-
-
 TERMS = (
-    _term(
+    term(
         "cube",
         "d = l + k l^3",
         cubed,
         Quantity("k", "1", -500.0, 500.0, 20.0, "size"),
         lookalikes=("quadratic",),
     ),
-    _term("time", "d = l (1 + k (t - mean t))", fading, Quantity("k", "1/s", -0.1, 0.1, 1e-5, "size")),
-    _term("warmth", "d = l (1 + k (T - mean T))", warming, Quantity("k", "1/K", -1.0, 1.0, 0.01, "size")),
-    _term(
+    term("time", "d = l (1 + k (t - mean t))", fading, Quantity("k", "1/s", -0.1, 0.1, 1e-5, "size")),
+    term("warmth", "d = l (1 + k (T - mean T))", warming, Quantity("k", "1/K", -1.0, 1.0, 0.01, "size")),
+    term(
         "offset",
         "d = l + k under any touch",
         lifted,
         Quantity("k", "1", -0.3, 0.3, 1e-3, "size"),
         lookalikes=("proximity",),
     ),
-    _term(
+    term(
         "load",
         "d = l (P / 200 N/m)^k",
         stiffening,
         Quantity("k", "1", -1.0, 1.0, 0.02, "exponent"),
         lookalikes=("quadratic", "hertz"),
     ),
-    _term(
+    term(
         "lopsided",
         "d = l + k x/w exp(-|x|/w), x from the touch",
         lopsided,
@@ -114,7 +90,7 @@ TERMS = (
         Quantity("w", "rad", 0.02, 1.0, 0.05, "reach", starts=(0.05, 0.15, 0.4)),
         lookalikes=("sliding_friction", "angle_offset"),
     ),
-    _term(
+    term(
         "ripple",
         "d = l + k sin(n t_i + phase) under any touch",
         rippled,

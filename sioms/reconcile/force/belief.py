@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+PLAYS = 8
 Response = Callable[[Floats, "Loads", Floats], Floats]
 
 
@@ -69,23 +70,26 @@ def readings(b: ForceBelief, loads: Loads) -> Floats:
 
 
 @lru_cache(maxsize=32)
-def played(loads: Loads, width: float) -> Floats:
-    """Return the play of known loads; the search asks for the same widths again and again."""
-    out = play(loads.load, width, loads.record)
+def lag(loads: Loads, reach: float) -> Floats:
+    """Return the lag of known loads, see ``lagged``; the search asks for the same reaches again and again."""
+    out = lagged(loads.load, reach, loads.record)
     out.setflags(write=False)
     return out
 
 
-def play(load: Floats, width: float, record: NDArray[np.int64]) -> Floats:
-    """Return the play operator of every column: what follows the load once it has moved ``width`` from where it turned.
+def lagged(load: Floats, reach: float, record: NDArray[np.int64]) -> Floats:
+    """Return how far every column lags behind itself, -1 to 1: the mean of plays whose widths are even up to ``reach``.
 
-    Source: M. A. Krasnosel'skii, A. V. Pokrovskii, "Systems with Hysteresis", 1989, sec. 2; it starts relaxed in every record.
+    A play follows the load once that has moved its width from where it turned. Even widths make loops of parabolas, as metal
+    under loads well below yield has them (Rayleigh's law), and a full loop of height one; at rest in every record's first row.
+    Source: M. A. Krasnosel'skii, A. V. Pokrovskii, "Systems with Hysteresis", 1989, sec. 2 and 34 (play, Prandtl-Ishlinskii).
     """
+    width = reach * ((np.arange(PLAYS) + 0.5) / PLAYS)[:, None]
     out = np.empty_like(load)
-    state = load[0].copy()
-    for i in range(len(load)):
+    state = np.repeat(load[:1], PLAYS, axis=0)
+    for i, here in enumerate(load):
         if i and record[i] != record[i - 1]:
-            state = load[i].copy()
-        state = np.minimum(np.maximum(state, load[i] - width), load[i] + width)
-        out[i] = state
+            state[:] = here
+        np.clip(state, here - width, here + width, out=state)
+        out[i] = ((state - here) / width).mean(0)
     return out

@@ -6,19 +6,16 @@ A user's package lists a ``SensorEffect`` (or a tuple of them) under the entry-p
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from sioms.reconcile.effect import Channel
-from sioms.reconcile.force.belief import Floats, ForceBelief, Loads, Response, played
-from sioms.reconcile.sensors.effect import Quantity, SensorEffect, Values
+from sioms.reconcile.force.belief import Floats, ForceBelief, Loads, lag
+from sioms.reconcile.sensors.effect import Quantity, SensorEffect, Values, responding, term
 from sioms.reconcile.sensors.library import collect
 
 GROUP = "sioms.effects.force"
-TERM_PREFIX = "term_"
 SENSOR, MECHANICS = Channel.SENSOR, Channel.MECHANICS
 
 
@@ -48,16 +45,8 @@ def softening(reading: Floats, loads: Loads, p: Floats) -> Floats:
 
 
 def lagging(reading: Floats, loads: Loads, p: Floats) -> Floats:
-    """Add b (play - load)/r of each component's own load; b per component, r last."""
-    width = float(p[-1])
-    return reading + p[:-1] * (played(loads, width) - loads.load) / width
-
-
-def _response(response: Response, *symbols: str) -> Callable[[Any, Values], Any]:
-    def change(b: ForceBelief, v: Values) -> ForceBelief:
-        return b.responding(response, np.concatenate([v[s] for s in symbols]))
-
-    return change
+    """Add b times the lag of each component's own load; b per component, its reach r last."""
+    return reading + p[:-1] * lag(loads, float(p[-1]))
 
 
 GAIN = SensorEffect(
@@ -78,7 +67,7 @@ QUADRATIC = SensorEffect(
     name="quadratic",
     title="quadratic terms",
     channel=SENSOR,
-    change=_response(squared, "q"),
+    change=responding(squared, "q"),
     equation="reading_i = l_i + q_i l_i^2",
     parameters=(Quantity("q", "1", -1.0, 1.0, 0.01, "at full range, of each component", each=True),),
     signature="off alike for both signs of the load, with its square",
@@ -89,7 +78,7 @@ DRIFT = SensorEffect(
     name="offset_drift",
     title="zero that drifts with time",
     channel=SENSOR,
-    change=_response(drifting, "d"),
+    change=responding(drifting, "d"),
     equation="reading_i = l_i + d_i t",
     parameters=(Quantity("d", "1/s", -1.0, 1.0, 1e-5, "of each component", each=True),),
     signature="off in proportion to time, whatever the load",
@@ -101,7 +90,7 @@ TEMPERATURE = SensorEffect(
     name="temperature",
     title="zero that follows the temperature",
     channel=SENSOR,
-    change=_response(warming, "k"),
+    change=responding(warming, "k"),
     equation="reading_i = l_i + k_i (T - T0)",
     parameters=(Quantity("k", "1/K", -1.0, 1.0, 1e-3, "of each component", each=True),),
     signature="off with the temperature, whatever the load",
@@ -113,7 +102,7 @@ TEMPERATURE_GAIN = SensorEffect(
     name="temperature_gain",
     title="gain that follows the temperature",
     channel=SENSOR,
-    change=_response(softening, "k"),
+    change=responding(softening, "k"),
     equation="reading = l (1 + k (T - T0))",
     parameters=(Quantity("k", "1/K", -0.2, 0.2, 2e-3, "relative, alike for all components"),),
     signature="off with load times temperature",
@@ -124,12 +113,12 @@ HYSTERESIS = SensorEffect(
     name="hysteresis",
     title="hysteresis",
     channel=MECHANICS,
-    change=_response(lagging, "b", "r"),
-    equation="reading_i = l_i + b_i (z_i - l_i)/r, z_i the play of width r about l_i",
+    change=responding(lagging, "b", "r"),
+    equation="reading_i = l_i + b_i mean over w of (z_w - l_i)/w, z_w the play of width w about l_i, w from 0 to r",
     parameters=(
         Quantity("b", "1", 0.0, 0.5, 5e-3, "half width of the loop, of each component", each=True),
         Quantity(
-            "r", "1", 5e-3, 1.0, 0.05, "change of load over which it turns round", starts=(0.03, 0.1, 0.3)
+            "r", "1", 5e-3, 0.5, 0.05, "change of load over which it turns round", starts=(0.03, 0.1, 0.3)
         ),
     ),
     signature="off one way while the load rises and the other way while it falls",
@@ -187,32 +176,15 @@ def coupled(reading: Floats, loads: Loads, p: Floats) -> Floats:
     return reading + p * loads.load * loads.load[:, :1]
 
 
-def _term(
-    name: str, equation: str, response: Response, *parameters: Quantity, lookalikes: tuple[str, ...] = ()
-) -> SensorEffect:
-    change = _response(response, *(q.symbol for q in parameters))
-    return SensorEffect(
-        name=TERM_PREFIX + name,
-        title=equation,
-        channel=SENSOR,
-        equation=equation,
-        change=change,
-        parameters=parameters,
-        signature="",
-        lookalikes=lookalikes,
-        separate="",
-    )
-
-
 TERMS = (
-    _term(
+    term(
         "cube",
         "reading_i = l_i + k_i l_i^3",
         cubed,
         Quantity("k", "1", -2.0, 2.0, 0.01, "at full range", each=True),
     ),
-    _term("time", "reading = l (1 + k t)", fading, Quantity("k", "1/s", -0.1, 0.1, 1e-5, "size")),
-    _term(
+    term("time", "reading = l (1 + k t)", fading, Quantity("k", "1/s", -0.1, 0.1, 1e-5, "size")),
+    term(
         "settling",
         "reading_i = l_i + d_i (1 - exp(-t/tau))",
         settling,
@@ -220,7 +192,7 @@ TERMS = (
         Quantity("tau", "s", 0.1, 1e5, 20.0, "time constant", starts=(5.0, 20.0, 60.0, 200.0)),
         lookalikes=("offset_drift",),
     ),
-    _term(
+    term(
         "coupled",
         "reading_i = l_i + k_i l_i l_1",
         coupled,

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.force.belief import Floats, Loads, readings
-from sioms.reconcile.force.effects import TERM_PREFIX
 from sioms.reconcile.refuse import hats
-from sioms.reconcile.sensors.analyse import Options, View, analyse
-from sioms.reconcile.sensors.effect import SensorModel
+from sioms.reconcile.sensors.analyse import Options, Variable, View, analyse
+from sioms.reconcile.sensors.effect import TERM_PREFIX, SensorModel
+from sioms.reconcile.sensors.refuse import knots
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
 from sioms.reconcile.verdict import NamedEffect
 
@@ -122,20 +122,20 @@ class ForceSubject:
         """Columns of the state, the same for every component."""
         d = self.training
         mine, loads = d.which, d.loads
-        columns = [hats(loads.time, _knots(loads.time, 12))]
+        columns = [hats(loads.time, knots(loads.time, 12))]
         for i in range(loads.load.shape[1]):
             own = loads.load[:, i]
             if np.ptp(own) == 0.0:
                 continue
             way = np.sign(np.gradient(own))
             columns += [
-                hats(own, _knots(own, 10)),
-                hats(own, _knots(own, 6)) * way[:, None],
-                own[:, None] * hats(loads.time, _knots(loads.time, 6)),
+                hats(own, knots(own, 10)),
+                hats(own, knots(own, 6)) * way[:, None],
+                own[:, None] * hats(loads.time, knots(loads.time, 6)),
                 (own * loads.warmth)[:, None],
             ]
             columns += [(own * loads.load[:, j])[:, None] for j in range(i)]
-        columns.append(hats(loads.warmth, _knots(loads.warmth, 6)))
+        columns.append(hats(loads.warmth, knots(loads.warmth, 6)))
         full = np.concatenate(columns, axis=1)[mine]
         full = full - full.mean(0)
         return {i: full / s for i, s in enumerate(d.sigma)}
@@ -144,7 +144,7 @@ class ForceSubject:
         """Row of time of each row of the first component."""
         return np.arange(int(self.training.which.sum()))
 
-    def variables(self) -> Sequence[tuple[str, str, int, Floats]]:
+    def variables(self) -> Sequence[Variable]:
         """What the disagreement is located by."""
         out: list[tuple[str, str, int, Floats]] = []
         r = self.records
@@ -154,12 +154,12 @@ class ForceSubject:
             out.append(("time", "s", i, r.time - r.time[0]))
             if np.isfinite(r.temperature).all():
                 out.append(("temperature", "K", i, r.temperature))
-        return out
+        return [Variable(*v) for v in out]
 
-    def propose(self, models: Sequence[SensorModel]) -> Proposal | None:
-        """Choose the programme of loads on which the models differ most."""
+    def propose(self, models: Sequence[SensorModel]) -> tuple[Proposal, ...]:
+        """Rank the programmes of loads by how far the models differ on them."""
         if len(models) < 2:
-            return None
+            return ()
         found = []
         for name, text, loads in catalogue(len(self.records.names)):
             said = [readings(m.belief(), loads) / self.whole.sigma for m in models]
@@ -168,7 +168,7 @@ class ForceSubject:
                 float(np.sqrt(np.mean((a - b) ** 2))) for i, a in enumerate(said) for b in said[i + 1 :]
             )
             found.append(Proposal(name, text, apart))
-        return max(found, key=lambda p: p.separation)
+        return tuple(sorted(found, key=lambda p: -p.separation))
 
     def curves(self, before: SensorModel, after: SensorModel) -> tuple[Curve, ...]:
         """Reading less load of the components that disagreed most, over time."""
@@ -187,6 +187,7 @@ class ForceSubject:
                     r.reading[:, i] - r.load[:, i],
                     old[:, i] + shift[0] - r.load[:, i],
                     new[:, i] + shift[1] - r.load[:, i],
+                    self.final.which,
                 )
             )
         return tuple(out)
@@ -199,11 +200,6 @@ class ForceSubject:
 def unit_of(name: str) -> str:
     """Return N m for torques (names that begin with t or m), else N."""
     return "N m" if name[:1].lower() in ("t", "m") else "N"
-
-
-def _knots(values: Floats, count: int) -> Floats:
-    q = np.unique(np.quantile(values, np.linspace(0.0, 1.0, count)))
-    return q if len(q) > 1 else np.array([q[0], q[0] + 1.0])
 
 
 def catalogue(count: int) -> Sequence[tuple[str, str, Loads]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +18,13 @@ from sioms.reconcile.excitation import SAME, common
 from sioms.reconcile.locate import Place, bins_of, explained
 from sioms.reconcile.noise import effective_samples
 from sioms.reconcile.search import GAIN
-from sioms.reconcile.sensors.effect import Array, SensorEffect, SensorModel
+from sioms.reconcile.sensors.effect import TERM_PREFIX, Array, SensorEffect, SensorModel
 from sioms.reconcile.sensors.fit import Data, Fit, refit
 from sioms.reconcile.sensors.refuse import burst_share, smoother_share
 from sioms.reconcile.sensors.search import Found, Rival, Searcher, screening_columns
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
 from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome
 
-TERM_PREFIX = "term_"
 UNEXPLAINED = 0.2  # share that a generic smoother explains beyond the named model: something is missing
 LEAST_ODD = 1.15  # multiple of the floor below which nothing is called unexplained
 BURSTS = 0.8
@@ -50,6 +49,22 @@ class View:
     title: str
     unit: str
     floor: float
+
+
+class Variable(NamedTuple):
+    """Something that the disagreement may go with.
+
+    Attributes:
+        view: number of the view whose rows it is given for.
+        values: for each row of that view of the subject's ``whole``.
+        bins: of the rows, from 0; None for bins of equal counts.
+    """
+
+    name: str
+    unit: str
+    view: int
+    values: Array
+    bins: NDArray[np.int64] | None = None
 
 
 class Subject(Protocol):
@@ -91,12 +106,12 @@ class Subject(Protocol):
         """Return the number of the touch or sample of each row of view 0 of ``training``."""
         ...
 
-    def variables(self) -> Sequence[tuple[str, str, int, Array]]:
-        """Return name, unit, view and value per row of that view of ``whole``, to locate the disagreement by."""
+    def variables(self) -> Sequence[Variable]:
+        """Return what the disagreement is located by."""
         ...
 
-    def propose(self, models: Sequence[SensorModel]) -> Proposal | None:
-        """Return the experiment on which the models differ most."""
+    def propose(self, models: Sequence[SensorModel]) -> tuple[Proposal, ...]:
+        """Return experiments, that on which the models differ most first."""
         ...
 
     def curves(self, before: SensorModel, after: SensorModel) -> tuple[Curve, ...]:
@@ -206,7 +221,7 @@ def _conclude(
         else Outcome.NONE
     )
     alternatives: tuple[tuple[str, ...], ...] = ()
-    plan = None
+    plan: tuple[Proposal, ...] = ()
     if outcome is Outcome.AMBIGUOUS:
         alternatives = tuple(
             tuple(r.rival if n == r.effect else n for n in fit.model.effects) for r in open_rivals
@@ -299,8 +314,10 @@ def _describe(
         gap = searcher.saving(found.losses, loss)
         frequency = _frequency(searcher, found.losses, loss, gap.view, rng)
         estimates = _estimates(subject, effect, fit.model, spread)
+        title = subject.views()[gap.view].title
         evidence = [
-            f"without it {100 * gap.share:.1f} % of the squares of {gap.view} would come back ({gap.errors:.1f} standard errors)"
+            f"without it the squared residual of the {title} would be {1.0 / max(1.0 - gap.share, 1e-3):.3g} times as large "
+            f"({gap.errors:.1f} standard errors, on blocks held out)"
         ]
         ruled = {
             r.rival: f"reproduces all but {100 * r.missed:.1f} % of it, {r.errors:.1f} standard errors worse"
@@ -381,12 +398,12 @@ def locate(subject: Subject, model: SensorModel, rng: np.random.Generator, shift
     e = -data.miss(data.predict(model))
     out = []
     told = subject.views()
-    for name, unit, view, values in subject.variables():
+    for name, unit, view, values, own in subject.variables():
         mine = np.flatnonzero(data.view == view)
         r = e[mine]
         if len(r) < 40 or np.ptp(values) == 0.0:
             continue
-        bins = bins_of(values)
+        bins = bins_of(values) if own is None else own
         share = explained(r, bins)
         chance = [explained(_shuffled(r, data.block[mine], rng), bins) for _ in range(shifts)]
         p = (1 + sum(c >= share for c in chance)) / (shifts + 1)
@@ -405,7 +422,8 @@ def locate(subject: Subject, model: SensorModel, rng: np.random.Generator, shift
                 spread * floor,
             )
         )
-    return sorted(out, key=lambda q: -q.explained)
+    # whatever else changed meanwhile goes with the time: it comes first only where nothing else explains a third as much
+    return sorted(out, key=lambda q: -q.explained / (3.0 if q.variable.startswith("time (") else 1.0))
 
 
 def _shuffled(r: Array, block: NDArray[np.int64], rng: np.random.Generator) -> Array:

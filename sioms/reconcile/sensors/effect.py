@@ -18,6 +18,7 @@ from sioms.reconcile.effect import Channel
 
 Array = NDArray[np.float64]
 Values = Mapping[str, Array]
+TERM_PREFIX = "term_"
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,3 +146,36 @@ class SensorModel:
             value = effect.neutral if i == 0 else (q.starts[0] if q.starts else 0.0)
             out[q.symbol] = np.full(self.count if q.each else 1, value)
         return out
+
+
+def responding(response: Callable[..., Array], *symbols: str) -> Callable[[Any, Values], Any]:
+    """Return the change of a belief that gets a response to these parameters, laid in a row."""
+
+    def change(belief: Any, v: Values) -> Any:
+        return belief.responding(response, np.concatenate([v[s] for s in symbols]))
+
+    return change
+
+
+def term(
+    name: str,
+    equation: str,
+    response: Callable[..., Array],
+    *parameters: Quantity,
+    lookalikes: tuple[str, ...] = (),
+) -> SensorEffect:
+    """Return a nameless term: what a refusal may offer where no effect of the library explains the data.
+
+    A term describes the residual in symbols; it claims no cause and is kept out of the list of named effects.
+    """
+    return SensorEffect(
+        name=TERM_PREFIX + name,
+        title=equation,
+        channel=Channel.SENSOR,
+        equation=equation,
+        change=responding(response, *(q.symbol for q in parameters)),
+        parameters=parameters,
+        signature="",
+        lookalikes=lookalikes,
+        separate="",
+    )

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.reconcile.descent import descend
 from sioms.reconcile.sensors.effect import Array, Quantity, SensorModel
 
 BASE = "base"
@@ -147,36 +148,20 @@ def refit(
         weights: of the rows, shape (n,): views far from the floor are brought on one footing.
     """
     free = free_numbers(model, frozen)
-    at = get(model, free)
-    r = weights * data.miss(data.predict(model))
     if not free:
+        r = weights * data.miss(data.predict(model))
         return Fit(model, free, r, np.empty((len(r), 0)))
     size = np.array([f.quantity.size for f in free])
     lower, upper = (np.array([getattr(f.quantity, n) for f in free]) for n in ("lower", "upper"))
     wraps = np.array([f.quantity.phase for f in free])
-    lower, upper = np.where(wraps, -np.inf, lower), np.where(wraps, np.inf, upper)
-    damping, cost = 1e-4, float(r @ r)
-    j = weights[:, None] * slopes(data, model, free, at)
-    for _ in range(iterations):
-        h, g = j.T @ j, j.T @ r
-        gained = False
-        for _ in range(5):
-            step = np.linalg.lstsq(
-                h + damping * np.diag(np.diag(h) + 1e-9 * np.trace(h) + 1e-30), -g, rcond=1e-12
-            )[0]
-            trial = np.clip(at + np.clip(step, -3.0, 3.0) * size, lower, upper)
-            rt = weights * data.miss(data.predict(put(model, free, trial)))
-            ct = float(rt @ rt)
-            if ct < cost:
-                gained = True
-                break
-            damping = max(damping, 1e-4) * 10.0
-        if not gained:
-            break
-        done = cost - ct < tolerance * cost
-        at, r, cost = trial, rt, ct
-        damping = max(damping * 0.1, 1e-8)
-        j = weights[:, None] * slopes(data, model, free, at)
-        if done:
-            break
+    at, r, j = descend(
+        lambda x: weights * data.miss(data.predict(put(model, free, x))),
+        lambda x, _: weights[:, None] * slopes(data, model, free, x),
+        get(model, free),
+        size,
+        np.where(wraps, -np.inf, lower),
+        np.where(wraps, np.inf, upper),
+        iterations,
+        tolerance,
+    )
     return Fit(put(model, free, at), free, r, j)

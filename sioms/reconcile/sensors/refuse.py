@@ -36,6 +36,12 @@ def smoother_share(data: Data, fit: Fit, weights: Array, features: Mapping[int, 
     return best, where
 
 
+def knots(values: Array, count: int) -> Array:
+    """Return knots at quantiles, so that every hat over them has data."""
+    q = np.unique(np.quantile(values, np.linspace(0.0, 1.0, count)))
+    return q if len(q) > 1 else np.array([q[0], q[0] + 1.0])
+
+
 def _explained(f: Array, r: Array, fold: NDArray[np.int64]) -> float:
     total = float(r @ r)
     if f.shape[1] == 0 or total == 0.0:

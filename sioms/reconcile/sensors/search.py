@@ -13,14 +13,14 @@ from itertools import product
 
 import numpy as np
 
+from sioms.reconcile.ambiguity import AMBIGUOUS
 from sioms.reconcile.blocks import better, heldout
 from sioms.reconcile.search import DOUBTFUL, FLOOR, GAIN, NEARLY, SPECIFIC, SURE, negligible
-from sioms.reconcile.sensors.effect import Array, SensorEffect, SensorModel, Values
+from sioms.reconcile.sensors.effect import TERM_PREFIX, Array, SensorEffect, SensorModel, Values
 from sioms.reconcile.sensors.fit import Data, Fit, Free, refit, slopes
 
 TRIES = 5
 STEPS = 8
-AMBIGUOUS = 0.05
 _SCREEN = 1e-3  # step of the screening difference, in natural sizes
 
 
@@ -206,7 +206,7 @@ class Searcher:
         model = good[best][0].model
         return min(
             near or [best],
-            key=lambda n: (n.startswith("term_"), model.library[n].size(model.count), -good[n][2].total),
+            key=lambda n: (n.startswith(TERM_PREFIX), model.library[n].size(model.count), -good[n][2].total),
         )
 
     def _eliminate(self, fit: Fit, losses: Array, ladder: list[Rung]) -> tuple[Fit, Array]:
@@ -270,7 +270,7 @@ class Searcher:
         out = []
         lib, count = found.fit.model.library, found.fit.model.count
         for name in [
-            n for n in found.fit.model.effects if n not in self.frozen and not n.startswith("term_")
+            n for n in found.fit.model.effects if n not in self.frozen and not n.startswith(TERM_PREFIX)
         ]:
             bare = self.fit(found.fit.model.without_effect(name), 4)
             contribution = bare.cost - found.fit.cost

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sioms.reconcile.locate import Place
 from sioms.reconcile.sensors.effect import Array, SensorModel
 from sioms.reconcile.sensors.search import Rung
@@ -21,7 +24,11 @@ class Proposal:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Curves for a picture: measured, and simulated before and after, over one variable."""
+    """Curves for a picture: measured, and simulated before and after, over one variable.
+
+    Attributes:
+        apart: rows that took no part in any choice.
+    """
 
     title: str
     axis: str
@@ -30,6 +37,7 @@ class Curve:
     measured: Array
     before: Array
     after: Array
+    apart: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +50,7 @@ class SensorVerdict:
         missing: effects that the records did not excite, with the record that would.
         pairs: effects that look the same in these records, with the share they have in common.
         places: where the nominal model disagreed.
+        experiments: what would decide where effects look alike, the best first.
     """
 
     outcome: Outcome
@@ -56,7 +65,7 @@ class SensorVerdict:
     missing: dict[str, str]
     pairs: tuple[tuple[str, str, float], ...]
     places: tuple[Place, ...]
-    experiment: Proposal | None
+    experiments: tuple[Proposal, ...]
     ratio: float
     smoother_share: float
     burst_share: float
@@ -65,3 +74,8 @@ class SensorVerdict:
     notes: tuple[str, ...]
     curves: tuple[Curve, ...]
     rejected: tuple[str, ...] = ()
+
+    @property
+    def experiment(self) -> Proposal | None:
+        """The experiment that would decide best, None where there is nothing to decide."""
+        return self.experiments[0] if self.experiments else None

@@ -136,9 +136,43 @@ def test_finger_shows_the_pressed_object_where_it_is(bench):
     assert np.argmax(finger.blocks[0].data) == np.argmin(np.abs(np.array(shape.angles_rad) - 1.6))
 
 
+MODEL = """[finger]
+core_m = 0.0096
+outer_m = 0.0127
+shear_modulus_pa = 83000.0
+poisson = 0.46
+angle_rad = [1.6, 1.44, 1.28]
+radius_m = 0.0103
+gain = 3.0
+[effects.gain_scatter]
+g = [0.0, 0.0, {last}]
+"""
+
+
+def test_a_twin_takes_its_elements_and_effects_from_a_model_and_shows_which(bench, tmp_path):
+    file = tmp_path / "model.toml"
+    seen = []
+    for last in (0.0, 0.25):
+        file.write_text(MODEL.format(last=last))
+        mod = bench.make(SimAxes, f"mod{len(seen)}", {"axis": TWO})
+        force_node = f"mod{len(seen)}.plant.z_contact"
+        table = {"model_file": str(file), "force_node": force_node, "angle_rad": 1.28, "noise": 0.0, "resolution": 0.0}
+        finger = bench.make(SimTactile, f"tactile{len(seen)}", table)
+        bench.run(0.02)
+        assert not finger.blocks[0].data.any()
+        bench.write(mod, axis=1, control_mode=ControlMode.FORCE, force=4.0)
+        bench.run(2.0)
+        seen.append((finger.blocks[0].data.copy(), finger.blocks[0].spec.channels[0].description))
+    (plain, first), (hidden, second) = seen
+    assert plain[2] == plain.max() > 1.0
+    np.testing.assert_allclose(hidden[:2], plain[:2], rtol=1e-3)
+    assert hidden[2] == pytest.approx(plain[2] / 1.25, rel=1e-3)
+    assert first != second and "model " in first
+
+
 @pytest.mark.parametrize(
     "table, words",
-    [({"gain": [1.0]}, "gain: 1 numbers; want 16"), ({"indenter_radius_m": -1.0}, "positive radius")],
+    [({"model_file": "/nowhere.toml"}, "No such file"), ({"gain": [1.0]}, "gain: 1 numbers; want 16"), ({"indenter_radius_m": -1.0}, "positive radius")],
 )
 def test_bad_finger_is_told_by_describe(table, words):
     with pytest.raises(ValueError, match=words):

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sioms.plant.finger import FingerShape, TactileArray
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.finger.belief import Belief, late, outputs, scene_of
 from sioms.reconcile.finger.effects import library
@@ -18,6 +19,7 @@ from sioms.reconcile.finger.model_file import from_table, to_toml
 from sioms.reconcile.finger.plan import propose
 from sioms.reconcile.finger.pressures import WAVES, hertz, sheet
 from sioms.reconcile.finger.records import find_lines
+from sioms.reconcile.finger.twin import FingerTwin
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile_selftest.finger_draw import HiddenFinger, draw_finger
 from sioms.reconcile_selftest.finger_world import FingerWorld
@@ -135,8 +137,8 @@ def test_a_model_file_reads_back_exactly_and_effects_can_be_switched_off() -> No
 def test_the_experiment_fits_the_pair() -> None:
     creep = believed(creep=0.15, creep_time=1.0)
     warm = believed(temperature=np.full(16, 3e-3))
-    assert propose([believed(), creep], 5e-4).name == "hold"  # type: ignore[union-attr]
-    assert propose([believed(), warm], 5e-4).name == "warm"  # type: ignore[union-attr]
+    assert propose([believed(), creep], 5e-4)[0].name == "hold"
+    assert propose([believed(), warm], 5e-4)[0].name == "warm"
 
 
 def test_a_line_is_found_in_noise_and_none_where_there_is_none() -> None:
@@ -311,3 +313,20 @@ def test_the_nominal_finger_may_be_a_calibrated_one(folder: Path) -> None:
     belief, _, stated = read_model(path, folder)
     assert not stated
     assert np.allclose(belief.gain, 3.0)
+
+
+def test_a_twin_answers_as_the_finger_of_another_mechanics_with_the_same_gains_and_creep() -> None:
+    """The simulated finger of ``sioms.plant`` solves its contacts in quite another way."""
+    creep, tau = 0.2, 0.5
+    finger = TactileArray(FingerShape(gain=3.0, gain_scatter=0.1, seed=3, creep=creep, creep_s=tau, length_m=0.012))
+    model = SensorModel(believed(), 16, library())
+    model = model.with_effect("gain_scatter", {"g": finger.truth.gains / 3.0 - 1.0})
+    model = model.with_effect("creep", {"c": np.array([creep]), "tau": np.array([tau])})
+    twin = FingerTwin(model, 0.012)
+    for began, radius in ((0.0, 0.0), (50.0, 6e-3)):
+        for step in range(40):
+            now = began + 0.05 * step
+            wanted, got = (a.read(2.4, 1.3, radius, np.empty(16), now).copy() for a in (finger, twin))
+            if step:
+                assert np.allclose(got, wanted, atol=0.012 * wanted.max())
+    assert not twin.read(0.0, 1.3, 0.0, np.empty(16), 100.0).any()

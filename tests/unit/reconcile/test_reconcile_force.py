@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sioms.reconcile.force.belief import Loads, play, readings
+from sioms.reconcile.force.belief import Loads, lagged, readings
 from sioms.reconcile.force.model_file import from_table, to_toml
 from sioms.reconcile_selftest.force_world import COMPONENTS, draw_sensor, record
 from sioms.tools import reconcile
@@ -18,10 +18,17 @@ from sioms.tools.reconcile_selftest_sensors import COLUMNS
 SENSOR = {"sensor": {"name": "s", "components": ["fx", "tz"], "full_range": [100.0, 5.0]}}
 
 
-def test_the_play_follows_after_its_width_and_forgets_nothing() -> None:
-    load = np.array([0.0, 0.05, 0.3, 0.25, 0.15, 0.05, -0.4])[:, None]
-    z = play(load, 0.1, np.zeros(7, dtype=np.int64))[:, 0]
-    assert np.allclose(z, [0.0, 0.0, 0.2, 0.2, 0.2, 0.15, -0.3])
+def test_the_lag_is_odd_full_after_its_reach_and_remembers_where_a_loop_began() -> None:
+    load = np.array([0.0, 0.05, 0.3, 0.26, 0.29, 0.26, 0.3, 0.1, -0.4])[:, None]
+    record = np.zeros(len(load), dtype=np.int64)
+    lag = lagged(load, 0.1, record)[:, 0]
+    assert np.allclose(lagged(-load, 0.1, record)[:, 0], -lag)
+    assert lag[0] == 0.0 and -1.0 < lag[1] < -0.5
+    assert lag[2] == pytest.approx(-1.0)  # beyond the reach every part has given way
+    assert lag[7:] == pytest.approx(1.0)  # and after twice the reach back, the other way
+    assert lag[5] == pytest.approx(lag[3]) and lag[6] == pytest.approx(lag[2])  # a loop within a loop closes
+    again = lagged(np.concatenate([load, load]), 0.1, np.repeat([0, 1], len(load)))[:, 0]
+    assert np.allclose(again[len(load) :], lag)  # every record begins at rest
 
 
 def test_every_effect_does_nothing_at_its_neutral_value_and_something_beside_it() -> None:

@@ -1,0 +1,66 @@
+"""Bounded Levenberg-Marquardt: least squares of a residual that is dear to evaluate and has few numbers.
+
+Source: D. W. Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", SIAM J. 11 (1963).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from sioms.reconcile.effect import Array
+
+TRIALS = 5  # of one step, each more cautious
+LONGEST = 3.0  # a step changes no number by more sizes
+
+
+def descend(
+    residual: Callable[[Array], Array],
+    slopes: Callable[[Array, Array], Array],
+    at: Array,
+    size: Array,
+    lower: Array,
+    upper: Array,
+    iterations: int,
+    tolerance: float,
+) -> tuple[Array, Array, Array]:
+    """Minimise the sum of squares of a residual.
+
+    Args:
+        residual: of the numbers, shape (k,) to (n,).
+        slopes: d residual / d (number / size) at numbers with their residual, shape (n, k).
+        at: numbers to start from, k > 0.
+        size: natural size of each number.
+        lower, upper: bounds, infinite where there is none.
+        iterations: largest number of accepted steps.
+        tolerance: stop when a step gains less than this share of the sum of squares.
+
+    Returns:
+        Numbers, residual and slopes at the best point found.
+    """
+    r = residual(at)
+    damping, cost = 1e-3, float(r @ r)
+    j = slopes(at, r)
+    for _ in range(iterations):
+        h, g = j.T @ j, j.T @ r
+        gained = False
+        for _ in range(TRIALS):
+            more = damping * np.diag(np.diag(h) + 1e-12 * np.trace(h) + 1e-30)
+            step = np.linalg.lstsq(h + more, -g, rcond=1e-12)[0]
+            trial = np.clip(at + np.clip(step, -LONGEST, LONGEST) * size, lower, upper)
+            rt = residual(trial)
+            ct = float(rt @ rt)
+            if ct < cost:
+                gained = True
+                break
+            damping = max(damping, 1e-4) * 8.0
+        if not gained:
+            break
+        done = cost - ct < tolerance * cost
+        at, r, cost = trial, rt, ct
+        damping = max(damping * 0.2, 1e-7)
+        j = slopes(at, r)
+        if done:
+            break
+    return at, r, j
