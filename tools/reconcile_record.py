@@ -15,10 +15,11 @@ import numpy as np
 import sioms
 from sioms.client.node import AxisNode
 from sioms.client.snapshot import AxisSnapshot
-from sioms.protocol.flags import AxisStatus
 from sioms.reconcile.effect import Array
 from sioms.reconcile.experiment import Envelope, Experiment
 from sioms.reconcile.records import Record
+from sioms.tools.stopping import ExperimentStopped as ExperimentStopped
+from sioms.tools.stopping import check_running
 
 #: Samples from knot to knot.
 KNOT = 10
@@ -32,11 +33,6 @@ AHEAD = 400
 #: it is run again, so many times.
 MOST_FILLED = 4
 ENOUGH, TRIES = 0.6, 3
-BROKEN = AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP | AxisStatus.FOLLOWING_ERROR | AxisStatus.STALLED
-
-
-class ExperimentStopped(RuntimeError):
-    """The experiment did not come to its end; the axis has been halted. The message says why."""
 
 
 def perform(
@@ -102,14 +98,14 @@ class Recorder:
     def _go(self, position: float) -> None:
         """Move to a position and let the axis come to rest."""
         e, here = self.envelope, self.node.read()
-        self._check(here)
+        check_running(self.node.name, here)
         self.node.move(position, max_velocity=0.5 * e.speed, max_acceleration=0.5 * e.acceleration)
         self.node.wait_until_idle(timeout=5.0 + 4.0 * abs(position - here.position[0]) / e.speed)
         end = time.monotonic() + SETTLE_S
         while time.monotonic() < end:
             time.sleep(POLL_S)
             self.node.keepalive()
-            self._check(self.node.read())
+            check_running(self.node.name, self.node.read())
 
     def _play(self, command: Array) -> list[AxisSnapshot]:
         """Write the knots ahead of the motion and collect every snapshot until the axis rests again."""
@@ -122,7 +118,7 @@ class Recorder:
         while True:
             new = self.node.history(last)
             for snapshot in new:
-                self._check(snapshot)
+                check_running(self.node.name, snapshot)
             seen += new
             last = new[-1].number if new else last
             self.node.keepalive()
@@ -145,14 +141,6 @@ class Recorder:
             if time.monotonic() > deadline:
                 raise ExperimentStopped(f"run an experiment on {self.node.name}: it did not end in time")
             time.sleep(POLL_S / 2)
-
-    def _check(self, snapshot: AxisSnapshot) -> None:
-        broken = AxisStatus(snapshot.status[0]) & BROKEN
-        if broken:
-            why = " and ".join(
-                str(flag.name).lower().replace("_", " ") for flag in AxisStatus if flag & broken
-            )
-            raise ExperimentStopped(f"run an experiment on {self.node.name}: {why}; the axis is halted")
 
 
 def knots(command: Array, dt: float, max_velocity: float, max_acceleration: float) -> list[bytes]:

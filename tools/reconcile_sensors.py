@@ -11,18 +11,22 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sioms.reconcile.sensors.verdict import SensorVerdict
 
-EXIT_BAD_INPUT = 2
+EXIT_BAD_INPUT, EXIT_STOPPED = 2, 1
 
 
 def add_parsers(kinds: Any) -> None:
     """Add the subjects to ``sioms reconcile``."""
-    tactile = kinds.add_parser("tactile", help="a tactile finger, from recorded touches")
+    tactile = kinds.add_parser("tactile", help="a tactile finger, from recorded touches or live")
     tactile.add_argument(
-        "data", type=Path, metavar="DATA", help="folder with one npz for each experiment (docs/tactile.md)"
+        "data",
+        type=Path,
+        metavar="DATA",
+        help="folder with one npz for each experiment (docs/tactile.md), or the node of a finger",
     )
     tactile.add_argument(
         "--model", type=Path, metavar="FILE", help="nominal finger (TOML; default: nominal.json in DATA)"
     )
+    _live_arguments(tactile)
     force = kinds.add_parser("force", help="a force/torque sensor, from recorded known loads")
     force.add_argument(
         "data", type=Path, metavar="DATA", help="file or folder of recordings, columns.toml beside them"
@@ -42,6 +46,48 @@ def add_parsers(kinds: Any) -> None:
     score.add_argument("truth", type=Path, metavar="TRUTH", help="NAME.json for each finger")
 
 
+def _live_arguments(tactile: argparse.ArgumentParser) -> None:
+    group = tactile.add_argument_group("with a node")
+    group.add_argument("--yes", action="store_true", help="move without asking")
+    group.add_argument(
+        "--place", default="prober.place", metavar="NODE", help="axis round the finger (prober.place)"
+    )
+    group.add_argument(
+        "--press",
+        default="prober.radial",
+        metavar="NODE",
+        help="axis that presses, deeper with larger positions (prober.radial)",
+    )
+    group.add_argument("--force", default="force0.fz", metavar="NODE", help="force on the finger (force0.fz)")
+    group.add_argument(
+        "--length", type=float, default=0.012, metavar="M", help="length of contact along the finger (0.012)"
+    )
+    group.add_argument(
+        "--indenters",
+        type=float,
+        nargs="+",
+        default=[0.0],
+        metavar="R",
+        help="radii at hand in m, 0 an edge, inf a flat; the first is mounted, the others are asked for (0)",
+    )
+    group.add_argument("--load", type=float, default=200.0, metavar="N/M", help="usual load (200)")
+    group.add_argument("--most-load", type=float, default=250.0, metavar="N/M", help="largest load (250)")
+    group.add_argument("--step", type=float, default=2.0, metavar="DEG", help="from place to place (2)")
+    group.add_argument(
+        "--first",
+        choices=("full", "one_place"),
+        default="full",
+        help="what is recorded before anything is decided",
+    )
+    group.add_argument(
+        "--install",
+        type=Path,
+        metavar="FILE",
+        help="write the corrected finger there and have the driver load it",
+    )
+    group.add_argument("--socket", metavar="PATH", help="the daemon's socket")
+
+
 def run_sensor(args: argparse.Namespace) -> int:
     """Reconcile one sensor from recordings, or score many; return the exit status."""
     # matrices are small: more threads only wait for each other, and badly so on a busy machine
@@ -55,11 +101,46 @@ def run_sensor(args: argparse.Namespace) -> int:
 
     progress = (lambda text: None) if args.quiet else _say
     try:
+        if args.subject == "tactile" and not args.data.exists() and len(args.data.parts) == 1:
+            return run_node(args, progress)
         verdict, seconds = _analysed(args, progress)
         _write(verdict, seconds, args)
     except BadInputError as e:
         print(f"bad input: {e}", file=sys.stderr)
         return EXIT_BAD_INPUT
+    return EXIT[verdict.outcome]
+
+
+def run_node(args: argparse.Namespace, progress: Any) -> int:
+    """Reconcile the finger behind a node; return the exit status."""
+    from math import radians
+
+    from sioms.reconcile.errors import BadInputError
+    from sioms.reconcile.verdict import EXIT
+    from sioms.tools.reconcile_touch import Probe, install, live
+    from sioms.tools.stopping import ExperimentStopped
+    from sioms.tools.tactile_prober import Rig
+
+    node = str(args.data)
+    if args.model is None:
+        raise BadInputError(
+            f"reconcile {node}: it is no folder, and for a node --model is needed: the nominal finger"
+        )
+    rig = Rig(args.place, args.press, node, args.force, args.length, args.most_load)
+    radii, full = tuple(dict.fromkeys(args.indenters)), args.first == "full"
+    asked = Probe(rig, radii, args.load, radians(args.step), full, args.yes, args.socket, args.seed)
+    try:
+        verdict, seconds = live(args.model, asked, args.out / "records", progress)
+    except (ExperimentStopped, OSError) as e:
+        print(f"stopped: {getattr(e, 'strerror', None) or e}", file=sys.stderr)
+        return EXIT_STOPPED
+    except KeyboardInterrupt:
+        print(f"stopped: interrupted; {args.press} is clear of the finger or halted", file=sys.stderr)
+        return EXIT_STOPPED
+    _write(verdict, seconds, args)
+    if args.install is not None:
+        text = (args.out / "finger.toml").read_text(encoding="utf-8")
+        print(install(text, args.install, node, args.socket))
     return EXIT[verdict.outcome]
 
 

@@ -13,7 +13,8 @@ import sioms
 from sioms.tactile.finger import to_toml
 from sioms.tools.report_page import Page
 from sioms.tools.tactile import Progress
-from sioms.tools.tactile_prober import FINGER, LENGTH_M, Prober, Touch, simulated, write_nominal
+from sioms.tools.tactile_prober import LENGTH_M, Prober, Touch, write_nominal
+from sioms.tools.tactile_simulated import FINGER, simulated
 from sioms.tools.tactile_tables import calibrated, tables
 
 ANGLES_DEG = 143.0 - 9.22 * np.arange(16)
@@ -49,18 +50,14 @@ def probe(folder: Path, finger: str, quick: bool, progress: Progress) -> None:
         tempfile.TemporaryDirectory(prefix="sioms-finger-", dir="/tmp") as place,
         simulated(Path(place), finger, RADII_M) as mount,
         sioms.Workcell(name="experiment") as cell,
+        Prober(cell, mount) as prober,
     ):
-        prober = Prober(cell, mount)
-        try:
-            prober.quiet(1024 if quick else 8192).save(folder / "noise.npz")
-            progress("noise")
-            prober.prepare(0.0, math.radians(74.0))
-            for name, touches in plan(quick).items():
-                prober.run(touches, progress, name).save(folder / f"{name}.npz")
-            seconds = 0.5 if quick else 2.0
-            prober.ramps(np.radians(ANGLES_DEG).tolist(), 250.0, seconds, progress).save(folder / "ramp.npz")
-        finally:
-            prober.close()
+        prober.quiet(1024 if quick else 8192).save(folder / "noise.npz")
+        progress("noise")
+        for name, touches in plan(quick).items():
+            prober.run(touches, progress, name).save(folder / f"{name}.npz")
+        seconds = 0.5 if quick else 2.0
+        prober.ramps(np.radians(ANGLES_DEG).tolist(), 250.0, seconds, progress).save(folder / "ramp.npz")
 
 
 def experiment(args: argparse.Namespace) -> int:

@@ -14,7 +14,8 @@ from sioms.tactile.cylinder import FINGER_B
 from sioms.tactile.estimator import Quality
 from sioms.tactile.finger import nominal_finger, to_toml
 from sioms.tools.tactile_data import read_folder
-from sioms.tools.tactile_prober import LENGTH_M, Prober, Touch, simulated, write_nominal
+from sioms.tools.tactile_prober import LENGTH_M, Prober, Rig, Touch, write_nominal
+from sioms.tools.tactile_simulated import simulated
 
 CONFIG = Path(__file__).parents[2] / "etc" / "prober.toml"
 ANGLES = np.radians(143.0 - 9.22 * np.arange(16))
@@ -38,13 +39,13 @@ def test_probing_is_felt_in_the_driver_and_recorded_for_calibration(short_folder
     with (
         simulated(short_folder, finger, (6e-3,), CONFIG.read_text() + SHAPE) as mount,
         sioms.Workcell(name="test") as cell,
+        Prober(cell, mount, Rig(lease_s=30.0)) as prober,
     ):
-        prober = Prober(cell, mount)
         prober.prepare(6e-3, place)
         with cell.open("tactile0.shape") as shape, cell.open("tactile0.strain") as strain:
             wait_for(lambda: felt(shape)["quality"] == Quality.NO_CONTACT.value, "an untouched finger")
-            prober._go(place, 6e-3)
-            prober._press(200.0 * LENGTH_M / prober._stiffness)
+            prober.go(place, 6e-3)
+            prober.press(200.0)
             found = wait_for(lambda: (now := felt(shape))["quality"] == 0.0 and now, "a good estimate")
             assert abs(math.degrees(found["angle"] - place)) < 0.5
             assert abs(found["load"] - 200.0) < 12.0
@@ -52,12 +53,11 @@ def test_probing_is_felt_in_the_driver_and_recorded_for_calibration(short_folder
             assert min(strain.read().data) < -0.05
             gains = strain.ioctl(Request.GET_GAINS)
             assert np.allclose(np.reshape(gains, (16, 16)), 3.0 * np.eye(16))
-            prober._clear()
+            prober.clear()
             assert strain.ioctl(Request.CALIBRATE_DEVICE, text) == "nominal"
             wait_for(lambda: felt(shape)["quality"] == Quality.NO_CONTACT.value, "the finger loaded anew")
         plan = [Touch(math.radians(d), 200.0, 6e-3) for d in (60.0, 90.0)]
         prober.run(plan, lambda what: None, "two touches").save(short_folder / "two.npz")
-        prober.close()
     write_nominal(short_folder / "nominal.json", ANGLES)
     touches = read_folder(short_folder).touches["two"]
     assert np.allclose(np.degrees(touches.angle_rad), (60.0, 90.0))

@@ -2,7 +2,8 @@
 
 The front end of ``adc`` with a simulated finger (``sioms.plant.finger``) on it. What touches it is told by nodes of a workcell that it
 reads as a client: the force on it, where, and how near. While these are not there nothing touches it. Further
-command on standard input: ``indenter RADIUS`` (m; 0 an edge, inf a flat), as if somebody changed the tool.
+command on standard input: ``indenter RADIUS`` (m; 0 an edge, inf a flat), as if somebody changed the tool. What the finger hides
+from those who probe it may come in a file (``--finger-file``) that nobody else reads.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import math
 import time
 import tomllib
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -125,16 +127,19 @@ def finger_parser() -> argparse.ArgumentParser:
         default="",
         help='fields of the finger as TOML: "gain = 3.0; creep = 0.1" (see sioms.plant.finger)',
     )
+    parser.add_argument(
+        "--finger-file", type=Path, help="file with further fields, one a line; read once, at the start"
+    )
     return parser
 
 
-def shape_of(text: str) -> FingerShape:
-    """Return the finger described by fields, one a line or parted by semicolons.
+def shape_of(text: str, more: str = "") -> FingerShape:
+    """Return the finger described by fields, one a line or parted by semicolons; ``more`` of them go before.
 
     Raises:
         ValueError: not TOML, an unknown field, or a value that makes no sense.
     """
-    fields = tomllib.loads(text.replace(";", "\n"))
+    fields = tomllib.loads(text.replace(";", "\n")) | tomllib.loads(more)
     if "angles_rad" in fields:
         fields["angles_rad"] = tuple(fields["angles_rad"])
     try:
@@ -148,8 +153,9 @@ def main() -> None:
     parser = finger_parser()
     options = parser.parse_args()
     try:
-        array = TactileArray(shape_of(options.finger), noise=options.noise_percent, seed=options.seed)
-    except ValueError as error:
+        hidden = options.finger_file.read_text(encoding="utf-8") if options.finger_file else ""
+        array = TactileArray(shape_of(options.finger, hidden), noise=options.noise_percent, seed=options.seed)
+    except (ValueError, OSError) as error:
         parser.error(str(error))
     options.channels = len(array.shape.angles_rad)
     world = World(
