@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from sioms.reconcile.blocks import better, block_ids, bootstrap, heldout
+from sioms.reconcile.blocks import better, block_ids, bootstrap, heldout, intervals
 from sioms.reconcile.channels import drive, drive_output, index_fit, lattice
 from sioms.reconcile.excitation import common, gate
 from sioms.reconcile.experiment import Envelope, catalogue, demands, one_speed, repeated, separate
@@ -122,6 +122,27 @@ def test_blocks_agree_with_refitting() -> None:
     assert loss.sum() == pytest.approx(fit.cost, rel=0.02)
     spread = np.std(bootstrap(fit, ids, 300, np.random.default_rng(1))[:, 0]) * fit.free[0].scale
     assert abs(fit.model.effects["viscous"]["b_extra"] - 5e-3) < 5.0 * spread + 5e-5
+
+
+def test_intervals_cover_where_few_blocks_tell_a_parameter() -> None:
+    """Four hundred linear fits to correlated noise; of two parameters the second acts in three of thirty blocks only."""
+
+    @dataclass
+    class Linear:
+        residual: np.ndarray
+        jacobian: np.ndarray
+
+    rng, blocks, size = np.random.default_rng(2), 30, 20
+    ids = np.repeat(np.arange(blocks), size)
+    columns = np.stack([np.sin(0.3 * np.arange(len(ids))), np.where(ids % 10 == 0, 1.0, 0.0)], axis=1)
+    hits = np.zeros(2)
+    for _ in range(400):
+        white = rng.standard_normal(len(ids) + 4)
+        noise = np.convolve(white, [1.0, 0.8, 0.6, 0.4, 0.2], "valid")
+        moved = np.linalg.lstsq(columns, noise, rcond=None)[0]  # the truth is zero
+        hits += np.abs(moved) <= intervals(Linear(columns @ moved - noise, columns), ids)
+    assert np.all(hits > 368)
+    assert hits[0] < 396
 
 
 def test_a_lucky_fit_to_loud_blocks_is_not_sure() -> None:
