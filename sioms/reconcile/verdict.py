@@ -36,7 +36,7 @@ EXIT_BAD_INPUT = 2
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """One parameter with its 95 % interval (block bootstrap)."""
+    """One parameter with its 95 % interval (blocks of time left out in turn)."""
 
     symbol: str
     value: float
