@@ -55,7 +55,8 @@ class Connected:
                 if now_ns > self._limit_ns:
                     raise OSError(
                         errno.ETIMEDOUT,
-                        f"connect to {self._base.line}: no answer within {self._base.line.connect_timeout_s:g} s",
+                        f"connect to {self._base.line}: no answer within {self._base.line.connect_timeout_s:g} s; "
+                        "look at host, port and network",
                     )
                 return False
         except OSError as error:

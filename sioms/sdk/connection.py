@@ -15,6 +15,8 @@ import serial
 from .datagram import Datagrams, split_address
 from .settings import LineSettings
 
+_LOOK = "look at host, port and network"
+
 
 class Connection:
     """A line that is open, or being opened.
@@ -56,7 +58,7 @@ class Connection:
             return False
         error = self._sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
         if error:
-            raise OSError(error, f"connect to {self.settings}: {os.strerror(error).lower()}")
+            raise OSError(error, f"connect to {self.settings}: {os.strerror(error).lower()}; {_LOOK}")
         return True
 
     def write(self, data: bytes) -> None:
@@ -118,8 +120,10 @@ class Connection:
                 timeout=0, exclusive=True,
             )  # fmt: skip
         except serial.SerialException as error:
-            number = error.errno or errno.EIO
+            cause = error.__context__  # the port was opened, and is none
+            number = error.errno or (cause.args[0] if isinstance(cause, termios.error) else errno.EIO)
             hint = {
+                errno.ENOTTY: "it is no serial port",
                 errno.ENOENT: "no such port; is the device plugged in",
                 errno.EACCES: "no permission; is the user in the group dialout",
                 errno.EBUSY: "in use by another process",
@@ -146,10 +150,11 @@ class Connection:
             result = sock.connect_ex((host, port))
         except OSError as error:
             sock.close()
-            raise OSError(error.errno, f"connect to {settings}: {error.strerror}") from None
+            why = (error.strerror or str(error)).lower()
+            raise OSError(error.errno, f"connect to {settings}: {why}; {_LOOK}") from None
         if result not in (0, errno.EINPROGRESS):
             sock.close()
-            raise OSError(result, f"connect to {settings}: {os.strerror(result).lower()}")
+            raise OSError(result, f"connect to {settings}: {os.strerror(result).lower()}; {_LOOK}")
         self._sock = sock
 
 

@@ -23,7 +23,7 @@ from sioms.protocol.nodeinfo import ChannelInfo
 
 from .blocks import AnyBlock, AxisBlock, BlockSpec
 from .driver import Kit, LineUnit
-from .exchange import DeviceError, LinkError, Steps
+from .exchange import DeviceError, LinkError, Steps, while_wanted
 from .tables import from_table, table_type
 
 BANK_MODES = (
@@ -211,28 +211,24 @@ class AxesUnit(LineUnit):
             return self.halt(action.axis, fastest=action.kind is ActionKind.QUICK_STOP)
         if action.kind is ActionKind.RESET:
             return self.reset(action.axis)  # a stop that overtakes it does not make it void
-        return self._while_wanted(action, self._epoch[action.axis])
+        return self._unless_overtaken(action, self._epoch[action.axis])
 
     def stop(self) -> Steps:
-        """Stop all axes the fastest way."""
+        """Stop all axes the fastest way; one that does not obey keeps none of the others from being stopped."""
+        failures: list[LinkError | DeviceError] = []
         for axis in range(self.bank.n):
             self._epoch[axis] += 1
             self._runs[axis] = self._goes[axis] = False
-            yield from self.halt(axis, fastest=True)
-
-    def _while_wanted(self, action: DriveAction, epoch: int) -> Steps:
-        """Carry out an action step by step, and no further once a stop has overtaken it."""
-        steps, value, failure = self._steps(action), None, None
-        while epoch == self._epoch[action.axis]:
             try:
-                step = steps.throw(failure) if failure else steps.send(value)
-            except StopIteration:
-                return
-            value, failure = None, None
-            try:
-                value = yield step
+                yield from self.halt(axis, fastest=True)
             except (LinkError, DeviceError) as error:
-                failure = error
+                failures.append(error)
+        if failures:
+            raise failures[0]
+
+    def _unless_overtaken(self, action: DriveAction, epoch: int) -> Steps:
+        """Carry out an action, and no further once a stop has overtaken it."""
+        yield from while_wanted(self._steps(action), lambda: epoch == self._epoch[action.axis])
 
     def _steps(self, action: DriveAction) -> Steps:
         match action.kind:

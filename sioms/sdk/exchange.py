@@ -22,7 +22,12 @@ class LinkError(Exception):
 
     The kit repeats a repeatable exchange, counts the failure, and declares the link lost after
     ``misses`` failures in a row. Not for what a device answers properly: that is DeviceError.
+
+    Attributes:
+        heard: bytes came, but no right reply; set by the kit.
     """
+
+    heard = False
 
 
 class DeviceError(Exception):
@@ -89,3 +94,20 @@ class Aside:
 Step = Exchange | Send | Pause | Aside
 Steps = Generator[Step, Any, None]
 """What a hook returns: a generator of steps."""
+
+
+def while_wanted(steps: Steps, is_wanted: Callable[[], bool]) -> Generator[Step, Any, bool]:
+    """Carry out steps one by one, and no further once they are not wanted any more; return whether they came to their end."""
+    value: Any = None
+    failure: Exception | None = None
+    while is_wanted():
+        try:
+            step = steps.throw(failure) if failure else steps.send(value)
+        except StopIteration:
+            return True
+        value, failure = None, None
+        try:
+            value = yield step
+        except (LinkError, DeviceError) as error:
+            failure = error
+    return False

@@ -116,6 +116,7 @@ class Line:
         self._state = _State.IDLE
         self._until_ns = 0
         self._babble_ns = 0
+        self._failure = LinkError("")
         self._quiet_since_ns = 0
 
     @property
@@ -178,7 +179,7 @@ class Line:
             value = exchange.decode(bytes(running.reply[:length]))
         except LinkError as error:
             self.counters.garbled += 1
-            self._recover(str(error), now_ns)
+            self._recover(str(error), now_ns, heard=True)
         except DeviceError as error:
             self.counters.replies += 1
             self.counters.refused += 1
@@ -210,8 +211,9 @@ class Line:
                 self.counters.timeouts += 1
                 step = running.step
                 what = step.what if isinstance(step, Exchange) else "exchange"
-                got = f"{len(running.reply)} bytes of a reply" if running.reply else "no reply"
-                self._recover(f"{what}: {got} within its time-out", now_ns)
+                heard = len(running.reply)
+                got = f"{heard} bytes and no whole reply" if heard else "no reply"
+                self._recover(f"{what}: {got} within its time-out", now_ns, heard=heard > 0)
             case _State.RECOVERING:
                 quiet_ns = self._quiet_since_ns + self._recovery_ns
                 if now_ns < quiet_ns and now_ns < self._babble_ns:
@@ -280,7 +282,8 @@ class Line:
         if running is None or not isinstance(running.step, Exchange | Send):
             return
         step = running.step
-        stale = self.connection.read()
+        just_read = now_ns == self._quiet_since_ns and self.connection.settings.udp is None
+        stale = b"" if just_read else self.connection.read()
         if stale and self._unsolicited is not None:
             self._unsolicited(stale, now_ns)
         else:
@@ -324,9 +327,10 @@ class Line:
             self.counters.replies += 1
             self._resume(found[0], now_ns)
 
-    def _recover(self, reason: str, now_ns: int) -> None:
+    def _recover(self, reason: str, now_ns: int, *, heard: bool) -> None:
         self._state = _State.RECOVERING
-        self._reason = reason
+        self._failure = LinkError(reason)
+        self._failure.heard = heard
         self._until_ns = max(now_ns, self._quiet_since_ns) + self._recovery_ns
         self._babble_ns = self._until_ns + BABBLE_NS
 
@@ -339,4 +343,4 @@ class Line:
             self.counters.repeats += 1
             self._transmit(now_ns)
         else:
-            self._resume(LinkError(self._reason), now_ns)
+            self._resume(self._failure, now_ns)

@@ -14,7 +14,7 @@ from sioms.protocol.flags import PageState
 from .blocks import AnyBlock, AxisBlock
 from .connected import FIRST_PAUSE_NS, LONGEST_PAUSE_NS, Connected
 from .driver import LineDriver, LineUnit
-from .exchange import DeviceError, LinkError, Steps
+from .exchange import DeviceError, LinkError, Steps, while_wanted
 from .handles import LATER, Handle
 from .line import Done, Priority
 
@@ -118,12 +118,14 @@ class LineEngine(Connected):
                     block, self._unowned(block)
                 )  # who wrote them may have gone meanwhile
         for block in state.unit.blocks:
-            self._runtime.publish(block, block.stamp_ns or now_ns)
             if isinstance(block, AxisBlock):
                 self._take_actions(state, block, now_ns)
-        self._runtime.after_publication(now_ns)
+        # the line is slower than the rate asked for: poll back to back, and publish while the request is on the line
         if state.due_ns <= now_ns and self.line is not None and not state.busy and self._runtime.running:
-            self._start(state, now_ns)  # the line is slower than the rate asked for: poll back to back
+            self._start(state, now_ns)
+        for block in state.unit.blocks:
+            self._runtime.publish(block, block.stamp_ns or now_ns)
+        self._runtime.after_publication(now_ns)
 
     def _told(self, unit: LineUnit, error: Exception) -> str:
         """Return what failed of which unit, and what to look at unless the driver has said so."""
@@ -234,19 +236,11 @@ class LineEngine(Connected):
 
     def _unless_void(self, steps: Steps, marks: dict[tuple[int, int], int]) -> Steps:
         """Carry out a write of outputs, and no further once a stop or a safe value has overtaken it."""
-        value: Any = None
-        failure: Exception | None = None
-        while all(self._voids[key] == mark for key, mark in marks.items()):
-            try:
-                step = steps.throw(failure) if failure else steps.send(value)
-            except StopIteration:
-                return
-            value, failure = None, None
-            try:
-                value = yield step
-            except (LinkError, DeviceError) as error:
-                failure = error
-        raise DeviceError(errno.ECANCELED, "overtaken by a stop or a safe value")
+        done = yield from while_wanted(
+            steps, lambda: all(self._voids[key] == mark for key, mark in marks.items())
+        )
+        if not done:
+            raise DeviceError(errno.ECANCELED, "overtaken by a stop or a safe value")
 
     def _unowned(self, block: AnyBlock) -> list[int]:
         """Return the channels whose outputs no client holds; a stopped workcell holds none."""

@@ -107,6 +107,7 @@ class Runtime:
         self._callbacks: dict[int, Callable[[], None]] = {}
         self._timer = TimerFd()
         self._line_timer = TimerFd()
+        self._line_due_ns: int | None = None
         self.stops = Stops(self, self.latch, request, options["stop_sources"])
         self._phase = float(options["phase"])
         self._daemon_lease_ns = int(float(options["daemon_lease_s"]) * 1e9)
@@ -167,7 +168,9 @@ class Runtime:
 
     def set_line_timer(self, when_ns: int | None) -> None:
         """Have ``line_due`` called at a time, None = not."""
-        self._line_timer.set(0 if when_ns is None else max(when_ns, 1))
+        if when_ns != self._line_due_ns:  # most bytes that come change nothing about it
+            self._line_due_ns = when_ns
+            self._line_timer.set(0 if when_ns is None else max(when_ns, 1))
 
     def set_link(self, blocks: Sequence[AnyBlock], state: PageState, reason: str) -> None:
         """Say how the device behind some blocks is: in their pages, and to the daemon once a change."""
@@ -293,6 +296,7 @@ class Runtime:
 
     def _on_line_timer(self) -> None:
         self._line_timer.expirations()
+        self._line_due_ns = None
         self.line_due()
 
     def _fail(self, error: Exception) -> None:

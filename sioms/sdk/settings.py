@@ -50,6 +50,11 @@ class LineSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Bits a character takes on a serial line: start, eight data, parity, stop."""
         return 9 + (self.parity != "N") + self.stop_bits
 
+    @property
+    def speed(self) -> str:
+        """Speed and format of a serial line in words, e.g. ``115200 baud, 8N1``."""
+        return f"{self.baud} baud, 8{self.parity}{self.stop_bits}"
+
     def __str__(self) -> str:
         return self.serial or self.tcp or self.udp or self.path or "?"
 

@@ -104,7 +104,8 @@ class Module:
 
     def exchange(self, op: Op, kind: int = 0, motor: int = 0, value: int = 0) -> Exchange:
         """Return a request and the check of its reply."""
-        what = f"{op.name} {kind} of motor {motor} of module {self.address}"
+        of_motor = "" if op in (Op.VERSION, Op.GGP, Op.SGP) else f"motor {motor} of "
+        what = f"{op.name} {kind} of {of_motor}module {self.address}"
         repeatable = op in _READS or (op is Op.RFS and kind == 2)
         data = request(self.address, op, kind, motor, value)
         return Exchange(data, _size, self._decoder(op, value, what), self.turnaround_s, repeatable, what)

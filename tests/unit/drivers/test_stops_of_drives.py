@@ -12,6 +12,7 @@ from sioms.drivers.grbl import Grbl
 from sioms.drivers.odrive import Odrive
 from sioms.drivers.tmcl import Tmcl
 from sioms.motion import ActionKind, DriveAction
+from sioms.sdk.exchange import DeviceError
 from sioms.tools.counterparts import dynamixel, grbl, odrive, tmcl
 
 ACTION = DriveAction(ActionKind.START, 0, None, 0.1, 1.0)
@@ -113,6 +114,21 @@ def test_a_search_of_a_driver_that_died_is_ended() -> None:
     assert not rig.device.motors[0].searching and not rig.device.motors[0].mover.busy
     requests = [data[1:4] for data in rig.sent]  # command, type, motor
     assert requests.index(b"\x0d\x01\x00") < requests.index(b"\x03\x00\x00"), "search ended, then stop"
+
+
+def test_a_motor_that_does_not_obey_keeps_no_other_from_being_stopped() -> None:
+    axes = [
+        {"name": name, "motor": motor, "travel_per_turn": 0.01, **LIMITS}
+        for name, motor in (("x", 5), ("y", 0))
+    ]
+    rig = Joined(Tmcl, {"axis": axes, "heartbeat_s": 0.0}, lambda clock: tmcl.Module(clock=clock))
+    rig.device.take(bytes((1, 1, 0, 0, 0, 0, 0x40, 0, 0x42)))  # rotate motor 0 at 0x4000
+    rig.wait(0.5)
+    assert rig.device.motors[0].mover.velocity > 10_000
+    with pytest.raises(DeviceError, match="motor 5"):
+        rig.do(rig.unit.open())  # the module has one motor
+    rig.wait(1.0)
+    assert rig.device.motors[0].mover.velocity == 0
 
 
 # --- ODrive ---------------------------------------------------------------------------------------
