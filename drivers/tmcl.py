@@ -21,6 +21,7 @@ from __future__ import annotations
 import errno
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -219,6 +220,8 @@ class TmclUnit(AxesUnit):
         position, velocity = np.zeros(n), np.zeros(n)
         moving, done = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         for axis, (motor, scale) in enumerate(zip(self._motors, self._scales, strict=True)):
+            # before the position, which the end of a search changes
+            searches = self._homes[axis] and (yield self._module.exchange(Op.RFS, 2, motor)) != 0
             steps = yield self._module.get(Axis.ACTUAL_POSITION, motor)
             speed = yield self._module.get(Axis.ACTUAL_SPEED, motor)
             reached = yield self._module.get(Axis.POSITION_REACHED, motor)
@@ -226,9 +229,8 @@ class TmclUnit(AxesUnit):
             velocity[axis] = speed / (scale.per_speed * scale.per_unit)
             moving[axis], done[axis] = speed != 0, bool(reached)
             if self._homes[axis]:
-                searching = yield self._module.exchange(Op.RFS, 2, motor)
-                moving[axis], done[axis] = searching != 0, searching == 0
-                self._homes[axis] = searching != 0
+                moving[axis], done[axis] = searches, not searches
+                self._homes[axis] = searches
         if self.clock() >= self._seldom_ns:
             self._seldom_ns = self.clock() + SELDOM_NS
             yield from self._read_faults()
@@ -271,10 +273,8 @@ class TmclUnit(AxesUnit):
     def _end_searches(self) -> Steps:
         """End reference searches that a process before this one began: MST stops the motor, the search may start it again."""
         for motor in self._motors:
-            try:
+            with suppress(DeviceError):  # there are modules without reference search
                 yield self._module.exchange(Op.RFS, 1, motor)
-            except DeviceError:
-                return  # a module without reference search
 
     def _ramp(self, axis: int, parameter: Axis, value: int) -> Steps:
         """Set a parameter of the ramp unless the module has it."""
