@@ -155,10 +155,10 @@ class ServoUnit(AxesUnit):
             yield from self._switch_on()
 
     def poll(self) -> Steps:
-        """Read moving, current, velocity and position in one message."""
-        answer: Status = yield self._bus.read(self._id, MOVING, 14)
-        data = answer.data
-        yield from self._judge(answer.alert)
+        """Read watchdog, moving, current, velocity and position in one message."""
+        answer: Status = yield self._bus.read(self._id, WATCHDOG, MOVING + 14 - WATCHDOG)
+        expired, data = answer.data[0] == WATCHDOG_EXPIRED, answer.data[MOVING - WATCHDOG :]
+        yield from self._judge(answer.alert, expired)
         speed = signed(data, 6, 4) / self._speed * math.copysign(1, self._per_unit)
         position = (signed(data, 10, 4) - self._axis.zero) / self._per_unit
         force = signed(data, 4, 2) * self._axis.current_unit * self._axis.force_per_ampere
@@ -284,19 +284,15 @@ class ServoUnit(AxesUnit):
             yield self._write(address, value, 4, repeatable=True)
             self._ramps[address] = value
 
-    def _judge(self, alert: bool) -> Steps:
+    def _judge(self, alert: bool, expired: bool) -> Steps:
         """Say why the servo cannot move."""
         if alert:
             errors: Status = yield self._bus.read(self._id, HARDWARE_ERROR, 1)
             names = [text for bit, text in HARDWARE_ERRORS.items() if errors.data[0] & bit]
             self._fault = f"hardware error {errors.data[0]:#x}, {', '.join(names)}; RESET restarts the servo"
             return
-        if self._settings.watchdog_s and self._torque:
-            watchdog: Status = yield self._bus.read(self._id, WATCHDOG, 1)
-            expired = watchdog.data[0] == WATCHDOG_EXPIRED
-            self._fault = "the bus watchdog expired: the servo heard nothing for too long" if expired else ""
-        else:
-            self._fault = ""
+        mute = expired and self._torque and self._settings.watchdog_s
+        self._fault = "the bus watchdog expired: the servo heard nothing for too long" if mute else ""
 
 
 class Dynamixel(LineDriver):
