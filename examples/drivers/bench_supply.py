@@ -165,6 +165,7 @@ class BenchSupply(LineDriver):
         "tables": '[device.supply]\ndriver = "./bench_supply.py"\nline = { serial = "{port}" }\npoll_hz = 50.0\n',
         "counterpart": ["bench_supply_device.py"],
         "analogs": ["supply.meas"],
+        "outputs": [{"node": "supply", "width": 0, "safe": 0.0, "other": 5.0}],
         "checked": False,
     }
 

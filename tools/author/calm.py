@@ -16,8 +16,10 @@ from .station import Node, Station
 
 REST_S = 0.2
 BAD = int(AnalogStatus.INVALID)
-WIDER = 1.0
+WIDER = 2.0
 """An analog reading may leave the band that it had at rest by so many of its widths."""
+NOISY, NOISY_S = 50, 0.6
+"""Readings of analog nodes that tell how wide that band is, and how long they are waited for [s]."""
 
 
 class Calm:
@@ -51,16 +53,29 @@ class Calm:
                 opened.close()
 
     def _learn(self) -> None:
-        """Note what the readings are now."""
+        """Note what the readings are now; the first time so many of an analog node that its noise is known."""
+        noise, seen = self._station.noise, dict.fromkeys(range(len(self._nodes)), 0)
+        fresh = [
+            i
+            for i, (n, _) in enumerate(self._nodes)
+            if n.node_class is NodeClass.ANALOG and n.name not in noise
+        ]
         for i, (_, opened) in enumerate(self._nodes):
             self._numbers[i] = opened.read().number
-        deadline = time.monotonic() + REST_S
-        while time.monotonic() < deadline:
+        began_s = time.monotonic()
+        while (took_s := time.monotonic() - began_s) < REST_S or (
+            took_s < NOISY_S and any(seen[i] < NOISY for i in fresh)
+        ):
             time.sleep(0.02)
             for i, (node, opened) in enumerate(self._nodes):
                 for snapshot in opened.history(self._numbers[i]):
                     self._numbers[i] = snapshot.number
                     self._still[i] = _widened(node, self._still[i], snapshot)
+                    seen[i] += 1
+        for i in fresh:
+            if self._still[i] is not None:
+                lows, highs = self._still[i]
+                noise[self._nodes[i][0].name] = [high - low for low, high in zip(lows, highs, strict=True)]
 
     def watch(self, seconds: float) -> None:
         """Look at all readings for a time."""
@@ -94,8 +109,9 @@ class Calm:
                     return f"{node.name}: data {snapshot.data}, at rest {still}"
             case NodeClass.ANALOG:
                 lows, highs = still
+                noise = self._station.noise.get(node.name, [0.0] * len(lows))
                 for c, (value, status) in enumerate(zip(snapshot.data, snapshot.flags, strict=True)):
-                    band = WIDER * (highs[c] - lows[c]) + 1e-9 * abs(highs[c])
+                    band = WIDER * max(highs[c] - lows[c], noise[c]) + 1e-9 * abs(highs[c])
                     if not lows[c] - band <= value <= highs[c] + band and not status & BAD:
                         return f"{node.name}: channel {c} reads {value:.6g}, at rest {lows[c]:.6g} to {highs[c]:.6g}"
         return ""

@@ -10,8 +10,11 @@ import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
+
+from sioms.wording import did_you_mean
 
 from ..counterparts.rigs import MAP_RIGS, RIGS, Rig, find_rig, rig_of
 from .check import Subject, check, trial_names
@@ -20,6 +23,7 @@ from .report import line_of, write_report
 from .trial import Verdict
 
 USAGE = 2
+GROUP = "sioms.drivers"
 
 
 class Unusable(Exception):
@@ -101,6 +105,11 @@ def subject_of(name: str, counterpart: str = "", config: Path | None = None) -> 
     is_file = name.endswith(".py") or "/" in name
     path = Path(name).resolve()
     folder = path.parent if is_file else None
+    if path.suffix == ".toml":
+        raise Unusable(
+            f"{name}: a register map is checked with its driver: give modbus-axis or modbus-io, and in a --config FILE a "
+            f'device with map = "{name}"; --counterpart "COMMAND" names what simulates it'
+        )
     rig = _named_by_class(path) if is_file else find_rig(name)
     if rig is None and not is_file:
         rig = _registered(name)
@@ -129,6 +138,11 @@ def _named_by_class(path: Path) -> Rig | None:
 
 
 def _registered(name: str) -> Rig | None:
+    installed = {entry.name for entry in entry_points(group=GROUP)}
+    if name not in installed:
+        known = sorted(installed | {rig.title for rig in (*RIGS, *MAP_RIGS)})
+        near = did_you_mean(name, known) or f"; there are: {', '.join(known)}"
+        raise Unusable(f"{name}: no driver or register map of this name{near}")
     try:
         keys = probe(name)["rig"]
         return rig_of({"driver": name, **keys}) if keys else None

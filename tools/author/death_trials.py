@@ -11,6 +11,7 @@ from typing import Any
 
 from sioms.protocol.flags import ControlMode
 
+from ..counterparts.rigs import Output
 from .motion_trials import REST_S, SLOW, STILL_S, check_rest, run, slowly, wait_moving
 from .station import Client, Station, wait_for
 from .trial import Failed, NotApplicable, Trial
@@ -29,7 +30,7 @@ time.sleep(1000)
 """
 SET = """
 node = cell.open(sys.argv[2], 'rw', timeout=5.0)
-node.set(int(sys.argv[3]))
+node.set(*[float(sys.argv[3])] * len(node.info.channels))
 print('ready', flush=True)
 time.sleep(1000)
 """
@@ -66,22 +67,23 @@ def client_killed(station: Station, full: bool) -> str:
 
 
 def _outputs_of_killed(station: Station) -> list[str]:
-    outputs = [output for output in station.rig.outputs if output.safe is not None]
-    if not outputs:
-        return []
-    output = outputs[0]
-    other = 0b10 if output.safe != 0b10 else 0b01
+    return [_output_of_killed(station, output) for output in station.rig.outputs if output.safe is not None]
+
+
+def _output_of_killed(station: Station, output: Output) -> str:
+    safe = output.safe or 0.0
     with station.cell.open(f"{output.node}.readonly") as seen:
-        client = station.start_client(SET, output.node, str(other))
-        shown = wait_for(lambda: seen.read().data[0] == other, 3.0)
+        client = station.start_client(SET, output.node, f"{output.another:g}")
+        shown = wait_for(lambda: output.shown(seen, output.another), 3.0)
         client.kill()
         if not shown:
-            raise Failed(f"outputs {other:#x} after a write", f"{seen.read().data[0]:#x}")
-        if not wait_for(lambda: seen.read().data[0] == output.safe, 3.0):
+            raise Failed(f"{output.node} = {output.another:g} after a write", f"{seen.read().data[0]:g}")
+        if not wait_for(lambda: output.shown(seen, safe), 3.0):
             raise Failed(
-                f"safe outputs {output.safe:#x} after SIGKILL of their writer", f"{seen.read().data[0]:#x}"
+                f"{output.node} = {safe:g}, the safe value, after SIGKILL of its writer",
+                f"{seen.read().data[0]:g}",
             )
-    return ["outputs safe"]
+    return f"{output.node} safe"
 
 
 def driver_killed(station: Station, full: bool) -> str:

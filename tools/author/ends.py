@@ -1,4 +1,4 @@
-"""The two ends of a wire: what a driver opens, and what leads to its device. Serial ports, TCP and UDP.
+"""The two ends of a wire: what a driver opens, and what leads to its device. Serial ports and TCP; UDP is in ``datagram_ends``.
 
 All are non-blocking. ``read`` returns whole datagrams on UDP. A line that is not there takes bytes and loses them.
 """
@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Protocol
 
 from ..counterparts.ports import allow_parity, make_link
+from .datagram_ends import GONE, PushedDevice, PushedHost, UdpDevice, UdpHost
 
-_GONE = (ConnectionError, BlockingIOError, TimeoutError)
+KINDS = ("serial", "tcp", "udp", "pushed")
+DATAGRAMS = ("udp", "pushed")
 
 
 class End(Protocol):
@@ -34,6 +36,16 @@ class End(Protocol):
 
     def unplug(self) -> None:
         """Make it vanish."""
+
+
+class Host(End, Protocol):
+    """The driver's end.
+
+    Attributes:
+        name: what the driver opens.
+    """
+
+    name: str
 
 
 class SerialHost:
@@ -166,7 +178,7 @@ class TcpHost:
     def write(self, data: bytes) -> None:
         """Send to the driver, if there is one."""
         if self._driver is not None:
-            with contextlib.suppress(*_GONE):
+            with contextlib.suppress(*GONE):
                 self._driver.send(data)
 
     def plug(self) -> None:
@@ -202,7 +214,7 @@ class TcpDevice:
     def write(self, data: bytes) -> None:
         """Send."""
         if self._sock is not None:
-            with contextlib.suppress(*_GONE):
+            with contextlib.suppress(*GONE):
                 self._sock.send(data)
 
     def plug(self) -> None:
@@ -222,76 +234,6 @@ class TcpDevice:
             self._sock = None
 
 
-class UdpHost:
-    """A UDP port that the driver sends to; what the device says goes to where the driver spoke from last."""
-
-    def __init__(self) -> None:
-        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._sock.bind(("127.0.0.1", 0))
-        self._sock.setblocking(False)
-        self._driver: tuple[str, int] | None = None
-        self._plugged = True
-        self.name = f"127.0.0.1:{self._sock.getsockname()[1]}"
-
-    def fds(self) -> list[int]:
-        """Return the socket."""
-        return [self._sock.fileno()]
-
-    def read(self, fd: int) -> bytes | None:
-        """Return a datagram of the driver."""
-        try:
-            data, self._driver = self._sock.recvfrom(65536)
-        except _GONE:
-            return b""
-        return data if self._plugged else b""
-
-    def write(self, data: bytes) -> None:
-        """Send a datagram to the driver."""
-        if self._driver is not None and self._plugged:
-            with contextlib.suppress(*_GONE):
-                self._sock.sendto(data, self._driver)
-
-    def plug(self) -> None:
-        """Carry datagrams again."""
-        self._plugged = True
-
-    def unplug(self) -> None:
-        """Lose every datagram: a pulled network cable."""
-        self._plugged = False
-
-
-class UdpDevice:
-    """The association with the device."""
-
-    def __init__(self, port: str) -> None:
-        host, _, number = port.rpartition(":")
-        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._sock.connect((host, int(number)))
-        self._sock.setblocking(False)
-
-    def fds(self) -> list[int]:
-        """Return the socket."""
-        return [self._sock.fileno()]
-
-    def read(self, fd: int) -> bytes | None:
-        """Return a datagram of the device."""
-        try:
-            return self._sock.recv(65536)
-        except _GONE:
-            return b""
-
-    def write(self, data: bytes) -> None:
-        """Send a datagram."""
-        with contextlib.suppress(*_GONE):
-            self._sock.send(data)
-
-    def plug(self) -> None:
-        """Nothing: it is always there."""
-
-    def unplug(self) -> None:
-        """Nothing: the other end loses what is sent."""
-
-
 def _receive(sock: socket.socket) -> bytes | None:
     try:
         return sock.recv(65536) or None
@@ -301,8 +243,8 @@ def _receive(sock: socket.socket) -> bytes | None:
         return None
 
 
-def make_ends(kind: str, device_port: str, link: Path) -> tuple[SerialHost | TcpHost | UdpHost, End]:
-    """Return both ends of a wire of a kind: serial, tcp or udp."""
+def make_ends(kind: str, device_port: str, link: Path) -> tuple[Host, End]:
+    """Return both ends of a wire of one of KINDS."""
     match kind:
         case "serial":
             host = SerialHost(link)
@@ -314,4 +256,6 @@ def make_ends(kind: str, device_port: str, link: Path) -> tuple[SerialHost | Tcp
             return tcp, tcp.device
         case "udp":
             return UdpHost(), UdpDevice(device_port)
-    raise ValueError(f"make a wire: no kind {kind}; serial, tcp and udp are right")
+        case "pushed":
+            return PushedHost(), PushedDevice(device_port)
+    raise ValueError(f"make a wire: no kind {kind}; one of {', '.join(KINDS)} is right")

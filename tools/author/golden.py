@@ -52,6 +52,7 @@ def check_frames(rig: Rig, folder: Path | None) -> Result:
     took_s = round(time.monotonic() - began, 3)
     if not frames:
         why = "it names none: let its class method golden() return some from the vendor's manual"
+        why = why if rig.line else "the driver has no line"
         return Result(NAME, TEXT, Verdict.NOT_APPLICABLE, why, took_s=took_s)
     wrong = [frame for frame in frames if frame["wrong"]]
     if wrong:

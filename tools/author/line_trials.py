@@ -10,7 +10,7 @@ from typing import Any
 from sioms.protocol.flags import NodeClass
 
 from .calm import Calm
-from .station import Station, wait_for
+from .station import Station, Unanswered, wait_for
 from .trial import Failed, NotApplicable, Trial
 
 BACK_S = 12.0
@@ -90,7 +90,7 @@ def _check_alive(station: Station, before: dict[str, Any]) -> None:
 
 def _check_back(station: Station) -> float:
     try:
-        return station.wait_good(BACK_S)
+        return station.wait_fresh(BACK_S)
     except TimeoutError as error:
         raise Failed(f"a good link within {BACK_S:g} s after the disturbance", str(error)) from None
 
@@ -143,22 +143,18 @@ def mute(station: Station, full: bool) -> str:
 
 def unplugged(station: Station, full: bool) -> str:
     """Pull the cable and put it back."""
-    times = 4 if full else 1
-    texts = [
-        _cut_off(
-            station,
-            lambda: station.tell_wire("unplug"),
-            lambda: station.tell_wire("plug"),
-            "the cable was pulled",
+    try:
+        station.pull("plug")
+    except Unanswered:
+        raise NotApplicable("the driver has no line, and no device that can be pulled") from None
+    for _ in range(4 if full else 1):
+        text = _cut_off(
+            station, lambda: station.pull("unplug"), lambda: station.pull("plug"), "the cable was pulled"
         )
-        for _ in range(times)
-    ]
-    return texts[-1]
+    return text
 
 
 def _cut_off(station: Station, cut: Any, mend: Any, what: str) -> str:
-    if "{device}" in station.rig.tables and station.rig.line == "tcp":
-        raise NotApplicable("its samples come on a second connection, past the wire")
     before = station.status()
     with Calm(station) as calm:
         cut()
@@ -219,7 +215,7 @@ def _timeout(station: Station) -> tuple[float, float]:
     with station.cell.open(station.nodes[0].reader) as node:
         if "stream" in node.statistics(1):
             raise NotApplicable("the device speaks unasked; no reply is waited for")
-        requests = list(station.tell_wire("log 200"))
+        requests = station.messages(200)
         gaps = sorted(b[0] - a[0] for a, b in itertools.pairwise(requests) if a[1] == ">" and b[1] == "<")
         if not gaps:
             raise NotApplicable("no request was answered")
@@ -235,8 +231,8 @@ def _timeout(station: Station) -> tuple[float, float]:
         now_ns = time.monotonic_ns()
     if not counted:
         raise NotApplicable(f"no time-out within {LATE_TIMEOUT_S:g} s")
-    lost = [t for t, way, _, _ in station.tell_wire("log 60") if way == ">" and t >= began_ns - 50_000_000]
-    times = [entry for entry in station.tell_wire("log 60") if entry[3] == "lost"]
+    lost = [t for t, way, _, _ in station.messages(60) if way == ">" and t >= began_ns - 50_000_000]
+    times = [entry for entry in station.messages(60) if entry[3] == "lost"]
     sent_ns = max((t for t in lost if times and t <= times[-1][0]), default=began_ns)
     return (now_ns - sent_ns) / 1e9, answer_s
 
@@ -260,16 +256,18 @@ def timing(station: Station, full: bool) -> str:
     with station.cell.open(station.nodes[0].reader) as node:
         asked_hz = node.info.tick_hz
         seconds = 4.0 if full else 0.8
-        before, number, began_ns = station.totals(), node.read().number, time.monotonic_ns()
+        before, number, began_ns = _carried(station), node.read().number, time.monotonic_ns()
         time.sleep(seconds)
-        after, last, took_s = station.totals(), node.read().number, (time.monotonic_ns() - began_ns) / 1e9
+        after, last, took_s = _carried(station), node.read().number, (time.monotonic_ns() - began_ns) / 1e9
     cycles = last - number
     if cycles < 2:
         raise Failed(f"{asked_hz * seconds:.0f} readings in {seconds:g} s", f"{cycles}")
-    characters = sum(after[key] - before[key] for key in ("request_bytes", "reply_bytes"))
+    characters = after - before
     cycle_s, line_s = took_s / cycles, characters * station.character_s / cycles
     waited_s = _answer_s(station, began_ns, took_s)
-    figures = f"{cycles / took_s:.1f} readings/s, {asked_hz:g} configured; {characters / cycles:.1f} characters a cycle"
+    figures = f"{cycles / took_s:.1f} readings/s, {asked_hz:g} configured"
+    if station.wires:
+        figures += f"; {characters / cycles:.1f} characters a cycle"
     if line_s:
         figures += (
             f" = {1e3 * line_s:.2f} ms at {station.baud:g} baud, line {100 * line_s / cycle_s:.0f} % busy"
@@ -281,11 +279,17 @@ def timing(station: Station, full: bool) -> str:
     return figures
 
 
+def _carried(station: Station) -> int:
+    """Return the characters that went over the line so far."""
+    totals = station.totals() if station.wires else {}
+    return sum(totals.get(key, 0) for key in ("request_bytes", "reply_bytes"))
+
+
 def _answer_s(station: Station, began_ns: int, took_s: float) -> float:
     """Return the part of a time in which a request was on its way or waited for its answer."""
-    entries = [
-        entry for entry in station.tell_wire("log 3000") if began_ns <= entry[0] <= began_ns + took_s * 1e9
-    ]
+    if not station.wires:
+        return 0.0
+    entries = [entry for entry in station.messages(3000) if began_ns <= entry[0] <= began_ns + took_s * 1e9]
     waits: list[int] = [b[0] - a[0] for a, b in itertools.pairwise(entries) if a[1] == ">" and b[1] == "<"]
     return sum(waits) / 1e9 / took_s
 
@@ -323,7 +327,7 @@ def has_class(station: Station, node_class: NodeClass) -> bool:
 
 
 TRIALS = (
-    Trial("timing", "cycle against configured rate and line's speed", timing),
+    Trial("timing", "cycle against configured rate and line's speed", timing, wire=False),
     Trial("chopped", "replies byte by byte and cut anywhere", chopped),
     Trial("noisy", "one bit of a third of the replies flipped", _bent((0.5, 5.0), flip=0.34)),
     Trial("garbage", "random bytes before or after a third of the replies", _bent((0.4, 4.0), garbage=0.34)),
@@ -332,6 +336,6 @@ TRIALS = (
     Trial("missing", "one of ten replies lost", _bent((0.5, 5.0), needs_check=False, lose=0.1)),
     Trial("once", "the reply to a relative move lost", outputs_missing),
     Trial("mute", "no reply at all, then the device speaks again", mute),
-    Trial("unplugged", "the cable pulled and put back", unplugged),
+    Trial("unplugged", "the cable pulled and put back", unplugged, wire=False),
     Trial("random", "random bytes for seconds", random_bytes),
 )

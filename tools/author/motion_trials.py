@@ -10,7 +10,7 @@ from typing import Any
 
 from sioms.protocol.flags import AxisStatus, ControlMode
 
-from ..counterparts.rigs import Axis
+from ..counterparts.rigs import Axis, Output
 from .station import Station, wait_for
 from .trial import Failed, NotApplicable, Trial
 
@@ -145,7 +145,8 @@ def _pushing(station: Station, node: Any, axis: Axis) -> float:
         raise NotApplicable("it has no force mode")
     limit = node.info.channels[0].limits.get("force", 1.0)
     node.command(force=forward(node, axis) * 0.1 * limit)
-    wait_for(lambda: node.read().in_motion[0], 3.0)
+    if not wait_for(lambda: node.read().in_motion[0], 3.0):
+        return 0.0  # something holds it: how fast the device creeps says nothing
     time.sleep(0.1)
     return abs(station.speed() or 0.0)
 
@@ -238,32 +239,41 @@ def safe_outputs(station: Station, full: bool) -> str:
     """Outputs take their safe value with an emergency stop and with their writer's end."""
     if not station.rig.outputs:
         raise NotApplicable("the device has no outputs")
-    output = station.rig.outputs[0]
-    if output.safe is None:
+    outputs = [output for output in station.rig.outputs if output.safe is not None]
+    if not outputs:
         raise NotApplicable("its outputs have no safe value: they keep the last")
-    other = 0b10 if output.safe != 0b10 else 0b01
+    return ", ".join(_becomes_safe(station, output) for output in outputs)
 
-    def shows(seen: Any, value: int, after: str) -> None:
-        if not wait_for(lambda: seen.read().data[0] == value, 3.0):
-            raise Failed(f"outputs {value:#x} after {after}", f"{seen.read().data[0]:#x}")
+
+def _becomes_safe(station: Station, output: Output) -> str:
+    safe = output.safe or 0.0
+
+    def shows(seen: Any, value: float, after: str) -> None:
+        if not wait_for(lambda: output.shown(seen, value), 3.0):
+            raise Failed(f"{output.node} = {value:g} after {after}", f"{seen.read().data[0]:g}")
 
     with station.cell.open(f"{output.node}.readonly") as seen:
         with station.cell.open(output.node, "rw", timeout=5.0) as node:
-            node.set(other)
-            shows(seen, other, "a write")
+            set_all(node, output)
+            shows(seen, output.another, "a write")
             station.cell.emergency_stop(why="driver check")
-            shows(seen, output.safe, "the emergency stop")
+            shows(seen, safe, "the emergency stop")
             station.cell.reset()
-            if not wait_for(lambda: _takes(node, other), 3.0):
+            if not wait_for(lambda: _takes(node, output), 3.0):
                 raise Failed("writes taken again after the reset", "they are refused")
-            shows(seen, other, "a write")
-        shows(seen, output.safe, "the close of its writer")
-    return f"safe value {output.safe:#x} after emergency stop and close"
+            shows(seen, output.another, "a write")
+        shows(seen, safe, "the close of its writer")
+    return f"{output.node} {safe:g} after emergency stop and close"
 
 
-def _takes(node: Any, value: int) -> bool:
+def set_all(node: Any, output: Output) -> None:
+    """Write another value than the safe one to all channels."""
+    node.set(*[output.another] * len(node.info.channels))
+
+
+def _takes(node: Any, output: Output) -> bool:
     try:
-        node.set(value)
+        set_all(node, output)
     except OSError:
         return False
     return True

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from ..counterparts.control import obey
-from .ends import SerialHost, TcpHost, UdpHost, make_ends
+from .ends import Host, TcpHost, make_ends
 from .traces import Replay, read_trace
 
 LONGEST_S = 0.05
@@ -42,7 +42,7 @@ def places(text: str) -> list[tuple[int, int]]:
     return [(int(low), int(high)) for low, _, high in pairs]
 
 
-def _turn(host: SerialHost | TcpHost | UdpHost, replay: Replay) -> bool:
+def _turn(host: Host, replay: Replay) -> bool:
     now_ns = time.monotonic_ns()
     for data in replay.due(now_ns):
         host.write(data)

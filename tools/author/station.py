@@ -6,6 +6,7 @@ Concurrency: one thread; the processes are the station's own and end with it.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import re
@@ -137,8 +138,10 @@ class Station:
 
     Attributes:
         rig: of the driver, its axes and outputs found out where it names none.
-        wire, counterpart: of the device; None for a driver that needs none.
+        counterpart: of the device; None for a driver that needs none.
+        wires: between them: of the line, and of what the device sends beside it; none for a driver without a line.
         nodes: of the device, one a block.
+        noise: how far the readings of an analog node's channels lie apart at rest.
         cell: the session.
     """
 
@@ -149,7 +152,8 @@ class Station:
         self._base = folder or Path.cwd()
         self._folder = Path(tempfile.mkdtemp(prefix="sioms-check-"))
         self.counterpart: Peer | None = None
-        self.wire: Peer | None = None
+        self.wires: list[Peer] = []
+        self.noise: dict[str, list[float]] = {}
         self.daemon: Daemon | None = None
         self.cell: Workcell
         self.port = ""
@@ -173,17 +177,16 @@ class Station:
         command = [sys.executable, *program, *link, *options]
         self.counterpart = Peer(command, f"counterpart {name}", self._base)
         self.port = self.counterpart.port
-        if not wired:
+        if not (wired and rig.line):
             return
         speed = (
             ["--baud", str(self.baud), "--bits", str(rig.bits_per_character)] if paced and self.baud else []
         )
-        self.wire = Peer(
-            [sys.executable, "-m", "sioms.tools.author.wire", "--kind", rig.line or "serial", "--device",
-             self.counterpart.port, "--link", str(self._folder / "port"), *speed],
-            "wire",
-        )  # fmt: skip
-        self.port = self.wire.port
+        for kind in (rig.line, "pushed") if rig.pushes else (rig.line,):
+            command = [sys.executable, "-m", "sioms.tools.author.wire", "--kind", kind, *speed]
+            command += ["--device", self.counterpart.port, "--link", str(self._folder / "port")]
+            self.wires.append(Peer(command, "wire"))
+        self.port = self.wires[0].port
 
     @property
     def baud(self) -> float:
@@ -203,7 +206,8 @@ class Station:
 
     def start_daemon(self) -> None:
         """Start a daemon with the device, and a session."""
-        text = self.rig.configured(self.port, self.counterpart.port if self.counterpart is not None else "")
+        device = self.counterpart.port if self.counterpart is not None else ""
+        text = self.rig.configured(self.port, device, self.wires[-1].port if len(self.wires) > 1 else "")
         driver = str(self._base / self.rig.driver)
         text = re.sub(r'(driver\s*=\s*")\{driver\}"', lambda found: f'{found[1]}{driver}"', text)
         # relative paths hold where the driver's file is, not in the daemon's folder
@@ -229,7 +233,7 @@ class Station:
     def close(self) -> None:
         """End everything."""
         self.end_daemon()
-        for peer in (self.wire, self.counterpart):
+        for peer in (*self.wires, self.counterpart):
             if peer is not None:
                 peer.close()
         shutil.rmtree(self._folder, ignore_errors=True)
@@ -298,6 +302,19 @@ class Station:
             time.sleep(0.005)
         return time.monotonic() - began
 
+    def wait_fresh(self, timeout_s: float = UP_S) -> float:
+        """Wait for a good link and a reading made from now on, so that nothing of before can lose it; return the time [s].
+
+        Raises:
+            TimeoutError: as wait_good.
+        """
+        began_ns = time.monotonic_ns()
+        while True:
+            self.wait_good(timeout_s - (time.monotonic_ns() - began_ns) / 1e9)
+            with contextlib.suppress(OSError), self.cell.open(self.nodes[0].reader) as node:
+                if wait_for(lambda: node.read().stamp_ns > began_ns, 0.5):
+                    return (time.monotonic_ns() - began_ns) / 1e9
+
     def has(self, mode: ControlMode) -> bool:
         """Whether the first axis has a control mode."""
         return bool(self.rig.axes and self.cell.info(self.rig.axes[0].node).channels[0].modes & mode)
@@ -314,26 +331,38 @@ class Station:
 
     # --- the wire --------------------------------------------------------------------------------
 
-    def tell_wire(self, line: str) -> Any:
-        """Send a command to the wire."""
-        if self.wire is None:
+    def tell_wire(self, line: str) -> list[Any]:
+        """Send a command to all wires; return their answers."""
+        if not self.wires:
             raise Unanswered("this driver has no wire")
-        return self.wire.tell(line)
+        return [wire.tell(line) for wire in self.wires]
+
+    def pull(self, verb: str) -> None:
+        """Pull the cable ("unplug") or put it back ("plug"); of a device without a line its counterpart does that."""
+        if not self.wires and self.counterpart is not None:
+            self.counterpart.tell(verb)
+        else:
+            self.tell_wire(verb)
 
     def fault(self, **keys: object) -> None:
         """Let the wire bend messages; none without keys."""
         self.tell_wire("fault " + json.dumps(keys, separators=(",", ":")))
 
     def totals(self) -> Mapping[str, int]:
-        """Return what the wire has carried."""
-        found: dict[str, int] = self.tell_wire("totals")
-        return found
+        """Return what the wires have carried."""
+        answers: list[dict[str, int]] = self.tell_wire("totals")
+        return {key: sum(each[key] for each in answers) for key in answers[0]}
+
+    def messages(self, count: int) -> list[list[Any]]:
+        """Return the last messages: time [ns], direction, hex, what was done to it."""
+        first, *others = self.tell_wire(f"log {count}")
+        return sorted(itertools.chain(first, *others))[-count:] if others else first
 
     def exchanges(self, count: int = 8) -> list[str]:
         """Return the last messages as lines to print."""
-        if self.wire is None:
+        if not self.wires:
             return []
-        entries = self.tell_wire(f"log {count}")
+        entries = self.messages(count)
         now_ns = time.monotonic_ns()
         return [
             f"{(t_ns - now_ns) / 1e6:9.2f} ms {way} {' '.join(text[i : i + 2] for i in range(0, len(text), 2))}"
@@ -343,13 +372,13 @@ class Station:
 
     def settle(self) -> None:
         """Bring all back to calm: no faults, no stop, link good, axes at rest."""
-        if self.wire is not None:
+        if self.wires:
             self.fault()
             self.tell_wire("plug")
         if self.daemon is None or self.daemon.process.poll() is not None:
             self.end_daemon()
             self.start_daemon()
-        self.wait_good()
+        self.wait_fresh()
         self.cell.reset()
         for axis in self.rig.axes[:1]:
             with contextlib.suppress(OSError), self.cell.open(axis.node, "rw", timeout=2.0) as node:

@@ -92,7 +92,7 @@ def attempt(trial: Trial, station: Station, full: bool) -> Result:
             trial.name, trial.text, verdict, seen, expected, traffic or [], round(time.monotonic() - began, 3)
         )
 
-    if trial.wire and station.wire is None:
+    if trial.wire and not station.wires:
         return result(Verdict.NOT_APPLICABLE, "the driver has no line")
     try:
         seen = trial.run(station, full)

@@ -28,7 +28,7 @@ from typing import Any
 
 from ..counterparts.control import obey
 from .bending import Bender, Faults, Piece, Way
-from .ends import TcpHost, make_ends
+from .ends import DATAGRAMS, KINDS, TcpHost, make_ends
 
 KEPT = 4000
 """Messages that the log holds."""
@@ -41,7 +41,7 @@ class Wire:
     """Both ends, both ways and the log.
 
     Args:
-        kind: serial, tcp or udp.
+        kind: one of KINDS.
         device_port: of the device.
         link: path of the driver's serial port.
         character_ns: time a character takes on the line [ns], 0 for none.
@@ -53,8 +53,9 @@ class Wire:
 
     def __init__(self, kind: str, device_port: str, link: Path, character_ns: float, seed: int) -> None:
         self.host, self.device = make_ends(kind, device_port, link)
-        self.to_device = Way(character_ns, kind != "udp")
-        self.to_host = Way(character_ns, kind != "udp")
+        self._whole = kind in DATAGRAMS
+        self.to_device = Way(character_ns, not self._whole)
+        self.to_host = Way(character_ns, not self._whole)
         self.bender = Bender(seed)
         self.log: deque[tuple[int, str, bytes, str]] = deque(maxlen=KEPT)
         self.device_ns = 0
@@ -69,8 +70,9 @@ class Wire:
         }  # fmt: skip
 
     def fault(self, keys: str = "{}") -> None:
-        """Bend by these faults."""
-        self.bender.set(Faults(**json.loads(keys)))
+        """Bend by these faults; datagrams are not chopped."""
+        wanted = json.loads(keys)
+        self.bender.set(Faults(**({**wanted, "chop": ""} if self._whole else wanted)))
 
     def babble(self, rate: str, seconds: str) -> None:
         """Say random bytes to the driver."""
@@ -163,7 +165,7 @@ class Wire:
 def main() -> int:
     """Serve until standard input ends."""
     parser = argparse.ArgumentParser(description="wire between a driver and its device")
-    parser.add_argument("--kind", choices=("serial", "tcp", "udp"), required=True)
+    parser.add_argument("--kind", choices=KINDS, required=True)
     parser.add_argument("--device", required=True, metavar="PORT")
     parser.add_argument(
         "--link", type=Path, default=Path("/nonexistent"), help="path of the driver's serial port"

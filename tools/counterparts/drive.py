@@ -47,6 +47,15 @@ class Mover:
         """What the encoder counts, as a 32-bit number."""
         return (round(self.position + self.slip) + 2**31) % 2**32 - 2**31
 
+    def seen(self) -> dict[str, float]:
+        """Return what a bystander sees of it."""
+        return {
+            "position": self.position,
+            "feedback": self.feedback,
+            "velocity": self.velocity,
+            "moving": int(self.busy),
+        }
+
     def go_to(self, target: float, speed: float, acceleration: float, deceleration: float) -> None:
         """Move to a position; replaces what is under way."""
         self.target, self.top_speed = target, abs(speed)

@@ -56,7 +56,9 @@ class Dummy:
         self._pipe = -1
 
     def plug(self) -> None:
-        """Make the files appear, with the buffer off."""
+        """Make the files appear, with the buffer off; nothing when they are there."""
+        if self._pipe >= 0:
+            return
         for path in (
             self.root / "scan_elements",
             self.root / "buffer",

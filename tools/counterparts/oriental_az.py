@@ -181,15 +181,7 @@ class Drive:
     def state(self) -> dict[str, float]:
         """Return what a bystander sees."""
         self.time.catch_up()
-        mover = self.mover
-        return {
-            "position": mover.position,
-            "feedback": mover.feedback,
-            "velocity": mover.velocity,
-            "moving": int(mover.busy),
-            "alarm": self.alarm,
-            "outputs": self.outputs(),
-        }
+        return {**self.mover.seen(), "alarm": self.alarm, "outputs": self.outputs()}
 
 
 async def run() -> None:

@@ -38,11 +38,30 @@ class Axis:
 
 @dataclass(frozen=True)
 class Output:
-    """A writable binary node of one port: its width, and its safe value (None: it keeps the last)."""
+    """A writable node.
+
+    Attributes:
+        node: its name.
+        width: bits of its one port, 0 for an analog node.
+        safe: its safe value, in all channels; None: it keeps the last.
+        other: another value that it takes; found out for bits.
+    """
 
     node: str
     width: int
-    safe: int | None
+    safe: float | None
+    other: float | None = None
+
+    @property
+    def another(self) -> float:
+        """A value other than the safe one."""
+        if self.other is not None:
+            return self.other
+        return 0b10 if self.safe != 0b10 else 0b01
+
+    def shown(self, node: Any, value: float) -> bool:
+        """Tell whether an opened node reads a value in its first channel."""
+        return bool(abs(node.read().data[0] - value) <= (0 if self.width else 1e-3 * max(1.0, abs(value))))
 
 
 @dataclass(frozen=True)
@@ -51,8 +70,8 @@ class Rig:
 
     Attributes:
         driver: registered name, or the path of a file.
-        tables: TOML of its device; ``{port}`` is the counterpart's port, ``{device}`` too, but past any wire that a test
-            puts between: for a second connection to the device.
+        tables: TOML of its device; ``{port}`` is the counterpart's port; ``{device}`` too, but past any wire that a test
+            puts between: for a second connection to the device; ``{data}`` is where it sends datagrams unasked.
         counterpart: module of ``sioms.tools.counterparts`` or path of a Python file, and options; empty for a driver
             that needs none; with ``--link PATH`` left out, as it is added, unless ``tcp``.
         tcp: the counterpart chooses its own TCP or UDP port.
@@ -96,15 +115,21 @@ class Rig:
         return found.group(1) if found else ""
 
     @property
+    def pushes(self) -> bool:
+        """Whether the device sends datagrams to a port of the host, beside the line on which it is told to."""
+        return "{data}" in self.tables
+
+    @property
     def table(self) -> dict[str, Any]:
         """The device's table, without what the daemon reads of it, its port a place holder."""
         port = "127.0.0.1:1" if self.line in ("tcp", "udp") else "/dev/null"
         device = tomllib.loads(self.configured(port, "127.0.0.1:1"))["device"][self.device]
         return {key: value for key, value in device.items() if key != "driver"}
 
-    def configured(self, port: str, device: str) -> str:
-        """Return its tables for a port, and for the counterpart's own."""
-        return self.tables.replace("{port}", port).replace("{device}", device)
+    def configured(self, port: str, device: str, data: str = "") -> str:
+        """Return its tables for a port, for the counterpart's own, and for the one that its data come to."""
+        text = self.tables.replace("{port}", port).replace("{device}", device)
+        return text.replace("{data}", data or device)
 
     def setting(self, key: str, default: float) -> float:
         """Return a number of the tables, e.g. ``baud`` or ``poll_hz``."""
@@ -237,7 +262,7 @@ RIGS: tuple[Rig, ...] = (
     Rig(
         "schunk-ft",
         '[device.schunk_ft]\ndriver = "schunk-ft"\nfull_scale = [400, 400, 400, 15, 15, 15]\n'
-        'line = { tcp = "{port}" }\ndata = "{device}"\n',
+        'line = { tcp = "{port}" }\ndata = "{data}"\n',
         ("schunk_ifb", "--port", "0", "--data-port", "0"), tcp=True,
         analogs=("schunk_ft",), checked=False,
     ),
@@ -277,8 +302,8 @@ MAP_RIGS: tuple[Rig, ...] = (
     Rig(
         "modbus-io",
         '[device.wago_750]\ndriver = "modbus-io"\nmap = "wago_750"\nchannels = { di = 8, do = 8, ai = 2, ao = 2 }\n'
-        'safe = { do = 0 }\nmain = "di"\nline = { tcp = "{port}" }\n',
+        'safe = { do = 0, ao = 0 }\nmain = "di"\nline = { tcp = "{port}" }\n',
         ("wago", "--inputs", "8", "--outputs", "8", "--analogs", "2"), tcp=True,
-        inputs=("wago_750",), outputs=(Output("wago_750.do", 8, 0),), analogs=("wago_750.ai",), name="wago_750",
+        inputs=("wago_750",), outputs=(Output("wago_750.do", 8, 0), Output("wago_750.ao", 0, 0, 5.0)), analogs=("wago_750.ai",), name="wago_750",
     ),
 )  # fmt: skip
