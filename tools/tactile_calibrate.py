@@ -26,6 +26,7 @@ from sioms.tactile.touches import Recording, Touches, join, ramps_of
 from sioms.tools.report_page import Page
 from sioms.tools.tactile import Progress
 from sioms.tools.tactile_data import Data, read_folder
+from sioms.tools.tactile_pictures import poisson_responses
 
 Floats = NDArray[np.float64]
 
@@ -101,6 +102,8 @@ def _elements(page: Page, result: Calibration) -> None:
     head = ("element", "angle, deg", "depth radius, mm", "gain, % strain / % output", "quadratic, 1/%", "its deviation",
             "noise, % output", "noise, % of peak")  # fmt: skip
     page.table((*head, *(f"{name}, % of peak" for name in result.residuals)), rows)
+    page.figure(poisson_responses(result.finger.cylinder, float(np.mean(e.radius_m))), "Frequency response at the mean depth "
+                "for several Poisson's ratios: what it takes to tell the ratio from the depth (figure 3.18)")  # fmt: skip
 
 
 def _deviation(value: float) -> str:

@@ -223,6 +223,18 @@ def class_differences(
     return figure
 
 
+def poisson_responses(body: Cylinder, radius_m: float) -> Figure:
+    """Draw the frequency response of the strain for several Poisson's ratios, the body's own among them (figure 3.18)."""
+    figure, axes = _axes()
+    k = np.arange(41)
+    for nu in sorted({0.40, 0.45, 0.48, 0.5, body.poisson}):
+        other = Cylinder(body.core_m, body.outer_m, nu, body.shear_pa)
+        axes.plot(k, 1e6 * respond(other, k, radius_m).e_rr[:, 0, 0], ".-", label=f"nu = {nu:.3g}")
+    axes.set(xlabel="k", ylabel="e_rr from p, 1/MPa")
+    axes.legend(fontsize=8)
+    return figure
+
+
 def conditions(body: Cylinder, angles: Floats, radius_m: float) -> Figure:
     """Draw the condition number of E over Poisson's ratio (figure 3.24)."""
     figure, axes = _axes()

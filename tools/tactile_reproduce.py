@@ -87,6 +87,7 @@ def _pictures(page: Page, progress: Progress) -> None:
             "2.25: telling classes",
             lambda: draw.class_differences(12.7e-3, 0.5, _shallow, 0.005, tick=progress),
         ),
+        ("3.18: frequency response over Poisson's ratio", lambda: draw.poisson_responses(FINGER_B, RS_B)),
         ("3.24: conditioning of E", lambda: draw.conditions(FINGER_B, ANGLES, RS_B)),
         ("3.25: singular values of E", lambda: draw.singular_values(FINGER_B, ANGLES, RS_B)),
         ("3.27 to 3.29: standard deviations at 0.1 % noise", lambda: draw.error_maps(finger)),
