@@ -347,7 +347,9 @@ class GrblUnit(AxesUnit):
         yield self._cancel()
         yield from self._until_rest(self._take)
 
-    def _until_rest(self, taken: Callable[[Report], None] = lambda report: None) -> Generator[Step, Any, Report]:
+    def _until_rest(
+        self, taken: Callable[[Report], None] = lambda report: None
+    ) -> Generator[Step, Any, Report]:
         """Wait until cancelled jogs have come to rest; return the last report, and give each to ``taken``."""
         limit_ns = self.clock() + int(HOLD_S * 1e9)
         while True:

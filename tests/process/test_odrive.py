@@ -72,7 +72,9 @@ def test_moves_torques_homes_and_faults(start: Callable[..., Any], short_folder:
         x.home()
         x.wait_until_idle(20.0)
         assert x.read().status[0] & AxisStatus.HOMED
-        assert x.read().position[0] == pytest.approx(0.0, abs=2e-3)  # the board lets go at the switch: it runs on a little
+        assert x.read().position[0] == pytest.approx(
+            0.0, abs=2e-3
+        )  # the board lets go at the switch: it runs on a little
         x.move(0.02)
         x.wait_until_idle(8.0)
         # emergency stop lets go; after a reset it moves again
