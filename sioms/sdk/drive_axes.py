@@ -144,10 +144,10 @@ class AxesUnit(LineUnit):
         self.block = AxisBlock(spec, self.bank)
         self._kit = kit
         self._epoch = [0] * len(settings)
-        self._runs = np.zeros(len(settings), dtype=bool)
+        self._runs = [False] * len(settings)
         self._guarded_ns = 0
-        self._goes = np.zeros(len(settings), dtype=bool)
-        self._stood_ns = np.zeros(len(settings), dtype=np.int64)
+        self._goes = [False] * len(settings)
+        self._stood_ns = [0] * len(settings)
         self._raw = np.zeros(len(settings))
 
     @property
@@ -270,21 +270,23 @@ class AxesUnit(LineUnit):
 
     def _look_for_short_moves(self, now_ns: int, moving: NDArray[np.bool_], done: NDArray[np.bool_]) -> None:
         """Put an axis in fault that came to rest before its target: a limit switch, a stall, a stop by others."""
-        self._goes &= ~(done & ~moving & (self._stood_ns > 0))
-        stands = self._goes & ~moving
-        self._stood_ns[~stands] = 0
-        self._stood_ns[stands & (self._stood_ns == 0)] = now_ns
-        short = stands & ~done & (now_ns - self._stood_ns > SHORT_NS)
-        for axis in np.flatnonzero(short).tolist():
-            self._goes[axis] = False
-            text = f"{self.name}: came to rest at {self.bank.fields[0, axis]:g} before its target; look at its limit switches"
-            self.bank.fault([axis], text, now_ns)
+        for axis in _where(self._goes):
+            if moving[axis]:
+                self._stood_ns[axis] = 0
+            elif done[axis] and self._stood_ns[axis]:  # it was so at the last look, too
+                self._goes[axis] = False
+            elif not self._stood_ns[axis]:
+                self._stood_ns[axis] = now_ns
+            elif now_ns - self._stood_ns[axis] > SHORT_NS:
+                self._goes[axis] = False
+                text = f"{self.name}: came to rest at {self.bank.fields[0, axis]:g} before its target; look at its limit switches"
+                self.bank.fault([axis], text, now_ns)
 
     def _guard(self, now_ns: int) -> None:
         """Stop an axis that runs at a velocity before it passes a soft limit."""
         between_s = min(1.0, (now_ns - self._guarded_ns) / 1e9)
         self._guarded_ns = now_ns
-        for axis in np.flatnonzero(self._runs).tolist():
+        for axis in _where(self._runs):
             settings = self.bank.settings[axis]
             limits = self.bank.get_limits([axis])
             low, high = limits["position_min"][0], limits["position_max"][0]
@@ -302,3 +304,8 @@ class AxesUnit(LineUnit):
                     f"{self.name} {settings.name}: stopped at {position:g}, the soft limit is {bound:g}",
                 )
                 self.bank.stop([axis], now_ns)
+
+
+def _where(marks: Sequence[bool]) -> list[int]:
+    """Return the axes that are marked."""
+    return [axis for axis, mark in enumerate(marks) if mark]
