@@ -5,17 +5,15 @@ from __future__ import annotations
 import html
 import json
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.verdict import SensorVerdict
 from sioms.reconcile.verdict import Estimate, NamedEffect, Outcome
-from sioms.tools.reconcile_report import HEAD, STYLE, _image, number
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from sioms.tools.reconcile_report import HEAD, STYLE, number
+from sioms.tools.reconcile_sensor_pictures import columns, groups, pictures
 
 
 def headline(v: SensorVerdict) -> str:
@@ -132,23 +130,23 @@ def as_json(v: SensorVerdict, seconds: float) -> str:
 
 def page(v: SensorVerdict, seconds: float) -> str:
     """Make the self-contained HTML page."""
-    pictures = _pictures(v)
+    drawn = pictures(v)
     name = html.escape(v.nominal.name)
     parts = [
         f"<!doctype html><html lang=en><meta charset=utf-8><title>{name}: reconcile</title><style>{STYLE}</style>"
         f"<h1>{name}: simulation against measurement</h1>",
         f"<p class='verdict {v.outcome.value}'><b>{v.outcome.value}</b> - {headline(v)}</p>",
         _what(v),
-        pictures.get("each", ""),
+        drawn.get("each", ""),
         "<h2>How far the gap shrank</h2><p>Root mean square on touches or loads that took no part in any choice (every fifth). The "
         "numbers of the model are frozen; zero, true load of a touch and level of a ramp are the session's own and are free in "
         "all columns.</p>",
         _gaps(v),
-        pictures.get("gap", ""),
-        pictures.get("curves", ""),
+        drawn.get("gap", ""),
+        drawn.get("curves", ""),
         "<h2>Where it disagreed</h2>",
         _where(v),
-        pictures.get("places", ""),
+        drawn.get("places", ""),
         "<h2>Why we believe it, and what else it could have been</h2>",
         "".join(_why(e, v.nominal) for e in (*v.effects, *v.symbolic))
         or "<p>There is nothing to believe in.</p>",
@@ -171,12 +169,12 @@ def _what(v: SensorVerdict) -> str:
     rows, lists = [], []
     for e in (*v.effects, *v.symbolic):
         label = html.escape(e.title) if e in v.effects else "nameless term"
-        groups = _groups(e)
-        for i, mine in enumerate(groups.values()):
-            span = f"<td rowspan={len(groups)}>"
+        parts = groups(e)
+        for i, mine in enumerate(parts.values()):
+            span = f"<td rowspan={len(parts)}>"
             first = f"{span}<b>{label}</b>{span}<code>{html.escape(e.equation)}</code>" if i == 0 else ""
             rows.append(f"<tr>{first}{_row(mine)}")
-        lists += [p for mine in groups.values() if len(mine) > 1 for p in mine]
+        lists += [p for mine in parts.values() if len(mine) > 1 for p in mine]
     head = "<table><tr><th>effect<th>equation<th>parameter<th>value<th>95 % interval<th>unit<th>"
     every = "".join(
         f"<tr><td>{p.symbol}<td class=n>{number(p.value)}<td class=n>{number(p.low)} to {number(p.high)}<td>{html.escape(p.unit)}"
@@ -191,14 +189,6 @@ def _what(v: SensorVerdict) -> str:
     return f"<h2>What was missing</h2>{head}{''.join(rows)}</table>{more}"
 
 
-def _groups(e: NamedEffect) -> dict[str, list[Estimate]]:
-    """Return the estimates by quantity; one that every element has of its own comes with all its numbers."""
-    out: dict[str, list[Estimate]] = {}
-    for p in e.parameters:
-        out.setdefault(p.symbol.split("[")[0], []).append(p)
-    return out
-
-
 def _row(mine: list[Estimate]) -> str:
     """Lay one quantity out: its value, or from where to where the values of the elements go."""
     p = mine[0]
@@ -208,8 +198,10 @@ def _row(mine: list[Estimate]) -> str:
         values = [q.value for q in mine]
         value = f"{number(min(values))} to {number(max(values))}"
         interval = f"each within {number(float(np.median([0.5 * (q.high - q.low) for q in mine])))}"
-        symbol = f"{len(mine)} of {p.symbol.split('[')[0]}"
-    return f"<td>{symbol}<td class=n>{value}<td class=n>{interval}<td>{html.escape(p.unit)}<td>{html.escape(p.text)}"
+        names = list(columns(mine))
+        symbol = f"{len(mine)} of {names[0]}" + (f" to {names[-1]}" if len(names) > 1 else "")
+    text = html.escape(p.text if len(columns(mine)) < 2 else p.text.rsplit(" ", 1)[0] + " each of the others")
+    return f"<td>{symbol}<td class=n>{value}<td class=n>{interval}<td>{html.escape(p.unit)}<td>{text}"
 
 
 def _gaps(v: SensorVerdict) -> str:
@@ -273,7 +265,8 @@ def _next(v: SensorVerdict) -> str:
 
 def _ladder(v: SensorVerdict) -> str:
     rows = [
-        f"<tr><td>{s.action}<td>{s.effect}<td class=n>{s.ratio:.2f}<td>" + _rivals(s.rivals.items())
+        f"<tr><td>{s.action}<td>{_titles(v.nominal, s.effect)}<td class=n>{s.ratio:.2f}<td>"
+        + _rivals(s.rivals.items())
         for s in v.ladder
     ]
     return (
@@ -283,107 +276,15 @@ def _ladder(v: SensorVerdict) -> str:
     )
 
 
+def _titles(model: SensorModel, effect: str) -> str:
+    """Return what the effects of a step ("one to other") are called, with their names."""
+    parts = [
+        f"{_title(model, n)} ({n})" if n in model.library else html.escape(n) for n in effect.split(" to ")
+    ]
+    return " to ".join(parts)
+
+
 def _rivals(rivals: Iterable[tuple[str, float]]) -> str:
     return ", ".join(
         f"{n} {100 * g:.0f} %" if g > -1.0 else f"{n} worse" for n, g in sorted(rivals, key=lambda q: -q[1])
     )
-
-
-def _pictures(v: SensorVerdict) -> dict[str, str]:
-    """Draw the pictures; without matplotlib the page says so."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        return {"gap": "<p class=small>Pictures need matplotlib (the extra <code>report</code>).</p>"}
-    out = {
-        "gap": _image(_gap_picture(Figure(figsize=(11, 0.6 + 0.35 * len(v.gaps)), layout="constrained"), v))
-    }
-    each = [
-        (e.title, mine)
-        for e in v.effects
-        for mine in _groups(e).values()
-        if len(mine) > 1 and e.name != "dead_element"
-    ]
-    if each:
-        out["each"] = _image(_each_picture(Figure(figsize=(11, 2.6), layout="constrained"), each[:3]))
-    if v.curves:
-        out["curves"] = _image(_curve_picture(Figure(figsize=(11, 3.6), layout="constrained"), v))
-    if v.places:
-        out["places"] = _image(_place_picture(Figure(figsize=(11, 3.2), layout="constrained"), v))
-    return out
-
-
-def _gap_picture(figure: Figure, v: SensorVerdict) -> Figure:
-    """Draw every channel's gap before and after in units of its noise floor."""
-    ax = figure.subplots()
-    for i, g in enumerate(reversed(v.gaps)):
-        ax.plot(
-            [g.before / g.floor, g.after / g.floor],
-            [i, i],
-            color="#cfd8e0",
-            lw=6,
-            solid_capstyle="butt",
-            zorder=1,
-        )
-        ax.plot(g.before / g.floor, i, "o", color="#c50", label="before" if i == 0 else None)
-        ax.plot(g.after / g.floor, i, "o", color="#08a", label="after" if i == 0 else None)
-    ax.axvline(1.0, color="#1c2733", lw=1, ls="--", label="noise floor")
-    ax.set_xscale("log")
-    ax.set_xlim(0.5, 2.0 * max(2.0, *(g.before / g.floor for g in v.gaps)))
-    ax.set_yticks(range(len(v.gaps)), [g.channel for g in reversed(v.gaps)], fontsize=8)
-    ax.set_ylim(-0.6, len(v.gaps) - 0.4)
-    ax.set_xlabel("simulated - measured over the noise floor, on what took no part", fontsize=8)
-    figure.legend(loc="outside right upper", fontsize=8)
-    return figure
-
-
-def _each_picture(figure: Figure, each: list[tuple[str, list[Estimate]]]) -> Figure:
-    """Draw the numbers that every element (or component) has of its own, with their intervals."""
-    for ax, (title, mine) in zip(figure.subplots(1, len(each), squeeze=False)[0], each, strict=True):
-        at = np.arange(len(mine))
-        value = np.array([p.value for p in mine])
-        ax.bar(at, value, color="#9cc9d8")
-        ax.errorbar(at, value, [0.5 * (p.high - p.low) for p in mine], fmt="none", ecolor="#1c2733", lw=1)
-        ax.axhline(0.0, color="#888", lw=0.6)
-        ax.set_title(title, fontsize=9, loc="left")
-        ax.set_xlabel("element or component", fontsize=8)
-        unit = f", {mine[0].unit}" if mine[0].unit != "1" else ""
-        ax.set_ylabel(mine[0].symbol.split("[")[0] + unit, fontsize=8)
-    return figure
-
-
-def _curve_picture(figure: Figure, v: SensorVerdict) -> Figure:
-    top, bottom = figure.subplots(2, len(v.curves), squeeze=False, sharex="col", height_ratios=(2, 1))
-    for upper, lower, c in zip(top, bottom, v.curves, strict=True):
-        upper.plot(c.at, c.before, color="#c50", lw=1, label="simulated, before")
-        upper.plot(c.at, c.after, color="#08a", lw=1, label="simulated, after")
-        used = ~c.apart
-        upper.plot(c.at[used], c.measured[used], ".", color="#9aa6b1", ms=3, label="measured, used")
-        upper.plot(
-            c.at[c.apart], c.measured[c.apart], ".", color="#1c2733", ms=5, label="measured, took no part"
-        )
-        upper.set_title(c.title, fontsize=9, loc="left")
-        lower.plot(c.at, c.before - c.measured, color="#c50", lw=0.8)
-        lower.plot(c.at, c.after - c.measured, color="#08a", lw=0.8)
-        lower.axhline(0.0, color="#888", lw=0.6)
-        lower.set_xlabel(c.axis)
-        upper.set_ylabel(c.unit)
-    bottom[0].set_ylabel("sim. - meas.")
-    figure.legend(*top[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize=8)
-    return figure
-
-
-def _place_picture(figure: Figure, v: SensorVerdict) -> Figure:
-    shown = v.places[:4]
-    for ax, p in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
-        order = np.argsort(p.centres)
-        ax.errorbar(
-            p.centres[order], p.means[order], p.spread[order], fmt=".-", color="#c50", ecolor="#e9c5ae", lw=1
-        )
-        ax.axhline(0.0, color="#888", lw=0.6)
-        name, view = p.variable.removesuffix(")").split(" (")
-        ax.set_xlabel(f"{name}, {p.unit}".removesuffix(", 1"), fontsize=8)
-        ax.set_title(f"{view}: {100 * p.explained:.0f} %, p = {p.p:.2f}", fontsize=8)
-        unit = next((g.unit for g in v.gaps if g.channel == view), "")
-        ax.set_ylabel(f"measured - simulated, {unit}", fontsize=8)
-    return figure

@@ -188,7 +188,7 @@ class FingerSubject:
             order = np.flatnonzero(mine)[np.argsort(d.touched.place[mine])]
             found.append(
                 Curve(
-                    f"element {worst} under the {indenter(radius)} (recording {name})",
+                    f"element {worst}, {indenter(radius)} ({name})",
                     "place of touch, deg",
                     "output, %",
                     np.degrees(d.touched.place[order]),
@@ -366,7 +366,10 @@ def _rows(
     count = len(t)
     told = bool(np.isfinite(t.cell).all() and np.ptp(t.cell) > 0.0 and np.all(t.cell > 0.0))
     load, share, spread = t.load.copy(), np.full(count, LOAD_SPREAD), np.nan
-    if told:
+    if told and np.allclose(t.cell, t.load, rtol=1e-6):
+        share = LOAD_MARGIN * t.cell_noise / t.cell
+        notes.append("the loads are what the load cell says: its scale is not judged")
+    elif told:
         level = float(np.median(t.cell / t.load))
         ratio = t.cell / t.load / level
         spread = float(max(1.4826 * np.median(np.abs(t.cell - level * t.load)), np.median(t.cell_noise)))
