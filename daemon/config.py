@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import Meta
 
-from sioms.wording import did_you_mean, explain, field_names
+from sioms.wording import choices, did_you_mean, explain, field_names
 
 Table = TypeVar("Table", bound=msgspec.Struct)
 RightName = Literal["read", "write", "stop", "administer"]
@@ -135,6 +135,9 @@ def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
         root = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         return None, [f"read configuration: {str(error)[0].lower() + str(error)[1:]}"]
+    if {"family", "signals"} <= root.keys():
+        text = "this is a register map; name it in the table of a device, map = \"FILE\", and give that configuration"
+        return None, [text]
     errors = [
         f"unknown section [{key}]{did_you_mean(key, _SECTIONS)}" for key in root if key not in _SECTIONS
     ]
@@ -210,5 +213,5 @@ def _convert(table: object, kind: type[Table], where: str, errors: list[str]) ->
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
-        errors.append(explain(where, error, field_names(kind)))
+        errors.append(explain(where, error, field_names(kind), choices(kind)))
         return None

@@ -45,7 +45,7 @@ def explain(
         return f"{where}: unknown key {key}{did_you_mean(key, known)}"
     if "missing required field" in text:
         return f"{where}: key {text.split('`')[1]} is missing"
-    if "enum value" in text and (may := (words or {}).get(path.rpartition(".")[2])):
+    if "enum value" in text and (may := (words or {}).get(path.rpartition(".")[2].partition("[")[0])):
         return f"{where} = {text.split()[-1]}: want one of {', '.join(map(repr, may))}"
     return f"{where}: {text[0].lower() + text[1:]}"
 

@@ -66,6 +66,8 @@ def test_all_errors_at_once_in_the_order_of_the_sections() -> None:
         ("[[device]]\nx = 1", "want tables [device.NAME]"),
         ("[grant]\nrights = ['read']", "want tables [[grant]]"),
         ("grant = 3", "want tables [[grant]]"),
+        ("[[grant]]\nrights = ['reed']", "'reed': want one of 'read', 'write', 'stop', 'administer'"),
+        ("[device.x]\ndriver = 'd'\non_loss = 'cry'", ".on_loss = 'cry': want one of 'none', 'stop'"),
         ("emergency_stop = 'x'", "want tables [[emergency_stop]]"),
         ("device = 3", "want tables [device.NAME]"),
         ("[workcell]\nmax_sessions = 0", "max_sessions"),
@@ -78,6 +80,7 @@ def test_all_errors_at_once_in_the_order_of_the_sections() -> None:
         ("[[emergency_stop]]\nnode = 'x'\nactive = 2", "active"),
         ("x = [", "read configuration: "),
         ("", "want at least one"),
+        ("family = 'x'\n[signals]\na = { address = 1 }", "this is a register map; name it in the table"),
     ],
 )
 def test_errors(text: str, words: str) -> None:
