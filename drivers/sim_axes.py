@@ -169,6 +169,7 @@ class SimAxes(TickDriver):
         self._switches = np.zeros(n, dtype=np.int64)
         self._command: Array | None = None
         self._last_ns = 0
+        self._ahead = 0
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
@@ -179,8 +180,9 @@ class SimAxes(TickDriver):
         """Let the world go on under the last command up to now, measure, and command anew."""
         if self._command is not None:
             ticks = round((now_ns - self._last_ns) / self._tick_ns)
-            for _ in range(min(ticks, _CATCH_UP)):
+            for _ in range(self._ahead, min(ticks, _CATCH_UP)):
                 self._advance(self._command)
+            self._ahead = max(0, self._ahead - ticks)
         self._last_ns = now_ns
         self._measure()
         self.inputs_ns = time.monotonic_ns()
@@ -190,8 +192,11 @@ class SimAxes(TickDriver):
             self._look(self._port, now_ns)
 
     def slack(self, now_ns: int, until_ns: int) -> None:
-        """Plan profiles ahead while there is time."""
-        if until_ns - now_ns > _SLACK_NS:
+        """Let the world go on to the next tick, which is sooner done then, and plan profiles ahead while there is time."""
+        if self._command is not None and not self._ahead:
+            self._advance(self._command)
+            self._ahead = 1
+        if until_ns - time.monotonic_ns() > _SLACK_NS:
             self.bank.plan_ahead(_PLANS)
 
     def _advance(self, command: Array) -> None:

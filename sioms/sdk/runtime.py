@@ -282,6 +282,7 @@ class Runtime:
             self._maybe_end(ended_ns)
         elif isinstance(engine, TickEngine):
             engine.slack(ended_ns, scheduled_ns + self.period_ns)
+            self.statistics.record_slack(time.monotonic_ns() - ended_ns)
 
     def _tick_and_publish(self, scheduled_ns: int) -> int:
         """Return when the tick itself was done."""

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-PHASES = ("late_ns", "input_ns", "control_ns", "publish_ns", "busy_ns", "total_ns")
+PHASES = ("late_ns", "input_ns", "control_ns", "publish_ns", "busy_ns", "total_ns", "spent_ns")
 """Scheduled to begun; to the readings being there; to the outputs being set; to all being published; all from begun;
-all from scheduled."""
+all from scheduled; all from begun with what is done after it in the slack."""
 _SIZE = 8192
 
 
@@ -41,9 +41,14 @@ class TickStatistics:
         ring[3][i] = ended_ns - ticked_ns
         ring[4][i] = ended_ns - began_ns
         ring[5][i] = total_ns
+        ring[6][i] = ended_ns - began_ns
         self.ticks += 1
         if total_ns > self.longest_ns:
             self.longest_ns = total_ns
+
+    def record_slack(self, slack_ns: int) -> None:
+        """Note what was done after the tick that was recorded last."""
+        self._ring[6][(self.ticks - 1) & (_SIZE - 1)] += slack_ns
 
     def summary(
         self, last: int = _SIZE, percentiles: Sequence[float] = (50.0, 90.0, 99.0, 99.9, 100.0)

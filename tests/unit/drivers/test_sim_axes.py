@@ -139,6 +139,22 @@ def test_late_ticks_cost_the_world_no_time(bench):
     assert mod.blocks[1].data[0] == pytest.approx(1.0 * seconds**2 / 2, rel=1e-9)
 
 
+def test_the_world_is_the_same_whether_it_goes_on_before_the_tick_or_in_the_slack_after_the_last(bench):
+    mods = [bench.make(SimAxes, name, {"axis": [SERVO, STEPPER]}) for name in ("mod0", "mod1")]
+    told = [[], []]
+    for at in (1, 2, 3, 4, 7, 8, 9, 300, 301, 302):  # some ticks late; the second device is given its slack
+        bench.now_ns = 1_000_000_000 + at * 1_000_000
+        for mod, seen in zip(mods, told, strict=True):
+            mod.tick(bench.now_ns)
+            seen.append(mod.bank.fields.copy())
+        mods[1].slack(bench.now_ns, bench.now_ns)
+        if at == 2:
+            for mod in mods:
+                bench.write(mod, control_mode=ControlMode.VELOCITY, velocity=0.1)
+    assert np.array_equal(told[0], told[1])
+    assert np.array_equal(mods[0].blocks[1].data, mods[1].blocks[1].data)
+
+
 def test_a_count_makes_so_many_axes_with_all_their_channels():
     settings = msgspec.convert(
         {"axis": [SERVO | {"count": 3}], "beam": [{"boxes": [{"x2": [0, 1]}]}]}, SimAxes.Settings
