@@ -49,7 +49,7 @@ REBOOT_S = 0.5
 HARDWARE_ERRORS = {1: "input voltage", 4: "overheating", 8: "encoder", 16: "electrical shock", 32: "overload"}
 """Bits of register 70 as the e-Manual numbers them for the X series."""
 WATCHDOG_TICK_S, WATCHDOG_EXPIRED = 0.02, 0xFF
-BRAKE_CHARACTERS, WAKE_S = 35, 0.001
+BRAKE_CHARACTERS, WAKE_S = 35, 0.0005
 """Between the reading of place and speed and the arrival of the goal made of them: reply and request, and the host."""
 DRIVE_MODE, OPERATING_MODE, VELOCITY_LIMIT, TORQUE, RETURN_LEVEL, HARDWARE_ERROR = 10, 11, 44, 64, 68, 70
 WATCHDOG, GOAL_CURRENT, GOAL_VELOCITY, PROFILE_ACCELERATION, PROFILE_VELOCITY = 98, 102, 104, 108, 112
