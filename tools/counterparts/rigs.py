@@ -167,6 +167,8 @@ def find_rig(name: str) -> Rig | None:
 
 LIMITS = "position_min = -1.0\nposition_max = 1.0\n"
 SERVO = "velocity_max = 1.0\nacceleration_max = 10.0\njerk_max = 2000.0\nforce_max = 100.0\n"
+QUICK = "override = { turnaround_s = 0.2 }\n"
+"""A simulated block answers at once: what is not answered need not be waited for as long as on a network."""
 DRIVE = "travel_per_turn = 0.01\nvelocity_max = 0.2\nacceleration_max = 2.0\n" + LIMITS
 
 RIGS: tuple[Rig, ...] = (
@@ -269,7 +271,7 @@ RIGS: tuple[Rig, ...] = (
     Rig(
         "modbus-io",
         '[device.modbus_io]\ndriver = "modbus-io"\nmap = "moxa_e1200"\nmodel = "E1212"\nsafe = { do = 0 }\n'
-        'line = { tcp = "{port}" }\n',
+        + QUICK + 'line = { tcp = "{port}" }\n',
         ("moxa", "--model", "E1212"), tcp=True,
         inputs=("modbus_io",), outputs=(Output("modbus_io.do", 8, 0),),
     ),
@@ -295,14 +297,14 @@ MAP_RIGS: tuple[Rig, ...] = (
     Rig(
         "modbus-io",
         '[device.moxa_e1200]\ndriver = "modbus-io"\nmap = "moxa_e1200"\nmodel = "E1212"\nsafe = { do = 0 }\n'
-        'line = { tcp = "{port}" }\n',
+        + QUICK + 'line = { tcp = "{port}" }\n',
         ("moxa", "--model", "E1212"), tcp=True,
         inputs=("moxa_e1200",), outputs=(Output("moxa_e1200.do", 8, 0),), name="moxa_e1200",
     ),
     Rig(
         "modbus-io",
         '[device.wago_750]\ndriver = "modbus-io"\nmap = "wago_750"\nchannels = { di = 8, do = 8, ai = 2, ao = 2 }\n'
-        'safe = { do = 0, ao = 0 }\nmain = "di"\nline = { tcp = "{port}" }\n',
+        'safe = { do = 0, ao = 0 }\nmain = "di"\n' + QUICK + 'line = { tcp = "{port}" }\n',
         ("wago", "--inputs", "8", "--outputs", "8", "--analogs", "2"), tcp=True,
         inputs=("wago_750",), outputs=(Output("wago_750.do", 8, 0), Output("wago_750.ao", 0, 0, 5.0)), analogs=("wago_750.ai",), name="wago_750",
     ),
