@@ -16,8 +16,6 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-import msgspec
-
 from sioms.protocol.flags import AnalogStatus, Request
 from sioms.sdk.blocks import AnyBlock, BlockSpec, Description
 from sioms.sdk.codec import ati_rdt as rdt
@@ -27,7 +25,7 @@ from sioms.sdk.codec.sequence import SequenceWatch
 from sioms.sdk.datagram import split_address
 from sioms.sdk.driver import Kit, StreamDriver
 from sioms.sdk.exchange import Aside, DeviceError, LinkError, Pause, Send, Steps
-from sioms.sdk.force_torque import ForceBlock, Six, check_whole, force_spec
+from sioms.sdk.force_torque import ForceBlock, ForceSettings, check_whole, force_spec
 from sioms.sdk.golden import Golden
 from sioms.sdk.settings import LineSettings
 
@@ -45,8 +43,8 @@ CLOCK_CHECK_NS = 5_000_000_000
 LOOK_AT_THE_SENSOR = "look at host and port, and that RDT is enabled on the sensor's communication page"
 
 
-class AtiRdtSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Keys of the device.
+class AtiRdtSettings(ForceSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keys of the device, beside those of ForceSettings.
 
     Attributes:
         line: the sensor's UDP port, ``host:49152``.
@@ -58,11 +56,8 @@ class AtiRdtSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         model: "net" or "axia", whose status words differ; by the product's name without.
         serial_number: of the calibrated transducer, e.g. "FT12345"; anything without.
         sample_hz: the sensor's internal samples in a second, which its records are stamped with [Hz].
-        full_scale: greatest forces [N] and torques [N m] of the transducer's calibration.
-        history: snapshots kept for readers.
     """
 
-    line: LineSettings
     rate_hz: float = 1000.0
     buffered: bool = False
     page: str = ""
@@ -71,8 +66,6 @@ class AtiRdtSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     model: Literal["", "net", "axia"] = ""
     serial_number: str = ""
     sample_hz: float = rdt.SAMPLE_HZ
-    full_scale: Six | None = None
-    history: int = 256
 
 
 class AtiRdt(StreamDriver):

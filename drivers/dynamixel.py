@@ -22,7 +22,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import msgspec
 import numpy as np
 
 from sioms.motion import DriveAction
@@ -31,11 +30,10 @@ from sioms.sdk import drive_axes
 from sioms.sdk.blocks import BlockSpec, Description
 from sioms.sdk.codec import dynamixel
 from sioms.sdk.codec.dynamixel import Bus, Status, signed
-from sioms.sdk.drive_axes import BANK_MODES, POSITION_MODES, AxesUnit, drive_table
+from sioms.sdk.drive_axes import BANK_MODES, POSITION_MODES, AxesUnit, DriveSettings, drive_table
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
 from sioms.sdk.exchange import DeviceError, Pause, Send, Steps
 from sioms.sdk.golden import Golden
-from sioms.sdk.settings import LineSettings
 
 MODES = {
     "velocity": (1, BANK_MODES | ControlMode.VELOCITY),
@@ -79,28 +77,20 @@ acceleration_unit_rpm2 [rev/min^2], current_unit [A]: of its registers; force_pe
 """
 
 
-class DynamixelSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Keys of the device.
+class DynamixelSettings(DriveSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keys of the device, beside those of DriveSettings.
 
     Attributes:
-        line: that the servos are on.
         axis: the servos, one axis each.
         watchdog_s: time without a request after which a servo stops, 0.02 to 2.54 s; 0 = none.
         quick_stop: "torque_off" frees the shaft, "hold" brakes and holds.
         turnaround_s: longest time that a servo needs before it answers [s].
-        poll_hz: rate at which each servo is read.
-        capacity: commands that each axis buffers.
-        history: snapshots kept for readers.
     """
 
-    line: LineSettings
     axis: list[AxisTable]
     watchdog_s: float = 0.5
     quick_stop: Literal["torque_off", "hold"] = "torque_off"
     turnaround_s: float = 0.05
-    poll_hz: float = 50.0
-    capacity: int = 4096
-    history: int = 64
 
 
 class ServoUnit(AxesUnit):

@@ -20,18 +20,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import msgspec
-
 from sioms.protocol.flags import ControlMode
 from sioms.sdk import drive_axes
 from sioms.sdk.blocks import Description
 from sioms.sdk.codec import grbl
 from sioms.sdk.codec.grbl import Report
-from sioms.sdk.drive_axes import BANK_MODES, POSITION_MODES, drive_table
+from sioms.sdk.drive_axes import BANK_MODES, POSITION_MODES, DriveSettings, drive_table
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
 from sioms.sdk.golden import Golden
 from sioms.sdk.grbl_unit import GrblUnit
-from sioms.sdk.settings import LineSettings
 
 MODES = (POSITION_MODES | ControlMode.VELOCITY | BANK_MODES) & ~ControlMode.SPECIFIED_MAX_VEL_ACC
 """The acceleration is a setting of the controller: a command cannot carry its own."""
@@ -46,30 +43,24 @@ letter: of the axis in the controller; home_required: no motion before homing. A
 """
 
 
-class GrblSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Keys of the device.
+class GrblSettings(DriveSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keys of the device, beside those of DriveSettings.
 
     Attributes:
-        line: to the controller.
         axis: its axes in use.
         version: text that its version must contain, e.g. "1.1h"; '' takes any.
         homing: the controller's homing ($H, all axes) may be used.
         homing_timeout_s: longest time that homing may take [s].
         quick_stop: "reset" stops at once and loses the position, "cancel" brakes and keeps it.
         poll_hz: rate of status reports; 5 to 10 is the firmware's advice, 20 to 50 works on an idle line.
-        capacity: commands that each axis buffers.
-        history: snapshots kept for readers.
     """
 
-    line: LineSettings
     axis: list[AxisTable]
     version: str = ""
     homing: bool = False
     homing_timeout_s: float = 120.0
     quick_stop: Literal["reset", "cancel"] = "reset"
     poll_hz: float = 20.0
-    capacity: int = 4096
-    history: int = 64
 
 
 class Grbl(LineDriver):

@@ -22,7 +22,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import msgspec
 import numpy as np
 
 from sioms.motion import DriveAction
@@ -31,11 +30,10 @@ from sioms.sdk import drive_axes
 from sioms.sdk.blocks import BlockSpec, Description
 from sioms.sdk.codec import odrive
 from sioms.sdk.codec.odrive import CLOSED_LOOP, HOMING, IDLE, confirmed
-from sioms.sdk.drive_axes import BANK_MODES, POSITION_MODES, AxesUnit, drive_table
+from sioms.sdk.drive_axes import BANK_MODES, POSITION_MODES, AxesUnit, DriveSettings, drive_table
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
 from sioms.sdk.exchange import DeviceError, Pause, Steps
 from sioms.sdk.golden import Golden
-from sioms.sdk.settings import LineSettings
 
 MODES = BANK_MODES | POSITION_MODES | ControlMode.VELOCITY | ControlMode.FORCE
 OLDEST = (0, 5, 1)
@@ -65,28 +63,20 @@ rests [turns/s]; homing: the board's homing may be used (needs an end switch the
 """
 
 
-class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Keys of the device.
+class OdriveSettings(DriveSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keys of the device, beside those of DriveSettings.
 
     Attributes:
-        line: to the board.
         axis: its axes in use.
         watchdog_s: time without a poll after which the axes let go [s]; 0 = none.
         quick_stop: "idle" lets the motors go, "hold" brakes them with all their torque and holds.
         timeout_s: longest time for a poll of all axes beyond the line's own [s].
-        poll_hz: rate of polling.
-        capacity: commands that each axis buffers.
-        history: snapshots kept for readers.
     """
 
-    line: LineSettings
     axis: list[AxisTable]
     watchdog_s: float = 0.5
     quick_stop: Literal["idle", "hold"] = "idle"
     timeout_s: float = 0.1
-    poll_hz: float = 50.0
-    capacity: int = 4096
-    history: int = 64
 
 
 class OdriveUnit(AxesUnit):

@@ -12,8 +12,6 @@ import errno
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import msgspec
-
 from sioms.protocol.flags import AnalogStatus, Request
 from sioms.sdk.blocks import AnyBlock, BlockSpec, Description
 from sioms.sdk.codec import schunk_ifb as ifb
@@ -23,7 +21,7 @@ from sioms.sdk.codec.sequence import SequenceWatch
 from sioms.sdk.datagram import split_address
 from sioms.sdk.driver import Kit, Refusal, StreamDriver
 from sioms.sdk.exchange import Aside, DeviceError, Exchange, LinkError, Steps
-from sioms.sdk.force_torque import ForceBlock, Six, check_whole, force_spec
+from sioms.sdk.force_torque import ForceBlock, ForceSettings, check_whole, force_spec
 from sioms.sdk.golden import Golden, Incomplete
 from sioms.sdk.settings import LineSettings
 
@@ -32,8 +30,8 @@ _BAD = Status.INVALID | Status.HARDWARE
 _OVERLOAD = Status.MECHANICAL_RANGE | Status.USER_RANGE
 
 
-class SchunkFtSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Keys of the device.
+class SchunkFtSettings(ForceSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keys of the device, beside those of ForceSettings.
 
     Attributes:
         line: the box's TCP port, ``host:82``.
@@ -41,17 +39,12 @@ class SchunkFtSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         product: what the sensor must call itself; anything without.
         tool: tool setting 0 to 3 to select; left alone without.
         noise_filter: 0 to 4, means of 1, 2, 4, 8, 16 samples; left alone without.
-        full_scale: greatest forces [N] and torques [N m] of the sensor.
-        history: snapshots kept for readers.
     """
 
-    line: LineSettings
     data: str = f"0.0.0.0:{ifb.DATA_PORT}"
     product: str = ""
     tool: int | None = None
     noise_filter: int | None = None
-    full_scale: Six | None = None
-    history: int = 256
 
 
 class SchunkFt(StreamDriver):

@@ -25,7 +25,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import msgspec
 import numpy as np
 
 from sioms.motion import DriveAction
@@ -33,11 +32,10 @@ from sioms.protocol.flags import ControlMode
 from sioms.sdk import drive_axes
 from sioms.sdk.blocks import BlockSpec, Description
 from sioms.sdk.codec.tmcl import SERIAL_HEARTBEAT, SIZE, Axis, Module, Op
-from sioms.sdk.drive_axes import BANK_MODES, POSITION_MODES, AxesUnit, drive_table
+from sioms.sdk.drive_axes import BANK_MODES, POSITION_MODES, AxesUnit, DriveSettings, drive_table
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
 from sioms.sdk.exchange import DeviceError, Steps
 from sioms.sdk.golden import Golden
-from sioms.sdk.settings import LineSettings
 
 MODES = BANK_MODES | POSITION_MODES | ControlMode.VELOCITY
 HIGHEST_INTERNAL = 2047
@@ -69,11 +67,10 @@ module's reference search (parameters 193 to 195) may be used.
 """
 
 
-class TmclSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Keys of the device.
+class TmclSettings(DriveSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keys of the device, beside those of DriveSettings.
 
     Attributes:
-        line: to the module.
         axis: its motors in use.
         address: of the module.
         host_address: that it answers to (global parameter 76).
@@ -85,11 +82,8 @@ class TmclSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         recovery_s: silence after a bad or missing reply [s]: a reply tells its command but not which parameter it is
             of, so one that comes later than that would be taken for another.
         poll_hz: rate at which the module is read.
-        capacity: commands that each axis buffers.
-        history: snapshots kept for readers.
     """
 
-    line: LineSettings
     axis: list[AxisTable]
     address: int = 1
     host_address: int = 2
@@ -100,8 +94,6 @@ class TmclSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     turnaround_s: float = 0.05
     recovery_s: float = 0.05
     poll_hz: float = 20.0
-    capacity: int = 4096
-    history: int = 64
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, assert_never
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +25,7 @@ from sioms.protocol.nodeinfo import ChannelInfo
 from .blocks import AnyBlock, AxisBlock, BlockSpec
 from .driver import Kit, LineUnit
 from .exchange import DeviceError, LinkError, Steps, while_wanted
+from .settings import LineSettings
 from .tables import from_table, table_type
 
 BANK_MODES = (
@@ -41,6 +43,22 @@ LATENCY_S = 0.03
 """Longest time that a start may wait for the line before the drive gets it."""
 _SERVO_KEYS = ("kind", "modes", "homing", "jerk_max", "k", "kz", "kp", "kb", "ki", "force_offset")
 _UNUSED_KEYS = (*_SERVO_KEYS, "velocity_filter_s", "following_error_max", "start_velocity")
+
+
+class DriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keys that the devices of such drives share.
+
+    Attributes:
+        line: that the drives are on.
+        poll_hz: rate at which each is read.
+        capacity: commands that each axis buffers.
+        history: snapshots kept for readers.
+    """
+
+    line: LineSettings
+    poll_hz: float = 50.0
+    capacity: int = 4096
+    history: int = 64
 
 
 def drive_table(extra: Mapping[str, tuple[Any, Any]], *, force: bool = False) -> Any:

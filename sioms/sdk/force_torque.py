@@ -6,6 +6,7 @@ import errno
 import math
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 
 from sioms.protocol.flags import AnalogStatus, NodeClass
@@ -13,12 +14,27 @@ from sioms.protocol.nodeinfo import ChannelInfo
 
 from .blocks import AnalogBlock, BlockSpec
 from .driver import Kit, Refusal
+from .settings import LineSettings
 
 COMPONENTS = ("fx", "fy", "fz", "tx", "ty", "tz")
 UNITS = ("N", "N", "N", "N*m", "N*m", "N*m")
 Six = tuple[float, float, float, float, float, float]
 SAY_AGAIN_NS = 1_000_000_000
 """A status that changes all the time is told of once in this time [ns]."""
+
+
+class ForceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keys that sensors on Ethernet share.
+
+    Attributes:
+        line: to the sensor.
+        full_scale: greatest forces [N] and torques [N m] of the sensor's calibration; None leaves the ranges open.
+        history: snapshots kept for readers.
+    """
+
+    line: LineSettings
+    full_scale: Six | None = None
+    history: int = 256
 
 
 def force_spec(full_scale: Six | None, history: int, description: str) -> BlockSpec:
