@@ -12,6 +12,7 @@ import numpy as np
 from sioms.reconcile.effect import Array
 
 TRIALS = 5  # of one step, each more cautious
+LEAST = 1e-7  # damping
 LONGEST = 3.0  # a step changes no number by more sizes
 
 
@@ -24,6 +25,8 @@ def descend(
     upper: Array,
     iterations: int,
     tolerance: float,
+    damping: float = 1e-3,
+    ease: float = 0.2,
 ) -> tuple[Array, Array, Array]:
     """Minimise the sum of squares of a residual.
 
@@ -35,12 +38,13 @@ def descend(
         lower, upper: bounds, infinite where there is none.
         iterations: largest number of accepted steps.
         tolerance: stop when a step gains less than this share of the sum of squares.
+        damping: at first, and ``ease`` its change after a good step; small for a residual that is smooth in its numbers.
 
     Returns:
         Numbers, residual and slopes at the best point found.
     """
     r = residual(at)
-    damping, cost = 1e-3, float(r @ r)
+    cost = float(r @ r)
     j = slopes(at, r)
     for _ in range(iterations):
         h, g = j.T @ j, j.T @ r
@@ -59,7 +63,7 @@ def descend(
             break
         done = cost - ct < tolerance * cost
         at, r, cost = trial, rt, ct
-        damping = max(damping * 0.2, 1e-7)
+        damping = max(damping * ease, LEAST)
         j = slopes(at, r)
         if done:
             break

@@ -108,7 +108,7 @@ ANGLE = SensorEffect(
     equation="t_i = stated t_i + dt_i",
     parameters=(Quantity("dt", "rad", -0.14, 0.14, 0.01, "departure of each element's angle", each=True),),
     signature="residual like the slope of the profile, of its own size and sign for each element",
-    lookalikes=("angle_offset", "sliding_friction"),
+    lookalikes=("angle_offset", "sliding_friction", "gain_scatter", "depth_scatter"),
     separate="edge touches every degree across each element",
 )
 DEPTH = SensorEffect(

@@ -130,7 +130,7 @@ def analyse(subject: Subject, options: Options | None = None) -> SensorVerdict:
     o.progress("excitation: what can these records show")
     missing, pairs = gate(subject)
     names = tuple(n for n in subject.names if n not in missing)
-    searcher = Searcher(subject.training, names, frozen, o.progress)
+    searcher = Searcher(subject.training, names, frozen, o.progress, subject.terms)
     found = searcher.run(subject.model)
     features = subject.features()
     share, where = smoother_share(subject.training, found.fit, searcher.weights, features)

@@ -163,5 +163,7 @@ def refit(
         np.where(wraps, np.inf, upper),
         iterations,
         tolerance,
+        damping=1e-5,
+        ease=0.1,
     )
     return Fit(put(model, free, at), free, r, j)

@@ -83,12 +83,18 @@ class Found:
 
 @dataclass(slots=True)
 class Searcher:
-    """Search over one set of data. Not thread-safe."""
+    """Search over one set of data. Not thread-safe.
+
+    Attributes:
+        names: effects that are tried; frozen: those that stay as they are.
+        terms: nameless terms that a name which saves little is measured against.
+    """
 
     data: Data
     names: tuple[str, ...]
     frozen: tuple[str, ...] = ()
     progress: Callable[[str], None] = lambda text: None
+    terms: tuple[str, ...] = ()
     weights: Array = field(init=False)
 
     def __post_init__(self) -> None:
@@ -193,7 +199,23 @@ class Searcher:
             if n != name
         ):
             return None
+        if saved.share < SPECIFIC and self._nameless(fit, losses, saved):
+            return None
         return Rung("add", name, self._ratio(new), saved.share, new.model, others)
+
+    def _nameless(self, fit: Fit, losses: Array, saved: Saving) -> bool:
+        """Say whether a term without a name saves far more than the best name does: then the residual has no name yet."""
+        free = [n for n in self.terms if n not in self.names and n not in fit.model.effects]
+        starts = [
+            s
+            for n in free
+            for s in screen(self.data, fit, self.weights, fit.model.library[n], self.frozen)[:1]
+        ]
+        best = max(starts, key=lambda s: s.gain, default=None)
+        if best is None or NEARLY * best.gain < saved.share:
+            return False
+        other = self.saving(self.loss(self.fit(fit.model.with_effect(best.effect, best.values))), losses)
+        return other.view == saved.view and NEARLY * other.share > saved.share
 
     def _simplest(self, good: dict[str, tuple[Fit, Array, Saving]]) -> str:
         """Of those within one standard error and ``GAIN`` of the best, the one with the fewest numbers."""
