@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import select
+import socket
+from pathlib import Path
+
 import pytest
 
 from sioms.tools.author.bending import Bender, Faults, Piece, Way
+from sioms.tools.author.ends import make_ends
 
 MESSAGE = bytes(range(20))
 
@@ -84,3 +90,28 @@ def test_what_is_at_once_arrives_at_once() -> None:
     way.send([Piece(MESSAGE)], 0)
     way.clear()
     assert way.next_ns is None
+
+
+def test_what_a_device_pushes_goes_on_to_the_driver_until_the_cable_is_pulled() -> None:
+    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(3)]
+    with contextlib.ExitStack() as stack:
+        sensor, driver, free = (stack.enter_context(each) for each in sockets)
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+        free.close()
+        host, device = make_ends("pushed", f"127.0.0.1:{port}", Path("/nonexistent"))
+        name, _, number = host.name.rpartition(":")
+        driver.bind((name, int(number)))
+        driver.settimeout(2.0)
+        assert host.fds() == [] and select.select(device.fds(), [], [], 0)[0] == []
+        for plugged in (True, False, True):
+            (host.plug if plugged else host.unplug)()
+            sensor.sendto(MESSAGE, ("127.0.0.1", port))
+            (fd,) = select.select(device.fds(), [], [], 2.0)[0]
+            data = device.read(fd)
+            assert data == MESSAGE
+            host.write(data + bytes((plugged,)))
+        assert [driver.recv(100), driver.recv(100)] == 2 * [MESSAGE + b"\x01"]
+        driver.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            driver.recv(100)
