@@ -12,14 +12,18 @@ import numpy as np
 import pytest
 
 from sioms.plant.finger import FingerShape, TactileArray
+from sioms.reconcile.descent import descend
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.finger.belief import Belief, late, outputs, scene_of
+from sioms.reconcile.finger.data import CELL
 from sioms.reconcile.finger.effects import library
 from sioms.reconcile.finger.model_file import from_table, to_toml
-from sioms.reconcile.finger.plan import propose
+from sioms.reconcile.finger.plan import Bench, catalogue, first, one_place, propose
 from sioms.reconcile.finger.pressures import WAVES, hertz, sheet
 from sioms.reconcile.finger.records import find_lines
+from sioms.reconcile.finger.subject import prepare
 from sioms.reconcile.finger.twin import FingerTwin
+from sioms.reconcile.sensors.analyse import gate
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile_selftest.finger_draw import HiddenFinger, draw_finger
 from sioms.reconcile_selftest.finger_world import FingerWorld
@@ -330,3 +334,47 @@ def test_a_twin_answers_as_the_finger_of_another_mechanics_with_the_same_gains_a
             if step:
                 assert np.allclose(got, wanted, atol=0.012 * wanted.max())
     assert not twin.read(0.0, 1.3, 0.0, np.empty(16), 100.0).any()
+
+
+def test_touches_keep_the_limits_of_the_bench() -> None:
+    bench = Bench((6e-3, 0.0), 120.0, 150.0, 0.8, 1.9)
+    for name, _, scene in (*first(believed(), bench), *one_place(believed(), bench), *catalogue(believed(), bench)):
+        assert len(scene.place) > 0, name
+        assert scene.load.max() <= 150.0 and scene.load.min() > 0.0, name
+        assert scene.place.min() >= 0.8 and scene.place.max() <= 1.9, name
+        assert set(scene.radius) <= {6e-3, 0.0}, name
+
+
+def test_loads_told_by_the_load_cell_alone_do_not_judge_its_scale(folder: Path) -> None:
+    for path in folder.glob("*.npz"):
+        with np.load(path) as file:
+            arrays = {k: file[k].copy() for k in file.files}
+        if "cmd_P" in arrays:
+            mine = [(arrays["touch"] == i) for i in range(len(arrays["cmd_P"]))]
+            felt = [
+                arrays["force"][m & (arrays["phase"] == 1)].mean() - arrays["force"][m & (arrays["phase"] == 0)].mean()
+                for m in mine
+            ]
+            arrays["cmd_P"] = np.array(felt)
+            np.savez(path, **arrays)
+    nominal, name, stated = read_model(folder / "nominal.toml", folder)
+    subject = prepare(read_experiments(folder), nominal, name, refine_extent=not stated)
+    assert not np.any(subject.whole.view == CELL)
+    assert any("its scale is not judged" in note for note in subject.notes)
+    assert "force_gain" in gate(subject)[0]
+
+
+def test_the_fit_finds_the_bottom_of_a_bent_valley_within_its_bounds() -> None:
+    """Rosenbrock's valley: the lowest point is (1, 1), or at the bound beside it."""
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        return np.array([1.0 - x[0], 10.0 * (x[1] - x[0] ** 2)])
+
+    def slopes(x: np.ndarray, r: np.ndarray) -> np.ndarray:
+        return np.array([[-1.0, 0.0], [-20.0 * x[0], 10.0]])
+
+    none, one = np.full(2, np.inf), np.ones(2)
+    at, r, _ = descend(residual, slopes, np.array([-1.2, 1.0]), one, -none, none, 200, 1e-12)
+    assert at == pytest.approx(one, abs=1e-4) and r @ r < 1e-8
+    at, _, _ = descend(residual, slopes, np.array([-1.2, 1.0]), one, -none, np.array([0.5, np.inf]), 200, 1e-12)
+    assert at == pytest.approx([0.5, 0.25], abs=1e-3)
