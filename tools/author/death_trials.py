@@ -28,6 +28,12 @@ node.command(**{key: float(value) for key, value in words.items()})
 print('ready', flush=True)
 time.sleep(1000)
 """
+HOME = """
+node = cell.open(sys.argv[2], 'rw', timeout=5.0)
+node.home()
+print('ready', flush=True)
+time.sleep(1000)
+"""
 SET = """
 node = cell.open(sys.argv[2], 'rw', timeout=5.0)
 node.set(*[float(sys.argv[3])] * len(node.info.channels))
@@ -87,13 +93,21 @@ def _output_of_killed(station: Station, output: Output) -> str:
 
 
 def driver_killed(station: Station, full: bool) -> str:
-    """SIGKILL of the driver: a new one comes, the device rests, nothing resumes."""
-    return ", ".join(_kill_driver(station) for _ in range(KILLS if full else 1))
+    """SIGKILL of the driver, in full also while it homes: a new one comes, the device rests, nothing resumes."""
+    ways = [_set_going] * (KILLS if full else 1)
+    if full and "homing = true" in station.rig.tables:
+        ways.append(_set_homing)
+    texts: list[str] = []
+    for way in ways:
+        if texts:
+            station.settle()  # the device's own dead-man may have put it in fault meanwhile
+        texts.append(_kill_driver(station, way))
+    return ", ".join(texts)
 
 
-def _kill_driver(station: Station) -> str:
+def _kill_driver(station: Station, set_going: Callable[[Station], tuple[float, Client | None]]) -> str:
     before = station.status()
-    fast, client = _set_going(station)
+    fast, client = set_going(station)
     os.kill(before["pid"], signal.SIGKILL)
     began = time.monotonic()
     text = ""
@@ -179,6 +193,18 @@ def _set_going(station: Station) -> tuple[float, Client | None]:
         except BaseException:
             client.kill()
             raise
+
+
+def _set_homing(station: Station) -> tuple[float, Client | None]:
+    """Let a client of its own home the first axis; return the device's speed, and the client."""
+    axis = station.rig.axes[0]
+    with station.cell.open(f"{axis.node}.readonly") as seen:
+        client = station.start_client(HOME, axis.node)
+        if not wait_for(lambda: seen.read().in_motion[0], 3.0):
+            client.kill()
+            raise Failed("an axis that homes", "it does not move")
+    time.sleep(BRAKE_S)
+    return abs(station.speed() or 0.0), client
 
 
 def _device_rests(station: Station, fast: float, after: str) -> float:
