@@ -6,6 +6,7 @@ The workflow is a process of its own that knows the socket, the node and the nom
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import signal
@@ -41,6 +42,31 @@ pitch = 0.02
 rated_force = 30.0
 max_speed = 0.5
 """
+ARM = """
+[[device.mod0.axis]]
+name = "arm"
+unit = "rad"
+position_min = -2.0
+position_max = 2.0
+velocity_max = 2.5
+acceleration_max = 60.0
+jerk_max = 6000.0
+force_max = 2.0
+following_error_max = 0.2
+motor = { mass = 2e-3, viscous = 2e-3, encoder_step = 1e-4 }
+"""
+ARM_MODEL = """[axis]
+name = "arm"
+kind = "rotary"
+sample_time_s = 0.001
+inertia = 2e-3
+viscous = 2e-3
+resolution = 1e-4
+pitch = 6.283185307179586
+rated_force = 1.0
+max_speed = 2.5
+"""
+WEIGHT = 0.2
 HEAD = '\n[device.{device}]\ndriver = "sim-axes"\nlate_max_s = 0.5\nhistory = 4096\n{more}\n'
 LEVEL = 3.0
 STOPPED, NAMED = 1, 0
@@ -63,11 +89,13 @@ def daemon(start_daemon: Callable[..., Daemon], tmp_path: Path) -> Iterator[Daem
     yield start_daemon(cell(hidden), files={"twin.toml": MODEL})
 
 
-def workflow(daemon: Daemon, folder: Path, *options: str) -> Running:
+def workflow(
+    daemon: Daemon, folder: Path, *options: str, node: str = "mod0.xaxis", model: str = MODEL
+) -> Running:
     """Start the workflow as a user does."""
-    model = folder / "nominal.toml"
-    model.write_text(MODEL)
-    command = [sys.executable, "-m", "sioms.tools.reconcile", "axis", "mod0.xaxis", "--model", str(model),
+    file = folder / "nominal.toml"
+    file.write_text(model)
+    command = [sys.executable, "-m", "sioms.tools.reconcile", "axis", node, "--model", str(file),
                "--socket", daemon.socket, "--out", str(folder / "report"), *options]  # fmt: skip
     return Running(command, {"OPENBLAS_NUM_THREADS": "1"}, None)
 
@@ -120,6 +148,31 @@ def cruising(session: object, node: str) -> float:
             if abs(snapshot.commanded_velocity[0] - 0.05) < 1e-9 and snapshot.position[0] > -0.09:
                 forces.append(snapshot.force[0])
         return sum(forces) / len(forces)
+
+
+@pytest.mark.timeout(240)
+def test_two_effects_that_look_alike_are_told_apart_by_the_experiment_it_designs(
+    start_daemon: Callable[..., Daemon], tmp_path: Path
+) -> None:
+    """An arm that moves little about the horizontal feels its weight as a constant force; a long way decides."""
+    hidden = tmp_path / "arm.toml"
+    hidden.write_text(f"[arm]\ngravity = {{ amplitude = {WEIGHT}, phase = {math.pi / 2} }}\n")
+    hidden.chmod(0o600)
+    head = HEAD.format(device="mod0", more=f'effects_file = "{hidden}"')
+    daemon = start_daemon('[workcell]\nname = "test"\n' + head + ARM)
+    run = workflow(daemon, tmp_path, "--yes", "--first", "one_speed", "--lap", "2", node="mod0.arm", model=ARM_MODEL)
+    assert run.wait_exit(200.0) == NAMED, said(run)
+    asked = next(line for line in run.lines if "not told apart" in line)
+    assert "gravity" in asked
+    assert "offset" in asked
+    found = json.loads((tmp_path / "report" / "verdict.json").read_text())
+    assert found["effects"] == ["gravity"]
+    assert found["parameters"]["gravity"]["amp"] == pytest.approx(WEIGHT, rel=0.03)
+    assert found["parameters"]["gravity"]["phase"] == pytest.approx(-math.pi / 2, abs=0.03)
+    assert "offset" in {**found["details"][0]["ruled_out"]}
+    records = {p.stem for p in (tmp_path / "report" / "records").glob("*.csv")}
+    assert "one_speed" in records
+    assert any(name.startswith("separate_") for name in records)
 
 
 def test_the_emergency_stop_ends_an_experiment_and_nothing_resumes(daemon: Daemon, tmp_path: Path) -> None:
