@@ -30,7 +30,7 @@ from sioms.tools.tactile_data import read_nominal
 
 if TYPE_CHECKING:
     from sioms.reconcile.finger.plan import Bench
-    from sioms.reconcile.finger.subject import Experiment
+    from sioms.reconcile.finger.prepare import Experiment
     from sioms.reconcile.sensors.verdict import SensorVerdict
 
 #: Arrays, the unit they come in, and what other units are worth in it.
@@ -63,7 +63,7 @@ def reconcile_tactile(
     Raises:
         BadInputError: data or model cannot be used.
     """
-    from sioms.reconcile.finger.subject import prepare
+    from sioms.reconcile.finger.prepare import prepare
     from sioms.reconcile.sensors.analyse import Options, analyse
 
     start = time.monotonic()
@@ -111,7 +111,7 @@ def read_experiments(data: Path) -> list[Experiment]:
     Raises:
         BadInputError: there is none, or one lacks an array or holds one of the wrong length.
     """
-    from sioms.reconcile.finger.subject import Experiment
+    from sioms.reconcile.finger.prepare import Experiment
 
     if not data.is_dir():
         raise BadInputError(f"read {data}: no such folder; needs one npz for each experiment")

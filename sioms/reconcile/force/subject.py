@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.force.belief import Floats, Loads, readings
 from sioms.reconcile.refuse import hats
-from sioms.reconcile.sensors.analyse import Options, Variable, View, analyse
+from sioms.reconcile.sensors.analyse import Options, analyse
 from sioms.reconcile.sensors.effect import TERM_PREFIX, SensorModel
 from sioms.reconcile.sensors.refuse import knots
+from sioms.reconcile.sensors.subject import Variable, View
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
 from sioms.reconcile.verdict import NamedEffect
 

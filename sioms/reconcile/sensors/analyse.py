@@ -8,20 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sioms.reconcile.blocks import bootstrap
 from sioms.reconcile.excitation import SAME, common
-from sioms.reconcile.locate import Place, bins_of, explained
+from sioms.reconcile.locate import Place
 from sioms.reconcile.noise import effective_samples
 from sioms.reconcile.search import GAIN
 from sioms.reconcile.sensors.effect import TERM_PREFIX, Array, SensorEffect, SensorModel
 from sioms.reconcile.sensors.fit import Data, Fit, refit
+from sioms.reconcile.sensors.locate import locate
 from sioms.reconcile.sensors.refuse import burst_share, smoother_share
-from sioms.reconcile.sensors.search import Found, Rival, Searcher, screening_columns
+from sioms.reconcile.sensors.screen import screening_columns
+from sioms.reconcile.sensors.search import Found, Rival, Searcher
+from sioms.reconcile.sensors.subject import Subject
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
 from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome
 
@@ -40,87 +41,6 @@ class Options:
     replicates: int = 200
     pictures: bool = True
     progress: Callable[[str], None] = field(default=lambda text: None)
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """How a view is reported: what it is called, its unit, and what one floor is in that unit."""
-
-    title: str
-    unit: str
-    floor: float
-
-
-class Variable(NamedTuple):
-    """Something that the disagreement may go with.
-
-    Attributes:
-        view: number of the view whose rows it is given for.
-        values: for each row of that view of the subject's ``whole``.
-        bins: of the rows, from 0; None for bins of equal counts.
-    """
-
-    name: str
-    unit: str
-    view: int
-    values: Array
-    bins: NDArray[np.int64] | None = None
-
-
-class Subject(Protocol):
-    """A prepared sensor: rows, model and what the report wants.
-
-    Attributes:
-        whole, training, final: all rows; those of the search; those that take no part in it.
-        model: the nominal model with the whole library (terms too).
-        names, terms: effects that are tried, and the nameless terms beside them.
-        settled: effects found by a channel of their own, with their values in the model as well.
-    """
-
-    @property
-    def whole(self) -> Data: ...
-    @property
-    def training(self) -> Data: ...
-    @property
-    def final(self) -> Data: ...
-    @property
-    def model(self) -> SensorModel: ...
-    @property
-    def names(self) -> tuple[str, ...]: ...
-    @property
-    def terms(self) -> tuple[str, ...]: ...
-    @property
-    def settled(self) -> tuple[NamedEffect, ...]: ...
-    @property
-    def notes(self) -> tuple[str, ...]: ...
-
-    def views(self) -> Mapping[str, View]:
-        """Return how each view is reported."""
-        ...
-
-    def features(self) -> Mapping[int, Array]:
-        """Return columns of the state for the generic smoother, per view of ``training``."""
-        ...
-
-    def groups(self) -> NDArray[np.int64]:
-        """Return the number of the touch or sample of each row of view 0 of ``training``."""
-        ...
-
-    def variables(self) -> Sequence[Variable]:
-        """Return what the disagreement is located by."""
-        ...
-
-    def propose(self, models: Sequence[SensorModel]) -> tuple[Proposal, ...]:
-        """Return experiments, that on which the models differ most first."""
-        ...
-
-    def curves(self, before: SensorModel, after: SensorModel) -> tuple[Curve, ...]:
-        """Return curves for the pictures."""
-        ...
-
-    def unit(self, effect: str, symbol: str) -> str:
-        """Return the unit of a parameter on this sensor."""
-        ...
 
 
 def analyse(subject: Subject, options: Options | None = None) -> SensorVerdict:
@@ -390,50 +310,3 @@ def _frequency(searcher: Searcher, good: Array, bad: Array, view: str, rng: np.r
     d, b = (bad - good)[mine], bad[mine]
     draws = rng.integers(0, len(d), (200, len(d)))
     return float(np.mean(d[draws].sum(1) > GAIN * b[draws].sum(1)))
-
-
-def locate(subject: Subject, model: SensorModel, rng: np.random.Generator, shifts: int = 99) -> list[Place]:
-    """Rank the variables by how far they order the residual of the nominal model, with permutation p-values."""
-    data = subject.whole
-    e = -data.miss(data.predict(model))
-    out = []
-    told = subject.views()
-    for name, unit, view, values, own in subject.variables():
-        mine = np.flatnonzero(data.view == view)
-        r = e[mine]
-        if len(r) < 40 or np.ptp(values) == 0.0:
-            continue
-        bins = bins_of(values) if own is None else own
-        share = explained(r, bins)
-        chance = [explained(_shuffled(r, data.block[mine], rng), bins) for _ in range(shifts)]
-        p = (1 + sum(c >= share for c in chance)) / (shifts + 1)
-        count = np.maximum(np.bincount(bins), 1)
-        floor = told[data.views[view]].floor
-        mean = np.bincount(bins, weights=r) / count
-        spread = np.sqrt(np.maximum(np.bincount(bins, weights=r**2) / count - mean**2, 0.0))
-        out.append(
-            Place(
-                f"{name} ({told[data.views[view]].title})",
-                unit,
-                share,
-                p,
-                np.bincount(bins, weights=values) / count,
-                mean * floor,
-                spread * floor,
-            )
-        )
-    # whatever else changed meanwhile goes with the time: it comes first only where nothing else explains a third as much
-    return sorted(out, key=lambda q: -q.explained / (3.0 if q.variable.startswith("time (") else 1.0))
-
-
-def _shuffled(r: Array, block: NDArray[np.int64], rng: np.random.Generator) -> Array:
-    """Lay the blocks in another order, each turned within itself: neighbours stay neighbours, and nothing keeps its place."""
-    parts = np.split(r, np.flatnonzero(np.diff(block)) + 1)
-    return np.concatenate(
-        [np.roll(parts[i], int(rng.integers(len(parts[i])))) for i in rng.permutation(len(parts))]
-    )
-
-
-def untouched(count: int) -> NDArray[np.bool_]:
-    """Say which of a number of touches (or samples) take no part in any choice: every fifth."""
-    return np.asarray(np.arange(count) % 5 == 2)

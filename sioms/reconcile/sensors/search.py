@@ -7,30 +7,20 @@ view where it shows most.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from itertools import product
 
 import numpy as np
 
 from sioms.reconcile.ambiguity import AMBIGUOUS
 from sioms.reconcile.blocks import better, heldout
 from sioms.reconcile.search import DOUBTFUL, FLOOR, GAIN, NEARLY, SPECIFIC, SURE, negligible
-from sioms.reconcile.sensors.effect import TERM_PREFIX, Array, SensorEffect, SensorModel, Values
-from sioms.reconcile.sensors.fit import Data, Fit, Free, refit, slopes
+from sioms.reconcile.sensors.effect import TERM_PREFIX, Array, SensorEffect, SensorModel
+from sioms.reconcile.sensors.fit import Data, Fit, refit
+from sioms.reconcile.sensors.screen import Start, screen
 
 TRIES = 5
 STEPS = 8
-_SCREEN = 1e-3  # step of the screening difference, in natural sizes
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """A screened candidate: values to start from and the share of the view's squares it would save."""
-
-    effect: str
-    values: Values
-    gain: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -354,84 +344,3 @@ def physical(model: SensorModel, name: str) -> bool:
         return True
     span = 1e-6 * (q.upper - q.lower)
     return bool(q.lower + span < value[0] < q.upper - span and abs(value[0] - effect.neutral) > 1e-3 * q.size)
-
-
-def screen(
-    data: Data, fit: Fit, weights: Array, effect: SensorEffect, frozen: tuple[str, ...] = ()
-) -> list[Start]:
-    """Regress the residual on what a little of the effect would change; one start per trial shape, best first."""
-    out = []
-    known, r = fit.jacobian, fit.residual
-    for shape in _shapes(fit.model, effect):
-        columns = [weights[:, None] * _columns(data, fit.model, effect, values) for values in shape]
-        full = np.concatenate([known, *columns], axis=1)
-        size = np.sqrt(np.einsum("ij,ij->j", full, full))
-        live = size > 1e-9
-        if not live[known.shape[1] :].any():
-            continue
-        scaled = full[:, live] / size[live]
-        h = scaled.T @ scaled
-        d = np.zeros(len(size))
-        d[live] = np.linalg.lstsq(h + 1e-9 * np.eye(len(h)), -scaled.T @ r, rcond=1e-10)[0] / size[live]
-        values = _settled(effect, shape, d[known.shape[1] :], fit.model.count)
-        if values is not None:
-            out.append(Start(effect.name, values, _gain(data, r, r + full @ d)))
-    return sorted(out, key=lambda s: -s.gain)
-
-
-def _gain(data: Data, before: Array, after: Array) -> float:
-    """Share of squares saved in the view where it is most."""
-    count = len(data.views)
-    old = np.bincount(data.view, weights=before**2, minlength=count)
-    new = np.bincount(data.view, weights=after**2, minlength=count)
-    return float(np.max(np.where(old > 0.0, 1.0 - new / np.where(old > 0.0, old, 1.0), 0.0)))
-
-
-def _shapes(model: SensorModel, effect: SensorEffect) -> Iterator[list[dict[str, Array]]]:
-    """Yield trial shapes: one set of values, or a pair a quarter turn apart where a phase is free."""
-    searched = [q for q in effect.parameters[1:] if len(q.starts) > 1]
-    phase = next((q for q in effect.parameters if q.phase), None)
-    for picks in product(*(q.starts for q in searched)):
-        values = model.plain(effect.name)
-        for q, pick in zip(searched, picks, strict=True):
-            values[q.symbol] = np.full_like(values[q.symbol], pick)
-        if phase is None:
-            yield [values]
-        else:
-            yield [{**values, phase.symbol: np.array([turn])} for turn in (0.0, 0.5 * np.pi)]
-
-
-def screening_columns(data: Data, model: SensorModel, effect: SensorEffect, tries: int = 5) -> Array:
-    """Return what a natural size of the effect changes at most, of a few of its shapes, in units of the floor, shape (n, k)."""
-    shapes = list(_shapes(model, effect))
-    step = max(len(shapes) // tries, 1)
-    found = [_columns(data, model, effect, shape[0]) for shape in shapes[::step]]
-    return max(found, key=lambda c: float(np.linalg.norm(c)))
-
-
-def _columns(data: Data, model: SensorModel, effect: SensorEffect, values: dict[str, Array]) -> Array:
-    """Return the whitened change per natural size of the first parameter."""
-    q = effect.primary
-    trial = model.with_effect(effect.name, values)
-    free = tuple(Free(effect.name, q, i) for i in range(model.count if q.each else 1))
-    return slopes(data, trial, free, np.full(len(free), effect.neutral))
-
-
-def _settled(
-    effect: SensorEffect, shape: list[dict[str, Array]], amount: Array, count: int
-) -> dict[str, Array] | None:
-    """Turn regression coefficients into values to start from; None where the sign is not the effect's."""
-    q = effect.primary
-    values = dict(shape[0])
-    if len(shape) == 2:
-        phase = next(p for p in effect.parameters if p.phase)
-        a, b = amount * q.size
-        values[q.symbol] = np.array([np.clip(np.hypot(a, b), q.lower, q.upper)])
-        values[phase.symbol] = np.array([np.arctan2(b, a)])
-        return values
-    wanted = effect.neutral + amount * q.size
-    held = np.clip(wanted, q.lower, q.upper)
-    if not q.each and abs(held[0] - effect.neutral) < 0.2 * abs(wanted[0] - effect.neutral):
-        return None
-    values[q.symbol] = held
-    return values

@@ -19,9 +19,9 @@ from sioms.reconcile.finger.data import CELL
 from sioms.reconcile.finger.effects import library
 from sioms.reconcile.finger.model_file import from_table, to_toml
 from sioms.reconcile.finger.plan import Bench, catalogue, first, one_place, propose
+from sioms.reconcile.finger.prepare import prepare
 from sioms.reconcile.finger.pressures import WAVES, hertz, sheet
 from sioms.reconcile.finger.records import find_lines
-from sioms.reconcile.finger.subject import prepare
 from sioms.reconcile.finger.twin import FingerTwin
 from sioms.reconcile.sensors.analyse import gate
 from sioms.reconcile.sensors.effect import SensorModel

@@ -1,0 +1,52 @@
+"""Where the disagreement of a sensor lives: its residual over the bins of what it may go with, with permutation p-values."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.reconcile.locate import Place, bins_of, explained
+from sioms.reconcile.sensors.effect import Array, SensorModel
+from sioms.reconcile.sensors.subject import Subject
+
+
+def locate(subject: Subject, model: SensorModel, rng: np.random.Generator, shifts: int = 99) -> list[Place]:
+    """Rank the variables by how far they order the residual of the nominal model, with permutation p-values."""
+    data = subject.whole
+    e = -data.miss(data.predict(model))
+    out = []
+    told = subject.views()
+    for name, unit, view, values, own in subject.variables():
+        mine = np.flatnonzero(data.view == view)
+        r = e[mine]
+        if len(r) < 40 or np.ptp(values) == 0.0:
+            continue
+        bins = bins_of(values) if own is None else own
+        share = explained(r, bins)
+        chance = [explained(_shuffled(r, data.block[mine], rng), bins) for _ in range(shifts)]
+        p = (1 + sum(c >= share for c in chance)) / (shifts + 1)
+        count = np.maximum(np.bincount(bins), 1)
+        floor = told[data.views[view]].floor
+        mean = np.bincount(bins, weights=r) / count
+        spread = np.sqrt(np.maximum(np.bincount(bins, weights=r**2) / count - mean**2, 0.0))
+        out.append(
+            Place(
+                f"{name} ({told[data.views[view]].title})",
+                unit,
+                share,
+                p,
+                np.bincount(bins, weights=values) / count,
+                mean * floor,
+                spread * floor,
+            )
+        )
+    # whatever else changed meanwhile goes with the time: it comes first only where nothing else explains a third as much
+    return sorted(out, key=lambda q: -q.explained / (3.0 if q.variable.startswith("time (") else 1.0))
+
+
+def _shuffled(r: Array, block: NDArray[np.int64], rng: np.random.Generator) -> Array:
+    """Lay the blocks in another order, each turned within itself: neighbours stay neighbours, and nothing keeps its place."""
+    parts = np.split(r, np.flatnonzero(np.diff(block)) + 1)
+    return np.concatenate(
+        [np.roll(parts[i], int(rng.integers(len(parts[i])))) for i in rng.permutation(len(parts))]
+    )
