@@ -77,6 +77,9 @@ def draw_axis(name: str, kind: str, rng: np.random.Generator, only: str = "") ->
         pair = list(CONFOUNDED[excitation])
         rng.shuffle(pair)
         named[pair[0]], rival = _effect(pair[0], base, rng), pair[1]
+        if pair[0] == "gravity":  # near the horizontal, where a little travel does not show its slope
+            drawn = named["gravity"]["phase"]
+            named["gravity"]["phase"] = float(np.copysign(0.5 * np.pi + 0.2 * (abs(drawn) - 0.5 * np.pi), drawn))
     elif kind == "unknown":
         pick = only or str(rng.choice(NAMELESS if rotary else [n for n in NAMELESS if n != "swinging_inertia"]))
         nameless[pick] = _effect(pick, base, rng)
