@@ -74,7 +74,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     shape.add_argument("--jobs", type=int, help="processes (default: one for each core)")
     shape.add_argument(
-        "--settle", type=int, default=20, help="frames averaged for the baseline, untouched (default 20)"
+        "--settle", type=int, default=20, help="untouched frames averaged for the baseline (default 20)"
     )
     shape.add_argument(
         "--load-deviation",

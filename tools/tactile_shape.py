@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import os
+import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -17,7 +19,7 @@ from sioms.tactile.chain import StrainFrame
 from sioms.tactile.estimator import Load, Quality
 from sioms.tactile.finger import Finger, from_toml
 from sioms.tactile.sensing import CHANNELS, LoadTare, Sensed, ShapeSensor, numbers
-from sioms.tactile.touches import LOADED, Recording
+from sioms.tactile.touches import BASELINE, Recording
 from sioms.tools.tactile import Progress
 from sioms.tools.tactile_data import read_recording
 
@@ -35,7 +37,7 @@ class Setting:
         finger: the calibrated finger.
         compiled: as in ``ShapeSensor``.
         load_deviation: of the recorded force [N/m]; None leaves the force alone.
-        settle_frames: averaged for the baseline.
+        settle_frames: averaged for the baseline, or as many as are marked before a touch.
     """
 
     finger: Finger
@@ -95,22 +97,16 @@ def _paths(given: list[Path]) -> list[Path]:
 
 
 def _read(path: Path, setting: Setting) -> Recording:
-    """Read a recording that begins untouched.
+    """Read a recording.
 
     Raises:
-        ValueError: no recording, of another finger, or touched too soon.
+        ValueError: no recording, or of another finger.
     """
     recording = read_recording(path)
     elements = len(setting.finger.angles_rad)
     if recording.raw.shape[1] != elements:
         raise ValueError(
             f"fit {path}: frames of {recording.raw.shape[1]} readings; finger {setting.finger.name!r} has {elements}"
-        )
-    loaded = np.flatnonzero(recording.phase == LOADED)
-    if loaded.size and loaded[0] < setting.settle_frames:
-        raise ValueError(
-            f"fit {path}: frame {loaded[0]} is under touch {recording.touch[loaded[0]]}, but the first "
-            f"{setting.settle_frames} are taken for the baseline; give --settle {max(int(loaded[0]), 1)}"
         )
     return recording
 
@@ -120,7 +116,7 @@ def rows(
 ) -> Iterator[list[tuple[float, ...]]]:
     """Return the numbers of a recording's frames, block by block in order; `ahead` blocks are being fitted meanwhile."""
     waiting: deque[Future[list[tuple[float, ...]]]] = deque()
-    for block in _blocks(recording, setting.sensor()):
+    for block in _blocks(recording, setting):
         waiting.append(pool.submit(_fit, block))
         if len(waiting) > ahead:
             yield waiting.popleft().result()
@@ -128,18 +124,33 @@ def rows(
         yield waiting.popleft().result()
 
 
-def _blocks(recording: Recording, sensor: ShapeSensor) -> Iterator[Block]:
-    """Bring the frames through baseline and drift, which is done in their order."""
+def _blocks(recording: Recording, setting: Setting) -> Iterator[Block]:
+    """Bring the frames through baseline and drift, which is done in their order.
+
+    Frames that are marked as a touch's baseline are taken for what they say: nothing touches, begin anew from these.
+    """
+    anew, fewest = baselines(recording)
+    sensor = dataclasses.replace(setting, settle_frames=min(setting.settle_frames, fewest)).sensor()
     stamps = np.round((recording.time_s - recording.time_s[:1]) * 1e9).astype(np.int64).tolist()
     force = recording.force.tolist()
     block: Block = []
     for number, raw in enumerate(recording.raw):
+        if number in anew:
+            sensor.zero()
         block.append(sensor.strain(raw, stamps[number], force[number]))
         if len(block) == FRAMES:
             yield block
             block = []
     if block:
         yield block
+
+
+def baselines(recording: Recording) -> tuple[set[int], int]:
+    """Return where the marked baselines of touches begin, and how many frames the shortest has; many without marks."""
+    marked = np.where(recording.phase == BASELINE, recording.touch, -1)
+    edges = np.flatnonzero(np.diff(marked, prepend=-1, append=-1))
+    begins, ends = edges[:-1][marked[edges[:-1]] >= 0], edges[1:][marked[edges[:-1]] >= 0]
+    return set(begins.tolist()), int(np.min(ends - begins, initial=sys.maxsize))
 
 
 class Tally:
