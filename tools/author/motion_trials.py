@@ -209,6 +209,7 @@ def _stop(station: Station, state: str, way: str) -> float:
             if not let_go:
                 _check_latch(station, node, axis, way)
             station.cell.reset()
+            wait_for(lambda: not seen.read().status[0] & AxisStatus.EMERGENCY_STOP, 3.0)
             return took_s
         finally:
             with contextlib.suppress(OSError):
