@@ -102,7 +102,8 @@ class Bystander:
         self.node.move(0.001)
         self.node.move(0.0)
         self.node.wait_until_idle(5.0)
-        assert abs(self.node.read().position[0]) < 2e-3
+        # After a tick that came late the axis has to swing back.
+        wait_for(lambda: abs(self.node.read().position[0]) < 2e-3, "mod1 back at 0", 2.0)
         self.cell.close()
 
 
