@@ -16,11 +16,13 @@ from sioms.reconcile.blocks import better
 from sioms.reconcile.effects import library
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.screen import screen
-from sioms.reconcile.search import DOUBTFUL, Found, Searcher, physical, size, without
+from sioms.reconcile.search import DOUBTFUL, Found, Searcher, Step, physical, size, without
 
 AMBIGUOUS = 0.015
 #: What a look-alike must miss whose trace has this share of its energy in common with that of the named effect.
 ALIKE, SAME_TRACE = 0.05, 0.98
+#: Look-alikes that take the place of what is named, one after the other.
+SWAPS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +83,24 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
         if (r.effect, r.rival) not in best or r.missed < best[r.effect, r.rival].missed:
             best[r.effect, r.rival] = r
     return sorted(best.values(), key=lambda r: r.missed)
+
+
+def settle(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]]) -> tuple[Found, list[Rival]]:
+    """Find the rivals; where one does better than what is named, with no more parameters, search on from it.
+
+    A step adds what saves most beside the effects of that moment; what came later may have made a look-alike the better one.
+    """
+    others = rivals(searcher, found, pairs)
+    for _ in range(SWAPS):
+        best = next((r for r in others if r.missed < 0.0 and size(r.rival) <= size(r.effect)), None)
+        if best is None:
+            break
+        searcher.progress(f"{best.rival} does better than {best.effect}: searching on from it")
+        further = searcher.run(best.fit.model)
+        step = Step("swap", f"{best.effect} to {best.rival}", best.fit.ratio, 1.0 - best.fit.cost / found.fit.cost, best.fit.model)
+        found = Found(further.fit, further.losses, (*found.ladder, step, *further.ladder[1:]))
+        others = rivals(searcher, found, pairs)
+    return found, others
 
 
 def _alike(name: str) -> list[str]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sioms.reconcile.ambiguity import Rival, rivals
+from sioms.reconcile.ambiguity import Rival, settle
 from sioms.reconcile.blocks import better, block_ids, intervals
 from sioms.reconcile.channels import Finding, drive, index_fit, index_scale, lattice
 from sioms.reconcile.checks import check, check_scale
@@ -129,7 +129,9 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
                 "data; are model, force and position of the same axis?")
         ready = replace(ready, notes=(*ready.notes, note))
     o.progress("identifiability: look-alikes in the place of each effect")
-    others = rivals(searcher, found, excited.pairs)
+    settled, others = settle(searcher, found, excited.pairs)
+    if settled is not found:
+        found, share, burst = settled, smoother_share(ready.problem, settled.fit), bursts(ready.problem, settled.fit)
     return _conclude(ready, nominal, o, excited, found, searcher, others, odd, share, burst, rejected)
 
 

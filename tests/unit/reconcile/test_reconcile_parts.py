@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from sioms.reconcile.ambiguity import settle
 from sioms.reconcile.blocks import better, block_ids, bootstrap, heldout, intervals
 from sioms.reconcile.channels import drive, drive_output, index_fit, lattice
 from sioms.reconcile.excitation import common, gate
@@ -20,7 +21,7 @@ from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.screen import screen
-from sioms.reconcile.search import Searcher, unspecific
+from sioms.reconcile.search import Found, Searcher, unspecific
 from sioms.reconcile.simulate import simulate
 
 AXIS = AxisModel(True, 1e-3, 2e-3, 1e-3, 2e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0))
@@ -105,6 +106,15 @@ def test_an_effect_that_is_not_needed_leaves() -> None:
     s = Searcher(problem(session(hidden)), names=("viscous", "coulomb", "offset"))
     start = AXIS.with_effect("offset", {"off": 0.05})
     assert set(s.run(start).fit.model.effects) == {"viscous"}
+
+
+def test_a_look_alike_that_does_better_takes_the_place_of_what_was_named() -> None:
+    s = Searcher(problem(session(AXIS.with_effect("viscous", {"b_extra": 8e-3}))), names=("viscous", "quadratic_drag"))
+    fit = s.fit(AXIS.with_effect("quadratic_drag", {"c": 1e-4}))
+    found, others = settle(s, Found(fit, s.loss(fit), ()), ())
+    assert set(found.fit.model.effects) == {"viscous"}
+    assert [step.action for step in found.ladder] == ["swap"]
+    assert not any(r.open for r in others)
 
 
 def test_a_residual_that_suits_everything_has_no_name() -> None:
