@@ -18,14 +18,13 @@ from sioms.protocol.flags import NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.finger.belief import Belief, Scene
-from sioms.reconcile.finger.plan import Bench, catalogue, first, indenter, one_place
+from sioms.reconcile.finger.plan import Bench, Plan, catalogue, first, indenter, one_place
 from sioms.reconcile.sensors.verdict import Proposal, SensorVerdict
 from sioms.reconcile.verdict import Outcome
 from sioms.tools.reconcile_finger import read_model, reconcile_tactile
 from sioms.tools.tactile_prober import Prober, Recorder, Rig, Touch
 
 Say = Callable[[str], None]
-Plan = tuple[str, str, Scene]  # name, description, touches
 
 #: Separating experiments after the first records; they must tell rivals apart by so many times the noise.
 ROUNDS, LEAST = 2, 2.0

@@ -17,6 +17,9 @@ FRAMES = 20  # averaged in a touch
 _STEP_K = 2.0
 _HELD_S = np.geomspace(0.1, 30.0, 12)
 
+#: Name, description and touches.
+Plan = tuple[str, str, Scene]
+
 
 @dataclass(frozen=True, slots=True)
 class Bench:
@@ -52,7 +55,7 @@ def _at(places: Floats, loads: Floats | float, radii: Floats | float) -> Scene:
     )
 
 
-def first(b: Belief, bench: Bench, step: float = np.radians(2.0)) -> Iterator[tuple[str, str, Scene]]:
+def first(b: Belief, bench: Bench, step: float = np.radians(2.0)) -> Iterator[Plan]:
     """Yield name, description and touches of what is recorded before anything is decided.
 
     Args:
@@ -66,26 +69,29 @@ def first(b: Belief, bench: Bench, step: float = np.radians(2.0)) -> Iterator[tu
         f"{name} every {np.degrees(step):.3g} degrees at {bench.load:g} N/m",
         bench.within(_at(places, bench.load, bench.radii[0])),
     )
-    yield from one_place(b, bench, (0.25, 0.5, 0.75), 4)
+    yield loads_at(b, bench, (0.25, 0.5, 0.75), np.geomspace(0.25 * bench.load, bench.most, 4))
     for radius in bench.radii[1:]:
         few = np.linspace(low, high, 12)
         text = f"{indenter(radius)} at 12 places at {bench.load:g} N/m"
         yield f"indenter_{1e3 * radius:g}mm", text, bench.within(_at(few, bench.load, radius))
 
 
-def one_place(
-    b: Belief, bench: Bench, where: tuple[float, ...] = (0.5,), repeats: int = 24
-) -> Iterator[tuple[str, str, Scene]]:
-    """Yield touches at one place (or a few shares of the arc) with loads from a quarter of the usual to the largest."""
+def loads_at(b: Belief, bench: Bench, shares: tuple[float, ...], loads: Floats, repeats: int = 1) -> Plan:
+    """Return touches at some shares of the arc, each with some loads [N/m], so many times over."""
     order = np.sort(b.angle)
-    at = [float(order[int(share * (len(order) - 1))]) for share in where]
-    loads = np.geomspace(0.25 * bench.load, bench.most, 4)
-    full = np.tile(loads, repeats // 4)
-    text = f"loads from {loads[0]:.0f} to {loads[-1]:.0f} N/m at {len(at)} place{'s' if len(at) > 1 else ''}"
-    yield "loads", text, bench.within(_at(np.repeat(at, len(full)), np.tile(full, len(at)), bench.radii[0]))
+    at = [float(order[int(share * (len(order) - 1))]) for share in shares]
+    full = np.tile(loads, repeats)
+    text = f"loads from {loads[0]:.0f} to {loads[-1]:.0f} N/m" if len(loads) > 1 else f"{loads[0]:.0f} N/m"
+    text += f" at {len(at)} place{'s' if len(at) > 1 else ''}"
+    return "loads", text, bench.within(_at(np.repeat(at, len(full)), np.tile(full, len(at)), bench.radii[0]))
 
 
-def catalogue(b: Belief, bench: Bench | None = None) -> Iterator[tuple[str, str, Scene]]:
+def one_place(b: Belief, bench: Bench, touches: int = 24) -> Iterator[Plan]:
+    """Yield the least that can be recorded: some loads at one place."""
+    yield loads_at(b, bench, (0.5,), np.geomspace(0.25 * bench.load, bench.most, 4), touches // 4)
+
+
+def catalogue(b: Belief, bench: Bench | None = None) -> Iterator[Plan]:
     """Yield name, description and touches of the experiments that consist of touches and can be made."""
     bench = bench or Bench()
     low, high = float(b.angle.min()), float(b.angle.max())
