@@ -43,7 +43,7 @@ angle_rad = {ANGLES.tolist()}
 radius_m = 0.0103
 gain = 3.0
 """
-SURFACE_M = 0.010
+SURFACE_M, MOST = 0.010, 100.0  # [m, N/m]
 NAMED, STOPPED = 0, 1
 
 
@@ -80,27 +80,23 @@ def said(run: Running) -> str:
 
 
 @pytest.mark.timeout(240)
-def test_hidden_gains_are_told_from_depths_by_a_second_experiment_and_the_driver_loads_the_finger(
-    cell: Path, tmp_path: Path
-) -> None:
-    """Touches at one place leave gain and depth alike; the workflow goes round the finger by itself and decides."""
+def test_hidden_gains_are_named_and_the_driver_loads_the_finger(cell: Path, tmp_path: Path) -> None:
+    """Light touches: the simulated finger's own error, 0.3 % of its peak, stays below the noise."""
     file = cell / "finger.toml"
-    run = workflow(cell, tmp_path, "--yes", "--first", "one_place", "--install", str(file))
+    run = workflow(cell, tmp_path, "--yes", "--load", "80", "--most-load", str(MOST), "--install", str(file))
     assert run.wait_exit(200.0) == NAMED, said(run)
     found = json.loads((tmp_path / "report" / "verdict.json").read_text())
     assert found["effects"] == ["gain_scatter"]
-    assert "not told apart: gain_scatter or depth_scatter; deciding by" in said(run)
     true = scattered(shape_of(PUBLIC, HIDDEN)).gains / 3.0 - 1.0
     given = [found["parameters"]["gain_scatter"][f"g[{i}]"] for i in range(ELEMENTS)]
-    assert np.allclose(given, true, atol=0.01)
+    assert np.allclose(given, true, atol=0.015)
     records = {p.name: np.load(p) for p in (tmp_path / "report" / "records").glob("*.npz")}
-    assert {"noise.npz", "loads_0mm.npz"} < set(records)
-    (name,) = set(records) - {"noise.npz", "loads_0mm.npz"}
-    assert name.startswith("separate_") and np.ptp(records[name]["cmd_theta"]) > 30.0
-    assert np.all(records[name]["force"] < 1.1 * 250.0)
+    assert set(records) == {"noise.npz", "places_0mm.npz", "loads_0mm.npz"}
+    for name in set(records) - {"noise.npz"}:
+        assert 0.5 * MOST < records[name]["force"].max() < 1.25 * MOST
 
     installed = from_toml(file.read_text())
-    assert np.allclose(np.array(installed.elements.gain) / 3.0 - 1.0, true, atol=0.01)
+    assert np.allclose(np.array(installed.elements.gain) / 3.0 - 1.0, true, atol=0.015)
     with (
         sioms.Workcell(str(cell / "prober.sock"), "test") as session,
         session.open("tactile0.strain") as strain,
