@@ -156,7 +156,13 @@ def test_a_twin_takes_its_elements_and_effects_from_a_model_and_shows_which(benc
         file.write_text(MODEL.format(last=last))
         mod = bench.make(SimAxes, f"mod{len(seen)}", {"axis": TWO})
         force_node = f"mod{len(seen)}.plant.z_contact"
-        table = {"model_file": str(file), "force_node": force_node, "angle_rad": 1.28, "noise": 0.0, "resolution": 0.0}
+        table = {
+            "model_file": str(file),
+            "force_node": force_node,
+            "angle_rad": 1.28,
+            "noise": 0.0,
+            "resolution": 0.0,
+        }
         finger = bench.make(SimTactile, f"tactile{len(seen)}", table)
         bench.run(0.02)
         assert not finger.blocks[0].data.any()
@@ -172,7 +178,11 @@ def test_a_twin_takes_its_elements_and_effects_from_a_model_and_shows_which(benc
 
 @pytest.mark.parametrize(
     "table, words",
-    [({"model_file": "/nowhere.toml"}, "No such file"), ({"gain": [1.0]}, "gain: 1 numbers; want 16"), ({"indenter_radius_m": -1.0}, "positive radius")],
+    [
+        ({"model_file": "/nowhere.toml"}, "No such file"),
+        ({"gain": [1.0]}, "gain: 1 numbers; want 16"),
+        ({"indenter_radius_m": -1.0}, "positive radius"),
+    ],
 )
 def test_bad_finger_is_told_by_describe(table, words):
     with pytest.raises(ValueError, match=words):

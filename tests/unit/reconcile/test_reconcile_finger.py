@@ -322,7 +322,9 @@ def test_the_nominal_finger_may_be_a_calibrated_one(folder: Path) -> None:
 def test_a_twin_answers_as_the_finger_of_another_mechanics_with_the_same_gains_and_creep() -> None:
     """The simulated finger of ``sioms.plant`` solves its contacts in quite another way."""
     creep, tau = 0.2, 0.5
-    finger = TactileArray(FingerShape(gain=3.0, gain_scatter=0.1, seed=3, creep=creep, creep_s=tau, length_m=0.012))
+    finger = TactileArray(
+        FingerShape(gain=3.0, gain_scatter=0.1, seed=3, creep=creep, creep_s=tau, length_m=0.012)
+    )
     model = SensorModel(believed(), 16, library())
     model = model.with_effect("gain_scatter", {"g": finger.truth.gains / 3.0 - 1.0})
     model = model.with_effect("creep", {"c": np.array([creep]), "tau": np.array([tau])})
@@ -338,7 +340,11 @@ def test_a_twin_answers_as_the_finger_of_another_mechanics_with_the_same_gains_a
 
 def test_touches_keep_the_limits_of_the_bench() -> None:
     bench = Bench((6e-3, 0.0), 120.0, 150.0, 0.8, 1.9)
-    for name, _, scene in (*first(believed(), bench), *one_place(believed(), bench), *catalogue(believed(), bench)):
+    for name, _, scene in (
+        *first(believed(), bench),
+        *one_place(believed(), bench),
+        *catalogue(believed(), bench),
+    ):
         assert len(scene.place) > 0, name
         assert scene.load.max() <= 150.0 and scene.load.min() > 0.0, name
         assert scene.place.min() >= 0.8 and scene.place.max() <= 1.9, name
@@ -352,7 +358,8 @@ def test_loads_told_by_the_load_cell_alone_do_not_judge_its_scale(folder: Path) 
         if "cmd_P" in arrays:
             mine = [(arrays["touch"] == i) for i in range(len(arrays["cmd_P"]))]
             felt = [
-                arrays["force"][m & (arrays["phase"] == 1)].mean() - arrays["force"][m & (arrays["phase"] == 0)].mean()
+                arrays["force"][m & (arrays["phase"] == 1)].mean()
+                - arrays["force"][m & (arrays["phase"] == 0)].mean()
                 for m in mine
             ]
             arrays["cmd_P"] = np.array(felt)
@@ -376,5 +383,7 @@ def test_the_fit_finds_the_bottom_of_a_bent_valley_within_its_bounds() -> None:
     none, one = np.full(2, np.inf), np.ones(2)
     at, r, _ = descend(residual, slopes, np.array([-1.2, 1.0]), one, -none, none, 200, 1e-12)
     assert at == pytest.approx(one, abs=1e-4) and r @ r < 1e-8
-    at, _, _ = descend(residual, slopes, np.array([-1.2, 1.0]), one, -none, np.array([0.5, np.inf]), 200, 1e-12)
+    at, _, _ = descend(
+        residual, slopes, np.array([-1.2, 1.0]), one, -none, np.array([0.5, np.inf]), 200, 1e-12
+    )
     assert at == pytest.approx([0.5, 0.25], abs=1e-3)
