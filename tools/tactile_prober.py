@@ -36,7 +36,7 @@ ATTEMPTS = 5  # at a touch whose frames did not come
 POLL_S = 2e-3
 MOVE_S = 10.0  # longest move
 #: The surface is felt for at one speed [m/s], the way in at another; a force is that of so many samples.
-FEEL_M_S, LEARN_M_S, NEAR = 5e-3, 1.5e-3, 8
+FEEL_M_S, LEARN_M_S, NEAR = 5e-3, 1e-3, 8
 FELT = 0.1  # of the largest load: the surface has been found
 LEARNT, OVER = 1.08, 1.3  # of the largest load: the way in is known up to there; pressing is stopped
 
