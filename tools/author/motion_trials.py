@@ -47,7 +47,10 @@ def wait_moving(station: Station, read: Callable[[], Any], axis: Axis) -> float:
     start = read().position[0]
     far = max(4 * axis.tolerance, 0.02 * axis.reach)
     if not wait_for(lambda: abs(read().position[0] - start) > far, 5.0):
-        raise Failed("motion after the command", f"{axis.node} stays at {read().position[0]:.6g}")
+        seen = read()
+        told = f"{AxisStatus(int(seen.status[0]))!s}, in_motion {seen.in_motion[0]}, {seen.buffered[0]} buffered"
+        text = f"{axis.node} stays at {seen.position[0]:.6g} ({told})"
+        raise Failed("motion after the command", text, station.exchanges(12))
     return abs(station.speed() or 0.0)
 
 

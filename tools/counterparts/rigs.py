@@ -169,6 +169,8 @@ LIMITS = "position_min = -1.0\nposition_max = 1.0\n"
 SERVO = "velocity_max = 1.0\nacceleration_max = 10.0\njerk_max = 2000.0\nforce_max = 100.0\n"
 QUICK = "override = { turnaround_s = 0.2 }\n"
 """A simulated block answers at once: what is not answered need not be waited for as long as on a network."""
+PATIENT = "turnaround_s = 0.15\n"
+"""Where the kernel holds up all real-time processes for 50 ms (sched_rt_runtime_us), that is no fault of the device."""
 DRIVE = "travel_per_turn = 0.01\nvelocity_max = 0.2\nacceleration_max = 2.0\n" + LIMITS
 
 RIGS: tuple[Rig, ...] = (
@@ -199,7 +201,7 @@ RIGS: tuple[Rig, ...] = (
     ),
     Rig(
         "tmcl",
-        '[device.tmcl]\ndriver = "tmcl"\nmodule = 1140\npoll_hz = 50.0\n'
+        f'[device.tmcl]\ndriver = "tmcl"\nmodule = 1140\npoll_hz = 50.0\n{PATIENT}'
         'line = { serial = "{port}", baud = 115200 }\n'
         f'[[device.tmcl.axis]]\nname = "x"\nmotor = 0\nmicrosteps_per_turn = 51200\n{DRIVE.replace("0.2", "0.1")}',
         ("tmcl", "--motors", "1"),
@@ -222,7 +224,8 @@ RIGS: tuple[Rig, ...] = (
     ),
     Rig(
         "dynamixel",
-        '[device.dynamixel]\ndriver = "dynamixel"\nquick_stop = "hold"\nline = { serial = "{port}", baud = 1000000 }\n'
+        f'[device.dynamixel]\ndriver = "dynamixel"\nquick_stop = "hold"\n{PATIENT}'
+        'line = { serial = "{port}", baud = 1000000 }\n'
         '[[device.dynamixel.axis]]\nname = "x"\nid = 1\nzero = 2048\ntravel_per_turn = 0.05\n'
         "velocity_max = 0.07\nacceleration_max = 0.5\n" + LIMITS,
         ("dynamixel", "--ids", "1"),
