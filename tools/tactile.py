@@ -132,12 +132,19 @@ def run(args: argparse.Namespace) -> int:
 
                 return experiment(args)
     except (ValueError, OSError, KeyError, RuntimeError) as error:
-        print(f"sioms tactile {args.tactile_command}: {error}", file=sys.stderr)
+        print(f"sioms tactile {args.tactile_command}: {_sentence(error)}", file=sys.stderr)
         return 1
     except ImportError as error:
         print(f"sioms tactile {args.tactile_command}: {error}; pip install sioms[report]", file=sys.stderr)
         return 1
     raise AssertionError(args.tactile_command)
+
+
+def _sentence(error: Exception) -> str:
+    """Return what an error says, without its number; of a file also which."""
+    if not isinstance(error, OSError) or not error.strerror:
+        return str(error)
+    return f"open {error.filename}: {error.strerror.lower()}" if error.filename else error.strerror
 
 
 class Progress:

@@ -114,9 +114,8 @@ class LineEngine(Connected):
             state.fresh = False
             self._runtime.set_link(state.unit.blocks, PageState.GOOD, "")
             for block in state.unit.blocks:
-                self._runtime.stops.make_safe(
-                    block, self._unowned(block)
-                )  # who wrote them may have gone meanwhile
+                # who wrote them may have gone meanwhile
+                self._runtime.stops.make_safe(block, self._unowned(block))
         for block in state.unit.blocks:
             if isinstance(block, AxisBlock):
                 self._take_actions(state, block, now_ns)

@@ -251,5 +251,6 @@ def test_shape_names_what_it_cannot_fit(tmp_path: Path, capsys: pytest.CaptureFi
     assert "x.npz: frames of 8 readings; finger 'demo' has 16" in refusal(str(tmp_path), "--finger", finger)
     (tmp_path / "x.npz").write_text("nothing")
     assert f"read {tmp_path / 'x.npz'}" in refusal(str(tmp_path), "--finger", finger)
-    assert "No such file" in refusal(str(tmp_path), "--finger", "/none/finger.toml")
+    missing = refusal(str(tmp_path), "--finger", "/none/finger.toml")
+    assert missing == "sioms tactile shape: open /none/finger.toml: no such file or directory\n"
     assert "deviation is -1" in refusal(str(tmp_path), "--finger", finger, "--load-deviation", "-1")
