@@ -7,12 +7,14 @@
 
 The model is the finger's E map with round contacts of the finger's width table (dissertation 3.5).  Errors
 are propagated from the elements' noise and, in proportion to the touch, from the misfit that calibration
-left; the covariance is that of weighted least squares.  An estimate always carries a quality; `Quality.GOOD`
-means no flag is set.
+left; the covariance is that of weighted least squares, and where that leaves the place open the estimate is the
+mean of what is possible (`sioms.tactile.posterior`).  An estimate always carries a quality; `Quality.GOOD` means no
+flag is set.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -22,11 +24,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sioms.tactile.finger import Finger
-from sioms.tactile.kernel import MOST_STEPS, Products, Solve, Status, compiled, plain
+from sioms.tactile.kernel import MOST_STEPS, NOT_DRAWN, Products, Solve, Status, compiled, drawn_frame, plain
 from sioms.tactile.linearity import linearise
+from sioms.tactile.posterior import Averager
 from sioms.tactile.proximity import Proximity
 
 Floats = NDArray[np.float64]
+Found = tuple[int, float, float, Products, int, float]  # status, t, b, products there, steps, sum of weights
 
 
 class Quality(Flag):
@@ -45,7 +49,9 @@ class Quality(Flag):
     FLAT_OR_HOLLOW = auto()  # R is not below rb: no convex indenter does that
     NOT_CONVERGED = auto()
     WRONG_SIGN = auto()  # the strains are those of a pull
-    IMPRECISE = auto()  # the place is known to no better than 2 degrees at four standard deviations
+    IMPRECISE = (
+        auto()
+    )  # four standard deviations of the best fit's place are over 2 degrees: means are given instead
     NO_BASELINE = auto()  # the readings without touch are not known yet: nothing is estimated
     WITHOUT_LOAD = (
         auto()
@@ -53,7 +59,6 @@ class Quality(Flag):
 
 
 _HUGE = 1e30  # variance of an element that must not count
-_PROXIMITY_PASSES = 3
 _PROXIMITY_STARTS = 3
 _APART = math.radians(6.0)
 _HOLD_PASSES = 8
@@ -171,6 +176,7 @@ class Estimator:
         self._largest = most_hollow * self._radius
         table = self._table
         self._widest = float(table.half_widths[-1]) ** 2
+        self._averager = Averager(table, self._widths, self._arc, self._largest)
         bank, places = self._templates()
         self._fixed = (
             table.nodes, table.first, table.step, float(table.half_widths[1]), bank, bank**2 + 1e-300, places,
@@ -239,22 +245,30 @@ class Estimator:
         if load is not None:
             value, weight = load.value, 1.0 / max(load.deviation, 1e-6 * load.value) ** 2
         least = count + self._contact_sigma * math.sqrt(2.0 * count)
-        if self._drawn is not None:
-            y = self._undrawn(self._drawn, y, noise, least, value, weight)
-        status, t, b, at, steps, total = self._search(noise, least, y, value, weight)
-        if status == Status.NO_CONTACT:
+        if self._drawn is None:
+            pull, found = NOT_DRAWN, self._search(noise, least, y, value, weight)
+        else:
+            pull = self._pull(self._drawn, y)
+            found = self._search_drawn(pull, noise, least, y, value, weight)
+        if found[0] == Status.NO_CONTACT:
             return nothing(quality | Quality.NO_CONTACT)
-        if status == Status.WRONG_SIGN:
+        if found[0] == Status.WRONG_SIGN:
             return nothing(quality | Quality.WRONG_SIGN)
-        return self._describe(t, b, at, steps, value, weight, count, total, quality)
+        shape = self._describe(*found[1:], value, weight, count, quality)
+        if not shape.covariance[0][0] < _SURE**2:
+            return self._averaged(shape, y, noise, pull, value, weight)
+        return shape
 
     def _search(
-        self, noise: Floats, least: float, y: Floats, load: float, load_weight: float
-    ) -> tuple[int, float, float, Products, int, float]:
+        self, noise: Floats, least: float, y: Floats, load: float, load_weight: float, pull: Floats = NOT_DRAWN,
+        start: tuple[float, float] = (0.0, -1.0),
+    ) -> Found:  # fmt: skip
         """Fit, and fit again no wider than the most hollow indenter while the fit is wider."""
         top = self._widest
         for _ in range(1 + _HOLD_PASSES):
-            found = self._solve(*self._fixed, noise, self._share, least, y, load, load_weight, top)
+            found = self._solve(
+                *self._fixed, noise, self._share, least, y, pull, load, load_weight, top, *start
+            )
             status, _, b, at, _, _ = found
             if status != Status.FITTED:
                 break
@@ -277,50 +291,77 @@ class Estimator:
             b = max(b - (radius - self._largest) / slope, 0.0)
         return b
 
-    def _undrawn(
-        self, drawn: Proximity, y: Floats, noise: Floats, least: float, load: float, load_weight: float
-    ) -> Floats:
-        """Return the strains without the pull of a conductor at the place that then fits best; y if untouched."""
-        if float(np.sum(y * y / noise)) < least:
-            return y
-        # the pull is an output: back before the quadratic, which acts on the sum
+    def _pull(self, drawn: Proximity, y: Floats) -> Floats:
+        """Return what the search needs of a frame under a conductor: the pull is an output and acts before the quadratic."""
         linear = -y / self._gain
         output = linear + self._quadratic * linear**2
+        return drawn_frame(
+            self._angles, self._gain, self._quadratic, output, drawn.amplitude, drawn.range_rad
+        )
 
-        def without(t: Floats | float) -> Floats:
-            strain = -self._gain * linearise(output - drawn.output(self._angles - t), self._quadratic)
-            return np.where(noise < _HUGE, strain, 0.0)
+    def _left(self, pull: Floats, y: Floats, t: Floats) -> Floats:
+        """Return the strains without the pull of a conductor at places t, shape (n, ns); (1, ns) if there is none."""
+        if not pull.shape[1]:
+            return y[None]
+        angle, gain, quadratic, output, amplitude, reach = pull
+        drawn = amplitude * np.exp(-np.abs(angle - t[:, None]) / reach)
+        strains: Floats = -gain * linearise(output - drawn, quadratic)
+        return strains
 
+    def _search_drawn(
+        self, pull: Floats, noise: Floats, least: float, y: Floats, load: float, load_weight: float
+    ) -> Found:
+        """Fit from the places where a touch and its pull together explain most; return the best."""
+        blank = (0.0,) * 10
+        if float(np.sum(y * y / noise)) < least:
+            return Status.NO_CONTACT, 0.0, 0.0, blank, 0, 0.0
         bank, places = self._fixed[4], self._fixed[6]
-        clean = without(places[:, :1])
+        clean = np.where(noise < _HUGE, self._left(pull, y, places[:, 0]), 0.0)
         score = np.maximum(np.sum(bank * clean / noise, axis=1), 0.0) ** 2 / np.sum(bank**2 / noise, axis=1)
         cost = np.sum(clean**2 / noise, axis=1) - score
-        best, least_cost = float(places[int(np.argmin(cost)), 0]), math.inf
+        best: Found = (Status.WRONG_SIGN, 0.0, 0.0, blank, 0, 0.0)
+        least_cost = math.inf
         for _ in range(_PROXIMITY_STARTS):
             start = int(np.argmin(cost))
-            t = float(places[start, 0])
+            t, b = float(places[start, 0]), float(places[start, 1])
             cost[np.abs(places[:, 0] - t) < _APART] = math.inf
-            t, left = self._settle(t, noise, without, load, load_weight)
+            found = self._search(noise, 0.0, clean[start], load, load_weight, pull, (t, b))
+            at, left = found[3], math.inf
+            if found[0] == Status.FITTED:
+                left = at[9] - (at[3] + load_weight * load) ** 2 / (at[0] + load_weight)
             if left < least_cost:
-                best, least_cost = t, left
-        return without(best)
+                best, least_cost = found, left
+        return best
 
-    def _settle(
-        self, t: float, noise: Floats, without: Callable[[float], Floats], load: float, load_weight: float
-    ) -> tuple[float, float]:
-        """Fit in turn the touch without the pull at its place, and its place; return it and the chi square left."""
-        left = math.inf
-        for _ in range(_PROXIMITY_PASSES):
-            status, found, _, at, _, _ = self._search(noise, 0.0, without(t), load, load_weight)
-            if status != Status.FITTED:
-                break
-            t = found
-            ff, fy = at[0] + load_weight, at[3] + load_weight * load
-            left = at[9] + load_weight * load * load - fy * fy / ff
-        return t, left
+    def _averaged(
+        self, shape: ShapeEstimate, y: Floats, noise: Floats, pull: Floats, load: float, load_weight: float
+    ) -> ShapeEstimate:
+        """Return the mean over all touches that the frame allows, in place of a best fit whose place is hardly known."""
+        t, arc = shape.angle_rad, self._averager.arc
+        if not arc[0] <= t <= arc[1]:
+            return dataclasses.replace(shape, quality=shape.quality | Quality.IMPRECISE)
+        deviation = math.sqrt(shape.covariance[0][0]) if shape.covariance[0][0] > 0.0 else math.inf
+        there = np.where(noise < _HUGE, self._left(pull, y, np.array([t]))[0], 0.0)
+        weights = 1.0 / (noise + self._share * float(np.max(there**2)))
+        mean = self._averager.average(
+            lambda places: self._left(pull, y, places), weights, load, load_weight, t, deviation
+        )
+        bend, rc = self._bent(mean.radius)
+        judged = self._judge(mean.angle, mean.square, mean.load, mean.radius, shape.misfit, shape.steps)
+        return dataclasses.replace(
+            shape, angle_rad=mean.angle, load_n_per_m=mean.load, equivalent_radius_m=mean.radius,
+            equivalent_curvature_per_m=bend, radius_m=rc, width_rad=2.0 * math.sqrt(mean.square),
+            covariance=mean.covariance, quality=shape.quality & Quality.BAD_ELEMENTS | judged | Quality.IMPRECISE,
+        )  # fmt: skip
+
+    def _bent(self, radius: float) -> tuple[float, float]:
+        """Return 1/R [1/m] and rc [m]."""
+        bend = 1.0 / radius if radius > 0.0 else math.inf
+        own = bend - 1.0 / self._radius
+        return bend, 1.0 / own if own > 0.0 else math.inf
 
     def _describe(
-        self, t: float, b: float, at: Products, steps: int, load: float, load_weight: float, count: int, total: float,
+        self, t: float, b: float, at: Products, steps: int, total: float, load: float, load_weight: float, count: int,
         quality: Quality,
     ) -> ShapeEstimate:  # fmt: skip
         ff, ft, fb, fy, tt, tb, _, bb, _, yy = at
@@ -331,12 +372,9 @@ class Estimator:
         radius, slope = self._widths.radius(p, b)
         covariance = _covariance(p, (p * p * tt, p * ft, p * p * tb, ff, p * fb, p * p * bb), radius, slope)
         quality |= self._judge(t, b, p, radius, misfit, steps)
-        if not covariance[0][0] < _SURE**2:
-            quality |= Quality.IMPRECISE
-        bend = 1.0 / radius if radius > 0.0 else math.inf
-        own = bend - 1.0 / self._radius
+        bend, rc = self._bent(radius)
         return ShapeEstimate(
-            t, p, radius, bend, 1.0 / own if own > 0.0 else math.inf, 2.0 * math.sqrt(b),
+            t, p, radius, bend, rc, 2.0 * math.sqrt(b),
             math.sqrt(chi / total), misfit, covariance, quality, steps,
         )  # fmt: skip
 

@@ -22,13 +22,14 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Products = tuple[float, float, float, float, float, float, float, float, float, float]
-# fits (nodes, first, step, width_step, weights, y, load, load_weight, t, b, widest b) -> (t, b, ten products,
-# iterations)
+# fits (nodes, first, step, width_step, weights, y, pull, load, load_weight, t, b, widest b) -> (t, b, ten
+# products, iterations)
 Fit = Callable[..., tuple[float, float, Products, int]]
 # solves one frame, see `_solver` -> (status, t, b, ten products, iterations, sum of weights)
 Solve = Callable[..., tuple[int, float, float, Products, int, float]]
 
 MOST_STEPS = 100
+LEAST_LOAD = 1e-3  # N/m, where the load of the best fit is not positive
 _TOLERANCE = 1e-7  # stop when a step gains less than this much chi square: 3e-4 standard deviations
 
 
@@ -39,10 +40,17 @@ def _products_numpy(
     width_step: float,
     weights: Floats,
     y: Floats,
+    pull: Floats,
+    load: float,
+    load_weight: float,
     t: float,
     b: float,
 ) -> Products:
-    """Return ff, ft, fb, fy, tt, tb, ty, bb, by, yy with f = f(t, b), t = df/dt, b = df/db, weighted."""
+    """Return ff, ft, fb, fy, tt, tb, ty, bb, by, yy with f = f(t, b), t = df/dt, b = df/db, weighted.
+
+    Under a conductor y is what is left of the outputs without its pull at t (see `drawn_frame`), and t = df/dt -
+    (dy/dt)/P: then all that is made of the products holds as it stands.
+    """
     rows, columns, _, elements = nodes.shape
     column = min(max(int((t - first) / step), 0), columns - 2)
     s = (t - first) / step - column
@@ -69,6 +77,15 @@ def _products_numpy(
     values = np.empty((4, elements))
     np.matmul(mixed.reshape(3, 16), block, out=values[:3])
     values[3] = y
+    if pull.shape[1]:
+        angle, gain, quadratic, output, amplitude, reach = pull
+        away = angle - t
+        drawn = amplitude * np.exp(-np.abs(away) / reach)
+        root = np.sqrt(np.maximum(1.0 + 4.0 * quadratic * (output - drawn), 1e-4))
+        values[3] = -2.0 * gain * (output - drawn) / (1.0 + root)
+        heavy = values[0] * weights
+        p = max((heavy @ values[3] + load_weight * load) / (heavy @ values[0] + load_weight), LEAST_LOAD)
+        values[1] -= gain * drawn * np.sign(away) / (reach * root * p)
     gram = (values * weights) @ values.T
     (ff, ft, fb, fy), (_, tt, tb, ty), (_, _, bb, by), (_, _, _, yy) = gram.tolist()
     return ff, ft, fb, fy, tt, tb, ty, bb, by, yy
@@ -81,6 +98,9 @@ def _products_loops(
     width_step: float,
     weights: Floats,
     y: Floats,
+    pull: Floats,
+    load: float,
+    load_weight: float,
     t: float,
     b: float,
 ) -> Products:
@@ -121,18 +141,34 @@ def _products_loops(
                     turn[e] += w1 * cell[e]
                     widen[e] += w2 * cell[e]
     ff = ft = fb = fy = tt = tb = ty = bb = by = yy = 0.0
+    left = y
+    if pull.shape[1]:
+        left = np.empty(elements)
+        slope = np.empty(elements)
+        for e in range(elements):
+            away = pull[0, e] - t
+            drawn = pull[4, e] * np.exp(-abs(away) / pull[5, e])
+            root = np.sqrt(max(1.0 + 4.0 * pull[2, e] * (pull[3, e] - drawn), 1e-4))
+            left[e] = -2.0 * pull[1, e] * (pull[3, e] - drawn) / (1.0 + root)
+            slope[e] = pull[1, e] * drawn * np.sign(away) / (pull[5, e] * root)
+            ff += weights[e] * value[e] * value[e]
+            fy += weights[e] * value[e] * left[e]
+        p = max((fy + load_weight * load) / (ff + load_weight), LEAST_LOAD)
+        ff = fy = 0.0
+        for e in range(elements):
+            turn[e] -= slope[e] / p
     for e in range(elements):
         w = weights[e]
         ff += w * value[e] * value[e]
         ft += w * value[e] * turn[e]
         fb += w * value[e] * widen[e]
-        fy += w * value[e] * y[e]
+        fy += w * value[e] * left[e]
         tt += w * turn[e] * turn[e]
         tb += w * turn[e] * widen[e]
-        ty += w * turn[e] * y[e]
+        ty += w * turn[e] * left[e]
         bb += w * widen[e] * widen[e]
-        by += w * widen[e] * y[e]
-        yy += w * y[e] * y[e]
+        by += w * widen[e] * left[e]
+        yy += w * left[e] * left[e]
     return ff, ft, fb, fy, tt, tb, ty, bb, by, yy
 
 
@@ -146,6 +182,7 @@ def _build(products: Callable[..., Products]) -> Fit:
         width_step: float,
         weights: Floats,
         y: Floats,
+        pull: Floats,
         load: float,
         load_weight: float,
         t: float,
@@ -154,16 +191,16 @@ def _build(products: Callable[..., Products]) -> Fit:
     ) -> tuple[float, float, Products, int]:
         top_t = first + step * (nodes.shape[1] - 1)
         b = min(b, top_b)
-        at = products(nodes, first, step, width_step, weights, y, t, b)
+        at = products(nodes, first, step, width_step, weights, y, pull, load, load_weight, t, b)
         ff, fy = at[0] + load_weight, at[3] + load_weight * load
-        cost = -(max(fy, 0.0) ** 2) / ff
+        cost = at[9] - max(fy, 0.0) ** 2 / ff
         damping = 1e-3
         steps = 0
         while steps < MOST_STEPS:
             steps += 1
             p = fy / ff
             # a load of the wrong sign gives no direction: fall back on a small positive one
-            p = max(p, 1e-3)
+            p = max(p, LEAST_LOAD)
             gain_t, gain_b = p * (at[6] - p * at[1]), p * (at[8] - p * at[2])
             tt, bb = p * p * (at[4] - at[1] ** 2 / ff), p * p * (at[7] - at[2] ** 2 / ff)
             tb = p * p * (at[5] - at[1] * at[2] / ff)
@@ -180,9 +217,11 @@ def _build(products: Callable[..., Products]) -> Fit:
             share = min(1.0, room / max(abs(move_t), 1e-30))
             new_t, new_b = t + share * move_t, min(max(b + share * move_b, 0.0), top_b)
             promised = (new_t - t) * gain_t + (new_b - b) * gain_b
-            try_at = products(nodes, first, step, width_step, weights, y, new_t, new_b)
+            try_at = products(
+                nodes, first, step, width_step, weights, y, pull, load, load_weight, new_t, new_b
+            )
             try_ff, try_fy = try_at[0] + load_weight, try_at[3] + load_weight * load
-            try_cost = -(max(try_fy, 0.0) ** 2) / try_ff
+            try_cost = try_at[9] - max(try_fy, 0.0) ** 2 / try_ff
             gained = cost - try_cost
             if gained >= -1e-12 * abs(cost):
                 t, b, at, ff, fy, cost = new_t, new_b, try_at, try_ff, try_fy, try_cost
@@ -198,6 +237,27 @@ def _build(products: Callable[..., Products]) -> Fit:
     return fit
 
 
+def drawn_frame(
+    angle: Floats, gain: Floats, quadratic: Floats, output: Floats, amplitude: float, reach: float
+) -> Floats:
+    """Return the rows that the search needs of a frame under a conductor, shape (6, ns); `NOT_DRAWN` without one.
+
+    Element i gives d = l + q l^2 + A exp(-|t_i - t|/reach) for a touch at t; what is left at t is -gain l.
+
+    Args:
+        angle, gain, quadratic: of the elements [rad, 1, 1/output].
+        output: d of the frame, shape (ns,).
+        amplitude: A [output].
+        reach: over which the pull falls to 1/e [rad].
+    """
+    return np.stack(
+        [angle, gain, quadratic, output, np.full(angle.size, amplitude), np.full(angle.size, reach)]
+    )
+
+
+NOT_DRAWN: Floats = np.zeros((6, 0))
+
+
 class Status(IntEnum):
     """Say how far `solve` came."""
 
@@ -207,7 +267,10 @@ class Status(IntEnum):
 
 
 def _solver(fit: Fit) -> Solve:
-    """Return one frame's whole work: weights, touch or not, best pattern, search; numba compiles its body too."""
+    """Return one frame's whole work: weights, touch or not, best pattern, search; numba compiles its body too.
+
+    The search starts from `start_t`, `start_b` unless `start_b` is negative.
+    """
 
     def solve(
         nodes: Floats,
@@ -221,19 +284,24 @@ def _solver(fit: Fit) -> Solve:
         share: Floats,
         least: float,
         y: Floats,
+        pull: Floats,
         load: float,
         load_weight: float,
         top_b: float,
+        start_t: float,
+        start_b: float,
     ) -> tuple[int, float, float, Products, int, float]:
         blank = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         square = y * y
         if (square / noise).sum() < least:
             return 1, 0.0, 0.0, blank, 0, 0.0
         weights = 1.0 / (noise + share * square.max())
-        score = bank @ (weights * y)
-        best = np.argmax(score * np.abs(score) / (bank_square @ weights))
-        if score[best] <= 0.0:
-            return 2, 0.0, 0.0, blank, 0, 0.0
+        if start_b < 0.0:
+            score = bank @ (weights * y)
+            best = np.argmax(score * np.abs(score) / (bank_square @ weights))
+            if score[best] <= 0.0:
+                return 2, 0.0, 0.0, blank, 0, 0.0
+            start_t, start_b = places[best, 0], places[best, 1]
         t, b, at, steps = fit(
             nodes,
             first,
@@ -241,10 +309,11 @@ def _solver(fit: Fit) -> Solve:
             width_step,
             weights,
             y,
+            pull,
             load,
             load_weight,
-            float(places[best, 0]),
-            float(places[best, 1]),
+            float(start_t),
+            float(start_b),
             top_b,
         )
         return 0, t, b, at, steps, weights.sum()

@@ -15,6 +15,7 @@ from sioms.tactile.closedform import ellipse_spectrum, equivalent_radius
 from sioms.tactile.cylinder import FINGER_B
 from sioms.tactile.estimator import Estimator, Load, Quality
 from sioms.tactile.finger import Finger, nominal_finger
+from sioms.tactile.linearity import linearise
 
 ANGLES = np.radians(143.0 - 9.22 * np.arange(16))
 MATRIX = emap.e_map(FINGER_B, ANGLES, 10.3e-3, 100)[:, :201]
@@ -209,18 +210,49 @@ def test_a_light_touch_beside_the_last_element_is_no_heavy_one_further_out(nomin
         assert shape.equivalent_radius_m < 1.55 * nominal.cylinder.outer_m
     worst_free, worst_held = (max(abs(s.angle_rad - place) for s in shapes) for shapes in (free, held))
     assert worst_held < 0.8 * worst_free
-    # where the bound changes a place at all, it was the fit without it that had left the convex
-    far = [f for s, f in zip(held, free, strict=True) if abs(s.angle_rad - f.angle_rad) > np.radians(0.5)]
-    assert far and all(Quality.FLAT_OR_HOLLOW in shape.quality for shape in far)
-    with pytest.raises(ValueError, match="need 1"):
-        Estimator(nominal, most_hollow=0.5)
 
 
-def test_a_place_that_is_hardly_known_is_flagged(nominal: Finger, estimator: Estimator, touch) -> None:  # type: ignore[no-untyped-def]
-    light_at_the_end = estimator.frame(touch(np.radians(6.0), 30.0, np.inf))
+def test_a_place_that_is_hardly_known_is_flagged_and_its_deviations_hold(
+    nominal: Finger, estimator: Estimator, touch
+) -> None:  # type: ignore[no-untyped-def]
+    """The best fit's covariance says 4 degrees there and its errors run to 3; the mean's keep what they promise."""
+    place, random = np.radians(6.0), np.random.default_rng(17)
+    frames = touch(place, 30.0, np.inf) + 1e-3 * random.normal(size=(300, 16))
+    shapes = [estimator.frame(y) for y in frames]
+    vague = [s for s in shapes if Quality.IMPRECISE in s.quality]
+    assert len(vague) > 100
+    errors = np.array([(s.angle_rad - place, s.load_n_per_m - 30.0) for s in vague])
+    promised = np.array([s.deviations[:2] for s in vague])
+    assert np.all(np.sqrt(np.mean((errors / promised) ** 2, axis=0)) < 1.2)
+    assert np.abs(errors[:, 0]).max() < np.radians(2.0)
+    for s in vague:
+        assert 1.0 / s.equivalent_curvature_per_m == pytest.approx(s.equivalent_radius_m)
     in_the_middle = estimator.frame(touch(np.radians(75.0), 30.0, np.inf))
-    assert light_at_the_end.deviations[0] > np.radians(0.5) and Quality.IMPRECISE in light_at_the_end.quality
     assert in_the_middle.deviations[0] < np.radians(0.5) and Quality.IMPRECISE not in in_the_middle.quality
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_light_touches_of_a_conductor_are_found_by_their_pull_too(nominal: Finger, compiled: bool) -> None:
+    """The pull is ten times the output of 25 N/m: taken off at a wrong place it leaves a touch 16 degrees away."""
+    signal = msgspec.structs.replace(nominal.signal, proximity=-0.1, proximity_range_rad=0.25)
+    elements = msgspec.structs.replace(nominal.elements, quadratic=(2.0,) * 16)
+    finger = msgspec.structs.replace(nominal, signal=signal, elements=elements)
+    fit, angles = Estimator(finger, compiled=compiled), np.array(nominal.angles_rad)
+    random = np.random.default_rng(4)
+    for place, load, rc in (
+        (80.0, 25.0, np.inf),
+        (31.7, 40.0, 2e-3),
+        (10.0, 60.0, 6e-3),
+        (120.4, 300.0, 1.6e-3),
+    ):
+        t = math.radians(place)
+        linear = -strains(nominal, t, load, rc)
+        output = linear + 2.0 * linear**2 - 0.1 * np.exp(-np.abs(angles - t) / 0.25)
+        felt = -linearise(output + 1e-3 * random.normal(size=16), np.full(16, 2.0))
+        shape = fit.frame(felt)
+        errors = np.abs([shape.angle_rad - t, shape.load_n_per_m - load])
+        assert not shape.doubtful and np.all(errors < 4.0 * np.array(shape.deviations[:2]))
+        assert errors[0] < math.radians(1.0)
 
 
 def test_no_touch_of_the_table_fits_better_than_the_estimate(nominal: Finger) -> None:
