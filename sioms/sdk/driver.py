@@ -175,7 +175,7 @@ class TickDriver(Driver):
         raise NotImplementedError(f"{type(self).__name__} describes a writable block but takes no outputs")
 
     def slack(self, now_ns: int, until_ns: int) -> None:  # a hook that may stay empty
-        """Use the time left before the next tick, e.g. ``bank.plan_ahead``; all is published already."""
+        """Use the time between two ticks, e.g. for ``bank.plan_ahead``: after a tick, or, of a slow rate, before the next."""
 
     def close(self) -> None:  # a hook that may stay empty
         """Leave the device safe; axes have already been stopped."""

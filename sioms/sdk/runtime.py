@@ -122,6 +122,7 @@ class Runtime:
         self.clients = Attachments(self)
         self.engine = self._make_engine()
         self.period_ns = int(1e9 / self.engine.tick_hz)
+        self._lead_ns = self.engine.lead_ns if isinstance(self.engine, TickEngine) else 0
         self._spare_until_ns = 0
 
     # --- services to the driver (Kit) ------------------------------------------------------------
@@ -236,7 +237,7 @@ class Runtime:
         self.watch(self._line_timer.fd, self._on_line_timer)
         phase_ns = int(self._phase * self.period_ns)
         self._scheduled_ns = time.monotonic_ns() // self.period_ns * self.period_ns + phase_ns
-        self._timer.set(self._scheduled_ns + 2 * self.period_ns, self.period_ns)
+        self._timer.set(self._scheduled_ns + 2 * self.period_ns - self._lead_ns, self.period_ns)
         status = 0
         try:
             self.stops.look()
@@ -261,10 +262,13 @@ class Runtime:
         expired = self._timer.expirations()
         if not expired:
             return
-        began_ns = time.monotonic_ns()
         self._scheduled_ns += expired * self.period_ns
         self.statistics.skipped += expired - 1
         scheduled_ns = self._scheduled_ns
+        engine, slack_ns = self.engine, 0
+        if self._lead_ns and isinstance(engine, TickEngine):
+            slack_ns = engine.warm_up(scheduled_ns)
+        began_ns = time.monotonic_ns()
         self.tick += 1
         self.stops.heed()
         if began_ns - self.latch.daemon_alive_ns > self._daemon_lease_ns:
@@ -272,7 +276,6 @@ class Runtime:
         elif self._daemon_late:
             self._daemon_late = False
         self.clients.check_leases(began_ns)
-        engine = self.engine
         ticked_ns = self._tick_and_publish(scheduled_ns)
         self._spare_until_ns = ticked_ns + self.period_ns // 4
         self.after_publication(ticked_ns)
@@ -281,8 +284,10 @@ class Runtime:
         if self._ending_ns:
             self._maybe_end(ended_ns)
         elif isinstance(engine, TickEngine):
-            engine.slack(ended_ns, scheduled_ns + self.period_ns)
-            self.statistics.record_slack(time.monotonic_ns() - ended_ns)
+            if not self._lead_ns:
+                engine.slack(ended_ns, scheduled_ns + self.period_ns)
+                slack_ns = time.monotonic_ns() - ended_ns
+            self.statistics.record_slack(slack_ns)
 
     def _tick_and_publish(self, scheduled_ns: int) -> int:
         """Return when the tick itself was done."""

@@ -9,7 +9,7 @@ import numpy as np
 
 PHASES = ("late_ns", "input_ns", "control_ns", "publish_ns", "busy_ns", "total_ns", "spent_ns")
 """Scheduled to begun; to the readings being there; to the outputs being set; to all being published; all from begun;
-all from scheduled; all from begun with what is done after it in the slack."""
+all from scheduled; all from begun, with what is done in the slack between two ticks."""
 _SIZE = 8192
 
 
@@ -47,7 +47,7 @@ class TickStatistics:
             self.longest_ns = total_ns
 
     def record_slack(self, slack_ns: int) -> None:
-        """Note what was done after the tick that was recorded last."""
+        """Note what was done in the slack before or after the tick that was recorded last."""
         self._ring[6][(self.ticks - 1) & (_SIZE - 1)] += slack_ns
 
     def summary(

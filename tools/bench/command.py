@@ -14,7 +14,7 @@ from .tables import markdown
 
 BENCHES: dict[str, tuple[str, str]] = {
     "read": ("reading", "read of 4 axes and of 48 analog channels, against a bare round trip"),
-    "update": ("reading", "publication to awake subscriber at 100 Hz and 1 kHz"),
+    "update": ("reading", "publication to awake subscriber at 100 Hz and 1 kHz, on one processor"),
     "write": ("writing", "write to acknowledgement: 1, 16 and 10,000 commands"),
     "open": ("opening", "open and close, descriptors and memory gained by --soak N of them"),
     "race": ("opening", "two writers racing for one output"),

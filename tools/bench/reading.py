@@ -10,8 +10,8 @@ from typing import Any
 from .baseline import RoundTrip, Wake
 from .figures import Bar, Report
 from .options import Options
-from .rig import CpuTimes, Daemon
-from .workcells import axes, workcell
+from .rig import CpuTimes, Daemon, on_one_processor
+from .workcells import axes, force, workcell
 
 CHUNK = 200
 SPEED = 8.0
@@ -63,18 +63,23 @@ def _time_calls(call: Callable[[], Any], count: int) -> list[int]:
 
 
 def bench_update(options: Options, report: Report) -> None:
-    """From the instant that a publication's values hold for to the subscriber holding them."""
-    config = workcell([axes("slow", tick_hz=100, axis_keys="bandwidth_hz = 5"), axes("fast")])
+    """From the instant that a publication's values hold for to the subscriber holding them, all on one processor."""
+    config = workcell([force("force0", tick_hz=100), axes("slow", tick_hz=100, axis_keys="bandwidth_hz = 5"), axes("fast")])
+    cases = (
+        ("force0", "six forces at 100 Hz", options.count(100, 2000)),
+        ("slow.readonly", "four axes at 100 Hz", options.count(100, 2000)),
+        ("fast.readonly", "four axes at 1000 Hz", options.count(1000, 10_000)),
+    )
     with Daemon(config) as daemon, daemon.cell() as cell, Wake() as wake:
         pids = daemon.device_pids()
-        woken = wake.samples(options.count(200, 3000))
-        base = report.samples("bare eventfd wake", woken)
-        for device, rate, seconds in (("slow", 100, options.count(1, 20)), ("fast", 1000, options.count(1, 10))):
-            with cell.open(f"{device}.readonly") as node:
-                cpu = CpuTimes({"driver": pids[device], "client": os.getpid()})
-                waited, lost = _updates(node, rate * seconds)
+        base = report.samples("bare eventfd wake", wake.samples(options.count(200, 3000)))
+        for name, what, count in cases:
+            driver = pids[name.partition(".")[0]]
+            with cell.open(name) as node, on_one_processor(driver, os.getpid()):
+                cpu = CpuTimes({"driver": driver, "client": os.getpid()})
+                waited, lost = _updates(node, count)
                 report.samples(
-                    f"update to subscriber at {rate} Hz", waited, baseline=base, cpu=cpu.shares(),
+                    f"update to subscriber, {what}", waited, baseline=base, cpu=cpu.shares(),
                     bars=[Bar("p50", 370), Bar("p99", 590)], notes=f"{lost} publications not seen one by one",
                 )  # fmt: skip
 

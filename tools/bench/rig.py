@@ -8,6 +8,7 @@ Concurrency: one thread.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
@@ -16,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -163,6 +164,21 @@ class CpuTimes:
         """Return the share of one core that each has used."""
         passed = max(1, time.monotonic_ns() - self._begin_ns)
         return {name: (run_ns(pid) - self._before[name]) / passed for name, pid in self._processes.items()}
+
+
+@contextlib.contextmanager
+def on_one_processor(*pids: int) -> Iterator[None]:
+    """Keep all threads of some processes on the last processor that they may use."""
+    tasks = [int(task) for pid in pids for task in os.listdir(f"/proc/{pid}/task")]
+    before = {task: os.sched_getaffinity(task) for task in tasks}
+    try:
+        for task in tasks:
+            os.sched_setaffinity(task, {max(before[task])})
+        yield
+    finally:
+        for task, processors in before.items():
+            with contextlib.suppress(ProcessLookupError):
+                os.sched_setaffinity(task, processors)
 
 
 def run_ns(pid: int) -> int:

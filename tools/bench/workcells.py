@@ -30,6 +30,11 @@ def axes(
     return head + "".join(f'[[device.{name}.axis]]\nname = "a{i}"\n{one}' for i in range(count))
 
 
+def force(name: str, *, tick_hz: float = 1000.0) -> str:
+    """Return a device with a six-component force/torque sensor."""
+    return f'[device.{name}]\ndriver = "sim-force"\ntick_hz = {tick_hz}\n'
+
+
 def wave(name: str, period_s: float, *, tick_hz: float = 1000.0) -> str:
     """Return a device with one input bit that a light beam breaks periodically."""
     return (
