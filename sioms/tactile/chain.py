@@ -7,10 +7,12 @@ A pure object: frames and their time stamps go in, a `StrainFrame` comes out, no
         out = chain.frame(raw, stamp_ns)
         if out.touched: shape = estimator.frame(out.strains, usable=out.usable)
 
-While untouched the baseline follows the readings with the finger's drift time (temperature moves it by per
-cents an hour); while touched, and until creep has faded after a release, it rests.  A touch is what rises
-above the noise in sum over all elements, what all have in common left out; it ends at half that level.  A
-touch from the first frame on cannot be told from an offset: call `zero` untouched.
+While untouched the baseline follows the readings, each element by a Kalman filter of one state: with the finger's
+drift time in long rests (temperature moves it by per cents an hour), faster after a touch in which nothing was seen of
+it, and hardly while what the touch left of creep is above the noise. So touches in quick succession leave it what
+little their pauses tell. A touch is what rises above the noise in sum over all elements, what all have in common
+left out; it ends at half that level.  A touch from the first frame on cannot be told from an offset: call `zero`
+untouched.
 """
 
 from __future__ import annotations
@@ -30,6 +32,11 @@ Flags = NDArray[np.bool_]
 SETTLE_FRAMES = 20  # averaged for the first baseline
 DEAD_FRAMES = 200  # an element whose reading has not changed for so long is dead; noise moves a living one
 _TOUCH_SIGMA = 8.0  # above the mean of the noise's chi square, in its standard deviations
+_CREPT, _CREPT_AFTER_HOLD = (
+    0.1,
+    0.02,
+)  # of the output of a touch, that may be left at once and after the release hold
+_DRIFT_SHARE = 0.2  # of the noise, by which the baseline may move unseen in one drift time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +77,7 @@ class SignalChain:
         self._count = len(e.angle_rad)
         self._used = np.array(e.used)
         self._gain, self._quadratic = np.array(e.gain), np.array(e.quadratic)
+        self._fading = math.log(_CREPT / _CREPT_AFTER_HOLD) / max(self._signal.release_hold_s, 1e-3)
         self._mixing: Floats | None = None  # the gains as a matrix, if they are more than a diagonal
         self._noise = np.array(e.noise) ** 2
         self._settle = settle_frames
@@ -85,7 +93,9 @@ class SignalChain:
         self._left = self._settle
         self._baseline = np.zeros(self._count)
         self._touched = False
-        self._hold_until_ns: int | None = None
+        # of the baseline, in squares of the noise; and what creep may have left in the readings
+        self._variance = np.full(self._count, 1.0 / self._settle)
+        self._crept = np.zeros(self._count)
 
     @property
     def baseline(self) -> Floats:
@@ -149,9 +159,8 @@ class SignalChain:
         usable &= self._seen > 0.0
         change = output - self._baseline
         strength, count = self._strength(change, usable)
-        self._touch(strength, count, stamp_ns)
-        if not self._touched and (self._hold_until_ns is None or stamp_ns >= self._hold_until_ns):
-            self._follow(change, usable, elapsed_s)
+        self._touch(strength, count)
+        self._follow(change, usable, elapsed_s)
         linear = linearise(change, self._quadratic)
         if self._mixing is None:
             strains = -self._gain * linear
@@ -183,14 +192,24 @@ class SignalChain:
         local = change[usable] - np.median(change[usable])
         return float(np.sum(local**2 / self._noise[usable])) / count, count
 
-    def _touch(self, strength: float, count: int, stamp_ns: int) -> None:
+    def _touch(self, strength: float, count: int) -> None:
         level = 1.0 + _TOUCH_SIGMA * math.sqrt(2.0 / max(count, 1))
         if strength > level:
             self._touched = True
-        elif self._touched and strength < 0.5 * (1.0 + level):
+        elif strength < 0.5 * (1.0 + level):
             self._touched = False
-            self._hold_until_ns = stamp_ns + round(self._signal.release_hold_s * 1e9)
 
     def _follow(self, change: Floats, usable: Flags, elapsed_s: float) -> None:
-        share = -math.expm1(-elapsed_s / self._signal.drift_time_s)
-        self._baseline[usable] += share * change[usable]
+        self._crept *= math.exp(-elapsed_s * self._fading)
+        share = elapsed_s / self._signal.drift_time_s
+        if self._touched:
+            self._variance = (np.sqrt(self._variance) + _DRIFT_SHARE * share) ** 2
+            np.maximum(self._crept, _CREPT * np.abs(change), out=self._crept)
+            return
+        self._variance += (
+            share**2
+        )  # so much that in the long run a reading counts by its share of the drift time
+        believed = self._variance / (self._variance + 1.0 + self._crept**2 / self._noise)
+        believed[~usable] = 0.0
+        self._baseline += believed * change
+        self._variance *= 1.0 - believed
