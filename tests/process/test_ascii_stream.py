@@ -13,6 +13,11 @@ from daemon_rig import wait_for
 from wire_rig import Wire
 
 from sioms.protocol.flags import AnalogStatus
+from sioms.tactile.cylinder import FINGER_B
+from sioms.tactile.emap import e_map
+from sioms.tactile.estimator import Quality
+from sioms.tactile.sensing import CHANNELS
+from sioms.tactile.series import line_load
 
 CONFIG = """
 [device.scale0]
@@ -73,3 +78,42 @@ def test_another_device_is_refused(start: Callable[..., Any], short_folder: Path
     )
     wait_for(lambda: "the configuration says 1 number a line" in wire.reason("scale0"), "the sentence")
     assert not wire.reads("scale0")
+
+
+def test_a_finger_that_prints_its_elements_is_felt(start: Callable[..., Any], short_folder: Path) -> None:
+    """An edge of 150 N/m at 60 degrees comes on as the outputs it gives, 3 % of strain for 1 %, and goes again."""
+    wire = Wire(
+        start,
+        short_folder,
+        "ascii_stream",
+        "--columns",
+        "16",
+        "--rate",
+        "80",
+        "--noise",
+        "2",
+        "--lag-s",
+        "0.01",
+    )
+    columns, finger = [f"e{i}" for i in range(16)], Path(__file__).parents[2] / "etc" / "finger.toml"
+    cell = wire.serve(
+        f'[device.finger0]\ndriver = "ascii-stream"\nline = {{ serial = "{{port}}" }}\ncolumns = {columns}\nunit = "%"\n'
+        f'offset = 200.0\nscale = 0.01\nrate_hz = 80.0\nshape = {{ finger_file = "{finger}" }}\n'
+    )
+    wire.wait_up("finger0")
+    angles = np.radians(143.0 - 9.22 * np.arange(16))
+    edge = e_map(FINGER_B, angles, 10.3e-3, 60)[:, :121] @ line_load(FINGER_B, -150.0, np.radians(60.0), 60)
+    with cell.open("finger0.shape") as shape, cell.open("finger0.strain") as strain:
+
+        def felt(name: str) -> float:
+            return float(shape.read().data[[channel for channel, _, _ in CHANNELS].index(name)])
+
+        wait_for(lambda: felt("quality") == Quality.NO_CONTACT.value, "the baseline")
+        for index, output in enumerate(-100.0 * edge / 3.0):
+            wire.tell(f"load {index} {output:.4f}")
+        wait_for(lambda: felt("touched") == 1.0 and abs(felt("load") - 150.0) < 10.0, "the touch")
+        assert np.degrees(felt("angle")) == pytest.approx(60.0, abs=0.5)
+        np.testing.assert_allclose(strain.read().data, edge, rtol=0.05, atol=3e-3)
+        for index in range(16):
+            wire.tell(f"load {index} 0")
+        wait_for(lambda: felt("touched") == 0.0 and felt("load") == 0.0, "the release")
