@@ -249,9 +249,10 @@ class Gpio(TickDriver):
         """
         edges: list[Edge] = []
         try:
-            while self._inputs is not None and self._inputs.wait_edge_events(0):
-                events = self._inputs.read_edge_events(self.settings.event_buffer)
-                edges += map(self._edge, events)
+            # a request of outputs has no edges: it becomes readable when its chip is gone, and says so then
+            for request in (self._outputs, self._inputs):
+                while request is not None and request.wait_edge_events(0):
+                    edges += map(self._edge, request.read_edge_events(self.settings.event_buffer))
         except OSError as error:
             raise LinkError(
                 f"read lines of {self.settings.chip}: {(error.strerror or str(error)).lower()}"

@@ -27,15 +27,12 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
-from sioms.sdk.codec.iio_scan import Element, ElementType, Layout, ScanReceiver, kind_of, parse_type, unit_of
+from sioms.sdk.codec.iio_scan import Element, ElementType, Layout, ScanReceiver, parse_type, unit_of
 from sioms.sdk.driver import Driver, Kit, StreamDriver, TickDriver
 from sioms.sdk.exchange import LinkError, Steps
 from sioms.sdk.golden import Golden, Incomplete
 from sioms.sdk.iio_device import TIMESTAMP, IioDevice, find_device
 from sioms.sdk.settings import LineSettings
-
-RATE_TOLERANCE = 0.05
-"""So far may the device's rate be from the configured one."""
 
 
 class IioSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -129,9 +126,8 @@ class Iio(StreamDriver):
         device = self._device()
         device.write(f"{device.buffer}/enable", 0)
         layout = device.switch_on(settings.channels, timestamp=True)
-        if settings.trigger:
-            device.write("trigger/current_trigger", settings.trigger)
-        self._has_rate = self._set_rate(device)
+        trigger = device.set_trigger(settings.trigger)
+        self._has_rate = device.set_rate(trigger, settings.channels, settings.rate_hz)
         self._is_realtime = not self._choose_clock(device)
         for key, value in (("length", settings.buffer_length), ("watermark", settings.watermark)):
             if device.has(f"{device.buffer}/{key}"):
@@ -141,7 +137,11 @@ class Iio(StreamDriver):
         self._types = {element.name: element.type for element in layout.elements}
         self._last_ns = 0
         self._began_ns = time.monotonic_ns() if TIMESTAMP in self._types else 0
-        device.write(f"{device.buffer}/enable", 1)
+        try:
+            device.write(f"{device.buffer}/enable", 1)
+        except LinkError as error:
+            hint = "" if trigger else "; no trigger is set, and its buffer may need one"
+            raise LinkError(f"{error}{hint}") from None
         yield from ()
 
     def feed(self, data: bytes, now_ns: int) -> int:
@@ -179,27 +179,6 @@ class Iio(StreamDriver):
 
     def _device(self) -> IioDevice:
         return IioDevice(find_device(self.settings.sysfs, self.settings.device))
-
-    def _set_rate(self, device: IioDevice) -> bool:
-        """Set the rate of device or trigger; return whether it is known to keep it."""
-        settings = self.settings
-        holders = [
-            (device, "sampling_frequency"),
-            (device, f"in_{kind_of(settings.channels[0])}_sampling_frequency"),
-        ]
-        for folder in device.folder.parent.glob("trigger*"):
-            trigger = IioDevice(folder)
-            if settings.trigger and trigger.has("name") and trigger.read("name") == settings.trigger:
-                holders.append((trigger, "sampling_frequency"))
-        there = [(holder, attribute) for holder, attribute in holders if holder.has(attribute)]
-        for holder, attribute in there:
-            holder.write(attribute, f"{settings.rate_hz:g}")
-            got_hz = holder.number(attribute)
-            if abs(got_hz / settings.rate_hz - 1) > RATE_TOLERANCE:
-                can = holder.read(f"{attribute}_available") if holder.has(f"{attribute}_available") else ""
-                text = f"rate_hz = {settings.rate_hz:g}, but {holder.folder.name} samples at {got_hz:g} Hz"
-                raise LinkError(f"open {self.name}: {text}; want {'one of ' + can if can else 'that'}")
-        return bool(there)
 
     def _choose_clock(self, device: IioDevice) -> bool:
         """Ask for stamps of the monotonic clock; return whether that is granted."""

@@ -24,7 +24,7 @@ LIMITS = "position_min = -1.0\nposition_max = 1.0\n"
 
 GPIO = Path(__file__).with_name("gpio_stand_in.py")
 
-# Rigs of the shipped drivers stand in sioms.tools.counterparts.rigs; that of the GPIO lines, which no process can simulate, here.
+# Rigs of the shipped drivers stand in sioms.tools.counterparts.rigs; that of the GPIO lines on a kernel without simulated ones here.
 RIGS = (
     *SHIPPED,
     Rig(

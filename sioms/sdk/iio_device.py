@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 from collections.abc import Sequence
@@ -12,6 +13,8 @@ from .exchange import LinkError
 
 TIMESTAMP = "timestamp"
 """Name of the channel that carries the time of a scan."""
+RATE_TOLERANCE = 0.05
+"""So far may a device's rate be from the one that is wanted."""
 
 
 def find_device(sysfs: str, wanted: str) -> Path:
@@ -69,7 +72,8 @@ class IioDevice:
             LinkError: it is not there, or the device does not answer the kernel.
         """
         try:
-            return (self.folder / attribute).read_text().strip()
+            # the kernel ends the names of clocks by a line feed and a zero
+            return (self.folder / attribute).read_text().strip("\0 \t\n")
         except OSError as error:
             raise LinkError(f"read {self.folder / attribute}: {_why(error)}") from None
 
@@ -106,6 +110,52 @@ class IioDevice:
             there = [f"{name}_{what}" for name in shared if self.has(f"{name}_{what}")]
             pair.append(self.number(there[0]) if there else default)
         return pair[0], pair[1]
+
+    def set_trigger(self, wanted: str) -> IioDevice | None:
+        """Choose what starts each scan; return it, None where nothing does.
+
+        Args:
+            wanted: name of a trigger; '' leaves what is set.
+
+        Raises:
+            LinkError: there is no such trigger: the kernel takes any name, and has no trigger then.
+        """
+        there = {
+            trigger.read("name"): trigger
+            for trigger in map(IioDevice, sorted(self.folder.parent.glob("trigger*")))
+            if trigger.has("name")
+        }
+        if wanted and wanted not in there:
+            has = ", ".join(there) or "none; mkdir /sys/kernel/config/iio/triggers/hrtimer/NAME makes one"
+            raise LinkError(f"set trigger {wanted!r} of {self.folder.name}: there is {has}")
+        if wanted:
+            self.write("trigger/current_trigger", wanted)
+        return (
+            there.get(self.read("trigger/current_trigger")) if self.has("trigger/current_trigger") else None
+        )
+
+    def set_rate(self, trigger: IioDevice | None, channels: Sequence[str], rate_hz: float) -> bool:
+        """Set how often it samples, by its trigger where that has a rate; return whether anything has one.
+
+        Raises:
+            LinkError: it samples at another rate.
+        """
+        rate = "sampling_frequency"
+        own = [rate, f"in_{rate}", *dict.fromkeys(f"in_{kind_of(name)}_{rate}" for name in channels)]
+        own += [f"in_{name}_{rate}" for name in channels]
+        holders = (
+            [(trigger, rate)] if trigger is not None and trigger.has(rate) else [(self, name) for name in own]
+        )
+        there = [(holder, attribute) for holder, attribute in holders if holder.has(attribute)]
+        for holder, attribute in there:
+            with contextlib.suppress(LinkError):  # one that only tells its rate, or has no such one
+                holder.write(attribute, f"{rate_hz:g}")
+            got_hz = holder.number(attribute)
+            if abs(got_hz / rate_hz - 1) > RATE_TOLERANCE:
+                can = holder.read(f"{attribute}_available") if holder.has(f"{attribute}_available") else ""
+                text = f"rate_hz = {rate_hz:g}, but {holder.folder.name} samples at {got_hz:g} Hz"
+                raise LinkError(f"{text}; want {'one of ' + can if can else 'that'}")
+        return bool(there)
 
     @property
     def buffer(self) -> str:

@@ -74,7 +74,10 @@ class StreamEngine(Connected):
             self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
         else:
             self._due_ns = now_ns
-        self._runtime.lose(self._driver.blocks, reason)
+        if self.line is not None and self.line.connection.settings.path is not None:
+            self.line_lost(reason, now_ns)  # a device that has gone keeps its open file silent for ever
+        else:
+            self._runtime.lose(self._driver.blocks, reason)
 
     def _opened(self, _: Any, error: Exception | None) -> None:
         self._busy = False

@@ -54,6 +54,7 @@ class Dummy:
         self.piece = 65536
         self.next_s = 0.0
         self._pipe = -1
+        self._gone: list[int] = []
 
     def plug(self) -> None:
         """Make the files appear, with the buffer off; nothing when they are there."""
@@ -68,7 +69,7 @@ class Dummy:
         ):
             path.mkdir(parents=True, exist_ok=True)
         files = {
-            "name": self.name, "current_timestamp_clock": "realtime", "trigger/current_trigger": "",
+            "name": self.name, "current_timestamp_clock": "realtime\n\0", "trigger/current_trigger": "",
             "buffer/enable": 0, "buffer/length": 2, "buffer/watermark": 1,
             "in_voltage_scale": SCALES["voltage0"], "in_voltage0_offset": OFFSETS["voltage0"],
             "in_voltage-voltage_scale": SCALES["voltage1-voltage2"], "in_accel_x_scale": SCALES["accel_x"],
@@ -88,9 +89,9 @@ class Dummy:
         self._pipe = os.open(self.fifo, os.O_RDWR | os.O_NONBLOCK)
 
     def unplug(self) -> None:
-        """Make the files vanish; who reads the buffer gets an end of file."""
+        """Make the files vanish; who has the buffer open hears nothing more, as of a device that the kernel has removed."""
         if self._pipe >= 0:
-            os.close(self._pipe)
+            self._gone.append(self._pipe)
             self._pipe = -1
         self.fifo.unlink(missing_ok=True)
         shutil.rmtree(self.root, ignore_errors=True)
@@ -107,7 +108,7 @@ class Dummy:
     def read(self, attribute: str) -> str:
         """Return what stands in an attribute."""
         with contextlib.suppress(OSError):
-            return (self.root / attribute).read_text().strip()
+            return (self.root / attribute).read_text().strip("\0 \n")
         return ""
 
     def volt(self, channel: str, value: str) -> None:

@@ -162,7 +162,7 @@ def rig_of(keys: Mapping[str, Any]) -> Rig:
 
 def find_rig(name: str) -> Rig | None:
     """Return the rig of a registered driver or shipped register map, None when there is none."""
-    return next((rig for rig in (*RIGS, *MAP_RIGS) if rig.title == name), None)
+    return next((rig for rig in (*RIGS, *MAP_RIGS, *KERNEL_RIGS) if rig.title == name), None)
 
 
 LIMITS = "position_min = -1.0\nposition_max = 1.0\n"
@@ -312,3 +312,20 @@ MAP_RIGS: tuple[Rig, ...] = (
         inputs=("wago_750",), outputs=(Output("wago_750.do", 8, 0), Output("wago_750.ao", 0, 0, 5.0)), analogs=("wago_750.ai",), name="wago_750",
     ),
 )  # fmt: skip
+
+KERNEL_RIGS: tuple[Rig, ...] = (
+    Rig(
+        "gpio",
+        '[device.gpio]\ndriver = "gpio"\nchip = "{port}"\ntick_hz = 100.0\n'
+        + "".join(f"[[device.gpio.output]]\nline = {i}\nsafe = {i % 2}\n" for i in range(4))
+        + "".join(f"[[device.gpio.input]]\nline = {4 + i}\n" for i in range(4)),
+        ("gpio_sim",), inputs=("gpio.in",), outputs=(Output("gpio", 4, 0b1010),), checked=False,
+    ),
+    Rig(
+        "iio",
+        '[device.iio_dummy]\ndriver = "iio"\ndevice = "sioms_dummy"\nmode = "buffer"\ntrigger = "sioms_timer"\n'
+        'channels = ["voltage0", "accel_x"]\nrate_hz = 50.0\n',
+        ("iio_dummy",), analogs=("iio_dummy",), name="iio-dummy", checked=False,
+    ),
+)  # fmt: skip
+"""Rigs whose device the kernel simulates, where it does: not among all, but found by name."""

@@ -1,7 +1,7 @@
 """The driver of GPIO lines: its pure core, and all that stands above the binding on a stand-in for the chip.
 
-No GPIO chip and no gpio-sim is needed here; that the kernel does what the stand-in does is what ``tests/process/test_gpio.py``
-looks at where there is a simulated chip.
+No GPIO chip and no gpio-sim is needed here; that the kernel does what the stand-in does is what ``tests/kernel``
+looks at on a simulated chip.
 """
 
 from __future__ import annotations

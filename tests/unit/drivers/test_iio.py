@@ -57,6 +57,55 @@ def test_scaling_is_the_channels_own_or_its_kinds(sysfs: Path) -> None:
         device.write("buffer/enable", 1)
 
 
+def attributes(folder: Path, **values: object) -> IioDevice:
+    for attribute, value in values.items():
+        path = folder / attribute.replace("__", "/")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"{value}\n")
+    return IioDevice(folder)
+
+
+def test_a_name_that_ends_by_a_zero(sysfs: Path) -> None:
+    """As the kernel tells its clocks: sizeof("monotonic\\n") bytes."""
+    assert (
+        attributes(sysfs / "iio:device0", current_timestamp_clock="monotonic\n\0").read(
+            "current_timestamp_clock"
+        )
+        == "monotonic"
+    )
+
+
+def test_a_trigger_with_a_rate_takes_the_place_of_the_devices_own(sysfs: Path) -> None:
+    device = attributes(sysfs / "iio:device0", trigger__current_trigger="", sampling_frequency=860)
+    with pytest.raises(
+        LinkError, match=r"set trigger 'timer' of iio:device0: there is none; mkdir .*hrtimer/NAME"
+    ):
+        device.set_trigger("timer")
+    attributes(sysfs / "trigger0", name="timer", sampling_frequency=100)
+    attributes(sysfs / "trigger1", name="adc-ready")
+    with pytest.raises(LinkError, match="there is timer, adc-ready"):
+        device.set_trigger("clock")
+    assert device.set_trigger("") is None
+    timer = device.set_trigger("timer")
+    assert timer is not None and device.set_trigger("") is not None, "it is left"
+    assert device.set_rate(timer, ["voltage0"], 25.0)
+    assert (timer.number("sampling_frequency"), device.number("sampling_frequency")) == (25.0, 860.0)
+    assert device.set_rate(device.set_trigger("adc-ready"), ["voltage0"], 128.0)
+    assert device.number("sampling_frequency") == 128.0
+
+
+def test_a_rate_that_only_is_told(sysfs: Path) -> None:
+    device = attributes(sysfs / "iio:device0", in_voltage0_sampling_frequency_available="128 250 860")
+    rate = device.folder / "in_voltage0_sampling_frequency"
+    assert not device.set_rate(None, ["voltage0"], 100.0), "nothing tells a rate"
+    rate.symlink_to("/proc/sys/kernel/ngroups_max")  # may be read and not written, by root neither
+    with pytest.raises(
+        LinkError, match="rate_hz = 100, but iio:device0 samples at 65536 Hz; want one of 128 250 860"
+    ):
+        device.set_rate(None, ["voltage0"], 100.0)
+    assert device.set_rate(None, ["voltage0"], 65536.0)
+
+
 class Kit:
     """Keeps what is published."""
 
