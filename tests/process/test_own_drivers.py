@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,25 @@ import pytest
 from daemon_rig import raises, wait_for
 from wire_rig import Wire
 
+from sioms.protocol.flags import AxisStatus
+from sioms.sdk import finding
+
 FOLDER = Path(__file__).parents[2] / "examples" / "drivers"
 SUPPLY = """
 [device.supply0]
 driver = "./bench_supply.py"
 line = { serial = "{port}", baud = 9600 }
 poll_hz = 20.0
+"""
+STAGE = """
+[device.stage0]
+driver = "./linear_stage.py"
+line = { serial = "{port}", baud = 115200 }
+steps_per_m = 1e6
+[[device.stage0.axis]]
+name = "x"
+velocity_max = 0.1
+acceleration_max = 1.0
 """
 OVEN = """
 [device.oven0]
@@ -104,3 +118,51 @@ def test_the_oven_by_a_register_map(start: Callable[..., Any], short_folder: Pat
             wire.tell("clear")
             wire.wait_up("oven0")
         wait_for(lambda: wire.state("targets") == [0, 0], "the safe values", 3.0)
+
+
+def test_the_linear_stage(start: Callable[..., Any], short_folder: Path) -> None:
+    wire = OwnWire(start, short_folder, "linear_stage_device.py")
+    cell = wire.serve(STAGE)
+    wire.wait_up("stage0")
+    assert wire.state("watchdog_s") == 0.2
+    with cell.open("stage0", "rw") as node:
+        node.move(0.01, timeout=1.0)
+        node.wait_until_idle(5.0)
+        assert wire.state("position") == pytest.approx(10_000)
+        node.command(velocity=-0.05)
+        wait_for(lambda: wire.state("velocity") < -40_000, "speed")
+        wire.tell("deaf")
+        wait_for(lambda: wire.state("velocity") == 0, "rest by the stage's own watchdog", 2.0)
+        wait_for(lambda: not wire.reads("stage0"), "the loss")
+        wire.tell("clear")
+        wire.wait_up("stage0")
+        assert wire.state("velocity") == 0, "nothing resumes"
+        node.reset()
+        wire.tell("place -0.299")
+        node.command(velocity=-0.05)
+        wait_for(lambda: node.read().status[0] & AxisStatus.FAULT, "the limit switch")
+        with raises(5, "limit switch"):
+            node.move(0.0, timeout=1.0)
+            node.wait_until_idle(2.0)
+        node.reset()
+        wait_for(lambda: not node.read().status[0] & AxisStatus.FAULT, "the reset")
+        node.move(-0.29, timeout=1.0)
+        node.wait_until_idle(5.0)
+        assert wire.state("position") == pytest.approx(-290_000)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("steps_per_m = 1e6", "steps_per_m = -1e6"), "steps_per_m = -1e+06"),
+        (("steps_per_m = 1e6", "steps_per_m = 1e6\nwatchdog_s = 0.01"), "watchdog_s = 0.01; want three polls, 0.06, to 10"),
+    ],
+)
+def test_a_stage_that_cannot_be(change: tuple[str, str], words: str) -> None:
+    driver = finding.find_driver("./linear_stage.py", str(FOLDER))
+    table = tomllib.loads(STAGE.replace(*change))["device"]["stage0"]
+    del table["driver"]
+    settings, errors = finding.read_settings(driver, table, str(FOLDER))
+    assert not errors
+    _, errors = finding.describe(driver, "stage0", settings)
+    assert any(words in str(error) for error in errors)
