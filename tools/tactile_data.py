@@ -9,16 +9,23 @@ or nominal.json with radii and angles.
 from __future__ import annotations
 
 import json
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from sioms.tactile.cylinder import Cylinder
 from sioms.tactile.finger import Elements, Finger, from_toml, nominal_finger
 from sioms.tactile.touches import Recording, Touches, average
+
+Floats = NDArray[np.float64]
+
+_UNREADABLE = (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile)
+_THINNEST_M = 0.1e-3  # no indenter is rounder, no finger smaller: the number must be of another unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +51,9 @@ def read_folder(folder: Path) -> Data:
             with np.load(path) as file:
                 recordings[path.stem] = recording = _recording(file)
                 if "cmd_theta" in file:
-                    angle, load = np.radians(file["cmd_theta"]), file["cmd_P"].astype(float)
-                    radius = 1e-3 * file["cmd_rc"]
-                    touches[path.stem] = average(recording, angle, load, radius, nominal.signal.scale)
-        except (ValueError, KeyError, OSError) as error:
-            raise ValueError(f"read {path}: {error}") from error
+                    touches[path.stem] = average(recording, *_commanded(file), nominal.signal.scale)
+        except _UNREADABLE as error:
+            raise ValueError(f"read {path}: {_words(error)}") from error
     if not touches:
         raise ValueError(
             f"read {folder}: no *.npz with touches (cmd_theta, cmd_P, cmd_rc); record some first"
@@ -66,26 +71,62 @@ def read_recording(path: Path) -> Recording:
     try:
         with np.load(path) as file:
             return _recording(file)
-    except (ValueError, KeyError, EOFError) as error:
-        raise ValueError(f"read {path}: {error}") from error
+    except _UNREADABLE as error:
+        raise ValueError(f"read {path}: {_words(error)}") from error
+
+
+def _words(error: BaseException) -> str:
+    return str(error.args[0]) if isinstance(error, KeyError) else str(error)
+
+
+def _commanded(file: Any) -> tuple[Floats, Floats, Floats]:
+    """Return places [rad], loads [N/m] and indenters [m] of the touches."""
+    columns = [np.asarray(file[name], dtype=np.float64) for name in ("cmd_theta", "cmd_P", "cmd_rc")]
+    sizes = [column.shape for column in columns]
+    if len(set(sizes)) != 1 or columns[0].ndim != 1:
+        raise ValueError(
+            f"cmd_theta, cmd_P and cmd_rc have shapes {sizes}; want one number each for every touch"
+        )
+    angle, load, radius = np.radians(columns[0]), columns[1], 1e-3 * columns[2]
+    if not (np.isfinite(angle).all() and np.isfinite(load).all() and np.all(radius >= 0.0)):
+        raise ValueError("cmd_theta, cmd_P or cmd_rc holds a value that is not finite, or a negative radius")
+    if np.any((radius > 0.0) & (radius < _THINNEST_M)):
+        raise ValueError(
+            f"cmd_rc holds {columns[2][(radius > 0.0)].min():g} mm; an indenter so thin is none: give mm, 0 for an edge"
+        )
+    return angle, load, radius
 
 
 def _recording(file: Any) -> Recording:
     raw = np.asarray(file["raw"], dtype=np.float64)
-    frames = raw.shape[0]
+    if raw.ndim != 2:
+        raise ValueError(f"raw has shape {raw.shape}; want frames by elements")
+    frames, time_s = raw.shape[0], np.asarray(file["time"], dtype=np.float64)
+    falls = np.flatnonzero(~(np.diff(time_s) >= 0.0))
+    if falls.size:
+        raise ValueError(
+            f"time falls or is no number after frame {falls[0]}; want the frames in the order of their times"
+        )
 
     def column(name: str, fallback: float) -> Any:
         return file[name] if name in file else np.full(frames, fallback)
 
     return Recording(
         raw=raw,
-        time_s=np.asarray(file["time"], dtype=np.float64),
-        touch=np.asarray(column("touch", -1)).astype(np.int64),
-        phase=np.asarray(column("phase", 2)).astype(np.int64),
+        time_s=time_s,
+        touch=_whole(column("touch", -1), "touch"),
+        phase=_whole(column("phase", 2), "phase"),
         force=np.asarray(column("force", np.nan), dtype=np.float64),
         temperature_c=np.asarray(column("temperature", np.nan), dtype=np.float64),
-        rate_hz=float(file["fs"]),
+        rate_hz=float(file["fs"]) if "fs" in file else (frames - 1) / max(float(np.ptp(time_s)), 1e-9),
     )
+
+
+def _whole(values: Any, name: str) -> NDArray[np.int64]:
+    numbers = np.asarray(values, dtype=np.float64)
+    if not np.all(numbers == np.round(numbers)):
+        raise ValueError(f"{name} holds a value that is no whole number")
+    return numbers.astype(np.int64)
 
 
 def read_nominal(folder: Path) -> Finger:
@@ -98,16 +139,28 @@ def read_nominal(folder: Path) -> Finger:
         raise ValueError(
             f"read {folder}: neither nominal.toml nor nominal.json; describe the finger as built"
         )
-    tree = json.loads(path.read_text(encoding="utf-8"))
     try:
-        body = Cylinder(1e-3 * tree["ra_mm"], 1e-3 * tree["rb_mm"], tree["poisson"], tree["shear_modulus_pa"])
-        angles = np.radians(tree["element_angle_deg"])
-        radii = tuple(1e-3 * r for r in tree["element_radius_mm"])
-        gains = tuple(float(g) for g in tree["gain_percent_strain_per_percent_output"])
-        noise = 0.01 * float(tree.get("output_noise_percent", 0.05))
+        return _built(json.loads(path.read_text(encoding="utf-8")), folder.name)
     except KeyError as error:
         raise ValueError(f"read {path}: key {error} is missing") from error
-    finger = nominal_finger(body, angles, radii[0], gains[0], noise, name=folder.name)
+    except (ValueError, TypeError, IndexError) as error:
+        raise ValueError(f"read {path}: {error}") from error
+
+
+def _built(tree: dict[str, Any], name: str) -> Finger:
+    body = Cylinder(1e-3 * tree["ra_mm"], 1e-3 * tree["rb_mm"], tree["poisson"], tree["shear_modulus_pa"])
+    if body.outer_m < 10.0 * _THINNEST_M:
+        raise ValueError(f"rb_mm is {tree['rb_mm']:g}; a finger so thin is none: give mm")
+    angles = np.radians(tree["element_angle_deg"])
+    if angles.size and np.degrees(np.ptp(angles)) < 0.5 * (angles.size - 1):
+        raise ValueError(
+            f"element_angle_deg puts {angles.size} elements within {np.degrees(np.ptp(angles)):.3g} degrees; give degrees"
+        )
+    radii = tuple(1e-3 * r for r in tree["element_radius_mm"])
+    gains = tuple(float(g) for g in tree["gain_percent_strain_per_percent_output"])
+    finger = nominal_finger(
+        body, angles, radii[0], gains[0], 0.01 * float(tree.get("output_noise_percent", 0.05)), name=name
+    )
     e = finger.elements
     elements = Elements(e.angle_rad, radii, e.poisson, gains, e.quadratic, e.noise, e.misfit, e.used)
     return msgspec.structs.replace(finger, elements=elements)

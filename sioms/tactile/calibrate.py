@@ -24,6 +24,7 @@ Floats = NDArray[np.float64]
 NEAR = np.radians(25.0)
 FEWEST = 12  # touches near an element for four parameters
 REFERENCE_LOAD = 200.0  # N/m, of the edge whose peak strain is the unit of residuals
+_SILENT = 0.05  # of what the others answer: an element that answers less is dead
 _TURN = 0.15  # rad, how far an element may lie from its nominal place
 _SMALLEST, _LARGEST = 0.35, 0.5  # Poisson's ratio
 
@@ -131,13 +132,15 @@ def fit_element(
 
 
 def starts(cylinder: Cylinder, angles: Floats, radii: Floats, touches: Touches) -> list[ElementFit | None]:
-    """Return where to start each element, None where too few touches are near."""
-    out: list[ElementFit | None] = []
-    for angle, radius in zip(angles, radii, strict=True):
-        near = int(np.count_nonzero(np.abs(touches.angle_rad - angle) <= NEAR))
-        fit = ElementFit(float(angle), float(radius), cylinder.poisson, 1.0, np.nan, near)
-        out.append(fit if near >= FEWEST else None)
-    return out
+    """Return where to start each element, None where too few touches are near or the element does not answer them."""
+    near = np.abs(touches.angle_rad[:, None] - angles) <= NEAR
+    enough = near.sum(axis=0) >= FEWEST
+    loudest = np.max(np.where(near, np.abs(touches.output), 0.0), axis=0, initial=0.0)
+    alive = loudest > _SILENT * np.median(loudest[enough]) if enough.any() else enough
+    return [
+        ElementFit(float(angle), float(radius), cylinder.poisson, 1.0, np.nan, int(count)) if good else None
+        for angle, radius, count, good in zip(angles, radii, near.sum(axis=0), enough & alive, strict=True)
+    ]
 
 
 def fit_elements(

@@ -31,8 +31,7 @@ from sioms.tactile.finger import ContactKind, ContactModel, Elements, Finger, Ge
 from sioms.tactile.identify import Identified, corrected, series_of, truncated
 from sioms.tactile.indenter import Wedge
 from sioms.tactile.linearity import Quadratic
-from sioms.tactile.preparation import HIGHEST, Fits, clean_outputs
-from sioms.tactile.proximity import Proximity
+from sioms.tactile.preparation import HIGHEST, Faults, Fits, clean_outputs
 from sioms.tactile.touches import Ramp, Touches, TouchLoads, touch_loads
 from sioms.tactile.width import WidthTable, hertz_table, rigid_core_table
 
@@ -42,6 +41,7 @@ FEWEST_TOUCHES = 30
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of full adhesion, tried in turn
 _BETTER = 0.97  # a richer model must bring the left-out residual below this share of the simpler one's
 _POISSON_DEVIATION = 0.03
+_FAR_GAIN = 5.0  # from nominal, either way: rather a wrong unit than scatter
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,19 +116,22 @@ def calibrate(
     body = nominal.cylinder
     widths = rigid_core_table(body)
     tick("loads of the touches")
-    touches, loads, clean = clean_outputs(
+    touches, loads, faults = clean_outputs(
         nominal, touches, widths, ramps or [], options.edge_half_angle_rad, warnings, tick
     )
-    quadratic, proximity = clean
     begin = starts(body, np.array(nominal.angles_rad), np.array(nominal.elements.radius_m), touches)
     for element, fit in enumerate(begin):
         if fit is None:
-            warnings.append(f"element {element}: too few touches within 25 degrees; left out of the finger")
+            warnings.append(
+                f"element {element}: too few touches within 25 degrees, or no answer to them; left out of the finger"
+            )
     if sum(fit is not None for fit in begin) < 4:
         raise ValueError(
             "calibrate finger: fewer than 4 elements have touches near them; probe more of the finger"
         )
-    kind, adhesion, contacts, loads, widths = _contact(body, begin, touches, loads, widths, options, tick)
+    kind, adhesion, contacts, loads, widths = _contact(
+        body, begin, touches, loads, widths, options, faults, tick
+    )
     uniform, (_, nu), (_, nu_sd) = fit_uniform(
         body, begin, touches, loads, adhesion, lambda: tick("uniform fit")
     )
@@ -145,6 +148,7 @@ def calibrate(
         body, [_with(fit, poisson=nu) for fit in uniform], touches, loads, adhesion, Freedom(True, False),
         lambda: tick("element fit"),
     )  # fmt: skip
+    _check_gains(nominal, own, warnings)
     peak = edge_peak(body, own, options.edge_half_angle_rad)
     residuals = {
         "uniform": _left_out(body, uniform, touches, loads, adhesion, Freedom(False, False), peak),
@@ -159,11 +163,20 @@ def calibrate(
         if found is not None:
             residuals[name] = np.full(known.size, np.nan)
             residuals[name][known] = found.left_out / peak
-    finger = _finger(
-        nominal, body, best, kind, adhesion, widths, quadratic, touches, residuals, direct, peak, proximity
-    )
+    finger = _finger(nominal, body, best, kind, adhesion, widths, faults, touches, residuals, direct, peak)
     return Calibration(
-        finger, touches, loads, quadratic, uniform, own, peak, contacts, cut, direct, residuals, warnings
+        finger,
+        touches,
+        loads,
+        faults.quadratic,
+        uniform,
+        own,
+        peak,
+        contacts,
+        cut,
+        direct,
+        residuals,
+        warnings,
     )
 
 
@@ -184,6 +197,23 @@ def _check(nominal: Finger, touches: Touches, warnings: list[str]) -> None:
     # about each touch's own mean: a conductor lowers all outputs, but the pressed ones stand out
     own = touches.output - touches.output.mean(axis=1, keepdims=True)
     nearest = np.abs(np.array(nominal.angles_rad) - touches.angle_rad[:, None]).argmin(axis=1)
+    angles = np.array(nominal.angles_rad)
+    arc, inside = (
+        float(np.ptp(angles)),
+        (touches.angle_rad - angles.min()) * (touches.angle_rad - angles.max()) < 0.0,
+    )
+    away = np.abs(angles[np.abs(own).argmax(axis=1)] - touches.angle_rad)[inside]
+    span = float(np.ptp(touches.angle_rad))
+    if span < 0.1 * arc:
+        raise ValueError(
+            f"calibrate finger: touches lie within {np.degrees(span):.3g} of {np.degrees(arc):.0f} degrees; places must be in "
+            "degrees and spread over the elements"
+        )
+    if away.size and np.median(away) > max(arc / 6.0, 1.5 * arc / (count - 1)):
+        raise ValueError(
+            f"calibrate finger: the element that answers most lies {np.degrees(np.median(away)):.0f} degrees from the touch, "
+            "as a rule; places must be in degrees, in direction and order of the elements' angles"
+        )
     if np.median(own[np.arange(len(touches)), nearest]) < 0.0:
         raise ValueError(
             "calibrate finger: pressing lowers the output; compression must be positive: change its sign"
@@ -196,13 +226,25 @@ def _check(nominal: Finger, touches: Touches, warnings: list[str]) -> None:
         )
 
 
+def _check_gains(nominal: Finger, fits: Fits, warnings: list[str]) -> None:
+    found = [
+        fit.gain / gain for fit, gain in zip(fits, nominal.elements.gain, strict=True) if fit is not None
+    ]
+    ratio = float(np.median(found))
+    if not 1.0 / _FAR_GAIN < ratio < _FAR_GAIN:
+        warnings.append(
+            f"the gains come out {ratio:.3g} times the nominal ones: outputs must be in the finger's raw unit (per cent of "
+            "the untouched output), loads in N/m"
+        )
+
+
 def _contact(
     body: Cylinder, begin: Fits, touches: Touches, loads: TouchLoads, widths: WidthTable, options: Options,
-    tick: Callable[[str], None],
+    faults: Faults, tick: Callable[[str], None],
 ) -> tuple[ContactKind, float, dict[str, float], TouchLoads, WidthTable]:  # fmt: skip
     """Choose the contact model by the residual of a fit with free depths."""
     half = hertz_table(body)
-    other = touch_loads(body, half, touches, HIGHEST, options.edge_half_angle_rad)
+    other = touch_loads(body, half, touches, HIGHEST, options.edge_half_angle_rad, faults.wider(touches))
     tried: dict[str, tuple[ContactKind, float, TouchLoads, WidthTable]] = {
         "hertz": ("hertz", 0.0, other, half)
     }
@@ -309,11 +351,10 @@ def _identify(
 
 def _finger(
     nominal: Finger, body: Cylinder, fits: Fits, kind: ContactKind, adhesion: float, widths: WidthTable,
-    quadratic: Quadratic | None, touches: Touches, residuals: dict[str, Floats], direct: Identified | None,
-    peak: float, proximity: Proximity | None,
+    faults: Faults, touches: Touches, residuals: dict[str, Floats], direct: Identified | None, peak: float,
 ) -> Finger:  # fmt: skip
     count = len(fits)
-    base = nominal.elements
+    base, quadratic, proximity = nominal.elements, faults.quadratic, faults.proximity
 
     def column(name: str, fallback: tuple[float, ...]) -> tuple[float, ...]:
         return tuple(fallback[e] if fit is None else float(getattr(fit, name)) for e, fit in enumerate(fits))
@@ -353,6 +394,7 @@ def _finger(
         signal=nominal.signal if proximity is None else msgspec.structs.replace(
             nominal.signal, proximity=proximity.amplitude, proximity_range_rad=proximity.range_rad
         ),
+        strips=faults.strips,
         identified=None if rows is None else IdentifiedMap(tuple(tuple(row) for row in rows.tolist())),
         notes={**nominal.notes, "map": method},
     )  # fmt: skip

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from sioms.tactile.cylinder import DEFAULT_SHEAR_MODULUS_PA, Cylinder
 from sioms.tactile.emap import e_map, highest_needed
 from sioms.tactile.model import Spectra, StrainTable, adhering, elliptic, strain_table
+from sioms.tactile.strips import Strips
 from sioms.tactile.width import WidthTable, hertz_table, rigid_core_table
 
 Floats = NDArray[np.float64]
@@ -110,6 +111,7 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     signal: Signal = Signal()
     contact: ContactModel = ContactModel()
     identified: IdentifiedMap | None = None
+    strips: Strips | None = None
     notes: dict[str, str] = {}
 
     def __post_init__(self) -> None:
@@ -208,7 +210,8 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         full = self.e_map()
         half = full.shape[1] // 2
         normal = full[:, :half] if self.identified is None else np.asarray(self.identified.rows)
-        return strain_table(outer, angles, normal, full[:, half:], spectra)
+        table = strain_table(outer, angles, normal, full[:, half:], spectra)
+        return table if self.strips is None else self.strips.applied(table)
 
     def width_table(self) -> WidthTable:
         """Return the width table of the file, or compute it."""

@@ -1,8 +1,10 @@
-"""Prepare recorded touches for calibration: loads from the load cell, proximity and quadratic off the outputs."""
+"""Prepare recorded touches for calibration: loads from the load cell; proximity, quadratic and strips off the outputs."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,7 @@ from sioms.tactile.cylinder import Cylinder
 from sioms.tactile.finger import Finger
 from sioms.tactile.linearity import Quadratic, find_quadratic, linearise, ramp_quadratic, with_ramps
 from sioms.tactile.proximity import Proximity, find_proximity
+from sioms.tactile.strips import Strips, find_strips
 from sioms.tactile.touches import Ramp, Touches, TouchLoads, touch_loads
 from sioms.tactile.width import WidthTable, rigid_core_table
 
@@ -19,14 +22,34 @@ Floats = NDArray[np.float64]
 Fits = list[ElementFit | None]
 
 HIGHEST = 60  # wave numbers of calibration
+_WIDER = 0.02  # of the half width, for a difference quotient
 _FOLLOWS = 0.3  # correlation of touches and load cell above which the cell is believed
+
+
+@dataclass(frozen=True, slots=True)
+class Faults:
+    """Hold what was taken off the outputs; None where there was nothing of the kind."""
+
+    quadratic: Quadratic | None
+    proximity: Proximity | None
+    strips: Strips | None
+
+    def wider(self, touches: Touches) -> Floats | float:
+        """Return by what the strips make each contact wider."""
+        return 1.0 if self.strips is None else self.strips.width_factor(touches.angle_rad)
+
+    def evened(self, touches: Touches) -> Touches:
+        """Return the touches as an even layer would have given them."""
+        if self.strips is None:
+            return touches
+        return touches.with_output(touches.output / self.strips.strain_factor(touches.angle_rad)[:, None])
 
 
 def clean_outputs(
     nominal: Finger, touches: Touches, widths: WidthTable, ramps: list[Ramp], edge_half_angle: float, warnings: list[str],
     tick: Callable[[str], None],
-) -> tuple[Touches, TouchLoads, tuple[Quadratic | None, Proximity | None]]:  # fmt: skip
-    """Take proximity and quadratic off the outputs; all the model needs for that is each element's depth.
+) -> tuple[Touches, TouchLoads, Faults]:  # fmt: skip
+    """Take proximity, quadratic and strips off the outputs; all the model needs for that is each element's depth.
 
     In rounds: how strain grows with load and falls with distance depends on the depth, which the first round
     finds; with a conductor's pull beside the quadratic there is a third.
@@ -36,10 +59,10 @@ def clean_outputs(
     fits = starts(body, np.array(nominal.angles_rad), np.array(nominal.elements.radius_m), touches)
     distance = np.array(nominal.angles_rad) - touches.angle_rad[:, None]
     ramped, quadratic, proximity = _Ramps(body, ramps, edge_half_angle), None, None
+    known = np.array([fit is not None for fit in fits])
     for number in range(3):
-        proximity = find_proximity(
-            recorded.output, _expected(body, fits, recorded, loads, quadratic), distance
-        )
+        expected = _expected(body, fits, recorded, loads, quadratic)
+        proximity = find_proximity(recorded.output[:, known], expected[:, known], distance[:, known])
         pull = 0.0 if proximity is None else proximity.output(distance)
         touches = recorded.with_output(recorded.output - pull)
         drawn = proximity is not None
@@ -61,7 +84,42 @@ def clean_outputs(
             break
         fits = fit_elements(body, fits, touches, loads, 0.0, Freedom(True, True), lambda: tick("first fit"))
     _tell(quadratic, proximity, bool(ramps), warnings)
-    return touches, loads, (quadratic, proximity)
+    wider = touch_loads(body, widths, touches, HIGHEST, edge_half_angle, 1.0 + _WIDER)
+    faults, uneven = Faults(quadratic, proximity, _strips(body, fits, touches, loads, wider)), touches
+    if faults.strips is not None:
+        # once more with depths and gains that the strips have not bent
+        even = faults.evened(uneven)
+        bent = touch_loads(body, widths, even, HIGHEST, edge_half_angle, faults.wider(even))
+        fits = fit_elements(body, fits, even, bent, 0.0, Freedom(True, True), lambda: tick("strips"))
+        faults = replace(faults, strips=_strips(body, fits, uneven, loads, wider))
+    if (strips := faults.strips) is not None:
+        touches = faults.evened(uneven)
+        loads = touch_loads(body, widths, touches, HIGHEST, edge_half_angle, faults.wider(touches))
+        warnings.append(
+            f"the finger answers unevenly along the arc, as over strips {math.degrees(strips.period_rad):.2f} deg apart: "
+            f"strains +-{100 * strips.gain:.1f} %, width +-{100 * strips.width:.1f} %; the finger's file undoes it"
+        )
+    return touches, loads, faults
+
+
+def _strips(
+    body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, wider: TouchLoads
+) -> Strips | None:
+    """Look for strips in what the elements' fits leave of touches over the elements."""
+    known = [element for element, fit in enumerate(fits) if fit is not None]
+    gain = np.array([fit.gain for fit in fits if fit is not None])
+    angles = [fit.angle_rad for fit in fits if fit is not None]
+    inside = (touches.angle_rad > min(angles)) & (touches.angle_rad < max(angles))
+    even, broad = (-_model(body, fits, touches, p)[inside][:, known] / gain for p in (loads, wider))
+    # one scale for loads within a quarter and each indenter: how the contact model errs over them is no matter of place
+    output, load, radius = touches.output[inside][:, known], touches.load[inside], touches.radius_m[inside]
+    kinds = np.stack([np.round(4.0 * np.log(load)), np.minimum(radius, 1e3)], axis=1)
+    for kind in np.unique(kinds, axis=0):
+        mine = np.all(kinds == kind, axis=1)
+        scale = np.sum(output[mine] * even[mine]) / np.sum(even[mine] ** 2)
+        even[mine] *= scale
+        broad[mine] *= scale
+    return find_strips(output - even, even, (broad - even) / _WIDER, touches.angle_rad[inside])
 
 
 def _tell(quadratic: Quadratic | None, proximity: Proximity | None, ramps: bool, warnings: list[str]) -> None:

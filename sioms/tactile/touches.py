@@ -130,6 +130,7 @@ def average(recording: Recording, angle_rad: Floats, load: Floats, radius_m: Flo
         force[number] = recording.force[under].mean() - recording.force[before].mean()
         if before.sum() > 2:
             spread.append(recording.raw[before].var(0, ddof=1))
+    output[:, ~np.isfinite(output).any(axis=0)] = 0.0  # an element that is not there is silent
     if not np.isfinite(output).all():
         touch, element = np.argwhere(~np.isfinite(output))[0]
         raise ValueError(
@@ -182,14 +183,16 @@ class TouchLoads:
 
 
 def touch_loads(
-    cylinder: Cylinder, widths: WidthTable, touches: Touches, highest: int, edge_half_angle: float = np.pi / 4
-) -> TouchLoads:
+    cylinder: Cylinder, widths: WidthTable, touches: Touches, highest: int, edge_half_angle: float = np.pi / 4,
+    wider: Floats | float = 1.0,
+) -> TouchLoads:  # fmt: skip
     """Return the tractions of the touches: an edge as a wedge with the rigid core, the others as ellipses of the table's
-    width, with the tangential traction of full adhesion beside them (scale it by the share of adhesion).
+    width, times `wider` of each touch, with the tangential traction of full adhesion beside them (scale it by the share
+    of adhesion).
     """
     k = np.arange(highest + 1)
     normal, shear = np.empty((len(touches), highest + 1)), np.empty((len(touches), highest + 1))
-    stuck = _adhesion_by_width(cylinder, highest)
+    stuck, factor = _adhesion_by_width(cylinder, highest), np.broadcast_to(wider, len(touches))
     for number in range(len(touches)):
         load, radius = float(touches.load[number]), float(touches.radius_m[number])
         if radius == 0.0:
@@ -198,7 +201,9 @@ def touch_loads(
             spectrum, half = _edge(cylinder, highest, edge_half_angle, step)
             p = load * spectrum
         else:
-            half = widths.half_width(load * closedform.equivalent_radius(cylinder, radius))
+            half = widths.half_width(load * closedform.equivalent_radius(cylinder, radius)) * float(
+                factor[number]
+            )
             p = -load / (np.pi * cylinder.outer_m) * closedform.ellipse_spectrum(k * half)
             p[0] *= 0.5
         normal[number], shear[number] = p, load * stuck.at(half)

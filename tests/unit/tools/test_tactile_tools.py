@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +141,42 @@ def test_calibrate_names_what_is_wrong(
     np.savez(empty / "bad.npz", raw=np.zeros((3, 16)), time=np.zeros(2), fs=33.0)
     assert command("calibrate", str(empty)) == 1
     assert "bad.npz: read recording: time_s has shape (2,); need (3,)" in capsys.readouterr().err
+    (empty / "bad.npz").write_bytes(b"PK\x03\x04 cut")
+    assert command("calibrate", str(empty)) == 1
+    assert f"read {empty / 'bad.npz'}: " in capsys.readouterr().err
+    (empty / "nominal.json").write_text('{"ra_mm": "9.6"}')
+    assert command("calibrate", str(empty)) == 1
+    assert "nominal.json: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"cmd_theta": lambda a: a[::-1]}, "in direction and order of the elements' angles"),
+        ({"cmd_theta": np.radians}, "touches lie within 2.62 of 138 degrees"),
+        ({"cmd_theta": lambda a: a[:-1]}, "one number each for every touch"),
+        ({"cmd_theta": lambda a: np.where(a > 60.0, np.nan, a)}, "not finite"),
+        ({"cmd_rc": lambda a: a + 0.006}, "an indenter so thin is none: give mm"),
+        ({"cmd_P": lambda a: -a}, "pressing loads are positive"),
+        ({"raw": lambda a: -a}, "compression must be positive: change its sign"),
+        ({"raw": lambda a: a[:, :15]}, "touches have 15 elements; the finger has 16"),
+        ({"raw": lambda a: np.where(np.arange(len(a))[:, None] == 15, np.nan, a)}, "touch 0: element 0 holds a reading"),
+        ({"time": lambda a: a[::-1]}, "time falls or is no number after frame 0"),
+        ({"touch": lambda a: a + 0.5}, "touch holds a value that is no whole number"),
+    ],
+)  # fmt: skip
+def test_recordings_of_another_unit_or_order_are_refused(
+    folder: Path, change: dict[str, Callable[[np.ndarray], np.ndarray]], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:  # fmt: skip
+    with np.load(folder / "edges.npz") as file:
+        tables = dict(file)
+    for name, made in change.items():
+        tables[name] = made(tables[name])
+    np.savez(folder / "edges.npz", **tables)
+    assert command("calibrate", str(folder), "-o", str(folder / "f.toml")) == 1
+    told = capsys.readouterr().err
+    assert words in told and "Traceback" not in told
+    assert not (folder / "f.toml").exists()
 
 
 def test_design_refuses_what_cannot_be_built(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
