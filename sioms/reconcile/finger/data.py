@@ -122,11 +122,14 @@ class FingerData:
 
     @cached_property
     def _level_sigma(self) -> float:
+        """Noise of a baseline's level: of its frames and its temperature, or what it shows from touch to touch."""
         t = self.touched
         own = float(np.mean(t.noise[self.alive] ** 2) * np.median(t.share)) / 2.0 / len(self.alive)
         level, warm = t.level[:, self.alive].mean(1), t.temperature - t.temperature.mean()
         slope = float(warm @ level) / max(float(warm @ warm), 1e-12)
-        return float(np.sqrt(own + slope**2 * np.median(t.temperature_noise) ** 2))
+        jumps = np.diff(level[np.argsort(t.time)], 2)
+        seen = 1.4826 * float(np.median(np.abs(jumps))) / np.sqrt(6.0)
+        return max(float(np.sqrt(own + slope**2 * np.median(t.temperature_noise) ** 2)), seen)
 
     def _drift(self, b: Belief) -> Floats:
         rows = []
@@ -145,11 +148,7 @@ class FingerData:
             n = len(r.load)
             own = full[at : at + n, r.element]
             at += n
-            if b.creep:
-                own = own - b.creep * b.creep_time * -np.expm1(-r.since / b.creep_time) * np.gradient(
-                    own, r.since
-                )
-            out.append(own / r.noise)
+            out.append((own - b.creep * behind(own, r, b.creep_time)) / r.noise if b.creep else own / r.noise)
         return np.concatenate(out)
 
     @cached_property
@@ -172,6 +171,24 @@ class FingerData:
             out.append((at, at + n, np.linalg.qr(np.stack([np.ones(n), r.output], axis=1))[0]))
             at += n
         return out
+
+
+def behind(own: Floats, r: Ramped, tau: float) -> Floats:
+    """Return how far a ramp's output through a lag of first order is behind it; the ramp may begin with a step.
+
+    Args:
+        own: output without creep in the ramp's bins, straight between them; tau: time constant [s].
+    """
+    rate, first = np.polyfit(r.since, r.load, 1)
+    begin = max(0.0, -first / rate)
+    time = np.concatenate([[min(begin, r.since[0])], r.since])
+    level = np.concatenate([[own[0] * max(first, 0.0) / r.load[0]], own])
+    out, behind = np.empty(len(own)), level[0]
+    for i, (step, rise) in enumerate(zip(np.diff(time), np.diff(level), strict=True)):
+        ease = np.exp(-step / tau)
+        behind = behind * ease + rise * tau / max(step, 1e-12) * (1.0 - ease)
+        out[i] = behind
+    return out
 
 
 def lay_out(

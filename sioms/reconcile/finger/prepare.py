@@ -35,6 +35,7 @@ from sioms.reconcile.verdict import Estimate, NamedEffect
 from sioms.tactile.touches import Recording
 
 EXTENT = Quantity("extent", "rad", 0.0, 0.16, 0.01, "half angle that an element averages over")
+START_EXTENT = 0.25  # of the elements' pitch: where the fit of an extent that is not stated begins
 LOAD_MARGIN = 1.15  # the load cell's noise during a touch is a little more than its frames say
 LOAD_SPREAD = 0.02  # of a touch's load where no load cell tells it
 FOLLOWS = 0.3  # correlation of outputs and load cell from touch to touch above which the cell is believed
@@ -91,8 +92,10 @@ def prepare(
     alive = check_match(touched, nominal, ~dead)
     after = max(float(e.recording.time_s[-1]) for e in experiments if e.name not in ("thermal", "noise"))
     still = reduce_untouched(by_name["thermal"], scale, after_s=after) if "thermal" in by_name else None
-    ramps = tuple(reduce_ramps(by_name["ramp"], scale, ~alive)) if "ramp" in by_name else ()
-    base = replace(nominal, angle=np.ascontiguousarray(nominal.angle), around=nominal.poisson)
+    ramps = tuple(reduce_ramps(by_name["ramp"], scale, ~alive, lines)) if "ramp" in by_name else ()
+    # from nothing the width of the elements would not move: a little of it changes nothing of first order
+    wide = nominal.extent or (START_EXTENT * _pitch(nominal.angle) if refine_extent else 0.0)
+    base = replace(nominal, angle=np.ascontiguousarray(nominal.angle), around=nominal.poisson, extent=wide)
     library_ = {**library(), **{t.name: t for t in TERMS}}
     model = SensorModel(base, count, library_, {}, (EXTENT,) if refine_extent else (), name)
     model, settled = _settle(model, lines, alive)
@@ -217,7 +220,7 @@ def _follows(t: Touched, ratio: Floats, base: Belief, alive: NDArray[np.intp]) -
     own = t.output[:, alive]
     expected = expected * (np.sum(own * expected, axis=0) / (np.sum(expected**2, axis=0) + 1e-30))
     strength = np.sum(own * expected, axis=1) / (np.sum(expected**2, axis=1) + 1e-30)
-    pitch = float(np.median(np.abs(np.diff(np.sort(base.angle))))) if len(base.angle) > 1 else 1.0
+    pitch = _pitch(base.angle)
     turn = 2.0 * np.pi * (t.place - base.angle[alive[0]])[:, None] / pitch * np.arange(1.0, 4.0)
     waves = np.concatenate([np.ones((len(t), 1)), np.cos(turn), np.sin(turn)], axis=1)
     inside = (t.place > base.angle[alive].min()) & (t.place < base.angle[alive].max())
@@ -234,6 +237,10 @@ def _follows(t: Touched, ratio: Floats, base: Belief, alive: NDArray[np.intp]) -
         return True
     x, y = np.concatenate(told), np.concatenate(heard)
     return bool(x @ y > FOLLOWS * np.sqrt((x @ x) * (y @ y)))
+
+
+def _pitch(angle: Floats) -> float:
+    return float(np.median(np.abs(np.diff(np.sort(angle))))) if len(angle) > 1 else 1.0
 
 
 def _missing(by_name: Mapping[str, Recording], t: Touched, refine: bool) -> list[str]:

@@ -15,6 +15,7 @@ from sioms.tactile.touches import BASELINE, LOADED, Recording
 PARTS = 4  # of the course of a touch under load
 LEAST_TOUCHES = 24
 RAMP_BINS = 16
+TOLD = 0.15  # root mean square of a unit sine over a run of frames from which on it is no constant
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,7 +29,7 @@ class Touched:
         output: mean under load less baseline; part: the same for ``PARTS`` parts, shape (nt, PARTS, ns).
         since: middle of each part after the load came on [s], shape (nt, PARTS).
         level: baseline; temperature, temperature_noise: [deg C] of the baseline, nan without; time: [s] of the baseline.
-        share: 1/frames under load + 1/frames of baseline, shape (nt,): variance of a mean over that of a frame.
+        share: 1/frames under load + 1/frames of baseline, shape (nt,): variance of a touch's output over that of a frame.
         noise: standard deviation of one frame, shape (ns,).
     """
 
@@ -120,12 +121,12 @@ def reduce_touches(
             if len(before) < 2 or len(under) < PARTS or not np.isfinite(readings).all():
                 left += 1
                 continue
-            quiet = _without_lines(r.raw[before] * scale, r.time_s[before], lines)
-            loud = _without_lines(r.raw[under] * scale, r.time_s[under], lines)
+            quiet, spent, more = without_lines(r.raw[before] * scale, r.time_s[before], lines)
+            loud, _, further = without_lines(r.raw[under] * scale, r.time_s[under], lines)
             onset = _onset(r, mine, before, under)
             parts = np.array_split(np.arange(len(under)), PARTS)
             level = quiet.mean(0)
-            variances.append(quiet.var(0, ddof=1))
+            variances.append(quiet.var(0, ddof=1 + spent))
             cell = r.force[under].mean() - r.force[before].mean()
             spread = np.sqrt(
                 np.var(r.force[under], ddof=1) / len(under) + np.var(r.force[before], ddof=1) / len(before)
@@ -144,7 +145,7 @@ def reduce_touches(
                 r.temperature_c[before].mean(),
                 np.std(r.temperature_c[before], ddof=1) / np.sqrt(len(before)),
                 r.time_s[before].mean(),
-                1.0 / len(under) + 1.0 / len(before),
+                1.0 / len(under) + 1.0 / len(before) + more + further,
             )
             for key, value in zip(rows, values, strict=True):
                 rows[key].append(value)
@@ -170,16 +171,31 @@ def _onset(r: Recording, mine: NDArray[np.intp], before: NDArray[np.intp], under
     return float(r.time_s[before[-1]])
 
 
-def _without_lines(frames: Floats, time: Floats, lines: Sequence[Line]) -> Floats:
-    """Take sines of known frequencies off a run of frames; amplitudes and phases are free."""
-    if not lines or len(frames) < 2 * len(lines) + 4:
-        return frames
-    angle = 2.0 * np.pi * np.array([line.frequency for line in lines]) * (time - time[0])[:, None]
+def without_lines(
+    frames: Floats, time: Floats, lines: Sequence[Line], order: int = 0
+) -> tuple[Floats, int, float]:
+    """Take sines of known frequencies off a run of frames; amplitudes and phases are free.
+
+    What these frames cannot tell from their course (a line that their rate folds to nothing) is left in.
+
+    Args:
+        order: of the polynomial that the course of the frames may follow.
+
+    Returns:
+        The frames without lines, how many of their degrees of freedom that took, and what it adds to the variance of their
+        mean, in variances of one frame.
+    """
+    if not lines or len(frames) < 2 * len(lines) + order + 4:
+        return frames, 0, 0.0
+    since = time - time[0]
+    angle = 2.0 * np.pi * np.array([line.frequency for line in lines]) * since[:, None]
     waves = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
-    full = np.concatenate([np.ones((len(time), 1)), waves], axis=1)
-    c = np.linalg.lstsq(full, frames, rcond=1e-8)[0]
-    out: Floats = frames - waves @ c[1:]
-    return out
+    course = np.linalg.qr(np.vander(since / max(since[-1], 1e-9), order + 1))[0]
+    u, s, v = np.linalg.svd(waves - course @ (course.T @ waves), full_matrices=False)
+    told = s > TOLD * np.sqrt(len(time))
+    back = v[told].T / s[told]
+    mean = waves.mean(0) @ back
+    return frames - waves @ back @ (u[:, told].T @ frames), int(told.sum()), float(mean @ mean)
 
 
 def reduce_untouched(
@@ -201,7 +217,9 @@ def reduce_untouched(
     return Untouched(output, r.temperature_c[good], np.maximum(noise, 1e-9))
 
 
-def reduce_ramps(r: Recording, scale: float, dead: NDArray[np.bool_]) -> list[Ramped]:
+def reduce_ramps(
+    r: Recording, scale: float, dead: NDArray[np.bool_], lines: Sequence[Line] = ()
+) -> list[Ramped]:
     """Return load ramps in bins; touch n lies over element n; the load is the line through the load cell's readings."""
     out = []
     for number in np.unique(r.touch[r.touch >= 0]):
@@ -218,6 +236,7 @@ def reduce_ramps(r: Recording, scale: float, dead: NDArray[np.bool_]) -> list[Ra
             continue
         load = np.polyval(np.polyfit(clock, r.force[under] - r.force[before].mean(), 1), clock)
         output = scale * (r.raw[under, n] - r.raw[before, n].mean())
+        output = without_lines(output[:, None], clock, lines, order=4)[0][:, 0]
         bins = np.array_split(np.arange(len(under)), RAMP_BINS)
         keep = [p for p in bins if load[p].min() > 0.02 * load.max()]
         if len(keep) < 4:

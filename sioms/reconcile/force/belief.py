@@ -70,26 +70,60 @@ def readings(b: ForceBelief, loads: Loads) -> Floats:
 
 
 @lru_cache(maxsize=32)
-def lag(loads: Loads, reach: float) -> Floats:
-    """Return the lag of known loads, see ``lagged``; the search asks for the same reaches again and again."""
-    out = lagged(loads.load, reach, loads.record)
+def late(loads: Loads, tau: float) -> Floats:
+    """Return how far every load is ahead of itself seen through a lag of first order, zero at the first row of a record.
+
+    Args:
+        tau: time constant [s]. A load is taken to have come right after the row before, as weights do.
+    """
+    out = np.zeros_like(loads.load)
+    ease = np.exp(-np.maximum(np.diff(loads.time), 0.0) / tau)
+    new = np.diff(loads.record) != 0
+    step = np.diff(loads.load, axis=0)
+    for i in range(len(ease)):
+        if not new[i]:
+            out[i + 1] = (out[i] + step[i]) * ease[i]
     out.setflags(write=False)
     return out
 
 
-def lagged(load: Floats, reach: float, record: NDArray[np.int64]) -> Floats:
-    """Return how far every column lags behind itself, -1 to 1: the mean of plays whose widths are even up to ``reach``.
+@lru_cache(maxsize=32)
+def lag(loads: Loads, reach: float, power: float) -> Floats:
+    """Return the lag of known loads, see ``lagged``; the search asks for the same ones again and again."""
+    out = lagged(loads.load, reach, power, loads.record)
+    out.setflags(write=False)
+    return out
 
-    A play follows the load once that has moved its width from where it turned. Even widths make loops of parabolas, as metal
-    under loads well below yield has them (Rayleigh's law), and a full loop of height one; at rest in every record's first row.
+
+class Plays:
+    """Plays about each of some loads, of widths up to ``reach``: a play follows the load once that has moved its width.
+
+    They weigh with a power of their width; even weights make loops of parabolas, as metal under loads well below yield has
+    them (Rayleigh's law). A full loop has height one. One caller at a time.
     Source: M. A. Krasnosel'skii, A. V. Pokrovskii, "Systems with Hysteresis", 1989, sec. 2 and 34 (play, Prandtl-Ishlinskii).
+
+    Args:
+        power: of the weights.
+        load: where they stand at rest, shape (n,).
     """
-    width = reach * ((np.arange(PLAYS) + 0.5) / PLAYS)[:, None]
+
+    def __init__(self, reach: float, power: float, load: Floats) -> None:
+        share = ((np.arange(PLAYS) + 0.5) / PLAYS)[:, None]
+        self._width, self._weight = reach * share, share**power / np.sum(share**power)
+        self._state = np.repeat(load[None], PLAYS, axis=0)
+
+    def follow(self, load: Floats) -> Floats:
+        """Move on to a load; return how far the plays lag behind it in widths, -1 to 1, shape (n,)."""
+        np.clip(self._state, load - self._width, load + self._width, out=self._state)
+        out: Floats = np.sum(self._weight * (self._state - load) / self._width, axis=0)
+        return out
+
+
+def lagged(load: Floats, reach: float, power: float, record: NDArray[np.int64]) -> Floats:
+    """Return how far every column lags behind itself, see ``Plays``; at rest in every record's first row."""
     out = np.empty_like(load)
-    state = np.repeat(load[:1], PLAYS, axis=0)
     for i, here in enumerate(load):
-        if i and record[i] != record[i - 1]:
-            state[:] = here
-        np.clip(state, here - width, here + width, out=state)
-        out[i] = ((state - here) / width).mean(0)
+        if i == 0 or record[i] != record[i - 1]:
+            plays = Plays(reach, power, here)
+        out[i] = plays.follow(here)
     return out

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from sioms.reconcile.effect import Channel
-from sioms.reconcile.force.belief import Floats, ForceBelief, Loads, lag
+from sioms.reconcile.force.belief import Floats, ForceBelief, Loads, lag, late
 from sioms.reconcile.sensors.effect import Quantity, SensorEffect, Values, responding, term
 from sioms.reconcile.sensors.library import collect
 
@@ -45,8 +45,8 @@ def softening(reading: Floats, loads: Loads, p: Floats) -> Floats:
 
 
 def lagging(reading: Floats, loads: Loads, p: Floats) -> Floats:
-    """Add b times the lag of each component's own load; b per component, its reach r last."""
-    return reading + p[:-1] * lag(loads, float(p[-1]))
+    """Add b times the lag of each component's own load; b per component, reach r and power a of the plays last."""
+    return reading + p[:-2] * lag(loads, float(p[-2]), float(p[-1]))
 
 
 GAIN = SensorEffect(
@@ -113,13 +113,14 @@ HYSTERESIS = SensorEffect(
     name="hysteresis",
     title="hysteresis",
     channel=MECHANICS,
-    change=responding(lagging, "b", "r"),
-    equation="reading_i = l_i + b_i mean over w of (z_w - l_i)/w, z_w the play of width w about l_i, w from 0 to r",
+    change=responding(lagging, "b", "r", "a"),
+    equation="reading_i = l_i + b_i mean over w of (z_w - l_i)/w weighed with w^a, z_w the play of width w about l_i, w up to r",
     parameters=(
         Quantity("b", "1", 0.0, 0.5, 5e-3, "half width of the loop, of each component", each=True),
         Quantity(
             "r", "1", 5e-3, 0.5, 0.05, "change of load over which it turns round", starts=(0.03, 0.1, 0.3)
         ),
+        Quantity("a", "1", -0.9, 3.0, 0.5, "form of the loop: 0 parabolas, larger fuller at its ends"),
     ),
     signature="off one way while the load rises and the other way while it falls",
     lookalikes=("quadratic", "gain"),
@@ -176,7 +177,44 @@ def coupled(reading: Floats, loads: Loads, p: Floats) -> Floats:
     return reading + p * loads.load * loads.load[:, :1]
 
 
+def following(reading: Floats, loads: Loads, p: Floats) -> Floats:
+    """Take off c of what has not yet come through a lag of tau; c per component, tau last."""
+    return reading - p[:-1] * late(loads, float(p[-1]))
+
+
+def bent(reading: Floats, loads: Loads, p: Floats) -> Floats:
+    """Take off c of what is beyond s, either way; c per component, s last."""
+    return reading - p[:-1] * (reading - np.clip(reading, -p[-1], p[-1]))
+
+
+def dulled(reading: Floats, loads: Loads, p: Floats) -> Floats:
+    """Take off c of what is within s, either way; c per component, s last."""
+    return reading - p[:-1] * np.clip(reading, -p[-1], p[-1])
+
+
 TERMS = (
+    term(
+        "late",
+        "reading_i = l_i - c_i (l_i - l_i through a lag of tau)",
+        following,
+        Quantity("c", "1", -1.0, 1.0, 0.01, "what comes late, of each component", each=True),
+        Quantity("tau", "s", 1e-3, 1e5, 1.0, "time constant", starts=(2.0, 0.02, 0.1, 0.5, 10.0, 60.0)),
+        lookalikes=("hysteresis",),
+    ),
+    term(
+        "knee",
+        "reading_i = l_i - c_i (|l_i| - s) sign(l_i) beyond |l_i| = s",
+        bent,
+        Quantity("c", "1", -1.0, 1.0, 0.02, "slope that is lost there, of each component", each=True),
+        Quantity("s", "1", 0.01, 1.0, 0.02, "of full range", starts=(0.3, 0.45, 0.6, 0.75, 0.9)),
+    ),
+    term(
+        "dull",
+        "reading_i = l_i - c_i l_i up to |l_i| = s, less c_i s beyond",
+        dulled,
+        Quantity("c", "1", -1.0, 1.0, 0.02, "slope that is lost there, of each component", each=True),
+        Quantity("s", "1", 1e-3, 0.3, 5e-3, "of full range", starts=(0.01, 0.03, 0.1)),
+    ),
     term(
         "cube",
         "reading_i = l_i + k_i l_i^3",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.force.belief import Floats, Loads, readings
+from sioms.reconcile.force.plan import Plan, catalogue, propose
 from sioms.reconcile.refuse import hats
 from sioms.reconcile.sensors.analyse import Options, analyse
 from sioms.reconcile.sensors.effect import TERM_PREFIX, SensorModel
@@ -109,7 +110,8 @@ class ForceSubject:
     notes: tuple[str, ...]
     names: tuple[str, ...] = ()
     terms: tuple[str, ...] = ()
-    settled: tuple[NamedEffect, ...] = field(default=())
+    settled: tuple[NamedEffect, ...] = ()
+    plans: tuple[Plan, ...] = ()
 
     def views(self) -> Mapping[str, View]:
         """Readings in their own units."""
@@ -158,18 +160,8 @@ class ForceSubject:
         return [Variable(*v) for v in out]
 
     def propose(self, models: Sequence[SensorModel]) -> tuple[Proposal, ...]:
-        """Rank the programmes of loads by how far the models differ on them."""
-        if len(models) < 2:
-            return ()
-        found = []
-        for name, text, loads in catalogue(len(self.records.names)):
-            said = [readings(m.belief(), loads) / self.whole.sigma for m in models]
-            said = [s - s.mean(0) for s in said]
-            apart = min(
-                float(np.sqrt(np.mean((a - b) ** 2))) for i, a in enumerate(said) for b in said[i + 1 :]
-            )
-            found.append(Proposal(name, text, apart))
-        return tuple(sorted(found, key=lambda p: -p.separation))
+        """Rank the programmes of loads by how far the models differ on them; those of the stand where there is one."""
+        return propose(models, self.plans or catalogue(len(self.records.names)), self.whole.sigma)
 
     def curves(self, before: SensorModel, after: SensorModel) -> tuple[Curve, ...]:
         """Reading less load of the components that disagreed most, over time."""
@@ -203,44 +195,11 @@ def unit_of(name: str) -> str:
     return "N m" if name[:1].lower() in ("t", "m") else "N"
 
 
-def catalogue(count: int) -> Sequence[tuple[str, str, Loads]]:
-    """Programmes of loads: each component alone, rest, rest with a temperature step, cold and warm."""
-    up = np.concatenate([np.linspace(0, 1, 6), np.linspace(0.8, -1, 10), np.linspace(-0.8, 0, 5)])
-    alone = np.concatenate([np.outer(up, np.eye(count)[i]) for i in range(count)])
-    seconds = 10.0 * np.arange(len(alone), dtype=np.float64)
-    still, rest = np.zeros((60, count)), 10.0 * np.arange(60, dtype=np.float64)
-    one = np.zeros(len(alone), dtype=np.int64)
-    return (
-        (
-            "alone",
-            "load each component alone in steps up and down, in both directions",
-            Loads(alone, 0 * seconds, 0 * seconds, one),
-        ),
-        (
-            "rest",
-            "ten minutes at zero load at constant temperature",
-            Loads(still, rest, 0 * rest, one[:1].repeat(60)),
-        ),
-        (
-            "warm",
-            "a temperature step of 5 K at zero load",
-            Loads(still, 0 * rest, np.where(rest > 300.0, 5.0, 0.0), one[:1].repeat(60)),
-        ),
-        (
-            "cold and warm",
-            "each component alone, cold and 10 K warmer",
-            Loads(
-                np.concatenate([alone, alone]),
-                np.zeros(2 * len(alone)),
-                np.repeat([-5.0, 5.0], len(alone)),
-                one.repeat(2),
-            ),
-        ),
-    )
-
-
-def prepare(records: ForceRecords, model: SensorModel) -> ForceSubject:
+def prepare(records: ForceRecords, model: SensorModel, plans: Sequence[Plan] = ()) -> ForceSubject:
     """Check the recordings and lay them out.
+
+    Args:
+        plans: programmes of loads that can be applied to decide between look-alikes; none for those of the catalogue.
 
     Raises:
         BadInputError: they cannot be used; the message says why.
@@ -267,7 +226,9 @@ def prepare(records: ForceRecords, model: SensorModel) -> ForceSubject:
     data = [ForceData(loads, measured, sigma, w, records.names) for w in (everything, ~mine, mine)]
     names = tuple(n for n, e in model.library.items() if e.rankable and not n.startswith(TERM_PREFIX))
     terms = tuple(n for n in model.library if n.startswith(TERM_PREFIX))
-    return ForceSubject(data[0], data[1], data[2], model, records, tuple(notes), names, terms)
+    return ForceSubject(
+        data[0], data[1], data[2], model, records, tuple(notes), names, terms, plans=tuple(plans)
+    )
 
 
 def noise_of(loads: Loads, measured: Floats) -> Floats:

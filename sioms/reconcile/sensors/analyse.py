@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sioms.reconcile.blocks import bootstrap
-from sioms.reconcile.excitation import SAME, common
+from sioms.reconcile.blocks import intervals
+from sioms.reconcile.excitation import SAME
 from sioms.reconcile.locate import Place
 from sioms.reconcile.noise import effective_samples
 from sioms.reconcile.search import GAIN
@@ -35,10 +35,9 @@ LEAST_TRACE = 6.0  # an effect of natural size must change the rows by this many
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Settings of one analysis: seed of permutations and bootstrap, replicates, pictures, and who is told."""
+    """Settings of one analysis: seed of permutations and bootstrap, pictures, and who is told."""
 
     seed: int = 1
-    replicates: int = 200
     pictures: bool = True
     progress: Callable[[str], None] = field(default=lambda text: None)
 
@@ -56,10 +55,9 @@ def analyse(subject: Subject, options: Options | None = None) -> SensorVerdict:
     share, where = smoother_share(subject.training, found.fit, searcher.weights, features)
     bursts = _bursts(subject, searcher, found)
     rejected: tuple[str, ...] = ()
-    odd = share > UNEXPLAINED and _loud(searcher, found, where)
-    if odd:
+    if _odd(searcher, found, share, where):
         o.progress(
-            f"a smoother explains {100 * share:.0f} % of what remains of {where}: searching for a term"
+            f"what remains has no name (a smoother explains {100 * share:.0f} %): searching for a term"
         )
         before = found
         searcher.names = names + subject.terms
@@ -68,8 +66,10 @@ def analyse(subject: Subject, options: Options | None = None) -> SensorVerdict:
         share, where = smoother_share(subject.training, found.fit, searcher.weights, features)
         searcher.names = names
     o.progress("identifiability: look-alikes in the place of each effect")
-    others = searcher.rivals(found)
-    left = share > UNEXPLAINED and _loud(searcher, found, where)
+    found, others = searcher.settle(found, pairs)
+    missing = {n: text for n, text in missing.items() if n not in found.fit.model.effects}
+    share, where = smoother_share(subject.training, found.fit, searcher.weights, features)
+    left = _odd(searcher, found, share, where)
     return _conclude(subject, o, searcher, found, others, missing, pairs, share, left, bursts, rejected)
 
 
@@ -88,17 +88,25 @@ def gate(subject: Subject) -> tuple[dict[str, str], tuple[tuple[str, str, float]
                 and b not in own.replaces
                 and a not in other.replaces
             )
-            if alike and columns[a].shape[1] == columns[b].shape[1] == 1:
-                same = common(columns[a], columns[b])
+            if alike and columns[a].shape[1] == columns[b].shape[1]:
+                same = min(_shared(columns[a], columns[b]), _shared(columns[b], columns[a]))
                 if same > SAME:
                     pairs.append((a, b, same))
     return missing, tuple(sorted(pairs, key=lambda p: -p[2]))
 
 
-def _loud(searcher: Searcher, found: Found, view: str) -> bool:
-    """Say whether a view is still above its floor."""
+def _shared(a: Array, b: Array) -> float:
+    """Share of the energy of a's columns that lies in the span of b's; of elements that hardly feel either, hardly any."""
+    q = np.linalg.qr(b[:, np.linalg.norm(b, axis=0) > 0.0])[0]
+    return float(np.sum((q.T @ a) ** 2) / np.sum(a**2))
+
+
+def _odd(searcher: Searcher, found: Found, share: float, view: str) -> bool:
+    """Say whether something is left: a view above its floor that the state explains, or one far above it whatever explains it."""
     ratios = searcher.ratios(found.fit.model)
-    return view != "" and bool(ratios[searcher.data.views.index(view)] > LEAST_ODD)
+    if view and share > UNEXPLAINED and ratios[searcher.data.views.index(view)] > LEAST_ODD:
+        return True
+    return bool(np.max(ratios) > QUIET)
 
 
 def _bursts(subject: Subject, searcher: Searcher, found: Found) -> float:
@@ -126,7 +134,7 @@ def _conclude(
     gaps = _gaps(subject, start, found.fit.model)
     weights = 1.0 / np.maximum(_ratios(subject.whole, found.fit.model), 1.0)[subject.whole.view]
     fit = refit(subject.whole, found.fit.model, weights, searcher.frozen)
-    named, terms = _describe(subject, fit, found, searcher, others, o.replicates, rng)
+    named, terms = _describe(subject, fit, found, searcher, others, rng)
     open_rivals = [r for r in others if r.open]
     disturbed = bursts > BURSTS and share < UNEXPLAINED
     unexplained = bool(terms) or left or disturbed
@@ -214,18 +222,11 @@ def _describe(
     found: Found,
     searcher: Searcher,
     others: Sequence[Rival],
-    replicates: int,
     rng: np.random.Generator,
 ) -> tuple[list[NamedEffect], list[NamedEffect]]:
     """Describe every effect, the largest first; terms apart."""
-    moves = (
-        bootstrap(fit, subject.whole.block, replicates, rng)
-        * np.array([f.quantity.size for f in fit.free])[None, :]
-    )
-    spread = {
-        (f.effect, f.quantity.symbol, f.index): 1.96 * float(s)
-        for f, s in zip(fit.free, np.std(moves, axis=0) if len(fit.free) else (), strict=True)
-    }
+    half = intervals(fit, subject.whole.block) * np.array([f.quantity.size for f in fit.free])
+    spread = {(f.effect, f.quantity.symbol, f.index): float(s) for f, s in zip(fit.free, half, strict=True)}
     out: list[tuple[float, NamedEffect]] = [(np.inf, e) for e in subject.settled]
     for name in [n for n in fit.model.effects if n not in searcher.frozen]:
         effect = fit.model.library[name]
@@ -293,12 +294,11 @@ def _estimates(
         values = model.effects[effect.name][q.symbol]
         for i, v in enumerate(values):
             s = spread.get((effect.name, q.symbol, i), 0.0)
+            low, high = (-np.inf, np.inf) if q.phase else (min(q.lower, v), max(q.upper, v))
             symbol = f"{q.symbol}[{i}]" if len(values) > 1 else q.symbol
-            out.append(
-                Estimate(
-                    symbol, float(v), float(v) - s, float(v) + s, subject.unit(effect.name, q.symbol), q.text
-                )
-            )
+            unit = subject.unit(effect.name, q.symbol)
+            span = max(float(v) - s, float(low)), min(float(v) + s, float(high))
+            out.append(Estimate(symbol, float(v), *span, unit, q.text))
     return tuple(out)
 
 

@@ -8,23 +8,24 @@ from itertools import product
 
 import numpy as np
 
-from sioms.reconcile.sensors.effect import Array, SensorEffect, SensorModel, Values
+from sioms.reconcile.sensors.effect import Array, Quantity, SensorEffect, SensorModel, Values
 from sioms.reconcile.sensors.fit import Data, Fit, Free, slopes
 
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """A screened candidate: values to start from and the share of the view's squares it would save."""
+    """A screened candidate: values to start from, the share of the view's squares it would save, and that of all squares."""
 
     effect: str
     values: Values
     gain: float
+    total: float
 
 
 def screen(
     data: Data, fit: Fit, weights: Array, effect: SensorEffect, frozen: tuple[str, ...] = ()
 ) -> list[Start]:
-    """Regress the residual on what a little of the effect would change; one start per trial shape, best first."""
+    """Regress the residual on what a little of the effect would change; one start per trial shape, the best of all views first."""
     out = []
     known, r = fit.jacobian, fit.residual
     for shape in _shapes(fit.model, effect):
@@ -40,8 +41,11 @@ def screen(
         d[live] = np.linalg.lstsq(h + 1e-9 * np.eye(len(h)), -scaled.T @ r, rcond=1e-10)[0] / size[live]
         values = _settled(effect, shape, d[known.shape[1] :], fit.model.count)
         if values is not None:
-            out.append(Start(effect.name, values, _gain(data, r, r + full @ d)))
-    return sorted(out, key=lambda s: -s.gain)
+            left = r + full @ d
+            out.append(
+                Start(effect.name, values, _gain(data, r, left), 1.0 - float(left @ left) / float(r @ r))
+            )
+    return sorted(out, key=lambda s: -s.total)
 
 
 def _gain(data: Data, before: Array, after: Array) -> float:
@@ -75,11 +79,23 @@ def screening_columns(data: Data, model: SensorModel, effect: SensorEffect, trie
 
 
 def _columns(data: Data, model: SensorModel, effect: SensorEffect, values: dict[str, Array]) -> Array:
-    """Return the whitened change per natural size of the first parameter."""
-    q = effect.primary
+    """Return the whitened change per natural size of every number that says how large the effect is."""
     trial = model.with_effect(effect.name, values)
-    free = tuple(Free(effect.name, q, i) for i in range(model.count if q.each else 1))
-    return slopes(data, trial, free, np.full(len(free), effect.neutral))
+    free = _amounts(effect, model.count)
+    at = np.concatenate([values[q.symbol] for q in _amplitudes(effect)])
+    return slopes(data, trial, free, at)
+
+
+def _amplitudes(effect: SensorEffect) -> tuple[Quantity, ...]:
+    """Return what says how large an effect is; what shapes it only changes nothing while it is neutral."""
+    first, *others = effect.parameters
+    if any(q.phase for q in others):
+        return (first,)
+    return (first, *(q for q in others if not q.starts))
+
+
+def _amounts(effect: SensorEffect, count: int) -> tuple[Free, ...]:
+    return tuple(Free(effect.name, q, i) for q in _amplitudes(effect) for i in range(count if q.each else 1))
 
 
 def _settled(
@@ -87,16 +103,17 @@ def _settled(
 ) -> dict[str, Array] | None:
     """Turn regression coefficients into values to start from; None where the sign is not the effect's."""
     q = effect.primary
-    values = dict(shape[0])
+    values = {symbol: v.copy() for symbol, v in shape[0].items()}
     if len(shape) == 2:
         phase = next(p for p in effect.parameters if p.phase)
         a, b = amount * q.size
         values[q.symbol] = np.array([np.clip(np.hypot(a, b), q.lower, q.upper)])
         values[phase.symbol] = np.array([np.arctan2(b, a)])
         return values
-    wanted = effect.neutral + amount * q.size
-    held = np.clip(wanted, q.lower, q.upper)
-    if not q.each and abs(held[0] - effect.neutral) < 0.2 * abs(wanted[0] - effect.neutral):
-        return None
-    values[q.symbol] = held
+    for f, change in zip(_amounts(effect, count), amount, strict=True):
+        wanted = values[f.quantity.symbol][f.index] + change * f.quantity.size
+        held = np.clip(wanted, f.quantity.lower, f.quantity.upper)
+        if f.quantity is q and not q.each and abs(held - effect.neutral) < 0.2 * abs(wanted - effect.neutral):
+            return None
+        values[f.quantity.symbol][f.index] = held
     return values

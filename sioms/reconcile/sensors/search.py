@@ -7,20 +7,22 @@ view where it shows most.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from sioms.reconcile.ambiguity import AMBIGUOUS
+from sioms.reconcile.ambiguity import ALIKE, AMBIGUOUS, SAME_TRACE, SWAPS
 from sioms.reconcile.blocks import better, heldout
-from sioms.reconcile.search import DOUBTFUL, FLOOR, GAIN, NEARLY, SPECIFIC, SURE, negligible
+from sioms.reconcile.search import DOUBTFUL, FLOOR, GAIN, NEARLY, PAIRS, SPECIFIC, SURE, negligible
 from sioms.reconcile.sensors.effect import TERM_PREFIX, Array, SensorEffect, SensorModel
 from sioms.reconcile.sensors.fit import Data, Fit, refit
 from sioms.reconcile.sensors.screen import Start, screen
 
 TRIES = 5
 STEPS = 8
+MOST_INSIDE = 0.7  # share of the elements whose own number must be one that the effect can have
+PAIRED = 1.3  # two effects are tried at once only where a view is above this multiple of its floor
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +33,12 @@ class Saving:
     errors: float
     view: str
     total: float
+
+    @property
+    def weight(self) -> float:
+        """How much and how surely it saves; below zero where it loses."""
+        sure = min(abs(self.errors), 10.0)
+        return min(self.share, 1.0) * sure if self.errors > 0.0 else -abs(self.share) * sure
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +60,7 @@ class Rival:
     effect: str
     rival: str
     missed: float
+    allowed: float
     errors: float
     excess: float
     fit: Fit
@@ -59,7 +68,7 @@ class Rival:
     @property
     def open(self) -> bool:
         """True where the data do not rule the rival out."""
-        return self.missed < AMBIGUOUS or (self.errors < 1.0 and self.excess < DOUBTFUL)
+        return self.missed < self.allowed or (self.errors < 1.0 and self.excess < DOUBTFUL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,8 +133,9 @@ class Searcher:
             if np.count_nonzero(mine) < 2:
                 continue
             share, errors = better(new[mine], old[mine])
-            if min(share, 1.0) * min(errors, 10.0) > best.share * min(best.errors, 10.0) or best.view == "":
-                best = Saving(share, errors, view, best.total)
+            new_one = Saving(share, errors, view, best.total)
+            if best.view == "" or new_one.weight > best.weight:
+                best = new_one
         return best
 
     def lost(self, worse: Array, good: Array) -> Saving:
@@ -142,7 +152,7 @@ class Searcher:
         for _ in range(STEPS):
             if np.all(self.ratios(fit.model) <= FLOOR):
                 break
-            step = self._add(fit, losses)
+            step = self._add(fit, losses) or self._add_pair(fit, losses)
             if step is None:
                 break
             ladder.append(step)
@@ -168,9 +178,7 @@ class Searcher:
         """Refit the best candidates and take the simplest of those that save most."""
         tried: dict[str, tuple[Fit, Array, Saving]] = {}
         for start in self.candidates(fit):
-            effect = fit.model.library[start.effect]
-            model = without(fit.model, effect.replaces).with_effect(start.effect, start.values)
-            new = self.fit(model)
+            new = self.fit(self._with(fit, start))
             loss = self.loss(new)
             tried[start.effect] = (new, loss, self.saving(loss, losses))
         good = {
@@ -193,6 +201,37 @@ class Searcher:
             return None
         return Rung("add", name, self._ratio(new), saved.share, new.model, others)
 
+    def _add_pair(self, fit: Fit, losses: Array) -> Rung | None:
+        """Add two effects at once where neither is sure alone: each hides what the other would save.
+
+        Both must save much together, and each much beside the other; less than that has no name yet.
+        """
+        if np.max(self.ratios(fit.model)) < PAIRED:
+            return None
+        best: tuple[Saving, Fit, str] | None = None
+        for first in self.candidates(fit)[:PAIRS]:
+            middle = self.fit(self._with(fit, first), 4)
+            inner = self.loss(middle)
+            for second in self.candidates(middle)[:PAIRS]:
+                new = self.fit(self._with(middle, second))
+                if first.effect not in new.model.effects or second.effect in family(new.model, first.effect):
+                    continue
+                loss = self.loss(new)
+                saved, more = self.saving(loss, losses), self.saving(loss, inner)
+                sure = all(s.share >= SPECIFIC and s.errors >= SURE and s.total > 0.0 for s in (saved, more))
+                good = sure and physical(new.model, first.effect) and physical(new.model, second.effect)
+                if good and (best is None or new.cost < best[1].cost):
+                    best = saved, new, f"{first.effect} and {second.effect}"
+        if best is None or self._nameless(fit, losses, best[0]):
+            return None
+        saved, new, name = best
+        return Rung("add", name, self._ratio(new), saved.share, new.model)
+
+    def _with(self, fit: Fit, start: Start) -> SensorModel:
+        """Switch a candidate on, and off what it replaces."""
+        model = without(fit.model, fit.model.library[start.effect].replaces)
+        return model.with_effect(start.effect, start.values)
+
     def _nameless(self, fit: Fit, losses: Array, saved: Saving) -> bool:
         """Say whether a term without a name saves far more than the best name does: then the residual has no name yet."""
         free = [n for n in self.terms if n not in self.names and n not in fit.model.effects]
@@ -210,6 +249,8 @@ class Searcher:
     def _simplest(self, good: dict[str, tuple[Fit, Array, Saving]]) -> str:
         """Of those within one standard error and ``GAIN`` of the best, the one with the fewest numbers."""
         best = max(good, key=lambda n: good[n][2].total)
+        if any(n.startswith(TERM_PREFIX) for n in good[best][0].model.effects):
+            return best  # where something has no name, a name is no better than another term
         near = []
         for n, (_, loss, _) in good.items():
             gap = self.lost(loss, good[best][1])
@@ -269,7 +310,7 @@ class Searcher:
             if any(name in fit.model.library[n].replaces for n in fit.model.effects):
                 continue
             starts = screen(self.data, fit, self.weights, fit.model.library[name], self.frozen)
-            found += [max(starts, key=lambda s: s.gain)] if starts else []
+            found += starts[:1]
         found = sorted((s for s in found if s.gain > 0.5 * GAIN), key=lambda s: -s.gain)
         chosen = found[:TRIES]
         if chosen:
@@ -277,9 +318,42 @@ class Searcher:
             chosen += [s for s in found[TRIES:] if s.effect in alike]
         return chosen
 
-    def rivals(self, found: Found) -> list[Rival]:
-        """Refit with each look-alike in the place of each named effect."""
+    def settle(self, found: Found, pairs: Sequence[tuple[str, str, float]]) -> tuple[Found, list[Rival]]:
+        """Find the rivals; where one of no more numbers does better than what is named, search on from it."""
+        others = self.rivals(found, pairs)
+        lib, count = found.fit.model.library, found.fit.model.count
+        for _ in range(SWAPS):
+            best = next(
+                (
+                    r
+                    for r in others
+                    if r.missed < 0.0 and lib[r.rival].size(count) <= lib[r.effect].size(count)
+                ),
+                None,
+            )
+            if best is None:
+                break
+            self.progress(f"{best.rival} does better than {best.effect}: searching on from it")
+            further = self.run(best.fit.model)
+            step = Rung(
+                "swap",
+                f"{best.effect} to {best.rival}",
+                self._ratio(best.fit),
+                1.0 - best.fit.cost / found.fit.cost,
+                best.fit.model,
+            )
+            found = Found(further.fit, further.losses, (*found.ladder, step, *further.ladder[1:]))
+            others = self.rivals(found, pairs)
+        return found, others
+
+    def rivals(self, found: Found, pairs: Sequence[tuple[str, str, float]] = ()) -> list[Rival]:
+        """Refit with each look-alike in the place of each named effect, also with those too weak by nature to be searched.
+
+        Args:
+            pairs: effects that leave the same trace, with the share in common, as the gate found them.
+        """
         out = []
+        same = {frozenset(p[:2]) for p in pairs if p[2] > SAME_TRACE}
         lib, count = found.fit.model.library, found.fit.model.count
         for name in [
             n for n in found.fit.model.effects if n not in self.frozen and not n.startswith(TERM_PREFIX)
@@ -289,10 +363,14 @@ class Searcher:
             if contribution <= 0.0:
                 continue
             for other in alike(lib, name, count):
-                if other not in self.names or other in found.fit.model.effects:
+                if (
+                    other.startswith(TERM_PREFIX)
+                    or not lib[other].rankable
+                    or other in found.fit.model.effects
+                ):
                     continue
                 for start in screen(self.data, bare, self.weights, lib[other], self.frozen)[:2]:
-                    fit = self.fit(without(bare.model, lib[other].replaces).with_effect(other, start.values))
+                    fit = self.fit(self._with(bare, start))
                     if physical(fit.model, other):
                         _, errors = better(found.losses, self.loss(fit))
                         out.append(
@@ -300,6 +378,7 @@ class Searcher:
                                 name,
                                 other,
                                 (fit.cost - found.fit.cost) / contribution,
+                                ALIKE if frozenset((name, other)) in same else AMBIGUOUS,
                                 errors,
                                 fit.cost / found.fit.cost - 1.0,
                                 fit,
@@ -337,10 +416,11 @@ def without(model: SensorModel, names: tuple[str, ...]) -> SensorModel:
 
 
 def physical(model: SensorModel, name: str) -> bool:
-    """Say whether the first parameter lies inside its bounds and away from doing nothing."""
+    """Say whether the first parameter lies inside its bounds (of the elements' own, most) and away from doing nothing."""
     effect, q = model.library[name], model.library[name].primary
     value = model.effects[name][q.symbol]
+    span = 1e-3 * (q.upper - q.lower)
+    inside = (q.lower + span < value) & (value < q.upper - span)
     if q.each:
-        return True
-    span = 1e-6 * (q.upper - q.lower)
-    return bool(q.lower + span < value[0] < q.upper - span and abs(value[0] - effect.neutral) > 1e-3 * q.size)
+        return bool(np.mean(inside | (value == effect.neutral)) > MOST_INSIDE)
+    return bool(inside[0] and abs(value[0] - effect.neutral) > 1e-3 * q.size)

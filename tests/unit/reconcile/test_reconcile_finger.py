@@ -15,13 +15,13 @@ from sioms.plant.finger import FingerShape, TactileArray
 from sioms.reconcile.descent import descend
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.finger.belief import Belief, late, outputs, scene_of
-from sioms.reconcile.finger.data import CELL
+from sioms.reconcile.finger.data import CELL, behind
 from sioms.reconcile.finger.effects import library
 from sioms.reconcile.finger.model_file import from_table, to_toml
 from sioms.reconcile.finger.plan import Bench, catalogue, first, one_place, propose
 from sioms.reconcile.finger.prepare import prepare
 from sioms.reconcile.finger.pressures import WAVES, hertz, sheet
-from sioms.reconcile.finger.records import find_lines
+from sioms.reconcile.finger.records import Line, Ramped, find_lines, without_lines
 from sioms.reconcile.finger.twin import FingerTwin
 from sioms.reconcile.sensors.analyse import gate
 from sioms.reconcile.sensors.effect import SensorModel
@@ -143,6 +143,27 @@ def test_the_experiment_fits_the_pair() -> None:
     warm = believed(temperature=np.full(16, 3e-3))
     assert propose([believed(), creep], 5e-4)[0].name == "hold"
     assert propose([believed(), warm], 5e-4)[0].name == "warm"
+
+
+def test_a_line_that_the_frames_fold_to_a_constant_takes_nothing_off_a_touch() -> None:
+    time = np.arange(20) / 50.0
+    frames = 0.1 + 2e-3 * np.sin(2.0 * np.pi * 62.0 * time + 1.0)[:, None] * np.ones(3)
+    assert np.allclose(without_lines(frames, time, [Line(50.0, 2e-3, 1e-5)])[0], frames)
+    both = [Line(62.0, 2e-3, 1e-5), Line(50.0, 2e-3, 1e-5)]
+    left, spent, _ = without_lines(frames, time, both)
+    assert np.allclose(left, 0.1, atol=1e-5)
+    assert spent == 2
+
+
+def test_creep_on_a_ramp_is_that_of_many_small_steps() -> None:
+    since = np.linspace(0.1, 3.9, 200)
+    load = 10.0 + 30.0 * since
+    own = 1e-3 * load**0.9
+    tau, fine = 0.4, np.linspace(0.0, 3.9, 20000)
+    level = 1e-3 * (10.0 + 30.0 * fine) ** 0.9
+    steps = np.concatenate([[level[0]], np.diff(level)])
+    exact = [float(np.sum(steps[fine <= t] * np.exp(-(t - fine[fine <= t]) / tau))) for t in since[::20]]
+    assert behind(own, Ramped(0, own, load, since, 1.0), tau)[::20] == pytest.approx(exact, rel=5e-3)
 
 
 def test_a_line_is_found_in_noise_and_none_where_there_is_none() -> None:

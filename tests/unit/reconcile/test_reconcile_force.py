@@ -9,8 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sioms.reconcile.force.belief import Loads, lagged, readings
+from sioms.plant.force_sensor import Contact, Flaws, ForceSensor
+from sioms.reconcile.force.belief import Loads, lagged, late, readings
 from sioms.reconcile.force.model_file import from_table, to_toml
+from sioms.reconcile.force.subject import ForceRecords, prepare
+from sioms.reconcile.force.twin import ForceTwin
+from sioms.reconcile.sensors.analyse import Options, analyse
+from sioms.reconcile.sensors.search import Saving
 from sioms.reconcile_selftest.force_world import COMPONENTS, draw_sensor, record
 from sioms.tools import reconcile
 from sioms.tools.reconcile_selftest_sensors import COLUMNS
@@ -21,14 +26,99 @@ SENSOR = {"sensor": {"name": "s", "components": ["fx", "tz"], "full_range": [100
 def test_the_lag_is_odd_full_after_its_reach_and_remembers_where_a_loop_began() -> None:
     load = np.array([0.0, 0.05, 0.3, 0.26, 0.29, 0.26, 0.3, 0.1, -0.4])[:, None]
     record = np.zeros(len(load), dtype=np.int64)
-    lag = lagged(load, 0.1, record)[:, 0]
-    assert np.allclose(lagged(-load, 0.1, record)[:, 0], -lag)
+    lag = lagged(load, 0.1, 0.0, record)[:, 0]
+    assert np.allclose(lagged(-load, 0.1, 0.0, record)[:, 0], -lag)
     assert lag[0] == 0.0 and -1.0 < lag[1] < -0.5
     assert lag[2] == pytest.approx(-1.0)  # beyond the reach every part has given way
     assert lag[7:] == pytest.approx(1.0)  # and after twice the reach back, the other way
     assert lag[5] == pytest.approx(lag[3]) and lag[6] == pytest.approx(lag[2])  # a loop within a loop closes
-    again = lagged(np.concatenate([load, load]), 0.1, np.repeat([0, 1], len(load)))[:, 0]
+    again = lagged(np.concatenate([load, load]), 0.1, 0.0, np.repeat([0, 1], len(load)))[:, 0]
     assert np.allclose(again[len(load) :], lag)  # every record begins at rest
+
+
+def test_what_comes_late_decays_with_its_time_constant_and_begins_anew_with_every_record() -> None:
+    time = np.array([0.0, 1.0, 2.0, 4.0, 0.0, 1.0])
+    load = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])[:, None]
+    loads = Loads(load, time, 0.0 * time, np.array([0, 0, 0, 0, 1, 1]))
+    assert np.allclose(late(loads, 2.0)[:, 0], [0.0, np.exp(-0.5), np.exp(-1.0), np.exp(-2.0), 0.0, 0.0])
+
+
+def test_a_twin_reads_what_the_model_says_row_by_row() -> None:
+    model, _ = from_table(SENSOR, "x")
+    model = model.with_effect("gain", {"g": np.array([0.02, -0.03])})
+    model = model.with_effect("offset_drift", {"d": np.array([1e-4, -2e-4])})
+    shape = {"r": np.array([0.1]), "a": np.array([0.7])}
+    model = model.with_effect("hysteresis", {"b": np.array([0.02, 0.01]), **shape})
+    walk = np.cumsum(np.random.default_rng(3).normal(0.0, 0.1, (60, 2)), axis=0)
+    load = np.concatenate([np.zeros((1, 2)), walk])
+    time = np.arange(61.0)
+    said = readings(model.belief(), Loads(load, time, 0.0 * time, np.zeros(61, dtype=np.int64)))
+    twin = ForceTwin(model)
+    read = np.array([twin.read(x * model.base.full, 7.0 + t) for x, t in zip(load, time, strict=True)])
+    assert np.allclose(read, said * model.base.full)
+
+
+def test_a_saving_and_an_error_that_both_lose_are_no_gain() -> None:
+    assert Saving(-1.6, -5.0, "touch", 0.0).weight < Saving(0.01, 0.5, "ramp", 0.0).weight
+    assert Saving(0.3, -1.0, "touch", 0.0).weight < 0.0
+
+
+def staircase(n: int) -> ForceRecords:
+    """Each of n components of a plant's sensor alone, up and down in both directions."""
+    up = np.concatenate([np.linspace(0, 1, 6), np.linspace(0.8, -1, 10), np.linspace(-0.8, 0, 5)])
+    load = np.concatenate([np.outer(up, np.eye(n)[i]) for i in range(n)])
+    time = 10.0 * np.arange(len(load))
+    nothing = np.full(len(load), np.nan)
+    names = ("fx", "fy", "fz")[:n]
+    return ForceRecords(names, 100.0 * load, 0.0 * load, time, nothing, np.zeros(len(load), dtype=np.int64))
+
+
+def test_flaws_of_a_simulated_sensor_are_named_by_the_workflow() -> None:
+    """Springs on dry friction are no plays, but the loop is one; the limit is full range."""
+    records = staircase(3)
+    flaws = Flaws(gain=(0.03, -0.02, 0.025, 0.0, 0.0, 0.0), loop=(0.01,) * 6)
+    axes = [Contact((1, 0, 0)), Contact((0, 1, 0)), Contact((0, 0, 1))]
+    sensor = ForceSensor(axes, 0.04, limit=100.0, seed=4, flaws=flaws)
+    for row, out in zip(records.load, records.reading, strict=True):
+        out[:] = sensor.read(row, np.zeros(6))[:3]
+    table = {"sensor": {"components": ["fx", "fy", "fz"], "full_range": [110.0] * 3}}
+    found = analyse(prepare(records, from_table(table, "x")[0]), Options(pictures=False))
+    assert {e.name for e in found.effects} == {"gain", "hysteresis"}
+    gains = next(e for e in found.effects if e.name == "gain").parameters
+    assert [p.value for p in gains] == pytest.approx([0.03, -0.02, 0.025], abs=2e-3)
+
+
+@pytest.mark.parametrize("dull", [False, True])
+def test_a_saturation_and_a_dead_band_are_refused_and_pass_for_no_gain(dull: bool) -> None:
+    records = staircase(3)
+    rng = np.random.default_rng(5)
+    true = records.load
+    bent = np.sign(true) * np.maximum(np.abs(true) - 1.5, 0.0) if dull else np.clip(true, -70.0, 70.0)
+    records.reading[:] = bent + rng.normal(0.0, 0.05, true.shape)
+    table = {"sensor": {"components": ["fx", "fy", "fz"], "full_range": [100.0] * 3}}
+    found = analyse(prepare(records, from_table(table, "x")[0]), Options(pictures=False))
+    assert found.outcome.value == "unexplained"
+    assert not found.effects
+    assert found.symbolic[0].name == ("term_dull" if dull else "term_knee")
+
+
+def test_a_look_alike_too_weak_by_nature_to_be_searched_is_not_ruled_out_by_that() -> None:
+    """A zero that runs off within a minute is no drift of the usual size; the temperature that rose meanwhile must not be named alone."""
+    records = staircase(1)
+    time = np.linspace(0.0, 60.0, 63)
+    load = np.tile(records.load, (3, 1))
+    noise = np.random.default_rng(6).normal(0.0, 0.05, load.shape)
+    warm = 20.0 + time / 20.0 + 0.02 * np.sin(time)
+    one = ForceRecords(
+        ("fx",), load, load + 0.02 * time[:, None] + noise, time, warm, np.zeros(63, dtype=np.int64)
+    )
+    table = {"sensor": {"components": ["fx"], "full_range": [100.0]}}
+    found = analyse(prepare(one, from_table(table, "x")[0]), Options(pictures=False))
+    assert found.outcome.value == "ambiguous"
+    assert {e.name for e in found.effects} | set(sum(found.alternatives, ())) == {
+        "offset_drift",
+        "temperature",
+    }
 
 
 def test_every_effect_does_nothing_at_its_neutral_value_and_something_beside_it() -> None:
