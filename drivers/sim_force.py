@@ -7,23 +7,34 @@ noise = [0.05, 0.05, 0.08, 0.002, 0.002, 0.002]
 node = "mod0.plant.zaxis_contact"
 direction = [0, 0, -1]
 point_m = [0.0, 0.02, 0.1]
+
+``flaws_file`` names a TOML file of what it does beyond its data sheet (``sioms.plant.force_sensor.Flaws``), to be
+hidden from who looks at the configuration. With a ``model_file``, as ``sioms reconcile force`` writes it,
+the sensor is the twin of the one that the model was found for.
 """
 
 from __future__ import annotations
 
+import tomllib
+import zlib
 from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
 
-from sioms.plant.force_sensor import COMPONENTS, Contact, ForceSensor
+from sioms.plant.force_sensor import COMPONENTS, Contact, Flaws, ForceSensor, Six
 from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
 from sioms.sdk.driver import Kit, TickDriver
+from sioms.sdk.tables import from_table, table_type
+
+if TYPE_CHECKING:
+    from sioms.reconcile.force.twin import ForceTwin
 
 Vector = tuple[float, float, float]
-Six = tuple[float, float, float, float, float, float]
 
 
 class ContactTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -50,6 +61,8 @@ class SimForceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         bias: readings without load.
         limit: the readings saturate here.
         cross_talk: 6 rows of 6, applied to the true components.
+        flaws_file: TOML file with flaws, read when the driver starts.
+        model_file: sensor and effects from a model instead.
         seed: of the noise.
         tick_hz: rate.
         history: snapshots kept for readers.
@@ -61,6 +74,8 @@ class SimForceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bias: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     limit: Six = (200.0, 200.0, 400.0, 10.0, 10.0, 10.0)
     cross_talk: tuple[Six, Six, Six, Six, Six, Six] | None = None
+    flaws_file: str = ""
+    model_file: str = ""
     seed: int = 0
     tick_hz: float = 1000.0
     history: int = 64
@@ -77,10 +92,13 @@ class SimForce(TickDriver):
     @classmethod
     def describe(cls, name: str, settings: SimForceSettings) -> Description:
         """Tell the six channels and the contact nodes."""
-        _sensor(settings)
+        _sensor(settings, None)
+        what = ""
+        if settings.model_file:
+            what = f"model {zlib.crc32(Path(settings.model_file).read_bytes()):08x}"
         units = ("N",) * 3 + ("N*m",) * 3
         channels = tuple(
-            ChannelInfo(component, unit, -limit, limit)
+            ChannelInfo(component, unit, -limit, limit, description=what)
             for component, unit, limit in zip(COMPONENTS, units, settings.limit, strict=True)
         )
         inputs = tuple(dict.fromkeys(contact.node for contact in settings.contact))
@@ -91,7 +109,8 @@ class SimForce(TickDriver):
     def __init__(self, name: str, settings: SimForceSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
         self._block = AnalogBlock(self.describe(name, settings).blocks[0])
-        self._sensor = _sensor(settings)
+        self._sensor = _sensor(settings, _flaws(settings.flaws_file))
+        self._twin = _twin(settings.model_file) if settings.model_file else None
         self._forces = np.zeros(len(settings.contact))
         self._limit = np.array(settings.limit)
 
@@ -107,13 +126,17 @@ class SimForce(TickDriver):
             reading = self.kit.inputs[contact.node].read(now_ns)
             missing |= reading is None
             self._forces[index] = 0.0 if reading is None else reading[0, 0]
-        data = self._sensor.read(self._forces, self._block.data)
+        data, sensor, time_s = self._block.data, self._sensor, now_ns * 1e-9
+        if self._twin is None:
+            sensor.read(self._forces, data, time_s)
+        else:
+            sensor.electronics(self._twin.read(sensor.load(self._forces), time_s), data)
         self._block.flags[:] = (np.abs(data) >= self._limit) * int(AnalogStatus.SATURATED)
         if missing:
             self._block.flags |= int(AnalogStatus.INVALID)
 
 
-def _sensor(settings: SimForceSettings) -> ForceSensor:
+def _sensor(settings: SimForceSettings, flaws: Flaws | None) -> ForceSensor:
     return ForceSensor(
         [Contact(contact.direction, contact.point_m) for contact in settings.contact],
         settings.noise,
@@ -122,7 +145,28 @@ def _sensor(settings: SimForceSettings) -> ForceSensor:
         settings.limit,
         None if settings.cross_talk is None else np.array(settings.cross_talk),
         settings.seed,
+        flaws,
     )
+
+
+def _flaws(path: str) -> Flaws | None:
+    if not path:
+        return None
+    try:
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        return from_table(Flaws, msgspec.convert(table, table_type(Flaws)))
+    except (OSError, ValueError, msgspec.ValidationError) as error:
+        raise ValueError(f"flaws_file {path}: {error}") from None
+
+
+def _twin(path: str) -> ForceTwin:
+    from sioms.reconcile.force.model_file import from_table as model_from  # heavy, and for twins only
+    from sioms.reconcile.force.twin import ForceTwin
+
+    model, names = model_from(tomllib.loads(Path(path).read_text(encoding="utf-8")), path)
+    if names != COMPONENTS:
+        raise ValueError(f"model_file {path}: of {', '.join(names)}; the sensor has {', '.join(COMPONENTS)}")
+    return ForceTwin(model)
 
 
 DRIVER = SimForce

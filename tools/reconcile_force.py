@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import time
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +26,11 @@ import numpy as np
 
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.force.model_file import from_table
+from sioms.reconcile.force.plan import Plan
 from sioms.reconcile.force.subject import ForceRecords, unit_of
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.verdict import SensorVerdict
-from sioms.tools.reconcile_input import SUFFIXES, load_columns
+from sioms.tools.reconcile_table import SUFFIXES, load_columns
 
 UNITS = {
     "N": 1.0,
@@ -57,18 +58,23 @@ def reconcile_force(
     columns: Path | None = None,
     seed: int = 1,
     progress: Callable[[str], None] = lambda text: None,
+    plans: Sequence[Plan] = (),
 ) -> tuple[SensorVerdict, float]:
     """Read, analyse and time one sensor.
+
+    Args:
+        plans: programmes of loads that can be applied to decide between look-alikes.
 
     Raises:
         BadInputError: data or model cannot be used.
     """
-    from sioms.reconcile.force.subject import reconcile
-    from sioms.reconcile.sensors.analyse import Options
+    from sioms.reconcile.force.subject import prepare
+    from sioms.reconcile.sensors.analyse import Options, analyse
 
     start = time.monotonic()
     nominal, names = read_model(model)
-    verdict = reconcile(read_loads(data, names, columns), nominal, Options(seed=seed, progress=progress))
+    subject = prepare(read_loads(data, names, columns), nominal, plans)
+    verdict = analyse(subject, Options(seed=seed, progress=progress))
     return verdict, time.monotonic() - start
 
 

@@ -27,14 +27,18 @@ def add_parsers(kinds: Any) -> None:
         "--model", type=Path, metavar="FILE", help="nominal finger (TOML; default: nominal.json in DATA)"
     )
     _live_arguments(tactile)
-    force = kinds.add_parser("force", help="a force/torque sensor, from recorded known loads")
+    force = kinds.add_parser("force", help="a force/torque sensor, from recorded known loads or live")
     force.add_argument(
-        "data", type=Path, metavar="DATA", help="file or folder of recordings, columns.toml beside them"
+        "data",
+        type=Path,
+        metavar="DATA",
+        help="file or folder of recordings, columns.toml beside them, or the node of a sensor",
     )
     force.add_argument("--model", type=Path, metavar="FILE", required=True, help="nominal sensor (TOML)")
     force.add_argument(
         "--columns", type=Path, metavar="FILE", help="column description (default: columns.toml beside DATA)"
     )
+    _loading_arguments(force)
     for parser in (tactile, force):
         parser.add_argument(
             "--out", type=Path, default=Path("report"), metavar="DIR", help="where the report goes"
@@ -88,6 +92,22 @@ def _live_arguments(tactile: argparse.ArgumentParser) -> None:
     group.add_argument("--socket", metavar="PATH", help="the daemon's socket")
 
 
+def _loading_arguments(force: argparse.ArgumentParser) -> None:
+    group = force.add_argument_group("with a node")
+    group.add_argument("--yes", action="store_true", help="move without asking")
+    group.add_argument("--stand", type=Path, metavar="FILE", help="how the sensor can be loaded (TOML)")
+    group.add_argument(
+        "--first", choices=("full", "one"), default="full", help="what is applied before anything is decided"
+    )
+    group.add_argument(
+        "--rest", type=float, default=120.0, metavar="S", help="time without a load, where that decides (120)"
+    )
+    group.add_argument(
+        "--install", type=Path, metavar="FILE", help="write the model there, for a simulated twin, and reload"
+    )
+    group.add_argument("--socket", metavar="PATH", help="the daemon's socket")
+
+
 def run_sensor(args: argparse.Namespace) -> int:
     """Reconcile one sensor from recordings, or score many; return the exit status."""
     # matrices are small: more threads only wait for each other, and badly so on a busy machine
@@ -101,7 +121,7 @@ def run_sensor(args: argparse.Namespace) -> int:
 
     progress = (lambda text: None) if args.quiet else _say
     try:
-        if args.subject == "tactile" and not args.data.exists() and len(args.data.parts) == 1:
+        if not args.data.exists() and len(args.data.parts) == 1 and not args.data.suffix:
             return run_node(args, progress)
         verdict, seconds = _analysed(args, progress)
         _write(verdict, seconds, args)
@@ -112,36 +132,63 @@ def run_sensor(args: argparse.Namespace) -> int:
 
 
 def run_node(args: argparse.Namespace, progress: Any) -> int:
-    """Reconcile the finger behind a node; return the exit status."""
-    from math import radians
-
+    """Reconcile the sensor behind a node; return the exit status."""
     from sioms.reconcile.errors import BadInputError
     from sioms.reconcile.verdict import EXIT
-    from sioms.tools.reconcile_touch import Probe, install, live
     from sioms.tools.stopping import ExperimentStopped
-    from sioms.tools.tactile_prober import Rig
 
-    node = str(args.data)
     if args.model is None:
         raise BadInputError(
-            f"reconcile {node}: it is no folder, and for a node --model is needed: the nominal finger"
+            f"reconcile {args.data}: it is no file or folder, and for a node --model is needed: what it should be"
         )
-    rig = Rig(args.place, args.press, node, args.force, args.length, args.most_load)
-    radii, full = tuple(dict.fromkeys(args.indenters)), args.first == "full"
-    asked = Probe(rig, radii, args.load, radians(args.step), full, args.yes, args.socket, args.seed)
+    run, install = _touching(args) if args.subject == "tactile" else _loading(args)
     try:
-        verdict, seconds = live(args.model, asked, args.out / "records", progress)
+        verdict, seconds = run(args.out / "records", progress)
     except (ExperimentStopped, OSError) as e:
         print(f"stopped: {getattr(e, 'strerror', None) or e}", file=sys.stderr)
         return EXIT_STOPPED
     except KeyboardInterrupt:
-        print(f"stopped: interrupted; {args.press} is clear of the finger or halted", file=sys.stderr)
+        print("stopped: interrupted; what pressed is clear or halted", file=sys.stderr)
         return EXIT_STOPPED
     _write(verdict, seconds, args)
     if args.install is not None:
-        text = (args.out / "finger.toml").read_text(encoding="utf-8")
-        print(install(text, args.install, node, args.socket))
+        print(install())
     return EXIT[verdict.outcome]
+
+
+def _touching(args: argparse.Namespace) -> tuple[Any, Any]:
+    """Return what probes a finger, and what installs its model."""
+    from math import radians
+
+    from sioms.tools.reconcile_touch import Probe, install, live
+    from sioms.tools.tactile_prober import Rig
+
+    node = str(args.data)
+    rig = Rig(args.place, args.press, node, args.force, args.length, args.most_load)
+    radii, full = tuple(dict.fromkeys(args.indenters)), args.first == "full"
+    asked = Probe(rig, radii, args.load, radians(args.step), full, args.yes, args.socket, args.seed)
+
+    def put() -> str:
+        return install(
+            (args.out / "finger.toml").read_text(encoding="utf-8"), args.install, node, args.socket
+        )
+
+    return lambda folder, say: live(args.model, asked, folder, say), put
+
+
+def _loading(args: argparse.Namespace) -> tuple[Any, Any]:
+    """Return what loads a force sensor, and what installs its model."""
+    from sioms.reconcile.errors import BadInputError
+    from sioms.tools.reconcile_load import Load, install, live
+
+    if args.stand is None:
+        raise BadInputError(f"reconcile {args.data}: for a node --stand is needed: how it can be loaded")
+    asked = Load(str(args.data), args.stand, args.first, args.rest, args.yes, args.socket, args.seed)
+
+    def put() -> str:
+        return install((args.out / "model.toml").read_text(encoding="utf-8"), args.install, args.socket)
+
+    return lambda folder, say: live(args.model, asked, folder, say), put
 
 
 def _analysed(args: argparse.Namespace, progress: Any) -> tuple[SensorVerdict, float]:

@@ -6,8 +6,7 @@ commands. It knows nothing of what the finger hides.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,16 +19,10 @@ from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.finger.belief import Belief, Scene
 from sioms.reconcile.finger.plan import Bench, Plan, catalogue, first, indenter, one_place
 from sioms.reconcile.sensors.verdict import Proposal, SensorVerdict
-from sioms.reconcile.verdict import Outcome
+from sioms.tools.experiments import Say, agree, decide, have_done, kept
 from sioms.tools.reconcile_finger import read_model, reconcile_tactile
 from sioms.tools.tactile_prober import Prober, Recorder, Rig, Touch
 
-Say = Callable[[str], None]
-
-#: Separating experiments after the first records; they must tell rivals apart by so many times the noise.
-ROUNDS, LEAST = 2, 2.0
-#: Of experiments that tell rivals apart nearly as well as the best, the one with the fewest touches is made.
-NEARLY = 0.95
 #: Frames of the untouched finger, and what a touch takes [s].
 QUIET, TOUCH_S = 1200, 0.4
 #: Distance kept from the ends of the axis round the finger [rad].
@@ -65,7 +58,7 @@ def live(model: Path, asked: Probe, folder: Path, say: Say) -> tuple[SensorVerdi
 
     Args:
         model: the nominal finger.
-        folder: where the records go, readable as DATA; records of an earlier run there are replaced.
+        folder: where the records go, readable as DATA; they replace those of an earlier run at the end.
 
     Returns:
         The verdict and the seconds of analysis.
@@ -80,13 +73,23 @@ def live(model: Path, asked: Probe, folder: Path, say: Say) -> tuple[SensorVerdi
         bench = bench_of(cell, nominal, asked)
         plan = list(first(nominal, bench, asked.step) if asked.full else one_place(nominal, bench))
         _agree(asked, bench, plan)
-        folder.mkdir(parents=True, exist_ok=True)
-        for old in folder.glob("*.npz"):
-            old.unlink()
-        hand = Hand(cell, asked.rig, bench.radii[0], folder, say)
-        hand.untouched()
-        hand.run(plan)
-        return _decide(hand, model, bench, asked, say)
+        with kept(folder) as fresh:
+            hand = Hand(cell, asked.rig, bench.radii[0], fresh, say)
+            hand.untouched()
+            hand.run(plan)
+            able = {name: (name, text, scene) for name, text, scene in catalogue(nominal, bench)}
+
+            def separate(best: Proposal) -> None:
+                name, text, scene = able[best.name]
+                hand.run([(f"separate_{name}", text, scene)])
+
+            return decide(
+                lambda: reconcile_tactile(fresh, model, asked.seed, say, bench)[0],
+                separate,
+                able,
+                lambda name: len(able[name][2].place),
+                say,
+            )
 
 
 class Hand:
@@ -129,11 +132,9 @@ class Hand:
     def _mount(self, radius: float) -> None:
         if radius == self._mounted:
             return
-        print(f"mount the {indenter(radius)}, clear of the finger, then press Enter", flush=True)
-        if not sys.stdin.readline():
-            raise BadInputError(
-                f"mount the {indenter(radius)}: nobody to ask; give --indenters only what is mounted"
-            )
+        have_done(
+            f"mount the {indenter(radius)}, clear of the finger", "give --indenters only what is mounted"
+        )
         self._mounted = radius
 
 
@@ -187,55 +188,16 @@ def _axis(cell: sioms.Workcell, node: str, unit: str) -> ChannelInfo:
 
 
 def _agree(asked: Probe, bench: Bench, plan: list[Plan]) -> None:
-    """Say what will be done and ask.
-
-    Raises:
-        BadInputError: the answer is not yes, or there is nobody to ask.
-    """
+    """Say what will be done and ask."""
     rig, places = asked.rig, np.concatenate([scene.place for _, _, scene in plan])
     most_n = bench.most * rig.length_m
-    print(
-        f"{rig.place} will go from {places.min():.3g} to {places.max():.3g} rad and {rig.press} press the {indenter(bench.radii[0])} "
-        f"on {rig.finger} with up to {bench.most:g} N/m ({most_n:.3g} N on {rig.force}), for some {TOUCH_S * len(places):.0f} s:"
-    )
-    for name, text, scene in plan:
-        print(f"  {name}: {text}, {len(scene.place)} touches")
-    if asked.yes:
-        return
-    if not sys.stdin.isatty():
-        raise BadInputError(f"probe {rig.finger}: nobody to ask; give --yes to move unattended")
-    if input("the indenter is clear of the finger; move? [yes/no] ").strip().lower() != "yes":
-        raise BadInputError(f"probe {rig.finger}: the answer was not yes; nothing was moved")
-
-
-def _decide(hand: Hand, model: Path, bench: Bench, asked: Probe, say: Say) -> tuple[SensorVerdict, float]:
-    """Analyse; while effects look alike, make the touches that separate them and analyse anew."""
-    nominal, _, _ = read_model(model, model)
-    known = {name: (name, text, scene) for name, text, scene in catalogue(nominal, bench)}
-    done: set[str] = set()
-    spent = 0.0
-    while True:
-        verdict, seconds = reconcile_tactile(hand.folder, model, asked.seed, say, bench)
-        spent += seconds
-        best = _deciding(verdict, known, done)
-        if best is None or len(done) >= ROUNDS:
-            return verdict, spent
-        done.add(best.name)
-        sets = ["+".join(e.name for e in verdict.effects), *("+".join(a) for a in verdict.alternatives)]
-        say(f"not told apart: {' or '.join(sets)}; deciding by {best.text}")
-        name, text, scene = known[best.name]
-        hand.run([(f"separate_{name}", text, scene)])
-
-
-def _deciding(verdict: SensorVerdict, known: dict[str, Plan], done: set[str]) -> Proposal | None:
-    """Return the experiment that would decide, of those that this prober can make and has not made."""
-    if verdict.outcome is not Outcome.AMBIGUOUS:
-        return None
-    open_ = [
-        p for p in verdict.experiments if p.name in known and p.name not in done and p.separation > LEAST
+    told = [
+        f"{rig.place} will go from {places.min():.3g} to {places.max():.3g} rad and {rig.press} press the "
+        f"{indenter(bench.radii[0])} on {rig.finger} with up to {bench.most:g} N/m ({most_n:.3g} N on {rig.force}), for some "
+        f"{TOUCH_S * len(places):.0f} s:",
+        *(f"  {name}: {text}, {len(scene.place)} touches" for name, text, scene in plan),
     ]
-    near = [p for p in open_ if p.separation > NEARLY * open_[0].separation]
-    return min(near, key=lambda p: len(known[p.name][2].place), default=None)
+    agree(f"probe {rig.finger}", told, "the indenter is clear of the finger; move?", asked.yes)
 
 
 def install(text: str, path: Path, node: str, socket: str | None) -> str:

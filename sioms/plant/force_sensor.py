@@ -4,7 +4,7 @@ Components in order: fx, fy, fz [N], tx, ty, tz [N m], about the sensor's origin
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,48 @@ class Contact:
     point: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
+Six = tuple[float, float, float, float, float, float]
+_NONE: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+_SLIDERS = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Flaws:
+    """What a sensor does beyond its data sheet, a number for each component.
+
+    Attributes:
+        gain: relative errors.
+        quadratic: added at the limit, as a share of it, with the square of the load.
+        drift: of the zero [N/s, N m/s].
+        cross_talk: rows of a matrix applied to the true components and added; None for none.
+        loop: half heights of the hysteresis loop, as shares of the limit; reach: share over which it turns round.
+    """
+
+    gain: Six = _NONE
+    quadratic: Six = _NONE
+    drift: Six = _NONE
+    cross_talk: tuple[Six, Six, Six, Six, Six, Six] | None = None
+    loop: Six = _NONE
+    reach: float = 0.1
+
+
+@dataclass(slots=True)
+class _Sliders:
+    """Springs on dry friction: each stretches with the load until it slides."""
+
+    flaws: Flaws
+    stretch: Array = field(default_factory=lambda: np.zeros((_SLIDERS, 6)))
+    last: Array = field(default_factory=lambda: np.zeros(6))
+
+    def move(self, share: Array) -> Array:
+        """Return what they hold back, as shares of the limit, at a load as a share of it."""
+        slip = self.flaws.reach * (np.arange(_SLIDERS) + 0.5)[:, None] / _SLIDERS
+        self.stretch = np.clip(self.stretch + share - self.last, -slip, slip)
+        self.last = share.copy()
+        held: Array = np.array(self.flaws.loop) * np.mean(self.stretch / slip, axis=0)
+        return held
+
+
 class ForceSensor:
     """Turns contact forces into six readings.
 
@@ -38,6 +80,7 @@ class ForceSensor:
         limit: readings saturate at this magnitude.
         cross_talk: shape (6, 6), applied to the true components; the identity when None.
         seed: of the noise.
+        flaws: beyond the data sheet; they need a limit where they are shares of it.
     """
 
     def __init__(
@@ -49,9 +92,13 @@ class ForceSensor:
         limit: float | Sequence[float] = np.inf,
         cross_talk: Array | None = None,
         seed: int = 0,
+        flaws: Flaws | None = None,
     ) -> None:
-        wrenches = np.array([_wrench(contact) for contact in contacts]).reshape(-1, 6).T
-        self._wrenches = wrenches if cross_talk is None else cross_talk @ wrenches
+        self._wrenches = np.array([_wrench(contact) for contact in contacts]).reshape(-1, 6).T
+        self._matrix = cross_talk
+        self._flaws = flaws
+        self._sliders = None if flaws is None else _Sliders(flaws)
+        self._began_s: float | None = None
         self._noise, self._step, self.bias, self._limit = (
             np.broadcast_to(np.asarray(v, dtype=np.float64), 6).copy()
             for v in (noise, resolution, bias, limit)
@@ -62,10 +109,31 @@ class ForceSensor:
         self._random = np.random.default_rng(seed)
         self._work = np.zeros(6)
 
-    def read(self, forces: Array, out: Array) -> Array:
-        """Fill out, shape (6,), from the contact forces [N], one for each contact."""
-        np.matmul(self._wrenches, forces, out=out)
-        np.add(out, self.bias, out=out)
+    def load(self, forces: Array) -> Array:
+        """Return the true components, shape (6,), of the contact forces [N], one for each contact."""
+        out: Array = self._wrenches @ forces
+        return out
+
+    def read(self, forces: Array, out: Array, time_s: float = 0.0) -> Array:
+        """Fill out, shape (6,), from the contact forces [N] at a time [s], which only drift asks for."""
+        return self.electronics(self._felt(self.load(forces), time_s), out)
+
+    def _felt(self, load: Array, time_s: float) -> Array:
+        felt = load if self._matrix is None else self._matrix @ load
+        if self._flaws is None or self._sliders is None:
+            return felt
+        if self._began_s is None:
+            self._began_s = time_s
+        flaws, share = self._flaws, load / self._limit
+        out: Array = felt + np.array(flaws.gain) * load + np.array(flaws.drift) * (time_s - self._began_s)
+        if flaws.cross_talk is not None:
+            out += np.array(flaws.cross_talk) @ load
+        out += self._limit * (np.array(flaws.quadratic) * share**2 - self._sliders.move(share))
+        return out
+
+    def electronics(self, felt: Array, out: Array) -> Array:
+        """Fill out, shape (6,), with bias, noise, range and steps about what is felt [N, N m]."""
+        np.add(felt, self.bias, out=out)
         self._random.standard_normal(out=self._work)
         np.multiply(self._work, self._noise, out=self._work)
         np.add(out, self._work, out=out)
