@@ -8,9 +8,9 @@ Column description (``columns.toml`` beside the data, or ``--columns``)::
     final = ["run9.csv"]             # optional: whole records that only the final statement sees
     [columns]
     time           = { name = "t",    unit = "s" }
-    position       = { name = "qm",   unit = "m" }       # m mm um rad deg turn count
-    command        = { name = "qg",   unit = "m" }
-    force          = { name = "vir",  unit = "N", scale = 35.15 }  # N mN kN, N m, mN m; value * scale
+    position       = { name = "qm",   unit = "m" }       # m mm um rad deg turn count ...
+    command        = { name = "qg" }                     # unit as the head of the column states it: "qg [mm]"
+    force          = { name = "vir",  unit = "V", scale = 35.15 }  # N mN kN, N m, mN m ...; value * scale
     force_measured = { name = "cur",  unit = "N" }
     index          = { name = "idx" }
 
@@ -20,8 +20,9 @@ A column that the data do not have, or a key that nobody reads, is an error.
 from __future__ import annotations
 
 import json
+import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,12 +34,18 @@ from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.model_file import only, parse_model
 from sioms.reconcile.records import Record, Session
+from sioms.tools.reconcile_table import SUFFIXES, UNITS, load_table, measures, named, unit_of
 
 Array = NDArray[np.float64]
-UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "rad": 1.0, "deg": np.pi / 180.0, "turn": 2.0 * np.pi, "s": 1.0, "ms": 1e-3,
-         "us": 1e-6, "ns": 1e-9, "N": 1.0, "mN": 1e-3, "kN": 1e3, "N m": 1.0, "mN m": 1e-3, "V": 1.0, "A": 1.0, "1": 1.0}
+#: Words in the head of a column that tell what it probably is.
+WORDS = {"time": ("t", "time", "zeit", "stamp"), "position": ("pos", "position", "enc", "encoder", "angle", "actual", "q", "qm", "counts"),
+         "command": ("cmd", "command", "ref", "reference", "set", "setpoint", "target", "qg"),
+         "force_measured": ("current", "cur", "i", "iq", "measured"), "force": ("force", "torque", "u", "effort", "out", "output", "tau"),
+         "index": ("index", "z", "mark")}
 QUANTITIES = ("time", "position", "command", "force", "force_measured", "index")
-SUFFIXES = (".csv", ".npz", ".mat", ".txt")
+#: What each quantity may be measured in, on a rotary and on a linear axis.
+ROTARY = {"time": "time", "position": "angle", "command": "angle", "force": "torque", "force_measured": "torque", "index": "number"}
+LINEAR = {**ROTARY, "position": "length", "command": "length", "force": "force", "force_measured": "force"}
 
 
 def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Session:
@@ -58,13 +65,19 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
     if columns is None and data.is_dir() and list(data.glob("rec_*.npz")) and not description.exists():
         return read_layout(data, model)
     if not description.exists():
-        raise BadInputError(f"read {data}: no column description; write {description.name} beside it or give --columns")
+        files = _files(data)
+        if not files:
+            raise BadInputError(f"read {data}: no data files; expects one of {', '.join(SUFFIXES)}")
+        raise BadInputError(f"read {data}: no column description (or give --columns): {_draft(files, description)}")
     with description.open("rb") as f:
         try:
             table = tomllib.load(f)
         except tomllib.TOMLDecodeError as e:
             raise BadInputError(f"read {description}: {e}") from e
     only(table, ("sample_time_s", "files", "continuous", "final", "columns"), str(description))
+    given = float(table.get("sample_time_s", model.sample_time_s))
+    if not 0.98 < given / model.sample_time_s < 1.02:
+        raise BadInputError(f"read {description}: sample_time_s is {given:g}, the model says {model.sample_time_s:g}; needs the same")
     last = [folder / n for n in table.get("final", ())]
     files = [folder / n for n in table["files"]] if "files" in table else [f for f in _files(data) if f not in last]
     if not files:
@@ -77,65 +90,62 @@ def _files(data: Path) -> list[Path]:
     return [data] if data.is_file() else sorted(p for p in data.iterdir() if p.suffix in SUFFIXES)
 
 
-def load_columns(path: Path) -> dict[str, Array]:
-    """Read the columns of one file."""
-    if not path.exists():
-        raise BadInputError(f"read {path}: no such file")
-    if path.suffix == ".npz":
-        with np.load(path, allow_pickle=False) as z:
-            return {k: np.asarray(z[k], dtype=np.float64) for k in z.files if z[k].ndim == 1}
-    if path.suffix == ".mat":
-        from scipy.io import loadmat
-
-        raw = loadmat(path, squeeze_me=True)
-        return {k: np.asarray(v, dtype=np.float64) for k, v in raw.items()
-                if not k.startswith("__") and np.ndim(v) == 1}
-    with path.open() as f:
-        head = f.readline()
-    sign = next((c for c in ",;\t" if c in head), ",")
-    names = [n.strip().strip('"') for n in head.split(sign)]
-    try:
-        table = np.loadtxt(path, delimiter=sign, skiprows=1, ndmin=2)
-    except ValueError as e:
-        raise BadInputError(f"read {path}: {e}; needs one head line of names and numbers below") from e
-    if table.shape[1] != len(names):
-        raise BadInputError(f"read {path}: {len(names)} names over {table.shape[1]} columns")
-    return {n: np.ascontiguousarray(table[:, i]) for i, n in enumerate(names)}
-
-
 def _record(path: Path, columns: Mapping[str, Any], model: AxisModel) -> Record:
-    raw = load_columns(path)
+    table = load_table(path)
     only(columns, QUANTITIES, "the column description")
+    for needed in ("position", "force"):
+        if needed not in columns:
+            raise BadInputError(f"read {path.name}: the column description names no {needed}; it is needed")
     found: dict[str, Array] = {}
     for quantity, spec in columns.items():
         only(spec, ("name", "unit", "scale", "offset"), f"column {quantity}")
-        if spec.get("name") not in raw:
-            raise BadInputError(f"read {path.name}: no column {spec.get('name')!r} for {quantity}; has {', '.join(sorted(raw))}")
-        found[quantity] = _convert(quantity, raw[spec["name"]], spec, model)
-    for needed in ("position", "force"):
-        if needed not in found:
-            raise BadInputError(f"read {path.name}: the column description names no {needed}; it is needed")
+        head = table.find(str(spec.get("name")))
+        if head is None:
+            raise BadInputError(f"read {path.name}: no column {spec.get('name')!r} for {quantity}; has {', '.join(sorted(table.columns))}")
+        found[quantity] = _convert(quantity, table.columns[head], spec, table.units.get(head), model)
     index = found.get("index")
     return Record(path.stem, found["position"], found["force"], found.get("command"), found.get("force_measured"),
                   None if index is None else index > 0.5, found.get("time"))
 
 
-def _convert(quantity: str, raw: Array, spec: Mapping[str, Any], model: AxisModel) -> Array:
-    unit = spec.get("unit", "1")
-    if unit == "count":
-        factor = model.resolution
-    elif unit in UNITS:
-        factor = UNITS[unit]
-    else:
-        raise BadInputError(f"read column {quantity}: unit {unit!r} is not known; known are count, {', '.join(UNITS)}")
+def _convert(quantity: str, raw: Array, spec: Mapping[str, Any], stated: str | None, model: AxisModel) -> Array:
+    """Bring a column to SI; its unit is what the description says, else what the head of the column states."""
+    where = f"read column {quantity}"
+    unit = unit_of(str(spec.get("unit", stated or "1")))
+    if unit is None:
+        known = ", ".join(["count", *(u for kind, group in UNITS.items() if kind != "speed" for u in group)])
+        raise BadInputError(f"{where}: unit {spec['unit']!r} is not known; known are {known}")
+    if stated not in (None, unit) and "scale" not in spec and unit != "1":
+        raise BadInputError(f"{where}: the description says {unit}, the head of the column {spec['name']!r} {stated}; which is it?")
+    kind, right = measures(unit), (ROTARY if model.rotary else LINEAR)[quantity]
+    if kind not in (right, "number", "count") and "scale" not in spec:
+        hint = "give scale = ..., what one unit of it is in SI units" if kind == "electric" else f"needs one of {', '.join(UNITS[right])}"
+        raise BadInputError(f"{where}: {unit} is a unit of {kind}, the {quantity} of a {'rotary' if model.rotary else 'linear'} axis is "
+                            f"{'an' if right == 'angle' else 'a'} {right}; {hint}")
+    factor = model.resolution if kind == "count" else UNITS[kind][unit]
+    if kind == "count" and factor <= 0.0:
+        raise BadInputError(f"{where}: it is in counts, and the model states no resolution; give resolution = ... in [axis]")
     return np.asarray((raw * float(spec.get("scale", 1.0)) + float(spec.get("offset", 0.0))) * factor, dtype=np.float64)
+
+
+def _draft(files: Sequence[Path], description: Path) -> str:
+    """Propose a column description from the heads of the first file, for a person to complete."""
+    table = load_table(files[0])
+    lines = ["[columns]"]
+    for head in table.columns:
+        name, unit = named(head)
+        unit = table.units.get(head, unit)
+        guess = next((q for q, words in WORDS.items() if any(w in re.split(r"[\W_]+", name.lower()) for w in words)), "QUANTITY")
+        lines.append(f'{guess} = {{ name = "{head}", unit = "{unit or "UNIT"}" }}')
+    return (f"write {description} with what each column is ({', '.join(QUANTITIES)}; position and force are needed, leave out the "
+            "others), for instance\n    " + "\n    ".join(lines))
 
 
 def read_layout(folder: Path, model: AxisModel) -> Session:
     """Read ``rec_*.npz`` with counts, cmd16, force, force_meas and index."""
     records = []
     for path in sorted(folder.glob("rec_*.npz")):
-        raw = load_columns(path)
+        raw = load_table(path).columns
         for needed in ("counts", "force"):
             if needed not in raw:
                 raise BadInputError(f"read {path.name}: no array {needed}; has {', '.join(sorted(raw))}")

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from sioms.reconcile.effect import Array
@@ -40,8 +41,7 @@ class Finding:
 
 def lattice(session: Session, model: AxisModel) -> Finding | None:
     """Find the largest number of which (nearly) all count differences are multiples."""
-    steps = np.concatenate([np.diff(np.rint(r.position / model.resolution).astype(np.int64)) for r in
-                            session.records])
+    steps = np.concatenate([_count_steps(r, model.resolution) for r in session.records])
     moved = np.abs(steps[steps != 0])
     if len(moved) < 20:
         return None
@@ -55,6 +55,13 @@ def lattice(session: Session, model: AxisModel) -> Finding | None:
     share = times[sizes % best == 0].sum() / times.sum()
     return Finding("encoder_quantisation", {"factor": float(best)}, {"factor": 0.0},
                    f"{100 * share:.1f} % of {len(moved)} position changes are multiples of {best} counts")
+
+
+def _count_steps(record: Record, resolution: float) -> NDArray[np.int64]:
+    """Differences in counts of neighbours that were both measured."""
+    counts = np.rint(record.position / resolution).astype(np.int64)
+    steps: NDArray[np.int64] = counts[1:] - counts[:-1]
+    return steps if record.filled is None else steps[~(record.filled[1:] | record.filled[:-1])]
 
 
 def index_scale(session: Session, model: AxisModel) -> Finding | None:

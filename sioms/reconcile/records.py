@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ class Record:
         force_measured: drive current times the nominal constant, mean over each sample, or None.
         index: True where an index mark was passed during the sample, or None.
         time_s: time stamps, or None where the sample time is taken on trust.
+        filled: True where a sample was lost and is interpolated, or None.
     """
 
     name: str
@@ -31,6 +33,7 @@ class Record:
     force_measured: Array | None = None
     index: NDArray[np.bool_] | None = None
     time_s: Array | None = None
+    filled: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.position)
@@ -38,13 +41,9 @@ class Record:
     def cut(self, start: int, stop: int) -> Record:
         """Return samples start..stop."""
 
-        def part(a: Array | None) -> Array | None:
-            return None if a is None else a[start:stop]
-
-        index = None if self.index is None else self.index[start:stop]
-        return replace(self, position=self.position[start:stop], force=self.force[start:stop],
-                       command=part(self.command), force_measured=part(self.force_measured), index=index,
-                       time_s=part(self.time_s))
+        arrays: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
+        parts: dict[str, Any] = {k: None if a is None else a[start:stop] for k, a in arrays.items()}
+        return Record(self.name, **parts)
 
 
 @dataclass(frozen=True, slots=True)
