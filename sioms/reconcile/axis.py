@@ -20,15 +20,16 @@ from sioms.reconcile.effects import known, library
 from sioms.reconcile.effects.terms import TERM_PREFIX, TERMS
 from sioms.reconcile.excitation import Gate, gate
 from sioms.reconcile.experiment import Envelope, Experiment, separate
-from sioms.reconcile.fit import BASE, Fit, Mapper, Problem, refit
+from sioms.reconcile.fit import BASE, SKIP, SKIP_S, Fit, Mapper, Problem, refit
 from sioms.reconcile.gaps import lap, measure, rungs, session_states
 from sioms.reconcile.locate import Place, Spectrum, locate, spectra
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, effective_samples, observer, sensor_noise
 from sioms.reconcile.records import Session
-from sioms.reconcile.refuse import bursts, smoother_share
+from sioms.reconcile.refuse import bursts, smoother_rest, smoother_share
 from sioms.reconcile.search import GAIN, Found, Searcher
 from sioms.reconcile.simulate import replay
+from sioms.reconcile.timing import on_grid
 from sioms.reconcile.verdict import Estimate, NamedEffect, Outcome, Trace, Verdict
 
 #: Share at the end of every record that takes no part in any choice.
@@ -153,7 +154,8 @@ def _search(ready: Prepared, names: tuple[str, ...], o: Options) -> tuple[Prepar
 
 def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     """Check the input, read the noise floor and go through the channels."""
-    notes = list(check(session, nominal))
+    session, notes = on_grid(session, nominal.sample_time_s)
+    notes += check(session, nominal)
     if session.final:
         check(Session(session.final), nominal)
     o.progress("channels: sensor, then drive")
@@ -170,7 +172,8 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     late = next((f.values["delay"] for f in driven if f.effect == "delay"), 0.0)
     noise = observer(nominal, sensor_noise(session, nominal.resolution * factor),
                      drive_noise(session, nominal.rated_force, round(late / nominal.sample_time_s)))
-    problem = Problem(session, noise, end=1.0 if session.final else 1.0 - UNTOUCHED, mapper=o.mapper)
+    skip = max(SKIP, round(SKIP_S / nominal.sample_time_s))
+    problem = Problem(session, noise, skip, end=1.0 if session.final else 1.0 - UNTOUCHED, mapper=o.mapper)
     check_scale(problem, nominal)
     problem = _calibrated(problem, session, model)
     excluded = {"encoder_quantisation"}
@@ -198,8 +201,9 @@ def _resampled(problem: Problem, model: AxisModel, seed: int) -> Problem:
 def _calibrated(problem: Problem, session: Session, model: AxisModel) -> Problem:
     """Where no force was measured, set the drive noise to what the innovations show.
 
-    Laps give it free of any model error (difference over sqrt 2); without laps the quietest quarter of the
-    time does, after a first refit.
+    Laps give it free of any model error (difference over sqrt 2). Without laps it is what the quietest quarter of the
+    time holds, after a first refit, of what no smooth function of the state explains: Coulomb friction, alike
+    everywhere, would else pass for noise.
     """
     if any(r.force_measured is not None for r in session.records):
         return problem
@@ -218,7 +222,7 @@ def _calibrated(problem: Problem, session: Session, model: AxisModel) -> Problem
         else:
             fit = refit(problem, model, iterations=3)
             ids = block_ids(problem, model.sample_time_s, 0.1)
-            energy = np.bincount(ids, weights=fit.residual**2) / np.bincount(ids)
+            energy = np.bincount(ids, weights=smoother_rest(problem, fit) ** 2) / np.bincount(ids)
             excess = float(np.sqrt(np.quantile(energy, 0.25)))
         least = LEAST_DRIVE * model.rated_force
         drive = float(np.clip(problem.noise.drive * excess, least, None))

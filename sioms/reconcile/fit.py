@@ -24,8 +24,8 @@ from sioms.reconcile.simulate import Run, pack, track
 #: ``map``, or the like of an executor.
 Mapper = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 BASE = "base"
-SKIP_S = 0.05
-
+#: Samples, and seconds, at the start of a record in which the observer finds the state.
+SKIP, SKIP_S = 50, 0.05
 
 #: A model whose friction falls with speed has two speeds at which it agrees with a force. It has lost the measurement
 #: where the innovation stays this many times over the expected one, and over its own median, for so many samples.
@@ -56,7 +56,7 @@ class Problem:
 
     session: Session
     noise: Noise
-    skip: int = 50
+    skip: int = SKIP
     begin: float = 0.0
     end: float = 1.0
     weights: Array | None = None

@@ -72,26 +72,31 @@ def basis(motions: list[Motion], model: AxisModel, dead: float) -> list[Array]:
     return out
 
 
-def smoother_share(problem: Problem, fit: Fit, folds: int = 5) -> float:
+def smoother_share(problem: Problem, fit: Fit) -> float:
     """Share of the residual's energy that the generic smoother explains on blocks it has not seen."""
+    rest = smoother_rest(problem, fit)
+    return 1.0 - float(rest @ rest) / float(fit.residual @ fit.residual)
+
+
+def smoother_rest(problem: Problem, fit: Fit, folds: int = 5) -> Array:
+    """Residual that the generic smoother leaves on blocks it has not seen, shape (n,); the residual itself where it explains nothing."""
     motions = instrument_motion(problem, fit.model)
     columns = basis(motions, fit.model, dead_band(problem, fit.model))
     f = problem.join([response(fit.model, problem.noise, c) for c in columns]) / problem.noise.innovation
     size = np.sqrt(np.mean(f**2, axis=0))
     f = f[:, size > 1e-12] / size[size > 1e-12]
-    ids = block_ids(problem, fit.model.sample_time_s)
-    fold = ids % folds
+    fold = block_ids(problem, fit.model.sample_time_s) % folds
     r = fit.residual
-    best = 0.0
+    best = r
     grams = [(f[fold == i].T @ f[fold == i], f[fold == i].T @ r[fold == i]) for i in range(folds)]
     for ridge in RIDGES:
-        left = 0.0
+        left = np.empty_like(r)
         for i in range(folds):
             h = sum((g[0] for k, g in enumerate(grams) if k != i), np.zeros_like(grams[0][0]))
             y = sum((g[1] for k, g in enumerate(grams) if k != i), np.zeros_like(grams[0][1]))
             c = np.linalg.solve(h + ridge * len(r) * 1e-2 * np.eye(len(h)), y)
-            left += float(np.sum((r[fold == i] - f[fold == i] @ c) ** 2))
-        best = max(best, 1.0 - left / float(r @ r))
+            left[fold == i] = r[fold == i] - f[fold == i] @ c
+        best = min(best, left, key=lambda e: float(e @ e))
     return best
 
 

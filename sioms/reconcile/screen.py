@@ -29,6 +29,8 @@ GRID_GAP = tuple(float(g) for g in np.geomspace(3e-4, 6e-2, 20))
 GRID_LIMIT = (0.95, 0.85, 0.7, 0.5, 0.3)
 GRID_TAU = (3.0, 10.0, 40.0)
 SPEED_STEPS = 7
+#: Below this the measured motion stands for one without noise; a command is followed up to COMMAND_HZ, if to this share.
+SLOW_HZ, COMMAND_HZ, FOLLOWED = 5.0, 30.0, 0.2
 STATE_SLOTS = (Slot.FORCE, Slot.FRICTION, Slot.GAIN, Slot.MODULATION)
 
 
@@ -61,13 +63,13 @@ def smoothed_motion(problem: Problem, model: AxisModel, cutoff_hz: float = 0.0) 
     dt = model.sample_time_s
     if cutoff_hz <= 0.0:
         cutoff_hz = float(np.clip(3.0 * np.sqrt(problem.noise.gain[1] / dt) / (2.0 * np.pi), 10.0, 150.0))
-    sos = butter(3, min(2.0 * cutoff_hz * dt, 0.8), output="sos")
     out = []
     for record, run in zip(problem.session.records, problem.runs(model), strict=True):
-        x = sosfiltfilt(sos, record.position, padtype="odd", padlen=min(300, len(record) - 1))
+        x = _low_passed(record.position, cutoff_hz, dt)
         v = np.gradient(x, dt)
         a = np.gradient(v, dt)
-        out.append(Motion(x, v, a, run.applied, run.temperature))
+        force = run.applied if cutoff_hz > SLOW_HZ else _low_passed(run.applied, cutoff_hz, dt)
+        out.append(Motion(x, v, a, force, run.temperature))
     return out
 
 
@@ -166,18 +168,40 @@ def screen(problem: Problem, fit: Fit, names: list[str], levels: Mapping[str, fl
 
 
 def instrument_motion(problem: Problem, model: AxisModel) -> list[Motion]:
-    """Return the motion of the simulated closed loop, which carries none of the noise of the measurement.
+    """Return a motion that carries (nearly) none of the noise of the measurement.
 
-    Falls back to the smoothed measurement where there is no controller or command to simulate.
+    That of the simulated closed loop; without a controller to simulate that of the command, where the axis follows it;
+    without a command the measured one, below ``SLOW_HZ``: faster, force and acceleration hold the noise itself.
     """
     records = problem.session.records
-    if model.controller is None or any(r.command is None for r in records):
-        return smoothed_motion(problem, model)
+    commands = [r.command for r in records if r.command is not None]
+    if len(commands) < len(records):
+        return smoothed_motion(problem, model, SLOW_HZ)
+    if model.controller is None:
+        error = np.concatenate([r.position - c for r, c in zip(records, commands, strict=True)])
+        if np.std(error) > FOLLOWED * np.std(np.concatenate(commands)):
+            return smoothed_motion(problem, model, SLOW_HZ)
+        return [_moved_by(model, c) for c in commands]
     out, temperature = [], 0.0
     for r in records:
         run = replay(model, r, temperature)
         temperature = run.end_temperature if problem.session.continuous else 0.0
         out.append(Motion(run.x, run.v, np.gradient(run.v, model.sample_time_s), run.applied, run.temperature))
+    return out
+
+
+def _moved_by(model: AxisModel, command: Array) -> Motion:
+    """Motion, and force of the rigid axis, of an axis that follows its command."""
+    dt = model.sample_time_s
+    x = _low_passed(command, COMMAND_HZ, dt)
+    v = np.gradient(x, dt)
+    a = np.gradient(v, dt)
+    return Motion(x, v, a, model.inertia * a + model.viscous * v, np.zeros_like(x))
+
+
+def _low_passed(x: Array, cutoff_hz: float, dt: float) -> Array:
+    sos = butter(3, min(2.0 * cutoff_hz * dt, 0.8), output="sos")
+    out: Array = sosfiltfilt(sos, x, padtype="odd", padlen=min(int(max(300, 0.5 / (cutoff_hz * dt))), len(x) - 1))
     return out
 
 

@@ -322,15 +322,20 @@ def simplest(good: dict[str, tuple[Fit, Array, float, float]]) -> str:
 
 
 def physical(fit: Fit, name: str) -> bool:
-    """Say whether the amplitude of an effect has left its lower bound."""
-    effect = known()[name]
+    """Say whether an effect stays within its bounds: a number that leans on one belongs to something else.
+
+    The stiffness and damping of a contact may: harder than what is seen is as good as hard. So may a time constant.
+    """
+    effect, given = known()[name], fit.model.effects[name]
+    free = [q for q in effect.parameters if not q.phase and not q.fixed]
+    for q in [effect.primary] if effect.slot in (Slot.BACKLASH, Slot.THERMAL) else free:
+        low, high = (bound * fit.model.scale(q) for bound in (q.lower, q.upper))
+        if given[q.symbol] > 0.98 * high or (q.lower < 0.0 and given[q.symbol] < 0.98 * low):
+            return False
     p, scale = effect.primary, fit.model.scale(effect.primary)
-    value = fit.model.effects[name][p.symbol]
-    if effect.slot in (Slot.LIMIT, Slot.ELASTIC):
-        return value < 0.98 * p.upper * scale
-    if p.lower < 0.0 or effect.slot is Slot.SCALE:
+    if p.lower < 0.0 or effect.slot in (Slot.SCALE, Slot.LIMIT, Slot.ELASTIC):
         return True
-    return value > max(p.lower, 1e-4 * p.start) * scale * 1.01
+    return given[p.symbol] > max(p.lower, 1e-4 * p.start) * scale * 1.01
 
 
 def polish(problem: Problem, model: AxisModel, frozen: Sequence[str]) -> Fit:

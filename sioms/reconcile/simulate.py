@@ -196,6 +196,12 @@ def replay(model: AxisModel, record: Record, temperature: float = 0.0) -> Run:
     return _march(p, True, command, command, command, controller_row(model), (0.0, 0.0), start)
 
 
+def _first_speed(position: Array, dt: float) -> float:
+    """Speed at the first sample of a record, which may begin in motion: of a parabola through the first 20 ms."""
+    n = min(max(8, round(0.02 / dt)), len(position))
+    return float(np.polyfit(np.arange(n) * dt, position[:n] - position[0], 2)[1]) if n > 2 else 0.0
+
+
 def track(model: AxisModel, position: Array, force: Array, gain: tuple[float, float],
           temperature: float = 0.0, packed: Packed | None = None, lost: float = np.inf) -> Run:
     """Drive the plant with a recorded force while an observer holds it on the recorded position.
@@ -212,5 +218,5 @@ def track(model: AxisModel, position: Array, force: Array, gain: tuple[float, fl
     y = np.ascontiguousarray(position, dtype=np.float64)
     u = np.ascontiguousarray(force, dtype=np.float64)
     p = packed or pack(model)
-    start = np.array([y[0] / p.plant[k.GAIN_Y], 0.0, temperature, 0.0, 0.0])
+    start = np.array([y[0] / p.plant[k.GAIN_Y], _first_speed(y, model.sample_time_s) / p.plant[k.GAIN_Y], temperature, 0.0, 0.0])
     return _march(p, False, y, y, u, np.zeros(k.CTL_SIZE), gain, start, lost)
