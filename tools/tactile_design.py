@@ -35,6 +35,12 @@ def design(args: argparse.Namespace) -> int:
         )
     if args.elements < 4:
         raise ValueError(f"design finger: {args.elements} elements; need at least 4")
+    if not 0.0 < args.pitch_deg * (args.elements - 1) < 360.0:
+        raise ValueError(
+            f"design finger: {args.elements} elements {args.pitch_deg:g} deg apart; need a positive pitch and less than a turn"
+        )
+    if not 0.0 < args.noise_percent < math.inf:
+        raise ValueError(f"design finger: noise of {args.noise_percent:g} %; need a positive number")
     progress = Progress()
     angles = np.radians(args.pitch_deg) * (np.arange(args.elements) - 0.5 * (args.elements - 1)) + np.pi / 2
     finger = nominal_finger(body, angles, radius, 1.0, 0.01 * args.noise_percent, "design")

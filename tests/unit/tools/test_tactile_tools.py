@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -11,13 +12,15 @@ import numpy as np
 import pytest
 
 from sioms.tactile.cylinder import FINGER_B
+from sioms.tactile.design import conditioning, predicted_errors
 from sioms.tactile.emap import e_map
 from sioms.tactile.estimator import Estimator
-from sioms.tactile.finger import from_toml
+from sioms.tactile.finger import from_toml, nominal_finger
 from sioms.tactile.sensing import CHANNELS, LoadTare, ShapeSensor, numbers
 from sioms.tactile.series import line_load
 from sioms.tools import tactile
 from sioms.tools.report_page import Page
+from sioms.tools.tactile_claims import chapter_2
 from sioms.tools.tactile_experiment import RADII_M, plan
 from sioms.tools.tactile_tables import Tables, calibrated
 
@@ -186,7 +189,37 @@ def test_design_refuses_what_cannot_be_built(tmp_path: Path, capsys: pytest.Capt
     assert (
         "elements 4.0 mm deep are at radius 8.7 mm; need between 9.6 and 12.7 mm" in capsys.readouterr().err
     )
+    for words, answer in (
+        (("--pitch-deg", "-9"), "16 elements -9 deg apart; need a positive pitch"),
+        (("--pitch-deg", "30"), "less than a turn"),
+        (("--noise-percent", "0"), "noise of 0 %; need a positive number"),
+        (("--poisson", "0.6"), "Poisson's ratio"),
+        (("--elements", "3"), "need at least 4"),
+    ):
+        assert command("design", *words, "-o", str(tmp_path / "d.html")) == 1
+        assert answer in capsys.readouterr().err
     assert not (tmp_path / "d.html").exists()
+
+
+def test_design_tells_conditioning_and_what_noise_leaves() -> None:
+    """Known: condition 2.79 of the published finger; deviations go with the noise and fall with the load."""
+    finger = nominal_finger(FINGER_B, np.radians(ANGLES), 10.3e-3, 1.0, 1e-3)
+    assert conditioning(FINGER_B, np.radians(ANGLES), 10.3e-3, 0.46) == pytest.approx([2.78769], rel=5e-3)
+    coarse = predicted_errors(finger, [100.0, 200.0], [6e-3], 3)
+    quiet = nominal_finger(FINGER_B, np.radians(ANGLES), 10.3e-3, 1.0, 5e-4)
+    fine = predicted_errors(quiet, [100.0, 200.0], [6e-3], 3)
+    for more, less in zip(
+        (coarse.angle, coarse.load, coarse.radius), (fine.angle, fine.load, fine.radius), strict=True
+    ):
+        assert less == pytest.approx(0.5 * more, rel=1e-3)
+    assert coarse.angle[1, 0] < 0.6 * coarse.angle[0, 0] and coarse.radius[1, 0] < 0.7 * coarse.radius[0, 0]
+
+
+def test_published_claims_are_judged_by_their_numbers() -> None:
+    """All of the first eight reproduce but the -40 dB frequency at alpha = 0.90, which is the -20 dB value."""
+    claims = list(itertools.islice(chapter_2(), 8))
+    assert [claim.holds for claim in claims] == [True] * 7 + [False]
+    assert claims[-1].where == "2.5.2" and "the -20 dB value is 12.3" in claims[-1].computed
 
 
 def test_page_escapes_and_colours(tmp_path: Path) -> None:
