@@ -79,11 +79,14 @@ class Inbox:
             commands = [c for c in write.commands if not self._queue.is_barred(c.axis)]
             if not commands:
                 continue
+            axes = np.array(sorted({c.axis for c in commands}), dtype=np.int64)
             if write.replace:
-                self._sequencer.drop(np.unique([c.axis for c in commands]).astype(np.int64))
-                self._sequencer.replaced(self._queue.append_plain(commands), at_ns)
+                self._sequencer.drop(axes)
+            self._queue.append_plain(commands, axes)
+            if write.replace:
+                self._sequencer.replaced(axes, at_ns)
             else:
-                self._sequencer.appended(self._queue.append_plain(commands), at_ns)
+                self._sequencer.appended(axes, at_ns)
 
     def forget(self, axes: NDArray[np.int64]) -> None:
         """Drop the writes to these axes."""

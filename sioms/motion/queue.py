@@ -202,8 +202,8 @@ class CommandQueue:
         latched: int = self.latched.item(axis)
         return latched & BARRED != 0 or (self.home_required.item(axis) and not latched & HOMED)
 
-    def append_plain(self, commands: Sequence[Command]) -> NDArray[np.int64]:
-        """Take plain commands; return the axes touched, each of which now has a head."""
+    def append_plain(self, commands: Sequence[Command], axes: NDArray[np.int64]) -> None:
+        """Take plain commands of these axes, each of which has a head then."""
         tail = self.tail
         for command in commands:
             axis, mode = command.axis, command.control_mode
@@ -211,9 +211,7 @@ class CommandQueue:
             if mode & modes.MAX_VEL_ACC:
                 tail.velocity[axis], tail.acceleration[axis] = command.max_velocity, command.max_acceleration
         self._buffers.append_commands(commands)
-        touched = np.unique([command.axis for command in commands]).astype(np.int64)
-        self.load_heads(touched)
-        return touched
+        self.load_heads(axes)
 
     def forget_tail(self, axes: NDArray[np.int64]) -> None:
         """The buffers of these axes were emptied: what follows begins in a state not known here."""

@@ -124,8 +124,7 @@ class Sequencer:
         rows = self.store.row[axes]
         self._row_signals[rows] = self._row_checked[rows] = self._row_taken[rows] = False
         self.store.cut(axes, now_ns)
-        self.advance(now_ns)
-        self.refresh(axes)
+        self.advance(now_ns)  # all of these plans end now, and what follows is what refreshes
 
     def release(self, axes: Axes, start_ns: int) -> None:
         """End the open-ended plans of these axes at start_ns where the head has no gate (any more)."""

@@ -8,6 +8,7 @@ is carried from command to command, so that a trajectory of many pieces does not
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ UNCUT_NS = 2**63 - 1
 FEW = 4
 """Axes up to which one by one is quicker than as arrays: segments of different axes seldom end together."""
 Axes = NDArray[np.int64]
+Number = TypeVar("Number", float, NDArray[np.float64])
 
 
 class PlanStore:
@@ -127,7 +129,7 @@ class PlanStore:
         """Go to the next segment of an axis; tell whether there is one."""
         end_ns = self.end_ns[axis]
         if end_ns >= self.cut_ns[axis]:
-            self._end_here(np.array([axis]))
+            self._end_one(axis)
             return False
         if self._segment[axis] + 1 >= self._count[self.row[axis]]:
             return False
@@ -142,6 +144,15 @@ class PlanStore:
         self.start_ns[axes] = cut_ns
         self.start_fraction[axes] = 0.0
         self.duration[rows] = 0.0
+
+    def _end_one(self, axis: int) -> None:
+        """Do what _end_here() does for one axis."""
+        row, cut_ns = self.row[axis], int(self.cut_ns[axis])
+        t = (cut_ns - int(self.segment_ns[axis])) * 1e-9
+        self.final[row] = _evaluate(t, *self._present[:, axis].tolist())
+        self.start_ns[axis] = cut_ns
+        self.start_fraction[axis] = 0.0
+        self.duration[row] = 0.0
 
     def _load_one(self, axis: int) -> None:
         """Do what _load() does for one axis."""
@@ -194,11 +205,7 @@ class PlanStore:
     def state(self, axes: Axes, now_ns: int | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return position, velocity, acceleration (m, 3) of the present segments at now."""
         t = (now_ns - self.segment_ns[axes]) * 1e-9
-        c0, c1, c2, c3, c4, c5 = self._present[:, axes]
-        position = c0 + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * c5))))
-        velocity = c1 + t * (2 * c2 + t * (3 * c3 + t * (4 * c4 + t * 5 * c5)))
-        acceleration = 2 * c2 + t * (6 * c3 + t * (12 * c4 + t * 20 * c5))
-        return np.stack((position, velocity, acceleration), axis=1)
+        return np.array(_evaluate(t, *self._present[:, axes])).T
 
     def evaluate(self, now_ns: int, position: NDArray[np.float64], velocity: NDArray[np.float64]) -> None:
         """Write the set-points of all axes at now into position and velocity (n,).
@@ -222,3 +229,13 @@ class PlanStore:
         """Drop the quintic terms again when no axis has any (called between ticks)."""
         if self._order == 5 and not self._present[4:].any():
             self._order = 3
+
+
+def _evaluate(
+    t: Number, c0: Number, c1: Number, c2: Number, c3: Number, c4: Number, c5: Number
+) -> tuple[Number, Number, Number]:
+    """Return position, velocity and acceleration of a polynomial at t."""
+    position = c0 + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * c5))))
+    velocity = c1 + t * (2 * c2 + t * (3 * c3 + t * (4 * c4 + t * 5 * c5)))
+    acceleration = 2 * c2 + t * (6 * c3 + t * (12 * c4 + t * 20 * c5))
+    return position, velocity, acceleration
