@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sioms.tactile.calibrate import NEAR, strain_of
 from sioms.tactile.calibration import Calibration, Options
 from sioms.tactile.calibration import calibrate as fit
-from sioms.tactile.characterize import creep_of, noise_of, proximity_of, thermal_of
+from sioms.tactile.characterize import creep_of, noise_of, proximity_of, relaxation_of, thermal_of
 from sioms.tactile.closedform import equivalent_radius, indenter_radius
 from sioms.tactile.estimator import Estimator, Load, ShapeEstimate
 from sioms.tactile.finger import Finger, from_toml, to_toml
@@ -301,15 +301,13 @@ def _characters(page: Page, recordings: dict[str, Recording], result: Calibratio
         _thermal(page, recordings["thermal"], rows)
     held = next((r for name, r in recordings.items() if name not in ("noise", "thermal", "ramp")), None)
     if held is not None:
-        creep = creep_of(held)
-        if creep is not None:
-            time = "" if math.isnan(creep.time_s) else f", time constant {creep.time_s:.2f} s"
-            rows.append(
-                (
-                    "creep within the touches",
-                    f"{100 * creep.share:+.1f} +- {100 * creep.deviation:.1f} %{time}",
-                )
-            )
+        for what, late in (
+            ("creep within the touches", creep_of(held)),
+            ("left after release", relaxation_of(held)),
+        ):
+            if late is not None:
+                time = "" if math.isnan(late.time_s) else f", time constant {late.time_s:.2f} s"
+                rows.append((what, f"{100 * late.share:+.1f} +- {100 * late.deviation:.1f} %{time}"))
         rows.append(
             ("far elements under a touch (proximity), raw units", f"{np.nanmean(proximity_of(held)):+.4f}")
         )

@@ -1,4 +1,7 @@
-"""Characterise a finger's outputs beside the touch itself: noise, mains lines, temperature, creep, proximity (dissertation 3.3)."""
+"""Characterise a finger's outputs beside the touch itself: noise, mains lines, temperature, creep, relaxation, proximity.
+
+As section 3.3 of the dissertation does.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import welch
 
-from sioms.tactile.touches import LOADED, Recording
+from sioms.tactile.touches import BASELINE, LOADED, Recording
 
 Floats = NDArray[np.float64]
 
@@ -82,10 +85,11 @@ def thermal_of(recording: Recording) -> Thermal | None:
 
 @dataclass(frozen=True, slots=True)
 class Creep:
-    """Hold the rise of the output under a constant load, out = 1 + share (1 - exp(-t/time)) from its first value.
+    """Hold what comes or goes late, as a share of the output under load.
 
     Args:
-        share: relative rise; deviation beside it.
+        share: that comes late under a constant load (creep: out = 1 + share (1 - exp(-t/time)) from its first value), or is
+            left at the first frame after a release (relaxation: out = share exp(-t/time)).
         deviation: of the share.
         time_s: time constant; nan if the share is within two deviations of zero.
     """
@@ -97,35 +101,73 @@ class Creep:
 
 def creep_of(recording: Recording) -> Creep | None:
     """Fit the mean course of touches held at constant load; None without at least five loaded frames in a touch."""
-    courses, clocks = [], []
+    fitted = _fit_course(_courses(recording, released=False))
+    if fitted is None:
+        return None
+    _, share, _, deviation, time_s = fitted
+    return _creep(share, deviation, time_s)
+
+
+def relaxation_of(recording: Recording) -> Creep | None:
+    """Fit the mean course after release; None without at least five frames of phase 2 after the loaded ones of a touch."""
+    fitted = _fit_course(_courses(recording, released=True))
+    if fitted is None:
+        return None
+    first, share, first_deviation, _, time_s = fitted
+    # what has come at last is off by the drift since the baseline and no relaxation
+    return _creep(-first * share, first_deviation, time_s)
+
+
+def _creep(share: float, deviation: float, time_s: float) -> Creep:
+    return Creep(share, deviation, time_s if abs(share) > 2.0 * deviation else np.nan)
+
+
+def _courses(recording: Recording, released: bool) -> list[tuple[Floats, Floats]]:
+    """Return time from the first frame and output over its mean under load, of the loudest element of each touch."""
+    out = []
     for number in np.unique(recording.touch[recording.touch >= 0]):
-        mine = (recording.touch == number) & (recording.phase == LOADED)
-        before = (recording.touch == number) & (recording.phase != LOADED)
-        if mine.sum() < 5 or not before.any():
+        mine = recording.touch == number
+        before, under = mine & (recording.phase == BASELINE), mine & (recording.phase == LOADED)
+        if not (before.any() and under.any()):
             continue
-        rise = recording.raw[mine] - recording.raw[before].mean(0)
-        loudest = int(rise.mean(0).argmax())
-        if rise[:, loudest].mean() > 0.0:
-            courses.append(rise[:, loudest] / rise[:, loudest].mean())
-            clocks.append(recording.time_s[mine] - recording.time_s[mine][0])
+        rise = recording.raw[under].mean(0) - recording.raw[before].mean(0)
+        loudest = int(rise.argmax())
+        after = mine & ~before & ~under & (recording.time_s > recording.time_s[under].max())
+        chosen = after if released else under
+        if chosen.sum() >= 5 and rise[loudest] > 0.0:
+            course = (recording.raw[chosen, loudest] - recording.raw[before, loudest].mean()) / rise[loudest]
+            out.append((recording.time_s[chosen] - recording.time_s[chosen][0], course))
+    return out
+
+
+def _fit_course(courses: list[tuple[Floats, Floats]]) -> tuple[float, float, float, float, float] | None:
+    """Fit first (1 + share (1 - exp(-t/time))) to the mean; return first, share, their deviations, time [s]."""
     if not courses:
         return None
-    shortest = min(course.size for course in courses)
-    mean = np.mean([course[:shortest] for course in courses], axis=0)
-    clock = np.mean([time[:shortest] for time in clocks], axis=0)
+    shortest = min(course.size for _, course in courses)
+    mean = np.mean([course[:shortest] for _, course in courses], axis=0)
+    clock = np.mean([time[:shortest] for time, _ in courses], axis=0)
 
     def miss(v: Floats) -> Floats:
-        out: Floats = v[0] * (1.0 + v[1] * -np.expm1(-clock / np.exp(v[2]))) - mean
+        out: Floats = v[0] + v[1] * -np.expm1(-clock / np.exp(v[2])) - mean
         return out
 
     found = least_squares(
-        miss, [mean[0], 0.05, np.log(0.3 * clock[-1] + 1e-9)], bounds=([0, -1, -7], [2, 5, 3])
+        miss,
+        [mean[0], mean[-1] - mean[0], np.log(0.3 * clock[-1] + 1e-9)],
+        bounds=([-1, -5, -7], [2, 5, 3]),
     )
     jacobian = np.asarray(found.jac, dtype=np.float64)
     variance = 2.0 * found.cost / max(shortest - 3, 1)
-    deviation = float(np.sqrt(np.linalg.pinv(jacobian.T @ jacobian)[1, 1] * variance))
-    share = float(found.x[1])
-    return Creep(share, deviation, float(np.exp(found.x[2])) if abs(share) > 2.0 * deviation else np.nan)
+    deviation = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * variance)
+    first = float(found.x[0]) if abs(found.x[0]) > 1e-9 else 1e-9
+    return (
+        first,
+        float(found.x[1]) / first,
+        float(deviation[0]),
+        float(deviation[1]) / abs(first),
+        float(np.exp(found.x[2])),
+    )
 
 
 def proximity_of(recording: Recording) -> Floats:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sioms.tactile.characterize import creep_of, noise_of, proximity_of, thermal_of
+from sioms.tactile.characterize import creep_of, noise_of, proximity_of, relaxation_of, thermal_of
 from sioms.tactile.touches import Recording, ramps_of
 
 RANDOM = np.random.default_rng(12)
@@ -69,6 +69,18 @@ def test_creep() -> None:
     assert still is not None
     assert abs(still.share) < 0.01
     assert creep_of(recording(np.zeros((10, 16)))) is None
+
+
+def test_relaxation_after_release() -> None:
+    clock = np.arange(150) / 100.0
+    course = np.where(clock < 0.5, 4.0, 0.4 * np.exp(-(clock - 0.5) / 0.25))
+    held = touches(course)
+    phase = np.tile(np.repeat([0, 1, 2], [10, 50, 100]), 60)
+    found = relaxation_of(recording(held.raw, touch=held.touch, phase=phase))
+    assert found is not None
+    assert found.share == pytest.approx(0.1, abs=5 * found.deviation) and found.deviation < 0.01
+    assert found.time_s == pytest.approx(0.25, rel=0.1)
+    assert relaxation_of(held) is None  # nothing was recorded after the release
 
 
 def test_proximity_is_what_far_elements_feel() -> None:
