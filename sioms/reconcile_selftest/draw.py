@@ -80,6 +80,8 @@ def draw_axis(name: str, kind: str, rng: np.random.Generator, only: str = "") ->
         if pair[0] == "gravity":  # near the horizontal, where a little travel does not show its slope
             drawn = named["gravity"]["phase"]
             named["gravity"]["phase"] = float(np.copysign(0.5 * np.pi + 0.2 * (abs(drawn) - 0.5 * np.pi), drawn))
+        if excitation == "oneway" and pair[0] == "offset":  # a force along with the motion is no friction, whatever is recorded
+            named["offset"]["off"] = -abs(named["offset"]["off"])
     elif kind == "unknown":
         pick = only or str(rng.choice(NAMELESS if rotary else [n for n in NAMELESS if n != "swinging_inertia"]))
         nameless[pick] = _effect(pick, base, rng)
