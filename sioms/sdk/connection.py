@@ -9,12 +9,15 @@ import socket
 import termios
 from collections.abc import Callable
 from io import FileIO
+from pathlib import Path
 
 import serial
 
 from .datagram import Datagrams, split_address
 from .settings import LineSettings
 
+MOST_PORTS = 4
+"""Ports that a sentence names."""
 _LOOK = "look at host, port and network"
 
 
@@ -124,7 +127,7 @@ class Connection:
             number = error.errno or (cause.args[0] if isinstance(cause, termios.error) else errno.EIO)
             hint = {
                 errno.ENOTTY: "it is no serial port",
-                errno.ENOENT: "no such port; is the device plugged in",
+                errno.ENOENT: f"no such port; is the device plugged in{_or_one_of(_ports())}",
                 errno.EACCES: "no permission; is the user in the group dialout",
                 errno.EBUSY: "in use by another process",
                 errno.EWOULDBLOCK: "in use by another process",
@@ -156,6 +159,18 @@ class Connection:
             sock.close()
             raise OSError(result, f"connect to {settings}: {os.strerror(result).lower()}; {_LOOK}")
         self._sock = sock
+
+
+def _ports() -> list[str]:
+    """Return the serial ports that devices were plugged into, by the names that last where they have such."""
+    for pattern in ("serial/by-id/*", "ttyUSB*", "ttyACM*"):
+        if found := sorted(map(str, Path("/dev").glob(pattern))):
+            return found[:MOST_PORTS]
+    return []
+
+
+def _or_one_of(ports: list[str]) -> str:
+    return f", or is it {' or '.join(ports)}" if ports else ""
 
 
 opened: Callable[..., Connection] = Connection

@@ -153,7 +153,11 @@ class MappedUnit:
             DeviceError: ENODEV, another device than configured.
         """
         tests = self.rmap.identify
-        values = yield from self.read(self.plan(test.signal for test in tests))
+        try:
+            values = yield from self.read(self.plan(test.signal for test in tests))
+        except DeviceError as error:
+            text = f"identify {self.name}: {error}; the configuration says {self.rmap.title!r}"
+            raise DeviceError(errno.ENODEV, f"{text}; check address, wiring and configuration") from None
         for test in tests:
             if wrong := _differs(test, values[test.signal], settings):
                 text = f"identify {self.name}: {test.signal} is {values[test.signal]!r}; {wrong}"

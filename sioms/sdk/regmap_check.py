@@ -13,7 +13,7 @@ import msgspec
 from sioms.wording import did_you_mean
 
 from .codec.modbus_pdu import MAX_READ_BITS, MAX_READ_REGISTERS, MAX_WRITE_REGISTERS
-from .registers import RANGES, UNITS, to_words, width
+from .registers import RANGES, UNITS, Per, to_words, width
 
 if TYPE_CHECKING:
     from .regmap import Command, Item, RegisterMap, Signal, Write
@@ -49,6 +49,10 @@ def schema_problems(value: Any, expected: Any, place: str = "") -> list[str]:
     if origin is dict and isinstance(value, Mapping):
         inner = typing.get_args(expected)[1]
         return [p for key, part in value.items() for p in schema_problems(part, inner, f"{place}{key}.")]
+    if origin is typing.Literal:
+        words = typing.get_args(expected)
+        near = did_you_mean(str(value), map(str, words))
+        return [] if value in words else [f"{place[:-1]} = {value!r}: unknown{near}"]
     if origin is tuple and isinstance(value, list):
         inner = typing.get_args(expected)[0]
         numbered = enumerate(value)
@@ -98,7 +102,8 @@ def _signals(m: RegisterMap) -> Iterator[str]:
 
 def _unit(place: str, unit: str) -> Iterator[str]:
     if unit not in UNITS:
-        yield f"{place}: unknown unit {unit!r}{did_you_mean(unit, UNITS)}"
+        near = did_you_mean(unit, UNITS) or f"; there are: {', '.join(filter(None, UNITS))}, and none"
+        yield f"{place}: unknown unit {unit!r}{near}"
 
 
 def _overlaps(m: RegisterMap) -> Iterator[str]:
@@ -264,6 +269,9 @@ def _ports(m: RegisterMap) -> Iterator[str]:
             yield f"{place}: {signal.count} bits; a port has at most 62"
         if port.node_class == "analog" and (signal.is_bits or signal.type == "text"):
             yield f"{place}: analog, but {port.signal} holds no numbers"
+        if port.writable and port.node_class == "analog":
+            yield from _fits(f"{place}.minimum", signal, port.minimum)
+            yield from _fits(f"{place}.maximum", signal, port.maximum)
         if port.writable and signal.table in ("input", "discrete"):
             yield f"{place}: writable, but the {signal.table} table is read-only; holding or coil is right"
     for model, counts in m.models.items():
@@ -272,6 +280,25 @@ def _ports(m: RegisterMap) -> Iterator[str]:
                 yield f"models.{model}: unknown port {name}{did_you_mean(name, m.ports)}"
             elif (signal := m.signals.get(m.ports[name].signal)) and not 0 <= count <= signal.count:
                 yield f"models.{model}.{name}: {count} channels; 0 to {signal.count} is right"
+
+
+def _fits(place: str, signal: Signal, value: float | None) -> Iterator[str]:
+    """Check that a value in SI can be written to a register, of one that does not count turns or pulses."""
+    unit = UNITS.get(signal.unit)
+    if (
+        value is None
+        or unit is None
+        or unit.per is not Per.ITSELF
+        or signal.scale == 0
+        or signal.type not in RANGES
+    ):
+        return
+    low, high = sorted((raw + signal.offset) * signal.scale * unit.factor for raw in RANGES[signal.type])
+    if not low <= value <= high:
+        yield (
+            f"{place}: {value:g} {unit.si} does not fit {signal.type} at {signal.address:#06x}, which takes "
+            f"{low:g} to {high:g}"
+        )
 
 
 def _alarms(m: RegisterMap) -> Iterator[str]:

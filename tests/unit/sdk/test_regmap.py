@@ -40,7 +40,13 @@ ITEM = "commands/position/writes/0/items/2"
     [
         ("signals/position/adress", 1, "signals.position.adress: unknown key; did you mean address"),
         ("signals/position/address", "x", "signals.position.address = 'x': expected `int`, got `str`"),
-        ("signals/position/type", "int32", "signals.position.type = 'int32': invalid enum value"),
+        ("signals/position/type", "int32", "signals.position.type = 'int32': unknown; did you mean i32"),
+        (
+            "signals/position/type",
+            "word",
+            "signals.position.type = 'word': unknown; there are: u16, i16, u32",
+        ),
+        ("signals/position/unit", "furlong", "unknown unit 'furlong'; there are: A, mA, V"),
         ("signals/position/unit", "puls", "signals.position.unit: unknown unit 'puls'; did you mean pulse"),
         (
             "signals/position/address",
@@ -96,6 +102,21 @@ def test_each_mistake_has_its_sentence(place: str, value: Any, sentence: str) ->
         parse_map(document, "x.toml")
     assert sentence in str(caught.value)
     assert str(caught.value).startswith("read register map x.toml: ")
+
+
+def test_a_bound_that_does_not_fit_its_register() -> None:
+    oven = MAPS.parents[1] / "examples" / "drivers" / "oven.toml"
+    assert load_map(oven, {"ports": {"target": {"maximum": 3276.7}}})
+    with pytest.raises(
+        RegisterMapError,
+        match=r"ports.target.maximum: 3276.8 degC does not fit i16 at 0x0020, which takes -3276.8 to 3276.7",
+    ):
+        load_map(oven, {"ports": {"target": {"maximum": 3276.8}}})
+    with pytest.raises(
+        RegisterMapError,
+        match=r"ports.target.minimum: -1 degC does not fit u16 at 0x0020, which takes 0 to 6553.5",
+    ):
+        load_map(oven, {"signals": {"target": {"type": "u16"}}, "ports": {"target": {"minimum": -1.0}}})
 
 
 def test_all_mistakes_come_at_once() -> None:
