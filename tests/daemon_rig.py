@@ -69,6 +69,14 @@ def wait_for(predicate: Callable[[], Any], what: str, timeout_s: float = 15.0) -
     return value
 
 
+def has_ended(pid: int) -> bool:
+    """Tell whether a process has ended, be it that nobody has reaped it yet."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
+    except OSError:
+        return True
+
+
 class Daemon:
     """The real daemon, ready.
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 
 import pytest
-from daemon_rig import WORKCELL, Client, Daemon, at_rest, axes, jog, raises, wait_for
+from daemon_rig import WORKCELL, Client, Daemon, at_rest, axes, has_ended, jog, raises, wait_for
 
 import sioms
 
@@ -177,7 +177,7 @@ def test_killed_daemon_stops_all_drivers(
             node.read()
         with raises(errno.EIO, node.name):
             node.command(velocity=0.1)
-    wait_for(lambda: not any(_alive(pid) for pid in pids), "drivers ended", 5.0)
+    wait_for(lambda: all(has_ended(pid) for pid in pids), "drivers ended", 5.0)
     print(f"daemon SIGKILL to all drivers gone: {(time.monotonic() - killed) * 1e3:.0f} ms")
     wait_for(lambda: not daemon.running._reader.is_alive(), "nobody holds its pipes open", 5.0)
     with raises(errno.EIO):
@@ -229,7 +229,7 @@ def test_sigterm_while_axes_move_ends_in_rest_and_leaves_nothing(start_daemon: C
     assert not last.in_motion[0] and abs(last.velocity[0]) < 0.1
     assert daemon.running.wait_exit(10.0) == 0
     assert not os.path.exists(daemon.socket)
-    wait_for(lambda: not any(_alive(pid) for pid in pids), "drivers ended", 5.0)
+    wait_for(lambda: all(has_ended(pid) for pid in pids), "drivers ended", 5.0)
 
 
 def _errno(call: Callable[[], object]) -> int | None:
@@ -245,11 +245,3 @@ def _last(node: sioms.Node) -> sioms.client.snapshot.Snapshot:
     wait_for(lambda: _errno(node.read) == errno.EIO, f"{node.name} is refused", 5.0)
     raw = wait_for(lambda: node._page.numbered(node._page.head), "the last snapshot")
     return node._snapshot(raw, node._layout)
-
-
-def _alive(pid: int) -> bool:
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            return file.read().rsplit(")", 1)[1].split()[0] != "Z"
-    except FileNotFoundError:
-        return False

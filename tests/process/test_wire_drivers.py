@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from daemon_rig import wait_for
+from daemon_rig import has_ended, wait_for
 from wire_rig import SLIDE, Wire
 
 import sioms
@@ -127,14 +127,6 @@ node.command(velocity=0.05)
 print("moving", flush=True)
 time.sleep(60)
 """
-
-
-def has_ended(pid: int) -> bool:
-    """Tell whether a process has ended, be it that nobody has reaped it yet."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
-    except OSError:
-        return True
 
 
 def jog(cell: Cell, start: Callable[..., Any], wait_until: Callable[..., None]) -> Any:

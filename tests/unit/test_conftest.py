@@ -5,6 +5,7 @@ import sys
 import time
 
 import pytest
+from daemon_rig import has_ended
 
 
 def test_wait_line_finds_old_and_new_lines_and_collects_stderr(start):
@@ -48,14 +49,7 @@ def test_end_kills_what_the_process_started(start, wait_until):
     pid = int(child.wait_line(r"child (\d+)")[1])
     child.end()
 
-    def gone():
-        try:
-            with open(f"/proc/{pid}/stat") as stat:
-                return stat.read().rpartition(")")[2].split()[0] == "Z"
-        except FileNotFoundError:
-            return True
-
-    wait_until(gone, what="the end of the grandchild")
+    wait_until(lambda: has_ended(pid), what="the end of the grandchild")
 
 
 def test_names_are_free_and_fit_a_socket_address(free_name):
