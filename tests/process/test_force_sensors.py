@@ -5,14 +5,16 @@ Starting a cell takes seconds on a busy machine, so each test tells a whole stor
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import re
 import signal
 import socket
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -289,6 +291,59 @@ def test_ati_wrong_host_port_identity_and_page(start: Callable[..., Any], short_
         )
         assert not wire.reads(name)
     assert not wire.tell("state")["streaming"] and wire.tell("sent") == 0
+
+
+PAGE = (
+    b"<prodname>Net F/T</prodname><setserial>FT1</setserial><cfgcpf>1e6</cfgcpf><cfgcpt>1e6</cfgcpt><scfgfu>N</scfgfu>"
+    b"<scfgtu>Nm</scfgtu><comrdtrate>1000</comrdtrate>"
+)
+OK = b"HTTP/1.0 200 OK\r\n\r\n"
+BAD_PAGES: dict[str, tuple[bytes, str]] = {
+    "mute": (b"HTTP/1.0 200 OK\r\nContent-Length: 999999999\r\n\r\n", "no reply within its time-out"),
+    "endless": (OK + b"x" * 100_000, "the page is longer than 65536 bytes"),
+    "other": (b"HTTP/1.0 200 OK\r\nContent-Length: 5\r\n\r\nhello", "no element prodname; is this a Net F/T or an Ethernet Axia"),
+    "absent": (b"HTTP/1.0 404 Not Found\r\nContent-Length: 0\r\n\r\n", "the web server answers 404; is it another device"),
+    "number": (b"HTTP/1.0 200 OK\r\nContent-Length: %d\r\n\r\n" % len(PAGE) + PAGE.replace(b"1e6", b"NaN", 1), "cfgcpf is 'NaN'"),
+}  # fmt: skip
+"""What a web server says, bytes at a time, and the words of the sentence; it keeps the connection open."""
+
+
+@contextlib.contextmanager
+def servers(replies: Iterable[bytes]) -> Iterator[list[tuple[str, list[bytes]]]]:
+    """Serve each reply at a port of its own, in two pieces; a reply may be changed by its list."""
+    with contextlib.ExitStack() as stack:
+        found = []
+        for reply in replies:
+            listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+            current = [reply]
+
+            def serve(listener: socket.socket = listener, current: list[bytes] = current) -> None:
+                with contextlib.suppress(OSError), contextlib.ExitStack() as kept:
+                    while True:
+                        sock = kept.enter_context(listener.accept()[0])
+                        with contextlib.suppress(OSError):
+                            sock.recv(1000)
+                            sock.sendall(current[0][:20])
+                            sock.sendall(current[0][20:])
+
+            threading.Thread(target=serve, daemon=True).start()
+            stack.callback(listener.shutdown, socket.SHUT_RDWR)
+            found.append((f"127.0.0.1:{listener.getsockname()[1]}", current))
+        yield found
+
+
+def test_ati_with_a_page_that_is_none(start: Callable[..., Any], short_folder: Path) -> None:
+    wire = Sensor(start, short_folder, "ati_rdt", "--port", "0", "--rate", "1000")
+    with servers(reply for reply, _ in BAD_PAGES.values()) as places:
+        table = ATI.partition("]\n")[2].replace('page = "{port}"', 'page = "PLACE"')
+        pairs = zip(BAD_PAGES, places, strict=True)
+        wire.serve("".join(f"[device.{name}]\n{table.replace('PLACE', place)}" for name, (place, _) in pairs))
+        for name, (_, words) in BAD_PAGES.items():
+            wait_for(lambda n=name, w=words: w in wire.reason(n), f"{words!r} in {wire.reason(name)!r}")
+            assert not wire.reads(name)
+        assert wire.tell("sent") == 0, "no stream of a sensor that was not identified"
+        places[0][1][0] = b"HTTP/1.0 200 OK\r\nContent-Length: %d\r\n\r\n" % len(PAGE) + PAGE
+        wire.wait_up("mute")
 
 
 def test_schunk_through_a_bad_network_stalls_and_deaths(
