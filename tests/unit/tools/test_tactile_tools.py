@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -33,9 +34,10 @@ def command(*words: str) -> int:
     return tactile.run(parser.parse_args(["tactile", *words]))
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write edges every third degree as frames of 33 Hz, noise, a thermal cycle, and the finger as built."""
+    tmp_path = tmp_path_factory.mktemp("recorded")
     random = np.random.default_rng(6)
     places = np.arange(0.0, 151.0, 3.0)
     matrix = e_map(FINGER_B, np.radians(ANGLES), 10.3e-3, 60)[:, :121]
@@ -64,6 +66,13 @@ def folder(tmp_path: Path) -> Path:
         "element_radius_mm": [10.3] * 16, "gain_percent_strain_per_percent_output": [3.2] * 16,
     }  # fmt: skip
     (tmp_path / "nominal.json").write_text(json.dumps(nominal))
+    return tmp_path
+
+
+@pytest.fixture
+def folder(recorded: Path, tmp_path: Path) -> Path:
+    """Copy the recordings, to be changed."""
+    shutil.copytree(recorded, tmp_path, dirs_exist_ok=True)
     return tmp_path
 
 
@@ -176,6 +185,7 @@ def test_recordings_of_another_unit_or_order_are_refused(
     for name, made in change.items():
         tables[name] = made(tables[name])
     np.savez(folder / "edges.npz", **tables)
+    (folder / "noise.npz").unlink()
     assert command("calibrate", str(folder), "-o", str(folder / "f.toml")) == 1
     told = capsys.readouterr().err
     assert words in told and "Traceback" not in told
@@ -202,17 +212,13 @@ def test_design_refuses_what_cannot_be_built(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_design_tells_conditioning_and_what_noise_leaves() -> None:
-    """Known: condition 2.79 of the published finger; deviations go with the noise and fall with the load."""
+    """Known: condition 2.79 of the published finger; a heavier touch is told better."""
     finger = nominal_finger(FINGER_B, np.radians(ANGLES), 10.3e-3, 1.0, 1e-3)
     assert conditioning(FINGER_B, np.radians(ANGLES), 10.3e-3, 0.46) == pytest.approx([2.78769], rel=5e-3)
-    coarse = predicted_errors(finger, [100.0, 200.0], [6e-3], 3)
-    quiet = nominal_finger(FINGER_B, np.radians(ANGLES), 10.3e-3, 1.0, 5e-4)
-    fine = predicted_errors(quiet, [100.0, 200.0], [6e-3], 3)
-    for more, less in zip(
-        (coarse.angle, coarse.load, coarse.radius), (fine.angle, fine.load, fine.radius), strict=True
-    ):
-        assert less == pytest.approx(0.5 * more, rel=1e-3)
-    assert coarse.angle[1, 0] < 0.6 * coarse.angle[0, 0] and coarse.radius[1, 0] < 0.7 * coarse.radius[0, 0]
+    found = predicted_errors(finger, [100.0, 200.0], [6e-3], 2)
+    assert 0.4 < found.angle[1, 0] / found.angle[0, 0] < 0.7
+    assert 0.2 < found.radius[1, 0] / found.radius[0, 0] < 0.5
+    assert 0.5 < found.load[1, 0] < 10.0
 
 
 def test_published_claims_are_judged_by_their_numbers() -> None:
