@@ -27,7 +27,8 @@ from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, effective_samples, observer, sensor_noise
 from sioms.reconcile.records import Session
 from sioms.reconcile.refuse import bursts, smoother_rest, smoother_share
-from sioms.reconcile.search import GAIN, Found, Searcher
+from sioms.reconcile.screen import thinned
+from sioms.reconcile.search import GAIN, Found, Searcher, Step
 from sioms.reconcile.simulate import replay
 from sioms.reconcile.timing import on_grid
 from sioms.reconcile.verdict import Estimate, NamedEffect, Outcome, Trace, Verdict
@@ -138,15 +139,18 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
 
 def _search(ready: Prepared, names: tuple[str, ...], o: Options) -> tuple[Prepared, Searcher, Found]:
     """Search; where no force was measured, the noise may look smaller under a better model: then search on."""
-    start = ready.model
+    start, earlier = ready.model, tuple[Step, ...]()
     for turn in range(AGAIN + 1):
         searcher = Searcher(ready.problem, tuple(f.effect for f in ready.findings), names, progress=o.progress)
         found = searcher.run(start)
+        if earlier:
+            found = replace(found, ladder=(*earlier, replace(found.ladder[0], action="noise read again"), *found.ladder[1:]))
         start = found.fit.model
         anew = _calibrated(ready.problem, ready.problem.session, start)
         if turn == AGAIN or anew.noise.drive > FELL * ready.problem.noise.drive:
             break
         o.progress(f"the noise is {anew.noise.drive / ready.problem.noise.drive:.2f} of what it seemed: searching on")
+        earlier = found.ladder
         final = replace(anew, weights=None, session=ready.final.session, begin=ready.final.begin, end=ready.final.end)
         ready = replace(ready, problem=anew, final=final)
     return ready, searcher, found
@@ -221,7 +225,7 @@ def _calibrated(problem: Problem, session: Session, model: AxisModel) -> Problem
             excess = float(np.sqrt(np.median(energy)))
         else:
             fit = refit(problem, model, iterations=3)
-            ids = block_ids(problem, model.sample_time_s, 0.1)
+            ids = block_ids(problem, model.sample_time_s, 0.1)[thinned(len(fit.residual))]
             energy = np.bincount(ids, weights=smoother_rest(problem, fit) ** 2) / np.bincount(ids)
             excess = float(np.sqrt(np.quantile(energy, 0.25)))
         least = LEAST_DRIVE * model.rated_force

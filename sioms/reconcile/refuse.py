@@ -14,7 +14,7 @@ from sioms.reconcile.effect import Array
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import response
-from sioms.reconcile.screen import Motion, dead_band, direction, instrument_motion
+from sioms.reconcile.screen import Motion, dead_band, direction, instrument_motion, thinned
 
 KNOTS = 14
 HARMONICS = 4
@@ -74,19 +74,24 @@ def basis(motions: list[Motion], model: AxisModel, dead: float) -> list[Array]:
 
 def smoother_share(problem: Problem, fit: Fit) -> float:
     """Share of the residual's energy that the generic smoother explains on blocks it has not seen."""
-    rest = smoother_rest(problem, fit)
-    return 1.0 - float(rest @ rest) / float(fit.residual @ fit.residual)
+    rest, r = smoother_rest(problem, fit), fit.residual[thinned(len(fit.residual))]
+    return 1.0 - float(rest @ rest) / float(r @ r)
 
 
 def smoother_rest(problem: Problem, fit: Fit, folds: int = 5) -> Array:
-    """Residual that the generic smoother leaves on blocks it has not seen, shape (n,); the residual itself where it explains nothing."""
+    """Residual that the generic smoother leaves on blocks it has not seen; the residual itself where it explains nothing.
+
+    Returns:
+        The rows of ``thinned``.
+    """
+    rows = thinned(len(fit.residual))
     motions = instrument_motion(problem, fit.model)
     columns = basis(motions, fit.model, dead_band(problem, fit.model))
-    f = problem.join([response(fit.model, problem.noise, c) for c in columns]) / problem.noise.innovation
+    f = problem.join([response(fit.model, problem.noise, c) for c in columns])[rows] / problem.noise.innovation
     size = np.sqrt(np.mean(f**2, axis=0))
     f = f[:, size > 1e-12] / size[size > 1e-12]
-    fold = block_ids(problem, fit.model.sample_time_s) % folds
-    r = fit.residual
+    fold = block_ids(problem, fit.model.sample_time_s)[rows] % folds
+    r = fit.residual[rows]
     best = r
     grams = [(f[fold == i].T @ f[fold == i], f[fold == i].T @ r[fold == i]) for i in range(folds)]
     for ridge in RIDGES:

@@ -31,6 +31,8 @@ GRID_TAU = (3.0, 10.0, 40.0)
 SPEED_STEPS = 7
 #: Below this the measured motion stands for one without noise; a command is followed up to COMMAND_HZ, if to this share.
 SLOW_HZ, COMMAND_HZ, FOLLOWED = 5.0, 30.0, 0.2
+#: A regression on more rows than this leaves some out.
+MOST_ROWS = 40_000
 STATE_SLOTS = (Slot.FORCE, Slot.FRICTION, Slot.GAIN, Slot.MODULATION)
 
 
@@ -152,8 +154,9 @@ def screen(problem: Problem, fit: Fit, names: list[str], levels: Mapping[str, fl
     """
     motions = smoothed_motion(problem, fit.model)
     lib = known()
-    q = _orthonormal(fit.jacobian)
-    rest = fit.residual - q @ (q.T @ fit.residual)
+    rows = thinned(len(fit.residual))
+    q = _orthonormal(fit.jacobian[rows])
+    rest = fit.residual[rows] - q @ (q.T @ fit.residual[rows])
     dead = dead_band(problem, fit.model)
     span = max(float(np.ptp(m.x)) for m in motions)
     largest = int(np.clip(60.0, 1, 60)) if span > 0.5 * fit.model.pitch else 1
@@ -210,6 +213,11 @@ def dead_band(problem: Problem, model: AxisModel) -> float:
     return float(3.0 * problem.noise.sensor * np.sqrt(problem.noise.gain[1] / model.sample_time_s))
 
 
+def thinned(count: int) -> slice:
+    """Choose the rows of a regression of ``count`` samples: in long or fast records neighbours say the same."""
+    return slice(None, None, max(count // MOST_ROWS, 1))
+
+
 def _orthonormal(j: Array) -> Array:
     if j.shape[1] == 0:
         return j
@@ -233,7 +241,7 @@ def _screen_state(problem: Problem, fit: Fit, effect: Effect, motions: list[Moti
     best: Start | None = None
     for shape in shapes(effect, fit.model, largest):
         f = _filtered(problem, fit.model,
-                      [state_columns(effect, fit.model, m, shape, dead) for m in motions])
+                      [state_columns(effect, fit.model, m, shape, dead) for m in motions])[thinned(len(fit.residual))]
         f = f - q @ (q.T @ f)
         size = np.linalg.norm(f, axis=0)
         keep = size > 1e-9
@@ -313,7 +321,7 @@ def _screen_trials(problem: Problem, fit: Fit, effect: Effect, q: Array, rest: A
         model = model.without_effect(name) if name in model.effects else model
     trials = list(trial_values(effect, model, problem))
     for values, tried in zip(trials, problem.mapper(lambda v: problem.residual(model.with_effect(effect.name, v)), trials), strict=True):
-        d = tried - fit.residual
+        d = (tried - fit.residual)[thinned(len(fit.residual))]
         d = d - q @ (q.T @ d)
         size = float(d @ d)
         if size <= 0.0:
