@@ -19,7 +19,7 @@ from sioms.protocol.flags import ControlMode
 
 from .blocks import AnyBlock, AxisBlock, BlockSpec
 from .driver import Kit, LineUnit
-from .exchange import DeviceError, Steps
+from .exchange import DeviceError, Steps, while_wanted
 from .mapped import MappedUnit, Values
 
 SELDOM_NS = 1_000_000_000
@@ -119,7 +119,9 @@ class DriveUnit(LineUnit):
             self._jog, self._homes = "", False
         if action.is_stop:
             self._epoch += 1
-        return self._act(action, self._epoch)
+        if action.is_stop or action.kind is ActionKind.RESET:
+            return self._act(action)
+        return self._unless_overtaken(action, self._epoch)
 
     def stop(self) -> Steps:
         """Stop, whatever goes on."""
@@ -129,13 +131,15 @@ class DriveUnit(LineUnit):
 
     # --- inside ----------------------------------------------------------------------------------
 
-    def _act(self, action: DriveAction, epoch: int) -> Steps:
-        if epoch != self._epoch and action.kind is not ActionKind.RESET:
-            return
+    def _unless_overtaken(self, action: DriveAction, epoch: int) -> Steps:
+        """Carry out an action, and no further once a stop has overtaken it: a command may take several messages."""
+        yield from while_wanted(self._act(action), lambda: epoch == self._epoch)
+
+    def _act(self, action: DriveAction) -> Steps:
         match action.kind:
             case ActionKind.START:
                 if action.command is not None:
-                    yield from self._start(action.command, action, epoch)
+                    yield from self._start(action.command, action)
             case ActionKind.STOP:
                 yield from self._mapped.command("stop")
             case ActionKind.QUICK_STOP:
@@ -147,7 +151,7 @@ class DriveUnit(LineUnit):
             case _:
                 assert_never(action.kind)
 
-    def _start(self, command: Command, action: DriveAction, epoch: int) -> Steps:
+    def _start(self, command: Command, action: DriveAction) -> Steps:
         mode = ControlMode(command.control_mode)
         ramps = {"acceleration": action.acceleration_max, "deceleration": action.acceleration_max}
         if mode & ControlMode.POSITION:
@@ -157,7 +161,7 @@ class DriveUnit(LineUnit):
             speed = self._speed(command, mode, action)
             yield from self._mapped.command("position", position=command.position, speed=speed, **ramps)
         elif self._jogs:
-            yield from self._start_jog(command.velocity, epoch)
+            yield from self._start_jog(command.velocity)
         else:
             yield from self._mapped.command("velocity", velocity=command.velocity, **ramps)
 
@@ -180,7 +184,7 @@ class DriveUnit(LineUnit):
         speed = (rate * duration_s - math.sqrt(under)) / 2
         return min(top, self._mapped.in_register("position", "speed", speed, more=1))
 
-    def _start_jog(self, velocity: float, epoch: int) -> Steps:
+    def _start_jog(self, velocity: float) -> Steps:
         """Begin or turn a jog; it is sent again by every poll, until it is stopped."""
         speed = abs(velocity)
         if speed == 0:
@@ -189,8 +193,6 @@ class DriveUnit(LineUnit):
         if speed != self._jog_speed:
             yield from self._mapped.command("jog_speed", speed=speed)
             self._jog_speed = speed
-            if epoch != self._epoch:
-                return  # a stop came in between
         forward = velocity * self._mapped.gearing.travel_per_turn > 0
         self._jog = "jog_plus" if forward else "jog_minus"
         yield from self._mapped.command(self._jog)

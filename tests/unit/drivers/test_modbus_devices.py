@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from sioms.drivers.modbus_axis import ModbusAxis
+from sioms.drivers.modbus_axis import MAPS, ModbusAxis
 from sioms.drivers.modbus_io import ModbusIo
 from sioms.motion import CommandError, DriveAction
 from sioms.protocol.flags import AxisStatus, ControlMode
@@ -19,6 +19,7 @@ from sioms.protocol.records import NodeClass, numpy_dtype
 from sioms.sdk.codec.modbus import frame_rtu, frame_tcp
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Pause, Steps
 from sioms.sdk.markers import Markers
+from sioms.sdk.regmap import named_map
 from sioms.tools.counterparts import leadshine, moxa, oriental_az
 
 EXCHANGE_S = 0.003
@@ -258,6 +259,68 @@ def test_a_stop_between_the_messages_of_a_jog(make: Callable[..., Rig] = leadshi
     assert rig.drive.state()["velocity"] == 0
 
 
+def test_a_stop_between_the_messages_of_a_move_by_a_map_of_ones_own() -> None:
+    """A drive whose target, speed and start are registers of their own: what is told in three messages is stopped in between."""
+    whole = named_map("leadshine", MAPS).commands["position"].writes[0]
+    parts = [
+        {
+            "address": 0x6200 + at,
+            "items": [{k: v for k, v in msgspec.to_builtins(whole.items[i]).items() if v is not None}],
+        }
+        for at, i in ((0, 0), (1, 1), (3, 2), (4, 3), (5, 4))
+    ]
+    start = {"address": 0x6002, "function": "single", "items": [{"value": 0x10}]}
+    override = {"commands": {"position": {"writes": [*parts, start]}}}
+    rig = leadshine_rig(override=override)
+    rig.write(ControlMode.POSITION, position=0.1)
+    rig.until_idle()
+    assert rig.position == pytest.approx(0.1, abs=1e-5), "it moves so"
+    for told in range(1, 7):
+        rig.write(ControlMode.POSITION, position=0.0)
+        rig.bus.run(rig.unit.poll())
+        (action,) = rig.bank.take_actions()
+        move, reply = rig.unit.act(action), None
+        for _ in range(told):
+            exchange = move.send(reply)
+            reply = exchange.decode(rig.bus.answer(exchange.data))
+        rig.bus.run(rig.unit.stop())
+        with pytest.raises(StopIteration):
+            move.send(reply)
+        rig.bank.action_failed(action, "stopped", rig.bus.clock_ns())
+        rig.go(0.3)
+        assert rig.drive.state()["velocity"] == 0, told
+        rig.bank.reset([0])
+        rig.go(0.1)
+        assert rig.position == pytest.approx(0.1, abs=1e-3 if told == 6 else 1e-5), told
+
+
+@RIGS
+@pytest.mark.parametrize("by", ["stop", "emergency_stop", "new driver"])
+def test_stops_of_a_drive_that_brakes_already(make: Callable[..., Rig], by: str) -> None:
+    """Stopped from 0.1 m/s at 0.25 m/s^2, and again each 40 ms: it brakes no longer, and never turns back."""
+    rig = make()
+    mode = ControlMode.POSITION | ControlMode.SPECIFIED_MAX_VEL_ACC
+    rig.write(mode, position=0.4, max_velocity=0.1, max_acceleration=0.25)
+    rig.go(1.0)
+    assert rig.bank.fields[1, 0] == pytest.approx(0.1, rel=0.02)
+    place, began_s = rig.position, rig.bus.now_s
+    rig.bank.stop([0], rig.bus.clock_ns())
+    places = [place]
+    while rig.drive.state()["velocity"] != 0:
+        assert rig.bus.now_s < began_s + 1.0
+        if by == "new driver":
+            rig.bus.run(rig.unit.open())
+        else:
+            getattr(rig.bank, by)([0], rig.bus.clock_ns())
+        rig.go(0.04)
+        places.append(rig.position)
+    rig.go(0.3)
+    places.append(rig.position)
+    assert (np.diff(places) >= -1e-9).all()
+    assert 0 < places[-1] - place < 0.1**2 / (2 * 0.25) + 0.1 * 0.1, "the braking distance and 100 ms"
+    assert rig.bank.is_idle([0])
+
+
 def test_a_stop_that_overtakes_a_reset_does_not_make_it_void() -> None:
     rig = leadshine_rig()
     rig.drive.raise_alarm(0x40)
@@ -371,7 +434,10 @@ def test_the_drive_cannot_pass_a_position() -> None:
         ),
         ({"axis": []}, "axis: none given"),
         ({"axis": [{"name": "a"}, {"name": "b"}]}, "2 drives have address 1"),
-        ({"axis": [{"name": "a", "velocity_max": 1e3}]}, "axis a: velocity_max: speed 1000 is .* in the register"),
+        (
+            {"axis": [{"name": "a", "velocity_max": 1e3}]},
+            "axis a: velocity_max: speed 1000 is .* in the register",
+        ),
         ({"axis": [{"name": "a", "position_max": 1e7}]}, "axis a: position_max: position 1e.07"),
         ({"axis": [{"name": "a", "address": 300}]}, "address of a unit is 300"),
         ({"axis": [{"name": "a", "travel_per_turn": 0.0}]}, "axis a: travel_per_turn is 0"),
