@@ -24,6 +24,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -150,17 +151,17 @@ def read_stand(path: Path, count: int) -> Stand:
         stand = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), Stand)
     except (OSError, ValueError, msgspec.ValidationError) as error:
         raise BadInputError(f"read stand {path}: {getattr(error, 'strerror', None) or error}") from None
-    items = (*stand.push, *stand.hang)
-    names = [i.name for i in items]
+    items = [(p.name, p.wrench, p.most) for p in stand.push]
+    items += [(h.name, h.wrench, min(h.loads, default=0.0)) for h in stand.hang]
+    names = [name for name, *_ in items]
     if not items or len(set(names)) != len(names):
         raise BadInputError(
             f"read stand {path}: names are {names}; needs one push or hang, each of its own name"
         )
-    for item in items:
-        most = item.most if isinstance(item, PushTable) else min(item.loads, default=0.0)
-        if len(item.wrench) != count or not any(item.wrench) or most <= 0.0:
+    for name, wrench, load_n in items:
+        if len(wrench) != count or not any(wrench) or load_n <= 0.0:
             raise BadInputError(
-                f"read stand {path}: {item.name} has a wrench of {len(item.wrench)} numbers and {most:g} N; needs {count} "
+                f"read stand {path}: {name} has a wrench of {len(wrench)} numbers and {load_n:g} N; needs {count} "
                 "(not all 0) and more than 0 N"
             )
     return stand
@@ -245,7 +246,7 @@ class Bench:
                 for level in push.levels:
                     what = f"hang {level:g} N on {push.name}" if level else f"take everything off {push.name}"
                     have_done(what, "loads by hand need somebody at the terminal")
-                    self._hold(sensor, push, lambda level=level: level, lambda: None)
+                    self._hold(sensor, push, partial(float, level), lambda: None)
             else:
                 self._pressed(sensor, push, table)
         self._save()
@@ -285,7 +286,8 @@ class Bench:
         """Keep the rows of one load."""
         wrench = np.array(push.wrench)
         for _ in range(ROWS):
-            last, seen = sensor.read().number, []
+            last = sensor.read().number
+            seen: list[Any] = []
             load()
             while len(seen) < SAMPLES:
                 sensor.wait_new(last, 2.0)
@@ -294,7 +296,7 @@ class Bench:
                 check()
             if any(flag & (AnalogStatus.SATURATED | AnalogStatus.INVALID) for s in seen for flag in s.flags):
                 raise ExperimentStopped(
-                    f"load {sensor.name}: it is saturated, or reads nothing, under {load():.3g} N"
+                    f"load {sensor.name}: it is saturated, or reads nothing, during {push.name}"
                 )
             reading = np.mean([s.data for s in seen], axis=0)
             self._rows.append(np.concatenate([[time.monotonic() - self._began], load() * wrench, reading]))
@@ -318,13 +320,12 @@ class Bench:
 
 def _told(presser: Presser) -> Callable[[], float]:
     """Return what tells the mean force [N] since it was asked last."""
-    last = presser.force.read().number
+    seen = [presser.force.read()]
 
     def told() -> float:
-        nonlocal last
-        new = presser.force.history(last)
-        last = new[-1].number if new else last
-        return presser.net(new) if new else np.nan
+        nonlocal seen
+        seen = presser.force.history(seen[-1].number) or seen[-1:]  # a slow one may have nothing new
+        return presser.net(seen)
 
     return told
 

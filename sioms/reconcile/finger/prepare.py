@@ -200,6 +200,8 @@ def _rows(
         if _follows(t, ratio, base, alive):
             load, share = t.cell / level, LOAD_MARGIN * t.cell_noise / t.cell
         else:
+            # no load was further from its command than the cell, with its noise, says
+            share = np.minimum(LOAD_SPREAD, LOAD_MARGIN * spread / t.cell)
             notes.append(
                 "the outputs do not follow the load cell from touch to touch: the commanded load was used"
             )

@@ -17,6 +17,12 @@ def cubed(output: Floats, scene: Scene, p: Floats) -> Floats:
     return out
 
 
+def bent(output: Floats, scene: Scene, p: Floats) -> Floats:
+    """Take off c of what is beyond s."""
+    out: Floats = output - p[0] * np.maximum(output - p[1], 0.0)
+    return out
+
+
 def fading(output: Floats, scene: Scene, p: Floats) -> Floats:
     """Multiply by 1 + k (t - mean t)."""
     out: Floats = output * (1.0 + p[0] * scene.time)[:, None]
@@ -64,6 +70,14 @@ TERMS = (
         "d = l + k l^3",
         cubed,
         Quantity("k", "1", -500.0, 500.0, 20.0, "size"),
+        lookalikes=("quadratic",),
+    ),
+    term(
+        "knee",
+        "d = l - c (l - s) beyond s",
+        bent,
+        Quantity("c", "1", -1.0, 1.0, 0.02, "slope that is lost there"),
+        Quantity("s", "1", 1e-3, 1.0, 5e-3, "output", starts=(0.01, 0.02, 0.04, 0.07, 0.12, 0.2)),
         lookalikes=("quadratic",),
     ),
     term("time", "d = l (1 + k (t - mean t))", fading, Quantity("k", "1/s", -0.1, 0.1, 1e-5, "size")),

@@ -207,6 +207,7 @@ TERMS = (
         bent,
         Quantity("c", "1", -1.0, 1.0, 0.02, "slope that is lost there, of each component", each=True),
         Quantity("s", "1", 0.01, 1.0, 0.02, "of full range", starts=(0.3, 0.45, 0.6, 0.75, 0.9)),
+        lookalikes=("gain", "quadratic"),
     ),
     term(
         "dull",
@@ -214,6 +215,7 @@ TERMS = (
         dulled,
         Quantity("c", "1", -1.0, 1.0, 0.02, "slope that is lost there, of each component", each=True),
         Quantity("s", "1", 1e-3, 0.3, 5e-3, "of full range", starts=(0.01, 0.03, 0.1)),
+        lookalikes=("gain", "hysteresis"),
     ),
     term(
         "cube",

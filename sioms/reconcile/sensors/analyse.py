@@ -55,7 +55,7 @@ def analyse(subject: Subject, options: Options | None = None) -> SensorVerdict:
     share, where = smoother_share(subject.training, found.fit, searcher.weights, features)
     bursts = _bursts(subject, searcher, found)
     rejected: tuple[str, ...] = ()
-    if _odd(searcher, found, share, where):
+    if _odd(searcher, found, share, where) or searcher.displaced(found):
         o.progress(
             f"what remains has no name (a smoother explains {100 * share:.0f} %): searching for a term"
         )

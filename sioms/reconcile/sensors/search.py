@@ -197,8 +197,8 @@ class Searcher:
             if n != name
         ):
             return None
-        if saved.share < SPECIFIC and self._nameless(fit, losses, saved):
-            return None
+        if saved.share < SPECIFIC and (_termed(new.model) or self._nameless(fit, losses, saved)):
+            return None  # what is left where a term stands may be what the term does not fit
         return Rung("add", name, self._ratio(new), saved.share, new.model, others)
 
     def _add_pair(self, fit: Fit, losses: Array) -> Rung | None:
@@ -249,7 +249,7 @@ class Searcher:
     def _simplest(self, good: dict[str, tuple[Fit, Array, Saving]]) -> str:
         """Of those within one standard error and ``GAIN`` of the best, the one with the fewest numbers."""
         best = max(good, key=lambda n: good[n][2].total)
-        if any(n.startswith(TERM_PREFIX) for n in good[best][0].model.effects):
+        if _termed(good[best][0].model):
             return best  # where something has no name, a name is no better than another term
         near = []
         for n, (_, loss, _) in good.items():
@@ -300,6 +300,21 @@ class Searcher:
                     )
                     break
         return fit, losses
+
+    def displaced(self, found: Found) -> bool:
+        """Say whether a nameless look-alike, of no more numbers, does surely better in the place of something named."""
+        lib, count = found.fit.model.library, found.fit.model.count
+        for name in [n for n in found.fit.model.effects if n not in self.frozen and n in self.names]:
+            like = [
+                n for n in alike(lib, name, count) if n in self.terms and n not in found.fit.model.effects
+            ]
+            bare = self.fit(found.fit.model.without_effect(name), 4) if like else found.fit
+            for other in like:
+                for start in screen(self.data, bare, self.weights, lib[other], self.frozen)[:1]:
+                    new = self.saving(self.loss(self.fit(self._with(bare, start))), found.losses)
+                    if new.share > GAIN and new.errors > SURE and new.total > 0.0:
+                        return True
+        return False
 
     def candidates(self, fit: Fit) -> list[Start]:
         """Screen every effect that is not in the model; the best few, look-alikes of the best among them."""
@@ -389,6 +404,10 @@ class Searcher:
             if (r.effect, r.rival) not in best or r.missed < best[r.effect, r.rival].missed:
                 best[r.effect, r.rival] = r
         return sorted(best.values(), key=lambda r: r.missed)
+
+
+def _termed(model: SensorModel) -> bool:
+    return any(n.startswith(TERM_PREFIX) for n in model.effects)
 
 
 def alike(lib: Mapping[str, SensorEffect], name: str, count: int) -> list[str]:
