@@ -48,7 +48,7 @@ def read_folder(folder: Path) -> Data:
     recordings, touches = {}, {}
     for path in sorted(folder.glob("*.npz")):
         try:
-            with np.load(path) as file:
+            with _opened(path) as file:
                 recordings[path.stem] = recording = _recording(file)
                 if "cmd_theta" in file:
                     touches[path.stem] = average(recording, *_commanded(file), nominal.signal.scale)
@@ -69,14 +69,23 @@ def read_recording(path: Path) -> Recording:
         OSError: the file cannot be read.
     """
     try:
-        with np.load(path) as file:
+        with _opened(path) as file:
             return _recording(file)
     except _UNREADABLE as error:
         raise ValueError(f"read {path}: {_words(error)}") from error
 
 
+def _opened(path: Path) -> Any:
+    path.stat()
+    if not zipfile.is_zipfile(path):
+        raise ValueError("this is no npz archive; want arrays raw and time, as numpy.savez writes them")
+    return np.load(path)
+
+
 def _words(error: BaseException) -> str:
-    return str(error.args[0]) if isinstance(error, KeyError) else str(error)
+    if isinstance(error, KeyError):
+        return f"{error.args[0]}; want at least raw and time, with touches also cmd_theta, cmd_P and cmd_rc"
+    return str(error)
 
 
 def _commanded(file: Any) -> tuple[Floats, Floats, Floats]:

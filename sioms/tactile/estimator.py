@@ -338,14 +338,16 @@ class Estimator:
     ) -> ShapeEstimate:
         """Return the mean over all touches that the frame allows, in place of a best fit whose place is hardly known."""
         t, arc = shape.angle_rad, self._averager.arc
-        if not arc[0] <= t <= arc[1]:
+        mean = None
+        if arc[0] <= t <= arc[1]:
+            deviation = math.sqrt(shape.covariance[0][0]) if shape.covariance[0][0] > 0.0 else math.inf
+            there = np.where(noise < _HUGE, self._left(pull, y, np.array([t]))[0], 0.0)
+            weights = 1.0 / (noise + self._share * float(np.max(there**2)))
+            mean = self._averager.average(
+                lambda places: self._left(pull, y, places), weights, load, load_weight, t, deviation
+            )
+        if mean is None:
             return dataclasses.replace(shape, quality=shape.quality | Quality.IMPRECISE)
-        deviation = math.sqrt(shape.covariance[0][0]) if shape.covariance[0][0] > 0.0 else math.inf
-        there = np.where(noise < _HUGE, self._left(pull, y, np.array([t]))[0], 0.0)
-        weights = 1.0 / (noise + self._share * float(np.max(there**2)))
-        mean = self._averager.average(
-            lambda places: self._left(pull, y, places), weights, load, load_weight, t, deviation
-        )
         bend, rc = self._bent(mean.radius)
         judged = self._judge(mean.angle, mean.square, mean.load, mean.radius, shape.misfit, shape.steps)
         return dataclasses.replace(

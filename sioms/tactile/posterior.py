@@ -55,15 +55,15 @@ class Averager:
     def average(
         self, left: Callable[[Floats], Floats], weights: Floats, load: float, load_weight: float, angle: float,
         deviation: float,
-    ) -> Average:  # fmt: skip
-        """Return the average over places within some deviations of the best fit's.
+    ) -> Average | None:  # fmt: skip
+        """Return the average over places within some deviations of the best fit's; None if no touch there presses.
 
         Args:
             left: returns the strains that are left for a touch at some places, shape (n, ns) or (1, ns) if the same for all.
             weights: inverse variances, shape (ns,).
             load: measured P [N/m], with its inverse variance; 0 and 0 without.
             load_weight: see above.
-            angle: of the best fit [rad], on the arc; its load presses.
+            angle: of the best fit [rad], on the arc.
             deviation: of that [rad].
         """
         reach = min(_REACH * deviation, _FARTHEST)
@@ -72,12 +72,14 @@ class Averager:
         ff = np.square(f) @ weights + load_weight
         fy = np.matmul(f[:, :, None], (weights * y)[:, :, None])[:, :, 0, 0] + load_weight * load
         p, square = fy / ff, self.table.half_widths[::_ROWS] ** 2
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             radius = self.widths.product(square)[:, None] / np.maximum(p, 0.0)
         chi = np.sum(y * y * weights, axis=1) - fy * p
         possible = (p > 0.0) & (radius <= self.largest)
+        if not possible.any():
+            return None
         # P integrates out to 1/sqrt(ff); rows are even steps of the half width
-        share = np.where(possible, np.exp(-0.5 * (chi - chi[possible].min())) / np.sqrt(ff), 0.0)
+        share = np.exp(-0.5 * np.where(possible, chi - chi[possible].min(), np.inf)) / np.sqrt(ff)
         share /= share.sum()
         values = np.stack([np.broadcast_to(t, p.shape)[possible], p[possible], radius[possible]])
         share_of, spread = share[possible], 1.0 / ff[possible]

@@ -20,9 +20,8 @@ from sioms.tactile.model import StrainTable
 
 Floats = NDArray[np.float64]
 
-_LEFT = (
-    0.85  # the fit must leave less than this share of the squares; of even fingers it leaves 0.97 and more
-)
+_LEAST = 0.15  # of the squares, that the sines must explain; of even fingers they explain 0.03
+_CHANCE = 1e-3  # that touches of scattered loads are taken for strips
 _LONGEST = np.radians(60.0)
 _FEWEST = 2.5  # touches in the shortest period looked for
 _FINENESS = 6.0  # frequencies tried in one over the arc
@@ -118,8 +117,10 @@ def find_strips(rest: Floats, model: Floats, widening: Floats, place: Floats) ->
     step = 2.0 * np.pi / (_FINENESS * span)
     found = minimize_scalar(lambda f: -solve(f)[1], bounds=(best - step, best + step), method="bounded")
     (a, b, c, d), explained = solve(float(found.x))
-    total = float(np.sum(rest**2))
-    if total - explained > _LEFT * total:
+    # the best of as many sines as touches explains so much of pure scatter of the loads
+    count = place.size
+    by_chance = 1.0 - (_CHANCE / count) ** (2.0 / (count - 5))
+    if explained < max(_LEAST, by_chance) * float(np.sum(rest**2)):
         return None
     return Strips(
         2.0 * np.pi / float(found.x), math.hypot(a, b), math.atan2(b, a), math.hypot(c, d), math.atan2(d, c)

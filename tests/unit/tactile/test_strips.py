@@ -78,6 +78,8 @@ def test_ripple_is_found_under_scattered_loads_and_none_where_there_is_none() ->
     noise = 0.004 * random.normal(size=model.shape)
     even = load[:, None] * model + noise
     assert find_strips(even - model, model, widening, place) is None
+    few = place < np.radians(70.0)  # as few as these explain a fifth of their scatter by some sine
+    assert find_strips((even - model)[few], model[few], widening[few], place[few]) is None
     change = (STRIPS.strain_factor(place) - 1.0)[:, None] * model
     change = change + (STRIPS.width_factor(place) - 1.0)[:, None] * widening
     found = find_strips(even + change - model, model, widening, place)
