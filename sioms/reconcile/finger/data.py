@@ -128,7 +128,7 @@ class FingerData:
         level, warm = t.level[:, self.alive].mean(1), t.temperature - t.temperature.mean()
         slope = float(warm @ level) / max(float(warm @ warm), 1e-12)
         jumps = np.diff(level[np.argsort(t.time)], 2)
-        seen = 1.4826 * float(np.median(np.abs(jumps))) / 6.0**0.5
+        seen = float(1.4826 * np.median(np.abs(jumps)) / np.sqrt(6.0))
         told = float(np.sqrt(own + slope**2 * np.median(t.temperature_noise) ** 2))
         return max(told, seen)
 
