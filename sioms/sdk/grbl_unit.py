@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import errno
 import math
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,22 +16,21 @@ import numpy as np
 from sioms.motion import ActionKind, AxisSettings, DriveAction
 from sioms.protocol.flags import ControlMode
 
+from . import grbl_opening
 from .blocks import BlockSpec
 from .codec import grbl
 from .codec.grbl import Answer, Report
 from .codec.grbl_homing import GrblHoming
 from .codec.grbl_jog import JogChain, straight_jog
-from .codec.grbl_machine import INCHES, MachinePosition, compare_limits
+from .codec.grbl_machine import INCHES, MachinePosition
 from .codec.grbl_moves import GrblMoves, Moves
 from .drive_axes import AxesUnit
 from .driver import Kit
-from .exchange import DeviceError, LinkError, Pause, Send, Step, Steps
+from .exchange import DeviceError, Pause, Send, Steps
+from .grbl_opening import RESET_S, TIMEOUT_S
 
-TIMEOUT_S = 0.5
 STATUS_S = 0.2
 """A status report comes within 5 to 20 ms; ten times that on a slow adapter."""
-RESET_S = 3.0
-HOLD_S = 5.0
 TOGETHER_S = 0.0005
 """How long a start waits for the starts of other axes that go out with it."""
 OFFSET_REPORTS = 35
@@ -118,24 +117,13 @@ class GrblUnit(AxesUnit):
         self._alarm, self._last = 0, None
         self._homing.forget()
         self._forget()
-        yield Send(b"\n" + grbl.JOG_CANCEL, "end a cut line, cancel jogs")
-        yield Pause(0.1)
-        try:
-            report, _ = yield grbl.status(TIMEOUT_S)
-        except LinkError:  # booting, or deaf because it homes: only a reset ends that
-            yield grbl.reset(RESET_S)
-            report, _ = yield grbl.status(TIMEOUT_S)
-        if report.state in ("Run", "Hold"):
-            yield from self._hold_and_reset()
-        elif report.state == "Jog":  # it brakes; what is asked next it would refuse
-            report = yield from self._until_rest()
-        answer: Answer = yield grbl.command("$I", TIMEOUT_S, repeatable=True)
-        version = answer.tagged("VER")
-        if not version or self._settings.version not in version:
-            text = f"identify {self.name}: version {version or 'not told'}; the configuration says "
-            raise DeviceError(errno.ENODEV, f"{text}{self._settings.version or 'a Grbl controller'}")
-        found: Answer = yield grbl.command("$$", TIMEOUT_S, repeatable=True)
-        self._compare(found.settings())
+        report = yield from grbl_opening.to_rest(self.clock, self._hear_report)
+        yield from grbl_opening.identify(self.name, self._settings.version)
+        answer: Answer = yield grbl.command("$$", TIMEOUT_S, repeatable=True)
+        found = answer.settings()
+        self._place.in_report = 25.4 if found.get(INCHES) else 1.0
+        axes, log = self.bank.settings, self._kit.log
+        grbl_opening.compare(self.name, found, axes, self._index, self._per_unit.tolist(), log)
         for _ in range(OFFSET_REPORTS):
             self._state = report.state
             if self._place.note(report):
@@ -151,8 +139,7 @@ class GrblUnit(AxesUnit):
             self._report_homing()
             return
         report, lines = yield grbl.status(STATUS_S)
-        self._hear(lines)
-        self._take(report)
+        self._take_heard(report, lines)
         if self._moves.interrupted:
             yield from self._go_on()
         elif self._chain.wanted.any() and self._state in ("Idle", "Jog"):
@@ -276,38 +263,19 @@ class GrblUnit(AxesUnit):
                     )
         self._moves.interrupted = False
 
-    def _hold_and_reset(self) -> Steps:
-        """End a program with its position kept: hold, wait for rest, reset."""
-        yield Send(grbl.HOLD, "feed hold")
-        limit_ns = self.clock() + int(HOLD_S * 1e9)
-        while self.clock() < limit_ns:
-            yield Pause(0.05)
-            report, _ = yield grbl.status(TIMEOUT_S)
-            if (report.state, report.sub) == ("Hold", 0) or report.state == "Idle":
-                break
-        yield grbl.reset(RESET_S)
-
-    def _compare(self, found: dict[int, float]) -> None:
-        """Compare the controller's limits with the configured ones; FluidNC does not tell them by number."""
-        self._place.in_report = 25.4 if found.get(INCHES) else 1.0
-        for settings, index, per_unit in zip(self.bank.settings, self._index, self._per_unit, strict=True):
-            try:
-                told = compare_limits(
-                    found, index, float(per_unit), settings.velocity_max, settings.acceleration_max
-                )
-            except DeviceError as error:
-                raise DeviceError(error.errno, f"open {self.name}: axis {settings.name}: {error}") from None
-            if not told:
-                self._kit.log(
-                    "warning", f"{self.name} {settings.name}: the controller does not tell its limits"
-                )
-
     def _hear(self, lines: Sequence[str]) -> None:
         number = grbl.alarm_of(lines)
         if number:
             self._alarm = number
             if number not in grbl.POSITION_KEPT:
                 self.bank.set_homed(range(self.bank.n), False)
+
+    def _hear_report(self, report: Report, lines: Sequence[str]) -> None:
+        self._hear(lines)
+
+    def _take_heard(self, report: Report, lines: Sequence[str]) -> None:
+        self._hear(lines)
+        self._take(report)
 
     def _take(self, report: Report) -> None:
         """Tell the bank what a report says."""
@@ -345,21 +313,7 @@ class GrblUnit(AxesUnit):
             return
         self._replaces[axis] = False
         yield self._cancel()
-        yield from self._until_rest(self._take)
-
-    def _until_rest(
-        self, taken: Callable[[Report], None] = lambda report: None
-    ) -> Generator[Step, Any, Report]:
-        """Wait until cancelled jogs have come to rest; return the last report, and give each to ``taken``."""
-        limit_ns = self.clock() + int(HOLD_S * 1e9)
-        while True:
-            yield Pause(0.02)
-            report: Report
-            report, lines = yield grbl.status(TIMEOUT_S)
-            self._hear(lines)
-            taken(report)
-            if report.state not in ("Jog", "Hold") or self.clock() >= limit_ns:
-                return report
+        yield from grbl_opening.until_rest(self.clock, self._take_heard)
 
     def _jog_to(self, together: Moves) -> Steps:
         """Send one line for these axes."""
