@@ -233,7 +233,7 @@ def _timeout(station: Station) -> tuple[float, float]:
         raise NotApplicable(f"no time-out within {LATE_TIMEOUT_S:g} s")
     lost = [t for t, way, _, _ in station.messages(60) if way == ">" and t >= began_ns - 50_000_000]
     times = [entry for entry in station.messages(60) if entry[3] == "lost"]
-    sent_ns = max((t for t in lost if times and t <= times[-1][0]), default=began_ns)
+    sent_ns = max((t for t in lost if times and t <= min(times[-1][0], now_ns)), default=began_ns)
     return (now_ns - sent_ns) / 1e9, answer_s
 
 
