@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from .server import Server
 
 _SEND_BUFFER = 1 << 18
+_START_S = 1.5
+"""How long an open that is not to wait for other clients waits for a device that is just starting; below the client's grace."""
 
 
 class NodeVerbs:
@@ -93,8 +95,11 @@ class NodeVerbs:
         if obstacle is None:
             self._grant(session, number, node, access, float(lease_s))
             return LATER
-        if timeout_s is not None and float(timeout_s) <= 0:
-            raise obstacle
+        patient = timeout_s is None or float(timeout_s) > 0
+        if not patient:
+            if not self._is_starting(node):
+                raise obstacle
+            timeout_s = _START_S
         wait = self._clients.wait(session, number, timeout_s, f"open {name}")
         wait.why = lambda: str(self._obstacle(node) or "it has just become free").removeprefix(
             f"open {name}: "
@@ -105,8 +110,12 @@ class NodeVerbs:
                 why = f"open {name}: it has been removed or changed meanwhile; open it again"
                 self._clients.answer(wait, refusal(wait.number, errno.EIO, why))
                 return True
-            if self._obstacle(node) is not None:
-                return False
+            obstacle = self._obstacle(node)
+            if obstacle is not None:
+                if patient or self._is_starting(node):
+                    return False
+                self._clients.answer(wait, refusal(wait.number, obstacle.errno, str(obstacle)))
+                return True
             if self._clients.drop(wait):
                 try:
                     self._grant(session, number, node, access, float(lease_s))
@@ -137,6 +146,10 @@ class NodeVerbs:
                 f"open {node.name}: device {node.device} is {state}" + (f": {reason}" if reason else ""),
             )
         return None
+
+    def _is_starting(self, node: Node) -> bool:
+        device = self._server.devices.get(node.device)
+        return device is not None and device.state is State.STARTING
 
     def _grant(self, session: Session, number: int, node: Node, access: Access, lease_s: float) -> None:
         device = self._server.devices[node.device]
@@ -233,6 +246,7 @@ class NodeVerbs:
         """Void all handles of a driver process that is no more."""
         for handle in [h for h in self._handles.values() if h.node.device == device.name]:
             self._forget(handle)
+        self.retry_opens()
 
     def holders(self) -> Iterator[Handle]:
         """Return the handles that own outputs."""

@@ -150,7 +150,8 @@ class Workcell:
             name: node name.
             mode: 'r', 'w' or 'rw'. A node that can be written is exclusive in whatever mode; its
                 ``.readonly`` companion opens any number of times.
-            timeout: how long to wait for it to be free [s]; 0: not; None: for ever.
+            timeout: how long to wait for it to be free [s]; 0: not; None: for ever. For a device that is
+                just starting any open waits 1.5 s.
             lease: longest silence of this client [s] before its axes are halted, for programs that may
                 hang; 0: none. Any request of the node renews it, ``keepalive`` does, and a call that
                 waits on the node keeps renewing it.

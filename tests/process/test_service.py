@@ -345,6 +345,13 @@ def test_a_driver_file_is_found_beside_the_configuration_and_its_faults_are_said
     assert "SyntaxError" in said[0] and "defines no DRIVER" in said[1] and "no such file" in said[2]
 
 
+def test_an_open_that_comes_before_its_device_is_up_waits_for_it(start_daemon: Callable[..., Daemon]) -> None:
+    daemon = start_daemon(ready=False)
+    wait_for(lambda: os.path.exists(daemon.socket), "the socket")
+    with daemon.cell() as cell, cell.open("force0") as node:
+        assert len(node.read().data) == 6
+
+
 def test_force_is_still_there(start_daemon: Callable[..., Daemon]) -> None:
     """A workcell of one sensor alone: nothing else is needed."""
     daemon = start_daemon(FORCE)
