@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -212,7 +213,7 @@ def _flat_and_edge(page: Page, result: Calibration) -> None:
 
 
 def _fit_all(finger: Finger, touches: Touches, with_load: bool) -> list[ShapeEstimate]:
-    estimator = Estimator(finger)
+    estimator = Estimator(finger, averaged=max(touches.averaged, 1.0))
     strains = -np.array(finger.elements.gain) * touches.output
     return [
         estimator.frame(y, Load(float(p), 4.0) if with_load else None)
@@ -235,9 +236,7 @@ def _indenters(page: Page, data: Data, result: Calibration) -> None:
     if np.isfinite(touches.force).all() and np.all(touches.force > 0.0):
         # what was applied: the cell's variation at the commanded level
         applied = touches.force * float(np.median(touches.load / touches.force))
-        touches = Touches(
-            touches.output, touches.angle_rad, applied, touches.radius_m, touches.force, touches.noise
-        )
+        touches = replace(touches, load=applied)
     free = _fit_all(finger, touches, False)
     loaded = _fit_all(finger, touches, True) if np.isfinite(touches.force).all() else None
     rows, radii = [], np.unique(touches.radius_m)

@@ -96,7 +96,7 @@ def fit_errors(finger: Finger, touches: Touches) -> tuple[Floats, NDArray[np.boo
     if len(touches) and np.isfinite(touches.force).all() and np.all(touches.force > 0.0):
         applied = touches.force * float(np.median(touches.load / touches.force))
     strains = -np.array(finger.elements.gain) * linearise(touches.output, np.array(finger.elements.quadratic))
-    estimator = Estimator(finger, compiled=None)
+    estimator = Estimator(finger, compiled=None, averaged=max(touches.averaged, 1.0))
     errors, doubted = np.full((len(touches), 3), np.nan), np.zeros(len(touches), dtype=np.bool_)
     for number, shape in enumerate(estimator.batch(strains)):
         doubted[number] = shape.doubtful

@@ -369,7 +369,7 @@ def _finger(
         misfit, method, rows = residuals["corrected"], "corrected", np.zeros((count, direct.rows.shape[1]))
         rows[[e for e, fit in enumerate(fits) if fit is not None]] = direct.rows
     # what averaging left of the noise is no misfit
-    own = np.array(column("gain", base.gain)) * touches.noise * np.sqrt(2.0 / 20.0) / peak
+    own = np.array(column("gain", base.gain)) * touches.noise / np.sqrt(touches.averaged) / peak
     misfit = np.sqrt(np.maximum(misfit**2 - np.where(np.isfinite(own), own, 0.0) ** 2, (0.2 * misfit) ** 2))
     noise = np.where(np.isfinite(touches.noise) & (touches.noise > 0.0), touches.noise, np.array(base.noise))
     elements = Elements(

@@ -143,6 +143,7 @@ class Estimator:
         conductor: what touches is a conductor; a finger calibrated with the proximity effect then undoes it.
         most_hollow: largest R of an estimate, in units of rb: 1 is a flat, 1.5 a hollow of radius 3 rb. Without a
             bound a light touch beside the last element can pass for a heavy, wide one further out.
+        averaged: frames given are means of so many.
     """
 
     def __init__(
@@ -153,6 +154,7 @@ class Estimator:
         contact_sigma: float = 6.0,
         conductor: bool = True,
         most_hollow: float = 1.5,
+        averaged: float = 1.0,
     ) -> None:
         if not most_hollow >= 1.0:
             raise ValueError(f"make estimator: most_hollow is {most_hollow}; need 1 (flats) or more")
@@ -161,7 +163,9 @@ class Estimator:
         self._widths = finger.width_table()
         self._solve = self._choose(compiled)
         self._poor_fit, self._contact_sigma = poor_fit, contact_sigma
-        noise = np.asarray(finger.strain_noise, dtype=np.float64) ** 2
+        if not averaged >= 1.0:
+            raise ValueError(f"make estimator: frames are means of {averaged}; need 1 or more")
+        noise = np.asarray(finger.strain_noise, dtype=np.float64) ** 2 / averaged
         self._used = np.isfinite(noise)
         self._noise = np.where(self._used, noise, _HUGE)
         self._share = np.asarray(finger.misfit, dtype=np.float64) ** 2

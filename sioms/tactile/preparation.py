@@ -193,7 +193,7 @@ def _cell_is_better(nominal: Finger, touches: Touches, loads: TouchLoads) -> boo
 def _cell_loads(touches: Touches) -> Touches:
     """Return the touches with the cell's loads, scaled to the commanded level."""
     load = touches.force * float(np.median(touches.load / touches.force))
-    return Touches(touches.output, touches.angle_rad, load, touches.radius_m, touches.force, touches.noise)
+    return replace(touches, load=load)
 
 
 class _Ramps:

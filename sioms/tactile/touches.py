@@ -7,7 +7,7 @@ A recording is a table of frames with marks: which touch, and whether the frame 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -67,6 +67,7 @@ class Touches:
         radius_m: indenter radius, 0 for an edge, infinite for a flat, shape (nt,).
         force: measured load [N/m], shape (nt,); nan without a load cell.
         noise: standard deviation of one frame's output, shape (ns,).
+        averaged: frames whose mean is as noisy as an output; 10 if it is 20 frames under load less 20 of baseline.
     """
 
     output: Floats
@@ -75,6 +76,7 @@ class Touches:
     radius_m: Floats
     force: Floats
     noise: Floats
+    averaged: float = 10.0
 
     def __len__(self) -> int:
         return int(self.angle_rad.size)
@@ -83,12 +85,12 @@ class Touches:
         """Return some of the touches."""
         return Touches(
             self.output[which], self.angle_rad[which], self.load[which], self.radius_m[which], self.force[which],
-            self.noise,
+            self.noise, self.averaged,
         )  # fmt: skip
 
     def with_output(self, output: Floats) -> Touches:
         """Return the same touches with other outputs (linearised, say)."""
-        return Touches(output, self.angle_rad, self.load, self.radius_m, self.force, self.noise)
+        return replace(self, output=output)
 
 
 def join(parts: list[Touches]) -> Touches:
@@ -99,7 +101,7 @@ def join(parts: list[Touches]) -> Touches:
     output, angle, load, radius, force = (np.concatenate([getattr(p, name) for p in parts]) for name in names)
     count = np.array([len(part) for part in parts], dtype=np.float64)
     noise = np.sqrt(count @ np.array([part.noise**2 for part in parts]) / count.sum())
-    return Touches(output, angle, load, radius, force, noise)
+    return Touches(output, angle, load, radius, force, noise, min(part.averaged for part in parts))
 
 
 def average(recording: Recording, angle_rad: Floats, load: Floats, radius_m: Floats, scale: float) -> Touches:
@@ -118,6 +120,7 @@ def average(recording: Recording, angle_rad: Floats, load: Floats, radius_m: Flo
     count = angle_rad.size
     output, force = np.empty((count, recording.raw.shape[1])), np.empty(count)
     spread: list[Floats] = []
+    shares = np.empty(count)
     for number in range(count):
         mine = recording.touch == number
         before, under = mine & (recording.phase == BASELINE), mine & (recording.phase == LOADED)
@@ -126,6 +129,7 @@ def average(recording: Recording, angle_rad: Floats, load: Floats, radius_m: Flo
                 f"average touch {number} of {count}: {int(before.sum())} baseline and {int(under.sum())} loaded frames; "
                 "need at least one of each"
             )
+        shares[number] = 1.0 / before.sum() + 1.0 / under.sum()
         output[number] = recording.raw[under].mean(0) - recording.raw[before].mean(0)
         force[number] = recording.force[under].mean() - recording.force[before].mean()
         if before.sum() > 2:
@@ -137,7 +141,8 @@ def average(recording: Recording, angle_rad: Floats, load: Floats, radius_m: Flo
             f"average touch {touch}: element {element} holds a reading that is not finite; leave the touch out"
         )
     noise = np.sqrt(np.mean(spread, axis=0)) if spread else np.full(output.shape[1], np.nan)
-    return Touches(output * scale, angle_rad, load, radius_m, force, noise * scale)
+    averaged = 1.0 / float(shares.mean()) if count else 1.0
+    return Touches(output * scale, angle_rad, load, radius_m, force, noise * scale, averaged)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

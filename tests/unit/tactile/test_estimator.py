@@ -175,6 +175,14 @@ def test_dead_elements_are_left_out(nominal: Finger, estimator: Estimator) -> No
     assert partly.frame(frame).quality is Quality.BAD_ELEMENTS
 
 
+def test_means_of_frames_are_told_more_exactly(nominal: Finger, estimator: Estimator) -> None:
+    frame = strains(nominal, math.radians(80.0), 200.0, 6e-3)
+    one, mean = estimator.frame(frame), Estimator(nominal, averaged=16).frame(frame)
+    assert mean.deviations == pytest.approx([d / 4.0 for d in one.deviations], rel=1e-3)
+    with pytest.raises(ValueError, match=r"frames are means of 0\.5; need 1 or more"):
+        Estimator(nominal, averaged=0.5)
+
+
 def test_calibrated_misfit_widens_the_deviations(nominal: Finger, estimator: Estimator) -> None:
     elements = msgspec.structs.replace(nominal.elements, misfit=(0.03,) * 16)
     rough = Estimator(msgspec.structs.replace(nominal, elements=elements))
