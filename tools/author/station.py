@@ -296,9 +296,10 @@ class Station:
             if time.monotonic() - began > timeout_s:
                 status = self.status()
                 why = status["reason"] or status["link_reason"] or "no reason given"
-                said = self.daemon.log()[-1500:] if self.daemon is not None else ""
+                log = self.daemon.log() if self.daemon is not None else ""
                 text = f"device {self.rig.device}: {status['state']}, link {status['link']}: {why}"
-                raise TimeoutError(f"{text}; not good within {timeout_s:g} s; the daemon said: {said}")
+                said = _crash(log) or f"the daemon said: {log[-1500:]}"
+                raise TimeoutError(f"{text}; not good within {timeout_s:g} s; {said}")
             time.sleep(0.005)
         return time.monotonic() - began
 
@@ -390,6 +391,13 @@ class Station:
         if self.daemon is None:
             raise Unanswered("no daemon runs")
         return Client(script, self.daemon.socket, *words)
+
+
+def _crash(log: str) -> str:
+    """Return the last exception of a driver in a daemon's log, with where it was raised; '' when there is none."""
+    found = re.findall(r'text="(driver failed: .*)"$', log, re.MULTILINE)
+    words = found[-1].replace('\\"', '"').split() if found else []
+    return " ".join(word for word in words if word.strip("~^"))  # without the marks below a line of code
 
 
 def _wait_sound(node: Any) -> None:
