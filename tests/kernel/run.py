@@ -140,7 +140,7 @@ def main() -> int:
         "--build", type=Path, default=cache / "sioms-kernel", help="where kernels are kept (%(default)s)"
     )
     parser.add_argument(
-        "--timeout", type=float, default=300.0, help="longest that the tests may take [s] (%(default)g)"
+        "--timeout", type=float, default=900.0, help="longest that the tests may take [s] (%(default)g)"
     )
     options, arguments = parser.parse_known_args()
     try:
