@@ -11,6 +11,9 @@ def main(argv: list[str] | None = None) -> int:
     """Run the daemon, or check a configuration; return the exit status."""
     nursery = start_nursery()  # it imports numpy and the motion core while we import; it ends when we do
     import argparse
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # until the service listens to signals: the end, and no traceback
 
     parser = argparse.ArgumentParser(
         prog="siomsd",

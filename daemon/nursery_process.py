@@ -7,6 +7,9 @@ import socket
 import sys
 from typing import NamedTuple
 
+_SIGINT = 2
+"""Of Linux; importing ``signal`` would delay the nursery by the import of ``enum``."""
+
 
 class NurseryProcess(NamedTuple):
     """A running nursery.
@@ -32,4 +35,6 @@ def start_nursery() -> NurseryProcess:
         theirs.set_inheritable(True)
         environment = dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", PYTHONFAULTHANDLER="1")
         arguments = [sys.executable, "-m", "sioms.sdk.nursery", str(theirs.fileno())]
-        return NurseryProcess(ours, os.posix_spawn(sys.executable, arguments, environment))
+        # A terminal's Ctrl-C is for the daemon, whose end ends the nursery.
+        pid = os.posix_spawn(sys.executable, arguments, environment, setsigmask=[_SIGINT])
+        return NurseryProcess(ours, pid)

@@ -15,6 +15,7 @@ import socket
 import sys
 import traceback
 import zlib
+from collections.abc import Sequence
 from typing import Any
 
 import msgpack
@@ -29,12 +30,8 @@ def main(fd: int) -> None:
     gc.disable()  # until the first fork: what is imported stays, and is not looked through again and again
     sock = socket.socket(fileno=fd)
     os.set_inheritable(fd, False)
-    for number in (
-        signal.SIGINT,
-        signal.SIGTERM,
-        signal.SIGHUP,
-    ):  # what these mean is for the daemon to decide
-        signal.signal(number, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # what these mean is for the daemon to decide
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel reaps; the daemon watches by pidfd
     asked = select.poll()
     asked.register(sock, select.POLLIN)
@@ -51,15 +48,23 @@ def main(fd: int) -> None:
                 case NurseryVerb.DESCRIBE:
                     # Thousands of alike channels would not fit into a packet.
                     described = zlib.compress(msgpack.packb(_describe(*message[2:])), 1)
-                    sock.send(encode(0, number, 0, described))
+                    _tell(sock, encode(0, number, 0, described))
                 case NurseryVerb.SPAWN:
                     _spawn(sock, number, fds, *message[2:])
         except Exception as error:  # a driver's describe may raise anything; the daemon must hear of it
             traceback.print_exc()
-            sock.send(refusal(number, 5, f"{type(error).__name__}: {error}"))
+            _tell(sock, refusal(number, 5, f"{type(error).__name__}: {error}"))
         finally:
             for each in fds:
                 os.close(each)
+
+
+def _tell(sock: socket.socket, packet: bytes, fds: Sequence[int] = ()) -> None:
+    """Answer the daemon; when it has ended meanwhile, so does the nursery, and every driver sees it by itself."""
+    try:
+        socket.send_fds(sock, [packet], fds)
+    except ConnectionError:
+        raise SystemExit from None
 
 
 def _describe(device: str, driver: str, table: dict[str, Any], folder: str) -> list[Any]:
@@ -105,7 +110,7 @@ def _spawn(
             os._exit(status)
     pidfd = os.pidfd_open(pid)
     try:
-        socket.send_fds(sock, [reply(number, pid)], [pidfd])
+        _tell(sock, reply(number, pid), [pidfd])
     finally:
         os.close(pidfd)
 

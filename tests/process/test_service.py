@@ -352,6 +352,14 @@ def test_an_open_that_comes_before_its_device_is_up_waits_for_it(start_daemon: C
         assert len(node.read().data) == 6
 
 
+def test_a_daemon_told_to_end_while_it_starts_ends_without_a_traceback(start_daemon: Callable[..., Daemon]) -> None:
+    daemon = start_daemon(ready=False)
+    wait_for(lambda: os.path.exists(daemon.socket), "the socket")
+    daemon.running.signal(signal.SIGINT)
+    assert daemon.running.wait_exit() == 0
+    assert "Traceback" not in "".join(daemon.running.lines)
+
+
 def test_force_is_still_there(start_daemon: Callable[..., Daemon]) -> None:
     """A workcell of one sensor alone: nothing else is needed."""
     daemon = start_daemon(FORCE)
