@@ -37,7 +37,7 @@ class FingerData:
     ramps: tuple[Ramped, ...]
     ramp_scene: Scene | None
     load_share: Floats  # relative standard deviation of each touch's load
-    cell_spread: float  # spread of the cell about the commanded load [N/m], nan without a cell
+    cell_spread: Floats  # of the cell about the commanded load, by touch [N/m], nan without a cell
     view: NDArray[np.int64]
     block: NDArray[np.int64]
     element: NDArray[np.int64]
@@ -54,7 +54,7 @@ class FingerData:
         rows.append((((course - mean[:, None]) @ _CONTRASTS.T) / self.course_sigma[:, None]).ravel())
         rows.append(self._drift(b))
         rows.append(self._ramps(b))
-        if np.isfinite(self.cell_spread):
+        if np.isfinite(self.cell_spread).all():
             rows.append(t.load * (1.0 + b.cell) / self.cell_spread)
         return np.concatenate(rows)
 
@@ -74,7 +74,7 @@ class FingerData:
         if self.untouched is not None:
             rows.append((self.untouched.output[:, self.alive] / self.untouched.noise[self.alive]).ravel())
         rows += [r.output / r.noise for r in self.ramps]
-        if np.isfinite(self.cell_spread):
+        if np.isfinite(self.cell_spread).all():
             rows.append(t.cell / self.cell_spread)
         return np.concatenate(rows)
 
@@ -200,7 +200,7 @@ def lay_out(
     elements: Floats,
     load_share: Floats,
     load: Floats,
-    cell_spread: float,
+    cell_spread: Floats,
 ) -> FingerData:
     """Lay out the rows.
 
@@ -208,7 +208,7 @@ def lay_out(
         alive: elements that answer.
         elements: angles of the elements [rad]; ramps lie over them.
         load: best guess of each touch's load [N/m] and its relative standard deviation beside it.
-        cell_spread: spread of the cell about the commanded load [N/m], nan without a cell.
+        cell_spread: spread of the cell about the commanded load by touch [N/m], nan without a cell.
     """
     warm = (
         np.nan_to_num(touched.temperature - np.nanmean(touched.temperature))
@@ -237,7 +237,7 @@ def lay_out(
         parts.append((DRIFT, np.repeat(np.arange(n) * 12 // n, ns), np.tile(alive, n)))
     for r in ramps:
         parts.append((RAMP, np.zeros(len(r.load), dtype=np.int64), np.full(len(r.load), r.element)))
-    if np.isfinite(cell_spread):
+    if np.isfinite(cell_spread).all():
         parts.append((CELL, group, np.full(count, -1)))
     blocks, first = [], 0
     for _, own, _ in parts:
@@ -279,5 +279,5 @@ def only(data: FingerData, which: NDArray[np.bool_], elements: Floats) -> Finger
         elements,
         data.load_share[which],
         data.scene.load[which],
-        data.cell_spread,
+        data.cell_spread[which],
     )

@@ -189,14 +189,16 @@ def _rows(
     """Lay out the rows with the best guess of each touch's load: the load cell at the commanded level if outputs follow it."""
     count = len(t)
     told = bool(np.isfinite(t.cell).all() and np.ptp(t.cell) > 0.0 and np.all(t.cell > 0.0))
-    load, share, spread = t.load.copy(), np.full(count, LOAD_SPREAD), np.nan
+    load, share, spread = t.load.copy(), np.full(count, LOAD_SPREAD), np.full(count, np.nan)
     if told and np.allclose(t.cell, t.load, rtol=1e-6):
         share = LOAD_MARGIN * t.cell_noise / t.cell
         notes.append("the loads are what the load cell says: its scale is not judged")
     elif told:
         level = float(np.median(t.cell / t.load))
         ratio = t.cell / t.load / level
-        spread = float(max(1.4826 * np.median(np.abs(t.cell - level * t.load)), np.median(t.cell_noise)))
+        # beyond its own noise the cell scatters in proportion to the load; 0.455 is the median of a normal deviate squared
+        seen, own = (np.median((v / t.load) ** 2) for v in (t.cell - level * t.load, t.cell_noise))
+        spread = np.sqrt(t.cell_noise**2 + max(float(seen / 0.455 - own), 0.0) * t.load**2)
         if _follows(t, ratio, base, alive):
             load, share = t.cell / level, LOAD_MARGIN * t.cell_noise / t.cell
         else:

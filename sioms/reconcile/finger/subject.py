@@ -59,7 +59,7 @@ class FingerSubject:
                     View("course under constant load", "%", 100.0 * float(np.median(d.course_sigma))),
                     View("untouched outputs", "%", 100.0 * drift),
                     View("load ramps", "%", 100.0 * ramp),
-                    View("load cell", "N/m", d.cell_spread),
+                    View("load cell", "N/m", float(np.median(d.cell_spread))),
                 ),
                 strict=True,
             )

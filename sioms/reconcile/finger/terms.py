@@ -76,7 +76,7 @@ TERMS = (
         "knee",
         "d = l - c (l - s) beyond s",
         bent,
-        Quantity("c", "1", -1.0, 1.0, 0.02, "slope that is lost there"),
+        Quantity("c", "1", -1.2, 1.2, 0.02, "slope that is lost there"),
         Quantity("s", "1", 1e-3, 1.0, 5e-3, "output", starts=(0.01, 0.02, 0.04, 0.07, 0.12, 0.2)),
         lookalikes=("quadratic",),
     ),

@@ -7,12 +7,12 @@ view where it shows most.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from sioms.reconcile.ambiguity import ALIKE, AMBIGUOUS, SAME_TRACE, SWAPS
+from sioms.reconcile.ambiguity import ALIKE, AMBIGUOUS, SWAPS
 from sioms.reconcile.blocks import better, heldout
 from sioms.reconcile.search import DOUBTFUL, FLOOR, GAIN, NEARLY, PAIRS, SPECIFIC, SURE, negligible
 from sioms.reconcile.sensors.effect import TERM_PREFIX, Array, SensorEffect, SensorModel
@@ -123,14 +123,14 @@ class Searcher:
             np.sqrt(np.bincount(self.data.view, weights=e**2, minlength=len(self.data.views)) / count)
         )
 
-    def saving(self, new: Array, old: Array) -> Saving:
-        """Compare held-out losses by view."""
+    def saving(self, new: Array, old: Array, among: Collection[str] = ()) -> Saving:
+        """Compare held-out losses by view: of all views, or of some."""
         of_block = np.zeros(len(new), dtype=np.int64)
         of_block[self.data.block] = self.data.view
         best = Saving(-np.inf, 0.0, "", float((old - new).sum() / old.sum()))
         for i, view in enumerate(self.data.views):
             mine = of_block == i
-            if np.count_nonzero(mine) < 2:
+            if np.count_nonzero(mine) < 2 or (among and view not in among):
                 continue
             share, errors = better(new[mine], old[mine])
             new_one = Saving(share, errors, view, best.total)
@@ -177,10 +177,12 @@ class Searcher:
     def _add(self, fit: Fit, losses: Array) -> Rung | None:
         """Refit the best candidates and take the simplest of those that save most."""
         tried: dict[str, tuple[Fit, Array, Saving]] = {}
+        ratios = zip(self.data.views, self.ratios(fit.model), strict=True)
+        loud = [view for view, ratio in ratios if ratio > FLOOR]
         for start in self.candidates(fit):
             new = self.fit(self._with(fit, start))
             loss = self.loss(new)
-            tried[start.effect] = (new, loss, self.saving(loss, losses))
+            tried[start.effect] = (new, loss, self.saving(loss, losses, loud))
         good = {
             n: t
             for n, t in tried.items()
@@ -368,7 +370,7 @@ class Searcher:
             pairs: effects that leave the same trace, with the share in common, as the gate found them.
         """
         out = []
-        same = {frozenset(p[:2]) for p in pairs if p[2] > SAME_TRACE}
+        same = {frozenset(p[:2]) for p in pairs}
         lib, count = found.fit.model.library, found.fit.model.count
         for name in [
             n for n in found.fit.model.effects if n not in self.frozen and not n.startswith(TERM_PREFIX)
