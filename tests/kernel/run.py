@@ -4,7 +4,8 @@
     .venv/bin/python tests/kernel/run.py [--source DIR-OR-TAR] [--build DIR] [--timeout S] [PYTEST-ARGUMENT ...]
 
 The kernel is a User Mode Linux: a process without any rights, without a virtual machine, that sees the files of this computer
-read-only. It is built once, from the sources of a distribution (5 minutes on two processors), and kept; a run takes three minutes.
+read-only. It is built once, from the sources of a distribution (5 minutes on two processors), and kept; a run takes three
+minutes.
 """
 
 from __future__ import annotations
@@ -148,7 +149,9 @@ def main() -> int:
     except Missing as missing:
         print(f"run.py: {missing}", file=sys.stderr)
         return 2
-    return run(kernel, arguments or [str(HERE)], options.timeout)
+    if not any(Path(word.partition("::")[0]).exists() for word in arguments):
+        arguments += ["-v", str(HERE)]
+    return run(kernel, arguments, options.timeout)
 
 
 if __name__ == "__main__":
