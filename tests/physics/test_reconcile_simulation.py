@@ -146,7 +146,8 @@ def test_the_linear_filter_is_the_answer_of_the_observer_to_a_missing_force() ->
         s = a @ s + b * f
     run = track(replace(AXIS, controller=None), np.array(y), known_force, noise.gain)
     expected = response(AXIS, noise, extra)
-    np.testing.assert_allclose(run.innovation, expected, atol=2e-4 * np.max(np.abs(expected)))
+    forgotten = slice(100, None)  # the first speed is read off the motion, not known to be none
+    np.testing.assert_allclose(run.innovation[forgotten], expected[forgotten], atol=2e-4 * np.max(np.abs(expected)))
 
 
 def test_the_expected_innovation_is_what_a_right_model_leaves() -> None:
