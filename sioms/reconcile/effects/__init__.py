@@ -36,7 +36,9 @@ def library() -> dict[str, Effect]:
             if not isinstance(effect, Effect):
                 raise ValueError(f"load effect {point.name}: got {type(effect).__name__}; needs an Effect")
             if effect.name in found:
-                raise ValueError(f"load effect {point.name}: the name {effect.name} is in use; choose another")
+                raise ValueError(
+                    f"load effect {point.name}: the name {effect.name} is in use; choose another"
+                )
             found[effect.name] = effect
     return found
 

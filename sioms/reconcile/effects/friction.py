@@ -74,8 +74,17 @@ VISCOUS_DIRECTION = Effect(
     slot=Slot.FORCE,
     function=direction_force,
     equation="F = -b_dir |v|: the coefficient is b + b_dir forward, b - b_dir backward",
-    parameters=(Parameter("b_dir", "{F} s/{x}", Ref.DAMPING, -2.0, 2.0, 0.02, "half the difference of the "
-                          "forward and backward coefficients"),),
+    parameters=(
+        Parameter(
+            "b_dir",
+            "{F} s/{x}",
+            Ref.DAMPING,
+            -2.0,
+            2.0,
+            0.02,
+            "half the difference of the forward and backward coefficients",
+        ),
+    ),
     signature="force residual proportional to speed, even in direction",
     lookalikes=("offset",),
     separate="cruise at several speeds both ways, and rest",
@@ -170,5 +179,12 @@ LOAD_FRICTION = Effect(
 )
 
 EFFECTS = (
-    VISCOUS, VISCOUS_DIRECTION, QUADRATIC_DRAG, COULOMB, COULOMB_POSITION, STRIBECK, PRESLIDING, LOAD_FRICTION,
+    VISCOUS,
+    VISCOUS_DIRECTION,
+    QUADRATIC_DRAG,
+    COULOMB,
+    COULOMB_POSITION,
+    STRIBECK,
+    PRESLIDING,
+    LOAD_FRICTION,
 )

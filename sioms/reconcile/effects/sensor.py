@@ -37,7 +37,9 @@ ENCODER_QUANTISATION = Effect(
     channel=Channel.SENSOR,
     slot=Slot.LATTICE,
     equation="counts come in multiples of factor",
-    parameters=(Parameter("factor", "1", Ref.ONE, 1.0, 4096.0, 1.0, "true over stated resolution", fixed=True),),
+    parameters=(
+        Parameter("factor", "1", Ref.ONE, 1.0, 4096.0, 1.0, "true over stated resolution", fixed=True),
+    ),
     signature="only multiples of a number in the counts",
     lookalikes=("backlash",),
     separate="slow motion in one direction",

@@ -30,7 +30,9 @@ BACKLASH = Effect(
     parameters=(
         Parameter("gap", "{x}", Ref.PITCH, 1e-5, 0.2, 3e-3, "free play"),
         Parameter("load_fraction", "1", Ref.ONE, 0.03, 0.97, 0.5, "share of the inertia behind the gap"),
-        Parameter("f_contact", "Hz", Ref.FREQUENCY, 20.0, 400.0, 120.0, "stiffness of the contact, as a resonance"),
+        Parameter(
+            "f_contact", "Hz", Ref.FREQUENCY, 20.0, 400.0, 120.0, "stiffness of the contact, as a resonance"
+        ),
         Parameter("zeta", "1", Ref.ONE, 0.0, 2.0, 0.05, "damping ratio of the contact"),
     ),
     signature="bursts of force residual after every reversal of force",
@@ -44,7 +46,17 @@ PAYLOAD = Effect(
     channel=Channel.MECHANICS,
     slot=Slot.INERTIA,
     equation="(J + J_extra) a = F",
-    parameters=(Parameter("J_extra", "{F} s^2/{x}", Ref.INERTIA, 0.0, 20.0, 0.1, "added inertia"),),
+    parameters=(
+        Parameter(
+            "J_extra",
+            "{F} s^2/{x}",
+            Ref.INERTIA,
+            0.02,
+            20.0,
+            0.1,
+            "added inertia, from where dry friction cannot pass for it",
+        ),
+    ),
     signature="force residual proportional to acceleration",
     lookalikes=("encoder_scale", "thermal_gain", "elastic"),
     separate="index marks, or a known added mass",
