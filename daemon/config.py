@@ -136,7 +136,7 @@ def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
     except tomllib.TOMLDecodeError as error:
         return None, [f"read configuration: {str(error)[0].lower() + str(error)[1:]}"]
     if {"family", "signals"} <= root.keys():
-        text = "this is a register map; name it in the table of a device, map = \"FILE\", and give that configuration"
+        text = 'this is a register map; name it in the table of a device, map = "FILE", and give that configuration'
         return None, [text]
     errors = [
         f"unknown section [{key}]{did_you_mean(key, _SECTIONS)}" for key in root if key not in _SECTIONS

@@ -13,7 +13,9 @@ def main(argv: list[str] | None = None) -> int:
     import argparse
     import signal
 
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # until the service listens to signals: the end, and no traceback
+    signal.signal(
+        signal.SIGINT, signal.SIG_DFL
+    )  # until the service listens to signals: the end, and no traceback
 
     parser = argparse.ArgumentParser(
         prog="siomsd",

@@ -185,7 +185,9 @@ class Server:
         old, self._nursery = self._nursery, plan.nursery
         changed_sources = {n for n in {*plan.stop_sources, *self._stop_sources}
                            if plan.stop_sources.get(n) != self._stop_sources.get(n)}  # fmt: skip
-        changed_alarms = {n for n in {*plan.alarms, *self._alarms} if plan.alarms.get(n) != self._alarms.get(n)}
+        changed_alarms = {
+            n for n in {*plan.alarms, *self._alarms} if plan.alarms.get(n) != self._alarms.get(n)
+        }
         names = self.names
         self.config, self.names, self._stop_sources = plan.config, plan.names, plan.stop_sources
         self._alarms = plan.alarms

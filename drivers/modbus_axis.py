@@ -60,7 +60,19 @@ KEY_OF = {
 DEAD_MAN_SHARE = 0.75
 """Part of a device's dead-man time that a round of polls may take."""
 
-_SERVO_KEYS = ("kind", "modes", "homing", "jerk_max", "force_max", "k", "kz", "kp", "kb", "ki", "force_offset")
+_SERVO_KEYS = (
+    "kind",
+    "modes",
+    "homing",
+    "jerk_max",
+    "force_max",
+    "k",
+    "kz",
+    "kp",
+    "kb",
+    "ki",
+    "force_offset",
+)
 AxisTable: Any = table_type(
     AxisSettings,
     without=(*_SERVO_KEYS, "velocity_filter_s", "following_error_max", "start_velocity"),

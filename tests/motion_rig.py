@@ -189,7 +189,9 @@ class Cell:
 
     def __init__(self, n=2, **settings):
         self.markers = Markers()
-        self.bank = DriveBank([axis(modes=DRIVE_MODES, k=None, **settings) for _ in range(n)], markers=self.markers)
+        self.bank = DriveBank(
+            [axis(modes=DRIVE_MODES, k=None, **settings) for _ in range(n)], markers=self.markers
+        )
         self.drives = [Drive() for _ in range(n)]
         self.now_ns, self.axes, self.events, self.starts = 10**9, list(range(n)), [], []
         self.poll()

@@ -91,7 +91,10 @@ class Columns:
             )
         if self._info.node_class is NodeClass.BINARY:
             return b"".join(
-                [BINARY_WRITE.pack(c, 0, _whole(x, "data"), 0) for c, x in zip(self._channels, numbers, strict=True)]
+                [
+                    BINARY_WRITE.pack(c, 0, _whole(x, "data"), 0)
+                    for c, x in zip(self._channels, numbers, strict=True)
+                ]
             )
         width = len(self._names)
         return b"".join(

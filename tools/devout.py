@@ -37,7 +37,9 @@ def _work(words: Sequence[str]) -> None:
     if not line.targets:
         raise UsageError("no device named; try --help")
     if line.trailing:
-        raise UsageError(f"-{next(iter(line.trailing))} holds for the device that follows it, and none follows")
+        raise UsageError(
+            f"-{next(iter(line.trailing))} holds for the device that follows it, and none follows"
+        )
     tokens = Tokens("skip-bad-lines" in line.common)
     if line.numbers:
         tokens.feed((" ".join(line.numbers) + " ").encode())

@@ -55,7 +55,10 @@ MANUALS: dict[str, Manual] = {
             ("a bare number", "devin -p atod0"),
             ("position of axis 0, with its number", "devin -n0pN mod0"),
             ("velocities of axes 1 to 3", "devin -l1h3v mod0"),
-            ("a damper: 500 samples at 20 Hz into a velocity", "devin -t0.05 -n0 -L500 lord1 | devout -rv -L-1 -W mod0.xaxis"),
+            (
+                "a damper: 500 samples at 20 Hz into a velocity",
+                "devin -t0.05 -n0 -L500 lord1 | devout -rv -L-1 -W mod0.xaxis",
+            ),
         ],
     ),
     "devout": Manual(
@@ -135,8 +138,12 @@ DAEMON_OPTIONS = [
     Option("", "log-level", "LEVEL", ALL, "debug, info, warning or error; info unless told"),
     Option("", "help", "", ALL, "print help"),
 ]
-STATUS = "0 on success; 1 after a failure, 2 after a wrong command line, each with one line on standard error."
-VARIABLES = "SIOMS_SOCKET is the daemon's socket; else /run/sioms/siomsd.sock, else one in the user's runtime folder."
+STATUS = (
+    "0 on success; 1 after a failure, 2 after a wrong command line, each with one line on standard error."
+)
+VARIABLES = (
+    "SIOMS_SOCKET is the daemon's socket; else /run/sioms/siomsd.sock, else one in the user's runtime folder."
+)
 
 
 def answer(tool: str, wanted: str) -> int:
@@ -164,7 +171,9 @@ def help_text(tool: str) -> str:
         lines += [fill(paragraph, 100), ""]
     for title, options in option_groups(tool):
         lines.append(f"{title}:")
-        lines += [fill(o.text, 100, initial_indent=f"  {shape(o):<32}", subsequent_indent=" " * 34) for o in options]
+        lines += [
+            fill(o.text, 100, initial_indent=f"  {shape(o):<32}", subsequent_indent=" " * 34) for o in options
+        ]
         lines.append("")
     lines.append("examples:")
     lines += [f"  {command}\n      {what}" for what, command in manual.examples]
@@ -177,7 +186,10 @@ def option_groups(tool: str) -> list[tuple[str, list[Option]]]:
         ("options for the device that follows", [o for o in TOOLS[tool] if o.scope == NODE]),
         ("options for the whole command line", [o for o in TOOLS[tool] if o.scope == ALL]),
     ]
-    general = [Option("", "help", "", ALL, "print this help"), Option("", "version", "", ALL, "print the version")]
+    general = [
+        Option("", "help", "", ALL, "print this help"),
+        Option("", "version", "", ALL, "print the version"),
+    ]
     found = [(title, options) for title, options in groups if options]
     found[-1][1].extend(general)
     return found

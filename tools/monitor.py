@@ -93,8 +93,12 @@ class Watch:
             if cell is None:
                 self._nodes, self._why = {}, {}
                 cell = Workcell(name="sioms monitor")
-            entries = [e for e in cell.nodes() if not e.name.endswith(READONLY)] if self._only else cell.nodes()
-            self._entries = [e for e in entries if (e.name in self._only if self._only else not is_part(e, entries))]
+            entries = (
+                [e for e in cell.nodes() if not e.name.endswith(READONLY)] if self._only else cell.nodes()
+            )
+            self._entries = [
+                e for e in entries if (e.name in self._only if self._only else not is_part(e, entries))
+            ]
             self._status = cell.status()
             self._open(cell)
             self.cell, self.lost = cell, ""
@@ -189,10 +193,14 @@ class Monitor:
             self._scroll += _SCROLL[typed]
         elif self._confirming:
             self._confirming = False
-            self._message = self._do("reset", lambda cell: cell.reset()) if typed[0] in "yY" else "reset left alone"
+            self._message = (
+                self._do("reset", lambda cell: cell.reset()) if typed[0] in "yY" else "reset left alone"
+            )
         elif typed[0] == "R":
             self._confirming = True
-            self._message = "reset the emergency stop? Motion may be commanded again. y: yes, any other key: no"
+            self._message = (
+                "reset the emergency stop? Motion may be commanded again. y: yes, any other key: no"
+            )
         elif typed[0] in "q\x04":
             self._ended = True
 

@@ -145,11 +145,17 @@ def body(view: View, width: int) -> list[Text]:
         if node.info is None or node.snapshot is None:
             lines.append(Text(f"  {node.why or 'nothing read yet'}", Style.WARN))
         elif node.info.node_class is NodeClass.AXIS:
-            lines += [_axis(c, reading, width) for c, reading in zip(node.info.channels, node.snapshot, strict=True)]
+            lines += [
+                _axis(c, reading, width) for c, reading in zip(node.info.channels, node.snapshot, strict=True)
+            ]
         elif node.info.node_class is NodeClass.ANALOG:
-            lines += _grid([_analog(c, r) for c, r in zip(node.info.channels, node.snapshot, strict=True)], width)
+            lines += _grid(
+                [_analog(c, r) for c, r in zip(node.info.channels, node.snapshot, strict=True)], width
+            )
         else:
-            lines += [_binary(c, reading) for c, reading in zip(node.info.channels, node.snapshot, strict=True)]
+            lines += [
+                _binary(c, reading) for c, reading in zip(node.info.channels, node.snapshot, strict=True)
+            ]
     return lines
 
 

@@ -282,9 +282,7 @@ def _group(options: list[Option], word: str, items: list[Item]) -> None:
         letter = word[at]
         option = by_letter.get(letter)
         if option is None:
-            raise UsageError(
-                f"{word}: unknown option -{letter}; there are: {''.join(by_letter)}; try --help"
-            )
+            raise UsageError(f"{word}: unknown option -{letter}; there are: {''.join(by_letter)}; try --help")
         at += 1
         value: float = 0
         if option.value:
@@ -304,7 +302,9 @@ def _long(options: list[Option], word: str) -> Item:
                 raise UsageError(f"{word}: --{name} takes no value")
             value = _value(option, f"--{name}=", text) if option.value else 0
             return Item(FLAG, option.key, value, option.scope)
-    raise UsageError(f"{word}: unknown option; there are: {', '.join('--' + o.long for o in options)}, --help")
+    raise UsageError(
+        f"{word}: unknown option; there are: {', '.join('--' + o.long for o in options)}, --help"
+    )
 
 
 def _number_end(word: str, at: int) -> int:

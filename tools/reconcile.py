@@ -27,29 +27,56 @@ SUFFIXES = (".csv", ".npz", ".mat", ".txt")
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add ``reconcile`` to the ``sioms`` command."""
     parser: argparse.ArgumentParser = subparsers.add_parser(
-        "reconcile", help="find where simulation and measurement disagree and name the missing effect")
+        "reconcile", help="find where simulation and measurement disagree and name the missing effect"
+    )
     kinds = parser.add_subparsers(dest="subject", required=True, metavar="SUBJECT")
     axis = kinds.add_parser("axis", help="a motor axis, from recordings or live")
-    axis.add_argument("data", type=Path, metavar="DATA", help="file or folder of recordings, or the node of an axis")
-    axis.add_argument("--model", type=Path, metavar="FILE", help="nominal model (TOML; default: DATA/nominal.json)")
-    axis.add_argument("--columns", type=Path, metavar="FILE", help="column description (default: columns.toml beside DATA)")
+    axis.add_argument(
+        "data", type=Path, metavar="DATA", help="file or folder of recordings, or the node of an axis"
+    )
+    axis.add_argument(
+        "--model", type=Path, metavar="FILE", help="nominal model (TOML; default: DATA/nominal.json)"
+    )
+    axis.add_argument(
+        "--columns", type=Path, metavar="FILE", help="column description (default: columns.toml beside DATA)"
+    )
     axis.add_argument("--out", type=Path, default=Path("report"), metavar="DIR", help="where the report goes")
     axis.add_argument("--seed", type=int, default=1, help="of permutations and bootstrap")
     axis.add_argument("--jobs", type=int, default=0, help="cores to use (default: all)")
-    axis.add_argument("--resample", type=int, default=None, metavar="SEED", help="draw the blocks of time anew: does the verdict stand?")
+    axis.add_argument(
+        "--resample",
+        type=int,
+        default=None,
+        metavar="SEED",
+        help="draw the blocks of time anew: does the verdict stand?",
+    )
     axis.add_argument("--quiet", action="store_true", help="no progress")
     _live_arguments(axis)
     add_sensors(kinds)
     test = kinds.add_parser("selftest", help="blind test on generated axes or sensors with hidden effects")
-    test.add_argument("kind", nargs="?", choices=("axis", "tactile", "force"), default="axis", help="what is generated (default axis)")
+    test.add_argument(
+        "kind",
+        nargs="?",
+        choices=("axis", "tactile", "force"),
+        default="axis",
+        help="what is generated (default axis)",
+    )
     test.add_argument("--axes", "--count", type=int, default=20, help="number of axes or sensors")
     test.add_argument("--seed", type=int, default=1, help="of the generator")
-    test.add_argument("--out", type=Path, default=None, metavar="DIR", help="keep what was generated and the answers here")
+    test.add_argument(
+        "--out", type=Path, default=None, metavar="DIR", help="keep what was generated and the answers here"
+    )
     test.add_argument("--jobs", type=int, default=0, help="solvers at a time (default: one for each core)")
-    test.add_argument("--replicates", type=int, default=0, help="solve each so many times more with its blocks drawn anew")
+    test.add_argument(
+        "--replicates", type=int, default=0, help="solve each so many times more with its blocks drawn anew"
+    )
     effects = kinds.add_parser("effects", help="print the library of effects")
-    effects.add_argument("of", nargs="?", choices=("axis", "sensors"), default="axis", help="whose (default axis)")
-    effects.add_argument("--out", type=Path, default=None, metavar="DIR", help="write page and pictures there instead")
+    effects.add_argument(
+        "of", nargs="?", choices=("axis", "sensors"), default="axis", help="whose (default axis)"
+    )
+    effects.add_argument(
+        "--out", type=Path, default=None, metavar="DIR", help="write page and pictures there instead"
+    )
     parser.set_defaults(run=run)
     return parser
 
@@ -86,10 +113,21 @@ def run(args: argparse.Namespace) -> int:
 def _live_arguments(axis: argparse.ArgumentParser) -> None:
     group = axis.add_argument_group("with a node")
     group.add_argument("--yes", action="store_true", help="move without asking")
-    group.add_argument("--travel", type=float, metavar="X", help="largest distance to either side of the present position")
-    group.add_argument("--lap", type=float, default=3.0, metavar="S", help="length of a lap of each experiment (default 3)")
-    group.add_argument("--first", choices=("full", "one_speed"), default="full", help="what is run before anything is decided")
-    group.add_argument("--install", type=Path, metavar="FILE", help="write the model there, for a simulated twin, and reload")
+    group.add_argument(
+        "--travel", type=float, metavar="X", help="largest distance to either side of the present position"
+    )
+    group.add_argument(
+        "--lap", type=float, default=3.0, metavar="S", help="length of a lap of each experiment (default 3)"
+    )
+    group.add_argument(
+        "--first",
+        choices=("full", "one_speed"),
+        default="full",
+        help="what is run before anything is decided",
+    )
+    group.add_argument(
+        "--install", type=Path, metavar="FILE", help="write the model there, for a simulated twin, and reload"
+    )
     group.add_argument("--socket", metavar="PATH", help="the daemon's socket")
 
 
@@ -120,7 +158,9 @@ def run_node(args: argparse.Namespace, say: Any) -> int:
 
     node = str(args.data)
     if args.model is None:
-        raise BadInputError(f"reconcile {node}: it is no file, and for a node --model is needed: the nominal model")
+        raise BadInputError(
+            f"reconcile {node}: it is no file, and for a node --model is needed: the nominal model"
+        )
     settings = Live(args.travel, args.lap, args.first, args.yes, args.socket, args.seed)
     try:
         verdict, session, seconds = live(node, read_model(args.model), settings, say)
@@ -137,7 +177,9 @@ def run_node(args: argparse.Namespace, say: Any) -> int:
     return EXIT[verdict.outcome]
 
 
-def reconcile_axis(data: Path, model: Path | None, columns: Path | None = None, **options: Any) -> tuple[Verdict, float]:
+def reconcile_axis(
+    data: Path, model: Path | None, columns: Path | None = None, **options: Any
+) -> tuple[Verdict, float]:
     """Read, analyse and time one axis.
 
     Args:

@@ -28,7 +28,9 @@ same axis in closed loop under the same commands (reversals, cruises, sines): ag
 """
 PICTURES = "pictures/effects"
 #: The axis of the pictures: 2 g m^2, 0.7 N m, with a loop of 10 Hz.
-AXIS = AxisModel(True, 1e-3, 2e-3, 1e-3, 1e-9, 2 * np.pi, 0.7, 20.0, Controller(17.5, -0.979, -0.8, 0.0, 0.0, 1.8, 0.0))
+AXIS = AxisModel(
+    True, 1e-3, 2e-3, 1e-3, 1e-9, 2 * np.pi, 0.7, 20.0, Controller(17.5, -0.979, -0.8, 0.0, 0.0, 1.8, 0.0)
+)
 #: Values that show better than the typical ones.
 SHOWN = {"encoder_scale": {"gain": 1.02}, "encoder_quantisation": {"factor": 4e5}, "saturation": {"limit": 0.25},
          "cogging": {"n": 5.0}, "torque_ripple": {"n": 5.0}, "coulomb_position": {"n": 2.0}, "thermal_gain": {"loss": 1.0, "tau": 3.0},
@@ -47,14 +49,24 @@ def page() -> str:
 def section(effect: Effect) -> str:
     """Write one effect."""
     kinds = " and ".join(k for k, yes in (("rotary", effect.rotary), ("linear", effect.linear)) if yes)
-    lines = [f"### {effect.name}: {effect.title}", "", f"`{effect.equation}`", "",
-             "| parameter | unit | bounds | of | meaning |", "| --- | --- | --- | --- | --- |"]
+    lines = [
+        f"### {effect.name}: {effect.title}",
+        "",
+        f"`{effect.equation}`",
+        "",
+        "| parameter | unit | bounds | of | meaning |",
+        "| --- | --- | --- | --- | --- |",
+    ]
     for p in effect.parameters:
         bounds = "any" if p.phase else f"{p.lower:g} to {p.upper:g}"
         lines.append(f"| {p.symbol} | {p.unit} | {bounds} | {p.ref.value} | {p.text} |")
-    lines += ["", f"![residual of {effect.title}]({PICTURES}/{effect.name}.png)", "",
-              f"Where its residual is: {effect.signature}. On {kinds} axes.",
-              f"Confused with: {', '.join(effect.lookalikes)}. Told apart by: {effect.separate}."]
+    lines += [
+        "",
+        f"![residual of {effect.title}]({PICTURES}/{effect.name}.png)",
+        "",
+        f"Where its residual is: {effect.signature}. On {kinds} axes.",
+        f"Confused with: {', '.join(effect.lookalikes)}. Told apart by: {effect.separate}.",
+    ]
     if effect.session:
         lines.append(f"Belongs to the session: {', '.join(effect.session)}.")
     return "\n".join(lines) + "\n"
@@ -93,7 +105,9 @@ def picture(effect: Effect) -> Figure:
     t, v, x, f = trace(effect)
     figure = Figure(figsize=(11, 2.3), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True, width_ratios=(2, 1, 1))
-    for a, against, label in zip(axes, (t, v, x), ("time / s", "speed / rad/s", "position / rad"), strict=True):
+    for a, against, label in zip(
+        axes, (t, v, x), ("time / s", "speed / rad/s", "position / rad"), strict=True
+    ):
         a.plot(against, f, "-" if against is t else ".", ms=1, lw=0.6, color="#1f5f8b")
         a.set_xlabel(label)
         a.grid(visible=True, lw=0.3)

@@ -38,13 +38,24 @@ from sioms.tools.reconcile_table import SUFFIXES, UNITS, load_table, measures, n
 
 Array = NDArray[np.float64]
 #: Words in the head of a column that tell what it probably is.
-WORDS = {"time": ("t", "time", "zeit", "stamp"), "position": ("pos", "position", "enc", "encoder", "angle", "actual", "q", "qm", "counts"),
-         "command": ("cmd", "command", "ref", "reference", "set", "setpoint", "target", "qg"),
-         "force_measured": ("current", "cur", "i", "iq", "measured"), "force": ("force", "torque", "u", "effort", "out", "output", "tau"),
-         "index": ("index", "z", "mark")}
+WORDS = {
+    "time": ("t", "time", "zeit", "stamp"),
+    "position": ("pos", "position", "enc", "encoder", "angle", "actual", "q", "qm", "counts"),
+    "command": ("cmd", "command", "ref", "reference", "set", "setpoint", "target", "qg"),
+    "force_measured": ("current", "cur", "i", "iq", "measured"),
+    "force": ("force", "torque", "u", "effort", "out", "output", "tau"),
+    "index": ("index", "z", "mark"),
+}
 QUANTITIES = ("time", "position", "command", "force", "force_measured", "index")
 #: What each quantity may be measured in, on a rotary and on a linear axis.
-ROTARY = {"time": "time", "position": "angle", "command": "angle", "force": "torque", "force_measured": "torque", "index": "number"}
+ROTARY = {
+    "time": "time",
+    "position": "angle",
+    "command": "angle",
+    "force": "torque",
+    "force_measured": "torque",
+    "index": "number",
+}
 LINEAR = {**ROTARY, "position": "length", "command": "length", "force": "force", "force_measured": "force"}
 
 
@@ -68,7 +79,9 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
         files = _files(data)
         if not files:
             raise BadInputError(f"read {data}: no data files; expects one of {', '.join(SUFFIXES)}")
-        raise BadInputError(f"read {data}: no column description (or give --columns): {_draft(files, description)}")
+        raise BadInputError(
+            f"read {data}: no column description (or give --columns): {_draft(files, description)}"
+        )
     with description.open("rb") as f:
         try:
             table = tomllib.load(f)
@@ -77,12 +90,20 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
     only(table, ("sample_time_s", "files", "continuous", "final", "columns"), str(description))
     given = float(table.get("sample_time_s", model.sample_time_s))
     if not 0.98 < given / model.sample_time_s < 1.02:
-        raise BadInputError(f"read {description}: sample_time_s is {given:g}, the model says {model.sample_time_s:g}; needs the same")
+        raise BadInputError(
+            f"read {description}: sample_time_s is {given:g}, the model says {model.sample_time_s:g}; needs the same"
+        )
     last = [folder / n for n in table.get("final", ())]
-    files = [folder / n for n in table["files"]] if "files" in table else [f for f in _files(data) if f not in last]
+    files = (
+        [folder / n for n in table["files"]]
+        if "files" in table
+        else [f for f in _files(data) if f not in last]
+    )
     if not files:
         raise BadInputError(f"read {data}: no data files; expects one of {', '.join(SUFFIXES)}")
-    records, final = (tuple(_record(f, table.get("columns", {}), model) for f in some) for some in (files, last))
+    records, final = (
+        tuple(_record(f, table.get("columns", {}), model) for f in some) for some in (files, last)
+    )
     return Session(records, bool(table.get("continuous", True)), final)
 
 
@@ -101,14 +122,25 @@ def _record(path: Path, columns: Mapping[str, Any], model: AxisModel) -> Record:
         only(spec, ("name", "unit", "scale", "offset"), f"column {quantity}")
         head = table.find(str(spec.get("name")))
         if head is None:
-            raise BadInputError(f"read {path.name}: no column {spec.get('name')!r} for {quantity}; has {', '.join(sorted(table.columns))}")
+            raise BadInputError(
+                f"read {path.name}: no column {spec.get('name')!r} for {quantity}; has {', '.join(sorted(table.columns))}"
+            )
         found[quantity] = _convert(quantity, table.columns[head], spec, table.units.get(head), model)
     index = found.get("index")
-    return Record(path.stem, found["position"], found["force"], found.get("command"), found.get("force_measured"),
-                  None if index is None else index > 0.5, found.get("time"))
+    return Record(
+        path.stem,
+        found["position"],
+        found["force"],
+        found.get("command"),
+        found.get("force_measured"),
+        None if index is None else index > 0.5,
+        found.get("time"),
+    )
 
 
-def _convert(quantity: str, raw: Array, spec: Mapping[str, Any], stated: str | None, model: AxisModel) -> Array:
+def _convert(
+    quantity: str, raw: Array, spec: Mapping[str, Any], stated: str | None, model: AxisModel
+) -> Array:
     """Bring a column to SI; its unit is what the description says, else what the head of the column states."""
     where = f"read column {quantity}"
     unit = unit_of(str(spec.get("unit", stated or "1")))
@@ -116,16 +148,28 @@ def _convert(quantity: str, raw: Array, spec: Mapping[str, Any], stated: str | N
         known = ", ".join(["count", *(u for kind, group in UNITS.items() if kind != "speed" for u in group)])
         raise BadInputError(f"{where}: unit {spec['unit']!r} is not known; known are {known}")
     if stated not in (None, unit) and "scale" not in spec and unit != "1":
-        raise BadInputError(f"{where}: the description says {unit}, the head of the column {spec['name']!r} {stated}; which is it?")
+        raise BadInputError(
+            f"{where}: the description says {unit}, the head of the column {spec['name']!r} {stated}; which is it?"
+        )
     kind, right = measures(unit), (ROTARY if model.rotary else LINEAR)[quantity]
     if kind not in (right, "number", "count") and "scale" not in spec:
-        hint = "give scale = ..., what one unit of it is in SI units" if kind == "electric" else f"needs one of {', '.join(UNITS[right])}"
-        raise BadInputError(f"{where}: {unit} is a unit of {kind}, the {quantity} of a {'rotary' if model.rotary else 'linear'} axis is "
-                            f"{'an' if right == 'angle' else 'a'} {right}; {hint}")
+        hint = (
+            "give scale = ..., what one unit of it is in SI units"
+            if kind == "electric"
+            else f"needs one of {', '.join(UNITS[right])}"
+        )
+        raise BadInputError(
+            f"{where}: {unit} is a unit of {kind}, the {quantity} of a {'rotary' if model.rotary else 'linear'} axis is "
+            f"{'an' if right == 'angle' else 'a'} {right}; {hint}"
+        )
     factor = model.resolution if kind == "count" else UNITS[kind][unit]
     if kind == "count" and factor <= 0.0:
-        raise BadInputError(f"{where}: it is in counts, and the model states no resolution; give resolution = ... in [axis]")
-    return np.asarray((raw * float(spec.get("scale", 1.0)) + float(spec.get("offset", 0.0))) * factor, dtype=np.float64)
+        raise BadInputError(
+            f"{where}: it is in counts, and the model states no resolution; give resolution = ... in [axis]"
+        )
+    return np.asarray(
+        (raw * float(spec.get("scale", 1.0)) + float(spec.get("offset", 0.0))) * factor, dtype=np.float64
+    )
 
 
 def _draft(files: Sequence[Path], description: Path) -> str:
@@ -135,10 +179,15 @@ def _draft(files: Sequence[Path], description: Path) -> str:
     for head in table.columns:
         name, unit = named(head)
         unit = table.units.get(head, unit)
-        guess = next((q for q, words in WORDS.items() if any(w in re.split(r"[\W_]+", name.lower()) for w in words)), "QUANTITY")
+        guess = next(
+            (q for q, words in WORDS.items() if any(w in re.split(r"[\W_]+", name.lower()) for w in words)),
+            "QUANTITY",
+        )
         lines.append(f'{guess} = {{ name = "{head}", unit = "{unit or "UNIT"}" }}')
-    return (f"write {description} with what each column is ({', '.join(QUANTITIES)}; position and force are needed, leave out the "
-            "others), for instance\n    " + "\n    ".join(lines))
+    return (
+        f"write {description} with what each column is ({', '.join(QUANTITIES)}; position and force are needed, leave out the "
+        "others), for instance\n    " + "\n    ".join(lines)
+    )
 
 
 def read_layout(folder: Path, model: AxisModel) -> Session:
@@ -150,9 +199,17 @@ def read_layout(folder: Path, model: AxisModel) -> Session:
             if needed not in raw:
                 raise BadInputError(f"read {path.name}: no array {needed}; has {', '.join(sorted(raw))}")
         q = model.resolution
-        records.append(Record(path.stem, raw["counts"] * q, raw["force"], raw["cmd16"] * q / 16 if "cmd16" in raw else None,
-                              raw.get("force_meas"), raw["index"] > 0.5 if "index" in raw else None,
-                              raw["t_ms"] * 1e-3 if "t_ms" in raw else None))
+        records.append(
+            Record(
+                path.stem,
+                raw["counts"] * q,
+                raw["force"],
+                raw["cmd16"] * q / 16 if "cmd16" in raw else None,
+                raw.get("force_meas"),
+                raw["index"] > 0.5 if "index" in raw else None,
+                raw["t_ms"] * 1e-3 if "t_ms" in raw else None,
+            )
+        )
     return Session(tuple(records))
 
 
@@ -177,10 +234,18 @@ def read_model(path: Path) -> AxisModel:
 def _layout_model(n: Mapping[str, Any]) -> AxisModel:
     c = n["controller"]
     return AxisModel(
-        rotary=n["kind"] == "rotary", sample_time_s=n["sample_time"], inertia=n["inertia"], viscous=n["viscous"],
-        resolution=n["encoder_resolution"], pitch=n["index_pitch"], rated_force=n["inertia"] * n["max_acceleration"],
-        max_speed=n["position_max_speed"], start_position=n.get("start_position", 0.0), name=n.get("scenario", "axis"),
-        controller=Controller(c["k"], c["kz"], c["kp"], c["kb"], c["tau_o"], c["tau_m"], c["vel_filter_hz"]))
+        rotary=n["kind"] == "rotary",
+        sample_time_s=n["sample_time"],
+        inertia=n["inertia"],
+        viscous=n["viscous"],
+        resolution=n["encoder_resolution"],
+        pitch=n["index_pitch"],
+        rated_force=n["inertia"] * n["max_acceleration"],
+        max_speed=n["position_max_speed"],
+        start_position=n.get("start_position", 0.0),
+        name=n.get("scenario", "axis"),
+        controller=Controller(c["k"], c["kz"], c["kp"], c["kb"], c["tau_o"], c["tau_m"], c["vel_filter_hz"]),
+    )
 
 
 def with_resolution(model: AxisModel, session: Session) -> AxisModel:

@@ -25,8 +25,28 @@ from sioms.reconcile_selftest.world import Recording, World
 from sioms.tools.reconcile_input import read_model
 
 #: The mixture of kinds, repeated: out of twenty axes.
-MIXTURE = ("null", "single", "multi", "unknown", "single", "confounded", "multi", "single", "null", "multi",
-           "single", "unknown", "null", "single", "confounded", "multi", "single", "unknown", "multi", "single")
+MIXTURE = (
+    "null",
+    "single",
+    "multi",
+    "unknown",
+    "single",
+    "confounded",
+    "multi",
+    "single",
+    "null",
+    "multi",
+    "single",
+    "unknown",
+    "null",
+    "single",
+    "confounded",
+    "multi",
+    "single",
+    "unknown",
+    "multi",
+    "single",
+)
 RECORD_S = 5.0
 COLUMNS = """[columns]
 time = { name = "time", unit = "s" }
@@ -41,8 +61,11 @@ index = { name = "index" }
 def generate(count: int, seed: int) -> list[Axis]:
     """Draw the axes of a test; every effect comes up in turn."""
     rng = np.random.default_rng(seed)
-    turns = {"single": list(rng.permutation(NAMED)), "unknown": list(rng.permutation(NAMELESS)),
-             "confounded": list(rng.permutation(list(CONFOUNDED)))}
+    turns = {
+        "single": list(rng.permutation(NAMED)),
+        "unknown": list(rng.permutation(NAMELESS)),
+        "confounded": list(rng.permutation(list(CONFOUNDED))),
+    }
     out = []
     for i in range(count):
         kind = MIXTURE[i % len(MIXTURE)]
@@ -54,7 +77,9 @@ def generate(count: int, seed: int) -> list[Axis]:
     return out
 
 
-def record_all(axes: list[Axis], seed: int, seconds: float = RECORD_S, heldout: bool = False) -> list[list[Recording]]:
+def record_all(
+    axes: list[Axis], seed: int, seconds: float = RECORD_S, heldout: bool = False
+) -> list[list[Recording]]:
     """Record all axes.
 
     Args:
@@ -100,8 +125,15 @@ def write_public(axis: Axis, recordings: list[Recording], folder: Path) -> None:
     """Write what the solver may see: records, column description and nominal model."""
     folder.mkdir(parents=True)
     for i, r in enumerate(recordings):
-        np.savez(folder / f"run{i}.npz", time=np.arange(len(r.counts)) * SAMPLE_S, counts=r.counts, command=r.command,
-                 force=r.force, force_measured=r.force_measured, index=r.index)
+        np.savez(
+            folder / f"run{i}.npz",
+            time=np.arange(len(r.counts)) * SAMPLE_S,
+            counts=r.counts,
+            command=r.command,
+            force=r.force,
+            force_measured=r.force_measured,
+            index=r.index,
+        )
     (folder / "columns.toml").write_text(COLUMNS)
     lines: list[str] = []
     for name, values in axis.public().items():
@@ -118,13 +150,37 @@ def solve(folder: Path, resample: int | None = None) -> dict[str, Any]:
     """
     out = folder / ("report" if resample is None else f"again{resample}")
     options = ["--jobs", "1", "--quiet", *([] if resample is None else ["--resample", str(resample)])]
-    done = subprocess.run([sys.executable, "-m", "sioms.tools.reconcile", "axis", str(folder), "--model", str(folder / "nominal.toml"),
-                           "--columns", str(folder / "columns.toml"), "--out", str(out), *options],
-                          capture_output=True, text=True, check=False, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "sioms.tools.reconcile",
+            "axis",
+            str(folder),
+            "--model",
+            str(folder / "nominal.toml"),
+            "--columns",
+            str(folder / "columns.toml"),
+            "--out",
+            str(out),
+            *options,
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+    )
     answer = out / "verdict.json"
     if not answer.exists():
-        return {"verdict": f"error: exit {done.returncode}: {done.stderr.strip()[-300:]}", "effects": [], "alternatives": [],
-                "separating_experiment": "", "details": [], "gaps": [], "seconds": 0.0}
+        return {
+            "verdict": f"error: exit {done.returncode}: {done.stderr.strip()[-300:]}",
+            "effects": [],
+            "alternatives": [],
+            "separating_experiment": "",
+            "details": [],
+            "gaps": [],
+            "seconds": 0.0,
+        }
     found: dict[str, Any] = json.loads(answer.read_text())
     return found
 
@@ -148,14 +204,20 @@ def selftest(count: int, seed: int, out: Path | None = None, jobs: int = 0, repl
         base = out if out is not None else Path(temporary)
         for axis, records in zip(axes, recordings, strict=True):
             write_public(axis, records[:4], base / axis.name)
-        work = [pool.submit(_judge, axis, records, base / axis.name, replicates) for axis, records in zip(axes, recordings, strict=True)]
+        work = [
+            pool.submit(_judge, axis, records, base / axis.name, replicates)
+            for axis, records in zip(axes, recordings, strict=True)
+        ]
         for future in work:
             row = future.result()
             rows.append(row)
             drawn = row.axis
             hidden = ", ".join((*drawn.named, *drawn.nameless)) or "nothing"
-            print(f"{drawn.name} {drawn.kind:10s} {'right' if row.right else 'WRONG'}  hidden {hidden} | {row.verdict}: "
-                  f"{', '.join(row.got) or '-'} ({row.seconds:.0f} s)", flush=True)
+            print(
+                f"{drawn.name} {drawn.kind:10s} {'right' if row.right else 'WRONG'}  hidden {hidden} | {row.verdict}: "
+                f"{', '.join(row.got) or '-'} ({row.seconds:.0f} s)",
+                flush=True,
+            )
     print(table(rows))
     return 0 if sum(r.right for r in rows) >= 0.9 * len(rows) else 1
 

@@ -30,9 +30,34 @@ UNITS = {
     "speed": dict.fromkeys(("m/s", "mm/s", "rad/s", "deg/s", "rpm", "1/min"), 1.0),
 }
 #: Other spellings of the same units.
-SPELLINGS = {"°": "deg", "degree": "deg", "degrees": "deg", "rev": "turn", "revs": "turn", "turns": "turn", "sec": "s", "msec": "ms",
-             "µs": "us", "μs": "us", "µm": "um", "μm": "um", "Nm": "N m", "N*m": "N m", "N·m": "N m", "Nmm": "N mm", "Ncm": "N cm", "mNm": "mN m",
-             "kNm": "kN m", "counts": "count", "cts": "count", "inc": "count", "ticks": "count", "U/min": "rpm", "-": "1", "": "1"}
+SPELLINGS = {
+    "°": "deg",
+    "degree": "deg",
+    "degrees": "deg",
+    "rev": "turn",
+    "revs": "turn",
+    "turns": "turn",
+    "sec": "s",
+    "msec": "ms",
+    "µs": "us",
+    "μs": "us",
+    "µm": "um",
+    "μm": "um",
+    "Nm": "N m",
+    "N*m": "N m",
+    "N·m": "N m",
+    "Nmm": "N mm",
+    "Ncm": "N cm",
+    "mNm": "mN m",
+    "kNm": "kN m",
+    "counts": "count",
+    "cts": "count",
+    "inc": "count",
+    "ticks": "count",
+    "U/min": "rpm",
+    "-": "1",
+    "": "1",
+}
 #: Lines that may stand before the head.
 REMARKS = 60
 _IN_BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]$")
@@ -92,7 +117,13 @@ def load_table(path: Path) -> Table:
         from scipy.io import loadmat
 
         raw = loadmat(path, squeeze_me=True)
-        return _table({k: np.asarray(v, dtype=np.float64) for k, v in raw.items() if not k.startswith("__") and np.ndim(v) == 1})
+        return _table(
+            {
+                k: np.asarray(v, dtype=np.float64)
+                for k, v in raw.items()
+                if not k.startswith("__") and np.ndim(v) == 1
+            }
+        )
     return _text(path)
 
 
@@ -112,19 +143,37 @@ def _text(path: Path) -> Table:
     except UnicodeDecodeError:
         lines = raw.decode("latin-1").splitlines()
     lines = [line for line in lines if line.strip(" \t,;")]
-    first = next((i for i in range(min(len(lines), REMARKS)) if _numbers(lines[i : i + 1]) is not None
-                  and _numbers(lines[i : i + 3]) is not None), None)
+    first = next(
+        (
+            i
+            for i in range(min(len(lines), REMARKS))
+            if _numbers(lines[i : i + 1]) is not None and _numbers(lines[i : i + 3]) is not None
+        ),
+        None,
+    )
     if first is None:
-        raise BadInputError(f"read {path}: no numbers in the first {REMARKS} lines; needs one head line of names and numbers below")
+        raise BadInputError(
+            f"read {path}: no numbers in the first {REMARKS} lines; needs one head line of names and numbers below"
+        )
     if first == 0:
-        raise BadInputError(f"read {path}: the first line has numbers, no names; needs one head line of names")
+        raise BadInputError(
+            f"read {path}: the first line has numbers, no names; needs one head line of names"
+        )
     rows = _numbers(lines[first:])
     if rows is None:
-        bad = next(i for i in range(first, len(lines)) if _numbers([lines[i]]) is None or _numbers([lines[first], lines[i]]) is None)
-        raise BadInputError(f"read {path}: line {bad + 1} is no row of numbers like line {first + 1}: {lines[bad][:60]!r}")
+        bad = next(
+            i
+            for i in range(first, len(lines))
+            if _numbers([lines[i]]) is None or _numbers([lines[first], lines[i]]) is None
+        )
+        raise BadInputError(
+            f"read {path}: line {bad + 1} is no row of numbers like line {first + 1}: {lines[bad][:60]!r}"
+        )
     head, units = _head(lines[:first], rows.shape[1])
     if any(_numbers([cell]) is not None for cell in head):
-        raise BadInputError(f"read {path}: line {first} is neither names nor {rows.shape[1]} numbers: {lines[first - 1][:60]!r}")
+        raise BadInputError(
+            f"read {path}: line {first} is neither names nor {rows.shape[1]} numbers: {lines[first - 1][:60]!r}"
+        )
     if not head:
         raise BadInputError(f"read {path}: no line of {rows.shape[1]} names over {rows.shape[1]} columns")
     table = _table({n: np.ascontiguousarray(rows[:, i]) for i, n in enumerate(head)})

@@ -46,7 +46,9 @@ def _check(line: Line) -> None:
     if not line.targets and list(line.trailing) != ["e"]:
         raise UsageError("no device named; only -e alone does without: it stops the whole workcell")
     if line.targets and line.trailing:
-        raise UsageError(f"-{next(iter(line.trailing))} holds for the device that follows it, and none follows")
+        raise UsageError(
+            f"-{next(iter(line.trailing))} holds for the device that follows it, and none follows"
+        )
     for target in line.targets:
         if not target.flags:
             raise UsageError(f"{target.name}: nothing to do; an option holds for the device that follows it")
@@ -84,9 +86,7 @@ class Setter:
             UsageError: a request that the class of the device does not know.
         """
         nodes = [self._open(target) for target in targets if target.flags]
-        plan = [
-            (node, key, self._take(node, key)) for node, target in nodes for key in target.flags
-        ]
+        plan = [(node, key, self._take(node, key)) for node, target in nodes for key in target.flags]
         if self._given and self._numbers.numbers:
             raise UsageError(f"{len(self._numbers.numbers)} numbers too many; -c takes one an axis, -g n*n")
         synched = [node for node, key, _ in plan if key == "s"]

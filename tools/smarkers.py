@@ -37,7 +37,11 @@ def _work(words: Sequence[str]) -> None:
     if not numbers:
         raise UsageError(f"-{actions[0]}: no marker named")
     cell = Workcell(name="smarkers")
-    act: dict[str, Callable[[int], object]] = {"f": cell.free_marker, "s": cell.signal_marker, "w": cell.wait_marker}
+    act: dict[str, Callable[[int], object]] = {
+        "f": cell.free_marker,
+        "s": cell.signal_marker,
+        "w": cell.wait_marker,
+    }
     for action in actions:
         for token in numbers:
             act[action](token)
@@ -49,7 +53,9 @@ def _read(words: Sequence[str]) -> tuple[list[str], list[int]]:
     for item in scan("smarkers", words):
         if item.kind == FLAG:
             actions.append(item.text)
-        elif item.kind == NAME or not item.text.isascii() or not item.text.isdigit() or int(item.text) > _MOST:
+        elif (
+            item.kind == NAME or not item.text.isascii() or not item.text.isdigit() or int(item.text) > _MOST
+        ):
             raise UsageError(f"{item.text}: want a marker, a whole number as smarkers -r prints it")
         else:
             numbers.append(int(item.text))

@@ -61,7 +61,12 @@ class Call:
     __slots__ = ("ahead", "arguments", "limit_s", "verb", "what")
 
     def __init__(
-        self, what: str, verb: int, *arguments: object, ahead: tuple[bytes, ...] = (), limit_s: float | None = 0.0
+        self,
+        what: str,
+        verb: int,
+        *arguments: object,
+        ahead: tuple[bytes, ...] = (),
+        limit_s: float | None = 0.0,
     ) -> None:
         self.what = what
         self.verb = verb

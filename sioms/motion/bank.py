@@ -305,7 +305,9 @@ class AxisBank:
         """Narrow the limits of axes, or with None return to the configured ones; see CommandQueue.set_limits()."""
         chosen = np.asarray(axes, dtype=np.int64)
         if not self.is_idle(chosen):
-            raise CommandError(errno.EBUSY, "set limits: an axis moves or has commands; wait until it is idle")
+            raise CommandError(
+                errno.EBUSY, "set limits: an axis moves or has commands; wait until it is idle"
+            )
         self._queue.set_limits(chosen, limits, self._position)
         held = self._queue.limits
         self._law.velocity_limit[chosen] = held.velocity[chosen]
@@ -452,7 +454,9 @@ class AxisBank:
             self._sequencer.release(np.array(released), now_ns)
             self._sequencer.refresh(np.array(released))
         for axis, number in broken:
-            self._abandon(np.array([axis]), now_ns, errno.EPIPE, f"marker {number} was freed while waited for")
+            self._abandon(
+                np.array([axis]), now_ns, errno.EPIPE, f"marker {number} was freed while waited for"
+            )
 
     def _control(self, dt: float) -> None:
         law, desired = self._law, self._desired
@@ -504,7 +508,9 @@ class AxisBank:
         for axis in axes[(self._queue.latched[axes] & bits) == 0].tolist():
             self._queue.latched[axis] |= bits | (int(AxisStatus.STALLED) if self.stepper[axis] else 0)
             unit = self.settings[axis].unit
-            text = f"following error {self._following[axis]:g} {unit}; at most {self._error_max[axis]:g} {unit}"
+            text = (
+                f"following error {self._following[axis]:g} {unit}; at most {self._error_max[axis]:g} {unit}"
+            )
             self.fault([axis], text, now_ns)
             if not self.stepper[axis]:
                 self._actuator[axis] = self._force[axis] = self._law.output[axis] = 0.0

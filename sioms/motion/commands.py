@@ -21,7 +21,9 @@ from .settings import AxisKind, AxisSettings
 from .types import CommandError, MarkerPort, RecordError
 
 WIRE_DTYPE = np.dtype(numpy_dtype(NodeClass.AXIS))
-COMMAND_DTYPE = np.dtype([*numpy_dtype(NodeClass.AXIS), ("signal_generation", "<i8"), ("wait_generation", "<i8")])
+COMMAND_DTYPE = np.dtype(
+    [*numpy_dtype(NodeClass.AXIS), ("signal_generation", "<i8"), ("wait_generation", "<i8")]
+)
 """A record as buffered: ``axis`` is the bank axis, marker tokens are resolved to number and generation."""
 
 M = ControlMode
@@ -103,7 +105,9 @@ class Limits:
         room = float(max(self.room_below[axis], self.room_above[axis]))
         return f" with {room:g} left for the take-up of backlash" if room else ""
 
-    def reach(self, axis: NDArray[np.int64], mode: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def reach(
+        self, axis: NDArray[np.int64], mode: NDArray[Any]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the lowest and highest position that each command of these modes may lead its axis to."""
         low, high, point = self.minimum[axis], self.maximum[axis], is_point_move(mode)
         return low + point * self.room_below[axis], high - point * self.room_above[axis]
@@ -220,8 +224,11 @@ class Validator:
             i = int(bad.argmax())
             names = ", ".join(str(c.name) for c in COMBINATIONS)
             raise self.refuse(
-                errno.EINVAL, commands, i, f"control_mode {int(mode[i]):#06x} is no command; one of {names}, "
-                "RELATIVE only with POSITION"
+                errno.EINVAL,
+                commands,
+                i,
+                f"control_mode {int(mode[i]):#06x} is no command; one of {names}, "
+                "RELATIVE only with POSITION",
             )
         passes = int(M.POSITION | M.VELOCITY)
         bad = (mode & passes) == passes
@@ -237,8 +244,10 @@ class Validator:
             i = int((missing != 0).argmax())
             offered = ControlMode(int(self._modes[commands["axis"][i]]))
             raise self.refuse(
-                errno.EINVAL, commands, i,
-                f"this axis cannot do {ControlMode(int(missing[i])).name}; it has {offered.name}"
+                errno.EINVAL,
+                commands,
+                i,
+                f"this axis cannot do {ControlMode(int(missing[i])).name}; it has {offered.name}",
             )
 
     def _check_values(self, commands: NDArray[Any]) -> None:
@@ -264,13 +273,18 @@ class Validator:
             towards = (mode & QUANTITIES) == int(M.VELOCITY | M.ACCELERATION)
             bad = towards & (commands["acceleration"] <= 0)
             if bad.any():
-                raise self._out_of_range(commands, int(bad.argmax()), TOWARDS, self._limits.acceleration[axis])
+                raise self._out_of_range(
+                    commands, int(bad.argmax()), TOWARDS, self._limits.acceleration[axis]
+                )
         if present & M.SPECIFIED_GAINS:
             bad = ((mode & int(M.SPECIFIED_GAINS)) != 0) & (np.abs(commands["kp"]) >= 1)
             if bad.any():
                 i = int(bad.argmax())
                 raise self.refuse(
-                    errno.ERANGE, commands, i, f"kp {commands['kp'][i]} makes the law unstable; between -1 and 1"
+                    errno.ERANGE,
+                    commands,
+                    i,
+                    f"kp {commands['kp'][i]} makes the law unstable; between -1 and 1",
                 )
 
     def _out_of_range(
@@ -280,8 +294,10 @@ class Validator:
         unit = rule.unit.format(u=settings.unit, f=settings.force_unit)
         low = "above 0" if rule.positive else f"{-bound[i]:g}"
         return self.refuse(
-            errno.ERANGE, commands, i,
-            f"{rule.field} {commands[rule.field][i]:g} {unit} is outside the limits; {low} to {bound[i]:g} {unit}"
+            errno.ERANGE,
+            commands,
+            i,
+            f"{rule.field} {commands[rule.field][i]:g} {unit} is outside the limits; {low} to {bound[i]:g} {unit}",
         )
 
     def _check_time(self, commands: NDArray[Any]) -> None:
@@ -293,8 +309,11 @@ class Validator:
         if bad.any():
             i = int(bad.argmax())
             raise self.refuse(
-                errno.EINVAL, commands, i, f"time {time[i]:g} s; more than 0 and at most 1e6 s, or negative for "
-                "'until the next command' (not with a position that is passed)"
+                errno.EINVAL,
+                commands,
+                i,
+                f"time {time[i]:g} s; more than 0 and at most 1e6 s, or negative for "
+                "'until the next command' (not with a position that is passed)",
             )
 
     def _check_position(self, commands: NDArray[Any]) -> None:
@@ -312,7 +331,9 @@ class Validator:
             i = int(bad.argmax())
             unit = self._settings[int(axis[i])].unit
             raise self.refuse(
-                errno.ERANGE, commands, i,
+                errno.ERANGE,
+                commands,
+                i,
                 f"position {value[i]:g} {unit} is outside the soft limits; {low[i]:g} to {high[i]:g} {unit}"
                 + self._limits.about_room(int(axis[i])),
             )

@@ -424,7 +424,12 @@ class DriveBank:
         self._send_to(axis, command, target if straight else target - approach.distance, now_ns)
 
     def _send_to(
-        self, axis: int, command: Command, place: float, now_ns: int, most: tuple[float, float] = (math.inf, math.inf)
+        self,
+        axis: int,
+        command: Command,
+        place: float,
+        now_ns: int,
+        most: tuple[float, float] = (math.inf, math.inf),
     ) -> None:
         """Tell the drive to go to a place, at a velocity and an acceleration of at most so much."""
         command = command._replace(position=float(place - self._offset[axis]))
@@ -485,7 +490,9 @@ class DriveBank:
             approach = self._approach_of(axis, command)
             try:
                 if not low <= target <= high:
-                    raise InfeasibleError(f"position {target:g} is outside the soft limits; {low:g} to {high:g}")
+                    raise InfeasibleError(
+                        f"position {target:g} is outside the soft limits; {low:g} to {high:g}"
+                    )
                 if approach is not None:
                     approach.begin_of_take_up(target, low, high)
             except InfeasibleError as error:

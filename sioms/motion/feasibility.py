@@ -69,11 +69,20 @@ class Feasibility:
         axis, mode = c["axis"].astype(np.int64), c["control_mode"]
         first = np.concatenate(([True], axis[1:] != axis[:-1]))
         velocity = _filled(c["max_velocity"], (mode & modes.MAX_VEL_ACC) != 0, first, tail.velocity[axis])
-        acceleration = _filled(c["max_acceleration"], (mode & modes.MAX_VEL_ACC) != 0, first, tail.acceleration[axis])
+        acceleration = _filled(
+            c["max_acceleration"], (mode & modes.MAX_VEL_ACC) != 0, first, tail.acceleration[axis]
+        )
         end, begin = self._states(c, first, tail, acceleration)
         self._check_reach(commands, order, c, end, velocity)
         bounds = np.stack(
-            (velocity, acceleration, self._limits.jerk[axis], self._limits.minimum[axis], self._limits.maximum[axis]), 1
+            (
+                velocity,
+                acceleration,
+                self._limits.jerk[axis],
+                self._limits.minimum[axis],
+                self._limits.maximum[axis],
+            ),
+            1,
         )
         doubtful = self._doubtful(c, begin, end, bounds)
         for tried, i in enumerate(np.flatnonzero(doubtful).tolist(), 1):
@@ -98,7 +107,9 @@ class Feasibility:
         begin = np.where(first[:, None], before, np.roll(end, 1, axis=0))
         free = certain & timed & ((mode & modes.PASS) == modes.PASS) & ((mode & modes.ACCELERATION) == 0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            own = pass_acceleration(begin[:, 0], begin[:, 1], end[:, 0], end[:, 1], np.where(timed, time, 1.0))
+            own = pass_acceleration(
+                begin[:, 0], begin[:, 1], end[:, 0], end[:, 1], np.where(timed, time, 1.0)
+            )
         own = np.clip(own, -limit, limit)
         end[:, 2] = np.where(free, own, np.where((mode & modes.ACCELERATION) != 0, c["acceleration"], 0.0))
         begin = np.where(first[:, None], before, np.roll(end, 1, axis=0))
@@ -120,7 +131,9 @@ class Feasibility:
         if bad.any():
             i = int(bad.argmax())
             raise self._refusal(
-                commands, int(order[i]), f"velocity {end[i, 1]:g} is above the max_velocity in force; {velocity[i]:g}"
+                commands,
+                int(order[i]),
+                f"velocity {end[i, 1]:g} is above the max_velocity in force; {velocity[i]:g}",
             )
 
     def _doubtful(self, c: NDArray[Any], begin: Floats, end: Floats, bounds: Floats) -> NDArray[np.bool_]:
@@ -133,7 +146,9 @@ class Feasibility:
         rows = np.flatnonzero(timed & passing)
         if rows.size:
             b, e, t = begin[rows].T, end[rows].T, c["time"][rows]
-            position, velocity, acceleration = enclosures(quintic((b[0], b[1], b[2]), (e[0], e[1], e[2]), t), t)
+            position, velocity, acceleration = enclosures(
+                quintic((b[0], b[1], b[2]), (e[0], e[1], e[2]), t), t
+            )
             v, a, _, low, high = bounds[rows].T
             doubtful[rows] = (
                 (np.abs(velocity).max(axis=0) > v)
@@ -169,7 +184,11 @@ def _filled(values: Floats, given: NDArray[np.bool_], first: NDArray[np.bool_], 
 
 
 def _positions(
-    position: Floats, certain: NDArray[np.bool_], relative: NDArray[np.bool_], first: NDArray[np.bool_], before: Floats
+    position: Floats,
+    certain: NDArray[np.bool_],
+    relative: NDArray[np.bool_],
+    first: NDArray[np.bool_],
+    before: Floats,
 ) -> Floats:
     """Return absolute end positions; relative ones count from the last anchor before them on their axis."""
     if not (certain & relative).any():
@@ -182,5 +201,3 @@ def _positions(
         present = (present + value if relative[i] else value) if certain[i] else np.nan
         ends[i] = present
     return ends
-
-

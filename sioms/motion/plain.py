@@ -64,7 +64,10 @@ class PlainCheck:
             if not -most <= value <= most or not -GREATEST <= value <= GREATEST or (positive and value <= 0):
                 return None
         if mode & modes.POSITION:  # all plain ones are point moves
-            low, high = self._minimum.item(axis) + self._below[axis], self._maximum.item(axis) - self._above[axis]
+            low, high = (
+                self._minimum.item(axis) + self._below[axis],
+                self._maximum.item(axis) - self._above[axis],
+            )
             if not low <= record[4] <= high:
                 return None
         return Command._make((axis, mode, 0, 0, *record[4:], 0, 0))

@@ -230,8 +230,12 @@ def enclosures(c: tuple[Any, ...], t: Any) -> tuple[tuple[Any, ...], tuple[Any, 
     """
     p0, c1, c2, c3, c4, c5 = c[0], c[1] * t, c[2] * t**2, c[3] * t**3, c[4] * t**4, c[5] * t**5
     position = (
-        p0, p0 + c1 / 5, p0 + 2 * c1 / 5 + c2 / 10, p0 + 3 * c1 / 5 + 3 * c2 / 10 + c3 / 10,
-        p0 + 4 * c1 / 5 + 3 * c2 / 5 + 2 * c3 / 5 + c4 / 5, p0 + c1 + c2 + c3 + c4 + c5,
+        p0,
+        p0 + c1 / 5,
+        p0 + 2 * c1 / 5 + c2 / 10,
+        p0 + 3 * c1 / 5 + 3 * c2 / 10 + c3 / 10,
+        p0 + 4 * c1 / 5 + 3 * c2 / 5 + 2 * c3 / 5 + c4 / 5,
+        p0 + c1 + c2 + c3 + c4 + c5,
     )
     velocity = tuple(5 * (position[i + 1] - position[i]) / t for i in range(5))
     acceleration = tuple(4 * (velocity[i + 1] - velocity[i]) / t for i in range(4))

@@ -87,7 +87,9 @@ class CommandQueue:
         self.gated_synch = np.zeros(self.n, dtype=bool)
         self.gated_marker = np.zeros(self.n, dtype=bool)
         self.latched = np.zeros(self.n, dtype=np.int64)
-        self.home_required = np.array([s.homing is not None and s.homing.required for s in settings], dtype=bool)
+        self.home_required = np.array(
+            [s.homing is not None and s.homing.required for s in settings], dtype=bool
+        )
         self._buffers = CommandBuffers(self.n, capacity)
         self._markers = markers
         self._validator = Validator(settings, self.limits, markers, passing)
@@ -380,7 +382,9 @@ class CommandQueue:
             array = self._limit_array(name)
             values = list(given) if isinstance(given, Sequence) else [given] * len(axes)
             if len(values) != len(axes):
-                raise CommandError(errno.EINVAL, f"set limits: {len(values)} values of {name}; {len(axes)} or one")
+                raise CommandError(
+                    errno.EINVAL, f"set limits: {len(values)} values of {name}; {len(axes)} or one"
+                )
             for axis, value in zip(axes.tolist(), values, strict=True):
                 changes.append((array, axis, self._checked_limit(axis, name, value, position)))
         for array, axis, value in changes:
@@ -403,7 +407,9 @@ class CommandQueue:
             raise CommandError(errno.EINVAL, f"set limits: no limit {name!r}; one of {', '.join(arrays)}")
         return arrays[name]
 
-    def _checked_limit(self, axis: int, name: str, value: float | None, position: NDArray[np.float64]) -> float:
+    def _checked_limit(
+        self, axis: int, name: str, value: float | None, position: NDArray[np.float64]
+    ) -> float:
         what = f"set limits of axis {axis} ({self.settings[axis].name}): "
         configured = getattr(self.settings[axis], name)
         lower = name == "position_min"
@@ -415,7 +421,8 @@ class CommandQueue:
             raise CommandError(errno.ERANGE, what + f"{name} {wanted:g} is wider than configured; {widest:g}")
         if (lower and position[axis] < wanted) or (name == "position_max" and position[axis] > wanted):
             raise CommandError(
-                errno.ERANGE, what + f"{name} {wanted:g}, but the axis stands at {position[axis]:g}; move it inside"
+                errno.ERANGE,
+                what + f"{name} {wanted:g}, but the axis stands at {position[axis]:g}; move it inside",
             )
         return wanted
 

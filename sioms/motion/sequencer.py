@@ -275,7 +275,9 @@ class Sequencer:
             return False
         one, measured = np.array([axis]), float(self._position[axis])
         start_ns, fraction = store.ended_at(one)
-        command = command._replace(position=float(store.final[row, 0]), control_mode=command.control_mode & ~modes.RELATIVE)
+        command = command._replace(
+            position=float(store.final[row, 0]), control_mode=command.control_mode & ~modes.RELATIVE
+        )
         bounds, taken = self._bounds(axis, command), bool(self._row_taken[row])
         try:
             approach = approach._replace(deadband=0.0)
@@ -320,13 +322,21 @@ class Sequencer:
             return
         law, mode = self._law, command.control_mode
         if mode & modes.GAINS:
-            law.k[axis], law.kz[axis], law.kp[axis], law.kb[axis] = command.k, command.kz, command.kp, command.kb
+            law.k[axis], law.kz[axis], law.kp[axis], law.kb[axis] = (
+                command.k,
+                command.kz,
+                command.kp,
+                command.kb,
+            )
         if mode & modes.FORCE_OFFSET:
             law.offset[axis] = command.force_offset
         if mode & modes.MAX_FORCE:
             law.force_limit[axis] = command.max_force
         if mode & modes.MAX_VEL_ACC:
-            self._velocity_limit[axis], self._acceleration_limit[axis] = command.max_velocity, command.max_acceleration
+            self._velocity_limit[axis], self._acceleration_limit[axis] = (
+                command.max_velocity,
+                command.max_acceleration,
+            )
 
     def _rest(
         self, axes: Axes, state: Floats, start_ns: NDArray[np.int64], fraction: Floats, now_ns: int
@@ -431,7 +441,11 @@ class Sequencer:
         else:
             velocity, acceleration = float(self._velocity_limit[axis]), float(self._acceleration_limit[axis])
         return Bounds(
-            velocity, acceleration, float(limits.jerk[axis]), float(limits.minimum[axis]), float(limits.maximum[axis]),
+            velocity,
+            acceleration,
+            float(limits.jerk[axis]),
+            float(limits.minimum[axis]),
+            float(limits.maximum[axis]),
             self._start_velocity[axis],
         )
 
@@ -454,7 +468,10 @@ class Sequencer:
         if ramp >= duration:
             end = present + rate * duration if rate else present
             return Plan([(duration, present, rate, 0.0, 0.0, 0.0, 0.0)], duration, (end, 0.0, 0.0), True)
-        segments = [(ramp, present, rate, 0.0, 0.0, 0.0, 0.0), (duration - ramp, goal, 0.0, 0.0, 0.0, 0.0, 0.0)]
+        segments = [
+            (ramp, present, rate, 0.0, 0.0, 0.0, 0.0),
+            (duration - ramp, goal, 0.0, 0.0, 0.0, 0.0, 0.0),
+        ]
         return Plan(segments, duration, (goal, 0.0, 0.0), True)
 
     def _refuse(self, axis: int, text: str, now_ns: int) -> None:

@@ -76,8 +76,17 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
                 continue
             _, errors = better(found.losses, searcher.loss(fit))
             allowed = ALIKE if frozenset((name, start.effect)) in same else AMBIGUOUS
-            out.append(Rival(name, start.effect, (fit.cost - found.fit.cost) / contribution, allowed, errors,
-                             fit.cost / found.fit.cost - 1.0, fit))
+            out.append(
+                Rival(
+                    name,
+                    start.effect,
+                    (fit.cost - found.fit.cost) / contribution,
+                    allowed,
+                    errors,
+                    fit.cost / found.fit.cost - 1.0,
+                    fit,
+                )
+            )
     best: dict[tuple[str, str], Rival] = {}
     for r in out:
         if (r.effect, r.rival) not in best or r.missed < best[r.effect, r.rival].missed:
@@ -85,7 +94,9 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
     return sorted(best.values(), key=lambda r: r.missed)
 
 
-def settle(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]]) -> tuple[Found, list[Rival]]:
+def settle(
+    searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]]
+) -> tuple[Found, list[Rival]]:
     """Find the rivals; where one does better than what is named, with no more parameters, search on from it.
 
     A step adds what saves most beside the effects of that moment; what came later may have made a look-alike the better one.
@@ -97,7 +108,13 @@ def settle(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
             break
         searcher.progress(f"{best.rival} does better than {best.effect}: searching on from it")
         further = searcher.run(best.fit.model)
-        step = Step("swap", f"{best.effect} to {best.rival}", best.fit.ratio, 1.0 - best.fit.cost / found.fit.cost, best.fit.model)
+        step = Step(
+            "swap",
+            f"{best.effect} to {best.rival}",
+            best.fit.ratio,
+            1.0 - best.fit.cost / found.fit.cost,
+            best.fit.model,
+        )
         found = Found(further.fit, further.losses, (*found.ladder, step, *further.ladder[1:]))
         others = rivals(searcher, found, pairs)
     return found, others

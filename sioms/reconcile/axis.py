@@ -127,13 +127,19 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
         # Names given to half of nothing mislead: the model, or a column, belongs to something else.
         fit = searcher.fit(ready.model)
         found = replace(found, fit=fit, losses=searcher.loss(fit))
-        note = (f"whatever is added, {found.fit.ratio:.0f} times what noise would leave remains: the nominal model does not match these "
-                "data; are model, force and position of the same axis?")
+        note = (
+            f"whatever is added, {found.fit.ratio:.0f} times what noise would leave remains: the nominal model does not match these "
+            "data; are model, force and position of the same axis?"
+        )
         ready = replace(ready, notes=(*ready.notes, note))
     o.progress("identifiability: look-alikes in the place of each effect")
     settled, others = settle(searcher, found, excited.pairs)
     if settled is not found:
-        found, share, burst = settled, smoother_share(ready.problem, settled.fit), bursts(ready.problem, settled.fit)
+        found, share, burst = (
+            settled,
+            smoother_share(ready.problem, settled.fit),
+            bursts(ready.problem, settled.fit),
+        )
     return _conclude(ready, nominal, o, excited, found, searcher, others, odd, share, burst, rejected)
 
 
@@ -141,17 +147,26 @@ def _search(ready: Prepared, names: tuple[str, ...], o: Options) -> tuple[Prepar
     """Search; where no force was measured, the noise may look smaller under a better model: then search on."""
     start, earlier = ready.model, tuple[Step, ...]()
     for turn in range(AGAIN + 1):
-        searcher = Searcher(ready.problem, tuple(f.effect for f in ready.findings), names, progress=o.progress)
+        searcher = Searcher(
+            ready.problem, tuple(f.effect for f in ready.findings), names, progress=o.progress
+        )
         found = searcher.run(start)
         if earlier:
-            found = replace(found, ladder=(*earlier, replace(found.ladder[0], action="noise read again"), *found.ladder[1:]))
+            found = replace(
+                found,
+                ladder=(*earlier, replace(found.ladder[0], action="noise read again"), *found.ladder[1:]),
+            )
         start = found.fit.model
         anew = _calibrated(ready.problem, ready.problem.session, start)
         if turn == AGAIN or anew.noise.drive > FELL * ready.problem.noise.drive:
             break
-        o.progress(f"the noise is {anew.noise.drive / ready.problem.noise.drive:.2f} of what it seemed: searching on")
+        o.progress(
+            f"the noise is {anew.noise.drive / ready.problem.noise.drive:.2f} of what it seemed: searching on"
+        )
         earlier = found.ladder
-        final = replace(anew, weights=None, session=ready.final.session, begin=ready.final.begin, end=ready.final.end)
+        final = replace(
+            anew, weights=None, session=ready.final.session, begin=ready.final.begin, end=ready.final.end
+        )
         ready = replace(ready, problem=anew, final=final)
     return ready, searcher, found
 
@@ -174,8 +189,11 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
         model = model.with_effect(f.effect, dict(f.values))
     factor = coarse.values["factor"] if coarse is not None else 1.0
     late = next((f.values["delay"] for f in driven if f.effect == "delay"), 0.0)
-    noise = observer(nominal, sensor_noise(session, nominal.resolution * factor),
-                     drive_noise(session, nominal.rated_force, round(late / nominal.sample_time_s)))
+    noise = observer(
+        nominal,
+        sensor_noise(session, nominal.resolution * factor),
+        drive_noise(session, nominal.rated_force, round(late / nominal.sample_time_s)),
+    )
     skip = max(SKIP, round(SKIP_S / nominal.sample_time_s))
     problem = Problem(session, noise, skip, end=1.0 if session.final else 1.0 - UNTOUCHED, mapper=o.mapper)
     check_scale(problem, nominal)
@@ -185,7 +203,9 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
         excluded.add("encoder_scale")
     if any(r.force_measured is not None for r in session.records):
         excluded |= {"delay", "lag", "saturation"}
-    names = tuple(n for n, e in library().items() if e.rankable and nominal.applicable(e) and n not in excluded)
+    names = tuple(
+        n for n, e in library().items() if e.rankable and nominal.applicable(e) and n not in excluded
+    )
     final = replace(problem, begin=1.0 - UNTOUCHED, end=1.0)
     if session.final:
         final = replace(final, session=Session(session.final, continuous=False), begin=0.0)
@@ -215,10 +235,16 @@ def _calibrated(problem: Problem, session: Session, model: AxisModel) -> Problem
     stiffness = model.inertia * (2.0 * np.pi * UNMEASURED_HZ) ** 2
     coarse = model.effects.get("encoder_quantisation", {}).get("factor", 1.0)
     sensor = sensor_noise(session, model.resolution * coarse)
-    problem = replace(problem, noise=observer(model, max(sensor, problem.noise.drive / stiffness), problem.noise.drive))
+    problem = replace(
+        problem, noise=observer(model, max(sensor, problem.noise.drive / stiffness), problem.noise.drive)
+    )
     for _ in range(2):
         if any(laps):
-            pairs = [(r.innovation[p:] - r.innovation[:-p]) / np.sqrt(2.0) for r, p in zip(problem.runs(model), laps, strict=True) if p]
+            pairs = [
+                (r.innovation[p:] - r.innovation[:-p]) / np.sqrt(2.0)
+                for r, p in zip(problem.runs(model), laps, strict=True)
+                if p
+            ]
             noise = np.concatenate(pairs) / problem.noise.innovation
             size = max(round(0.1 / model.sample_time_s), 1)
             energy = np.mean(noise[: len(noise) // size * size].reshape(-1, size) ** 2, axis=1)
@@ -231,12 +257,26 @@ def _calibrated(problem: Problem, session: Session, model: AxisModel) -> Problem
         least = LEAST_DRIVE * model.rated_force
         drive = float(np.clip(problem.noise.drive * excess, least, None))
         # A drive without noise has none whose colour is unknown: then the observer may be as fast as the sensor allows.
-        problem = replace(problem, noise=observer(model, sensor if drive < 2.0 * least else max(sensor, drive / stiffness), drive))
+        problem = replace(
+            problem,
+            noise=observer(model, sensor if drive < 2.0 * least else max(sensor, drive / stiffness), drive),
+        )
     return problem
 
 
-def _conclude(ready: Prepared, nominal: AxisModel, o: Options, excited: Gate, found: Found, searcher: Searcher,
-              others: Sequence[Rival], odd: bool, share: float, burst: float, rejected: tuple[str, ...]) -> Verdict:
+def _conclude(
+    ready: Prepared,
+    nominal: AxisModel,
+    o: Options,
+    excited: Gate,
+    found: Found,
+    searcher: Searcher,
+    others: Sequence[Rival],
+    odd: bool,
+    share: float,
+    burst: float,
+    rejected: tuple[str, ...],
+) -> Verdict:
     rng = np.random.default_rng(o.seed)
     o.progress("untouched samples: gap before and after")
     states = session_states(ready.final, found.fit.model)
@@ -251,16 +291,23 @@ def _conclude(ready: Prepared, nominal: AxisModel, o: Options, excited: Gate, fo
     rattles = any(known()[n].slot is Slot.BACKLASH for n in found.fit.model.effects)
     disturbance = found.fit.ratio > QUIET and burst > BURSTS and share < UNEXPLAINED and not rattles
     large = found.fit.ratio > LARGE and not rattles
-    outcome = _outcome(bool(named), bool(terms) or disturbance or large or (found.fit.ratio > LEAST_ODD and share > UNEXPLAINED),
-                       bool(open_rivals))
+    outcome = _outcome(
+        bool(named),
+        bool(terms) or disturbance or large or (found.fit.ratio > LEAST_ODD and share > UNEXPLAINED),
+        bool(open_rivals),
+    )
     alternatives = tuple(_set(r, fit.model) for r in open_rivals) if outcome is Outcome.AMBIGUOUS else ()
     plan = _plan(ready, o, fit.model, open_rivals) if outcome is Outcome.AMBIGUOUS else None
     notes = list(ready.notes)
     if disturbance:
-        notes.append(f"the residual comes in bursts ({100 * burst:.0f} % of its energy in a tenth of the time) that no state "
-                     "of the axis orders: a disturbance from outside, not an effect")
+        notes.append(
+            f"the residual comes in bursts ({100 * burst:.0f} % of its energy in a tenth of the time) that no state "
+            "of the axis orders: a disturbance from outside, not an effect"
+        )
     elif large:
-        notes.append(f"what remains is {found.fit.ratio:.1f} times what noise would leave, and no state of the axis orders it")
+        notes.append(
+            f"what remains is {found.fit.ratio:.1f} times what noise would leave, and no state of the axis orders it"
+        )
     places: tuple[Place, ...] = ()
     spectrum: tuple[Spectrum, Spectrum] | None = None
     traces: tuple[Trace, ...] = ()
@@ -269,10 +316,31 @@ def _conclude(ready: Prepared, nominal: AxisModel, o: Options, excited: Gate, fo
         places = tuple(locate(whole, nominal, rng))
         spectrum = spectra(whole, nominal)
         traces = _traces(whole, nominal, fit.model)
-    return Verdict(outcome, nominal, fit.model, tuple(named), alternatives, tuple(terms), gaps,
-                   found.ladder, rungs(ready.final, [s.model for s in found.ladder]), ready.findings, excited, places, spectrum, plan, found.fit.ratio, share, burst,
-                   effective_samples(found.fit.residual), len(found.fit.residual), tuple(notes), traces,
-                   tuple((r.name, s) for r, s in zip(ready.final.session.records, states, strict=True)), rejected)
+    return Verdict(
+        outcome,
+        nominal,
+        fit.model,
+        tuple(named),
+        alternatives,
+        tuple(terms),
+        gaps,
+        found.ladder,
+        rungs(ready.final, [s.model for s in found.ladder]),
+        ready.findings,
+        excited,
+        places,
+        spectrum,
+        plan,
+        found.fit.ratio,
+        share,
+        burst,
+        effective_samples(found.fit.residual),
+        len(found.fit.residual),
+        tuple(notes),
+        traces,
+        tuple((r.name, s) for r, s in zip(ready.final.session.records, states, strict=True)),
+        rejected,
+    )
 
 
 def _outcome(named: bool, unexplained: bool, ambiguous: bool) -> Outcome:
@@ -287,19 +355,28 @@ def _set(r: Rival, model: AxisModel) -> tuple[str, ...]:
     return tuple(r.rival if n == r.effect else n for n in model.effects)
 
 
-def _intervals(problem: Problem, fit: Fit, replicates: int, rng: np.random.Generator) -> dict[tuple[str, str], tuple[float, float]]:
+def _intervals(
+    problem: Problem, fit: Fit, replicates: int, rng: np.random.Generator
+) -> dict[tuple[str, str], tuple[float, float]]:
     """95 % intervals per (effect, symbol), by leaving out each block of time, within the bounds of the parameters."""
-    spread = intervals(fit, block_ids(problem, fit.model.sample_time_s)) * np.array([f.scale for f in fit.free])
+    spread = intervals(fit, block_ids(problem, fit.model.sample_time_s)) * np.array(
+        [f.scale for f in fit.free]
+    )
     out = {}
     for f, s in zip(fit.free, spread, strict=True):
         value = getattr(fit.model, f.symbol) if f.effect == BASE else fit.model.effects[f.effect][f.symbol]
         if f.effect != BASE and known()[f.effect].slot is Slot.BACKLASH:
             s = max(float(s), value * _rough_spread(problem, fit, f.effect, f.symbol, replicates, rng))
-        out[f.effect, f.symbol] = (max(value - float(s), min(f.lower, value)), min(value + float(s), max(f.upper, value)))
+        out[f.effect, f.symbol] = (
+            max(value - float(s), min(f.lower, value)),
+            min(value + float(s), max(f.upper, value)),
+        )
     return out
 
 
-def _rough_spread(problem: Problem, fit: Fit, name: str, symbol: str, replicates: int, rng: np.random.Generator) -> float:
+def _rough_spread(
+    problem: Problem, fit: Fit, name: str, symbol: str, replicates: int, rng: np.random.Generator
+) -> float:
     """95 % half-width, relative, of a parameter whose cost is rough: where the best of a grid falls, over bootstrap replicates."""
     here = fit.model.effects[name]
     ids = block_ids(problem, fit.model.sample_time_s)
@@ -316,9 +393,15 @@ def _rough_spread(problem: Problem, fit: Fit, name: str, symbol: str, replicates
     return float(1.96 * np.sqrt(np.mean((best - 1.0) ** 2) + step**2 / 12.0))
 
 
-def _describe(ready: Prepared, fit: Fit, found: Found, searcher: Searcher, others: Sequence[Rival],
-              given: dict[tuple[str, str], tuple[float, float]],
-              rng: np.random.Generator) -> tuple[list[NamedEffect], list[NamedEffect]]:
+def _describe(
+    ready: Prepared,
+    fit: Fit,
+    found: Found,
+    searcher: Searcher,
+    others: Sequence[Rival],
+    given: dict[tuple[str, str], tuple[float, float]],
+    rng: np.random.Generator,
+) -> tuple[list[NamedEffect], list[NamedEffect]]:
     """Describe every effect of the model, the largest first; terms apart."""
     named: list[NamedEffect] = []
     for name in fit.model.effects:
@@ -327,28 +410,71 @@ def _describe(ready: Prepared, fit: Fit, found: Found, searcher: Searcher, other
         finding = next((f for f in ready.findings if f.effect == name), None)
         spans = dict(given)
         if finding is not None:
-            spans.update({(name, s): (finding.values[s] - 1.96 * e, finding.values[s] + 1.96 * e)
-                          for s, e in finding.errors.items()})
-        estimates = tuple(Estimate(p.symbol, fit.model.effects[name][p.symbol],
-                                   *spans.get((name, p.symbol), (fit.model.effects[name][p.symbol],) * 2),
-                                   fit.model.unit(p), p.text) for p in effect.parameters)
+            spans.update(
+                {
+                    (name, s): (finding.values[s] - 1.96 * e, finding.values[s] + 1.96 * e)
+                    for s, e in finding.errors.items()
+                }
+            )
+        estimates = tuple(
+            Estimate(
+                p.symbol,
+                fit.model.effects[name][p.symbol],
+                *spans.get((name, p.symbol), (fit.model.effects[name][p.symbol],) * 2),
+                fit.model.unit(p),
+                p.text,
+            )
+            for p in effect.parameters
+        )
         evidence = [finding.evidence] if finding is not None else []
-        evidence.append(f"without it {100 * saved:.1f} % of the residual energy would come back ({errors:.1f} standard errors)")
-        ruled = {r.rival: f"reproduces all but {100 * r.missed:.1f} % of it, {r.errors:.1f} standard errors worse"
-                 for r in others if r.effect == name and not r.open}
-        ruled.update({rival: f"saved {100 * gain:.0f} % where this saved {100 * s.saved:.0f} %" for s in found.ladder
-                      if s.effect == name for rival, gain in s.rivals.items()
-                      if rival in effect.lookalikes and rival not in ruled and rival not in fit.model.effects})
-        still = {r.rival: f"leaves only {100 * r.missed:.1f} % of it unexplained" for r in others if r.effect == name and r.open}
+        evidence.append(
+            f"without it {100 * saved:.1f} % of the residual energy would come back ({errors:.1f} standard errors)"
+        )
+        ruled = {
+            r.rival: f"reproduces all but {100 * r.missed:.1f} % of it, {r.errors:.1f} standard errors worse"
+            for r in others
+            if r.effect == name and not r.open
+        }
+        ruled.update(
+            {
+                rival: f"saved {100 * gain:.0f} % where this saved {100 * s.saved:.0f} %"
+                for s in found.ladder
+                if s.effect == name
+                for rival, gain in s.rivals.items()
+                if rival in effect.lookalikes and rival not in ruled and rival not in fit.model.effects
+            }
+        )
+        still = {
+            r.rival: f"leaves only {100 * r.missed:.1f} % of it unexplained"
+            for r in others
+            if r.effect == name and r.open
+        }
         ruled = {k: v for k, v in ruled.items() if k not in still}
-        named.append(NamedEffect(name, effect.title, effect.equation, effect.channel.value, estimates, saved, errors,
-                                 frequency, tuple(evidence), ruled, still))
+        named.append(
+            NamedEffect(
+                name,
+                effect.title,
+                effect.equation,
+                effect.channel.value,
+                estimates,
+                saved,
+                errors,
+                frequency,
+                tuple(evidence),
+                ruled,
+                still,
+            )
+        )
     named.sort(key=lambda e: -e.saved)
-    return ([e for e in named if not e.name.startswith(TERM_PREFIX)],
-            [e for e in named if e.name.startswith(TERM_PREFIX)])
+    return (
+        [e for e in named if not e.name.startswith(TERM_PREFIX)],
+        [e for e in named if e.name.startswith(TERM_PREFIX)],
+    )
 
 
-def _worth(found: Found, searcher: Searcher, name: str, rng: np.random.Generator) -> tuple[float, float, float]:
+def _worth(
+    found: Found, searcher: Searcher, name: str, rng: np.random.Generator
+) -> tuple[float, float, float]:
     """How much an effect saves beyond the others, in how many standard errors and bootstrap replicates."""
     bare = refit(searcher.problem, found.fit.model.without_effect(name), searcher.frozen, 4)
     loss = searcher.loss(bare)

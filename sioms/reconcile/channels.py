@@ -53,8 +53,12 @@ def lattice(session: Session, model: AxisModel) -> Finding | None:
     if best == 1:
         return None
     share = times[sizes % best == 0].sum() / times.sum()
-    return Finding("encoder_quantisation", {"factor": float(best)}, {"factor": 0.0},
-                   f"{100 * share:.1f} % of {len(moved)} position changes are multiples of {best} counts")
+    return Finding(
+        "encoder_quantisation",
+        {"factor": float(best)},
+        {"factor": 0.0},
+        f"{100 * share:.1f} % of {len(moved)} position changes are multiples of {best} counts",
+    )
 
 
 def _count_steps(record: Record, resolution: float) -> NDArray[np.int64]:
@@ -72,8 +76,12 @@ def index_scale(session: Session, model: AxisModel) -> Finding | None:
     gain, error, marks = fit
     if abs(gain - 1.0) < SIGNIFICANT * error or abs(gain - 1.0) < 3e-4:
         return None
-    return Finding("encoder_scale", {"gain": gain}, {"gain": error},
-                   f"{marks} index marks lie {gain:.5f} +- {error:.5f} of their pitch apart")
+    return Finding(
+        "encoder_scale",
+        {"gain": gain},
+        {"gain": error},
+        f"{marks} index marks lie {gain:.5f} +- {error:.5f} of their pitch apart",
+    )
 
 
 def index_fit(session: Session, model: AxisModel) -> tuple[float, float, int] | None:
@@ -154,13 +162,25 @@ def drive(session: Session, model: AxisModel) -> list[Finding]:
     n = sum(len(r) - 20 for r in records)
     found = []
     if at_limit:
-        found.append(Finding("saturation", {"limit": limit}, {"limit": noise * np.sqrt(0.5 * np.pi / at_limit)},
-                             f"measured force stays at {limit:.4g} {model.force_unit} in {at_limit} samples "
-                             "while the command goes on"))
+        found.append(
+            Finding(
+                "saturation",
+                {"limit": limit},
+                {"limit": noise * np.sqrt(0.5 * np.pi / at_limit)},
+                f"measured force stays at {limit:.4g} {model.force_unit} in {at_limit} samples "
+                "while the command goes on",
+            )
+        )
     none = misfit(0.0, 0.0)
     delay = _delay(misfit, dt)
-    lag = dt * float(minimize_scalar(lambda p: misfit(0.0, float(p) * dt), bounds=(0.0, 20.0), method="bounded",
-                                     options={"maxiter": 25}).x)
+    lag = dt * float(
+        minimize_scalar(
+            lambda p: misfit(0.0, float(p) * dt),
+            bounds=(0.0, 20.0),
+            method="bounded",
+            options={"maxiter": 25},
+        ).x
+    )
     scores = {"delay": misfit(delay, 0.0), "lag": misfit(0.0, max(lag, 0.0))}
     name = min(scores, key=lambda s: scores[s])
     value = delay if name == "delay" else lag
@@ -169,10 +189,16 @@ def drive(session: Session, model: AxisModel) -> list[Finding]:
     if value > max(SIGNIFICANT * error, 1e-3 * dt) and scores[name] < (1.0 - DRIVE_GAIN) * none:
         symbol = "delay" if name == "delay" else "tau"
         other = "lag" if name == "delay" else "delay"
-        found.append(Finding(name, {symbol: float(value)}, {symbol: error},
-                             f"measured force is late by {1e3 * value:.3f} ms; misfit {np.sqrt(scores[name] / n):.3g}, "
-                             f"with {other} {np.sqrt(scores[other] / n):.3g}, with neither {np.sqrt(none / n):.3g} "
-                             f"{model.force_unit}"))
+        found.append(
+            Finding(
+                name,
+                {symbol: float(value)},
+                {symbol: error},
+                f"measured force is late by {1e3 * value:.3f} ms; misfit {np.sqrt(scores[name] / n):.3g}, "
+                f"with {other} {np.sqrt(scores[other] / n):.3g}, with neither {np.sqrt(none / n):.3g} "
+                f"{model.force_unit}",
+            )
+        )
     return found
 
 
@@ -180,15 +206,22 @@ def _delay(misfit: Callable[[float, float], float], dt: float) -> float:
     """Search half samples first, then between."""
     grid = np.arange(0.0, 20.5, 0.5) * dt
     start = float(grid[int(np.argmin([misfit(float(d), 0.0) for d in grid]))] / dt)
-    best = minimize_scalar(lambda p: misfit(float(p) * dt, 0.0), bounds=(max(start - 0.6, 0.0), start + 0.6),
-                           method="bounded", options={"xatol": 1e-4})
+    best = minimize_scalar(
+        lambda p: misfit(float(p) * dt, 0.0),
+        bounds=(max(start - 0.6, 0.0), start + 0.6),
+        method="bounded",
+        options={"xatol": 1e-4},
+    )
     return float(best.x) * dt
 
 
 def _white(records: list[Record]) -> float:
     """White noise of the measured force."""
-    second = [1.4826 * np.median(np.abs(np.diff(r.force_measured, 2))) / np.sqrt(6.0) for r in records
-              if r.force_measured is not None]
+    second = [
+        1.4826 * np.median(np.abs(np.diff(r.force_measured, 2))) / np.sqrt(6.0)
+        for r in records
+        if r.force_measured is not None
+    ]
     return float(max(np.median(second), 1e-12))
 
 

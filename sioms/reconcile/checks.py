@@ -35,12 +35,15 @@ def check(session: Session, model: AxisModel) -> tuple[str, ...]:
         _check_record(r, model)
     seconds = session.samples * model.sample_time_s
     if seconds < LEAST_TOTAL_S:
-        raise BadInputError(f"read records: {seconds:.2f} s altogether is too short; record {LEAST_TOTAL_S:g} s or more")
+        raise BadInputError(
+            f"read records: {seconds:.2f} s altogether is too short; record {LEAST_TOTAL_S:g} s or more"
+        )
     travel = max(float(np.ptp(r.position)) for r in session.records)
     if travel < LEAST_COUNTS * model.resolution:
         raise BadInputError(
             f"read records: no motion, position stays within {travel:.3g} {model.position_unit} "
-            f"({travel / model.resolution:.0f} counts); record moves of {LEAST_COUNTS} counts and far more")
+            f"({travel / model.resolution:.0f} counts); record moves of {LEAST_COUNTS} counts and far more"
+        )
     return tuple(_notes(session, model))
 
 
@@ -48,25 +51,42 @@ def _check_record(r: Record, model: AxisModel) -> None:
     where = f"read record {r.name}"
     if len(r) < LEAST_SAMPLES:
         raise BadInputError(f"{where}: {len(r)} samples are too few; needs {LEAST_SAMPLES}")
-    for name, a in (("position", r.position), ("force", r.force), ("command", r.command),
-                    ("force_measured", r.force_measured)):
+    for name, a in (
+        ("position", r.position),
+        ("force", r.force),
+        ("command", r.command),
+        ("force_measured", r.force_measured),
+    ):
         if a is None:
             continue
         if len(a) != len(r):
-            raise BadInputError(f"{where}: {name} has {len(a)} samples, position {len(r)}; needs the same number")
+            raise BadInputError(
+                f"{where}: {name} has {len(a)} samples, position {len(r)}; needs the same number"
+            )
         if not np.all(np.isfinite(a)):
-            raise BadInputError(f"{where}: {name} has {int(np.sum(~np.isfinite(a)))} values that are no numbers")
-    for name, a, what in (("force", r.force, "the force that moved the axis"), ("force_measured", r.force_measured, "the drive's current"),
-                          ("command", r.command, "the command that was followed")):
-        if a is not None and np.ptp(a) == 0.0 and (name == "force" or np.ptp(r.position) >= LEAST_COUNTS * model.resolution):
+            raise BadInputError(
+                f"{where}: {name} has {int(np.sum(~np.isfinite(a)))} values that are no numbers"
+            )
+    for name, a, what in (
+        ("force", r.force, "the force that moved the axis"),
+        ("force_measured", r.force_measured, "the drive's current"),
+        ("command", r.command, "the command that was followed"),
+    ):
+        if (
+            a is not None
+            and np.ptp(a) == 0.0
+            and (name == "force" or np.ptp(r.position) >= LEAST_COUNTS * model.resolution)
+        ):
             raise BadInputError(f"{where}: {name} is constant at {a[0]:.6g}; needs {what}, or no such column")
     if r.time_s is not None:
         _check_time(r, r.time_s, model.sample_time_s)
     limit = model.controller.limit if model.controller is not None else float(np.max(np.abs(r.force)))
     share = float(np.mean(np.abs(r.force) >= 0.999 * limit))
     if share > SATURATED:
-        raise BadInputError(f"{where}: force is at its limit of {limit:.4g} {model.force_unit} in {100 * share:.0f} % of the "
-                            "samples; record gentler moves")
+        raise BadInputError(
+            f"{where}: force is at its limit of {limit:.4g} {model.force_unit} in {100 * share:.0f} % of the "
+            "samples; record gentler moves"
+        )
     if r.command is not None:
         _check_command(r, r.command, model)
 
@@ -78,13 +98,19 @@ def _check_time(r: Record, time: Array, dt: float) -> None:
         raise BadInputError(f"read record {r.name}: time does not increase; needs seconds, rising")
     factor = typical / dt
     if not 0.98 < factor < 1.02:
-        hint = f" (a factor of {factor:.4g}: is it in another unit?)" if factor > 30 or factor < 1 / 30 else ""
-        raise BadInputError(f"read record {r.name}: time steps are {typical:.6g} s, the model says {dt:.6g} s{hint}")
+        hint = (
+            f" (a factor of {factor:.4g}: is it in another unit?)" if factor > 30 or factor < 1 / 30 else ""
+        )
+        raise BadInputError(
+            f"read record {r.name}: time steps are {typical:.6g} s, the model says {dt:.6g} s{hint}"
+        )
     odd = np.flatnonzero(np.abs(steps - typical) > 0.5 * typical)
     if len(odd):
         i = int(odd[0])
-        raise BadInputError(f"read record {r.name}: time jumps by {steps[i]:.6g} s after sample {i} ({len(odd)} jumps); "
-                            f"needs steps of {typical:.6g} s, or cut the record there")
+        raise BadInputError(
+            f"read record {r.name}: time jumps by {steps[i]:.6g} s after sample {i} ({len(odd)} jumps); "
+            f"needs steps of {typical:.6g} s, or cut the record there"
+        )
 
 
 def _check_command(r: Record, command: Array, model: AxisModel) -> None:
@@ -93,18 +119,24 @@ def _check_command(r: Record, command: Array, model: AxisModel) -> None:
         return
     ratio = float(np.sqrt(np.mean(y**2) / max(np.mean(c**2), 1e-300)))
     if ratio > 30.0 or ratio < 1.0 / 30.0:
-        raise BadInputError(f"read record {r.name}: position is {ratio:.4g} times the command; is one of them in another unit "
-                            f"(a factor of {10.0 ** round(np.log10(ratio)):g})? needs both in {model.position_unit}")
+        raise BadInputError(
+            f"read record {r.name}: position is {ratio:.4g} times the command; is one of them in another unit "
+            f"(a factor of {10.0 ** round(np.log10(ratio)):g})? needs both in {model.position_unit}"
+        )
 
 
 def _notes(session: Session, model: AxisModel) -> list[str]:
     out = []
     if all(r.force_measured is None for r in session.records):
-        out.append("no force was measured: drive delay, lag and saturation are judged by their effect on motion only")
+        out.append(
+            "no force was measured: drive delay, lag and saturation are judged by their effect on motion only"
+        )
     if all(r.index is None for r in session.records):
         out.append("no index marks: encoder scale and payload cannot be told apart")
     if model.controller is None:
-        out.append("no controller in the model: the closed loop is not simulated, gaps are given in force only")
+        out.append(
+            "no controller in the model: the closed loop is not simulated, gaps are given in force only"
+        )
     if model.controller is not None and any(r.command is None for r in session.records):
         out.append("no command recorded: the closed loop is not simulated, gaps are given in force only")
     return out
@@ -118,9 +150,21 @@ def check_scale(problem: Problem, model: AxisModel) -> None:
     """
     motions = smoothed_motion(problem, model)
     dead = dead_band(problem, model)
-    columns = [np.stack([model.inertia * m.a, m.v, direction(m.v, dead), m.x, np.ones_like(m.x),
-                         np.sin(2 * np.pi * m.x / model.pitch), np.cos(2 * np.pi * m.x / model.pitch)], axis=1)
-               for m in motions]
+    columns = [
+        np.stack(
+            [
+                model.inertia * m.a,
+                m.v,
+                direction(m.v, dead),
+                m.x,
+                np.ones_like(m.x),
+                np.sin(2 * np.pi * m.x / model.pitch),
+                np.cos(2 * np.pi * m.x / model.pitch),
+            ],
+            axis=1,
+        )
+        for m in motions
+    ]
     a, u = problem.join(columns), problem.join([m.u for m in motions])
     size = np.linalg.norm(a, axis=0)
     size[size == 0.0] = 1.0
@@ -130,10 +174,14 @@ def check_scale(problem: Problem, model: AxisModel) -> None:
     if inertial < 0.02 or share < 0.2:
         return
     if c[0] < -0.05:
-        raise BadInputError(f"compare force with motion: force is {c[0]:.3g} times what the nominal inertia needs; the sign "
-                            "of force or position is turned round")
+        raise BadInputError(
+            f"compare force with motion: force is {c[0]:.3g} times what the nominal inertia needs; the sign "
+            "of force or position is turned round"
+        )
     if c[0] > UNIT_FACTOR or c[0] < 1.0 / UNIT_FACTOR:
         near = 10.0 ** round(np.log10(c[0]))
-        raise BadInputError(f"compare force with motion: force is {c[0]:.4g} times what the nominal inertia of "
-                            f"{model.inertia:.4g} needs (about {near:g}); check the units of force, position and inertia "
-                            f"(m against mm, N against mN), or the model is of another axis")
+        raise BadInputError(
+            f"compare force with motion: force is {c[0]:.4g} times what the nominal inertia of "
+            f"{model.inertia:.4g} needs (about {near:g}); check the units of force, position and inertia "
+            f"(m against mm, N against mN), or the model is of another axis"
+        )

@@ -138,7 +138,9 @@ class Effect:
         known = [p.symbol for p in self.parameters]
         if set(given) != set(known):
             odd = sorted(set(given) ^ set(known))
-            raise ValueError(f"read effect {self.name}: parameters {odd} are unknown or missing; needs {known}")
+            raise ValueError(
+                f"read effect {self.name}: parameters {odd} are unknown or missing; needs {known}"
+            )
         return np.array([given[s] for s in known], dtype=np.float64)
 
     def row(self, values: Array, pitch: float) -> Array:
@@ -162,6 +164,8 @@ class Effect:
             TypeError: the slot has no state function.
         """
         if self.function is None:
-            raise TypeError(f"evaluate effect {self.name}: slot {self.slot.value} is no function of the state")
+            raise TypeError(
+                f"evaluate effect {self.name}: slot {self.slot.value} is no function of the state"
+            )
         out = self.function(x, v, u, temperature, p)
         return np.broadcast_to(np.asarray(out, dtype=np.float64), np.shape(x)).copy()

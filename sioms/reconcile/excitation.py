@@ -75,8 +75,13 @@ def _trace(problem: Problem, model: AxisModel, effect: Effect) -> Array | None:
     size = effect.primary.start * model.scale(effect.primary)
     if effect.slot in STATE_SLOTS:
         motions, dead = smoothed_motion(problem, model), dead_band(problem, model)
-        shape = next(iter(shapes(effect, model, 1)), {p.symbol: p.start * model.scale(p) for p in effect.parameters})
-        parts = [response(model, problem.noise, size * state_columns(effect, model, m, shape, dead)) for m in motions]
+        shape = next(
+            iter(shapes(effect, model, 1)), {p.symbol: p.start * model.scale(p) for p in effect.parameters}
+        )
+        parts = [
+            response(model, problem.noise, size * state_columns(effect, model, m, shape, dead))
+            for m in motions
+        ]
         trace = problem.join(parts) / problem.noise.innovation
     else:
         values = next(iter(trial_values(effect, model, problem)))

@@ -104,7 +104,9 @@ def _falls(model: AxisModel) -> bool:
         effect = known()[name]
         if effect.slot is Slot.FRICTION:
             row = effect.row(effect.values(given), model.pitch)
-            slow, fast = (effect.evaluate(zero, zero + share * model.max_speed, zero, zero, row) for share in (0.0, 0.5))
+            slow, fast = (
+                effect.evaluate(zero, zero + share * model.max_speed, zero, zero, row) for share in (0.0, 0.5)
+            )
             if slow[0] > 1.05 * fast[0]:
                 return True
     return False
@@ -159,8 +161,10 @@ def _free(model: AxisModel, name: str, p: Parameter, value: float) -> Free:
 
 def get(model: AxisModel, free: Sequence[Free]) -> Array:
     """Read the free numbers."""
-    return np.array([getattr(model, f.symbol) if f.effect == BASE else model.effects[f.effect][f.symbol]
-                     for f in free], dtype=np.float64)
+    return np.array(
+        [getattr(model, f.symbol) if f.effect == BASE else model.effects[f.effect][f.symbol] for f in free],
+        dtype=np.float64,
+    )
 
 
 def put(model: AxisModel, free: Sequence[Free], values: Array) -> AxisModel:
@@ -178,8 +182,9 @@ def put(model: AxisModel, free: Sequence[Free], values: Array) -> AxisModel:
     return replace(model, effects=effects, **base)  # type: ignore[arg-type]
 
 
-def jacobian(problem: Problem, model: AxisModel, free: Sequence[Free], at: Array, base: Array,
-             step: float = 2e-3) -> Array:
+def jacobian(
+    problem: Problem, model: AxisModel, free: Sequence[Free], at: Array, base: Array, step: float = 2e-3
+) -> Array:
     """Forward differences in the scaled parameters, stepping away from a bound."""
 
     def column(i: int) -> Array:
@@ -192,8 +197,13 @@ def jacobian(problem: Problem, model: AxisModel, free: Sequence[Free], at: Array
     return np.stack(list(problem.mapper(column, range(len(free)))), axis=1)
 
 
-def refit(problem: Problem, model: AxisModel, frozen: Sequence[str] = (), iterations: int = 8,
-          tolerance: float = 1e-3) -> Fit:
+def refit(
+    problem: Problem,
+    model: AxisModel,
+    frozen: Sequence[str] = (),
+    iterations: int = 8,
+    tolerance: float = 1e-3,
+) -> Fit:
     """Fit all free parameters by bounded Levenberg-Marquardt.
 
     Args:
@@ -210,6 +220,14 @@ def refit(problem: Problem, model: AxisModel, frozen: Sequence[str] = (), iterat
         return Fit(model, free, r, np.empty((len(r), 0)))
     scale = np.array([f.scale for f in free])
     lower, upper = np.array([f.lower for f in free]), np.array([f.upper for f in free])
-    at, r, j = descend(lambda x: problem.residual(put(model, free, x)), lambda x, r: jacobian(problem, model, free, x, r),
-                       get(model, free), scale, lower, upper, iterations, tolerance)
+    at, r, j = descend(
+        lambda x: problem.residual(put(model, free, x)),
+        lambda x, r: jacobian(problem, model, free, x, r),
+        get(model, free),
+        scale,
+        lower,
+        upper,
+        iterations,
+        tolerance,
+    )
     return Fit(put(model, free, at), free, r, j)

@@ -47,7 +47,10 @@ def lap(record: Record, sample_time_s: float) -> int:
 
 def lap_floor(record: Record, period: int) -> tuple[float, float]:
     """Root mean square lap-to-lap difference over sqrt 2: of force and of position."""
-    f, y = record.force[period:] - record.force[:-period], record.position[period:] - record.position[:-period]
+    f, y = (
+        record.force[period:] - record.force[:-period],
+        record.position[period:] - record.position[:-period],
+    )
     return float(np.std(f) / np.sqrt(2.0)), float(np.std(y) / np.sqrt(2.0))
 
 
@@ -59,17 +62,26 @@ def loop_floor(model: AxisModel, noise: Noise) -> tuple[float, float]:
     z = np.exp(1j * np.linspace(1e-3, np.pi, 4096))
     a, b = rigid(model)
     plant = (b[0] * (z - a[1, 1]) + a[0, 1] * b[1]) / ((z - a[0, 0]) * (z - a[1, 1]) - a[0, 1] * a[1, 0])
-    alpha = 1.0 - np.exp(-2.0 * np.pi * c.velocity_filter_hz * model.sample_time_s) if c.velocity_filter_hz else 1.0
+    alpha = (
+        1.0 - np.exp(-2.0 * np.pi * c.velocity_filter_hz * model.sample_time_s)
+        if c.velocity_filter_hz
+        else 1.0
+    )
     speed = alpha * (1.0 - 1.0 / z) / model.sample_time_s / (1.0 - (1.0 - alpha) / z)
     gain = (c.k * (1.0 + c.kz / z) - c.kb * speed) / (1.0 + c.kp / z)
     loop = gain * plant
     close = 1.0 / (1.0 + loop)
-    force = np.sqrt(np.mean(np.abs(gain * close) ** 2) * noise.sensor**2 + np.mean(np.abs(loop * close) ** 2) * noise.drive**2)
+    force = np.sqrt(
+        np.mean(np.abs(gain * close) ** 2) * noise.sensor**2
+        + np.mean(np.abs(loop * close) ** 2) * noise.drive**2
+    )
     place = np.sqrt(np.mean(np.abs(plant * close) ** 2) * noise.drive**2 + noise.sensor**2)
     return float(force), float(place)
 
 
-def measure(problem: Problem, nominal: AxisModel, model: AxisModel, states: Sequence[State] = ()) -> tuple[Gap, ...]:
+def measure(
+    problem: Problem, nominal: AxisModel, model: AxisModel, states: Sequence[State] = ()
+) -> tuple[Gap, ...]:
     """Compare before and after on the samples of ``problem`` (the untouched ones).
 
     Args:
@@ -85,16 +97,32 @@ def measure(problem: Problem, nominal: AxisModel, model: AxisModel, states: Sequ
         return tuple(out)
     errors = [closed_errors(problem, m) for m in (nominal, model)]
     floors = [lap_floor(r, p) for r in problem.session.records if (p := lap(r, nominal.sample_time_s))]
-    force, place = (float(np.median([f[i] for f in floors])) for i in (0, 1)) if floors else loop_floor(nominal, problem.noise)
+    force, place = (
+        (float(np.median([f[i] for f in floors])) for i in (0, 1))
+        if floors
+        else loop_floor(nominal, problem.noise)
+    )
     out.append(Gap("force, closed loop", unit, errors[0][0], errors[1][0], force, frozen[1], session[1]))
-    out.append(Gap("position, closed loop", nominal.position_unit, errors[0][1], errors[1][1], place, frozen[2], session[2]))
+    out.append(
+        Gap(
+            "position, closed loop",
+            nominal.position_unit,
+            errors[0][1],
+            errors[1][1],
+            place,
+            frozen[2],
+            session[2],
+        )
+    )
     return tuple(out)
 
 
 def session_states(problem: Problem, model: AxisModel) -> tuple[State, ...]:
     """Estimate the session parameters of every record on the first half of its samples in ``problem``."""
-    return tuple(estimate(problem, model, r, half(problem, r), heat)
-                 for r, heat in zip(problem.session.records, heats(problem, model), strict=True))
+    return tuple(
+        estimate(problem, model, r, half(problem, r), heat)
+        for r, heat in zip(problem.session.records, heats(problem, model), strict=True)
+    )
 
 
 def _late_errors(problem: Problem, model: AxisModel, states: Sequence[State]) -> tuple[float | None, ...]:
@@ -116,8 +144,12 @@ def _late_errors(problem: Problem, model: AxisModel, states: Sequence[State]) ->
 def rungs(problem: Problem, models: Sequence[AxisModel]) -> tuple[float, ...]:
     """Force error of each model on the samples of ``problem``: in closed loop where it can be, [{F}]."""
     closed = all(r.command is not None for r in problem.session.records)
-    return tuple(closed_errors(problem, m)[0] if closed and m.controller is not None
-                 else _rms(problem.residual(m)) * problem.noise.drive for m in models)
+    return tuple(
+        closed_errors(problem, m)[0]
+        if closed and m.controller is not None
+        else _rms(problem.residual(m)) * problem.noise.drive
+        for m in models
+    )
 
 
 def closed_errors(problem: Problem, model: AxisModel) -> tuple[float, float]:

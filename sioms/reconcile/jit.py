@@ -55,8 +55,10 @@ def state_function(function: F) -> F:
     """
     taken = len(inspect.signature(function).parameters)
     if taken != STATE_ARGUMENTS:
-        raise TypeError(f"define state function {function.__name__}: it takes {taken} arguments; "
-                        "needs (x, v, u, temperature, p)")
+        raise TypeError(
+            f"define state function {function.__name__}: it takes {taken} arguments; "
+            "needs (x, v, u, temperature, p)"
+        )
     return function
 
 

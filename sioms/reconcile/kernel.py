@@ -23,8 +23,31 @@ TypedList = typed_list()
 
 # Places in the plant row.
 (
-    INERTIA, VISCOUS, DT, QUANTUM, GAIN_Y, ECC_AMP, ECC_PHASE, TURN_X, DELAY, LAG, LIMIT, LOSS, TAU_T, RATED,
-    LOAD, STIFF, DAMP, GAP, HYST_F, HYST_X, LOAD_VISCOUS, MOD_A, MOD_PHASE, MOD_N, PLANT_SIZE,
+    INERTIA,
+    VISCOUS,
+    DT,
+    QUANTUM,
+    GAIN_Y,
+    ECC_AMP,
+    ECC_PHASE,
+    TURN_X,
+    DELAY,
+    LAG,
+    LIMIT,
+    LOSS,
+    TAU_T,
+    RATED,
+    LOAD,
+    STIFF,
+    DAMP,
+    GAP,
+    HYST_F,
+    HYST_X,
+    LOAD_VISCOUS,
+    MOD_A,
+    MOD_PHASE,
+    MOD_N,
+    PLANT_SIZE,
 ) = range(25)
 # Places in the controller row.
 CTL_K, CTL_KZ, CTL_KP, CTL_KB, CTL_OFFSET, CTL_MAX, CTL_ALPHA, CTL_MEAN, CTL_SIZE = range(9)
@@ -91,8 +114,17 @@ def delayed(u: Array, n: int, start: float, end: float, delay: float, dt: float)
 
 
 @kernel
-def slide(x: float, v: float, a: float, level: float, mass: float, force: float, h: float,
-          break_p: float, break_m: float) -> tuple[float, float]:
+def slide(
+    x: float,
+    v: float,
+    a: float,
+    level: float,
+    mass: float,
+    force: float,
+    h: float,
+    break_p: float,
+    break_m: float,
+) -> tuple[float, float]:
     """Advance one step under constant ``force`` and dry friction, splitting at rest.
 
     Args:
@@ -116,9 +148,29 @@ def slide(x: float, v: float, a: float, level: float, mass: float, force: float,
 
 
 @kernel
-def march(closed: bool, command: Array, measured: Array, force_in: Array, ctl: Array, plant: Array,
-          forces: Any, nf: int, pf: Array, levels: Any, nl: int, pl: Array, gains: Any, ng: int, pg: Array,
-          l1: float, l2: float, lost: float, start: Array, sub: int, out: Array) -> None:
+def march(
+    closed: bool,
+    command: Array,
+    measured: Array,
+    force_in: Array,
+    ctl: Array,
+    plant: Array,
+    forces: Any,
+    nf: int,
+    pf: Array,
+    levels: Any,
+    nl: int,
+    pl: Array,
+    gains: Any,
+    ng: int,
+    pg: Array,
+    l1: float,
+    l2: float,
+    lost: float,
+    start: Array,
+    sub: int,
+    out: Array,
+) -> None:
     """Run the axis over one record.
 
     Args:
@@ -160,7 +212,12 @@ def march(closed: bool, command: Array, measured: Array, force_in: Array, ctl: A
             y_older = y_old
             y_old = y
             e = command[i] - y
-            u = ctl[CTL_K] * (e + ctl[CTL_KZ] * e_old) - ctl[CTL_KP] * u_old + ctl[CTL_KB] * v_f + ctl[CTL_OFFSET]
+            u = (
+                ctl[CTL_K] * (e + ctl[CTL_KZ] * e_old)
+                - ctl[CTL_KP] * u_old
+                + ctl[CTL_KB] * v_f
+                + ctl[CTL_OFFSET]
+            )
             u = min(max(u, -ctl[CTL_MAX]), ctl[CTL_MAX])
             e_old, u_old = e, u
             innovation = 0.0
@@ -223,7 +280,9 @@ def march(closed: bool, command: Array, measured: Array, force_in: Array, ctl: A
                 before = hyst
                 hyst = goal + (hyst - goal) * way
                 base += before - 0.5 * (before + hyst)
-            force = base - smooth(force_of, nf, pf, x, v, ua, temp) + smooth(force_of, nf, pf, xp, vp, ua, temp)
+            force = (
+                base - smooth(force_of, nf, pf, x, v, ua, temp) + smooth(force_of, nf, pf, xp, vp, ua, temp)
+            )
             force -= plant[VISCOUS] * vp
             if plant[MOD_A] != 0.0:
                 w = plant[MOD_N] * plant[TURN_X]
@@ -241,10 +300,20 @@ def march(closed: bool, command: Array, measured: Array, force_in: Array, ctl: A
                 force -= link
             if nl > 0:
                 if v != 0.0:
-                    level = sign * friction(level_of, nl, pl, xp, vp if vp != 0.0 else sign * TINY_SPEED, ua, temp)
-                x, v = slide(x, v, (force - level) / jm, level, jm, force, h,
-                             friction(level_of, nl, pl, x, TINY_SPEED, ua, temp),
-                             friction(level_of, nl, pl, x, -TINY_SPEED, ua, temp))
+                    level = sign * friction(
+                        level_of, nl, pl, xp, vp if vp != 0.0 else sign * TINY_SPEED, ua, temp
+                    )
+                x, v = slide(
+                    x,
+                    v,
+                    (force - level) / jm,
+                    level,
+                    jm,
+                    force,
+                    h,
+                    friction(level_of, nl, pl, x, TINY_SPEED, ua, temp),
+                    friction(level_of, nl, pl, x, -TINY_SPEED, ua, temp),
+                )
             else:
                 a = force / jm
                 x += h * (v + 0.5 * h * a)

@@ -100,8 +100,14 @@ def variables(motions: list[Motion], model: AxisModel, dead: float) -> dict[str,
         "acceleration": (f"{x}/s^2", [m.a for m in motions]),
         "motor force": (f, [m.u for m in motions]),
         "heat": ("1", [_heat(m.u, model) for m in motions]),
-        "displacement since reversal": (x, [s * since_reversal(m.x, s) for m, s in zip(motions, sign, strict=True)]),
-        "time": ("s", [(np.arange(len(m.x)) + t) * model.sample_time_s for m, t in zip(motions, time, strict=False)]),
+        "displacement since reversal": (
+            x,
+            [s * since_reversal(m.x, s) for m, s in zip(motions, sign, strict=True)],
+        ),
+        "time": (
+            "s",
+            [(np.arange(len(m.x)) + t) * model.sample_time_s for m, t in zip(motions, time, strict=False)],
+        ),
     }
     return out
 

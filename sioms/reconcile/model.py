@@ -124,5 +124,6 @@ def controller_row(model: AxisModel) -> Array:
         raise ValueError(f"simulate {model.name}: the model has no controller; a closed loop needs one")
     f = c.velocity_filter_hz
     alpha = 1.0 - np.exp(-2.0 * np.pi * f * model.sample_time_s) if f > 0.0 else 1.0
-    return np.array([c.k, c.kz, c.kp, c.kb, c.offset, c.limit, alpha,
-                     float(c.velocity_mean)], dtype=np.float64)
+    return np.array(
+        [c.k, c.kz, c.kp, c.kb, c.offset, c.limit, alpha, float(c.velocity_mean)], dtype=np.float64
+    )

@@ -15,8 +15,19 @@ from sioms.reconcile.effects import known
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.model import AxisModel, Controller
 
-AXIS_KEYS = ("name", "kind", "sample_time_s", "inertia", "viscous", "resolution", "pitch", "rated_force", "max_speed",
-             "start_position", "refine")
+AXIS_KEYS = (
+    "name",
+    "kind",
+    "sample_time_s",
+    "inertia",
+    "viscous",
+    "resolution",
+    "pitch",
+    "rated_force",
+    "max_speed",
+    "start_position",
+    "refine",
+)
 CONTROLLER_KEYS = ("k", "kz", "kp", "kb", "offset", "limit", "velocity_filter_hz", "velocity_mean")
 
 

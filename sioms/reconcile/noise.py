@@ -44,8 +44,10 @@ def rigid(model: AxisModel) -> tuple[Array, Array]:
     if a * t < 1e-9:
         return np.array([[1.0, t], [0.0, 1.0]]), np.array([0.5 * t * t, t]) / model.inertia
     decay = np.exp(-a * t)
-    return (np.array([[1.0, (1.0 - decay) / a], [0.0, decay]]),
-            np.array([(t - (1.0 - decay) / a) / model.viscous, (1.0 - decay) / model.viscous]))
+    return (
+        np.array([[1.0, (1.0 - decay) / a], [0.0, decay]]),
+        np.array([(t - (1.0 - decay) / a) / model.viscous, (1.0 - decay) / model.viscous]),
+    )
 
 
 def observer(model: AxisModel, sensor: float, drive: float) -> Noise:
@@ -57,7 +59,9 @@ def observer(model: AxisModel, sensor: float, drive: float) -> Noise:
     an, bn = a * d[None, :] / d[:, None], b / d * drive
     p = solve_discrete_are(an.T, np.array([[1.0], [0.0]]), np.outer(bn, bn) + 1e-12 * np.eye(2), np.eye(1))
     s = p[0, 0] + 1.0
-    return Noise(sensor, drive, (float(p[0, 0] / s), float(p[1, 0] / s * speed / scale)), float(np.sqrt(s)) * sensor)
+    return Noise(
+        sensor, drive, (float(p[0, 0] / s), float(p[1, 0] / s * speed / scale)), float(np.sqrt(s)) * sensor
+    )
 
 
 def sensor_noise(session: Session, resolution: float) -> float:

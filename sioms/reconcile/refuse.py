@@ -61,13 +61,28 @@ def basis(motions: list[Motion], model: AxisModel, dead: float) -> list[Array]:
     for m in motions:
         s = direction(m.v, dead)
         xi = since_reversal(m.x, s)
-        columns = [hats(m.x, kx), hats(m.x, kx) * s[:, None], hats(m.v, kv), hats(m.u, ku), hats(m.a, ka),
-                   s[:, None] * np.exp(-xi[:, None] / (length * np.array([3e-3, 1e-2, 3e-2, 1e-1]))),
-                   (m.x * m.v)[:, None], s[:, None]]
+        columns = [
+            hats(m.x, kx),
+            hats(m.x, kx) * s[:, None],
+            hats(m.v, kv),
+            hats(m.u, ku),
+            hats(m.a, ka),
+            s[:, None] * np.exp(-xi[:, None] / (length * np.array([3e-3, 1e-2, 3e-2, 1e-1]))),
+            (m.x * m.v)[:, None],
+            s[:, None],
+        ]
         if whole:
-            wave = np.concatenate([f(h * turn * m.x)[:, None] for h in range(1, HARMONICS + 1)
-                                   for f in (np.sin, np.cos)], axis=1)
-            columns += [wave, wave * m.a[:, None], wave * (m.v**2)[:, None], wave * m.u[:, None], wave * m.v[:, None]]
+            wave = np.concatenate(
+                [f(h * turn * m.x)[:, None] for h in range(1, HARMONICS + 1) for f in (np.sin, np.cos)],
+                axis=1,
+            )
+            columns += [
+                wave,
+                wave * m.a[:, None],
+                wave * (m.v**2)[:, None],
+                wave * m.u[:, None],
+                wave * m.v[:, None],
+            ]
         out.append(np.concatenate(columns, axis=1))
     return out
 
@@ -87,7 +102,10 @@ def smoother_rest(problem: Problem, fit: Fit, folds: int = 5) -> Array:
     rows = thinned(len(fit.residual))
     motions = instrument_motion(problem, fit.model)
     columns = basis(motions, fit.model, dead_band(problem, fit.model))
-    f = problem.join([response(fit.model, problem.noise, c) for c in columns])[rows] / problem.noise.innovation
+    f = (
+        problem.join([response(fit.model, problem.noise, c) for c in columns])[rows]
+        / problem.noise.innovation
+    )
     size = np.sqrt(np.mean(f**2, axis=0))
     f = f[:, size > 1e-12] / size[size > 1e-12]
     fold = block_ids(problem, fit.model.sample_time_s)[rows] % folds

@@ -81,7 +81,9 @@ def direction(v: Array, dead: float) -> Array:
     return s
 
 
-def state_columns(effect: Effect, model: AxisModel, motion: Motion, shape: dict[str, float], dead: float) -> Array:
+def state_columns(
+    effect: Effect, model: AxisModel, motion: Motion, shape: dict[str, float], dead: float
+) -> Array:
     """Forces per unit of each amplitude of a state effect (two columns where it has a phase), shape (n, k)."""
     columns = []
     for amplitude, phase in amplitudes(effect):
@@ -106,7 +108,9 @@ def state_columns(effect: Effect, model: AxisModel, motion: Motion, shape: dict[
 def _modulation(model: AxisModel, motion: Motion, shape: dict[str, float], phase: float) -> Array:
     """Force of a unit inertia that varies over the turn: -(s a + s' v^2 / 2)."""
     w = shape["n"] * 2.0 * np.pi / model.pitch
-    f: Array = -(np.sin(w * motion.x + phase) * motion.a + 0.5 * motion.v**2 * w * np.cos(w * motion.x + phase))
+    f: Array = -(
+        np.sin(w * motion.x + phase) * motion.a + 0.5 * motion.v**2 * w * np.cos(w * motion.x + phase)
+    )
     return f
 
 
@@ -125,7 +129,9 @@ def shapes(effect: Effect, model: AxisModel, largest_order: int) -> Iterator[dic
     """Yield trial values of the parameters in which a state effect is not linear."""
     linear = {p.symbol for p, _ in amplitudes(effect)}
     order = next((p for p in effect.parameters if p.fixed), None)
-    shape = next((p for p in effect.parameters if p.symbol not in linear and not p.fixed and not p.phase), None)
+    shape = next(
+        (p for p in effect.parameters if p.symbol not in linear and not p.fixed and not p.phase), None
+    )
     if order is not None:
         first = 1 if not model.rotary else max(int(order.lower), 2 if effect.slot is Slot.FORCE else 1)
         for n in range(first, largest_order + 1):
@@ -142,7 +148,9 @@ def shapes(effect: Effect, model: AxisModel, largest_order: int) -> Iterator[dic
         yield {}
 
 
-def screen(problem: Problem, fit: Fit, names: list[str], levels: Mapping[str, float] | None = None) -> list[Start]:
+def screen(
+    problem: Problem, fit: Fit, names: list[str], levels: Mapping[str, float] | None = None
+) -> list[Start]:
     """Rank effects by what they could explain beyond the fitted model.
 
     Args:
@@ -189,7 +197,9 @@ def instrument_motion(problem: Problem, model: AxisModel) -> list[Motion]:
     for r in records:
         run = replay(model, r, temperature)
         temperature = run.end_temperature if problem.session.continuous else 0.0
-        out.append(Motion(run.x, run.v, np.gradient(run.v, model.sample_time_s), run.applied, run.temperature))
+        out.append(
+            Motion(run.x, run.v, np.gradient(run.v, model.sample_time_s), run.applied, run.temperature)
+        )
     return out
 
 
@@ -204,7 +214,9 @@ def _moved_by(model: AxisModel, command: Array) -> Motion:
 
 def _low_passed(x: Array, cutoff_hz: float, dt: float) -> Array:
     sos = butter(3, min(2.0 * cutoff_hz * dt, 0.8), output="sos")
-    out: Array = sosfiltfilt(sos, x, padtype="odd", padlen=min(int(max(300, 0.5 / (cutoff_hz * dt))), len(x) - 1))
+    out: Array = sosfiltfilt(
+        sos, x, padtype="odd", padlen=min(int(max(300, 0.5 / (cutoff_hz * dt))), len(x) - 1)
+    )
     return out
 
 
@@ -236,12 +248,22 @@ def _filtered(problem: Problem, model: AxisModel, columns: list[Array]) -> Array
     return e if problem.weights is None else e * problem.weights[:, None]
 
 
-def _screen_state(problem: Problem, fit: Fit, effect: Effect, motions: list[Motion], q: Array, rest: Array,
-                  dead: float, largest: int, levels: Mapping[str, float]) -> Start | None:
+def _screen_state(
+    problem: Problem,
+    fit: Fit,
+    effect: Effect,
+    motions: list[Motion],
+    q: Array,
+    rest: Array,
+    dead: float,
+    largest: int,
+    levels: Mapping[str, float],
+) -> Start | None:
     best: Start | None = None
     for shape in shapes(effect, fit.model, largest):
-        f = _filtered(problem, fit.model,
-                      [state_columns(effect, fit.model, m, shape, dead) for m in motions])[thinned(len(fit.residual))]
+        f = _filtered(
+            problem, fit.model, [state_columns(effect, fit.model, m, shape, dead) for m in motions]
+        )[thinned(len(fit.residual))]
         f = f - q @ (q.T @ f)
         size = np.linalg.norm(f, axis=0)
         keep = size > 1e-9
@@ -261,11 +283,17 @@ def _overtone(effect: Effect, values: Mapping[str, float], largest: int) -> bool
     """Say whether the second harmonic is the larger: then the wave is one of twice the order, which is tried too."""
     order = next((p.symbol for p in effect.parameters if p.fixed), None)
     waves = [a.symbol for a, phase in amplitudes(effect) if phase is not None]
-    return order is not None and len(waves) == 2 and values[waves[1]] > values[waves[0]] and 2 * values[order] <= largest
+    return (
+        order is not None
+        and len(waves) == 2
+        and values[waves[1]] > values[waves[0]]
+        and 2 * values[order] <= largest
+    )
 
 
-def _values(effect: Effect, model: AxisModel, shape: dict[str, float], c: Array,
-            levels: Mapping[str, float]) -> dict[str, float]:
+def _values(
+    effect: Effect, model: AxisModel, shape: dict[str, float], c: Array, levels: Mapping[str, float]
+) -> dict[str, float]:
     """Turn regression coefficients into parameters within their bounds."""
     values, i = dict(shape), 0
     for amplitude, phase in amplitudes(effect):
@@ -320,7 +348,11 @@ def _screen_trials(problem: Problem, fit: Fit, effect: Effect, q: Array, rest: A
     for name in effect.replaces:
         model = model.without_effect(name) if name in model.effects else model
     trials = list(trial_values(effect, model, problem))
-    for values, tried in zip(trials, problem.mapper(lambda v: problem.residual(model.with_effect(effect.name, v)), trials), strict=True):
+    for values, tried in zip(
+        trials,
+        problem.mapper(lambda v: problem.residual(model.with_effect(effect.name, v)), trials),
+        strict=True,
+    ):
         d = (tried - fit.residual)[thinned(len(fit.residual))]
         d = d - q @ (q.T @ d)
         size = float(d @ d)
@@ -333,7 +365,9 @@ def _screen_trials(problem: Problem, fit: Fit, effect: Effect, q: Array, rest: A
     return best[: 2 if effect.slot in (Slot.ELASTIC, Slot.BACKLASH) else 1]
 
 
-def _stretched(effect: Effect, model: AxisModel, values: dict[str, float], stretch: float) -> dict[str, float]:
+def _stretched(
+    effect: Effect, model: AxisModel, values: dict[str, float], stretch: float
+) -> dict[str, float]:
     """Scale the amplitude where the effect is linear in it."""
     p = effect.parameters[0]
     neutral = {Slot.SCALE: 1.0}.get(effect.slot, 0.0)

@@ -93,7 +93,9 @@ class Searcher:
                 del self._fits[next(iter(self._fits))]
         return self._fits[key]
 
-    def screen(self, fit: Fit, names: Sequence[str], levels: Mapping[str, float] | None = None) -> list[Start]:
+    def screen(
+        self, fit: Fit, names: Sequence[str], levels: Mapping[str, float] | None = None
+    ) -> list[Start]:
         """Screen as ``sioms.reconcile.screen.screen`` does; what was screened before is looked up."""
         key = (values_of(fit.model), tuple(sorted((levels or {}).items())))
         fresh = [n for n in names if (key, n) not in self._starts]
@@ -112,7 +114,11 @@ class Searcher:
         if len(self.ids) != len(fit.residual):
             self.ids = block_ids(self.problem, fit.model.sample_time_s)
         losses = heldout(fit, self.ids)
-        return losses if self.problem.weights is None else losses[np.bincount(self.ids, weights=self.problem.weights) > 0.0]
+        return (
+            losses
+            if self.problem.weights is None
+            else losses[np.bincount(self.ids, weights=self.problem.weights) > 0.0]
+        )
 
     def run(self, start: AxisModel) -> Found:
         """Search from a model."""
@@ -127,14 +133,21 @@ class Searcher:
                 break
             ladder.append(step[2])
             fit, losses = step[0], step[1]
-            self.progress(f"{ladder[-1].action} {ladder[-1].effect}: residual {fit.ratio:.2f} of the expected")
+            self.progress(
+                f"{ladder[-1].action} {ladder[-1].effect}: residual {fit.ratio:.2f} of the expected"
+            )
             fit, losses = self._simplify(fit, losses, ladder)
             fit, losses = self._eliminate(fit, losses, ladder)
         return Found(fit, losses, tuple(ladder))
 
     def _candidates(self, fit: Fit) -> list[Start]:
-        names = [n for n in self.names if n not in fit.model.effects and n not in self.frozen
-                 and not any(f in known()[n].replaces for f in self.frozen)]
+        names = [
+            n
+            for n in self.names
+            if n not in fit.model.effects
+            and n not in self.frozen
+            and not any(f in known()[n].replaces for f in self.frozen)
+        ]
         fresh = [n for n in names if not replaced(fit.model, n) and not self._enrichment(n)]
         starts = [s for s in self.screen(fit, fresh) if s.gain > 0.5 * GAIN]
         starts += self._upgrades(fit, [n for n in names if replaced(fit.model, n)])
@@ -148,7 +161,9 @@ class Searcher:
     def _enrichment(self, name: str) -> bool:
         """Say whether an effect with a searched order only enriches a plainer one, which goes first."""
         effect = known()[name]
-        return any(p.fixed for p in effect.parameters) and any(o in effect.replaces for o in plainer(name, self.names))
+        return any(p.fixed for p in effect.parameters) and any(
+            o in effect.replaces for o in plainer(name, self.names)
+        )
 
     def _upgrades(self, fit: Fit, names: list[str]) -> list[Start]:
         """Screen richer forms of an effect in the model, on top of the level it has."""
@@ -172,7 +187,9 @@ class Searcher:
         if max((t[2] for t in tried.values()), default=0.0) < CLEAR:
             for effect, new in self._afresh(fit):
                 self._try(tried, effect, new, losses)
-        good = {n: t for n, t in tried.items() if t[2] >= GAIN and t[3] >= self._sure(n) and physical(t[0], n)}
+        good = {
+            n: t for n, t in tried.items() if t[2] >= GAIN and t[3] >= self._sure(n) and physical(t[0], n)
+        }
         if not good:
             return None
         name = simplest(good)
@@ -193,16 +210,32 @@ class Searcher:
         for first in self._candidates(fit)[:PAIRS]:
             middle = self._with(fit, first, 5)
             inner = self.loss(middle)
-            for second in [s for s in self._candidates(middle) if s.effect not in known()[first.effect].replaces][:PAIRS]:
+            for second in [
+                s for s in self._candidates(middle) if s.effect not in known()[first.effect].replaces
+            ][:PAIRS]:
                 new = self._with(middle, second, 8)
                 if first.effect not in new.model.effects:
                     continue
                 loss = self.loss(new)
                 gain, sure = better(loss, losses)
                 more, surer = better(loss, inner)
-                good = gain >= SPECIFIC and sure >= SURE and more >= SPECIFIC and surer >= self._sure(second.effect)
-                if good and physical(new, first.effect) and physical(new, second.effect) and (best is None or new.cost < best[0].cost):
-                    best = new, loss, Step("add", f"{first.effect} and {second.effect}", new.ratio, gain, new.model)
+                good = (
+                    gain >= SPECIFIC
+                    and sure >= SURE
+                    and more >= SPECIFIC
+                    and surer >= self._sure(second.effect)
+                )
+                if (
+                    good
+                    and physical(new, first.effect)
+                    and physical(new, second.effect)
+                    and (best is None or new.cost < best[0].cost)
+                ):
+                    best = (
+                        new,
+                        loss,
+                        Step("add", f"{first.effect} and {second.effect}", new.ratio, gain, new.model),
+                    )
         return best
 
     def _with(self, fit: Fit, start: Start, iterations: int) -> Fit:
@@ -210,7 +243,9 @@ class Searcher:
         model = without(fit.model, known()[start.effect].replaces)
         return self.fit(model.with_effect(start.effect, start.values), iterations)
 
-    def _try(self, tried: dict[str, tuple[Fit, Array, float, float]], effect: str, new: Fit, losses: Array) -> None:
+    def _try(
+        self, tried: dict[str, tuple[Fit, Array, float, float]], effect: str, new: Fit, losses: Array
+    ) -> None:
         """Score a refitted candidate; keep the better of two ways to the same effect."""
         loss = self.loss(new)
         gain, sure = better(loss, losses)
@@ -223,10 +258,15 @@ class Searcher:
         for name in [n for n in fit.model.effects if n not in self.frozen]:
             for other in [o for o in plainer(name, self.names) if o in known()[name].replaces]:
                 base = self.fit(swapped(fit.model, name, other), 5)
-                starts = [s for s in self._candidates(base) if name not in (s.effect, *known()[s.effect].replaces)]
+                starts = [
+                    s for s in self._candidates(base) if name not in (s.effect, *known()[s.effect].replaces)
+                ]
                 for s in starts[:2]:
                     middle = self._with(base, s, 5)
-                    out += [(s.effect, self._with(middle, again, 6)) for again in self._upgrades(middle, [name])[:1]]
+                    out += [
+                        (s.effect, self._with(middle, again, 6))
+                        for again in self._upgrades(middle, [name])[:1]
+                    ]
         return out
 
     def _sure(self, name: str) -> float:
@@ -263,7 +303,10 @@ class Searcher:
 
 def values_of(model: AxisModel) -> Hashable:
     """Return all that a search may change of a model, to look it up by."""
-    return (tuple(getattr(model, symbol) for symbol in model.refine), tuple((n, *v.items()) for n, v in model.effects.items()))
+    return (
+        tuple(getattr(model, symbol) for symbol in model.refine),
+        tuple((n, *v.items()) for n, v in model.effects.items()),
+    )
 
 
 def plainer(name: str, names: Sequence[str]) -> list[str]:
@@ -298,7 +341,12 @@ def size(name: str) -> int:
 def unspecific(name: str, gains: dict[str, float]) -> bool:
     """Say whether an effect of quite another kind saves nearly as much: then the residual has no name yet."""
     lib = known()
-    family = {name, *lib[name].lookalikes, *lib[name].replaces, *(n for n in lib if name in lib[n].lookalikes)}
+    family = {
+        name,
+        *lib[name].lookalikes,
+        *lib[name].replaces,
+        *(n for n in lib if name in lib[n].lookalikes),
+    }
     return any(g > NEARLY * gains[name] for n, g in gains.items() if n not in family)
 
 
@@ -343,10 +391,18 @@ def polish(problem: Problem, model: AxisModel, frozen: Sequence[str]) -> Fit:
     name = next(n for n in model.effects if known()[n].slot is Slot.BACKLASH)
     best, cost = model, np.inf
     for spread in (0.25, 0.08, 0.025, 0.008):
-        for symbol, width in (("gap", spread), ("load_fraction", spread), ("zeta", 2.0 * spread), ("f_contact", spread)):
+        for symbol, width in (
+            ("gap", spread),
+            ("load_fraction", spread),
+            ("zeta", 2.0 * spread),
+            ("f_contact", spread),
+        ):
             here = best.effects[name]
             trials = [best] if cost == np.inf else []
-            trials += [best.with_effect(name, {**here, symbol: here[symbol] * (1.0 + width * sign)}) for sign in (1.0, -1.0, 0.4, -0.4)]
+            trials += [
+                best.with_effect(name, {**here, symbol: here[symbol] * (1.0 + width * sign)})
+                for sign in (1.0, -1.0, 0.4, -0.4)
+            ]
             trials = [t for t in trials if _inside(t, name)]
             costs = list(problem.mapper(lambda t: float(np.sum(problem.residual(t) ** 2)), trials))
             if costs and min(costs) < cost:
@@ -355,5 +411,7 @@ def polish(problem: Problem, model: AxisModel, frozen: Sequence[str]) -> Fit:
 
 
 def _inside(model: AxisModel, name: str) -> bool:
-    return all(p.lower * model.scale(p) <= model.effects[name][p.symbol] <= p.upper * model.scale(p)
-               for p in known()[name].parameters)
+    return all(
+        p.lower * model.scale(p) <= model.effects[name][p.symbol] <= p.upper * model.scale(p)
+        for p in known()[name].parameters
+    )

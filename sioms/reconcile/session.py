@@ -110,7 +110,9 @@ def estimate(problem: Problem, model: AxisModel, record: Record, stop: int, heat
         columns = [_slope(residual, state, k, r) for k in moving]
         j = np.stack(columns, axis=1)
         # As many independent samples, each as noisy as the residual is: against them the expected spread counts.
-        off = np.array([(getattr(state, k.name) - getattr(State(heat=heat), k.name)) / k.spread for k in moving])
+        off = np.array(
+            [(getattr(state, k.name) - getattr(State(heat=heat), k.name)) / k.spread for k in moving]
+        )
         weight = effective_samples(r) / float(r @ r)
         step = np.linalg.solve(weight * j.T @ j + np.eye(len(moving)), -(weight * j.T @ r + off))
         trial = _moved(state, moving, step)

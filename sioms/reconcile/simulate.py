@@ -22,6 +22,7 @@ from sioms.reconcile.records import Record
 #: Places for effects of one kind; the kernel unpacks as many.
 SLOTS = 6
 
+
 @state_function
 def _nothing(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """Fill an empty place."""
@@ -89,7 +90,9 @@ def pack(model: AxisModel, substeps: int = 0) -> Packed:
         if effect.slot in functions:
             place = len(functions[effect.slot])
             if place >= SLOTS:
-                raise ValueError(f"simulate {model.name}: more than {SLOTS} effects of kind {effect.slot.value}")
+                raise ValueError(
+                    f"simulate {model.name}: more than {SLOTS} effects of kind {effect.slot.value}"
+                )
             rows[effect.slot][place] = effect.row(p, model.pitch)
             functions[effect.slot].append(effect.function)
         elif effect.slot in (Slot.ELASTIC, Slot.BACKLASH):
@@ -153,15 +156,51 @@ def _couple(plant: Array, slot: Slot, p: Array) -> None:
     plant[k.DAMP] = 2.0 * zeta * np.sqrt(stiff * reduced)
 
 
-def _march(p: Packed, closed: bool, command: Array, measured: Array, force: Array, ctl: Array,
-           gain: tuple[float, float], start: Array, lost: float = np.inf) -> Run:
+def _march(
+    p: Packed,
+    closed: bool,
+    command: Array,
+    measured: Array,
+    force: Array,
+    ctl: Array,
+    gain: tuple[float, float],
+    start: Array,
+    lost: float = np.inf,
+) -> Run:
     out = np.zeros((len(command), k.OUT_SIZE))
     f, lv, g = Slot.FORCE, Slot.FRICTION, Slot.GAIN
-    k.march(closed, command, measured, force, ctl, p.plant, p.functions[f], p.counts[f], p.rows[f],
-            p.functions[lv], p.counts[lv], p.rows[lv], p.functions[g], p.counts[g], p.rows[g],
-            gain[0], gain[1], lost, start, p.substeps, out)
-    return Run(out[:, k.OUT_Y], out[:, k.OUT_FORCE], out[:, k.OUT_APPLIED], out[:, k.OUT_INNOVATION],
-               out[:, k.OUT_X], out[:, k.OUT_V], out[:, k.OUT_T])
+    k.march(
+        closed,
+        command,
+        measured,
+        force,
+        ctl,
+        p.plant,
+        p.functions[f],
+        p.counts[f],
+        p.rows[f],
+        p.functions[lv],
+        p.counts[lv],
+        p.rows[lv],
+        p.functions[g],
+        p.counts[g],
+        p.rows[g],
+        gain[0],
+        gain[1],
+        lost,
+        start,
+        p.substeps,
+        out,
+    )
+    return Run(
+        out[:, k.OUT_Y],
+        out[:, k.OUT_FORCE],
+        out[:, k.OUT_APPLIED],
+        out[:, k.OUT_INNOVATION],
+        out[:, k.OUT_X],
+        out[:, k.OUT_V],
+        out[:, k.OUT_T],
+    )
 
 
 def simulate(model: AxisModel, command: Array, temperature: float = 0.0, substeps: int = 0) -> Run:
@@ -176,7 +215,9 @@ def simulate(model: AxisModel, command: Array, temperature: float = 0.0, substep
     """
     command = np.ascontiguousarray(command, dtype=np.float64)
     start = np.array([model.start_position, 0.0, temperature, 0.0, 0.0])
-    return _march(pack(model, substeps), True, command, command, command, controller_row(model), (0.0, 0.0), start)
+    return _march(
+        pack(model, substeps), True, command, command, command, controller_row(model), (0.0, 0.0), start
+    )
 
 
 def replay(model: AxisModel, record: Record, temperature: float = 0.0) -> Run:
@@ -202,8 +243,15 @@ def _first_speed(position: Array, dt: float) -> float:
     return float(np.polyfit(np.arange(n) * dt, position[:n] - position[0], 2)[1]) if n > 2 else 0.0
 
 
-def track(model: AxisModel, position: Array, force: Array, gain: tuple[float, float],
-          temperature: float = 0.0, packed: Packed | None = None, lost: float = np.inf) -> Run:
+def track(
+    model: AxisModel,
+    position: Array,
+    force: Array,
+    gain: tuple[float, float],
+    temperature: float = 0.0,
+    packed: Packed | None = None,
+    lost: float = np.inf,
+) -> Run:
     """Drive the plant with a recorded force while an observer holds it on the recorded position.
 
     Args:
@@ -218,5 +266,13 @@ def track(model: AxisModel, position: Array, force: Array, gain: tuple[float, fl
     y = np.ascontiguousarray(position, dtype=np.float64)
     u = np.ascontiguousarray(force, dtype=np.float64)
     p = packed or pack(model)
-    start = np.array([y[0] / p.plant[k.GAIN_Y], _first_speed(y, model.sample_time_s) / p.plant[k.GAIN_Y], temperature, 0.0, 0.0])
+    start = np.array(
+        [
+            y[0] / p.plant[k.GAIN_Y],
+            _first_speed(y, model.sample_time_s) / p.plant[k.GAIN_Y],
+            temperature,
+            0.0,
+            0.0,
+        ]
+    )
     return _march(p, False, y, y, u, np.zeros(k.CTL_SIZE), gain, start, lost)

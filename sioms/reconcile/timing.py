@@ -33,12 +33,18 @@ def on_grid(session: Session, sample_time_s: float) -> tuple[Session, list[str]]
     parts = [_pieces(r, sample_time_s, notes) for r in session.records]
     final = [_pieces(r, sample_time_s, notes) for r in session.final]
     whole = all(len(p) == 1 for p in parts)
-    return Session(tuple(r for p in parts for r in p), session.continuous and whole, tuple(r for p in final for r in p)), notes
+    return Session(
+        tuple(r for p in parts for r in p), session.continuous and whole, tuple(r for p in final for r in p)
+    ), notes
 
 
 def _pieces(record: Record, dt: float, notes: list[str]) -> list[Record]:
-    arrays = [a for a in (record.force, record.command, record.force_measured, record.time_s) if a is not None]
-    usable = len(record) >= LEAST and all(len(a) == len(record) and np.all(np.isfinite(a)) for a in (record.position, *arrays))
+    arrays = [
+        a for a in (record.force, record.command, record.force_measured, record.time_s) if a is not None
+    ]
+    usable = len(record) >= LEAST and all(
+        len(a) == len(record) and np.all(np.isfinite(a)) for a in (record.position, *arrays)
+    )
     if record.time_s is None or not usable:
         return [record]
     place = places(record.time_s, dt)
@@ -52,10 +58,17 @@ def _pieces(record: Record, dt: float, notes: list[str]) -> list[Record]:
     if not kept or lost > MOST * len(record):
         return [record]
     if lost:
-        notes.append(f"record {record.name}: {lost} of {len(record) + lost} samples were lost and are interpolated")
+        notes.append(
+            f"record {record.name}: {lost} of {len(record) + lost} samples were lost and are interpolated"
+        )
     if len(cuts):
-        notes.append(f"record {record.name}: {len(cuts)} gaps of more than {LONGEST} samples; read as {len(kept)} records")
-    return [_filled(record.cut(a, b), place[a:b] - place[a], "" if len(kept) == 1 else f".{i + 1}", dt) for i, (a, b) in enumerate(kept)]
+        notes.append(
+            f"record {record.name}: {len(cuts)} gaps of more than {LONGEST} samples; read as {len(kept)} records"
+        )
+    return [
+        _filled(record.cut(a, b), place[a:b] - place[a], "" if len(kept) == 1 else f".{i + 1}", dt)
+        for i, (a, b) in enumerate(kept)
+    ]
 
 
 def places(time: Array, dt: float) -> NDArray[np.int64] | None:
@@ -85,5 +98,13 @@ def _filled(record: Record, place: NDArray[np.int64], suffix: str, dt: float) ->
         return None if a is None else np.interp(grid, place, a[first])
 
     index = None if record.index is None else np.isin(grid, place[record.index[first]])
-    return Record(record.name + suffix, CubicSpline(place, record.position[first])(grid), np.interp(grid, place, record.force[first]),
-                  line(record.command), line(record.force_measured), index, grid * dt, ~np.isin(grid, place))
+    return Record(
+        record.name + suffix,
+        CubicSpline(place, record.position[first])(grid),
+        np.interp(grid, place, record.force[first]),
+        line(record.command),
+        line(record.force_measured),
+        index,
+        grid * dt,
+        ~np.isin(grid, place),
+    )

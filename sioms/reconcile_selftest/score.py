@@ -9,9 +9,23 @@ from typing import Any, Protocol
 from sioms.reconcile_selftest.draw import Axis
 
 #: The parameter that says how large an effect is.
-PRIMARY = {"viscous": "b_extra", "coulomb": "Fc", "stribeck": "Fc", "backlash": "gap", "cogging": "amp", "torque_ripple": "depth",
-           "gravity": "amp", "offset": "off", "delay": "delay", "saturation": "limit", "elastic": "f_res", "encoder_scale": "gain",
-           "encoder_quantisation": "factor", "thermal_gain": "loss", "payload": "J_extra"}
+PRIMARY = {
+    "viscous": "b_extra",
+    "coulomb": "Fc",
+    "stribeck": "Fc",
+    "backlash": "gap",
+    "cogging": "amp",
+    "torque_ripple": "depth",
+    "gravity": "amp",
+    "offset": "off",
+    "delay": "delay",
+    "saturation": "limit",
+    "elastic": "f_res",
+    "encoder_scale": "gain",
+    "encoder_quantisation": "factor",
+    "thermal_gain": "loss",
+    "payload": "J_extra",
+}
 
 
 class Hidden(Protocol):
@@ -49,7 +63,12 @@ class Scored:
     seconds: float
 
 
-def score(axis: Axis, answer: Mapping[str, Any], closed: float | None = None, again: Sequence[Mapping[str, Any]] = ()) -> Scored:
+def score(
+    axis: Axis,
+    answer: Mapping[str, Any],
+    closed: float | None = None,
+    again: Sequence[Mapping[str, Any]] = (),
+) -> Scored:
     """Score one verdict (the parsed verdict.json).
 
     Args:
@@ -63,7 +82,12 @@ def score(axis: Axis, answer: Mapping[str, Any], closed: float | None = None, ag
         case "null":
             right = verdict == "none" and not got
         case "confounded":
-            right = verdict == "ambiguous" and truth in sets and {axis.rival} in sets and bool(answer["separating_experiment"])
+            right = (
+                verdict == "ambiguous"
+                and truth in sets
+                and {axis.rival} in sets
+                and bool(answer["separating_experiment"])
+            )
         case "unknown":
             right = verdict == "unexplained" and set(got) == truth
         case _:
@@ -78,12 +102,23 @@ def score(axis: Axis, answer: Mapping[str, Any], closed: float | None = None, ag
             inside.append(bool(p["low"] <= true <= p["high"]))
     same = [str(a["verdict"]) == verdict and set(a["effects"]) == set(got) for a in again]
     stable = sum(same) / len(same) if same else None
-    return Scored(axis, verdict, got, right, bool(got) and got[0] in truth, tuple(errors), tuple(inside), closed, stable,
-                  float(answer["seconds"]))
+    return Scored(
+        axis,
+        verdict,
+        got,
+        right,
+        bool(got) and got[0] in truth,
+        tuple(errors),
+        tuple(inside),
+        closed,
+        stable,
+        float(answer["seconds"]),
+    )
 
 
 def table(rows: Sequence[Scored]) -> str:
     """Lay the figures out with their counts."""
+
     def share(kind: str, key: str = "right") -> str:
         chosen = [r for r in rows if r.axis.kind == kind]
         return f"{sum(getattr(r, key) for r in chosen)}/{len(chosen)}"
@@ -99,12 +134,18 @@ def table(rows: Sequence[Scored]) -> str:
     named = sum(len(r.got) for r in rows if r.axis.kind != "confounded")
     hidden = sum(len(r.axis.named) for r in rows if r.axis.kind != "confounded")
     lines = [
-        ("nothing hidden: silent", share("null")), ("one hidden: named exactly", share("single")),
-        ("one hidden: leading effect", share("single", "leading")), ("two or three: named exactly", share("multi")),
-        ("precision over effects", f"{hits}/{named}"), ("recall over effects", f"{hits}/{hidden}"),
-        ("outside the library: refused, known part right", share("unknown")), ("confounded: both named", share("confounded")),
-        ("gap closed, median", quantile(closed, 0.5)), ("gap closed, tenth percentile", quantile(closed, 0.1)),
-        ("parameter error, median", quantile(errors, 0.5)), ("parameter error, ninetieth percentile", quantile(errors, 0.9)),
+        ("nothing hidden: silent", share("null")),
+        ("one hidden: named exactly", share("single")),
+        ("one hidden: leading effect", share("single", "leading")),
+        ("two or three: named exactly", share("multi")),
+        ("precision over effects", f"{hits}/{named}"),
+        ("recall over effects", f"{hits}/{hidden}"),
+        ("outside the library: refused, known part right", share("unknown")),
+        ("confounded: both named", share("confounded")),
+        ("gap closed, median", quantile(closed, 0.5)),
+        ("gap closed, tenth percentile", quantile(closed, 0.1)),
+        ("parameter error, median", quantile(errors, 0.5)),
+        ("parameter error, ninetieth percentile", quantile(errors, 0.9)),
         ("95 % intervals that cover", f"{sum(inside)}/{len(inside)}"),
         ("same verdict with the blocks drawn anew", f"{sum(stable) / len(stable):.3f}" if stable else "-"),
         ("seconds an axis, largest", quantile([r.seconds for r in rows], 1.0)),

@@ -108,7 +108,9 @@ class World:
             e_old, u_old = e, u
             force[i] = u
             queue[i + 10] = u
-            disturbance += SAMPLE_S / 0.02 * -disturbance + 0.003 * rated * np.sqrt(2 * SAMPLE_S / 0.02) * rng.standard_normal(m)
+            disturbance += SAMPLE_S / 0.02 * -disturbance + 0.003 * rated * np.sqrt(
+                2 * SAMPLE_S / 0.02
+            ) * rng.standard_normal(m)
             before = np.floor(x * turn / (2 * np.pi))
             passed = np.zeros(m, dtype=bool)
             mean = np.zeros(m)
@@ -118,14 +120,27 @@ class World:
                 acting = np.clip(_held(queue, i + 10 + ((s - 0.5) * STEP_S - late) / SAMPLE_S), -limit, limit)
                 self.heat += STEP_S / tau * ((acting / rated) ** 2 - self.heat) * (loss > 0)
                 theta = turn * x
-                f = acting * (1.0 - loss * self.heat) * (1.0 + r_d * np.sin(r_n * theta + r_ph)) + disturbance + knock[i]
-                f += off + g_amp * np.sin(theta + g_ph) + c_amp * np.sin(c_n * theta + c_ph) - viscous * v - cubic * x**3
+                f = (
+                    acting * (1.0 - loss * self.heat) * (1.0 + r_d * np.sin(r_n * theta + r_ph))
+                    + disturbance
+                    + knock[i]
+                )
+                f += (
+                    off
+                    + g_amp * np.sin(theta + g_ph)
+                    + c_amp * np.sin(c_n * theta + c_ph)
+                    - viscous * v
+                    - cubic * x**3
+                )
                 f -= d_c * v / (1.0 + (v / d_v) ** 2)
                 hyst += np.abs(v) * STEP_S / h_x * (h_f * np.sign(v) - hyst)
                 f -= hyst
                 level = fc + extra * np.exp(-((v / vs) ** 2))
                 z = np.clip(z + v * STEP_S, -level / bristle, level / bristle)
-                f -= bristle * z + (np.abs(z) < 0.999 * level / bristle) * (fc > 0) * 1.2 * np.sqrt(bristle * motor) * v
+                f -= (
+                    bristle * z
+                    + (np.abs(z) < 0.999 * level / bristle) * (fc > 0) * 1.2 * np.sqrt(bristle * motor) * v
+                )
                 wind = x - xl
                 depth = np.where(loose > 0, np.sign(wind) * np.maximum(np.abs(wind) - loose, 0.0), wind)
                 link = np.where((loose > 0) & (depth == 0.0), 0.0, stiff * depth + damp * (v - vl)) * two
@@ -141,7 +156,9 @@ class World:
                 before = now
             measured[i] = mean / sub + 0.004 * rated * rng.standard_normal(m)
             marks[i] = passed
-        return [Recording(counts[:, j], command[:, j], force[:, j], measured[:, j], marks[:, j]) for j in range(m)]
+        return [
+            Recording(counts[:, j], command[:, j], force[:, j], measured[:, j], marks[:, j]) for j in range(m)
+        ]
 
     def _knocks(self, n: int) -> Array:
         """Draw short force pulses at random times for axes that are knocked."""

@@ -23,7 +23,9 @@ class TickStatistics:
     """
 
     def __init__(self) -> None:
-        self._ring = [array("q", bytes(8 * _SIZE)) for _ in PHASES]  # of fixed size, as lists of numbers are not
+        self._ring = [
+            array("q", bytes(8 * _SIZE)) for _ in PHASES
+        ]  # of fixed size, as lists of numbers are not
         self.ticks = 0
         self.skipped = 0
         self.longest_ns = 0
@@ -70,5 +72,7 @@ class TickStatistics:
             # By numpy: sorting thousands of Python numbers takes longer than axes may go without a tick.
             kept = np.frombuffer(ring, dtype=np.int64)
             values = np.sort(np.take(kept, np.arange(newest - n, newest), mode="wrap"))
-            result[phase] = {str(p): int(values[min(n - 1, int(n * p / 100))]) for p in percentiles} if n else {}
+            result[phase] = (
+                {str(p): int(values[min(n - 1, int(n * p / 100))]) for p in percentiles} if n else {}
+            )
         return result

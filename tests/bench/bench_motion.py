@@ -35,8 +35,19 @@ class NoMarkers:
 def bank_of(n: int, tick_s: float = 1e-3) -> AxisBank:
     """Return a bank of n servo axes."""
     settings = AxisSettings(
-        name="x", velocity_max=1.0, acceleration_max=10.0, jerk_max=200.0, position_min=-5.0, position_max=5.0,
-        force_max=50.0, k=400.0, kz=-0.5, kp=0.1, kb=-5.0, following_error_max=0.5, velocity_filter_s=2e-3,
+        name="x",
+        velocity_max=1.0,
+        acceleration_max=10.0,
+        jerk_max=200.0,
+        position_min=-5.0,
+        position_max=5.0,
+        force_max=50.0,
+        k=400.0,
+        kz=-0.5,
+        kp=0.1,
+        kb=-5.0,
+        following_error_max=0.5,
+        velocity_filter_s=2e-3,
     )
     return AxisBank([settings] * n, tick_s=tick_s, markers=NoMarkers())
 
@@ -102,7 +113,10 @@ def synch_thousand(n: int = 1000) -> None:
 
 def append_many(count: int = 10_000) -> None:
     """Append many commands at once."""
-    for mode, what in ((M.POSITION, "positions"), (M.POSITION | M.VELOCITY | M.SPECIFIED_TIME, "timed passes")):
+    for mode, what in (
+        (M.POSITION, "positions"),
+        (M.POSITION | M.VELOCITY | M.SPECIFIED_TIME, "timed passes"),
+    ):
         bank, now = bank_of(4), 10**9
         bank.tick(now, np.zeros(4))
         records = np.zeros(count, dtype=WIRE_DTYPE)
@@ -120,8 +134,15 @@ def append_many(count: int = 10_000) -> None:
 def main() -> None:
     """Run all benches."""
     gc.disable()
-    for n, tick_s, ticks in ((1, 1e-3, 4000), (4, 1e-3, 4000), (16, 1e-3, 4000), (90, 1e-3, 3000), (200, 2e-4, 8000),
-                             (1000, 1e-3, 2000), (2000, 1e-3, 2000)):
+    for n, tick_s, ticks in (
+        (1, 1e-3, 4000),
+        (4, 1e-3, 4000),
+        (16, 1e-3, 4000),
+        (90, 1e-3, 3000),
+        (200, 2e-4, 8000),
+        (1000, 1e-3, 2000),
+        (2000, 1e-3, 2000),
+    ):
         run(n, tick_s, ticks, 12)
     synch_thousand()
     append_many()

@@ -21,7 +21,9 @@ COMMAND = 1.2 * np.sin(2 * np.pi * 1.1 * TIME) + 0.3 * np.sin(2 * np.pi * 4.3 * 
 Rate = Callable[[float, np.ndarray, float], list[float]]
 
 
-def reference(rate: Rate, states: int, read: Callable[[np.ndarray], float] = lambda s: float(s[0])) -> tuple[np.ndarray, np.ndarray]:
+def reference(
+    rate: Rate, states: int, read: Callable[[np.ndarray], float] = lambda s: float(s[0])
+) -> tuple[np.ndarray, np.ndarray]:
     """Close the loop around an ODE, sample by sample, with a solver of its own (DOP853, 1e-11)."""
     state, e0, u0, y0, v = np.zeros(states), 0.0, 0.0, 0.0, 0.0
     alpha = 1 - np.exp(-2 * np.pi * 100 * DT)
@@ -55,8 +57,14 @@ def warm(t: float, s: np.ndarray, u: float) -> list[float]:
 
 
 CASES = {
-    "gravity and cogging": (gravity, 2, {"gravity": {"amp": 0.2, "phase": 0.4},
-                                         "cogging": {"amp": 0.05, "phase": 1.0, "n": 7.0, "amp2": 0.0, "phase2": 0.0}}),
+    "gravity and cogging": (
+        gravity,
+        2,
+        {
+            "gravity": {"amp": 0.2, "phase": 0.4},
+            "cogging": {"amp": 0.05, "phase": 1.0, "n": 7.0, "amp2": 0.0, "phase2": 0.0},
+        },
+    ),
     "two masses": (two_masses, 4, {"elastic": {"f_res": 18.0, "load_fraction": 0.55, "zeta": 0.05}}),
     "heat": (warm, 3, {"thermal_gain": {"loss": 0.6, "tau": 2.0}}),
 }
@@ -99,7 +107,9 @@ def test_coulomb_friction_stops_where_energy_says_and_holds() -> None:
 
 @pytest.mark.parametrize("force", [0.11, -0.11])
 def test_stribeck_friction_holds_up_to_breakaway_and_then_runs_away(force: float) -> None:
-    model = replace(AXIS, viscous=0.0, controller=None).with_effect("stribeck", {"Fc": 0.05, "Fs": 0.1, "vs": 0.1})
+    model = replace(AXIS, viscous=0.0, controller=None).with_effect(
+        "stribeck", {"Fc": 0.05, "Fs": 0.1, "vs": 0.1}
+    )
     held = track(model, np.zeros(200), np.full(200, 0.9 * force), (0.0, 0.0))
     assert np.all(held.x == 0.0)
     free = track(model, np.zeros(200), np.full(200, force), (0.0, 0.0))
@@ -118,7 +128,9 @@ def test_dahl_friction_builds_up_exponentially_over_its_length() -> None:
 
 
 def test_backlash_conserves_momentum_and_hides_the_load() -> None:
-    model = replace(AXIS, viscous=0.0, controller=None).with_effect("backlash", {"gap": 0.5, "load_fraction": 0.6, "f_contact": 120.0, "zeta": 0.1})
+    model = replace(AXIS, viscous=0.0, controller=None).with_effect(
+        "backlash", {"gap": 0.5, "load_fraction": 0.6, "f_contact": 120.0, "zeta": 0.1}
+    )
     push = np.concatenate([np.full(20, 0.2), np.zeros(4000)])
     run = track(model, np.zeros(len(push)), push, (0.0, 0.0))
     assert run.v[21] == pytest.approx(0.2 * 0.02 / (0.4 * 2e-3), rel=1e-6)  # the motor alone
@@ -147,7 +159,9 @@ def test_the_linear_filter_is_the_answer_of_the_observer_to_a_missing_force() ->
     run = track(replace(AXIS, controller=None), np.array(y), known_force, noise.gain)
     expected = response(AXIS, noise, extra)
     forgotten = slice(100, None)  # the first speed is read off the motion, not known to be none
-    np.testing.assert_allclose(run.innovation[forgotten], expected[forgotten], atol=2e-4 * np.max(np.abs(expected)))
+    np.testing.assert_allclose(
+        run.innovation[forgotten], expected[forgotten], atol=2e-4 * np.max(np.abs(expected))
+    )
 
 
 def test_the_expected_innovation_is_what_a_right_model_leaves() -> None:

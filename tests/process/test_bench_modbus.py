@@ -123,7 +123,9 @@ def test_limits_hold_and_a_refused_move_moves_nothing(bench: Bench, cell: sioms.
         axis.move(0.29)
         axis.wait_until_idle(10.0)
         axis.command(velocity=0.05)
-        wait_for(lambda: axis.read().status[0] & AxisStatus.LIMIT_PLUS or not axis.read().in_motion[0], "the limit")
+        wait_for(
+            lambda: axis.read().status[0] & AxisStatus.LIMIT_PLUS or not axis.read().in_motion[0], "the limit"
+        )
         at_rest(axis)
         assert bench.drive.tell("state")["position"] <= 0.30 * PULSES_PER_M + 1
 
@@ -131,7 +133,12 @@ def test_limits_hold_and_a_refused_move_moves_nothing(bench: Bench, cell: sioms.
 def test_a_disturbed_line_is_repeated_and_counted(bench: Bench, cell: sioms.Workcell) -> None:
     with cell.open("slide0", "rw") as axis:
         before = axis.statistics()["link"]
-        for fault, counter in (("noise 1", "garbled"), ("late 0.3 1", "timeouts"), ("cut 1 2", "timeouts"), ("mute 1", "timeouts")):
+        for fault, counter in (
+            ("noise 1", "garbled"),
+            ("late 0.3 1", "timeouts"),
+            ("cut 1 2", "timeouts"),
+            ("mute 1", "timeouts"),
+        ):
             seen = axis.statistics()["link"][counter]
             bench.drive.tell(fault)
             wait_for(lambda c=counter, s=seen: axis.statistics()["link"][c] > s, f"{fault} counted")
@@ -191,7 +198,9 @@ def test_a_killed_driver_leaves_the_jogging_drive_to_its_dead_man(bench: Bench, 
     os.kill(before["pid"], signal.SIGSTOP)  # a driver that hangs is no better than a dead one
     wait_for(lambda: bench.velocity() == 0, "the drive stopped itself", 3.0)
     os.kill(before["pid"], signal.SIGKILL)
-    assert "device slide0" in wait_for(lambda: cell.status()["stop_source"], "the workcell stopped, as configured")
+    assert "device slide0" in wait_for(
+        lambda: cell.status()["stop_source"], "the workcell stopped, as configured"
+    )
     after = bench.daemon.wait_up("slide0", before["generation"] + 1)
     assert after["pid"] != before["pid"] and bench.velocity() == 0
     assert [bench.daemon.device(name)["pid"] for name in ("tactile0", "io0")] == others
@@ -212,7 +221,9 @@ def test_a_port_that_vanishes_stops_the_workcell_and_comes_back(bench: Bench, ce
         bench.drive.tell("plug")
         bench.daemon.wait_up("slide0")
         cell.reset()
-        wait_for(lambda: not axis.read().status[0] & (AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP), "the reset")
+        wait_for(
+            lambda: not axis.read().status[0] & (AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP), "the reset"
+        )
         assert bench.velocity() == 0, "nothing resumes"
         axis.move(0.01)
         axis.wait_until_idle(10.0)

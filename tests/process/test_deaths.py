@@ -124,7 +124,7 @@ def test_hung_driver_is_stale_then_killed_and_restarted(daemon: Daemon, cell: si
             with raises(errno.EIO, "has not ticked for"):
                 node.read()
             daemon.wait_up("force0", before["generation"] + 1)
-    daemon.said("event=\"device lost\" device=force0 .*hung for")
+    daemon.said('event="device lost" device=force0 .*hung for')
     with cell.open("force0") as node:
         assert node.read().data[2] == pytest.approx(3.0)
 

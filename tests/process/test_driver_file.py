@@ -95,7 +95,10 @@ def test_analog_outputs_are_checked_and_set(cell: sioms.Workcell) -> None:
                 node.set(value, 0.0)
             with raises(errno.EINVAL, "right", "finite"):
                 node.set(0.0, value)
-        for values, words in (((10.5, 0.0), "10.5 V; want -10 to 10 V"), ((0.0, 5.5), "5.5 V; want -inf to 5 V")):
+        for values, words in (
+            ((10.5, 0.0), "10.5 V; want -10 to 10 V"),
+            ((0.0, 5.5), "5.5 V; want -inf to 5 V"),
+        ):
             with raises(errno.ERANGE, "heat", words):
                 node.set(*values)
         with raises(errno.ENXIO, "3 V is unlucky"):
@@ -138,7 +141,9 @@ def test_a_device_that_is_not_there_yet_is_tried_again(heater: Daemon, cell: sio
 
 
 def test_a_driver_that_raises_ends_alone_and_says_why(start_daemon: Callable[..., Daemon]) -> None:
-    daemon = start_daemon(CONFIG + '[device.bad]\ndriver = "./heater.py"\nfails_at = 100\n', files={"heater.py": DRIVER})
+    daemon = start_daemon(
+        CONFIG + '[device.bad]\ndriver = "./heater.py"\nfails_at = 100\n', files={"heater.py": DRIVER}
+    )
     with daemon.cell() as cell:
         pid = daemon.device("heat")["pid"]
         daemon.said(r"driver failed: RuntimeError\(.bad day.\)")

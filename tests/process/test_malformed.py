@@ -163,7 +163,9 @@ BAD_HANDLE = [
 
 
 @pytest.mark.parametrize("packet", BAD_SESSION, ids=lambda p: p[:12].hex() or "empty")
-def test_bad_message_ends_its_session_only(bystander: Bystander, raw: Callable[[], Raw], packet: bytes) -> None:
+def test_bad_message_ends_its_session_only(
+    bystander: Bystander, raw: Callable[[], Raw], packet: bytes
+) -> None:
     session = raw()
     session.sock.send(packet)
     assert session.is_ended()
@@ -232,7 +234,9 @@ def test_parts_of_a_write_that_never_came_are_dropped(handle: Callable[..., tupl
     assert decode(node.sock.recv(MAX_PACKET))[2] == 0
 
 
-@pytest.mark.parametrize("arguments", [(), (1,), (1, "text"), ("1", b""), (1, bytes(MAX_INLINE + 1)), (1, b"", 2)])
+@pytest.mark.parametrize(
+    "arguments", [(), (1,), (1, "text"), ("1", b""), (1, bytes(MAX_INLINE + 1)), (1, b"", 2)]
+)
 def test_a_malformed_part_ends_the_connection(
     handle: Callable[..., tuple[Raw, Raw]], arguments: tuple[object, ...]
 ) -> None:

@@ -155,7 +155,10 @@ def test_the_linear_stage(start: Callable[..., Any], short_folder: Path) -> None
     ("change", "words"),
     [
         (("steps_per_m = 1e6", "steps_per_m = -1e6"), "steps_per_m = -1e+06"),
-        (("steps_per_m = 1e6", "steps_per_m = 1e6\nwatchdog_s = 0.01"), "watchdog_s = 0.01; want three polls, 0.06, to 10"),
+        (
+            ("steps_per_m = 1e6", "steps_per_m = 1e6\nwatchdog_s = 0.01"),
+            "watchdog_s = 0.01; want three polls, 0.06, to 10",
+        ),
     ],
 )
 def test_a_stage_that_cannot_be(change: tuple[str, str], words: str) -> None:

@@ -366,7 +366,9 @@ def test_a_right_that_a_reload_takes_away_ends_what_was_open(
         cell.reload()
         at_rest(watch)
         assert client.wait_exit() == 0
-        assert any(f"{errno.EACCES} mod0.xaxis: the right to write it" in line for line in client.lines), client.lines
+        assert any(f"{errno.EACCES} mod0.xaxis: the right to write it" in line for line in client.lines), (
+            client.lines
+        )
         assert client.lines[-1] == "still reads"
         assert daemon.device("mod0")["pid"] == pid, "the device was not touched"
 

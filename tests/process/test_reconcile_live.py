@@ -160,7 +160,9 @@ def test_two_effects_that_look_alike_are_told_apart_by_the_experiment_it_designs
     hidden.chmod(0o600)
     head = HEAD.format(device="mod0", more=f'effects_file = "{hidden}"')
     daemon = start_daemon('[workcell]\nname = "test"\n' + head + ARM)
-    run = workflow(daemon, tmp_path, "--yes", "--first", "one_speed", "--lap", "2", node="mod0.arm", model=ARM_MODEL)
+    run = workflow(
+        daemon, tmp_path, "--yes", "--first", "one_speed", "--lap", "2", node="mod0.arm", model=ARM_MODEL
+    )
     assert run.wait_exit(200.0) == NAMED, said(run)
     asked = next(line for line in run.lines if "not told apart" in line)
     assert "gravity" in asked

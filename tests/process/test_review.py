@@ -271,7 +271,11 @@ def test_a_client_cannot_block_its_driver_by_the_wake_pipe(daemon: Daemon, cell:
         os.set_blocking(wake, True)
         fcntl.fcntl(wake, fcntl.F_SETPIPE_SZ, 4096)
         first = node.history(0)[-1].number
-        wait_for(lambda: node.history(0, gone=True)[-1].number > first + 5000, "5,000 wakes that nobody takes", 20.0)
+        wait_for(
+            lambda: node.history(0, gone=True)[-1].number > first + 5000,
+            "5,000 wakes that nobody takes",
+            20.0,
+        )
         assert daemon.device("mod0")["generation"] == 1
         statistics = node.ioctl(Request.GET_STATISTICS, 5000)
         assert statistics["skipped"] < 50, statistics

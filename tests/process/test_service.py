@@ -99,7 +99,10 @@ def test_errors_of_names_come_at_once(tmp_path: Path) -> None:
     [
         ("grant = 3\n" + IO, "grant"),
         (IO + 'user = "nobody-of-that-name"', "user"),
-        (axes("m", "x").replace("-1.0", "0.0").replace("_max = 1.0", "_max = 0.0"), "position_min 0 is not below"),
+        (
+            axes("m", "x").replace("-1.0", "0.0").replace("_max = 1.0", "_max = 0.0"),
+            "position_min 0 is not below",
+        ),
         (axes("m", "x").replace("acceleration_max = 10.0", "acceleration_max = nan"), "acceleration_max"),
     ],
 )
@@ -121,7 +124,9 @@ def test_a_missing_configuration_is_said(tmp_path: Path) -> None:
         [sys.executable, "-m", "sioms.daemon.main", "--config", tmp_path / "none.toml", "--socket", tmp_path / "s"],
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
-    assert done.returncode == 2 and "no such file or directory" in done.stderr and "Traceback" not in done.stderr
+    assert (
+        done.returncode == 2 and "no such file or directory" in done.stderr and "Traceback" not in done.stderr
+    )
 
 
 def pids(daemon: Daemon) -> dict[str, int]:
@@ -139,7 +144,9 @@ def test_reload_takes_up_changes_and_touches_nothing_else(start_daemon: Callable
         # force0 removed, mod1 changed, mod2 and a name added
         changed = axes("mod1", "xaxis").replace("velocity_max = 1.0", "velocity_max = 0.5")
         added = axes("mod2", "zaxis") + '[node.lift]\nof = "mod2"\n'
-        daemon.config.write_text('[workcell]\nname = "test"\n' + axes("mod0", "xaxis", "yaxis") + changed + IO + added)
+        daemon.config.write_text(
+            '[workcell]\nname = "test"\n' + axes("mod0", "xaxis", "yaxis") + changed + IO + added
+        )
         cell.reload()
         for name in ("mod1", "mod2"):
             daemon.wait_up(name)
@@ -169,7 +176,9 @@ def test_reload_with_errors_keeps_everything(start_daemon: Callable[..., Daemon]
     with daemon.cell() as cell, cell.open("mod0.xaxis", "rw") as axis:
         axis.command(velocity=0.05)
         daemon.config.write_text(WORKCELL.replace("velocity_max", "velocity_maxi") + "[nodes]\n")
-        with raises(errno.EINVAL, "nothing taken up", "velocity_maxi", "unknown section [nodes]", "device.mod1"):
+        with raises(
+            errno.EINVAL, "nothing taken up", "velocity_maxi", "unknown section [nodes]", "device.mod1"
+        ):
             cell.reload()
         daemon.config.unlink()
         with raises(errno.EINVAL, "nothing taken up", "no such file"):
@@ -184,7 +193,9 @@ def test_reload_with_errors_keeps_everything(start_daemon: Callable[..., Daemon]
 
 def test_sighup_reloads(start_daemon: Callable[..., Daemon]) -> None:
     daemon = start_daemon('[device.io0]\ndriver = "sim-io"\ninputs = 1\n')
-    daemon.config.write_text('[device.io0]\ndriver = "sim-io"\ninputs = 1\n[device.io1]\ndriver = "sim-io"\ninputs = 2\n')
+    daemon.config.write_text(
+        '[device.io0]\ndriver = "sim-io"\ninputs = 1\n[device.io1]\ndriver = "sim-io"\ninputs = 2\n'
+    )
     daemon.running.signal(signal.SIGHUP)
     daemon.said("event=reload errors=0")
     daemon.wait_up("io1")
@@ -284,7 +295,10 @@ def test_a_second_daemon_on_one_socket_is_refused(start_daemon: Callable[..., Da
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert second.returncode == 1
-    assert second.stderr == f"siomsd: listen: another daemon answers at {daemon.socket}; stop it or choose another path\n"
+    assert (
+        second.stderr
+        == f"siomsd: listen: another daemon answers at {daemon.socket}; stop it or choose another path\n"
+    )
     daemon.cell().close()
 
 
@@ -335,7 +349,7 @@ def test_a_driver_file_is_found_beside_the_configuration_and_its_faults_are_said
     (tmp_path / "mine.py").write_text("from sioms.drivers.sim_io import SimIo\nDRIVER = SimIo\n")
     (tmp_path / "syntax.py").write_text("def\n")
     (tmp_path / "none.py").write_text("X = 1\n")
-    head = "\n[device.{0}]\ndriver = \"./{0}.py\"\ninputs = 1\n"
+    head = '\n[device.{0}]\ndriver = "./{0}.py"\ninputs = 1\n'
     status, said = check(tmp_path / "cell.toml", head.format("mine"))
     assert status == 0, said
     status, said = check(
@@ -352,7 +366,9 @@ def test_an_open_that_comes_before_its_device_is_up_waits_for_it(start_daemon: C
         assert len(node.read().data) == 6
 
 
-def test_a_daemon_told_to_end_while_it_starts_ends_without_a_traceback(start_daemon: Callable[..., Daemon]) -> None:
+def test_a_daemon_told_to_end_while_it_starts_ends_without_a_traceback(
+    start_daemon: Callable[..., Daemon],
+) -> None:
     daemon = start_daemon(ready=False)
     wait_for(lambda: os.path.exists(daemon.socket), "the socket")
     daemon.running.signal(signal.SIGINT)

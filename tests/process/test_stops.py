@@ -23,8 +23,14 @@ def _fill(axis: sioms.AxisNode) -> None:
     axis.move(0.0, time=2.0)
 
 
-def test_stop_of_the_workcell_overtakes_full_buffers_and_ends_waits(daemon: Daemon, cell: sioms.Workcell) -> None:
-    with cell.open("mod0.xaxis", "rw") as first, cell.open("mod1", "rw") as second, cell.open("io0", "rw") as io:
+def test_stop_of_the_workcell_overtakes_full_buffers_and_ends_waits(
+    daemon: Daemon, cell: sioms.Workcell
+) -> None:
+    with (
+        cell.open("mod0.xaxis", "rw") as first,
+        cell.open("mod1", "rw") as second,
+        cell.open("io0", "rw") as io,
+    ):
         io.set(0b11)
         for axis in (first, second):
             _fill(axis)
@@ -40,7 +46,9 @@ def test_stop_of_the_workcell_overtakes_full_buffers_and_ends_waits(daemon: Daem
             print(f"stop to rest of two processes: {took * 1e3:.1f} ms")
             assert time.monotonic() - began < 1.0
         assert [wait.errno() for wait in (*idle, room)] == [errno.ECANCELED] * 3
-        assert "emergency stop by pid" in str(idle[0].error), "who stopped, as far as the drivers know by then"
+        assert "emergency stop by pid" in str(idle[0].error), (
+            "who stopped, as far as the drivers know by then"
+        )
         for axis in (first, second):
             reading = axis.read()
             assert reading.buffered[0] == 0 and reading.status[0] & AxisStatus.EMERGENCY_STOP
@@ -166,8 +174,12 @@ def test_input_configured_as_stop_source(start_daemon: Callable[..., Daemon]) ->
         axis.wait_until_idle(5.0)
 
 
-def test_stop_source_that_is_still_active_stops_again_after_a_reset(start_daemon: Callable[..., Daemon]) -> None:
-    daemon = start_daemon(WORKCELL + '\n[[emergency_stop]]\nnode = "io0.in.bit0"\n')  # active 0: a broken wire stops
+def test_stop_source_that_is_still_active_stops_again_after_a_reset(
+    start_daemon: Callable[..., Daemon],
+) -> None:
+    daemon = start_daemon(
+        WORKCELL + '\n[[emergency_stop]]\nnode = "io0.in.bit0"\n'
+    )  # active 0: a broken wire stops
     with daemon.cell() as cell:
         for _ in range(3):
             wait_for(lambda: cell.status()["stopped_ns"], "stopped, since the input reads 0")
@@ -225,7 +237,10 @@ def test_waits_are_cancelled_by_another_session(daemon: Daemon, cell: sioms.Work
 
 def test_stop_from_asyncio(daemon: Daemon, cell: sioms.Workcell) -> None:
     async def story() -> None:
-        async with await sioms.aio.connect(daemon.socket) as mine, await mine.open("mod0.xaxis", "rw") as axis:
+        async with (
+            await sioms.aio.connect(daemon.socket) as mine,
+            await mine.open("mod0.xaxis", "rw") as axis,
+        ):
             await axis.command(velocity=0.1)
             waiting = asyncio.create_task(axis.wait_until_idle())
             await asyncio.sleep(0.05)

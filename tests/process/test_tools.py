@@ -173,8 +173,11 @@ def devout(daemon: Daemon) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
     def start(*arguments: str, socket: str = daemon.socket) -> subprocess.Popen[bytes]:
         running.append(
             subprocess.Popen(
-                [BIN / "devout", *arguments], env=environment(socket), stdin=subprocess.PIPE,
-                stderr=subprocess.PIPE, bufsize=0,
+                [BIN / "devout", *arguments],
+                env=environment(socket),
+                stdin=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                bufsize=0,
             )
         )
         return running[-1]
@@ -195,7 +198,9 @@ def moving(cell: sioms.Workcell, speed: float, axis: int = 0) -> None:
     wait_for(lambda: abs(node.read().velocity[axis] - speed) < 0.02, f"{speed} m/s")
 
 
-def test_each_row_takes_over_from_the_last(devout: Callable[..., subprocess.Popen[bytes]], cell: sioms.Workcell) -> None:
+def test_each_row_takes_over_from_the_last(
+    devout: Callable[..., subprocess.Popen[bytes]], cell: sioms.Workcell
+) -> None:
     process = devout("-rv", "-L-1", "mod0.xaxis")
     for speed in (0.1, -0.1):
         feed(process, f"{speed} ".encode())
@@ -216,7 +221,9 @@ def test_a_killed_devout_leaves_its_axes_halted(
     cell.open("mod0.xaxis", "w", timeout=5.0).close()
 
 
-def test_a_bad_number_halts_and_is_named(devout: Callable[..., subprocess.Popen[bytes]], cell: sioms.Workcell) -> None:
+def test_a_bad_number_halts_and_is_named(
+    devout: Callable[..., subprocess.Popen[bytes]], cell: sioms.Workcell
+) -> None:
     process = devout("-rv", "-L-1", "mod0.xaxis")
     feed(process, b"0.1\n0.1\n")
     moving(cell, 0.1)
@@ -230,7 +237,10 @@ def test_a_bad_number_halts_and_is_named(devout: Callable[..., subprocess.Popen[
 
 def test_bad_lines_are_left_out_when_asked(shell: Shell, cell: sioms.Workcell) -> None:
     result = shell("devout --skip-bad-lines -r -L-1 gripper0", "1\nx\n3\n")
-    assert (result.returncode, result.stderr) == (0, "devout: line 2: 'x' is no finite number; line left out\n")
+    assert (result.returncode, result.stderr) == (
+        0,
+        "devout: line 2: 'x' is no finite number; line left out\n",
+    )
 
 
 @pytest.mark.parametrize("hung", [False, True])
@@ -265,7 +275,9 @@ def test_pieces_with_times_queue_up_and_none_is_lost(shell: Shell, cell: sioms.W
 
 
 def test_input_that_ends_within_an_iteration(shell: Shell) -> None:
-    refused(shell("devout -r -L-1 mod0", "0 0 0 0\n0 0\n"), "line 2", "2 of the 4 numbers", "after 1 complete")
+    refused(
+        shell("devout -r -L-1 mod0", "0 0 0 0\n0 0\n"), "line 2", "2 of the 4 numbers", "after 1 complete"
+    )
 
 
 def test_one_iteration_without_r_and_as_many_as_said(shell: Shell) -> None:
@@ -277,8 +289,17 @@ def test_one_iteration_without_r_and_as_many_as_said(shell: Shell) -> None:
 
 
 def test_no_daemon(shell: Shell) -> None:
-    for line in ("devin mod0", "devout mod0 1 2 3 4", "sdev -e", "smarkers -r", "sioms list", "sioms monitor"):
-        refused(shell(line, socket="/tmp/there-is-no-such.sock"), "no daemon listens there", "siomsd --config")
+    for line in (
+        "devin mod0",
+        "devout mod0 1 2 3 4",
+        "sdev -e",
+        "smarkers -r",
+        "sioms list",
+        "sioms monitor",
+    ):
+        refused(
+            shell(line, socket="/tmp/there-is-no-such.sock"), "no daemon listens there", "siomsd --config"
+        )
 
 
 def test_unknown_node(shell: Shell) -> None:
@@ -360,7 +381,9 @@ def test_sdev_zeroes_a_sensor_and_sets_gains(shell: Shell) -> None:
     refused(shell("sdev -g tactile0", "1 2 3"), "wants 256 numbers: there are 3")
 
 
-def test_sdev_stops_the_workcell_and_writes_stay_refused_until_reset(shell: Shell, cell: sioms.Workcell) -> None:
+def test_sdev_stops_the_workcell_and_writes_stay_refused_until_reset(
+    shell: Shell, cell: sioms.Workcell
+) -> None:
     node = cell.open("mod0.xaxis", "rw")
     node.command(velocity=0.1)
     good(shell("sdev -e"))
@@ -394,7 +417,9 @@ def test_sdev_synchronises_two_devices(shell: Shell, cell: sioms.Workcell) -> No
     for node, after in zip(nodes, before, strict=True):
         moved = wait_for(lambda n=node, a=after: [s for s in n.history(a) if s.in_motion[0]], "the start")
         starts.append(moved[0].stamp_ns)
-    assert abs(starts[0] - starts[1]) < 20e6  # one instant; the ticks of two processes may be late on a busy machine
+    assert (
+        abs(starts[0] - starts[1]) < 20e6
+    )  # one instant; the ticks of two processes may be late on a busy machine
     good(shell("sdev -w mod0.xaxis -w mod1"))
     for node in nodes:
         assert not node.read().in_motion[0]
@@ -402,7 +427,14 @@ def test_sdev_synchronises_two_devices(shell: Shell, cell: sioms.Workcell) -> No
 
 
 def test_markers_by_shell(shell: Shell) -> None:
-    assert good(shell("M=$(smarkers -r); (sleep 0.1; smarkers -s $M) & smarkers -w $((M % 1024)) && smarkers -f $M")) == ""
+    assert (
+        good(
+            shell(
+                "M=$(smarkers -r); (sleep 0.1; smarkers -s $M) & smarkers -w $((M % 1024)) && smarkers -f $M"
+            )
+        )
+        == ""
+    )
     tokens = good(shell("smarkers -r 3")).split()
     assert len(set(tokens)) == 3
     good(shell(f"smarkers -sf {' '.join(tokens)}"))
@@ -410,7 +442,11 @@ def test_markers_by_shell(shell: Shell) -> None:
 
 
 def test_an_axis_signals_a_marker_of_the_shell(shell: Shell) -> None:
-    good(shell("M=$(smarkers -r); devout -ps -W mod0.taxis 0.01 $M; devout -ps mod0.taxis 0 $M; smarkers -w $M; smarkers -f $M"))
+    good(
+        shell(
+            "M=$(smarkers -r); devout -ps -W mod0.taxis 0.01 $M; devout -ps mod0.taxis 0 $M; smarkers -w $M; smarkers -f $M"
+        )
+    )
 
 
 # --- sioms ---------------------------------------------------------------------------------------
@@ -457,7 +493,11 @@ def test_monitor_prints_one_picture_into_a_pipe(shell: Shell) -> None:
 def test_monitor_in_a_terminal_stops_and_resets_by_key(daemon: Daemon, cell: sioms.Workcell) -> None:
     pid, terminal = pty.fork()
     if pid == 0:
-        os.execve(BIN / "sioms", ["sioms", "monitor"], {**environment(daemon.socket), "TERM": "xterm", "LINES": "40"})
+        os.execve(
+            BIN / "sioms",
+            ["sioms", "monitor"],
+            {**environment(daemon.socket), "TERM": "xterm", "LINES": "40"},
+        )
     seen = bytearray()
 
     def shows(text: bytes) -> None:

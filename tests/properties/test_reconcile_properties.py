@@ -16,7 +16,9 @@ from sioms.reconcile.noise import effective_samples, observer, rigid
 from sioms.reconcile.refuse import hats, since_reversal
 from sioms.reconcile.simulate import simulate
 
-AXIS = AxisModel(True, 1e-3, 2e-3, 1e-3, 1e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0))
+AXIS = AxisModel(
+    True, 1e-3, 2e-3, 1e-3, 1e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)
+)
 COMMAND = np.sin(2 * np.pi * np.arange(300) * 2e-3)
 NAMES = st.lists(st.sampled_from(sorted(library())), unique=True, max_size=5)
 SHARE = st.floats(0.0, 1.0)

@@ -48,7 +48,9 @@ def wait_moving(station: Station, read: Callable[[], Any], axis: Axis) -> float:
     far = max(4 * axis.tolerance, 0.02 * axis.reach)
     if not wait_for(lambda: abs(read().position[0] - start) > far, 5.0):
         seen = read()
-        told = f"{AxisStatus(int(seen.status[0]))!s}, in_motion {seen.in_motion[0]}, {seen.buffered[0]} buffered"
+        told = (
+            f"{AxisStatus(int(seen.status[0]))!s}, in_motion {seen.in_motion[0]}, {seen.buffered[0]} buffered"
+        )
         text = f"{axis.node} stays at {seen.position[0]:.6g} ({told})"
         raise Failed("motion after the command", text, station.exchanges(12))
     return abs(station.speed() or 0.0)

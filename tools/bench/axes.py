@@ -190,7 +190,8 @@ def _fill(group: Any) -> None:
     axes = range(len(group.info.channels))
     for _ in range(0, MOVES, 10):
         group.write(
-            b"".join([command(a, position=generator.uniform(-0.2, 0.2)) for _ in range(10) for a in axes]), 5.0
+            b"".join([command(a, position=generator.uniform(-0.2, 0.2)) for _ in range(10) for a in axes]),
+            5.0,
         )
 
 

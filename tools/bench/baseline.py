@@ -64,7 +64,8 @@ class Wake:
         self._event = os.eventfd(0)
         self._answer, theirs = os.pipe()
         self._process = subprocess.Popen(
-            [sys.executable, "-IS", "-c", _WAKE, str(self._event), str(theirs)], pass_fds=[self._event, theirs]
+            [sys.executable, "-IS", "-c", _WAKE, str(self._event), str(theirs)],
+            pass_fds=[self._event, theirs],
         )
         os.close(theirs)
         os.read(self._answer, 8)
@@ -101,7 +102,9 @@ def run_ns(command: list[str], environment: dict[str, str] | None = None) -> int
     _, status = os.waitpid(pid, 0)
     took = time.perf_counter_ns() - begin
     if status:
-        raise RuntimeError(f"run {' '.join(command)}: exit status {os.waitstatus_to_exitcode(status)}; want 0")
+        raise RuntimeError(
+            f"run {' '.join(command)}: exit status {os.waitstatus_to_exitcode(status)}; want 0"
+        )
     return took
 
 

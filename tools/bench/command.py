@@ -25,9 +25,15 @@ BENCHES: dict[str, tuple[str, str]] = {
     "edge": ("motion", "edge of a light beam to a waiting client awake"),
     "client": ("deaths", "client killed, or hung with a lease, to its axes halting"),
     "daemon": ("deaths", "daemon killed to all axes halting"),
-    "stop": ("stopping", "emergency stop to 16 axes in 4 processes acting on it, from Python and from the shell"),
+    "stop": (
+        "stopping",
+        "emergency stop to 16 axes in 4 processes acting on it, from Python and from the shell",
+    ),
     "pipe": ("pipes", "start of devin; devin piped into devout as a 1 kHz loop"),
-    "drivers": ("drivers", "drivers: cycle against the line's speed, streams without loss, stop on a busy line"),
+    "drivers": (
+        "drivers",
+        "drivers: cycle against the line's speed, streams without loss, stop on a busy line",
+    ),
     "tactile": ("tactile", "shape from strain: time of a frame, errors against theory, convergence"),
     "protocol": ("fuzzing", "malformed frames on the sockets of daemon and drivers"),
 }

@@ -42,7 +42,9 @@ class Summary:
         ordered = sorted(samples)
         last = len(ordered) - 1
         scale = UNITS.get(unit, 1.0)
-        return cls(len(ordered), {n: ordered[min(last, int(p * len(ordered)))] * scale for n, p in PERCENTILES})
+        return cls(
+            len(ordered), {n: ordered[min(last, int(p * len(ordered)))] * scale for n, p in PERCENTILES}
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,7 +63,9 @@ def bench_protocol(options: Options, report: Report) -> None:
         left = _left(before, {who: pid for who, pid in pids.items() if alive.get(who) == pid})
         zero = [Bar("value", 0)]
         report.value("processes that died", deaths, "", bars=zero)
-        report.value("stray exceptions in the log", len(stray), "", bars=zero, notes="; ".join(stray[:2])[:600])
+        report.value(
+            "stray exceptions in the log", len(stray), "", bars=zero, notes="; ".join(stray[:2])[:600]
+        )
         report.value("motions without an acknowledged write", fuzz.motions, "", bars=zero)
         report.value("descriptors left open", left, "", bars=zero)
 
@@ -125,7 +127,9 @@ class _Fuzz:
                 with cell.open(f"mod{i}", "rw", 5.0) as node:
                     node.read()
 
-    def _send(self, connect: Callable[[], socket.socket], make: Callable[[random.Random], bytes], count: int) -> None:
+    def _send(
+        self, connect: Callable[[], socket.socket], make: Callable[[random.Random], bytes], count: int
+    ) -> None:
         """Send frames; after one that ended its connection connect anew."""
         sock = connect()
         try:
@@ -247,7 +251,14 @@ def _client_message(generator: random.Random) -> bytes:
     number = generator.randint(1, 1 << 20)
     messages: list[list[Any]] = [
         [ClientVerb.HELLO, number, PROTOCOL_VERSION, "fuzz"],
-        [ClientVerb.OPEN, number, generator.choice(("mod0", "mod1.a1", "mod0.plant", "nowhere")), 3, 0.0, 0.0],
+        [
+            ClientVerb.OPEN,
+            number,
+            generator.choice(("mod0", "mod1.a1", "mod0.plant", "nowhere")),
+            3,
+            0.0,
+            0.0,
+        ],
         [ClientVerb.CLOSE, number, generator.randint(0, 5)],
         [ClientVerb.LIST, number],
         [ClientVerb.INFO, number, "mod0.a0"],
@@ -266,7 +277,9 @@ def _client_message(generator: random.Random) -> bytes:
 def _handle_message(generator: random.Random) -> bytes:
     """Return a message to a driver; its records are never valid as they are: every number in them is NaN."""
     number = generator.randint(1, 1 << 20)
-    mode = generator.choice([*ControlMode, ControlMode(0x7FFF), ControlMode.POSITION | ControlMode.SPECIFIED_TIME])
+    mode = generator.choice(
+        [*ControlMode, ControlMode(0x7FFF), ControlMode.POSITION | ControlMode.SPECIFIED_TIME]
+    )
     record = AXIS_WRITE.pack(generator.randint(-1, 5), int(mode), generator.getrandbits(50), 0, *[NAN] * 15)
     messages: list[list[Any]] = [
         [HandleVerb.WRITE, number, generator.randint(0, 3), 0.0, record * generator.randint(1, 3)],

@@ -30,7 +30,10 @@ def bench_pipe(options: Options, report: Report) -> None:
     if missing:
         report.note(f"{missing[0]} is not installed: left out; install the package, also in place")
         return
-    devices = [axes("mod0", history=HISTORY, limits=False, acceleration=100.0, jerk=None), wave("beam0", STEP_S)]
+    devices = [
+        axes("mod0", history=HISTORY, limits=False, acceleration=100.0, jerk=None),
+        wave("beam0", STEP_S),
+    ]
     with Daemon(workcell(devices)) as daemon:
         environment = dict(os.environ, SIOMS_SOCKET=daemon.socket)
         devin, devout = (str(tool) for tool in tools)
@@ -99,7 +102,9 @@ def _loop(
     report.value(f"rows lost between devin and devout{how}", rows - len(arrivals), "", bars=[Bar("value", 0)],
                  notes=f"of {rows}; exit statuses {statuses}; devout ends {drained_ms:.0f} ms after its last row")  # fmt: skip
     left_out = arrivals[-1][0] + 1 - len(arrivals)
-    report.value(f"samples left out, their time had passed{how}", left_out, "", notes=f"of {arrivals[-1][0] + 1}")
+    report.value(
+        f"samples left out, their time had passed{how}", left_out, "", notes=f"of {arrivals[-1][0] + 1}"
+    )
 
 
 def _steps(
@@ -108,7 +113,9 @@ def _steps(
     """``devin | devout``, nothing between: from each edge of the beam to the axis commanded otherwise."""
     seconds = options.count(2, 60)
     source = subprocess.Popen(
-        [devin, "-t0.001", f"-L{1000 * (seconds + 2)}", "-n0p", "beam0"], env=environment, stdout=subprocess.PIPE
+        [devin, "-t0.001", f"-L{1000 * (seconds + 2)}", "-n0p", "beam0"],
+        env=environment,
+        stdout=subprocess.PIPE,
     )
     sink = subprocess.Popen([devout, "-rv", "-L-1", "mod0.a0"], env=environment, stdin=source.stdout)
     if source.stdout is not None:
@@ -119,7 +126,9 @@ def _steps(
         source.terminate()
         source.wait()
         sink.wait(10.0)
-    report.samples("edge of the beam to the axis following it, through the pipe", took, bars=[Bar("p50", 5000)])
+    report.samples(
+        "edge of the beam to the axis following it, through the pipe", took, bars=[Bar("p50", 5000)]
+    )
 
 
 def _step_times(beam: Any, axis: Any, seconds: float) -> list[int]:
@@ -131,7 +140,9 @@ def _step_times(beam: Any, axis: Any, seconds: float) -> list[int]:
         watch = Watch(axis)
         event = beam.wait_event(last=last, timeout=5.0)
         last = event
-        before = watch.first(lambda s: True, event.stamp_ns - 2 * PERIOD_NS, 1.0, "a look before").commanded_velocity[0]
+        before = watch.first(
+            lambda s: True, event.stamp_ns - 2 * PERIOD_NS, 1.0, "a look before"
+        ).commanded_velocity[0]
         sign = 1 if event.final else -1
 
         def follows(snapshot: Any, sign: int = sign, before: float = before) -> bool:

@@ -74,7 +74,9 @@ class Daemon:
                     return
             except TimeoutError:
                 continue
-        raise RuntimeError(f"start daemon: not ready; want READY=1 within {READY_S:g} s; it said:\n{self.log()}")
+        raise RuntimeError(
+            f"start daemon: not ready; want READY=1 within {READY_S:g} s; it said:\n{self.log()}"
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -196,7 +198,11 @@ def memory_kb(pid: int) -> dict[str, int]:
         key, _, rest = line.partition(":")
         if key in sizes:
             sizes[key] = int(rest.split()[0])
-    return {"rss": sizes["Rss"], "pss": sizes["Pss"], "private": sizes["Private_Clean"] + sizes["Private_Dirty"]}
+    return {
+        "rss": sizes["Rss"],
+        "pss": sizes["Pss"],
+        "private": sizes["Private_Clean"] + sizes["Private_Dirty"],
+    }
 
 
 def descriptors(pid: int) -> int:

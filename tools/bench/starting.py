@@ -41,7 +41,11 @@ def bench_start(options: Options, report: Report) -> None:
                 sizes = {who: memory_kb(pid) for who, pid in pids.items()}
     base = report.samples("bare interpreter, start to exit", bare, "ms")
     report.samples(
-        "daemon start to ready, three devices", starts, "ms", baseline=base, bars=[Bar("p50", 300), Bar("p50", 100)]
+        "daemon start to ready, three devices",
+        starts,
+        "ms",
+        baseline=base,
+        bars=[Bar("p50", 300), Bar("p50", 100)],
     )
     for who, size in sizes.items():
         bar = Bar("value", 25 * 1024) if who == "daemon" else Bar("value", 12 * 1024)
@@ -78,7 +82,9 @@ def bench_restart(options: Options, report: Report) -> None:
                 stamps = [snapshot.stamp_ns for snapshot in neighbour.history(before)]
                 gaps += [b - a for a, b in itertools.pairwise(stamps)]
                 report.progress(f"restart: {trial}")
-    report.samples("driver killed to its node open and read again", back, "ms", bars=[Bar("p50", 500), Bar("p50", 50)])
+    report.samples(
+        "driver killed to its node open and read again", back, "ms", bars=[Bar("p50", 500), Bar("p50", 50)]
+    )
     report.samples("period of the neighbour's publications meanwhile", gaps, "us")
 
 

@@ -43,7 +43,9 @@ def bench_stop(options: Options, report: Report) -> None:
         bars = [Bar("max", 2 * TICK_MS), Bar("p99", 2 * TICK_MS)]
         report.samples("emergency stop to the last of 4 drivers braking", acted, "ms", bars=bars)
         bars = [Bar("p50", 5.0), Bar("p99", 10.0)]
-        report.samples("emergency stop to the last of 16 axes at rest", rested, "ms", bars=bars, cpu=cpu.shares())
+        report.samples(
+            "emergency stop to the last of 16 axes at rest", rested, "ms", bars=bars, cpu=cpu.shares()
+        )
         _shell(options, report, daemon, cell, nodes)
 
 
@@ -113,6 +115,8 @@ def _shell(options: Options, report: Report, daemon: Daemon, cell: Any, nodes: l
         for samples, more in zip((acted, rested, calls), found, strict=True):
             samples += more
     base = report.samples("bare interpreter, start to exit", bare, "ms")
-    report.samples("sdev -e from start to the last driver braking", acted, "ms", baseline=base, bars=[Bar("ratio", 2.0)])
+    report.samples(
+        "sdev -e from start to the last driver braking", acted, "ms", baseline=base, bars=[Bar("ratio", 2.0)]
+    )
     report.samples("sdev -e from start to the last axis at rest", rested, "ms", baseline=base)
     report.samples("sdev -e from start to exit", calls, "ms", baseline=base)

@@ -15,14 +15,22 @@ def markdown(figures: Sequence[Figure]) -> str:
 
 def _table(bench: str, figures: list[Figure]) -> str:
     names = [name for name, _ in PERCENTILES]
-    lines = [f"### {bench}", "", _row(["figure", "count", *names, "ratio", "bars"]), _row(["---"] * (len(names) + 4))]
+    lines = [
+        f"### {bench}",
+        "",
+        _row(["figure", "count", *names, "ratio", "bars"]),
+        _row(["---"] * (len(names) + 4)),
+    ]
     return "\n".join([*lines, *map(_line, figures), ""])
 
 
 def _line(figure: Figure) -> str:
     unit = f" [{figure.unit}]" if figure.unit else ""
     if figure.summary is not None:
-        cells = [str(figure.summary.count), *(_number(figure.summary.values[name]) for name, _ in PERCENTILES)]
+        cells = [
+            str(figure.summary.count),
+            *(_number(figure.summary.values[name]) for name, _ in PERCENTILES),
+        ]
     else:
         cells = ["", _number(figure.value or 0.0), *[""] * (len(PERCENTILES) - 1)]
     ratio = f"{figure.ratio:.3g}" if figure.ratio is not None else ""

@@ -29,7 +29,11 @@ def bench_write(options: Options, report: Report) -> None:
             velocity = [command(0, velocity=v) for v in (0.001, -0.001)]
             sixteen = [b"".join([command(i, position=p) for i in range(16)]) for p in (0.001, -0.001)]
             trips: list[int] = []
-            taken: dict[str, list[int]] = {"1 position, replacing": [], "1 velocity, replacing": [], "16, replacing": []}
+            taken: dict[str, list[int]] = {
+                "1 position, replacing": [],
+                "1 velocity, replacing": [],
+                "16, replacing": [],
+            }
             cpu = CpuTimes({"client": os.getpid(), "driver": pids["mod0"]})
             while len(trips) < count:
                 trips += bare.samples(CHUNK, len(one[0]))
@@ -84,4 +88,6 @@ def _append_many(node: Any, options: Options, report: Report) -> None:
         samples.append(time.perf_counter_ns() - begin)
         node.stop()
         node.wait_until_idle(5.0)
-    report.samples("append 10,000 commands in one write", samples, "ms", bars=[Bar("p50", 100), Bar("max", 100)])
+    report.samples(
+        "append 10,000 commands in one write", samples, "ms", bars=[Bar("p50", 100), Bar("max", 100)]
+    )

@@ -197,7 +197,9 @@ class _Show:
             peak = max(abs(v) for v in snapshot.data) or 1.0
             for index, value in enumerate(snapshot.data):
                 _say(f"element {index:2} {value:+7.2f} %  {'#' * round(40 * abs(value) / peak)}")
-            felt = dict(zip((channel.name for channel in shape.info.channels), shape.read().data, strict=True))
+            felt = dict(
+                zip((channel.name for channel in shape.info.channels), shape.read().data, strict=True)
+            )
             _say(
                 f"shape: {math.degrees(felt['angle']):.2f} +- {math.degrees(felt['var_angle'] ** 0.5):.2f} deg, "
                 f"{felt['load']:.0f} N/m, radius {1e3 * felt['radius']:.1f} mm (it is 6 mm)"

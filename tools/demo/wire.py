@@ -34,7 +34,10 @@ def bench(folder: str, stack: ExitStack) -> str:
 
 def show(folder: str) -> None:
     """Run the bench configuration and use its nodes like any others."""
-    print("\n\033[1mReal protocols\033[0m   the same verbs on a Modbus RTU drive, a framed sample stream and a Modbus TCP block", flush=True)
+    print(
+        "\n\033[1mReal protocols\033[0m   the same verbs on a Modbus RTU drive, a framed sample stream and a Modbus TCP block",
+        flush=True,
+    )
     with ExitStack() as stack:
         process = daemon(bench(folder, stack), f"{folder}/bench.sock")
         stack.callback(process.end)
@@ -51,7 +54,9 @@ def show(folder: str) -> None:
                 print(f"  tactile0   {rate:.0f} frames/s, {len(last)} elements, flags {set(last.flags)}")
             with cell.open("io0.do", "rw") as outputs:
                 outputs.set(0b101)
-                print(f"  io0.do     outputs written and read back: {outputs.wait_new(outputs.read().number, 1.0).data[0]:#010b}")
+                print(
+                    f"  io0.do     outputs written and read back: {outputs.wait_new(outputs.read().number, 1.0).data[0]:#010b}"
+                )
 
 
 def _wait_links(cell: sioms.Workcell) -> None:
@@ -67,11 +72,15 @@ def _move(cell: sioms.Workcell) -> None:
         began = time.monotonic()
         axis.move(0.02)
         axis.wait_until_idle(10.0)
-        print(f"  slide0     moved to {axis.read().position[0] * 1e3:.2f} mm in {time.monotonic() - began:.2f} s")
+        print(
+            f"  slide0     moved to {axis.read().position[0] * 1e3:.2f} mm in {time.monotonic() - began:.2f} s"
+        )
         axis.command(velocity=-0.01)
         time.sleep(0.4)
         cell.emergency_stop(why="demo")
         time.sleep(0.3)
         reading = axis.read()[0]
-        print(f"  slide0     emergency stop: {reading.velocity * 1e3:.2f} mm/s at {reading.position * 1e3:.2f} mm")
+        print(
+            f"  slide0     emergency stop: {reading.velocity * 1e3:.2f} mm/s at {reading.position * 1e3:.2f} mm"
+        )
         cell.reset()

@@ -57,7 +57,11 @@ def test_aliases_and_their_parts() -> None:
     assert names.errors == []
     assert names.nodes["mod0.xz"].channels == (0, 2) and names.nodes["zx"].channels == (2, 0)
     assert names.nodes["mod0.xz.z"].channels == (2,) and "mod0.xz.readonly" in names.nodes
-    assert names.nodes["grip"].bit == 2 and names.nodes["again"] .bit == 2 and names.nodes["grip.readonly"].read_only
+    assert (
+        names.nodes["grip"].bit == 2
+        and names.nodes["again"].bit == 2
+        and names.nodes["grip.readonly"].read_only
+    )
 
 
 @pytest.mark.parametrize(
@@ -86,7 +90,12 @@ def test_an_input_of_a_driver_that_is_not_there() -> None:
 def test_information_survives_the_wire() -> None:
     names = table()
     info = NodeInfo(names.pack(names.nodes["mod0.y"]))
-    assert (info.name, info.node_class, info.read_only, info.number_structs) == ("mod0.y", NodeClass.AXIS, False, 1)
+    assert (info.name, info.node_class, info.read_only, info.number_structs) == (
+        "mod0.y",
+        NodeClass.AXIS,
+        False,
+        1,
+    )
     assert info.channels[0].name == "y" and info.channels[0].minimum == -1.0 and info.buffer_capacity == 16
     assert info.read_struct_size == 8 * 13 and info.write_struct_size == 144
     bit = NodeInfo(names.pack(names.nodes["io0.bit2"]))
@@ -105,7 +114,9 @@ AGREE = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("first", "second", "free"), [(*p, False) for p in EXCLUDE] + [(*p, True) for p in AGREE])
+@pytest.mark.parametrize(
+    ("first", "second", "free"), [(*p, False) for p in EXCLUDE] + [(*p, True) for p in AGREE]
+)
 def test_who_excludes_whom(first: str, second: str, free: bool) -> None:
     names = table(mod0__xz=NodeTable("mod0", ["x", "z"]), grip=NodeTable("io0.bit2")).nodes
     claims: Claims[str] = Claims()

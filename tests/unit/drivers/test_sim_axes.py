@@ -98,7 +98,10 @@ def test_stepper_that_slips_every_time_says_so(bench):
     bench.run(4.0, until=lambda: mod.bank.is_idle([0]))
     assert mod.bank.particulars([0])["retries"] == [3] and mod.bank.particulars([0])["misses"] == [1]
     assert status(mod) & AxisStatus.MISSED_TARGET
-    assert mod.blocks[1].data[0] == pytest.approx(mod.bank.fields[0, 0], abs=1e-5) and mod.bank.fields[0, 0] < 0.04
+    assert (
+        mod.blocks[1].data[0] == pytest.approx(mod.bank.fields[0, 0], abs=1e-5)
+        and mod.bank.fields[0, 0] < 0.04
+    )
 
 
 def test_homing_finds_the_switch_edge(bench):

@@ -233,7 +233,9 @@ def test_following_error_is_a_fault_with_zero_force():
 
 
 def test_stepper_that_loses_steps_is_stalled_and_stops():
-    rig = Rig([axis(kind=AxisKind.STEPPER, k=None, following_error_max=0.01)], plant=lambda output, dt: np.zeros(1))
+    rig = Rig(
+        [axis(kind=AxisKind.STEPPER, k=None, following_error_max=0.01)], plant=lambda output, dt: np.zeros(1)
+    )
     rig.write(mode=MODE.POSITION, position=1.0)
     rig.tick(1500)
     assert rig.field("status") & S.STALLED
@@ -243,7 +245,9 @@ def test_stepper_that_loses_steps_is_stalled_and_stops():
     rig.tick(5)
     assert not rig.field("status") & (S.STALLED | S.FAULT)
     assert rig.field("commanded_position") == rig.field("position") == 0.0
-    assert rig.bank.tick(rig.now_ns + TICK_NS, rig.raw)[0] == pytest.approx(output), "the motor stays where it is"
+    assert rig.bank.tick(rig.now_ns + TICK_NS, rig.raw)[0] == pytest.approx(output), (
+        "the motor stays where it is"
+    )
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
@@ -273,7 +277,9 @@ def test_late_tick_stops_from_where_it_was():
 def test_infeasible_at_planning_stops_with_a_latched_fault():
     rig = Rig([axis()])
     rig.write(mode=MODE.VELOCITY | MODE.SPECIFIED_TIME, velocity=1.0, time=0.5)
-    rig.write(mode=[TIMED, MODE.POSITION], position=[-2.0, 0.0], time=0.3)  # begins in a state not known at the write
+    rig.write(
+        mode=[TIMED, MODE.POSITION], position=[-2.0, 0.0], time=0.3
+    )  # begins in a state not known at the write
     rig.run()
     assert rig.field("status") & S.FAULT
     assert "too short" in rig.bank.fault_text(0)

@@ -109,7 +109,9 @@ def test_limits_in_force_count_for_feasibility(rig):
     rig.run()
     slow = MODE.POSITION | MODE.SPECIFIED_MAX_VEL_ACC
     with pytest.raises(CommandError, match="too short"):
-        rig.write(mode=[slow, timed], position=[0.9, 0.0], max_velocity=0.1, max_acceleration=1.0, time=[0, 1.2])
+        rig.write(
+            mode=[slow, timed], position=[0.9, 0.0], max_velocity=0.1, max_acceleration=1.0, time=[0, 1.2]
+        )
 
 
 def test_not_before_the_first_measurement():

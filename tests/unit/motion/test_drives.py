@@ -145,7 +145,9 @@ def test_homing_is_the_drives_own():
     from sioms.motion import Homing
 
     cell = Cell(1)
-    cell.bank = DriveBank([axis(modes=DRIVE_MODES, homing=Homing(0.1, 0.01, required=True))], markers=cell.markers)
+    cell.bank = DriveBank(
+        [axis(modes=DRIVE_MODES, homing=Homing(0.1, 0.01, required=True))], markers=cell.markers
+    )
     cell.poll()
     with pytest.raises(CommandError, match="home required"):
         cell.write(mode=MODE.POSITION, position=0.1)

@@ -39,7 +39,9 @@ def test_the_clipped_torque_is_fed_back_not_the_wish():
 
 def test_force_mode_is_force_plus_damping_plus_offset():
     law = law_of(*[AxisSettings("x", k=100.0, kb=-2.0, force_offset=0.25, force_max=10.0)] * 2)
-    law.step(np.array([3.0, 1.0]), np.zeros(2), np.zeros(2), np.array([0.5, 0.0]), 1e-3, np.array([True, False]))
+    law.step(
+        np.array([3.0, 1.0]), np.zeros(2), np.zeros(2), np.array([0.5, 0.0]), 1e-3, np.array([True, False])
+    )
     assert law.output.tolist() == [3.0 - 2.0 * 0.5 + 0.25, 10.0]
 
 
@@ -47,7 +49,9 @@ def test_stepper_is_dead_beat_by_default():
     law = law_of(AxisSettings("x", kind=AxisKind.STEPPER, velocity_max=1.0, acceleration_max=10.0))
     t = np.arange(1, 300) * 1e-3
     velocity = 9.0 * np.minimum(t, 0.1)
-    for position, v in zip(0.5 * velocity * np.minimum(t, 0.1) + 0.9 * np.maximum(t - 0.1, 0), velocity, strict=True):
+    for position, v in zip(
+        0.5 * velocity * np.minimum(t, 0.1) + 0.9 * np.maximum(t - 0.1, 0), velocity, strict=True
+    ):
         law.step(np.array([position]), np.array([v]), np.zeros(1), np.zeros(1), 1e-3)
         assert law.slewed[0] == pytest.approx(position, abs=1e-12)
 
@@ -66,7 +70,8 @@ def test_stepper_output_keeps_velocity_and_acceleration_on_a_jump():
 
 def test_servo_and_stepper_do_not_touch_each_other():
     mixed = law_of(
-        AxisSettings("a", k=20.0, kb=-1.0, force_max=5.0), AxisSettings("b", kind=AxisKind.STEPPER, velocity_max=1.0)
+        AxisSettings("a", k=20.0, kb=-1.0, force_max=5.0),
+        AxisSettings("b", kind=AxisKind.STEPPER, velocity_max=1.0),
     )
     alone = law_of(AxisSettings("a", k=20.0, kb=-1.0, force_max=5.0))
     rng = np.random.default_rng(1)

@@ -14,8 +14,12 @@ from sioms.motion import CommandError
 from sioms.motion import plain as plain_module
 
 VALUES = st.sampled_from([0.0, 1e-3, -0.05, 0.19, 0.21, 5.0, 1e9, np.inf, -np.inf, np.nan, -0.0])
-PLAIN = st.sampled_from([MODE.POSITION, MODE.VELOCITY, MODE.ACCELERATION, MODE.JERK, MODE.FORCE, MODE.FORCE_VELOCITY])
-BESIDE = st.sampled_from([MODE(0), MODE.SPECIFIED_MAX_VEL_ACC, MODE.SPECIFIED_MAX_FORCE, MODE.SPECIFIED_FORCE_OFFSET])
+PLAIN = st.sampled_from(
+    [MODE.POSITION, MODE.VELOCITY, MODE.ACCELERATION, MODE.JERK, MODE.FORCE, MODE.FORCE_VELOCITY]
+)
+BESIDE = st.sampled_from(
+    [MODE(0), MODE.SPECIFIED_MAX_VEL_ACC, MODE.SPECIFIED_MAX_FORCE, MODE.SPECIFIED_FORCE_OFFSET]
+)
 FIELDS = ("position", "velocity", "acceleration", "jerk", "force", "force_velocity", "max_velocity", "max_acceleration",
           "max_force", "force_offset")  # fmt: skip
 
@@ -48,7 +52,12 @@ def test_a_short_write_is_accepted_and_refused_as_the_general_way_does(commands,
 
 
 @settings(max_examples=60)
-@given(st.lists(st.tuples(PLAIN, st.floats(-0.15, 0.15), st.integers(0, 1), st.booleans(), st.integers(1, 40)), max_size=8))
+@given(
+    st.lists(
+        st.tuples(PLAIN, st.floats(-0.15, 0.15), st.integers(0, 1), st.booleans(), st.integers(1, 40)),
+        max_size=8,
+    )
+)
 def test_axes_move_as_they_do_by_the_general_way(commands):
     rigs = [Rig([axis(), axis()]) for _ in range(2)]
     general(rigs[1])

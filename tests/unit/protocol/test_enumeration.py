@@ -23,13 +23,26 @@ def pair(kind: str, members: dict[str, int]) -> tuple[Any, Any]:
 
 
 NAMES = st.sampled_from(["A", "B", "C", "D", "E_F"])
-CODES = st.dictionaries(NAMES, st.integers(0, 300), min_size=1).filter(lambda d: len(set(d.values())) == len(d))
-BITS = st.dictionaries(NAMES, st.sampled_from([1 << n for n in range(9)]), min_size=1).filter(lambda d: len(set(d.values())) == len(d))
+CODES = st.dictionaries(NAMES, st.integers(0, 300), min_size=1).filter(
+    lambda d: len(set(d.values())) == len(d)
+)
+BITS = st.dictionaries(NAMES, st.sampled_from([1 << n for n in range(9)]), min_size=1).filter(
+    lambda d: len(set(d.values())) == len(d)
+)
 WORD = st.integers(0, 1 << 10)
 
 
 def shown(value: Any) -> tuple[object, ...]:
-    return int(value), repr(value), str(value), f"{value}", f"{value:#x}", value.name, value.value, bool(value)
+    return (
+        int(value),
+        repr(value),
+        str(value),
+        f"{value}",
+        f"{value:#x}",
+        value.name,
+        value.value,
+        bool(value),
+    )
 
 
 def outcome(act: Any) -> object:
@@ -55,7 +68,10 @@ def test_flags_are_as_the_original(members, a, b):
     theirs, ours = pair("IntFlag", members)
     assert int(ours(a)) == int(theirs(a)) == a  # bits without a name are kept
     mask = sum(members.values())
-    a, b = a & mask, b & mask  # what such bits are called, and how they invert, differs between versions of Python
+    a, b = (
+        a & mask,
+        b & mask,
+    )  # what such bits are called, and how they invert, differs between versions of Python
     for act in (
         lambda c: c(a), lambda c: c(a) | c(b), lambda c: c(a) & c(b), lambda c: c(a) ^ c(b), lambda c: c(a) | b,
         lambda c: a & c(b), lambda c: a | c(b), lambda c: c(a) & ~c(b), lambda c: c(a) in c(b), lambda c: len(c(a)),
@@ -76,6 +92,10 @@ def test_members_cannot_be_changed_and_copy_to_themselves():
 
 def test_the_protocol_uses_them():
     for module in (flags, messages):
-        made = [v for v in vars(module).values() if isinstance(v, enumeration._Members) and v.__module__ == module.__name__]
+        made = [
+            v
+            for v in vars(module).values()
+            if isinstance(v, enumeration._Members) and v.__module__ == module.__name__
+        ]
         assert len(made) > 3
         assert all(len(cls) > 0 for cls in made)

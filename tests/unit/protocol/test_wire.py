@@ -14,9 +14,27 @@ from sioms.protocol import wire
 INTEGERS = st.integers(-(1 << 63), (1 << 64) - 1)
 LEAVES = st.none() | st.booleans() | INTEGERS | st.floats() | st.text(max_size=300) | st.binary(max_size=300)
 VALUES = st.recursive(
-    LEAVES, lambda inner: st.lists(inner, max_size=20) | st.dictionaries(st.text(max_size=40), inner, max_size=20)
+    LEAVES,
+    lambda inner: st.lists(inner, max_size=20) | st.dictionaries(st.text(max_size=40), inner, max_size=20),
 )
-EDGES = [0, 127, 128, 255, 256, 65535, 65536, (1 << 32) - 1, 1 << 32, -1, -32, -33, -128, -129, -32768, -32769]
+EDGES = [
+    0,
+    127,
+    128,
+    255,
+    256,
+    65535,
+    65536,
+    (1 << 32) - 1,
+    1 << 32,
+    -1,
+    -32,
+    -33,
+    -128,
+    -129,
+    -32768,
+    -32769,
+]
 
 
 def theirs(data: bytes) -> object:
@@ -43,13 +61,22 @@ def test_the_same_bytes_and_back(value):
 
 @pytest.mark.parametrize("size", [0, 15, 16, 31, 32, 255, 256, 65535, 65536])
 def test_every_form_of_length(size):
-    for value in ("x" * size, b"x" * size, [0] * size, {str(i): i for i in range(size)}, [*EDGES, size, -size]):
+    for value in (
+        "x" * size,
+        b"x" * size,
+        [0] * size,
+        {str(i): i for i in range(size)},
+        [*EDGES, size, -size],
+    ):
         packed = wire.pack(value)
         assert packed == msgpack.packb(value, use_bin_type=True)
         assert same(wire.unpack(packed), theirs(packed))
 
 
-@given(st.binary(max_size=40) | VALUES.map(wire.pack).flatmap(lambda b: st.integers(0, len(b)).map(lambda n: b[:n])))
+@given(
+    st.binary(max_size=40)
+    | VALUES.map(wire.pack).flatmap(lambda b: st.integers(0, len(b)).map(lambda n: b[:n]))
+)
 def test_nonsense_is_refused_and_sense_is_taken_like_the_package_does(data):
     try:
         expected = theirs(data)
@@ -66,7 +93,12 @@ def test_nonsense_is_refused_and_sense_is_taken_like_the_package_does(data):
 
 
 def test_deep_nesting_and_great_promises_cost_nothing():
-    for data in (b"\x91" * 100_000, b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff"):
+    for data in (
+        b"\x91" * 100_000,
+        b"\xdd\xff\xff\xff\xff",
+        b"\xdf\xff\xff\xff\xff",
+        b"\xc6\xff\xff\xff\xff",
+    ):
         with pytest.raises(ValueError):
             wire.unpack(data)
 

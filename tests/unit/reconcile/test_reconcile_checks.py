@@ -15,7 +15,9 @@ from sioms.reconcile.records import Record, Session
 from sioms.reconcile.simulate import simulate
 from sioms.reconcile.verdict import BadInputError, Outcome
 
-AXIS = AxisModel(True, 1e-3, 2e-3, 1e-3, 2e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0))
+AXIS = AxisModel(
+    True, 1e-3, 2e-3, 1e-3, 2e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)
+)
 
 
 def recorded(model: AxisModel = AXIS, seconds: float = 3.0) -> Record:
@@ -23,7 +25,9 @@ def recorded(model: AxisModel = AXIS, seconds: float = 3.0) -> Record:
     command = 1.5 * np.sin(2 * np.pi * 0.7 * t) + 0.5 * np.sin(2 * np.pi * 2.3 * t)
     run = simulate(model, command)
     rng = np.random.default_rng(1)
-    return Record("run", run.position, run.force, command, run.force + 2e-3 * rng.standard_normal(len(t)), None, t)
+    return Record(
+        "run", run.position, run.force, command, run.force + 2e-3 * rng.standard_normal(len(t)), None, t
+    )
 
 
 GOOD = recorded()
@@ -45,11 +49,17 @@ BAD = {
     "constant force": (lambda r: replace(r, force=np.ones(len(r))), "force is constant"),
     "constant command": (lambda r: replace(r, command=np.zeros(len(r))), "command is constant"),
     "constant current": (lambda r: replace(r, force_measured=np.ones(len(r))), "force_measured is constant"),
-    "not a number": (lambda r: replace(r, position=np.where(np.arange(len(r)) == 5, np.nan, r.position)), "no numbers"),
+    "not a number": (
+        lambda r: replace(r, position=np.where(np.arange(len(r)) == 5, np.nan, r.position)),
+        "no numbers",
+    ),
     "jumping time": (_jump, "time jumps"),
     "milliseconds as seconds": (lambda r: replace(r, time_s=r.time_s * 1000), "another unit"),
     "saturated throughout": (lambda r: replace(r, force=np.where(r.force > 0, 1.8, -1.8)), "at its limit"),
-    "position in other units than the command": (lambda r: replace(r, position=r.position * 1000), "factor of 1000"),
+    "position in other units than the command": (
+        lambda r: replace(r, position=r.position * 1000),
+        "factor of 1000",
+    ),
     "channel of another length": (lambda r: replace(r, force=r.force[:-1]), "same number"),
 }
 
@@ -73,7 +83,9 @@ def test_data_of_another_axis_get_no_name() -> None:
     """Position of one motion, force of another: no library can explain that, and none is claimed to."""
     rng = np.random.default_rng(5)
     t = GOOD.time_s if GOOD.time_s is not None else np.zeros(0)
-    force = 0.3 * np.sin(2 * np.pi * 3.7 * t + 1.0) * np.sign(np.sin(2 * np.pi * 1.1 * t)) + 2e-3 * rng.standard_normal(len(t))
+    force = 0.3 * np.sin(2 * np.pi * 3.7 * t + 1.0) * np.sign(
+        np.sin(2 * np.pi * 1.1 * t)
+    ) + 2e-3 * rng.standard_normal(len(t))
     other = replace(GOOD, force=force, force_measured=force + 2e-3 * rng.standard_normal(len(t)))
     try:
         verdict = analyse(Session((other,)), AXIS, Options(pictures=False, replicates=10))

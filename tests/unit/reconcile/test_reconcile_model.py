@@ -16,11 +16,35 @@ from sioms.reconcile.simulate import pack, simulate
 from sioms.reconcile.verdict import BadInputError
 from sioms.tools.reconcile_input import read_data, read_model
 
-AXIS = AxisModel(True, 1e-3, 2e-3, 1e-3, 1e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0))
+AXIS = AxisModel(
+    True, 1e-3, 2e-3, 1e-3, 1e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)
+)
 #: The list of the specification: every one of these must be nameable.
-DEMANDED = {"viscous", "viscous_direction", "coulomb", "coulomb_position", "stribeck", "presliding", "load_friction", "backlash", "cogging",
-            "torque_ripple", "gravity", "offset", "delay", "lag", "saturation", "elastic", "encoder_scale", "eccentricity",
-            "encoder_quantisation", "payload", "thermal_gain", "spring", "quadratic_drag"}
+DEMANDED = {
+    "viscous",
+    "viscous_direction",
+    "coulomb",
+    "coulomb_position",
+    "stribeck",
+    "presliding",
+    "load_friction",
+    "backlash",
+    "cogging",
+    "torque_ripple",
+    "gravity",
+    "offset",
+    "delay",
+    "lag",
+    "saturation",
+    "elastic",
+    "encoder_scale",
+    "eccentricity",
+    "encoder_quantisation",
+    "payload",
+    "thermal_gain",
+    "spring",
+    "quadratic_drag",
+}
 
 
 def test_the_library_holds_what_is_demanded() -> None:
@@ -77,7 +101,9 @@ def test_more_effects_than_places_are_refused() -> None:
 
 
 def test_a_model_survives_its_file(tmp_path: Path) -> None:
-    model = AXIS.with_effect("coulomb", {"Fc": 0.05}).with_effect("cogging", {"amp": 0.1, "phase": 1.0, "n": 7.0, "amp2": 0.0, "phase2": 0.0})
+    model = AXIS.with_effect("coulomb", {"Fc": 0.05}).with_effect(
+        "cogging", {"amp": 0.1, "phase": 1.0, "n": 7.0, "amp2": 0.0, "phase2": 0.0}
+    )
     (tmp_path / "m.toml").write_text(write_model(model))
     assert read_model(tmp_path / "m.toml") == model
 
@@ -88,12 +114,25 @@ def test_an_effect_can_be_switched_off_in_the_file(tmp_path: Path) -> None:
     assert read_model(tmp_path / "m.toml") == AXIS
 
 
-@pytest.mark.parametrize(("change", "says"), [
-    ({"kind": "round"}, "rotary or linear"), ({"speling": 1}, "nobody reads speling"),
-])
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"kind": "round"}, "rotary or linear"),
+        ({"speling": 1}, "nobody reads speling"),
+    ],
+)
 def test_a_model_file_is_checked(change: dict[str, object], says: str) -> None:
-    axis: dict[str, object] = {"name": "a", "kind": "linear", "sample_time_s": 1e-3, "inertia": 1.0, "viscous": 1.0, "resolution": 1e-6,
-                               "pitch": 0.01, "rated_force": 1.0, "max_speed": 1.0}
+    axis: dict[str, object] = {
+        "name": "a",
+        "kind": "linear",
+        "sample_time_s": 1e-3,
+        "inertia": 1.0,
+        "viscous": 1.0,
+        "resolution": 1e-6,
+        "pitch": 0.01,
+        "rated_force": 1.0,
+        "max_speed": 1.0,
+    }
     with pytest.raises(ValueError, match=says):
         model_from({"axis": axis | change})
 
@@ -104,19 +143,28 @@ def _write(folder: Path, columns: str, data: str = "t,x,f\n0,0,1\n0.001,1,2\n0.0
 
 
 def test_columns_are_converted(tmp_path: Path) -> None:
-    _write(tmp_path, '[columns]\nposition = { name = "x", unit = "deg" }\nforce = { name = "f", unit = "mN m", scale = 2.0 }\n')
+    _write(
+        tmp_path,
+        '[columns]\nposition = { name = "x", unit = "deg" }\nforce = { name = "f", unit = "mN m", scale = 2.0 }\n',
+    )
     record = read_data(tmp_path, AXIS).records[0]
     np.testing.assert_allclose(record.position, np.radians([0, 1, 2]))
     np.testing.assert_allclose(record.force, [2e-3, 4e-3, 6e-3])
 
 
-@pytest.mark.parametrize(("columns", "says"), [
-    ('[columns]\nposition = { name = "y" }\nforce = { name = "f" }\n', "no column 'y'"),
-    ('[columns]\nposition = { name = "x", unit = "furlong" }\nforce = { name = "f" }\n', "furlong"),
-    ('[columns]\nposition = { name = "x" }\n', "names no force"),
-    ('[columns]\nposition = { name = "x" }\nforce = { name = "f" }\nspeed = { name = "f" }\n', "nobody reads speed"),
-    ("[columns\n", "columns.toml"),
-])
+@pytest.mark.parametrize(
+    ("columns", "says"),
+    [
+        ('[columns]\nposition = { name = "y" }\nforce = { name = "f" }\n', "no column 'y'"),
+        ('[columns]\nposition = { name = "x", unit = "furlong" }\nforce = { name = "f" }\n', "furlong"),
+        ('[columns]\nposition = { name = "x" }\n', "names no force"),
+        (
+            '[columns]\nposition = { name = "x" }\nforce = { name = "f" }\nspeed = { name = "f" }\n',
+            "nobody reads speed",
+        ),
+        ("[columns\n", "columns.toml"),
+    ],
+)
 def test_bad_column_files_say_what_is_wrong(tmp_path: Path, columns: str, says: str) -> None:
     _write(tmp_path, columns)
     with pytest.raises(BadInputError, match=says):

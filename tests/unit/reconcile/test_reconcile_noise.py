@@ -15,7 +15,9 @@ from sioms.reconcile.screen import SLOW_HZ, instrument_motion
 from sioms.reconcile.search import physical
 from sioms.reconcile.simulate import simulate
 
-AXIS = AxisModel(True, 1e-3, 2e-3, 1e-3, 1e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0))
+AXIS = AxisModel(
+    True, 1e-3, 2e-3, 1e-3, 1e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)
+)
 FRICTION = 0.1
 T = np.arange(12000) * 1e-3
 COMMAND = 4.0 * np.sin(0.9 * T * (1.0 + 0.05 * T)) * np.minimum(T / 0.3, 1.0) + 0.3 * np.sin(9.0 * T)
@@ -64,6 +66,8 @@ def test_a_motion_without_noise_is_found_without_a_loop() -> None:
     ("thermal_gain", {"loss": 0.3, "tau": 10000.0}, True),
     ("backlash", {"gap": 0.01, "load_fraction": 0.4, "f_contact": 400.0, "zeta": 2.0}, True),
 ])  # fmt: skip
-def test_a_number_that_leans_on_its_bound_is_another_effect(name: str, values: dict[str, float], is_one: bool) -> None:
+def test_a_number_that_leans_on_its_bound_is_another_effect(
+    name: str, values: dict[str, float], is_one: bool
+) -> None:
     fit = Fit(AXIS.with_effect(name, values), (), np.zeros(1), np.empty((1, 0)))
     assert physical(fit, name) is is_one

@@ -24,7 +24,9 @@ from sioms.reconcile.screen import screen
 from sioms.reconcile.search import Found, Searcher, unspecific
 from sioms.reconcile.simulate import simulate
 
-AXIS = AxisModel(True, 1e-3, 2e-3, 1e-3, 2e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0))
+AXIS = AxisModel(
+    True, 1e-3, 2e-3, 1e-3, 2e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)
+)
 T = np.arange(4000) * 1e-3
 COMMAND = 3.5 * np.sin(2 * np.pi * 0.5 * T) + 0.4 * np.sin(2 * np.pi * 3.1 * T)
 
@@ -59,8 +61,10 @@ def test_index_marks_give_the_scale(gain: float) -> None:
     assert error < 2e-3
 
 
-@pytest.mark.parametrize(("effect", "symbol", "value", "within"), [
-    ("delay", "delay", 2.7e-3, 2e-5), ("lag", "tau", 3e-3, 1e-4), ("saturation", "limit", 0.35, 2e-3)])
+@pytest.mark.parametrize(
+    ("effect", "symbol", "value", "within"),
+    [("delay", "delay", 2.7e-3, 2e-5), ("lag", "tau", 3e-3, 1e-4), ("saturation", "limit", 0.35, 2e-3)],
+)
 def test_the_drive_is_judged_by_its_current(effect: str, symbol: str, value: float, within: float) -> None:
     found = drive(session(AXIS.with_effect(effect, {symbol: value}), 2.0 * COMMAND), AXIS)
     assert [f.effect for f in found] == [effect]
@@ -74,7 +78,9 @@ def test_a_good_drive_shows_nothing() -> None:
 def test_the_drive_model_is_that_of_the_simulation() -> None:
     model = AXIS.with_effect("delay", {"delay": 2.7e-3}).with_effect("lag", {"tau": 2e-3})
     run = simulate(model, COMMAND)
-    np.testing.assert_allclose(drive_output(run.force, 2.7e-3, 2e-3, np.inf, 1e-3)[5:], run.applied[5:], atol=4e-3)
+    np.testing.assert_allclose(
+        drive_output(run.force, 2.7e-3, 2e-3, np.inf, 1e-3)[5:], run.applied[5:], atol=4e-3
+    )
 
 
 def test_screening_puts_the_hidden_effect_first_and_starts_near_it() -> None:
@@ -96,7 +102,10 @@ def test_a_refit_finds_the_parameters() -> None:
 
 def test_a_search_adds_what_is_missing_and_nothing_else() -> None:
     hidden = AXIS.with_effect("offset", {"off": 0.06})
-    s = Searcher(problem(session(hidden)), names=("viscous", "coulomb", "offset", "payload", "spring", "viscous_direction"))
+    s = Searcher(
+        problem(session(hidden)),
+        names=("viscous", "coulomb", "offset", "payload", "spring", "viscous_direction"),
+    )
     assert set(s.run(AXIS).fit.model.effects) == {"offset"}
     assert set(s.run(hidden).fit.model.effects) == {"offset"}
 
@@ -109,7 +118,9 @@ def test_an_effect_that_is_not_needed_leaves() -> None:
 
 
 def test_a_look_alike_that_does_better_takes_the_place_of_what_was_named() -> None:
-    s = Searcher(problem(session(AXIS.with_effect("viscous", {"b_extra": 8e-3}))), names=("viscous", "quadratic_drag"))
+    s = Searcher(
+        problem(session(AXIS.with_effect("viscous", {"b_extra": 8e-3}))), names=("viscous", "quadratic_drag")
+    )
     fit = s.fit(AXIS.with_effect("quadratic_drag", {"c": 1e-4}))
     found, others = settle(s, Found(fit, s.loss(fit), ()), ())
     assert set(found.fit.model.effects) == {"viscous"}
@@ -193,8 +204,14 @@ def test_the_experiment_that_separates_is_the_one_that_excites() -> None:
     assert plan.separation > 20.0
 
 
-@pytest.mark.parametrize("envelope", [
-    Envelope(0.3, 6.0, 12.0, 170.0, 17000.0), Envelope(-0.2, 0.04, 0.25, 3.0, 60.0), Envelope(0.0, 0.002, 0.5, 5.0, 1000.0)])
+@pytest.mark.parametrize(
+    "envelope",
+    [
+        Envelope(0.3, 6.0, 12.0, 170.0, 17000.0),
+        Envelope(-0.2, 0.04, 0.25, 3.0, 60.0),
+        Envelope(0.0, 0.002, 0.5, 5.0, 1000.0),
+    ],
+)
 @pytest.mark.parametrize("duration", [1.5, 5.0])
 def test_experiments_stay_within_their_envelope(envelope: Envelope, duration: float) -> None:
     e = envelope
@@ -212,13 +229,23 @@ def test_experiments_stay_within_their_envelope(envelope: Envelope, duration: fl
 
 
 def test_the_plain_path_gives_the_same_numbers() -> None:
-    code = ("import numpy as np; from sioms.reconcile.jit import numba; from sioms.reconcile.model import *; "
-            "from sioms.reconcile.simulate import simulate; "
-            "m = AxisModel(True, 1e-3, 2e-3, 1e-3, 2e-4, 6.28, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)); "
-            "m = m.with_effect('stribeck', {'Fc': 0.05, 'Fs': 0.1, 'vs': 0.3}).with_effect('offset', {'off': 0.01}); "
-            "r = simulate(m, np.sin(np.arange(300) * 0.01)); print(numba() is not None, repr(float(r.force.sum())), repr(float(r.position[-1])))")
-    out = [subprocess.run([sys.executable, "-W", "ignore", "-c", code], env={**os.environ, **extra}, capture_output=True, text=True,
-                          check=True).stdout.split() for extra in ({}, {"SIOMS_PLAIN": "1"})]
+    code = (
+        "import numpy as np; from sioms.reconcile.jit import numba; from sioms.reconcile.model import *; "
+        "from sioms.reconcile.simulate import simulate; "
+        "m = AxisModel(True, 1e-3, 2e-3, 1e-3, 2e-4, 6.28, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)); "
+        "m = m.with_effect('stribeck', {'Fc': 0.05, 'Fs': 0.1, 'vs': 0.3}).with_effect('offset', {'off': 0.01}); "
+        "r = simulate(m, np.sin(np.arange(300) * 0.01)); print(numba() is not None, repr(float(r.force.sum())), repr(float(r.position[-1])))"
+    )
+    out = [
+        subprocess.run(
+            [sys.executable, "-W", "ignore", "-c", code],
+            env={**os.environ, **extra},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.split()
+        for extra in ({}, {"SIOMS_PLAIN": "1"})
+    ]
     assert [o[0] for o in out] == ["True", "False"]
     assert float(out[0][1]) == pytest.approx(float(out[1][1]), rel=1e-9)
     assert out[0][2] == out[1][2]

@@ -15,7 +15,9 @@ from sioms.reconcile.records import Record, Session
 from sioms.reconcile.session import State, applied, knobs
 from sioms.reconcile.simulate import simulate
 
-AXIS = AxisModel(True, 1e-3, 2e-3, 1e-3, 2e-5, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0))
+AXIS = AxisModel(
+    True, 1e-3, 2e-3, 1e-3, 2e-5, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)
+)
 MODEL = AXIS.with_effect("coulomb", {"Fc": 0.06}).with_effect("gravity", {"amp": 0.1, "phase": 0.3})
 T = np.arange(6000) * 1e-3
 COMMAND = 3.5 * np.sin(2 * np.pi * 0.5 * T) + 0.4 * np.sin(2 * np.pi * 3.1 * T)

@@ -100,7 +100,9 @@ def _to(position: float) -> np.ndarray[Any, Any]:
 @pytest.mark.parametrize("gap_ms", [60, 400])
 def test_no_verb_lets_the_set_point_run_on_before_a_late_tick(verb: str, gap_ms: int) -> None:
     settings = [
-        AxisSettings(name, "m", velocity_max=1.0, acceleration_max=10.0, position_min=-1.0, position_max=1.0, k=100.0)
+        AxisSettings(
+            name, "m", velocity_max=1.0, acceleration_max=10.0, position_min=-1.0, position_max=1.0, k=100.0
+        )
         for name in "xy"
     ]
     bank = AxisBank(settings, tick_s=1e-3, markers=_NoMarkers())
@@ -116,4 +118,6 @@ def test_no_verb_lets_the_set_point_run_on_before_a_late_tick(verb: str, gap_ms:
     now += gap_ms * MS
     VERBS[verb](bank, now)
     bank.tick(now + 1000, position)
-    assert bank.fields[7][0] == pytest.approx(position[0], abs=1e-4), "it brakes from where it was last put out"
+    assert bank.fields[7][0] == pytest.approx(position[0], abs=1e-4), (
+        "it brakes from where it was last put out"
+    )

@@ -33,7 +33,16 @@ def test_numbers_have_one_order_whatever_the_order_of_the_letters():
     made = columns("-n1smtoFfjavp mod0")
     assert made.count == 10
     (record,) = axis_records(made.records([1, 2, 3, 4, 5, 6, 7, 8, 9, 1 << 49]))
-    order = ["position", "velocity", "acceleration", "jerk", "force", "force_velocity", "force_offset", "time"]
+    order = [
+        "position",
+        "velocity",
+        "acceleration",
+        "jerk",
+        "force",
+        "force_velocity",
+        "force_offset",
+        "time",
+    ]
     assert [record[name] for name in order] == [1, 2, 3, 4, 5, 6, 7, 8]
     assert (record["axis"], record["wait_marker_number"], record["signal_marker_number"]) == (1, 9, 1 << 49)
 
@@ -50,7 +59,13 @@ def test_other_letters_leave_the_position():
 
 @pytest.mark.parametrize(
     ("line", "replace", "has_end"),
-    [("-v m", True, False), ("-vt m", False, True), ("-p m", True, True), ("-pm m", False, True), ("-f m", True, False)],
+    [
+        ("-v m", True, False),
+        ("-vt m", False, True),
+        ("-p m", True, True),
+        ("-pm m", False, True),
+        ("-f m", True, False),
+    ],
 )
 def test_what_takes_over_and_what_queues_up(line, replace, has_end):
     made = columns(line)

@@ -16,7 +16,15 @@ SECOND = 1_000_000_000
 
 
 def status(stopped_ns: int = 0, **device: Any) -> dict[str, Any]:
-    one = {"name": "mod0", "state": "up", "link": "good", "deaths": 0, "reason": "", "link_reason": "", **device}
+    one = {
+        "name": "mod0",
+        "state": "up",
+        "link": "good",
+        "deaths": 0,
+        "reason": "",
+        "link_reason": "",
+        **device,
+    }
     return {
         "workcell": "demo", "pid": 42, "stopped_ns": stopped_ns, "stop_source": "eva: hand", "devices": [one], "sessions": [],
     }  # fmt: skip
@@ -24,7 +32,15 @@ def status(stopped_ns: int = 0, **device: Any) -> dict[str, Any]:
 
 def node(node_class: NodeClass, names: list[str], reading: Any, **rest: Any) -> NodeView:
     info = node_info(node_class, names, width=8)
-    given = {"name": "mod0", "device": "mod0", "info": info, "snapshot": reading, "why": "", "holder": "", "rate_hz": None}
+    given = {
+        "name": "mod0",
+        "device": "mod0",
+        "info": info,
+        "snapshot": reading,
+        "why": "",
+        "holder": "",
+        "rate_hz": None,
+    }
     return NodeView(**{**given, **rest})
 
 
@@ -44,7 +60,16 @@ VIEW = View(status(), [AXIS, ANALOG, BINARY], "", "", 5 * SECOND)
 
 def test_everything_is_there():
     text = "\n".join(page(VIEW, 140))
-    for part in ("held by pid 7 (eva) devout", "1000/s", "0.100000 m", "moving", "fault", "buffer     3", "00000101  = 5  9 edges", "saturated"):
+    for part in (
+        "held by pid 7 (eva) devout",
+        "1000/s",
+        "0.100000 m",
+        "moving",
+        "fault",
+        "buffer     3",
+        "00000101  = 5  9 edges",
+        "saturated",
+    ):
         assert part in text
 
 

@@ -45,7 +45,10 @@ def test_long_options_mean_the_same_as_short_ones():
 
 
 def test_after_two_dashes_nothing_is_an_option():
-    assert [(i.kind, i.text) for i in scan("devout", ["--", "-r", "-1"])] == [("name", "-r"), ("number", "-1")]
+    assert [(i.kind, i.text) for i in scan("devout", ["--", "-r", "-1"])] == [
+        ("name", "-r"),
+        ("number", "-1"),
+    ]
 
 
 @pytest.mark.parametrize("word", ["--help", "--version"])
@@ -79,7 +82,13 @@ def test_wrong_lines_are_refused_in_a_sentence(tool, words, said):
 
 @pytest.mark.parametrize(
     ("flags", "chosen"),
-    [({}, [0, 1, 2, 3]), ({"l": 1}, [1, 2, 3]), ({"h": 1}, [0, 1]), ({"l": 1, "h": 3}, [1, 2, 3]), ({"n": 2}, [2])],
+    [
+        ({}, [0, 1, 2, 3]),
+        ({"l": 1}, [1, 2, 3]),
+        ({"h": 1}, [0, 1]),
+        ({"l": 1, "h": 3}, [1, 2, 3]),
+        ({"n": 2}, [2]),
+    ],
 )
 def test_choice_of_structures(flags, chosen):
     assert list(Target("mod0", flags).channels(4)) == chosen
