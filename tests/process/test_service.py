@@ -372,7 +372,7 @@ def test_a_daemon_told_to_end_while_it_starts_ends_without_a_traceback(
     daemon = start_daemon(ready=False)
     wait_for(lambda: os.path.exists(daemon.socket), "the socket")
     daemon.running.signal(signal.SIGINT)
-    assert daemon.running.wait_exit() == 0
+    assert daemon.running.wait_exit() in (0, -signal.SIGINT)  # the latter before it listens to signals
     assert "Traceback" not in "".join(daemon.running.lines)
 
 
