@@ -134,8 +134,8 @@ def to_toml(model: SensorModel) -> str:
 def corrected(model: SensorModel, nominal: Finger | None, dead: tuple[int, ...] = ()) -> Finger:
     """Return the finger that driver and estimator load: elements, body and contact as the model now has them.
 
-    The turn of the fixture belongs to the rig and not to the finger; creep, drift and strips have no place in a finger's
-    file and stay in the model.
+    The turn of the fixture belongs to the rig and not to the finger; creep and drift have no place in a finger's file,
+    and strips are what a calibration finds: all three stay in the model.
     """
     b: Belief = model.belief()
     if nominal is None:
