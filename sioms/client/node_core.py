@@ -203,6 +203,8 @@ class NodeCore:
             state = {
                 PageState.STALE: "its driver is gone or hung",
                 PageState.STARTING: "its device is starting",
+                PageState.LINK_LOST: "the link to its device is lost",
+                PageState.CLOSED: "its driver has ended",
             }
             what = state.get(error.state, f"its device is in {error.state.name.lower().replace('_', ' ')}")
             return OSError(errno.EIO, f"read {self.name}: {what}: {why}")
