@@ -130,7 +130,7 @@ class Node(NodeCore):
     emergency_stop = stop_all
 
     def reset(self) -> None:
-        """Clear a latched stop or fault of this node. Nothing resumes."""
+        """Clear a latched stop or fault of this node; shown from the next tick on. Nothing resumes."""
         self.ioctl(Request.RESET)
 
     def cancel_waits(self) -> int:

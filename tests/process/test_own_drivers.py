@@ -138,6 +138,7 @@ def test_the_linear_stage(start: Callable[..., Any], short_folder: Path) -> None
         wire.wait_up("stage0")
         assert wire.state("velocity") == 0, "nothing resumes"
         node.reset()
+        wait_for(lambda: not node.read().status[0] & AxisStatus.FAULT, "the reset of the loss")
         wire.tell("place -0.299")
         node.command(velocity=-0.05)
         wait_for(lambda: node.read().status[0] & AxisStatus.FAULT, "the limit switch")
