@@ -1,131 +1,33 @@
-"""The report of one reconciliation: a self-contained page, verdict.json and the terminal's ten lines."""
+"""The report on an axis: a self-contained page, verdict.json and the terminal's ten lines."""
 
 from __future__ import annotations
 
-import base64
 import html
-import io
-import json
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sioms.reconcile.effects import library
 from sioms.reconcile.session import knobs
-from sioms.reconcile.verdict import Gap, NamedEffect, Outcome, Verdict
+from sioms.reconcile.verdict import Gap, Verdict
+from sioms.tools import reconcile_page
+from sioms.tools.reconcile_page import NO_PICTURES, gap_of, image, number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-HEAD = {
-    Outcome.NONE: "Nothing is missing: the model agrees with the measurement down to the noise.",
-    Outcome.NAMED: "Found what the model lacks.",
-    Outcome.UNEXPLAINED: "Something is missing that no effect of the library explains.",
-    Outcome.AMBIGUOUS: "Something is missing, but these records cannot tell which of the look-alikes it is.",
-}
-STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;max-width:66rem;margin:2rem auto;padding:0 1rem;color:#1c2733;background:#fff}
-h1{font-size:1.5rem;margin-bottom:.2rem} h2{font-size:1.15rem;margin-top:2rem;border-bottom:1px solid #cfd8e0}
-.verdict{padding:.8rem 1rem;border-left:6px solid #2a7;background:#eef8f3} .unexplained{border-color:#c50;background:#fdf2ea}
-.ambiguous{border-color:#c90;background:#fdf8e6} table{border-collapse:collapse;margin:.6rem 0} td,th{padding:.2rem .7rem;
-border-bottom:1px solid #dde4ea;text-align:left} td.n{text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums}
-code{background:#eef2f5;padding:0 .3em} img{max-width:100%} .small{font-size:.85rem;color:#52606d}
-"""
-
-
-def headline(v: Verdict) -> str:
-    """One sentence."""
-    if v.outcome is Outcome.UNEXPLAINED and v.effects:
-        return "Found part of what the model lacks; something remains that no effect of the library explains."
-    return HEAD[v.outcome]
-
-
-def number(value: float) -> str:
-    """Four significant digits."""
-    return f"{value:.4g}"
-
 
 def summary(v: Verdict, out: str) -> list[str]:
-    """Say the verdict in at most ten lines."""
-    lines = [f"verdict: {v.outcome.value} - {headline(v)}"]
-    for e in v.effects[:3]:
-        lines.append("  " + _line(e))
-    lines += [f"  unexplained part looks like {_line(e)}" for e in v.symbolic[:2]]
-    if v.alternatives:
-        lines.append(
-            "  not told apart: "
-            + " or ".join([_names(e.name for e in v.effects), *map(_names, v.alternatives)])
-        )
-    if v.experiment is not None:
-        lines.append(
-            f"  decide by: {v.experiment.text} (rivals differ by {v.experiment.separation:.0f} times the noise)"
-        )
-    gap = v.gaps[min(1, len(v.gaps) - 1)]
-    lines.append(
-        f"gap on untouched samples, {gap.channel}: {number(gap.before)} before, {number(gap.after)} after, "
-        f"floor {number(gap.floor)} {gap.unit}"
-    )
-    if v.notes:
-        lines.append(f"note: {v.notes[-1]}")
-    lines.append(f"report: {out}")
-    return lines[:10]
-
-
-def _names(names: Any) -> str:
-    return " + ".join(names) or "nothing"
-
-
-def _line(e: NamedEffect) -> str:
-    values = ", ".join(
-        f"{p.symbol} = {number(p.value)} {p.unit}".rstrip(" 1") + f" [{number(p.low)}, {number(p.high)}]"
-        for p in e.parameters[:3]
-    )
-    return f"{e.title}: {values}"
+    """Say the verdict in at most ten lines; the gap in force, or of the one channel there is."""
+    return reconcile_page.summary(v, v.gaps[min(1, len(v.gaps) - 1)], out)
 
 
 def as_json(v: Verdict, seconds: float) -> str:
     """Everything a program wants from the verdict."""
-
-    def effect(e: NamedEffect) -> dict[str, Any]:
-        return {
-            "name": e.name,
-            "title": e.title,
-            "equation": e.equation,
-            "channel": e.channel,
-            "saved": e.saved,
-            "standard_errors": e.errors,
-            "selection_frequency": e.frequency,
-            "evidence": list(e.evidence),
-            "ruled_out": e.ruled_out,
-            "not_ruled_out": e.open,
-            "parameters": {
-                p.symbol: {"value": p.value, "low": p.low, "high": p.high, "unit": p.unit}
-                for p in e.parameters
-            },
-        }
-
-    table = {
-        "verdict": v.outcome.value,
-        "effects": [e.name for e in v.effects],
-        "parameters": {e.name: {p.symbol: p.value for p in e.parameters} for e in v.effects},
-        "alternatives": [list(a) for a in v.alternatives],
-        "separating_experiment": v.experiment.text if v.experiment else "",
-        "separation_in_noise": v.experiment.separation if v.experiment else None,
-        "details": [effect(e) for e in v.effects],
-        "symbolic": [effect(e) for e in v.symbolic],
+    more = {
         "gaps": [
-            {
-                "channel": g.channel,
-                "unit": g.unit,
-                "before": g.before,
-                "after": g.after,
-                "floor": g.floor,
-                "frozen_later_half": g.frozen,
-                "session_later_half": g.session,
-                "closed": g.closed,
-            }
-            for g in v.gaps
+            {**gap_of(g), "frozen_later_half": g.frozen, "session_later_half": g.session} for g in v.gaps
         ],
         "ladder": [
             {
@@ -140,27 +42,16 @@ def as_json(v: Verdict, seconds: float) -> str:
         ],
         "not_excited": v.gate.missing,
         "same_in_these_records": [list(p) for p in v.gate.pairs],
-        "located": [{"variable": p.variable, "explained": p.explained, "p": p.p} for p in v.places],
         "residual_over_floor": v.ratio,
-        "smoother_share": v.smoother_share,
-        "burst_share": v.burst_share,
         "session": {name: {k: getattr(s, k) for k in knobs(v.model)} for name, s in v.states},
-        "effective_samples": v.effective_samples,
-        "samples": v.samples,
-        "notes": list(v.notes),
-        "seconds": seconds,
     }
-    return json.dumps(table, indent=1, default=float) + "\n"
+    return reconcile_page.as_json(v, more, seconds)
 
 
 def page(v: Verdict, seconds: float) -> str:
     """Make the self-contained HTML page."""
     pictures = _pictures(v)
-    parts = [
-        f"<!doctype html><html lang=en><meta charset=utf-8><title>{html.escape(v.nominal.name)}: reconcile</title>"
-        f"<style>{STYLE}</style><h1>{html.escape(v.nominal.name)}: simulation against measurement</h1>",
-        f"<p class='verdict {v.outcome.value}'><b>{v.outcome.value}</b> - {headline(v)}</p>",
-    ]
+    parts = [reconcile_page.opening(v)]
     parts.append(_what(v))
     parts.append(
         "<h2>How far the gap shrank</h2><p>Root mean square on samples that took no part in any choice.</p>"
@@ -173,9 +64,11 @@ def page(v: Verdict, seconds: float) -> str:
     )
     parts.append(
         "<h2>Why we believe it, and what else it could have been</h2>"
-        + "".join(map(_why, (*v.effects, *v.symbolic)))
+        + reconcile_page.why((*v.effects, *v.symbolic), _title)
     )
-    parts.append(_next(v))
+    parts.append(
+        reconcile_page.what_next(v, "their forces then differ", v.gate.missing, v.gate.pairs, _title)
+    )
     parts.append("<h2>How it was found</h2>" + _ladder(v))
     parts.append(
         f"<p class=small>{v.samples} samples count as {v.effective_samples:.0f} independent ones; the residual of the final "
@@ -272,34 +165,9 @@ def _where(v: Verdict) -> str:
     return f"<p>Force residual of the old model with measured motion: {text}.</p>"
 
 
-def _why(e: NamedEffect) -> str:
-    items = [*e.evidence, f"it earns its place in {100 * e.frequency:.0f} % of block bootstrap replicates"]
-    items += [f"{library()[n].title}: ruled out, {t}" for n, t in e.ruled_out.items() if n in library()]
-    items += [
-        f"<b>{library()[n].title}: not ruled out</b>, it {t}" for n, t in e.open.items() if n in library()
-    ]
-    return f"<h3>{html.escape(e.title)}</h3><ul>" + "".join(f"<li>{i}" for i in items) + "</ul>"
-
-
-def _next(v: Verdict) -> str:
-    parts = []
-    if v.experiment is not None:
-        parts.append(
-            f"<p>To decide between the look-alikes: <b>{html.escape(v.experiment.text)}</b>; their forces then differ by "
-            f"{v.experiment.separation:.0f} times the drive noise.</p>"
-        )
-    if v.gate.missing:
-        rows = "".join(
-            f"<li>{library()[n].title}: {html.escape(t)}" for n, t in v.gate.missing.items() if n in library()
-        )
-        parts.append(
-            f"<p>Not excited by these records, and so not judged (with the record that would show it):</p><ul>{rows}</ul>"
-        )
-    if v.gate.pairs:
-        pairs = "; ".join(f"{a} and {b} ({100 * c:.0f} % in common)" for a, b, c in v.gate.pairs)
-        parts.append(f"<p>Look the same in these records: {pairs}.</p>")
-    parts += [f"<p>{html.escape(n)}</p>" for n in v.notes]
-    return "<h2>Next</h2>" + "".join(parts) if parts else ""
+def _title(name: str) -> str | None:
+    known = library()
+    return known[name].title if name in known else None
 
 
 def _ladder(v: Verdict) -> str:
@@ -320,23 +188,17 @@ def _pictures(v: Verdict) -> dict[str, str]:
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        return {"gap": "<p class=small>Pictures need matplotlib (the extra <code>report</code>).</p>"}
+        return NO_PICTURES
     out = {}
     if v.traces:
-        out["gap"] = _image(
+        out["gap"] = image(
             _gap_picture(Figure(figsize=(11, 1.9 * min(len(v.traces), 4) + 1), layout="constrained"), v)
         )
     if v.places:
-        out["places"] = _image(_place_picture(Figure(figsize=(11, 3.2), layout="constrained"), v))
+        out["places"] = image(_place_picture(Figure(figsize=(11, 3.2), layout="constrained"), v))
     if v.spectra is not None:
-        out["spectra"] = _image(_spectrum_picture(Figure(figsize=(11, 2.6), layout="constrained"), v))
+        out["spectra"] = image(_spectrum_picture(Figure(figsize=(11, 2.6), layout="constrained"), v))
     return out
-
-
-def _image(figure: Figure) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=80)
-    return f"<img alt='' src='data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}'>"
 
 
 def _gap_picture(figure: Figure, v: Verdict) -> Figure:

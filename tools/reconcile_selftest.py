@@ -7,46 +7,19 @@ folder with the public part only.
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
-import tempfile
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.simulate import simulate
 from sioms.reconcile_selftest.draw import CONFOUNDED, NAMED, NAMELESS, SAMPLE_S, Axis, commands, draw_axis
-from sioms.reconcile_selftest.score import Scored, score, table
+from sioms.reconcile_selftest.score import Scored, score
 from sioms.reconcile_selftest.world import Recording, World
+from sioms.tools.reconcile_blind import in_turn, judge_all, solve
 from sioms.tools.reconcile_input import read_model
 
-#: The mixture of kinds, repeated: out of twenty axes.
-MIXTURE = (
-    "null",
-    "single",
-    "multi",
-    "unknown",
-    "single",
-    "confounded",
-    "multi",
-    "single",
-    "null",
-    "multi",
-    "single",
-    "unknown",
-    "null",
-    "single",
-    "confounded",
-    "multi",
-    "single",
-    "unknown",
-    "multi",
-    "single",
-)
 RECORD_S = 5.0
 COLUMNS = """[columns]
 time = { name = "time", unit = "s" }
@@ -61,20 +34,8 @@ index = { name = "index" }
 def generate(count: int, seed: int) -> list[Axis]:
     """Draw the axes of a test; every effect comes up in turn."""
     rng = np.random.default_rng(seed)
-    turns = {
-        "single": list(rng.permutation(NAMED)),
-        "unknown": list(rng.permutation(NAMELESS)),
-        "confounded": list(rng.permutation(list(CONFOUNDED))),
-    }
-    out = []
-    for i in range(count):
-        kind = MIXTURE[i % len(MIXTURE)]
-        only = ""
-        if kind in turns:
-            only = str(turns[kind][0])
-            turns[kind] = turns[kind][1:] + turns[kind][:1]
-        out.append(draw_axis(f"axis{i:03d}", kind, rng, only))
-    return out
+    effects = {"single": NAMED, "unknown": NAMELESS, "confounded": CONFOUNDED}
+    return [draw_axis(f"axis{i:03d}", kind, rng, only) for i, kind, only in in_turn(count, rng, effects)]
 
 
 def record_all(
@@ -142,49 +103,6 @@ def write_public(axis: Axis, recordings: list[Recording], folder: Path) -> None:
     (folder / "nominal.toml").write_text("\n".join(lines) + "\n")
 
 
-def solve(folder: Path, resample: int | None = None) -> dict[str, Any]:
-    """Solve one axis in a process of its own, on one core; return its verdict.
-
-    Args:
-        resample: seed with which the blocks of time are drawn anew.
-    """
-    out = folder / ("report" if resample is None else f"again{resample}")
-    options = ["--jobs", "1", "--quiet", *([] if resample is None else ["--resample", str(resample)])]
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "sioms.tools.reconcile",
-            "axis",
-            str(folder),
-            "--model",
-            str(folder / "nominal.toml"),
-            "--columns",
-            str(folder / "columns.toml"),
-            "--out",
-            str(out),
-            *options,
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-    )
-    answer = out / "verdict.json"
-    if not answer.exists():
-        return {
-            "verdict": f"error: exit {done.returncode}: {done.stderr.strip()[-300:]}",
-            "effects": [],
-            "alternatives": [],
-            "separating_experiment": "",
-            "details": [],
-            "gaps": [],
-            "seconds": 0.0,
-        }
-    found: dict[str, Any] = json.loads(answer.read_text())
-    return found
-
-
 def selftest(count: int, seed: int, out: Path | None = None, jobs: int = 0, replicates: int = 0) -> int:
     """Run the blind test and print the table.
 
@@ -198,32 +116,21 @@ def selftest(count: int, seed: int, out: Path | None = None, jobs: int = 0, repl
     """
     axes = generate(count, seed)
     print(f"generating {count} axes", file=sys.stderr, flush=True)
-    recordings = record_all(axes, seed, heldout=True)
-    rows: list[Scored] = []
-    with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(jobs or os.cpu_count() or 1) as pool:
-        base = out if out is not None else Path(temporary)
-        for axis, records in zip(axes, recordings, strict=True):
-            write_public(axis, records[:4], base / axis.name)
-        work = [
-            pool.submit(_judge, axis, records, base / axis.name, replicates)
-            for axis, records in zip(axes, recordings, strict=True)
-        ]
-        for future in work:
-            row = future.result()
-            rows.append(row)
-            drawn = row.axis
-            hidden = ", ".join((*drawn.named, *drawn.nameless)) or "nothing"
-            print(
-                f"{drawn.name} {drawn.kind:10s} {'right' if row.right else 'WRONG'}  hidden {hidden} | {row.verdict}: "
-                f"{', '.join(row.got) or '-'} ({row.seconds:.0f} s)",
-                flush=True,
-            )
-    print(table(rows))
-    return 0 if sum(r.right for r in rows) >= 0.9 * len(rows) else 1
+    recordings = dict(zip((a.name for a in axes), record_all(axes, seed, heldout=True), strict=True))
+
+    def judge(axis: Axis, folder: Path) -> Scored:
+        records = recordings[axis.name]
+        write_public(axis, records[:4], folder)
+        return _judge(axis, records, folder, replicates)
+
+    return judge_all(axes, judge, out, jobs)
 
 
 def _judge(axis: Axis, records: list[Recording], folder: Path, replicates: int) -> Scored:
-    answer = solve(folder)
-    again = [solve(folder, i) for i in range(replicates)]
+    options = ("--jobs", "1")
+    answer = solve(folder, "axis", *options)
+    again = [
+        solve(folder, "axis", *options, "--resample", str(i), report=f"again{i}") for i in range(replicates)
+    ]
     share = closed(folder, records) if (folder / "report" / "model.toml").exists() else None
     return score(axis, answer, share, again)

@@ -6,13 +6,8 @@ folder with recordings, column description and nominal model.
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
 import sys
-import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +17,9 @@ from sioms.reconcile_selftest import finger_draw, force_world
 from sioms.reconcile_selftest.finger_draw import HiddenFinger, draw_finger
 from sioms.reconcile_selftest.finger_world import FingerWorld
 from sioms.reconcile_selftest.force_world import COMPONENTS, HiddenSensor, draw_sensor, record
-from sioms.reconcile_selftest.score import Scored, table
+from sioms.reconcile_selftest.score import Scored
 from sioms.reconcile_selftest.sensors import score_sensor
-from sioms.tools.reconcile_selftest import MIXTURE
+from sioms.tools.reconcile_blind import MIXTURE, in_turn, judge_all, solve
 
 COLUMNS = (
     "\n".join(
@@ -48,18 +43,13 @@ def generate(
     """Draw the sensors of a test; every effect comes up in turn."""
     rng = np.random.default_rng(seed)
     source = finger_draw if subject == "tactile" else force_world
-    turns = {"single": list(rng.permutation(source.NAMED)), "unknown": list(rng.permutation(source.NAMELESS))}
+    effects = {"single": source.NAMED, "unknown": source.NAMELESS}
     if subject == "force":
-        turns["confounded"] = list(rng.permutation(list(force_world.CONFOUNDED)))
-    out: list[HiddenFinger | HiddenSensor] = []
-    for i in range(count):
-        kind, only = kinds[i % len(kinds)], ""
-        if kind in turns:
-            only = str(turns[kind][0])
-            turns[kind] = turns[kind][1:] + turns[kind][:1]
-        draw: Any = draw_finger if subject == "tactile" else draw_sensor
-        out.append(draw(f"{subject}{i:03d}", kind, rng, only))
-    return out
+        effects["confounded"] = tuple(force_world.CONFOUNDED)
+    draw: Any = draw_finger if subject == "tactile" else draw_sensor
+    return [
+        draw(f"{subject}{i:03d}", kind, rng, only) for i, kind, only in in_turn(count, rng, effects, kinds)
+    ]
 
 
 def write_public(hidden: HiddenFinger | HiddenSensor, folder: Path, seed: int) -> None:
@@ -73,42 +63,6 @@ def write_public(hidden: HiddenFinger | HiddenSensor, folder: Path, seed: int) -
         np.savez(folder / "loads.npz", **record(hidden, rng))  # type: ignore[arg-type]
         (folder / "columns.toml").write_text(COLUMNS)
     (folder / "nominal.toml").write_text(hidden.public())
-
-
-def solve(folder: Path, subject: str) -> dict[str, Any]:
-    """Solve one sensor in a process of its own, on one core; return its verdict."""
-    out = folder / "report"
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "sioms.tools.reconcile",
-            subject,
-            str(folder),
-            "--model",
-            str(folder / "nominal.toml"),
-            "--out",
-            str(out),
-            "--quiet",
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-    )
-    answer = out / "verdict.json"
-    if not answer.exists():
-        return {
-            "verdict": f"error: exit {done.returncode}: {done.stderr.strip()[-300:]}",
-            "effects": [],
-            "alternatives": [],
-            "separating_experiment": "",
-            "details": [],
-            "gaps": [],
-            "seconds": 0.0,
-        }
-    found: dict[str, Any] = json.loads(answer.read_text())
-    return found
 
 
 def judge(subject: str, hidden: HiddenFinger | HiddenSensor, folder: Path, seed: int) -> Scored:
@@ -125,16 +79,4 @@ def selftest(subject: str, count: int, seed: int, out: Path | None = None, jobs:
     """
     drawn = generate(subject, count, seed)
     print(f"generating {count} sensors", file=sys.stderr, flush=True)
-    rows: list[Scored] = []
-    with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(jobs or os.cpu_count() or 1) as pool:
-        base = out if out is not None else Path(temporary)
-        for row in pool.map(lambda h: judge(subject, h, base / h.name, seed), drawn):
-            rows.append(row)
-            hidden = ", ".join((*row.axis.named, *row.axis.nameless)) or "nothing"
-            print(
-                f"{row.axis.name} {row.axis.kind:10s} {'right' if row.right else 'WRONG'}  hidden {hidden} | {row.verdict}: "
-                f"{', '.join(row.got) or '-'} ({row.seconds:.0f} s)",
-                flush=True,
-            )
-    print(table(rows))
-    return 0 if sum(r.right for r in rows) >= 0.9 * len(rows) else 1
+    return judge_all(drawn, lambda hidden, folder: judge(subject, hidden, folder, seed), out, jobs)

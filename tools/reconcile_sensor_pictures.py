@@ -8,7 +8,7 @@ import numpy as np
 
 from sioms.reconcile.sensors.verdict import SensorVerdict
 from sioms.reconcile.verdict import Estimate, NamedEffect
-from sioms.tools.reconcile_report import _image
+from sioms.tools.reconcile_page import NO_PICTURES, image
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,9 +35,9 @@ def pictures(v: SensorVerdict) -> dict[str, str]:
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        return {"gap": "<p class=small>Pictures need matplotlib (the extra <code>report</code>).</p>"}
+        return NO_PICTURES
     out = {
-        "gap": _image(_gap_picture(Figure(figsize=(11, 0.6 + 0.35 * len(v.gaps)), layout="constrained"), v))
+        "gap": image(_gap_picture(Figure(figsize=(11, 0.6 + 0.35 * len(v.gaps)), layout="constrained"), v))
     }
     each = [
         (e.title, mine)
@@ -46,11 +46,11 @@ def pictures(v: SensorVerdict) -> dict[str, str]:
         if len(mine) > 1 and e.name != "dead_element"
     ]
     if each:
-        out["each"] = _image(_each_picture(Figure(figsize=(11, 2.6), layout="constrained"), each[:3]))
+        out["each"] = image(_each_picture(Figure(figsize=(11, 2.6), layout="constrained"), each[:3]))
     if v.curves:
-        out["curves"] = _image(_curve_picture(Figure(figsize=(11, 3.6), layout="constrained"), v))
+        out["curves"] = image(_curve_picture(Figure(figsize=(11, 3.6), layout="constrained"), v))
     if v.places:
-        out["places"] = _image(_place_picture(Figure(figsize=(11, 3.2), layout="constrained"), v))
+        out["places"] = image(_place_picture(Figure(figsize=(11, 3.2), layout="constrained"), v))
     return out
 
 

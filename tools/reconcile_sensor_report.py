@@ -3,112 +3,27 @@
 from __future__ import annotations
 
 import html
-import json
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.verdict import SensorVerdict
-from sioms.reconcile.verdict import Estimate, NamedEffect, Outcome
-from sioms.tools.reconcile_report import HEAD, STYLE, number
+from sioms.reconcile.verdict import Estimate
+from sioms.tools import reconcile_page
+from sioms.tools.reconcile_page import gap_of, number
 from sioms.tools.reconcile_sensor_pictures import columns, groups, pictures
 
 
-def headline(v: SensorVerdict) -> str:
-    """One sentence."""
-    if v.outcome is Outcome.UNEXPLAINED and v.effects:
-        return "Found part of what the model lacks; something remains that no effect of the library explains."
-    return HEAD[v.outcome]
-
-
 def summary(v: SensorVerdict, out: str) -> list[str]:
-    """Say the verdict in at most ten lines."""
-    lines = [f"verdict: {v.outcome.value} - {headline(v)}"]
-    lines += ["  " + _line(e) for e in v.effects[:4]]
-    lines += [f"  unexplained part looks like {_line(e)}" for e in v.symbolic[:2]]
-    if v.alternatives:
-        sets = [[e.name for e in v.effects], *v.alternatives]
-        lines.append("  not told apart: " + " or ".join(" + ".join(s) or "nothing" for s in sets))
-    if v.experiment is not None:
-        lines.append(
-            f"  decide by: {v.experiment.text} (rivals differ by {v.experiment.separation:.0f} times the noise)"
-        )
-    gap = max(v.gaps, key=lambda g: g.before / g.floor)
-    lines.append(
-        f"gap on what took no part, {gap.channel}: {number(gap.before)} before, {number(gap.after)} after, floor "
-        f"{number(gap.floor)} {gap.unit}"
-    )
-    if v.notes:
-        lines.append(f"note: {v.notes[-1]}")
-    lines.append(f"report: {out}")
-    return lines[:10]
-
-
-def _line(e: NamedEffect) -> str:
-    """Name an effect with its values; of a number for every element, the spread."""
-    parts = [
-        f"{p.symbol} = {number(p.value)} {p.unit}".removesuffix(" 1")
-        + f" [{number(p.low)}, {number(p.high)}]"
-        for p in e.parameters
-        if "[" not in p.symbol
-    ]
-    each = [p for p in e.parameters if "[" in p.symbol]
-    if each:
-        values = np.array([p.value for p in each])
-        name, unit = each[0].symbol.split("[")[0], each[0].unit
-        parts.insert(
-            0,
-            f"{name} from {number(float(values.min()))} to {number(float(values.max()))} {unit}".removesuffix(
-                " 1"
-            )
-            + f", mean {number(float(values.mean()))}",
-        )
-    return f"{e.title}: {', '.join(parts[:4])}"
+    """Say the verdict in at most ten lines; the largest gap before."""
+    return reconcile_page.summary(v, max(v.gaps, key=lambda g: g.before / g.floor), out)
 
 
 def as_json(v: SensorVerdict, seconds: float) -> str:
     """Everything a program wants from the verdict; the keys are those of the axis."""
-
-    def effect(e: NamedEffect) -> dict[str, Any]:
-        return {
-            "name": e.name,
-            "title": e.title,
-            "equation": e.equation,
-            "channel": e.channel,
-            "saved": e.saved,
-            "standard_errors": min(e.errors, 1e6),
-            "selection_frequency": e.frequency,
-            "evidence": list(e.evidence),
-            "ruled_out": e.ruled_out,
-            "not_ruled_out": e.open,
-            "parameters": {
-                p.symbol: {"value": p.value, "low": p.low, "high": p.high, "unit": p.unit}
-                for p in e.parameters
-            },
-        }
-
-    table = {
-        "verdict": v.outcome.value,
-        "effects": [e.name for e in v.effects],
-        "parameters": {e.name: {p.symbol: p.value for p in e.parameters} for e in v.effects},
-        "alternatives": [list(a) for a in v.alternatives],
-        "separating_experiment": v.experiment.text if v.experiment else "",
-        "separation_in_noise": v.experiment.separation if v.experiment else None,
-        "details": [effect(e) for e in v.effects],
-        "symbolic": [effect(e) for e in v.symbolic],
-        "gaps": [
-            {
-                "channel": g.channel,
-                "unit": g.unit,
-                "before": g.before,
-                "after": g.after,
-                "floor": g.floor,
-                "closed": g.closed,
-            }
-            for g in v.gaps
-        ],
+    more = {
+        "gaps": [gap_of(g) for g in v.gaps],
         "ladder": [
             {"action": s.action, "effect": s.effect, "ratio": s.ratio, "saved": s.saved, "rivals": s.rivals}
             for s in v.ladder
@@ -116,26 +31,16 @@ def as_json(v: SensorVerdict, seconds: float) -> str:
         "not_excited": v.missing,
         "same_in_these_records": [list(p) for p in v.pairs],
         "residual_over_floor": v.floors,
-        "located": [{"variable": p.variable, "explained": p.explained, "p": p.p} for p in v.places],
-        "smoother_share": v.smoother_share,
-        "burst_share": v.burst_share,
         "rejected": list(v.rejected),
-        "effective_samples": v.effective_samples,
-        "samples": v.samples,
-        "notes": list(v.notes),
-        "seconds": seconds,
     }
-    return json.dumps(table, indent=1, default=float) + "\n"
+    return reconcile_page.as_json(v, more, seconds)
 
 
 def page(v: SensorVerdict, seconds: float) -> str:
     """Make the self-contained HTML page."""
     drawn = pictures(v)
-    name = html.escape(v.nominal.name)
     parts = [
-        f"<!doctype html><html lang=en><meta charset=utf-8><title>{name}: reconcile</title><style>{STYLE}</style>"
-        f"<h1>{name}: simulation against measurement</h1>",
-        f"<p class='verdict {v.outcome.value}'><b>{v.outcome.value}</b> - {headline(v)}</p>",
+        reconcile_page.opening(v),
         _what(v),
         drawn.get("each", ""),
         "<h2>How far the gap shrank</h2><p>Root mean square on touches or loads that took no part in any choice (every fifth). The "
@@ -148,9 +53,10 @@ def page(v: SensorVerdict, seconds: float) -> str:
         _where(v),
         drawn.get("places", ""),
         "<h2>Why we believe it, and what else it could have been</h2>",
-        "".join(_why(e, v.nominal) for e in (*v.effects, *v.symbolic))
-        or "<p>There is nothing to believe in.</p>",
-        _next(v),
+        reconcile_page.why((*v.effects, *v.symbolic), lambda name: v.nominal.library[name].title),
+        reconcile_page.what_next(
+            v, "they then differ", v.missing, v.pairs, lambda name: v.nominal.library[name].title
+        ),
         "<h2>How it was found</h2>",
         _ladder(v),
     ]
@@ -230,37 +136,8 @@ def _where(v: SensorVerdict) -> str:
     )
 
 
-def _why(e: NamedEffect, model: SensorModel) -> str:
-    items = [
-        *map(html.escape, e.evidence),
-        f"it earns its place in {100 * e.frequency:.0f} % of block bootstrap replicates",
-    ]
-    items += [f"{_title(model, n)}: ruled out, {t}" for n, t in e.ruled_out.items()]
-    items += [f"<b>{_title(model, n)}: not ruled out</b>, it {t}" for n, t in e.open.items()]
-    return f"<h3>{html.escape(e.title)}</h3><ul>" + "".join(f"<li>{i}" for i in items) + "</ul>"
-
-
 def _title(model: SensorModel, name: str) -> str:
     return html.escape(model.library[name].title)
-
-
-def _next(v: SensorVerdict) -> str:
-    parts = []
-    if v.experiment is not None:
-        parts.append(
-            f"<p>To decide between the look-alikes: <b>{html.escape(v.experiment.text)}</b>; they then differ by "
-            f"{v.experiment.separation:.0f} times the noise.</p>"
-        )
-    if v.missing:
-        rows = "".join(f"<li>{_title(v.nominal, n)}: {html.escape(t)}" for n, t in v.missing.items())
-        parts.append(
-            f"<p>Not excited by these records, and so not judged (with the record that would show it):</p><ul>{rows}</ul>"
-        )
-    if v.pairs:
-        pairs = "; ".join(f"{a} and {b} ({100 * c:.0f} % in common)" for a, b, c in v.pairs)
-        parts.append(f"<p>Look the same in these records: {pairs}.</p>")
-    parts += [f"<p>{html.escape(n)}</p>" for n in v.notes]
-    return "<h2>Next</h2>" + "".join(parts) if parts else ""
 
 
 def _ladder(v: SensorVerdict) -> str:

@@ -36,6 +36,8 @@ class Hidden(Protocol):
     @property
     def kind(self) -> str: ...
     @property
+    def rival(self) -> str: ...
+    @property
     def named(self) -> Mapping[str, Any]: ...
     @property
     def nameless(self) -> Mapping[str, Any]: ...
@@ -63,6 +65,23 @@ class Scored:
     seconds: float
 
 
+def is_right(hidden: Hidden, answer: Mapping[str, Any]) -> bool:
+    """Tell whether a verdict (the parsed verdict.json) is the one that this kind of case demands."""
+    got, truth = set(answer["effects"]), set(hidden.named)
+    verdict = str(answer["verdict"])
+    match hidden.kind:
+        case "null":
+            return verdict == "none" and not got
+        case "confounded":
+            sets = [got, *(set(a) for a in answer["alternatives"])]
+            both = truth in sets and {hidden.rival} in sets
+            return verdict == "ambiguous" and both and bool(answer["separating_experiment"])
+        case "unknown":
+            return verdict == "unexplained" and got == truth
+        case _:
+            return verdict == "named" and got == truth
+
+
 def score(
     axis: Axis,
     answer: Mapping[str, Any],
@@ -77,21 +96,6 @@ def score(
     """
     got, truth = tuple(answer["effects"]), set(axis.named)
     verdict = str(answer["verdict"])
-    sets = [set(got), *(set(a) for a in answer["alternatives"])]
-    match axis.kind:
-        case "null":
-            right = verdict == "none" and not got
-        case "confounded":
-            right = (
-                verdict == "ambiguous"
-                and truth in sets
-                and {axis.rival} in sets
-                and bool(answer["separating_experiment"])
-            )
-        case "unknown":
-            right = verdict == "unexplained" and set(got) == truth
-        case _:
-            right = verdict == "named" and set(got) == truth
     errors, inside = [], []
     for detail in answer["details"]:
         name = detail["name"]
@@ -106,7 +110,7 @@ def score(
         axis,
         verdict,
         got,
-        right,
+        is_right(axis, answer),
         bool(got) and got[0] in truth,
         tuple(errors),
         tuple(inside),

@@ -9,7 +9,7 @@ import numpy as np
 
 from sioms.reconcile_selftest.finger_draw import HiddenFinger
 from sioms.reconcile_selftest.force_world import COMPONENTS, HiddenSensor
-from sioms.reconcile_selftest.score import Scored
+from sioms.reconcile_selftest.score import Scored, is_right
 
 #: The parameter that says how large an effect is.
 PRIMARY = {
@@ -39,21 +39,6 @@ def score_sensor(hidden: HiddenFinger | HiddenSensor, answer: Mapping[str, Any])
     """Score one verdict (the parsed verdict.json)."""
     got, truth = tuple(answer["effects"]), set(hidden.named)
     verdict = str(answer["verdict"])
-    sets = [set(got), *(set(a) for a in answer["alternatives"])]
-    match hidden.kind:
-        case "null":
-            right = verdict == "none" and not got
-        case "confounded":
-            right = (
-                verdict == "ambiguous"
-                and truth in sets
-                and {hidden.rival} in sets
-                and bool(answer["separating_experiment"])
-            )
-        case "unknown":
-            right = verdict == "unexplained" and set(got) == truth
-        case _:
-            right = verdict == "named" and set(got) == truth
     errors: list[float] = []
     inside: list[bool] = []
     for detail in answer["details"]:
@@ -67,7 +52,7 @@ def score_sensor(hidden: HiddenFinger | HiddenSensor, answer: Mapping[str, Any])
         hidden,
         verdict,
         got,
-        right,
+        is_right(hidden, answer),
         bool(got) and got[0] in truth,
         tuple(errors),
         tuple(inside),

@@ -17,7 +17,8 @@ from sioms.reconcile_selftest.draw import draw_axis
 from sioms.reconcile_selftest.score import score
 from sioms.tools import reconcile
 from sioms.tools.reconcile_input import read_data, read_model
-from sioms.tools.reconcile_selftest import generate, record_all, solve, write_public
+from sioms.tools.reconcile_blind import solve
+from sioms.tools.reconcile_selftest import generate, record_all, write_public
 
 AXES = Path(__file__).parent / "reconcile_axes"
 
@@ -97,7 +98,7 @@ def test_a_small_blind_test(tmp_path: Path) -> None:
         folder = tmp_path / axis.name
         write_public(axis, records, folder)
         assert not any("delay" in p.read_text() for p in folder.glob("*.toml"))
-        assert score(axis, solve(folder)).right
+        assert score(axis, solve(folder, "axis", "--jobs", "1")).right
 
 
 def test_the_draw_is_reproducible_and_mixed() -> None:
