@@ -81,7 +81,7 @@ def said(run: Running) -> str:
 
 @pytest.mark.timeout(240)
 def test_hidden_gains_are_named_and_the_driver_loads_the_finger(cell: Path, tmp_path: Path) -> None:
-    """Light touches: the simulated finger's own error, 0.3 % of its peak, stays below the noise."""
+    """Light touches: the finger's own error, 0.3 % of its peak, stays below the noise, which moves a gain by 0.005."""
     file = cell / "finger.toml"
     run = workflow(cell, tmp_path, "--yes", "--load", "80", "--most-load", str(MOST), "--install", str(file))
     assert run.wait_exit(200.0) == NAMED, said(run)
@@ -89,14 +89,14 @@ def test_hidden_gains_are_named_and_the_driver_loads_the_finger(cell: Path, tmp_
     assert found["effects"] == ["gain_scatter"]
     true = scattered(shape_of(PUBLIC, HIDDEN)).gains / 3.0 - 1.0
     given = [found["parameters"]["gain_scatter"][f"g[{i}]"] for i in range(ELEMENTS)]
-    assert np.allclose(given, true, atol=0.015)
+    assert np.allclose(given, true, atol=0.03)
     records = {p.name: np.load(p) for p in (tmp_path / "report" / "records").glob("*.npz")}
     assert set(records) == {"noise.npz", "places_0mm.npz", "loads_0mm.npz"}
     for name in set(records) - {"noise.npz"}:
         assert 0.5 * MOST < records[name]["force"].max() < 1.25 * MOST
 
     installed = from_toml(file.read_text())
-    assert np.allclose(np.array(installed.elements.gain) / 3.0 - 1.0, true, atol=0.015)
+    assert np.allclose(np.array(installed.elements.gain) / 3.0 - 1.0, given, atol=1e-6)
     with (
         sioms.Workcell(str(cell / "prober.sock"), "test") as session,
         session.open("tactile0.strain") as strain,
