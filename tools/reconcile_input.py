@@ -13,8 +13,11 @@ Column description (``columns.toml`` beside the data, or ``--columns``)::
     force          = { name = "vir",  unit = "V", scale = 35.15 }  # N mN kN, N m, mN m ...; value * scale
     force_measured = { name = "cur",  unit = "N" }
     index          = { name = "idx" }
+    feedforward    = { name = "ff",   unit = "N" }       # the part of force that is no feedback, a test signal for instance
+    external       = { name = "push", unit = "N" }       # known force on the axis beside the drive's
 
-A column that the data do not have, or a key that nobody reads, is an error.
+A column that the data do not have, or a key that nobody reads, is an error; a file may be without the last two when another
+has them.
 """
 
 from __future__ import annotations
@@ -46,7 +49,9 @@ WORDS = {
     "force": ("force", "torque", "u", "effort", "out", "output", "tau"),
     "index": ("index", "z", "mark"),
 }
-QUANTITIES = ("time", "position", "command", "force", "force_measured", "index")
+QUANTITIES = ("time", "position", "command", "force", "force_measured", "index", "feedforward", "external")
+#: Those which some files of a session may be without: there was none.
+SOMETIMES = ("feedforward", "external")
 #: What each quantity may be measured in, on a rotary and on a linear axis.
 ROTARY = {
     "time": "time",
@@ -55,8 +60,12 @@ ROTARY = {
     "force": "torque",
     "force_measured": "torque",
     "index": "number",
+    "feedforward": "torque",
+    "external": "torque",
 }
-LINEAR = {**ROTARY, "position": "length", "command": "length", "force": "force", "force_measured": "force"}
+LINEAR = {**ROTARY, "position": "length", "command": "length"} | dict.fromkeys(
+    ("force", "force_measured", "feedforward", "external"), "force"
+)
 
 
 def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Session:
@@ -104,6 +113,13 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
     records, final = (
         tuple(_record(f, table.get("columns", {}), model) for f in some) for some in (files, last)
     )
+    for quantity in SOMETIMES:
+        if quantity in table.get("columns", {}) and all(
+            getattr(r, quantity) is None for r in records + final
+        ):
+            raise BadInputError(
+                f"read {data}: no file has a column {table['columns'][quantity].get('name')!r} for {quantity}"
+            )
     return Session(records, bool(table.get("continuous", True)), final)
 
 
@@ -121,6 +137,8 @@ def _record(path: Path, columns: Mapping[str, Any], model: AxisModel) -> Record:
     for quantity, spec in columns.items():
         only(spec, ("name", "unit", "scale", "offset"), f"column {quantity}")
         head = table.find(str(spec.get("name")))
+        if head is None and quantity in SOMETIMES:
+            continue
         if head is None:
             raise BadInputError(
                 f"read {path.name}: no column {spec.get('name')!r} for {quantity}; has {', '.join(sorted(table.columns))}"
@@ -135,6 +153,8 @@ def _record(path: Path, columns: Mapping[str, Any], model: AxisModel) -> Record:
         found.get("force_measured"),
         None if index is None else index > 0.5,
         found.get("time"),
+        feedforward=found.get("feedforward"),
+        external=found.get("external"),
     )
 
 

@@ -3,10 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.signal import lfilter
 
 from sioms.reconcile.effect import Array
 from sioms.reconcile.fit import Problem
-from sioms.reconcile.model import AxisModel
+from sioms.reconcile.kernel import (
+    CTL_ALPHA,
+    CTL_K,
+    CTL_KB,
+    CTL_KP,
+    CTL_KZ,
+    CTL_MAX,
+    CTL_MEAN,
+    CTL_OFFSET,
+)
+from sioms.reconcile.model import AxisModel, controller_row
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.screen import dead_band, direction, smoothed_motion
 from sioms.reconcile.verdict import BadInputError
@@ -18,6 +29,8 @@ LEAST_TOTAL_S = 2.0
 UNIT_FACTOR = 60.0
 #: Share of samples at the controller's limit above which nothing is left to learn.
 SATURATED = 0.5
+#: Share of the force above which what feedback does not explain is told, and samples until a filter of speed has settled.
+FOREIGN, SETTLED = 0.05, 100
 
 
 def check(session: Session, model: AxisModel) -> tuple[str, ...]:
@@ -31,7 +44,7 @@ def check(session: Session, model: AxisModel) -> tuple[str, ...]:
     """
     if not session.records:
         raise BadInputError("read records: there are none; give at least one recording of the axis")
-    for r in session.records:
+    for r in session.records + session.final:
         _check_record(r, model)
     seconds = session.samples * model.sample_time_s
     if seconds < LEAST_TOTAL_S:
@@ -56,6 +69,8 @@ def _check_record(r: Record, model: AxisModel) -> None:
         ("force", r.force),
         ("command", r.command),
         ("force_measured", r.force_measured),
+        ("feedforward", r.feedforward),
+        ("external", r.external),
     ):
         if a is None:
             continue
@@ -139,7 +154,34 @@ def _notes(session: Session, model: AxisModel) -> list[str]:
         )
     if model.controller is not None and any(r.command is None for r in session.records):
         out.append("no command recorded: the closed loop is not simulated, gaps are given in force only")
+    if model.controller is not None:
+        shares = [(r.name, _beyond_feedback(r, model)) for r in session.records + session.final]
+        if odd := [f"{name} {100 * share:.0f} %" for name, share in shares if share > FOREIGN]:
+            out.append(
+                "the controller of the model does not make the recorded force from command and position (off by, share of the "
+                f"force: {', '.join(odd)}), and the closed loop suffers; if a feed-forward or a test signal was added, "
+                "name its column feedforward"
+            )
     return out
+
+
+def _beyond_feedback(r: Record, model: AxisModel) -> float:
+    """Size of the recorded force that the controller does not explain, over the size of the force; 0 without a command.
+
+    The size is the 98th percentile, so that some interpolated samples do not count.
+    """
+    if r.command is None or len(r) < LEAST_SAMPLES:
+        return 0.0
+    c, y = controller_row(model), r.position
+    e, own = r.command - y, r.force - (0.0 if r.feedforward is None else r.feedforward)
+    if c[CTL_MEAN] > 0.0:
+        v = 0.5 * (y - np.concatenate([y[:1], y[:1], y[:-2]])) / model.sample_time_s
+    else:
+        steps = np.diff(y, prepend=y[0]) / model.sample_time_s
+        v = lfilter([c[CTL_ALPHA]], [1.0, c[CTL_ALPHA] - 1.0], steps)
+    u = c[CTL_K] * (e[1:] + c[CTL_KZ] * e[:-1]) - c[CTL_KP] * own[:-1] + c[CTL_KB] * v[1:] + c[CTL_OFFSET]
+    off = np.abs(own[1:] - np.clip(u, -c[CTL_MAX], c[CTL_MAX]))[SETTLED:]
+    return float(np.quantile(off, 0.98) / max(float(np.quantile(np.abs(own), 0.98)), 1e-300))
 
 
 def check_scale(problem: Problem, model: AxisModel) -> None:
@@ -165,7 +207,7 @@ def check_scale(problem: Problem, model: AxisModel) -> None:
         )
         for m in motions
     ]
-    a, u = problem.join(columns), problem.join([m.u for m in motions])
+    a, u = problem.join(columns), problem.join([m.u + m.outer for m in motions])
     size = np.linalg.norm(a, axis=0)
     size[size == 0.0] = 1.0
     c = np.linalg.lstsq(a / size, u, rcond=1e-10)[0] / size

@@ -72,9 +72,11 @@ class Problem:
         packed, falling = pack(model), _falls(model)
         temperature, out = 0.0, []
         for r in self.session.records:
-            run = track(model, r.position, r.force, self.noise.gain, temperature, packed)
+            run = track(model, r.position, r.force, self.noise.gain, temperature, packed, external=r.external)
             if falling and (level := self._lost(run)) < np.inf:
-                run = track(model, r.position, r.force, self.noise.gain, temperature, packed, level)
+                run = track(
+                    model, r.position, r.force, self.noise.gain, temperature, packed, level, r.external
+                )
             temperature = run.end_temperature if self.session.continuous else 0.0
             out.append(run)
         return out

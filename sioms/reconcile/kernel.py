@@ -153,6 +153,7 @@ def march(
     command: Array,
     measured: Array,
     force_in: Array,
+    external: Array,
     ctl: Array,
     plant: Array,
     forces: Any,
@@ -174,7 +175,9 @@ def march(
     """Run the axis over one record.
 
     Args:
-        command, measured, force_in: shape (n,); ``command`` is read when closed, the others when tracking.
+        command, measured, force_in: shape (n,); ``command`` is read when closed, ``measured`` when tracking; ``force_in``
+            is the whole force when tracking, and what is added to the controller's when closed.
+        external: force on the axis beside the drive's, shape (n,).
         lost: innovation at which, held for ``PATIENCE`` samples, the speed is taken from the measurement.
         start: x, v, temperature, and error and force of the controller at the sample before the first.
         out: shape (n, OUT_SIZE), filled.
@@ -220,6 +223,7 @@ def march(
             )
             u = min(max(u, -ctl[CTL_MAX]), ctl[CTL_MAX])
             e_old, u_old = e, u
+            u = min(max(u + force_in[i], -ctl[CTL_MAX]), ctl[CTL_MAX])
             innovation = 0.0
         else:
             u = force_in[i]
@@ -268,7 +272,7 @@ def march(
             level = 0.0
             if v != 0.0 and nl > 0:
                 level = sign * friction(level_of, nl, pl, x, v, ua, temp)
-            base = drive + smooth(force_of, nf, pf, x, v, ua, temp) - hyst
+            base = drive + external[i] + smooth(force_of, nf, pf, x, v, ua, temp) - hyst
             link = coupling(plant, x - xl, v - vl) if two else 0.0
             a0 = (base - plant[VISCOUS] * v - level - link) / jm
             vp = v + 0.5 * h * a0

@@ -63,7 +63,7 @@ def force_residual(problem: Problem, model: AxisModel) -> tuple[list[Motion], li
     sos = butter(3, min(2.0 * cutoff * dt, 0.8), output="sos")
     out = []
     for m in motions:
-        u = sosfiltfilt(sos, m.u, padtype="odd", padlen=min(300, len(m.u) - 1))
+        u = sosfiltfilt(sos, m.u + m.outer, padtype="odd", padlen=min(300, len(m.u) - 1))
         # the force of sample n acts from n to n + 1: half a sample late against the speed at n
         u = 0.5 * (u + np.concatenate([u[:1], u[:-1]]))
         lacking = model.inertia * m.a + model.viscous * m.v - u - _known_force(model, m, dead)

@@ -18,12 +18,14 @@ class Record:
 
     Attributes:
         position: measured, [{x}].
-        force: command of the controller, held over each sample, [{F}].
+        force: command to the drive, held over each sample, [{F}].
         command: position command, [{x}], or None.
         force_measured: drive current times the nominal constant, mean over each sample, or None.
         index: True where an index mark was passed during the sample, or None.
         time_s: time stamps, or None where the sample time is taken on trust.
         filled: True where a sample was lost and is interpolated, or None.
+        feedforward: the part of ``force`` that is no feedback (a feed-forward, an injected test signal), or None.
+        external: known force that acts on the axis beside the drive's, held over each sample, [{F}], or None.
     """
 
     name: str
@@ -34,6 +36,8 @@ class Record:
     index: NDArray[np.bool_] | None = None
     time_s: Array | None = None
     filled: NDArray[np.bool_] | None = None
+    feedforward: Array | None = None
+    external: Array | None = None
 
     def __len__(self) -> int:
         return len(self.position)

@@ -38,13 +38,14 @@ STATE_SLOTS = (Slot.FORCE, Slot.FRICTION, Slot.GAIN, Slot.MODULATION)
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Smoothed motion of one record; arrays of shape (n,)."""
+    """Smoothed motion of one record; arrays of shape (n,). ``u`` is the drive's force, ``outer`` a known one beside it."""
 
     x: Array
     v: Array
     a: Array
     u: Array
     temperature: Array
+    outer: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +72,8 @@ def smoothed_motion(problem: Problem, model: AxisModel, cutoff_hz: float = 0.0) 
         v = np.gradient(x, dt)
         a = np.gradient(v, dt)
         force = run.applied if cutoff_hz > SLOW_HZ else _low_passed(run.applied, cutoff_hz, dt)
-        out.append(Motion(x, v, a, force, run.temperature))
+        outer = np.zeros(len(record)) if record.external is None else record.external
+        out.append(Motion(x, v, a, force, run.temperature, outer))
     return out
 
 
@@ -209,7 +211,8 @@ def _moved_by(model: AxisModel, command: Array) -> Motion:
     x = _low_passed(command, COMMAND_HZ, dt)
     v = np.gradient(x, dt)
     a = np.gradient(v, dt)
-    return Motion(x, v, a, model.inertia * a + model.viscous * v, np.zeros_like(x))
+    nothing = np.zeros_like(x)
+    return Motion(x, v, a, model.inertia * a + model.viscous * v, nothing, nothing)
 
 
 def _low_passed(x: Array, cutoff_hz: float, dt: float) -> Array:

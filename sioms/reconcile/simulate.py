@@ -161,19 +161,22 @@ def _march(
     closed: bool,
     command: Array,
     measured: Array,
-    force: Array,
+    force: Array | None,
+    external: Array | None,
     ctl: Array,
     gain: tuple[float, float],
     start: Array,
     lost: float = np.inf,
 ) -> Run:
+    nothing = np.zeros(len(command))
     out = np.zeros((len(command), k.OUT_SIZE))
     f, lv, g = Slot.FORCE, Slot.FRICTION, Slot.GAIN
     k.march(
         closed,
         command,
         measured,
-        force,
+        nothing if force is None else np.ascontiguousarray(force, dtype=np.float64),
+        nothing if external is None else np.ascontiguousarray(external, dtype=np.float64),
         ctl,
         p.plant,
         p.functions[f],
@@ -216,7 +219,7 @@ def simulate(model: AxisModel, command: Array, temperature: float = 0.0, substep
     command = np.ascontiguousarray(command, dtype=np.float64)
     start = np.array([model.start_position, 0.0, temperature, 0.0, 0.0])
     return _march(
-        pack(model, substeps), True, command, command, command, controller_row(model), (0.0, 0.0), start
+        pack(model, substeps), True, command, command, None, None, controller_row(model), (0.0, 0.0), start
     )
 
 
@@ -233,8 +236,10 @@ def replay(model: AxisModel, record: Record, temperature: float = 0.0) -> Run:
     y = record.position[0]
     turned = y / p.plant[k.GAIN_Y] * p.plant[k.TURN_X] + p.plant[k.ECC_PHASE]
     x = (y - p.plant[k.ECC_AMP] * np.sin(turned)) / p.plant[k.GAIN_Y]
-    start = np.array([x, 0.0, temperature, command[0] - y, record.force[0]])
-    return _march(p, True, command, command, command, controller_row(model), (0.0, 0.0), start)
+    added = record.feedforward
+    held = record.force[0] - (0.0 if added is None else added[0])
+    start = np.array([x, 0.0, temperature, command[0] - y, held])
+    return _march(p, True, command, command, added, record.external, controller_row(model), (0.0, 0.0), start)
 
 
 def _first_speed(position: Array, dt: float) -> float:
@@ -251,20 +256,21 @@ def track(
     temperature: float = 0.0,
     packed: Packed | None = None,
     lost: float = np.inf,
+    external: Array | None = None,
 ) -> Run:
     """Drive the plant with a recorded force while an observer holds it on the recorded position.
 
     Args:
         position: measured, shape (n,), [{x}].
-        force: command force, shape (n,), held over each sample, [{F}].
+        force: command to the drive, shape (n,), held over each sample, [{F}].
         gain: correction of position [1] and speed [1/s] by the innovation.
         lost: innovation beyond which the model has lost the measurement and takes its speed from it, [{x}].
+        external: force on the axis beside the drive's, shape (n,), [{F}]; None: none.
 
     Returns:
         The run; ``innovation`` is what the model could not predict.
     """
     y = np.ascontiguousarray(position, dtype=np.float64)
-    u = np.ascontiguousarray(force, dtype=np.float64)
     p = packed or pack(model)
     start = np.array(
         [
@@ -275,4 +281,4 @@ def track(
             0.0,
         ]
     )
-    return _march(p, False, y, y, u, np.zeros(k.CTL_SIZE), gain, start, lost)
+    return _march(p, False, y, y, force, external, np.zeros(k.CTL_SIZE), gain, start, lost)

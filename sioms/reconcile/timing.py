@@ -40,7 +40,16 @@ def on_grid(session: Session, sample_time_s: float) -> tuple[Session, list[str]]
 
 def _pieces(record: Record, dt: float, notes: list[str]) -> list[Record]:
     arrays = [
-        a for a in (record.force, record.command, record.force_measured, record.time_s) if a is not None
+        a
+        for a in (
+            record.force,
+            record.command,
+            record.force_measured,
+            record.time_s,
+            record.feedforward,
+            record.external,
+        )
+        if a is not None
     ]
     usable = len(record) >= LEAST and all(
         len(a) == len(record) and np.all(np.isfinite(a)) for a in (record.position, *arrays)
@@ -107,4 +116,6 @@ def _filled(record: Record, place: NDArray[np.int64], suffix: str, dt: float) ->
         index,
         grid * dt,
         ~np.isin(grid, place),
+        line(record.feedforward),
+        line(record.external),
     )

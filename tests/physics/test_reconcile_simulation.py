@@ -11,7 +11,8 @@ from scipy.integrate import solve_ivp
 
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import observer, response, rigid
-from sioms.reconcile.simulate import simulate, track
+from sioms.reconcile.records import Record
+from sioms.reconcile.simulate import replay, simulate, track
 
 DT = 1e-3
 LOOP = Controller(20.0, -0.985, -0.7, -1e-4, 0.0, 1.8, 100.0)
@@ -81,6 +82,36 @@ def test_the_closed_loop_agrees_with_scipy_far_below_a_count(case: str) -> None:
     count = 1e-4  # a fine encoder of such an axis
     assert np.max(np.abs(run.position - y)) < 0.3 * count
     assert np.max(np.abs(run.force - u)) < 0.004 * 0.7  # the drive noise of a good drive
+
+
+def test_a_test_signal_and_a_push_from_outside_are_in_the_loop() -> None:
+    """Pulses added to the controller's force, and others that act on the axis alone, against scipy's solver."""
+    n = 400
+    added, push = np.zeros(n), np.zeros(n)
+    added[100:120], push[200:230] = 0.5, -0.3
+    state, e0, u0, y0, v, ys, us = np.zeros(2), 0.0, 0.0, 0.0, 0.0, [], []
+    alpha = 1 - np.exp(-2 * np.pi * 100 * DT)
+    for c, more, outer in zip(COMMAND[:n], added, push, strict=True):
+        y = float(state[0])
+        v += alpha * ((y - y0) / DT - v)
+        e = c - y
+        own = float(np.clip(20.0 * (e - 0.985 * e0) + 0.7 * u0 - 1e-4 * v, -1.8, 1.8))
+        e0, u0, y0 = e, own, y
+        u = float(np.clip(own + more, -1.8, 1.8))
+        ys.append(y)
+        us.append(u)
+        state = solve_ivp(
+            gravity, (0, DT), state, args=(u + outer,), method="DOP853", rtol=1e-11, atol=1e-13
+        ).y[:, -1]
+    model = AXIS
+    for name, values in CASES["gravity and cogging"][2].items():
+        model = model.with_effect(name, values)
+    record = Record("pulses", np.array(ys), np.array(us), COMMAND[:n], feedforward=added, external=push)
+    run = replay(replace(model, resolution=1e-13), record)
+    assert np.max(np.abs(run.position - record.position)) < 1e-5 * np.ptp(record.position)
+    assert np.max(np.abs(run.force - record.force)) < 1e-3 * np.ptp(record.force)
+    blind = replay(model, replace(record, external=None))
+    assert np.max(np.abs(blind.position - record.position)) > 1e-3 * np.ptp(record.position)
 
 
 def test_the_error_falls_with_the_square_of_the_step() -> None:

@@ -37,6 +37,13 @@ def test_good_data_pass() -> None:
     assert any("index" in n for n in check(Session((GOOD,)), AXIS))
 
 
+def test_a_force_that_is_no_feedback_is_told_until_it_is_named() -> None:
+    pulses = np.where(np.arange(len(GOOD)) % 500 < 30, 0.4, 0.0)
+    driven = replace(GOOD, force=GOOD.force + pulses)
+    for record, said in ((GOOD, False), (driven, True), (replace(driven, feedforward=pulses), False)):
+        assert any("name its column feedforward" in n for n in check(Session((record,)), AXIS)) == said
+
+
 def _jump(r: Record) -> Record:
     t = r.time_s.copy()  # type: ignore[union-attr]
     t[1000:] += 0.01

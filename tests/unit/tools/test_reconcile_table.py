@@ -71,3 +71,16 @@ def test_counts_need_a_resolution(tmp_path: Path) -> None:
 ])  # fmt: skip
 def test_a_head_states_its_unit(head: str, name: str, unit: str | None) -> None:
     assert named(head) == (name, unit)
+
+
+def test_a_test_signal_is_in_some_files_only(tmp_path: Path) -> None:
+    more = COLUMNS + 'feedforward = { name = "extra", unit = "mN m" }\n'
+    _folder(tmp_path, "t [ms];pos [deg];M [Nm]\n" + ROWS, more)
+    with pytest.raises(BadInputError, match="no file has a column 'extra' for feedforward"):
+        read_data(tmp_path, AXIS)
+    (tmp_path / "second.csv").write_text(
+        "t [ms];pos [deg];M [Nm];extra\n0;0;0;0\n1;1,5;0,25;50\n2;3,0;0,5;100\n"
+    )
+    first, second = read_data(tmp_path, AXIS).records
+    assert first.feedforward is None
+    np.testing.assert_allclose(second.feedforward, [0.0, 0.05, 0.1])
