@@ -200,7 +200,14 @@ def instrument_motion(problem: Problem, model: AxisModel) -> list[Motion]:
         run = replay(model, r, temperature)
         temperature = run.end_temperature if problem.session.continuous else 0.0
         out.append(
-            Motion(run.x, run.v, np.gradient(run.v, model.sample_time_s), run.applied, run.temperature)
+            Motion(
+                run.x,
+                run.v,
+                np.gradient(run.v, model.sample_time_s),
+                run.applied,
+                run.temperature,
+                np.zeros_like(run.x),
+            )
         )
     return out
 
