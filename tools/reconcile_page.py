@@ -142,10 +142,12 @@ def gap_of(g: Gap) -> dict[str, Any]:
 def opening(v: AnyVerdict) -> str:
     """Begin the page: its head, and the verdict."""
     name = html.escape(v.nominal.name)
+    found = html.escape("; ".join(e.title for e in v.effects))
     return (
         f"<!doctype html><html lang=en><meta charset=utf-8><title>{name}: reconcile</title><style>{STYLE}</style>"
         f"<h1>{name}: simulation against measurement</h1>"
-        f"<p class='verdict {v.outcome.value}'><b>{v.outcome.value}</b> - {headline(v)}</p>"
+        f"<p class='verdict {v.outcome.value}'><b>{v.outcome.value}</b> - {headline(v)}"
+        f"{'<br>' if found else ''}<b>{found}</b></p>"
     )
 
 
