@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from sioms.reconcile.blocks import better
 from sioms.reconcile.effects import library
 from sioms.reconcile.fit import Fit
+from sioms.reconcile.plausible import DOUBTFUL, GAIN, physical, size, without
 from sioms.reconcile.screen import screen
-from sioms.reconcile.search import DOUBTFUL, Found, Searcher, Step, physical, size, without
+from sioms.reconcile.search import SURE, Found, Searcher, Step
 
 AMBIGUOUS = 0.015
 #: What a look-alike must miss whose trace has this share of its energy in common with that of the named effect.
@@ -48,6 +49,13 @@ class Rival:
     def open(self) -> bool:
         """True where the data do not rule the rival out."""
         return self.missed < self.allowed or (self.errors < 1.0 and self.excess < DOUBTFUL)
+
+    @property
+    def wins(self) -> bool:
+        """True where the rival does better: with more numbers, surely and by as much as an effect must save."""
+        if size(self.rival) <= size(self.effect):
+            return self.missed < 0.0
+        return self.excess < -GAIN and self.errors < -SURE
 
 
 def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]] = ()) -> list[Rival]:
@@ -97,13 +105,13 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
 def settle(
     searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]]
 ) -> tuple[Found, list[Rival]]:
-    """Find the rivals; where one does better than what is named, with no more parameters, search on from it.
+    """Find the rivals; where one does better than what is named, search on from it.
 
     A step adds what saves most beside the effects of that moment; what came later may have made a look-alike the better one.
     """
     others = rivals(searcher, found, pairs)
     for _ in range(SWAPS):
-        best = next((r for r in others if r.missed < 0.0 and size(r.rival) <= size(r.effect)), None)
+        best = next((r for r in others if r.wins and searcher.follows(r.fit.model, found.fit.model)), None)
         if best is None:
             break
         searcher.progress(f"{best.rival} does better than {best.effect}: searching on from it")

@@ -13,6 +13,7 @@ import numpy as np
 
 from sioms.reconcile.ambiguity import Rival, settle
 from sioms.reconcile.blocks import better, block_ids, intervals
+from sioms.reconcile.calibrate import calibrated
 from sioms.reconcile.channels import Finding, drive, index_fit, index_scale, lattice
 from sioms.reconcile.checks import check, check_scale
 from sioms.reconcile.effect import Array, Slot
@@ -21,14 +22,14 @@ from sioms.reconcile.effects.terms import TERM_PREFIX, TERMS
 from sioms.reconcile.excitation import Gate, gate
 from sioms.reconcile.experiment import Envelope, Experiment, separate
 from sioms.reconcile.fit import BASE, SKIP, SKIP_S, Fit, Mapper, Problem, refit
-from sioms.reconcile.gaps import lap, measure, rungs, session_states
+from sioms.reconcile.gaps import measure, rungs, session_states
 from sioms.reconcile.locate import Place, Spectrum, locate, spectra
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, effective_samples, observer, sensor_noise
+from sioms.reconcile.plausible import GAIN
 from sioms.reconcile.records import Session
-from sioms.reconcile.refuse import bursts, smoother_rest, smoother_share
-from sioms.reconcile.screen import thinned
-from sioms.reconcile.search import GAIN, Found, Searcher, Step
+from sioms.reconcile.refuse import bursts, smoother_share
+from sioms.reconcile.search import SPECIFIC, SURE, Found, Searcher, Step
 from sioms.reconcile.simulate import replay
 from sioms.reconcile.timing import on_grid
 from sioms.reconcile.verdict import Estimate, NamedEffect, Outcome, Trace, Verdict
@@ -48,11 +49,8 @@ ROUGH_GRID = tuple(float(x) for x in np.linspace(0.9, 1.1, 17))
 #: Below these multiples of the expected innovation nothing is called unexplained, or a burst.
 LEAST_ODD = 1.25
 QUIET = 1.6
-#: Bandwidth of the observer where no force was measured: with the colour of the drive noise unknown, what
-#: happens above it would drown the mechanics below.
-UNMEASURED_HZ = 20.0
-#: No model is asked to be nearer than this share of the rated force; below it lies the exactness of any simulation.
-LEAST_DRIVE = 1e-3
+#: Above this multiple a nameless term is looked for, though no smoother explains anything (a bend in force is no function of motion).
+LOUD = 1.4
 #: The noise is taken again from what a search leaves, and the search repeated, when it fell below this share; so often.
 FELL, AGAIN = 0.7, 2
 
@@ -106,21 +104,24 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
     """
     o = options or Options()
     ready = prepare(session, nominal, o)
-    o.progress("excitation: what can these records show")
-    excited = gate(ready.problem, ready.model, ready.names)
-    names = tuple(n for n in ready.names if n not in excited.missing)
-    ready, searcher, found = _search(ready, names, o)
+    ready, excited, searcher, found = _search(ready, o)
     share = smoother_share(ready.problem, found.fit)
     rejected: tuple[str, ...] = ()
     odd = found.fit.ratio > LEAST_ODD and share > UNEXPLAINED
     if odd:
         o.progress(f"a smoother explains {100 * share:.0f} % of what remains: searching for a term")
         before = found
-        searcher.names = names + tuple(t.name for t in TERMS if ready.model.applicable(t))
-        found = searcher.run(ready.model)
+        found = _run_with_terms(searcher, ready.model)
         rejected = tuple(n for n in before.fit.model.effects if n not in found.fit.model.effects)
         share = smoother_share(ready.problem, found.fit)
-        searcher.names = names
+    elif found.fit.ratio > LOUD and not _rattles(found.fit.model):
+        o.progress(f"{found.fit.ratio:.1f} times what is expected remains: searching for a term")
+        other = _run_with_terms(searcher, ready.model)
+        gain, sure = better(other.losses, found.losses)
+        if gain > SPECIFIC and sure > SURE:
+            found, share = other, smoother_share(ready.problem, other.fit)
+    if found.fit.ratio > LARGE or (found.fit.ratio > LEAST_ODD and share > UNEXPLAINED):
+        found = searcher.plainly(found)
     burst = bursts(ready.problem, found.fit)
     hopeless = found.fit.ratio > HOPELESS and found.fit.cost > HALF * searcher.fit(ready.model).cost
     if hopeless:
@@ -143,10 +144,27 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
     return _conclude(ready, nominal, o, excited, found, searcher, others, odd, share, burst, rejected)
 
 
-def _search(ready: Prepared, names: tuple[str, ...], o: Options) -> tuple[Prepared, Searcher, Found]:
-    """Search; where no force was measured, the noise may look smaller under a better model: then search on."""
+def _run_with_terms(searcher: Searcher, model: AxisModel) -> Found:
+    """Search anew with nameless terms beside the library."""
+    names = searcher.names
+    searcher.names = names + tuple(t.name for t in TERMS if model.applicable(t))
+    found = searcher.run(model)
+    searcher.names = names
+    return found
+
+
+def _rattles(model: AxisModel) -> bool:
+    """Say whether there is a gap, whose bounces leave more than noise does."""
+    return any(known()[n].slot is Slot.BACKLASH for n in model.effects)
+
+
+def _search(ready: Prepared, o: Options) -> tuple[Prepared, Gate, Searcher, Found]:
+    """Search among what the records can show; the noise may look smaller under a better model: then they show more."""
     start, earlier = ready.model, tuple[Step, ...]()
     for turn in range(AGAIN + 1):
+        o.progress("excitation: what can these records show")
+        excited = gate(ready.problem, ready.model, ready.names)
+        names = tuple(n for n in ready.names if n not in excited.missing)
         searcher = Searcher(
             ready.problem, tuple(f.effect for f in ready.findings), names, progress=o.progress
         )
@@ -157,7 +175,7 @@ def _search(ready: Prepared, names: tuple[str, ...], o: Options) -> tuple[Prepar
                 ladder=(*earlier, replace(found.ladder[0], action="noise read again"), *found.ladder[1:]),
             )
         start = found.fit.model
-        anew = _calibrated(ready.problem, ready.problem.session, start)
+        anew = calibrated(ready.problem, ready.problem.session, start)
         if turn == AGAIN or anew.noise.drive > FELL * ready.problem.noise.drive:
             break
         o.progress(
@@ -168,7 +186,7 @@ def _search(ready: Prepared, names: tuple[str, ...], o: Options) -> tuple[Prepar
             anew, weights=None, session=ready.final.session, begin=ready.final.begin, end=ready.final.end
         )
         ready = replace(ready, problem=anew, final=final)
-    return ready, searcher, found
+    return ready, excited, searcher, found
 
 
 def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
@@ -197,7 +215,7 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     skip = max(SKIP, round(SKIP_S / nominal.sample_time_s))
     problem = Problem(session, noise, skip, end=1.0 if session.final else 1.0 - UNTOUCHED, mapper=o.mapper)
     check_scale(problem, nominal)
-    problem = _calibrated(problem, session, model)
+    problem = calibrated(problem, session, model)
     excluded = {"encoder_quantisation"}
     if index_fit(session, nominal) is not None:
         excluded.add("encoder_scale")
@@ -220,48 +238,6 @@ def _resampled(problem: Problem, model: AxisModel, seed: int) -> Problem:
     count = int(ids.max()) + 1
     times = np.bincount(np.random.default_rng(seed).integers(0, count, count), minlength=count)
     return replace(problem, weights=np.sqrt(times.astype(np.float64))[ids])
-
-
-def _calibrated(problem: Problem, session: Session, model: AxisModel) -> Problem:
-    """Where no force was measured, set the drive noise to what the innovations show.
-
-    Laps give it free of any model error (difference over sqrt 2). Without laps it is what the quietest quarter of the
-    time holds, after a first refit, of what no smooth function of the state explains: Coulomb friction, alike
-    everywhere, would else pass for noise.
-    """
-    if any(r.force_measured is not None for r in session.records):
-        return problem
-    laps = [lap(r, model.sample_time_s) for r in session.records]
-    stiffness = model.inertia * (2.0 * np.pi * UNMEASURED_HZ) ** 2
-    coarse = model.effects.get("encoder_quantisation", {}).get("factor", 1.0)
-    sensor = sensor_noise(session, model.resolution * coarse)
-    problem = replace(
-        problem, noise=observer(model, max(sensor, problem.noise.drive / stiffness), problem.noise.drive)
-    )
-    for _ in range(2):
-        if any(laps):
-            pairs = [
-                (r.innovation[p:] - r.innovation[:-p]) / np.sqrt(2.0)
-                for r, p in zip(problem.runs(model), laps, strict=True)
-                if p
-            ]
-            noise = np.concatenate(pairs) / problem.noise.innovation
-            size = max(round(0.1 / model.sample_time_s), 1)
-            energy = np.mean(noise[: len(noise) // size * size].reshape(-1, size) ** 2, axis=1)
-            excess = float(np.sqrt(np.median(energy)))
-        else:
-            fit = refit(problem, model, iterations=3)
-            ids = block_ids(problem, model.sample_time_s, 0.1)[thinned(len(fit.residual))]
-            energy = np.bincount(ids, weights=smoother_rest(problem, fit) ** 2) / np.bincount(ids)
-            excess = float(np.sqrt(np.quantile(energy, 0.25)))
-        least = LEAST_DRIVE * model.rated_force
-        drive = float(np.clip(problem.noise.drive * excess, least, None))
-        # A drive without noise has none whose colour is unknown: then the observer may be as fast as the sensor allows.
-        problem = replace(
-            problem,
-            noise=observer(model, sensor if drive < 2.0 * least else max(sensor, drive / stiffness), drive),
-        )
-    return problem
 
 
 def _conclude(
@@ -288,7 +264,7 @@ def _conclude(
     spans = _intervals(whole, fit, o.replicates, rng)
     named, terms = _describe(ready, fit, found, searcher, others, spans, rng)
     open_rivals = [r for r in others if r.open]
-    rattles = any(known()[n].slot is Slot.BACKLASH for n in found.fit.model.effects)
+    rattles = _rattles(found.fit.model)
     disturbance = found.fit.ratio > QUIET and burst > BURSTS and share < UNEXPLAINED and not rattles
     large = found.fit.ratio > LARGE and not rattles
     outcome = _outcome(

@@ -27,6 +27,7 @@ def descend(
     tolerance: float,
     damping: float = 1e-3,
     ease: float = 0.2,
+    left: float = 0.0,
 ) -> tuple[Array, Array, Array]:
     """Minimise the sum of squares of a residual.
 
@@ -39,6 +40,8 @@ def descend(
         iterations: largest number of accepted steps.
         tolerance: stop when a step gains less than this share of the sum of squares.
         damping: at first, and ``ease`` its change after a good step; small for a residual that is smooth in its numbers.
+        left: share of a number that can only be positive which a step leaves at least: where it nearly vanishes (the speed
+            over which friction drops), nothing changes with it any more.
 
     Returns:
         Numbers, residual and slopes at the best point found.
@@ -47,12 +50,13 @@ def descend(
     cost = float(r @ r)
     j = slopes(at, r)
     for _ in range(iterations):
+        least = np.where(lower > 0.0, np.maximum(lower, left * at), lower)
         h, g = j.T @ j, j.T @ r
         gained = False
         for _ in range(TRIALS):
             more = damping * np.diag(np.diag(h) + 1e-12 * np.trace(h) + 1e-30)
             step = np.linalg.lstsq(h + more, -g, rcond=1e-12)[0]
-            trial = np.clip(at + np.clip(step, -LONGEST, LONGEST) * size, lower, upper)
+            trial = np.clip(at + np.clip(step, -LONGEST, LONGEST) * size, least, upper)
             rt = residual(trial)
             ct = float(rt @ rt)
             if ct < cost:

@@ -77,6 +77,8 @@ class Parameter:
 
     ``fixed`` marks numbers that are searched, not differentiated (orders, lattice factors).
     ``phase`` marks an angle: free, wrapped, without bounds that mean anything.
+    ``shape`` marks a force in which the effect is not linear.
+    ``least`` is the smallest size, either way, that is named; what is smaller may belong to something else.
     """
 
     symbol: str
@@ -88,6 +90,8 @@ class Parameter:
     text: str
     fixed: bool = False
     phase: bool = False
+    least: float = 0.0
+    shape: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +103,7 @@ class Effect:
         rotary, linear: kinds of axis on which it makes sense.
         rankable: False where moving data can never tell it from its look-alike.
         replaces: effects that this one contains or excludes; switching it on switches them off.
+        ratios: (symbol, symbol, most): the first number is at most so many times the second.
         session: parameters that belong to the session and not to the axis.
     """
 
@@ -117,6 +122,7 @@ class Effect:
     rankable: bool = True
     session: tuple[str, ...] = ()
     replaces: tuple[str, ...] = ()
+    ratios: tuple[tuple[str, str, float], ...] = ()
 
     @property
     def primary(self) -> Parameter:

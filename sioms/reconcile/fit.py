@@ -19,7 +19,7 @@ from sioms.reconcile.effects import known
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import Noise
 from sioms.reconcile.records import Record, Session
-from sioms.reconcile.simulate import Run, pack, track
+from sioms.reconcile.simulate import Run, pack, replay, track
 
 #: ``map``, or the like of an executor.
 Mapper = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
@@ -27,6 +27,8 @@ BASE = "base"
 #: Samples, and seconds, at the start of a record in which the observer finds the state.
 SKIP, SKIP_S = 50, 0.05
 
+#: Share of a positive number that a step of a fit leaves at least.
+LEFT = 0.3
 #: A model whose friction falls with speed has two speeds at which it agrees with a force. It has lost the measurement
 #: where the innovation stays this many times over the expected one, and over its own median, for so many samples.
 LOST, LOST_SHARE, LOST_SAMPLES = 10.0, 8.0, 50
@@ -97,6 +99,18 @@ class Problem:
     def join(self, parts: Sequence[Array]) -> Array:
         """Lay per-record arrays out as ``residual`` does."""
         return np.concatenate([p[self.span(r)] for p, r in zip(parts, self.session.records, strict=True)])
+
+
+def closed_errors(problem: Problem, model: AxisModel) -> tuple[float, float]:
+    """Root mean square error of the simulated closed loop in force and position."""
+    force, place, temperature = [], [], 0.0
+    for r in problem.session.records:
+        run = replay(model, r, temperature)
+        temperature = run.end_temperature if problem.session.continuous else 0.0
+        force.append(np.nan_to_num(run.force - r.force, nan=1e9))
+        place.append(np.nan_to_num(run.position - r.position, nan=1e9))
+    f, x = (float(np.sqrt(np.mean(problem.join(e) ** 2))) for e in (force, place))
+    return f, x
 
 
 def _falls(model: AxisModel) -> bool:
@@ -231,5 +245,6 @@ def refit(
         upper,
         iterations,
         tolerance,
+        left=LEFT,
     )
     return Fit(put(model, free, at), free, r, j)

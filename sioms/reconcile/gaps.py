@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sioms.reconcile.effect import Array
-from sioms.reconcile.fit import Problem
+from sioms.reconcile.fit import Problem, closed_errors
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import Noise, rigid
 from sioms.reconcile.records import Record
@@ -151,17 +151,6 @@ def rungs(problem: Problem, models: Sequence[AxisModel]) -> tuple[float, ...]:
         else _rms(problem.residual(m)) * problem.noise.drive
         for m in models
     )
-
-
-def closed_errors(problem: Problem, model: AxisModel) -> tuple[float, float]:
-    """Root mean square error of the simulated closed loop in force and position."""
-    force, place, temperature = [], [], 0.0
-    for r in problem.session.records:
-        run = replay(model, r, temperature)
-        temperature = run.end_temperature if problem.session.continuous else 0.0
-        force.append(np.nan_to_num(run.force - r.force, nan=1e9))
-        place.append(np.nan_to_num(run.position - r.position, nan=1e9))
-    return _rms(problem.join(force)), _rms(problem.join(place))
 
 
 def _rms(x: Array) -> float:

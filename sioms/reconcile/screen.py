@@ -120,7 +120,11 @@ def amplitudes(effect: Effect) -> list[tuple[Parameter, Parameter | None]]:
     """Pair every parameter in which the effect is linear with the phase that follows it, if any."""
     out: list[tuple[Parameter, Parameter | None]] = []
     for i, p in enumerate(effect.parameters):
-        linear = "{F}" in p.unit or (effect.slot is Slot.GAIN and i == 0) or (i == 0 and p.unit == "1")
+        linear = (
+            ("{F}" in p.unit and not p.shape)
+            or (effect.slot is Slot.GAIN and i == 0)
+            or (i == 0 and p.unit == "1")
+        )
         if linear:
             following = effect.parameters[i + 1] if i + 1 < len(effect.parameters) else None
             out.append((p, following if following is not None and following.phase else None))
@@ -352,12 +356,13 @@ def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator
 
 
 def _screen_trials(problem: Problem, fit: Fit, effect: Effect, q: Array, rest: Array) -> list[Start]:
-    """Try an effect on a grid in the simulation; the change it makes may be stretched, not turned round."""
+    """Try an effect on a grid in the simulation; the change it makes may be stretched, and turned round where its size has a sign."""
     best: list[Start] = []
     model = fit.model
     for name in effect.replaces:
         model = model.without_effect(name) if name in model.effects else model
     trials = list(trial_values(effect, model, problem))
+    least = -9.0 if effect.slot is Slot.SCALE or effect.primary.lower < 0.0 else 0.0
     for values, tried in zip(
         trials,
         problem.mapper(lambda v: problem.residual(model.with_effect(effect.name, v)), trials),
@@ -368,7 +373,7 @@ def _screen_trials(problem: Problem, fit: Fit, effect: Effect, q: Array, rest: A
         size = float(d @ d)
         if size <= 0.0:
             continue
-        stretch = float(np.clip(-(d @ rest) / size, 0.0 if effect.slot is not Slot.SCALE else -9.0, 9.0))
+        stretch = float(np.clip(-(d @ rest) / size, least, 9.0))
         gain = 1.0 - float(np.sum((rest + stretch * d) ** 2)) / float(rest @ rest)
         best.append(Start(effect.name, gain, _stretched(effect, model, values, stretch)))
     best.sort(key=lambda s: -s.gain)

@@ -15,27 +15,44 @@ from numpy.typing import NDArray
 
 from sioms.reconcile.blocks import better, block_ids, heldout
 from sioms.reconcile.effect import Array, Slot
-from sioms.reconcile.effects import known, library
-from sioms.reconcile.fit import Fit, Problem, refit
+from sioms.reconcile.effects import known
+from sioms.reconcile.fit import Fit, Problem, closed_errors, refit
 from sioms.reconcile.model import AxisModel
+from sioms.reconcile.plausible import (
+    GAIN,
+    Tried,
+    negligible,
+    physical,
+    plainer,
+    replaced,
+    simplest,
+    small,
+    swapped,
+    unspecific,
+    without,
+)
 from sioms.reconcile.screen import Start, screen
 
-GAIN = 0.05  # least share of what remains that an effect must save on held-out blocks
 SURE = 2.0  # least number of standard errors of that saving
-FLOOR = 1.15  # stop at this multiple of the expected innovation
+FLOOR = 1.05  # stop at this multiple of the expected innovation
 TRIES = 4  # candidates refitted per step
 STEPS = 6
-#: A saving below ``SPECIFIC`` counts only where no unrelated effect saves ``NEARLY`` as much.
+#: A saving below this counts only where no unrelated effect saves nearly as much.
 SPECIFIC = 0.3
-NEARLY = 0.5
-#: A larger loss than this is one, however unevenly it falls on the blocks.
-DOUBTFUL = 0.2
 #: A step that saves this much needs no second look at the friction law.
 CLEAR = 0.5
 #: Two effects are tried at once only above this multiple of the expected innovation, so many firsts and seconds.
 PAIRED = 1.5
 PAIRS = 3
+LOOSE = 2.0  # an effect does not make the error of the simulated closed loop this many times larger
 PERIODIC_SURE = 3.0  # for effects whose order is searched over tens of values
+#: Relative steps in which the numbers of a gap are searched: when it is new, and when it was found beside other effects.
+UNPOLISHED = tuple(
+    (symbol, width * spread)
+    for spread in (0.25, 0.08, 0.025, 0.008)
+    for symbol, width in (("gap", 1.0), ("load_fraction", 1.0), ("zeta", 2.0), ("f_contact", 1.0))
+)
+POLISHED = (("gap", 0.08), ("gap", 0.025), ("gap", 0.008))
 #: Fits are kept in memory up to this size: a second search, with terms beside the library, retraces the first.
 KEPT_BYTES = 128_000_000
 
@@ -78,6 +95,8 @@ class Searcher:
     ids: NDArray[np.int64] = field(init=False)
     _fits: dict[Hashable, Fit] = field(init=False, default_factory=dict)
     _starts: dict[Hashable, list[Start]] = field(init=False, default_factory=dict)
+    _polished: set[Hashable] = field(init=False, default_factory=set)
+    _loops: dict[Hashable, float] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         """Number the blocks."""
@@ -106,7 +125,10 @@ class Searcher:
     def _fit(self, model: AxisModel, iterations: int) -> Fit:
         effect = next((known()[n] for n in model.effects if known()[n].slot is Slot.BACKLASH), None)
         if effect is not None and iterations > 4:
-            return polish(self.problem, model, self.frozen)
+            known_gap = tuple(model.effects[effect.name].values()) in self._polished
+            fit = polish(self.problem, model, self.frozen, POLISHED if known_gap else UNPOLISHED)
+            self._polished.add(tuple(fit.model.effects[effect.name].values()))
+            return fit
         return refit(self.problem, model, self.frozen, iterations)
 
     def loss(self, fit: Fit) -> Array:
@@ -119,6 +141,18 @@ class Searcher:
             if self.problem.weights is None
             else losses[np.bincount(self.ids, weights=self.problem.weights) > 0.0]
         )
+
+    def follows(self, model: AxisModel, before: AxisModel) -> bool:
+        """Say whether the closed loop agrees with the records about as well as that of another model, where it can be simulated.
+
+        A model that hardly listens to its force (a huge inertia) predicts short windows by the measured motion alone.
+        """
+        if model.controller is None or any(r.command is None for r in self.problem.session.records):
+            return True
+        for m in (model, before):
+            if (key := values_of(m)) not in self._loops:
+                self._loops[key] = closed_errors(self.problem, m)[0]
+        return self._loops[values_of(model)] <= LOOSE * self._loops[values_of(before)]
 
     def run(self, start: AxisModel) -> Found:
         """Search from a model."""
@@ -140,7 +174,21 @@ class Searcher:
             fit, losses = self._eliminate(fit, losses, ladder)
         return Found(fit, losses, tuple(ladder))
 
-    def _candidates(self, fit: Fit) -> list[Start]:
+    def plainly(self, found: Found) -> Found:
+        """Take back what a searched order enriched, unless it saves half: where much is unexplained some order always fits."""
+        fit, losses, ladder = found.fit, found.losses, list(found.ladder)
+        for name in [n for n in fit.model.effects if n not in self.frozen and self._enrichment(n)]:
+            other = next(o for o in plainer(name, self.names) if o in known()[name].replaces)
+            new = self.fit(swapped(fit.model, name, other), 6)
+            loss = self.loss(new)
+            lost, _ = better(losses, loss)
+            if lost < CLEAR:
+                fit, losses = new, loss
+                ladder.append(Step("simplify", f"{name} to {other}", fit.ratio, -lost, fit.model))
+        return Found(fit, losses, tuple(ladder))
+
+    def _candidates(self, fit: Fit, passed: int = 0) -> list[Start]:
+        """Screen what may be added: the best few after so many, and their look-alikes."""
         names = [
             n
             for n in self.names
@@ -152,10 +200,10 @@ class Searcher:
         starts = [s for s in self.screen(fit, fresh) if s.gain > 0.5 * GAIN]
         starts += self._upgrades(fit, [n for n in names if replaced(fit.model, n)])
         starts.sort(key=lambda s: -s.gain)
-        chosen = starts[:TRIES]
+        chosen, further = starts[passed : passed + TRIES], starts[passed + TRIES :]
         if chosen:
             alike = known()[chosen[0].effect].lookalikes
-            chosen += [s for s in starts[TRIES:] if s.effect in alike and s.gain > 0.3 * chosen[0].gain]
+            chosen += [s for s in further if s.effect in alike and s.gain > 0.3 * chosen[0].gain]
         return chosen
 
     def _enrichment(self, name: str) -> bool:
@@ -181,15 +229,17 @@ class Searcher:
         A rich friction law may have bent itself to stand in for the next effect; so the best candidates are tried
         with it started afresh too.
         """
-        tried: dict[str, tuple[Fit, Array, float, float]] = {}
+        tried: dict[str, Tried] = {}
         for i, s in enumerate(self._candidates(fit)):
             self._try(tried, s.effect, self._with(fit, s, 8 if i == 0 else 5), losses)
         if max((t[2] for t in tried.values()), default=0.0) < CLEAR:
             for effect, new in self._afresh(fit):
                 self._try(tried, effect, new, losses)
-        good = {
-            n: t for n, t in tried.items() if t[2] >= GAIN and t[3] >= self._sure(n) and physical(t[0], n)
-        }
+        sure, good = self._good(tried, fit)
+        if sure and not good:  # what cannot be has taken the places of what can
+            for s in self._candidates(fit, TRIES):
+                self._try(tried, s.effect, self._with(fit, s, 5), losses)
+            sure, good = self._good(tried, fit)
         if not good:
             return None
         name = simplest(good)
@@ -198,6 +248,11 @@ class Searcher:
             return None
         rivals = {n: t[2] for n, t in tried.items() if n != name}
         return new, loss, Step("add", name, new.ratio, gain, new.model, rivals)
+
+    def _good(self, tried: dict[str, Tried], fit: Fit) -> tuple[dict[str, Tried], dict[str, Tried]]:
+        """Pick those that save enough, surely; and of them those that can be."""
+        sure = {n: t for n, t in tried.items() if t[2] >= GAIN and t[3] >= self._sure(n)}
+        return sure, {n: t for n, t in sure.items() if self._sound(t[0], fit)}
 
     def _add_pair(self, fit: Fit, losses: Array) -> tuple[Fit, Array, Step] | None:
         """Add two effects at once where neither saves enough alone: each hides what the other would save.
@@ -225,12 +280,7 @@ class Searcher:
                     and more >= SPECIFIC
                     and surer >= self._sure(second.effect)
                 )
-                if (
-                    good
-                    and physical(new, first.effect)
-                    and physical(new, second.effect)
-                    and (best is None or new.cost < best[0].cost)
-                ):
+                if good and self._sound(new, fit) and (best is None or new.cost < best[0].cost):
                     best = (
                         new,
                         loss,
@@ -238,14 +288,21 @@ class Searcher:
                     )
         return best
 
+    def _sound(self, new: Fit, fit: Fit) -> bool:
+        """Say whether a model can be, and the closed loop does not suffer by it."""
+        return self._possible(new, fit) and self.follows(new.model, fit.model)
+
+    def _possible(self, new: Fit, fit: Fit) -> bool:
+        """Say whether every number is one that its effect can have, where it was before."""
+        mine = [n for n in new.model.effects if n not in self.frozen]
+        return all(physical(new, n) or (n in fit.model.effects and not physical(fit, n)) for n in mine)
+
     def _with(self, fit: Fit, start: Start, iterations: int) -> Fit:
         """Switch a candidate on, what it replaces off, and refit."""
         model = without(fit.model, known()[start.effect].replaces)
         return self.fit(model.with_effect(start.effect, start.values), iterations)
 
-    def _try(
-        self, tried: dict[str, tuple[Fit, Array, float, float]], effect: str, new: Fit, losses: Array
-    ) -> None:
+    def _try(self, tried: dict[str, Tried], effect: str, new: Fit, losses: Array) -> None:
         """Score a refitted candidate; keep the better of two ways to the same effect."""
         loss = self.loss(new)
         gain, sure = better(loss, losses)
@@ -280,7 +337,7 @@ class Searcher:
             without = self.fit(fit.model.without_effect(name), 6)
             loss = self.loss(without)
             gain, sure = better(losses, loss)
-            if negligible(gain, sure):
+            if (negligible(gain, sure) and self._possible(without, fit)) or small(fit.model, name):
                 fit, losses = without, loss
                 ladder.append(Step("leave", name, fit.ratio, -gain, fit.model))
         return fit, losses
@@ -309,104 +366,23 @@ def values_of(model: AxisModel) -> Hashable:
     )
 
 
-def plainer(name: str, names: Sequence[str]) -> list[str]:
-    """List the look-alikes with fewer parameters."""
-    return [o for o in known()[name].lookalikes if o in names and size(o) < size(name)]
-
-
-def swapped(model: AxisModel, name: str, other: str) -> AxisModel:
-    """Put another effect in the place of one, keeping the values of parameters that both have."""
-    plain = {p.symbol: p.start * model.scale(p) for p in known()[other].parameters}
-    shared = {k: v for k, v in model.effects[name].items() if k in plain}
-    return model.without_effect(name).with_effect(other, {**plain, **shared})
-
-
-def without(model: AxisModel, names: Sequence[str]) -> AxisModel:
-    """Switch some effects off."""
-    for name in names:
-        model = model.without_effect(name) if name in model.effects else model
-    return model
-
-
-def replaced(model: AxisModel, name: str) -> bool:
-    """Say whether an effect would take the place of one in the model."""
-    return any(n in model.effects for n in known()[name].replaces)
-
-
-def size(name: str) -> int:
-    """Number of parameters of an effect."""
-    return len(known()[name].parameters)
-
-
-def unspecific(name: str, gains: dict[str, float]) -> bool:
-    """Say whether an effect of quite another kind saves nearly as much: then the residual has no name yet."""
-    lib = known()
-    family = {
-        name,
-        *lib[name].lookalikes,
-        *lib[name].replaces,
-        *(n for n in lib if name in lib[n].lookalikes),
-    }
-    return any(g > NEARLY * gains[name] for n, g in gains.items() if n not in family)
-
-
-def negligible(lost: float, errors: float) -> bool:
-    """Say whether a loss counts for nothing: small, or not large and within one standard error."""
-    return lost < GAIN or (errors < 1.0 and lost < DOUBTFUL)
-
-
-def simplest(good: dict[str, tuple[Fit, Array, float, float]]) -> str:
-    """Of the candidates within one standard error and ``GAIN`` of the best, the one with the fewest parameters.
-
-    A named effect goes before a nameless term that does no better.
-    """
-    best = max(good, key=lambda n: good[n][2])
-    near = []
-    for n, (_, loss, _, _) in good.items():
-        lost, sure = better(good[best][1], loss)
-        if negligible(lost, sure):
-            near.append(n)
-    return min(near, key=lambda n: (n not in library(), size(n), -good[n][2]))
-
-
-def physical(fit: Fit, name: str) -> bool:
-    """Say whether an effect stays within its bounds: a number that leans on one belongs to something else.
-
-    The stiffness and damping of a contact may: harder than what is seen is as good as hard. So may a time constant.
-    """
-    effect, given = known()[name], fit.model.effects[name]
-    free = [q for q in effect.parameters if not q.phase and not q.fixed]
-    for q in [effect.primary] if effect.slot in (Slot.BACKLASH, Slot.THERMAL) else free:
-        low, high = (bound * fit.model.scale(q) for bound in (q.lower, q.upper))
-        if given[q.symbol] > 0.98 * high or (q.lower < 0.0 and given[q.symbol] < 0.98 * low):
-            return False
-    p, scale = effect.primary, fit.model.scale(effect.primary)
-    if p.lower < 0.0 or effect.slot in (Slot.SCALE, Slot.LIMIT, Slot.ELASTIC):
-        return True
-    return given[p.symbol] > max(p.lower, 1e-4 * p.start) * scale * 1.01
-
-
-def polish(problem: Problem, model: AxisModel, frozen: Sequence[str]) -> Fit:
-    """Fit a backlash: its cost is rough, so search the gap by golden steps before the smooth fit of the rest."""
+def polish(
+    problem: Problem, model: AxisModel, frozen: Sequence[str], widths: Sequence[tuple[str, float]]
+) -> Fit:
+    """Fit a backlash: its cost is rough, so search by steps of given relative widths before the smooth fit of the rest."""
     name = next(n for n in model.effects if known()[n].slot is Slot.BACKLASH)
     best, cost = model, np.inf
-    for spread in (0.25, 0.08, 0.025, 0.008):
-        for symbol, width in (
-            ("gap", spread),
-            ("load_fraction", spread),
-            ("zeta", 2.0 * spread),
-            ("f_contact", spread),
-        ):
-            here = best.effects[name]
-            trials = [best] if cost == np.inf else []
-            trials += [
-                best.with_effect(name, {**here, symbol: here[symbol] * (1.0 + width * sign)})
-                for sign in (1.0, -1.0, 0.4, -0.4)
-            ]
-            trials = [t for t in trials if _inside(t, name)]
-            costs = list(problem.mapper(lambda t: float(np.sum(problem.residual(t) ** 2)), trials))
-            if costs and min(costs) < cost:
-                best, cost = trials[int(np.argmin(costs))], min(costs)
+    for symbol, width in widths:
+        here = best.effects[name]
+        trials = [best] if cost == np.inf else []
+        trials += [
+            best.with_effect(name, {**here, symbol: here[symbol] * (1.0 + width * sign)})
+            for sign in (1.0, -1.0, 0.4, -0.4)
+        ]
+        trials = [t for t in trials if _inside(t, name)]
+        costs = list(problem.mapper(lambda t: float(np.sum(problem.residual(t) ** 2)), trials))
+        if costs and min(costs) < cost:
+            best, cost = trials[int(np.argmin(costs))], min(costs)
     return refit(problem, best, frozen, 4)
 
 

@@ -97,7 +97,7 @@ def twins(
             effect = known()[name]
             if effect.function is not None:
                 acting.setdefault(name, []).append((i, effect.row(effect.values(values), model.pitch)))
-            elif effect.slot is not Slot.THERMAL:
+            elif effect.slot not in (Slot.THERMAL, Slot.INERTIA):
                 table.setdefault(names[i], {}).update(_slot(effect, values, model))
     heat = _heat(models, len(motors), tick_s)
     forces = {n: Acting(known()[n], [i for i, _ in a], [r for _, r in a], heat) for n, a in acting.items()}
@@ -108,9 +108,10 @@ def twins(
 
 def _motor(model: AxisModel, motor: Motor) -> Motor:
     """Give a motor the body of the model; its friction is the model's effects and nothing else."""
+    added = sum(known()[n].values(v)[0] for n, v in model.effects.items() if known()[n].slot is Slot.INERTIA)
     return replace(
         motor,
-        mass=model.inertia,
+        mass=model.inertia + added,
         viscous=model.viscous,
         coulomb=0.0,
         stiction=None,
@@ -134,8 +135,6 @@ def _slot(effect: Effect, values: Mapping[str, float], model: AxisModel) -> dict
     """Say an effect that fills a slot of the time step in the words of the plant."""
     p = effect.values(values)
     match effect.slot:
-        case Slot.INERTIA:
-            return {"payload": {"mass": p[0]}}
         case Slot.DELAY:
             return {"delay": {"delay_s": p[0]}}
         case Slot.LAG:

@@ -147,6 +147,7 @@ STRIBECK = Effect(
     signature="as Coulomb friction, larger below the Stribeck speed",
     lookalikes=("coulomb", "presliding", "backlash"),
     separate="reversals at several low speeds",
+    ratios=(("Fs", "Fc", 5.0),),
     replaces=("coulomb", "presliding", "coulomb_position"),
 )
 PRESLIDING = Effect(

@@ -73,6 +73,18 @@ def load_square(x: Number, v: Number, u: Number, temperature: Number, p: Array) 
     return -p[0] * u * np.abs(u)
 
 
+@state_function
+def place_level(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
+    """g x."""
+    return p[0] * x
+
+
+@state_function
+def dull_force(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
+    """-f tanh(u/u0)."""
+    return -p[0] * np.tanh(u / p[1])
+
+
 PHASE = Parameter("phase", "rad", Ref.ANGLE, -np.pi, np.pi, 0.0, "phase at position zero", phase=True)
 ORDER = Parameter("n", "1/pitch", Ref.ONE, 1.0, 12.0, 1.0, "periods in a pitch", fixed=True)
 SPEED = Parameter("v0", "{x}/s", Ref.SPEED, 2e-3, 1.0, 0.1, "speed of the bend")
@@ -151,7 +163,22 @@ TERMS = (
         Parameter("kappa", "1/pitch", Ref.ONE, 0.02, 3.0, 0.5, "periods in a pitch, any number"),
         lookalikes=("offset",),
     ),
+    _term(
+        "place_friction",
+        "F = -g x sign(v)",
+        place_level,
+        _size("g", "{F}/{x}", Ref.STIFFNESS, "slope of dry friction along the range"),
+        slot=Slot.FRICTION,
+    ),
     _term("load_square", "F = -g u |u|", load_square, _size("g", "1/({F})", Ref.ONE)),
+    _term(
+        "dull_force",
+        "F = -f tanh(u/u0)",
+        dull_force,
+        _size("f", "{F}", Ref.FORCE),
+        Parameter("u0", "{F}", Ref.FORCE, 5e-3, 0.5, 0.05, "force of the bend", shape=True),
+        lookalikes=("load_friction", "payload"),
+    ),
     _term(
         "hysteresis",
         "dF/dx = (f sign(v) - F)/length, force -F",

@@ -51,10 +51,11 @@ PAYLOAD = Effect(
             "J_extra",
             "{F} s^2/{x}",
             Ref.INERTIA,
-            0.02,
+            -0.8,
             20.0,
             0.1,
-            "added inertia, from where dry friction cannot pass for it",
+            "added inertia; negative where the nominal model has too much",
+            least=0.02,  # below it dry friction passes for it
         ),
     ),
     signature="force residual proportional to acceleration",

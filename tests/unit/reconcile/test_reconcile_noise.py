@@ -10,10 +10,11 @@ import pytest
 from sioms.reconcile.axis import Options, prepare
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.model import AxisModel, Controller
+from sioms.reconcile.plausible import physical
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.screen import SLOW_HZ, instrument_motion
-from sioms.reconcile.search import physical
-from sioms.reconcile.simulate import simulate
+from sioms.reconcile.search import Searcher
+from sioms.reconcile.simulate import simulate, track
 
 AXIS = AxisModel(
     True, 1e-3, 2e-3, 1e-3, 1e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)
@@ -35,6 +36,25 @@ def test_friction_that_is_alike_everywhere_is_no_noise(controller: Controller | 
     right = ready.problem.residual(hidden)
     assert ready.problem.noise.drive < 0.2 * FRICTION
     assert np.sqrt(np.mean(ready.problem.residual(AXIS) ** 2)) > 5.0 * np.sqrt(np.mean(right**2))
+
+
+def test_noise_of_the_current_sensor_is_not_that_of_the_drive() -> None:
+    rng, force, measured = np.random.default_rng(4), 4e-3, 4e-2
+    run = simulate(AXIS, COMMAND)
+    shaken = replace(AXIS, controller=None)
+    u = run.force + force * rng.standard_normal(len(T))
+    moved = track(shaken, run.position, u, (0.0, 0.0))
+    position = np.round(moved.x / AXIS.resolution) * AXIS.resolution
+    record = Record("r", position, run.force, force_measured=u + measured * rng.standard_normal(len(T)))
+    ready = prepare(Session((record,)), shaken, Options())
+    assert 0.4 * force < ready.problem.noise.drive < 4.0 * force
+
+
+def test_an_inertia_that_ignores_the_force_is_told_by_the_loop() -> None:
+    ready = prepare(_session(AXIS.with_effect("coulomb", {"Fc": FRICTION})), AXIS, Options())
+    searcher = Searcher(ready.problem, (), ready.names)
+    assert searcher.follows(AXIS.with_effect("coulomb", {"Fc": 0.5 * FRICTION}), AXIS)
+    assert not searcher.follows(AXIS.with_effect("payload", {"J_extra": 15.0 * AXIS.inertia}), AXIS)
 
 
 def test_a_record_may_begin_in_motion() -> None:
@@ -62,6 +82,10 @@ def test_a_motion_without_noise_is_found_without_a_loop() -> None:
     ("presliding", {"Fc": 0.1, "xs": 0.003 * 2 * np.pi}, True),
     ("presliding", {"Fc": 0.1, "xs": 0.005 * 2 * np.pi}, False),
     ("payload", {"J_extra": 20.0 * 2e-3}, False),
+    ("payload", {"J_extra": -0.1e-3}, True),
+    ("payload", {"J_extra": -0.01e-3}, False),
+    ("stribeck", {"Fc": 0.05, "Fs": 0.1, "vs": 0.2}, True),
+    ("stribeck", {"Fc": 0.01, "Fs": 0.1, "vs": 0.2}, False),
     ("offset", {"off": -0.7}, False),
     ("thermal_gain", {"loss": 0.3, "tau": 10000.0}, True),
     ("backlash", {"gap": 0.01, "load_fraction": 0.4, "f_contact": 400.0, "zeta": 2.0}, True),

@@ -13,15 +13,17 @@ import pytest
 from sioms.reconcile.ambiguity import settle
 from sioms.reconcile.blocks import better, block_ids, bootstrap, heldout, intervals
 from sioms.reconcile.channels import drive, drive_output, index_fit, lattice
+from sioms.reconcile.descent import descend
 from sioms.reconcile.excitation import common, gate
 from sioms.reconcile.experiment import Envelope, catalogue, demands, one_speed, repeated, separate
-from sioms.reconcile.fit import Problem, refit
+from sioms.reconcile.fit import LEFT, Problem, refit
 from sioms.reconcile.locate import locate
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
+from sioms.reconcile.plausible import unspecific
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.screen import screen
-from sioms.reconcile.search import Found, Searcher, unspecific
+from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.simulate import simulate
 
 AXIS = AxisModel(
@@ -100,6 +102,34 @@ def test_a_refit_finds_the_parameters() -> None:
     assert fit.model.effects["payload"]["J_extra"] == pytest.approx(4e-4, rel=0.02)
 
 
+@pytest.mark.parametrize(("left", "found"), [(LEFT, True), (0.0, False)])
+@pytest.mark.parametrize("start", [0.05, 0.1])
+def test_a_number_that_can_only_be_positive_does_not_vanish_in_one_step(
+    left: float, found: bool, start: float
+) -> None:
+    rng, width = np.random.default_rng(0), 0.03
+    speed = np.concatenate([rng.uniform(0.0, 1.5, 600), rng.uniform(0.0, 0.05, 6)])
+    noise = 0.02 * rng.standard_normal(len(speed))
+
+    def residual(p: np.ndarray) -> np.ndarray:
+        return (
+            p[0]
+            + p[1] * np.exp(-((speed / p[2]) ** 2))
+            - 0.79
+            - 0.53 * np.exp(-((speed / width) ** 2))
+            + noise
+        )
+
+    size = np.array([0.75, 0.1, start])
+
+    def slopes(p: np.ndarray, r: np.ndarray) -> np.ndarray:
+        return np.stack([(residual(p + h) - r) / 2e-3 for h in np.diag(2e-3 * size)], axis=1)
+
+    lower, upper = np.array([0.0, 0.0, 2e-4]), np.array([2.0, 3.0, 1.0])
+    at, _, _ = descend(residual, slopes, size, size, lower, upper, 8, 1e-3, left=left)
+    assert bool(abs(at[2] - width) < 0.1 * width) is found
+
+
 def test_a_search_adds_what_is_missing_and_nothing_else() -> None:
     hidden = AXIS.with_effect("offset", {"off": 0.06})
     s = Searcher(
@@ -145,14 +175,16 @@ def test_blocks_agree_with_refitting() -> None:
     assert abs(fit.model.effects["viscous"]["b_extra"] - 5e-3) < 5.0 * spread + 5e-5
 
 
+@dataclass
+class Linear:
+    """A linear fit."""
+
+    residual: np.ndarray
+    jacobian: np.ndarray
+
+
 def test_intervals_cover_where_few_blocks_tell_a_parameter() -> None:
     """Four hundred linear fits to correlated noise; of two parameters the second acts in three of thirty blocks only."""
-
-    @dataclass
-    class Linear:
-        residual: np.ndarray
-        jacobian: np.ndarray
-
     rng, blocks, size = np.random.default_rng(2), 30, 20
     ids = np.repeat(np.arange(blocks), size)
     columns = np.stack([np.sin(0.3 * np.arange(len(ids))), np.where(ids % 10 == 0, 1.0, 0.0)], axis=1)
@@ -164,6 +196,21 @@ def test_intervals_cover_where_few_blocks_tell_a_parameter() -> None:
         hits += np.abs(moved) <= intervals(Linear(columns @ moved - noise, columns), ids)
     assert np.all(hits > 368)
     assert hits[0] < 396
+
+
+def test_intervals_are_not_wild_where_two_blocks_tell_each_of_many() -> None:
+    """Eight elements, each touched in two blocks of sixteen: 95 % cover, and no interval is far wider than the others."""
+    rng, blocks, size = np.random.default_rng(4), 16, 20
+    ids = np.repeat(np.arange(blocks), size)
+    columns = (ids[:, None] % 8 == np.arange(8)).astype(np.float64)
+    hits, widths = 0, []
+    for _ in range(200):
+        noise = rng.standard_normal(len(ids)) + np.repeat(rng.standard_normal(blocks), size)
+        moved = np.linalg.lstsq(columns, noise, rcond=None)[0]  # the truth is zero
+        widths.append(intervals(Linear(columns @ moved - noise, columns), ids))
+        hits += int(np.sum(np.abs(moved) <= widths[-1]))
+    assert 0.88 * 1600 < hits < 0.995 * 1600
+    assert np.quantile(widths, 0.99) < 4.0 * np.median(widths)
 
 
 def test_a_lucky_fit_to_loud_blocks_is_not_sure() -> None:

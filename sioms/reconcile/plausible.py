@@ -1,0 +1,105 @@
+"""What an effect in a model may be: its numbers possible, its saving its own, its form the simplest that does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sioms.reconcile.blocks import better
+from sioms.reconcile.effect import Array, Slot
+from sioms.reconcile.effects import known, library
+from sioms.reconcile.fit import Fit
+from sioms.reconcile.model import AxisModel
+
+GAIN = 0.05  # least share of what remains that an effect must save on held-out blocks
+#: An unrelated effect that saves this share as much leaves the residual without a name.
+NEARLY = 0.5
+#: A larger loss than this is one, however unevenly it falls on the blocks.
+DOUBTFUL = 0.2
+#: A refitted candidate: fit, held-out losses, share saved, standard errors.
+Tried = tuple[Fit, Array, float, float]
+
+
+def plainer(name: str, names: Sequence[str]) -> list[str]:
+    """List the look-alikes with fewer parameters."""
+    return [o for o in known()[name].lookalikes if o in names and size(o) < size(name)]
+
+
+def swapped(model: AxisModel, name: str, other: str) -> AxisModel:
+    """Put another effect in the place of one, keeping the values of parameters that both have."""
+    plain = {p.symbol: p.start * model.scale(p) for p in known()[other].parameters}
+    shared = {k: v for k, v in model.effects[name].items() if k in plain}
+    return model.without_effect(name).with_effect(other, {**plain, **shared})
+
+
+def without(model: AxisModel, names: Sequence[str]) -> AxisModel:
+    """Switch some effects off."""
+    for name in names:
+        model = model.without_effect(name) if name in model.effects else model
+    return model
+
+
+def replaced(model: AxisModel, name: str) -> bool:
+    """Say whether an effect would take the place of one in the model."""
+    return any(n in model.effects for n in known()[name].replaces)
+
+
+def size(name: str) -> int:
+    """Number of parameters of an effect."""
+    return len(known()[name].parameters)
+
+
+def unspecific(name: str, gains: dict[str, float]) -> bool:
+    """Say whether an effect of quite another kind saves nearly as much: then the residual has no name yet."""
+    lib = known()
+    family = {
+        name,
+        *lib[name].lookalikes,
+        *lib[name].replaces,
+        *(n for n in lib if name in lib[n].lookalikes),
+    }
+    return any(g > NEARLY * gains[name] for n, g in gains.items() if n not in family)
+
+
+def negligible(lost: float, errors: float) -> bool:
+    """Say whether a loss counts for nothing: small, or not large and within one standard error."""
+    return lost < GAIN or (errors < 1.0 and lost < DOUBTFUL)
+
+
+def simplest(good: dict[str, Tried]) -> str:
+    """Of the candidates within one standard error and ``GAIN`` of the best, the one with the fewest parameters.
+
+    A named effect goes before a nameless term that does no better.
+    """
+    best = max(good, key=lambda n: good[n][2])
+    near = []
+    for n, (_, loss, _, _) in good.items():
+        lost, sure = better(good[best][1], loss)
+        if negligible(lost, sure):
+            near.append(n)
+    return min(near, key=lambda n: (n not in library(), size(n), -good[n][2]))
+
+
+def physical(fit: Fit, name: str) -> bool:
+    """Say whether an effect stays within its bounds: a number that leans on one belongs to something else.
+
+    The stiffness and damping of a contact may: harder than what is seen is as good as hard. So may a time constant.
+    """
+    effect, given = known()[name], fit.model.effects[name]
+    if any(given[a] > most * given[b] for a, b, most in effect.ratios):
+        return False
+    free = [q for q in effect.parameters if not q.phase and not q.fixed]
+    for q in [effect.primary] if effect.slot in (Slot.BACKLASH, Slot.THERMAL) else free:
+        low, high = (bound * fit.model.scale(q) for bound in (q.lower, q.upper))
+        if given[q.symbol] > 0.98 * high or (q.lower < 0.0 and given[q.symbol] < 0.98 * low):
+            return False
+    return not small(fit.model, name)
+
+
+def small(model: AxisModel, name: str) -> bool:
+    """Say whether an effect has become smaller than it may be to be named."""
+    effect = known()[name]
+    if effect.slot in (Slot.SCALE, Slot.LIMIT, Slot.ELASTIC):
+        return False
+    p = effect.primary
+    least = max(p.lower, p.least, 1e-4 * p.start) * model.scale(p)
+    return abs(model.effects[name][p.symbol]) <= 1.01 * least
