@@ -16,8 +16,8 @@ from sioms.reconcile.records import Session
 from sioms.reconcile_selftest.draw import draw_axis
 from sioms.reconcile_selftest.score import score
 from sioms.tools import reconcile
-from sioms.tools.reconcile_input import read_data, read_model
 from sioms.tools.reconcile_blind import solve
+from sioms.tools.reconcile_input import read_data, read_model
 from sioms.tools.reconcile_selftest import generate, record_all, write_public
 
 AXES = Path(__file__).parent / "reconcile_axes"
