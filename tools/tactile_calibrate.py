@@ -77,7 +77,8 @@ def _summary(page: Page, result: Calibration) -> None:
             for name, r in result.residuals.items()]  # fmt: skip
     page.text(
         f"Contact model {finger.contact.model}, share of adhesion {finger.contact.adhesion:.2f}; Poisson's ratio "
-        f"{finger.geometry.poisson:.3f}; map in use: {finger.notes['map']}. Residuals are root mean squares over touches "
+        f"{finger.geometry.poisson:.3f}; an element averages over +-{math.degrees(finger.geometry.extent_rad):.2f} deg; map in "
+        f"use: {finger.notes['map']}. Residuals are root mean squares over touches "
         f"that were left out of the fit, in per cent of the peak strain of a 200 N/m edge ({100 * result.peak:.2f} %); those "
         "of the model within 25 degrees of the element, those of identified maps over all touches."
     )
@@ -172,7 +173,7 @@ def _predictions(result: Calibration, which: NDArray[np.bool_] | NDArray[np.intp
     loads = type(result.loads)(result.loads.normal[which], result.loads.shear[which])
     e, body, share = result.finger.elements, result.finger.cylinder, result.finger.contact.adhesion
     columns = [
-        strain_of(body, t, r, nu, touches, loads, share)
+        strain_of(body, t, r, nu, touches, loads, share, result.finger.geometry.extent_rad)
         for t, r, nu in zip(e.angle_rad, e.radius_m, e.poisson, strict=True)
     ]
     out = {"model": np.stack(columns, axis=1)}

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.tactile.calibrate import ElementFit, Freedom, fit_elements, fit_uniform, starts
+from sioms.tactile.calibrate import ElementFit, Freedom, fit_elements, starts
 from sioms.tactile.calibration import Calibration, Options
 from sioms.tactile.calibration import calibrate as fit
 from sioms.tactile.closedform import equivalent_radius, indenter_radius
@@ -22,6 +22,7 @@ from sioms.tactile.finger import ContactModel, Finger, IdentifiedMap
 from sioms.tactile.identify import series_of, truncated
 from sioms.tactile.linearity import linearise
 from sioms.tactile.preparation import HIGHEST
+from sioms.tactile.together import Common, fit_together
 from sioms.tactile.touches import LOADED, Touches, TouchLoads, join, ramps_of, touch_loads
 from sioms.tactile.width import hertz_table
 from sioms.tools.tactile_data import Data, read_folder
@@ -84,7 +85,10 @@ class Tables:
         self.edge = usual & (result.touches.radius_m == 0.0)
         self.both = self.edge | (usual & np.isinf(result.touches.radius_m))
         e = result.finger.elements
-        self.begin = starts(self.body, np.array(e.angle_rad), np.array(e.radius_m), result.touches)
+        self.extent = result.finger.geometry.extent_rad
+        self.begin = starts(
+            self.body, np.array(e.angle_rad), np.array(e.radius_m), result.touches, self.extent
+        )
 
     def part(self, which: NDArray[np.bool_], loads: TouchLoads | None = None) -> tuple[Touches, TouchLoads]:
         """Return some touches with their tractions."""
@@ -163,9 +167,12 @@ class Tables:
 
     def table_3_7(self) -> Table:
         """Uniform fits."""
-        places, (depth, nu), _ = fit_uniform(self.body, self.begin, *self.part(self.edge), 0.0)
+        places, _ = fit_together(
+            self.body, self.begin, *self.part(self.edge), 0.0, Common(depth=True, extent=self.extent > 0.0)
+        )
         fits = {number: one for number, one in enumerate(places) if one is not None}
-        rows = [("this finger", f"{nu:.2f}", f"{1e3 * depth:.1f}", _three([self.error(o) for o in fits.values()], 2),
+        one = next(iter(fits.values()))
+        rows = [("this finger", f"{one.poisson:.2f}", f"{1e3 * one.radius_m:.1f}", _three([self.error(o) for o in fits.values()], 2),
                  _three(self.noise(fits), 2)),
                 ("published 0", "0.45", "10.3", "1.86 3.18 5.07", "0.95 1.73 2.80"),
                 ("published 4", "0.43", "10.1", "3.17 5.61 8.13", "0.39 0.96 1.50"),
@@ -184,7 +191,7 @@ class Tables:
         e = self.result.finger.elements
         pressure, shear = series_of(touches, tractions)
         tangential = np.split(
-            e_map(self.body, e.angle_rad, e.radius_m, HIGHEST, self.body.poisson), 2, axis=1
+            e_map(self.body, e.angle_rad, e.radius_m, HIGHEST, self.body.poisson, self.extent), 2, axis=1
         )[1]
         strain = -touches.output * np.array(e.gain) - share * shear @ tangential.T
         found = truncated(pressure, strain)
@@ -217,6 +224,10 @@ class Tables:
         middle = (all_of.angle_rad > math.radians(54.0)) & (all_of.angle_rad < math.radians(95.0))
         return all_of.pick(middle & (np.abs(all_of.load / 200.0 - 1.0) < 0.2))
 
+    def estimator(self, finger: Finger) -> Estimator:
+        """Return an estimator of the touches, which are means of frames."""
+        return Estimator(finger, compiled=None, averaged=max(self.result.touches.averaged, 1.0))
+
     def mean_rc(
         self, estimator: Estimator, touches: Touches, radius_m: float, load: bool = False
     ) -> tuple[float, float]:
@@ -232,9 +243,7 @@ class Tables:
         """Mean radii by contact model and map."""
         touches, rows = self.indenters(), []
         model, mapped = without_map(self.result.finger), with_map(self.result)
-        fingers = [
-            Estimator(one, compiled=None) for one in (hertzian(model), hertzian(mapped), model, mapped)
-        ]
+        fingers = [self.estimator(one) for one in (hertzian(model), hertzian(mapped), model, mapped)]
         for rc, published in PUBLISHED_3_10.items():
             if np.any(np.isclose(touches.radius_m, 1e-3 * rc, atol=1e-9)):
                 mine = [self.mean_rc(one, touches, 1e-3 * rc)[0] for one in fingers]
@@ -261,7 +270,7 @@ class Tables:
     def table_3_12(self) -> Table:
         """Radii without and with load information."""
         touches, rows = self.indenters(), []
-        estimator = Estimator(with_map(self.result), compiled=None)
+        estimator = self.estimator(with_map(self.result))
         for rc, published in PUBLISHED_3_12.items():
             if np.any(np.isclose(touches.radius_m, 1e-3 * rc, atol=1e-9)):
                 free, loaded = (self.mean_rc(estimator, touches, 1e-3 * rc, load) for load in (False, True))
@@ -289,21 +298,23 @@ def scatter(data: Data, result: Calibration, finger: Finger) -> tuple[Floats, Fl
         touches.radius_m, radii[np.linspace(0, radii.size - 1, min(NOISY, radii.size)).round().astype(int)]
     )
     quadratic, scale = np.array(finger.elements.quadratic), finger.signal.scale
-    estimator = Estimator(finger, compiled=None)
+    single = Estimator(finger, compiled=None)
+    meant = Estimator(finger, compiled=None, averaged=max(touches.averaged, 1.0))
     by_place, frames = [], []
     for number in np.flatnonzero(chosen):
         mine = recording.touch == number
         rest = recording.raw[mine & (recording.phase != LOADED)].mean(0)
         output = linearise(scale * (recording.raw[mine & (recording.phase == LOADED)] - rest), quadratic)
-        many = np.concatenate([output.mean(0, keepdims=True), output])
-        count = len(many)
-        copies = Touches(many, np.full(count, touches.angle_rad[number]), np.full(count, touches.load[number]),
+        mean, count = output.mean(0, keepdims=True), len(output)
+        copies = Touches(output, np.full(count, touches.angle_rad[number]), np.full(count, touches.load[number]),
                          np.full(count, touches.radius_m[number]), np.full(count, np.nan), touches.noise)  # fmt: skip
         truth = np.array([math.degrees(touches.angle_rad[number]), touches.load[number],
                           1e3 * equivalent_radius(finger.cylinder, float(touches.radius_m[number]))])  # fmt: skip
-        found = np.array(fitted(estimator, copies, False)) * [180.0 / math.pi, 1.0, 1e3] - truth
-        by_place.append(found[0])
-        frames.append(found[1:])
+        units = np.array([180.0 / math.pi, 1.0, 1e3])
+        by_place.append(
+            np.array(fitted(meant, copies.pick(np.arange(1)).with_output(mean), False))[0] * units - truth
+        )
+        frames.append(np.array(fitted(single, copies, False)) * units - truth)
     means, every = np.array(by_place), np.concatenate(frames)
     about = np.concatenate([part - mean for part, mean in zip(frames, by_place, strict=True)])
     return np.nanstd(every, axis=0), np.nanstd(means, axis=0), np.nanstd(about, axis=0)

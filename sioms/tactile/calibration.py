@@ -7,40 +7,47 @@ support stays at its nominal value and is said so in `warnings`.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from sioms.tactile.calibrate import (
+    FEWEST,
+    NEAR,
     REFERENCE_LOAD,
-    ElementFit,
     Freedom,
     fit_elements,
-    fit_uniform,
-    starts,
     strain_of,
 )
 from sioms.tactile.contact import width_for_load
 from sioms.tactile.cylinder import Cylinder, respond
-from sioms.tactile.emap import e_map
+from sioms.tactile.emap import e_map, felt
 from sioms.tactile.finger import ContactKind, ContactModel, Elements, Finger, Geometry, IdentifiedMap
 from sioms.tactile.identify import Identified, corrected, series_of, truncated
 from sioms.tactile.indenter import Wedge
 from sioms.tactile.linearity import Quadratic
-from sioms.tactile.preparation import HIGHEST, Faults, Fits, clean_outputs
+from sioms.tactile.preparation import HIGHEST, Faults, Fits, begin_at, clean_outputs
+from sioms.tactile.together import Common, fit_together
 from sioms.tactile.touches import Ramp, Touches, TouchLoads, touch_loads
 from sioms.tactile.width import WidthTable, hertz_table, rigid_core_table
 
 Floats = NDArray[np.float64]
 
 FEWEST_TOUCHES = 30
-SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of full adhesion, tried in turn
+SHARES = (
+    0.0,
+    0.4,
+    0.8,
+    1.2,
+)  # of full adhesion, tried in turn; what is full has no sharp meaning, see `adhere`
 _BETTER = 0.97  # a richer model must bring the left-out residual below this share of the simpler one's
 _POISSON_DEVIATION = 0.03
+_STANDS_OUT = 5.0  # standard deviations of the square of the elements' extent
+_ROUNDS = 3
+_POISSON_MATTERS = 4e-3
 _FAR_GAIN = 5.0  # from nominal, either way: rather a wrong unit than scatter
 
 
@@ -119,7 +126,7 @@ def calibrate(
     touches, loads, faults = clean_outputs(
         nominal, touches, widths, ramps or [], options.edge_half_angle_rad, warnings, tick
     )
-    begin = starts(body, np.array(nominal.angles_rad), np.array(nominal.elements.radius_m), touches)
+    begin = begin_at(nominal, touches)
     for element, fit in enumerate(begin):
         if fit is None:
             warnings.append(
@@ -129,25 +136,26 @@ def calibrate(
         raise ValueError(
             "calibrate finger: fewer than 4 elements have touches near them; probe more of the finger"
         )
-    kind, adhesion, contacts, loads, widths = _contact(
-        body, begin, touches, loads, widths, options, faults, tick
-    )
-    uniform, (_, nu), (_, nu_sd) = fit_uniform(
-        body, begin, touches, loads, adhesion, lambda: tick("uniform fit")
-    )
-    if nu_sd > _POISSON_DEVIATION or nu > 0.4995 or nu < 0.36:
-        warnings.append(
-            f"Poisson's ratio is not supported by the data ({nu:.3f} +- {nu_sd:.3f}): kept at {body.poisson}"
+    begin = _with_extent(body, begin, touches, loads)
+    tick("width of the elements")
+    for _ in range(_ROUNDS):
+        kind, adhesion, contacts, tractions, table = _contact(
+            body, begin, touches, loads, widths, options, faults, tick
         )
-        uniform, _, _ = fit_uniform(
-            body, begin, touches, loads, adhesion, lambda: tick("uniform fit"), free_poisson=False
+        own, nu = _together(body, begin, touches, tractions, adhesion, warnings)
+        tick("element fit")
+        if abs(nu - body.poisson) < _POISSON_MATTERS:
+            break
+        # the contact's width goes with Poisson's ratio
+        body = Cylinder(body.core_m, body.outer_m, nu, body.shear_pa)
+        widths, begin = rigid_core_table(body), own
+        loads = touch_loads(
+            body, widths, touches, HIGHEST, options.edge_half_angle_rad, faults.wider(touches)
         )
-        nu = body.poisson
+        tick("loads of the touches")
+    loads, widths = tractions, table
     body = Cylinder(body.core_m, body.outer_m, nu, body.shear_pa)
-    own = fit_elements(
-        body, [_with(fit, poisson=nu) for fit in uniform], touches, loads, adhesion, Freedom(True, False),
-        lambda: tick("element fit"),
-    )  # fmt: skip
+    uniform, _ = fit_together(body, own, touches, loads, adhesion, Common(True, False, False))
     _check_gains(nominal, own, warnings)
     peak = edge_peak(body, own, options.edge_half_angle_rad)
     residuals = {
@@ -283,12 +291,41 @@ def edge_peak(body: Cylinder, fits: Fits, half_angle: float) -> float:
     series = width_for_load(body, Wedge(half_angle), REFERENCE_LOAD).series(0.0, HIGHEST)[
         : 2 * HIGHEST + 1 : 2
     ]
-    radii = [fit.radius_m for fit in fits if fit is not None]
-    return float(-np.mean(respond(body, np.arange(HIGHEST + 1), radii).e_rr[:, :, 0].T @ series))
+    known = [fit for fit in fits if fit is not None]
+    factors = respond(body, np.arange(HIGHEST + 1), [fit.radius_m for fit in known]).e_rr[:, :, 0].T
+    return float(-np.mean(factors @ (series * felt(HIGHEST, known[0].extent_rad))))
 
 
-def _with(fit: ElementFit | None, poisson: float) -> ElementFit | None:
-    return None if fit is None else dataclasses.replace(fit, poisson=poisson)
+def _with_extent(body: Cylinder, begin: Fits, touches: Touches, loads: TouchLoads) -> Fits:
+    """Return the elements with the arc over which they average, zero if that does not stand out.
+
+    Edges tell it whatever the friction; where there are few of them all touches must.
+    """
+    edge = touches.radius_m == 0.0
+    near = np.abs(touches.angle_rad[edge, None] - [fit.angle_rad for fit in begin if fit is not None]) <= NEAR
+    if np.any(near.sum(axis=0) < FEWEST):
+        edge[:] = True
+    found, shared = fit_together(
+        body, begin, touches.pick(edge), TouchLoads(loads.normal[edge], loads.shear[edge]), 0.0, Common()
+    )
+    return found if shared.extent_square > _STANDS_OUT * shared.extent_deviation else begin
+
+
+def _together(
+    body: Cylinder, begin: Fits, touches: Touches, loads: TouchLoads, adhesion: float, warnings: list[str]
+) -> tuple[Fits, float]:
+    """Fit depths of all elements with one Poisson's ratio, the body's if the data do not support another."""
+    wide = any(fit is not None and fit.extent_rad > 0.0 for fit in begin)
+    found, shared = fit_together(body, begin, touches, loads, adhesion, Common(extent=wide))
+    nu, deviation = shared.poisson, shared.poisson_deviation
+    if deviation < _POISSON_DEVIATION and 0.36 < nu < 0.4995:
+        return found, nu
+    warnings.append(
+        f"Poisson's ratio is not supported by the data ({nu:.3f} +- {deviation:.3f}): kept at {body.poisson:.3g}"
+    )
+    held = [None if fit is None else replace(fit, poisson=body.poisson) for fit in begin]
+    found, _ = fit_together(body, held, touches, loads, adhesion, Common(poisson=False, extent=wide))
+    return found, body.poisson
 
 
 def _left_out(
@@ -316,8 +353,10 @@ def _left_out(
         for element, fit in enumerate(trained):
             if fit is None:
                 continue
-            strain = strain_of(body, fit.angle_rad, fit.radius_m, fit.poisson, test, tractions, adhesion)
-            near = np.abs(test.angle_rad - fit.angle_rad) <= np.radians(25.0)
+            strain = strain_of(
+                body, fit.angle_rad, fit.radius_m, fit.poisson, test, tractions, adhesion, fit.extent_rad
+            )
+            near = np.abs(test.angle_rad - fit.angle_rad) <= NEAR
             miss = (fit.gain * test.output[:, element] + strain)[near]
             square[element] += float(miss @ miss)
             count[element] += miss.size
@@ -335,8 +374,9 @@ def _identify(
     strain = -touches.output[:, [element for element, _ in known]] * gain
     pressure, shear = series_of(touches, loads)
     full = e_map(
-        body, [fit.angle_rad for _, fit in known], [fit.radius_m for _, fit in known], HIGHEST, body.poisson
-    )
+        body, [fit.angle_rad for _, fit in known], [fit.radius_m for _, fit in known], HIGHEST, body.poisson,
+        known[0][1].extent_rad,
+    )  # fmt: skip
     normal, tangential = np.split(full, 2, axis=1)
     covered = float(np.ptp(touches.angle_rad)) / np.ptp([fit.angle_rad for _, fit in known])
     if covered < 0.8:
@@ -385,7 +425,9 @@ def _finger(
     table = rigid_core_table(body) if kind != "hertz" else widths
     return msgspec.structs.replace(
         nominal,
-        geometry=Geometry(body.core_m, body.outer_m, body.poisson, body.shear_pa),
+        geometry=Geometry(
+            body.core_m, body.outer_m, body.poisson, body.shear_pa, max(f.extent_rad for f in fits if f is not None)
+        ),
         elements=elements,
         contact=ContactModel(
             kind, adhesion, tuple(table.half_widths.tolist()), tuple(table.ratio.tolist()),

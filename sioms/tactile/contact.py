@@ -18,6 +18,7 @@ Chebyshev pairs of the Hilbert transform: Erdogan and Gupta (1972).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -186,20 +187,24 @@ def width_for_load(
             return adhere(cylinder, indenter, half_width)
         return slide(cylinder, indenter, half_width, friction)
 
-    low, high = 1e-4, 0.1
-    while solve(low).load > load:
-        low *= 0.1
-        if low < 1e-9:
+    def over(log_width: float) -> float:
+        """Return the logarithm of load over load wanted: nearly straight over that of the width."""
+        return math.log(max(solve(math.exp(log_width)).load, 1e-300) / load)
+
+    low = high = math.log(0.05)
+    while over(low) > 0.0:
+        high, low = low, low - 1.5
+        if low < math.log(1e-9):
             raise ValueError(
                 f"find contact width: {load} N/m needs a strip under 1e-9 rad; the load is too small"
             )
-    while solve(high).load < load:
-        high *= 1.5
-        if high > _WIDEST:
+    while low == high or over(high) < 0.0:
+        if high == math.log(_WIDEST):
             raise ValueError(
                 f"find contact width: {load} N/m presses a strip over {_WIDEST} rad; the load is too high"
             )
-    return solve(float(brentq(lambda a: solve(a).load - load, low, high, xtol=1e-10, rtol=1e-9)))
+        low, high = high, min(high + 0.8, math.log(_WIDEST))
+    return solve(math.exp(float(brentq(over, low, high, xtol=1e-10))))
 
 
 def _check_width(half_width: float) -> None:

@@ -50,7 +50,7 @@ class Cylinder:
     shear_pa: float = DEFAULT_SHEAR_MODULUS_PA
 
     def __post_init__(self) -> None:
-        where = f"describe cylinder with core {self.core_m} m and outer radius {self.outer_m} m"
+        where = f"describe cylinder with core {self.core_m:g} m and outer radius {self.outer_m:g} m"
         if not 0.0 < self.core_m < self.outer_m < np.inf:
             raise ValueError(f"{where}: the core must be smaller than the finger; need 0 < core < outer")
         if not 0.0 <= self.poisson <= 0.5:

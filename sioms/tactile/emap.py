@@ -16,12 +16,15 @@ from sioms.tactile.series import wave_numbers
 
 Floats = NDArray[np.float64]
 
+MOST_EXTENT = 0.2  # rad; half angle of an element's strip
+
 _MOST = 2000
 
 
 def e_map(
-    cylinder: Cylinder, angles: ArrayLike, radii: ArrayLike, highest: int, poisson: ArrayLike | None = None
-) -> Floats:
+    cylinder: Cylinder, angles: ArrayLike, radii: ArrayLike, highest: int, poisson: ArrayLike | None = None,
+    extent_rad: float = 0.0,
+) -> Floats:  # fmt: skip
     """Return E, shape (ns, 4 nc + 2) [1/Pa].
 
     Args:
@@ -30,12 +33,13 @@ def e_map(
         radii: effective element radii rs_i [m], shape (ns,) or scalar.
         highest: nc, the highest wave number kept.
         poisson: Poisson's ratio seen by each element, shape (ns,) or scalar; None takes the cylinder's.
+        extent_rad: half angle over which an element averages.
     """
     theta = np.atleast_1d(np.asarray(angles, dtype=np.float64))
     radius = np.broadcast_to(np.asarray(radii, dtype=np.float64), theta.shape)
     given = np.asarray(cylinder.poisson if poisson is None else poisson, dtype=np.float64)
     ratio = np.broadcast_to(given, theta.shape)
-    factors = strain_factors(cylinder, radius, ratio, highest)
+    factors = strain_factors(cylinder, radius, ratio, highest) * felt(highest, extent_rad)[:, None]
     k = wave_numbers(highest)
     normal, shear = factors[:, k, 0], factors[:, k, 1]
     phase = theta[:, None] * k
@@ -44,6 +48,15 @@ def e_map(
     tangential = shear * np.where(sine, -np.cos(phase), np.sin(phase))
     tangential[:, 0] = shear[:, 0]
     return np.concatenate([pressure, tangential], axis=1)
+
+
+def felt(highest: int, extent_rad: float) -> Floats:
+    """Return the share of each wave number that an element feels as it averages over an arc, shape (nc + 1,).
+
+    A strip of copper is no line: over t - extent to t + extent cos kt has the mean cos kt times sin(k extent)/(k extent).
+    """
+    share: Floats = np.sinc(np.arange(highest + 1) * extent_rad / np.pi)
+    return share
 
 
 def strain_factors(cylinder: Cylinder, radii: Floats, poisson: Floats, highest: int) -> Floats:

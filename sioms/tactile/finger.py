@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.tactile.cylinder import DEFAULT_SHEAR_MODULUS_PA, Cylinder
-from sioms.tactile.emap import e_map, highest_needed
+from sioms.tactile.emap import MOST_EXTENT, e_map, highest_needed
 from sioms.tactile.model import Spectra, StrainTable, adhering, elliptic, strain_table
 from sioms.tactile.strips import Strips
 from sioms.tactile.width import WidthTable, hertz_table, rigid_core_table
@@ -27,16 +27,18 @@ from sioms.tactile.width import WidthTable, hertz_table, rigid_core_table
 Floats = NDArray[np.float64]
 
 FORMAT = "sioms finger 1"
+MOST_ADHESION = 1.5  # full adhesion has no size of its own below Poisson's ratio 1/2: see `contact.adhere`
 ContactKind = Literal["frictionless", "adhering", "hertz"]
 
 
 class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Radii [m] and material of the layer."""
+    """Radii [m] and material of the layer; half angle over which every element averages (half its strip's width)."""
 
     core_m: float
     outer_m: float
     poisson: float
     shear_modulus_pa: float = DEFAULT_SHEAR_MODULUS_PA
+    extent_rad: float = 0.0
 
 
 class Elements(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -122,8 +124,12 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         self._check_elements(what)
         if self.identified is not None:
             self._check_map(what, self.identified)
-        if not 0.0 <= self.contact.adhesion <= 1.0:
-            raise ValueError(f"{what}: share of adhesion is {self.contact.adhesion}; need 0 to 1")
+        if not 0.0 <= self.geometry.extent_rad <= MOST_EXTENT:
+            raise ValueError(f"{what}: extent_rad is {self.geometry.extent_rad}; need 0 to {MOST_EXTENT} rad")
+        if not 0.0 <= self.contact.adhesion <= MOST_ADHESION:
+            raise ValueError(
+                f"{what}: share of adhesion is {self.contact.adhesion}; need 0 to {MOST_ADHESION}"
+            )
         if len(self.contact.half_width_rad) != len(self.contact.ratio):
             raise ValueError(f"{what}: contact table has unequal columns; give as many ratios as half widths")
         if not self.signal.lowest < self.signal.highest:
@@ -195,8 +201,9 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Return E of the elements' model, shape (ns, 4 nc + 2) [1/Pa], even if a map was identified."""
         e = self.elements
         return e_map(
-            self.cylinder, e.angle_rad, np.asarray(e.radius_m), self.highest(), np.asarray(e.poisson)
-        )
+            self.cylinder, e.angle_rad, np.asarray(e.radius_m), self.highest(), np.asarray(e.poisson),
+            self.geometry.extent_rad,
+        )  # fmt: skip
 
     def spectra(self) -> Spectra:
         """Return the spectra of the contact model."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,9 +65,9 @@ def truncated(pressure: Floats, strain: Floats, cut: float = CUT) -> Identified:
         kept = s > cut * s[0]
         return (v[kept].T / s[kept]) @ (u[:, kept].T @ y), int(kept.sum())
 
-    left_out = np.sqrt(np.mean(_leave_out(pressure, strain, lambda p, y: solve(p, y)[0]) ** 2, axis=0))
+    left_out = _leave_out(pressure, strain, lambda p, y: solve(p, y)[0][None])[0]
     found, rank = solve(pressure, strain)
-    return Identified(found.T, left_out, rank)
+    return Identified(found.T, np.sqrt(np.mean(left_out**2, axis=0)), rank)
 
 
 def corrected(pressure: Floats, strain: Floats, model: Floats) -> Identified:
@@ -86,29 +85,32 @@ def corrected(pressure: Floats, strain: Floats, model: Floats) -> Identified:
     size = np.sqrt(np.mean(model**2, axis=0))
     size = np.maximum(size, 1e-6 * size.max())
     scaled, rest = pressure * size, strain - pressure @ model.T
-    unit = np.linalg.svd(scaled, compute_uv=False)[0]
-
-    def solve(p: Floats, y: Floats, weight: float) -> Floats:
-        u, s, v = np.linalg.svd(p, full_matrices=False)
-        answer: Floats = (v.T * (s / (s**2 + (weight * unit) ** 2))) @ (u.T @ y)
-        return answer
-
-    misses = [_leave_out(scaled, rest, partial(solve, weight=0.01 * weight)) for weight in _WEIGHTS]
-    best = int(np.argmin([np.mean(miss**2) for miss in misses]))
-    change = solve(scaled, rest, 0.01 * _WEIGHTS[best])
     singular = np.linalg.svd(scaled, compute_uv=False)
-    rank = int(np.count_nonzero(singular > 0.01 * _WEIGHTS[best] * unit))
-    return Identified(model + (change * size[:, None]).T, np.sqrt(np.mean(misses[best] ** 2, axis=0)), rank)
+    weights = 0.01 * singular[0] * np.array(_WEIGHTS)
+
+    def solve(p: Floats, y: Floats) -> Floats:
+        u, s, v = np.linalg.svd(p, full_matrices=False)
+        answers: Floats = (v.T * (s / (s**2 + weights[:, None] ** 2))[:, None]) @ (u.T @ y)
+        return answers
+
+    misses = np.mean(_leave_out(scaled, rest, solve) ** 2, axis=1)
+    best = int(np.argmin(misses.mean(axis=1)))
+    change = solve(scaled, rest)[best]
+    rank = int(np.count_nonzero(singular > weights[best]))
+    return Identified(model + (change * size[:, None]).T, np.sqrt(misses[best]), rank)
 
 
 def _leave_out(pressure: Floats, strain: Floats, solve: Callable[[Floats, Floats], Floats]) -> Floats:
-    """Return the residual of each touch predicted from the others, in folds of every fifth touch."""
-    miss = np.empty_like(strain)
+    """Return the residual of each touch predicted from the others, in folds of every fifth touch.
+
+    `solve` returns maps in some ways, shape (ways, directions, ns); the residuals have shape (ways, nt, ns).
+    """
+    miss: list[Floats] = [np.empty(0)] * _FOLDS
     fold = np.arange(pressure.shape[0]) % _FOLDS
     for number in range(_FOLDS):
         out = fold == number
-        miss[out] = strain[out] - pressure[out] @ solve(pressure[~out], strain[~out])
-    return miss
+        miss[number] = strain[out] - pressure[out] @ solve(pressure[~out], strain[~out])
+    return np.concatenate(miss, axis=1)
 
 
 def _check(pressure: Floats, strain: Floats) -> None:

@@ -9,6 +9,7 @@ the default steps, far below any noise).  One look-up costs the same for 40 or 4
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,21 +63,26 @@ def adhering(cylinder: Cylinder, highest: int, share: float, widest: float = WID
 
     A real contact slips at its rim and sticks inside; the share is fitted, not predicted.
     """
-    base = elliptic(highest, widest)
-    nodes = widest * np.arange(1, 9) / 8
-    rows = [np.zeros(highest + 1)]
-    for a in nodes:
-        solved = adhere(cylinder, FLAT, float(a))
-        q = np.zeros(highest + 1)
-        q[1:] = solved.series(0.0, highest)[2 * highest + 2 :: 2]
-        rows.append(q * np.pi * cylinder.outer_m / solved.load)
-    spline = CubicSpline(np.concatenate([[0.0], nodes]), np.array(rows))
+    base, spline = elliptic(highest, widest), stuck(cylinder, highest)
     a = base.half_widths
-    shear = share * spline(a)
-    slope = np.zeros_like(shear)
+    slope = np.zeros_like(base.shear)
     slope[1:] = share * spline(a[1:], 1) / (2.0 * a[1:, None])
     slope[0] = slope[1]
-    return Spectra(a, base.normal, base.normal_slope, shear, slope)
+    return Spectra(a, base.normal, base.normal_slope, share * spline(a), slope)
+
+
+@lru_cache(maxsize=8)
+def stuck(cylinder: Cylinder, highest: int) -> CubicSpline:
+    """Return q's sine coefficients under full adhesion over the half width [rad], in units of a line load's pressure.
+
+    Up to the widest contact; takes some seconds.
+    """
+    nodes = WIDEST * np.arange(9) / 8
+    rows = np.zeros((nodes.size, highest + 1))
+    for row, a in zip(rows[1:], nodes[1:], strict=True):
+        solved = adhere(cylinder, FLAT, float(a))
+        row[1:] = solved.series(0.0, highest)[2 * highest + 2 :: 2] * np.pi * cylinder.outer_m / solved.load
+    return CubicSpline(nodes, rows)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

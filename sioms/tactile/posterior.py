@@ -3,7 +3,7 @@
 Beside the outermost elements a light touch and a heavier one further out look nearly alike: the best fit then runs
 along the valley between them, and a covariance at its end is too small. The mean over the valley errs least
 in the mean square, and its spread is an honest covariance. Taken as known beforehand: the touch lies on the
-covered arc, it presses, all widths of contact up to that of the most hollow indenter are as likely.
+covered arc, it presses, all widths of contact up to that of a flat are as likely, and hollows the less the more hollow they are.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ Floats = NDArray[np.float64]
 _PLACES = 31
 _ROWS = 2  # every second half width of the table
 _REACH = 5.0  # standard deviations of the best fit's place, both ways
+_FALL = 1.5  # hollows count fully up to a third of the way from a flat to the most hollow, which does not count at all
 _FARTHEST = np.radians(10.0)
 
 
@@ -44,7 +45,7 @@ class Averager:
         table: strains per unit load.
         widths: P R over b.
         arc: lowest and highest place [rad].
-        largest: R of the most hollow indenter [m].
+        largest: R of the most hollow indenter [m], at least that of a flat.
     """
 
     table: StrainTable
@@ -80,6 +81,9 @@ class Averager:
             return None
         # P integrates out to 1/sqrt(ff); rows are even steps of the half width
         share = np.exp(-0.5 * np.where(possible, chi - chi[possible].min(), np.inf)) / np.sqrt(ff)
+        flat = self.widths.cylinder.outer_m
+        if self.largest > flat:
+            share *= np.clip(_FALL * (self.largest - radius) / (self.largest - flat), 0.0, 1.0)
         share /= share.sum()
         values = np.stack([np.broadcast_to(t, p.shape)[possible], p[possible], radius[possible]])
         share_of, spread = share[possible], 1.0 / ff[possible]

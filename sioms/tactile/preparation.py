@@ -45,6 +45,12 @@ class Faults:
         return touches.with_output(touches.output / self.strips.strain_factor(touches.angle_rad)[:, None])
 
 
+def begin_at(nominal: Finger, touches: Touches) -> Fits:
+    """Return where to start each element, as `starts`."""
+    e, extent = nominal.elements, nominal.geometry.extent_rad
+    return starts(nominal.cylinder, np.array(e.angle_rad), np.array(e.radius_m), touches, extent)
+
+
 def clean_outputs(
     nominal: Finger, touches: Touches, widths: WidthTable, ramps: list[Ramp], edge_half_angle: float, warnings: list[str],
     tick: Callable[[str], None],
@@ -56,7 +62,7 @@ def clean_outputs(
     """
     body, recorded = nominal.cylinder, touches
     loads = touch_loads(body, widths, touches, HIGHEST, edge_half_angle)
-    fits = starts(body, np.array(nominal.angles_rad), np.array(nominal.elements.radius_m), touches)
+    fits = begin_at(nominal, touches)
     distance = np.array(nominal.angles_rad) - touches.angle_rad[:, None]
     ramped, quadratic, proximity = _Ramps(body, ramps, edge_half_angle), None, None
     known = np.array([fit is not None for fit in fits])
@@ -148,7 +154,7 @@ def _model(body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads) -> F
     columns = [
         silent
         if fit is None
-        else strain_of(body, fit.angle_rad, fit.radius_m, fit.poisson, touches, loads, 0.0)
+        else strain_of(body, fit.angle_rad, fit.radius_m, fit.poisson, touches, loads, 0.0, fit.extent_rad)
         for fit in fits
     ]
     return np.stack(columns, axis=1)
@@ -172,7 +178,7 @@ def _cell_is_better(nominal: Finger, touches: Touches, loads: TouchLoads) -> boo
     if not np.isfinite(touches.force).all() or np.any(touches.force <= 0.0):
         return False
     e = nominal.elements
-    begin = starts(nominal.cylinder, np.array(e.angle_rad), np.array(e.radius_m), touches)
+    begin = begin_at(nominal, touches)
     model = _model(nominal.cylinder, begin, touches, loads)
     # each element at its own gain first, or the gains' scatter hides the loads'
     model = -model * (np.sum(touches.output * -model, axis=0) / (np.sum(model**2, axis=0) + 1e-30))
@@ -219,7 +225,14 @@ class _Ramps:
             fit = fits[ramp.element]
             if fit is not None:
                 strain = strain_of(
-                    self._body, 0.0, fit.radius_m, fit.poisson, self._touches, self._loads, 0.0
+                    self._body,
+                    0.0,
+                    fit.radius_m,
+                    fit.poisson,
+                    self._touches,
+                    self._loads,
+                    0.0,
+                    fit.extent_rad,
                 )
                 # strain per load is nearly constant: interpolate that
                 found[ramp.element] = ramp_quadratic(

@@ -12,11 +12,14 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.optimize import brentq
 
 from sioms.tactile import closedform
-from sioms.tactile.contact import adhere, width_for_load
+from sioms.tactile.contact import frictionless, width_for_load
 from sioms.tactile.cylinder import Cylinder
-from sioms.tactile.indenter import FLAT, Wedge
+from sioms.tactile.indenter import Wedge
+from sioms.tactile.model import stuck
 from sioms.tactile.width import WidthTable
 
 Floats = NDArray[np.float64]
@@ -67,7 +70,8 @@ class Touches:
         radius_m: indenter radius, 0 for an edge, infinite for a flat, shape (nt,).
         force: measured load [N/m], shape (nt,); nan without a load cell.
         noise: standard deviation of one frame's output, shape (ns,).
-        averaged: frames whose mean is as noisy as an output; 10 if it is 20 frames under load less 20 of baseline.
+        averaged: frames of white noise whose mean is as noisy as an output; 10 if it is 20 frames under load less 20 of
+            baseline, more with a mains line, which a mean leaves out.
     """
 
     output: Floats
@@ -120,7 +124,8 @@ def average(recording: Recording, angle_rad: Floats, load: Floats, radius_m: Flo
     count = angle_rad.size
     output, force = np.empty((count, recording.raw.shape[1])), np.empty(count)
     spread: list[Floats] = []
-    shares = np.empty(count)
+    slow: list[Floats] = []
+    shares, living = np.empty(count), np.isfinite(recording.raw).any(axis=0)
     for number in range(count):
         mine = recording.touch == number
         before, under = mine & (recording.phase == BASELINE), mine & (recording.phase == LOADED)
@@ -130,10 +135,11 @@ def average(recording: Recording, angle_rad: Floats, load: Floats, radius_m: Flo
                 "need at least one of each"
             )
         shares[number] = 1.0 / before.sum() + 1.0 / under.sum()
-        output[number] = recording.raw[under].mean(0) - recording.raw[before].mean(0)
+        output[number] = _mean(recording.raw[under]) - _mean(recording.raw[before])
         force[number] = recording.force[under].mean() - recording.force[before].mean()
-        if before.sum() > 2:
+        if before.sum() > 2 and np.isfinite(recording.raw[before][:, living]).all():
             spread.append(recording.raw[before].var(0, ddof=1))
+            slow.append(_slow(recording.raw[before]))
     output[:, ~np.isfinite(output).any(axis=0)] = 0.0  # an element that is not there is silent
     if not np.isfinite(output).all():
         touch, element = np.argwhere(~np.isfinite(output))[0]
@@ -142,7 +148,25 @@ def average(recording: Recording, angle_rad: Floats, load: Floats, radius_m: Flo
         )
     noise = np.sqrt(np.mean(spread, axis=0)) if spread else np.full(output.shape[1], np.nan)
     averaged = 1.0 / float(shares.mean()) if count else 1.0
+    if spread:
+        alive = np.isfinite(noise)
+        felt = float(np.mean(slow, axis=0)[alive].sum())
+        averaged *= float(np.sum(noise[alive] ** 2)) / felt if felt > 0.0 else 1.0
     return Touches(output * scale, angle_rad, load, radius_m, force, noise * scale, averaged)
+
+
+def _mean(frames: Floats) -> Floats:
+    """Return the mean of the readings that are finite, nan where there is none, shape (ns,)."""
+    finite = np.isfinite(frames)
+    count = finite.sum(axis=0)
+    total = np.where(finite, frames, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _slow(frames: Floats) -> Floats:
+    """Return the variance per frame of what a mean of such frames feels: that of the slowest waves, shape (ns,)."""
+    waves = np.fft.rfft(frames - frames.mean(0), axis=0)[1 : 1 + max(1, min(3, (len(frames) - 1) // 2))]
+    return np.asarray(np.mean(np.abs(waves) ** 2, axis=0) / len(frames))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,53 +219,61 @@ def touch_loads(
     width, times `wider` of each touch, with the tangential traction of full adhesion beside them (scale it by the share
     of adhesion).
     """
-    k = np.arange(highest + 1)
+    k, line = np.arange(highest + 1), 1.0 / (np.pi * cylinder.outer_m)
     normal, shear = np.empty((len(touches), highest + 1)), np.empty((len(touches), highest + 1))
-    stuck, factor = _adhesion_by_width(cylinder, highest), np.broadcast_to(wider, len(touches))
+    sticking, factor = stuck(cylinder, highest), np.broadcast_to(wider, len(touches))
     for number in range(len(touches)):
         load, radius = float(touches.load[number]), float(touches.radius_m[number])
         if radius == 0.0:
-            # an edge's narrow width hardly matters: one solution for each four per cent of load, scaled
-            step = round(float(np.log(load)) / 0.04)
-            spectrum, half = _edge(cylinder, highest, edge_half_angle, step)
-            p = load * spectrum
+            # the shape of an edge's narrow pressure hardly matters: one for each per cent of load
+            alike = float(np.exp(0.01 * np.round(100.0 * np.log(load))))
+            p, half = _edge(cylinder, highest, edge_half_angle, alike)
+            p = p * (load / alike)
         else:
-            half = widths.half_width(load * closedform.equivalent_radius(cylinder, radius)) * float(
-                factor[number]
-            )
-            p = -load / (np.pi * cylinder.outer_m) * closedform.ellipse_spectrum(k * half)
+            half = widths.half_width(load * closedform.equivalent_radius(cylinder, radius))
+            half *= float(factor[number])
+            p = -load * line * closedform.ellipse_spectrum(k * half)
             p[0] *= 0.5
-        normal[number], shear[number] = p, load * stuck.at(half)
+        normal[number], shear[number] = p, load * line * sticking(half)
     return TouchLoads(normal, shear)
 
 
-@lru_cache(maxsize=1000)
-def _edge(cylinder: Cylinder, highest: int, half_angle: float, step: int) -> tuple[Floats, float]:
-    """Return the cosine coefficients of p under an edge per unit load, and its half width, at the load exp(0.04 step)."""
-    solved = width_for_load(cylinder, Wedge(half_angle), float(np.exp(0.04 * step)))
-    return solved.series(0.0, highest)[: 2 * highest + 1 : 2] / solved.load, solved.half_width
+class _Edges:
+    """Solve edges on a few half widths; in between load over width and the pressure's shape go as cubics."""
 
+    _WIDTHS = (0.08, 0.2, 0.35, 0.55, 0.75, 1.0)
+    _HEAVY = 1000.0  # N/m
 
-class _AdhesionByWidth:
-    """Interpolate q's coefficients per unit load over the half width."""
+    def __init__(self, cylinder: Cylinder, highest: int, half_angle: float) -> None:
+        self._highest, self._edge = highest, Wedge(half_angle)
+        # the core narrows the contact, so that the table goes beyond the heavy load
+        top = min(0.5 * closedform.wedge_width(cylinder, self._HEAVY, half_angle), 0.5)
+        solved = [frictionless(cylinder, self._edge, top * share) for share in self._WIDTHS]
+        half = np.array([one.half_width for one in solved])
+        # without width a half plane's
+        first = 2.0 / closedform.wedge_width(cylinder, 1.0, half_angle)
+        self._load = CubicSpline(
+            np.concatenate([[0.0], half]), [first, *(one.load / one.half_width for one in solved)]
+        )
+        self._shape = CubicSpline(half, [one.normal * one.half_width / one.load for one in solved])
+        self._widest = solved[-1]
 
-    def __init__(self, cylinder: Cylinder, highest: int) -> None:
-        self._nodes = np.array([0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.27, 0.35, 0.5])
-        rows = [np.zeros(highest + 1)]
-        for half in self._nodes[1:]:
-            solved = adhere(cylinder, FLAT, float(half))
-            q = np.zeros(highest + 1)
-            q[1:] = solved.series(0.0, highest)[2 * highest + 2 :: 2] / solved.load
-            rows.append(q)
-        self._rows = np.array(rows)
-
-    def at(self, half_width: float) -> Floats:
-        place = int(np.clip(np.searchsorted(self._nodes, half_width) - 1, 0, self._nodes.size - 2))
-        part = (half_width - self._nodes[place]) / (self._nodes[place + 1] - self._nodes[place])
-        blend: Floats = (1.0 - part) * self._rows[place] + part * self._rows[place + 1]
-        return blend
+    def at(self, load: float) -> tuple[Floats, float]:
+        """Return the cosine coefficients of p about the middle [Pa], and the half width [rad]."""
+        widest = self._widest
+        if load > widest.load:
+            solved = width_for_load(widest.cylinder, self._edge, load)
+        else:
+            half = float(brentq(lambda a: a * float(self._load(a)) - load, 0.0, widest.half_width))
+            solved = replace(widest, half_width=half, load=load, normal=self._shape(half) * load / half)
+        return solved.series(0.0, self._highest)[: 2 * self._highest + 1 : 2], solved.half_width
 
 
 @lru_cache(maxsize=8)
-def _adhesion_by_width(cylinder: Cylinder, highest: int) -> _AdhesionByWidth:
-    return _AdhesionByWidth(cylinder, highest)
+def _edges(cylinder: Cylinder, highest: int, half_angle: float) -> _Edges:
+    return _Edges(cylinder, highest, half_angle)
+
+
+@lru_cache(maxsize=1000)
+def _edge(cylinder: Cylinder, highest: int, half_angle: float, load: float) -> tuple[Floats, float]:
+    return _edges(cylinder, highest, half_angle).at(load)

@@ -130,6 +130,16 @@ def test_truncation_rule() -> None:
         assert bool(abs(cut[0] / exact[0] - 1) < 2e-3) is fine
 
 
+def test_an_element_of_some_width_feels_the_mean_over_it() -> None:
+    points, weights = np.polynomial.legendre.leggauss(12)
+    mean = sum(
+        w / 2 * emap.e_map(FINGER_B, 1.0 + 0.08 * x, 10.3e-3, 60)
+        for x, w in zip(points, weights, strict=True)
+    )
+    wide = emap.e_map(FINGER_B, 1.0, 10.3e-3, 60, extent_rad=0.08)
+    assert wide == pytest.approx(mean, abs=1e-6 * np.abs(wide).max())
+
+
 def test_finite_elements_agree() -> None:
     layer = Cylinder(9.6e-3, 12.7e-3, 0.40)
     theta = np.array([0.0, 0.15, 0.4, 1.0])

@@ -25,9 +25,14 @@ def nominal() -> Finger:
     return nominal_finger(FINGER_B, ANGLES, 10.3e-3, 1.0, 1e-3)
 
 
-def exact_strains(angles: Floats, radii: Floats | float) -> Strains:
-    """Return a function (place [rad], load [N/m], rc [m]; 0 an edge) -> strains by the bounded contact, 100 wave numbers."""
-    matrix = emap.e_map(FINGER_B, angles, radii, 100)
+def exact_strains(angles: Floats, radii: Floats | float, extent: float = 0.0) -> Strains:
+    """Return a function (place [rad], load [N/m], rc [m]; 0 an edge) -> strains by the bounded contact, 100 wave numbers.
+
+    Means over elements of a half angle `extent`, by Gauss's rule.
+    """
+    points, weights = np.polynomial.legendre.leggauss(6 if extent else 1)
+    maps = [emap.e_map(FINGER_B, angles + extent * x, radii, 100) for x in points]
+    matrix = np.tensordot(weights / 2.0, maps, axes=1)
     solved: dict[tuple[float, float], contact.Contact] = {}
 
     def strains(place: float, load: float, rc: float) -> Floats:
@@ -57,7 +62,8 @@ class Made:
         self.quadratic = 4.0  # per unit of output
         self.noise = 5e-4
         self._random = random
-        self._strains = exact_strains(self.angles, self.radii)
+        self.extent = 0.05
+        self._strains = exact_strains(self.angles, self.radii, self.extent)
 
     def output(self, place: float, load: float, rc: float, frames: int = 20) -> Floats:
         """Return the averaged output of one touch."""

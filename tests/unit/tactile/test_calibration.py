@@ -42,6 +42,7 @@ def test_elements_are_found(result: Calibration, made) -> None:  # type: ignore[
     assert np.corrcoef([fit.radius_m for fit in fits], made.radii)[0, 1] > 0.95
     assert np.array([fit.gain for fit in fits]) == pytest.approx(made.gain, rel=0.12)
     assert result.finger.geometry.poisson == pytest.approx(0.46, abs=0.01)
+    assert result.finger.geometry.extent_rad == pytest.approx(made.extent, abs=0.01)
 
 
 def test_quadratic_is_kept_apart_from_the_contacts_growth(result: Calibration, made) -> None:  # type: ignore[no-untyped-def]
@@ -53,7 +54,7 @@ def test_quadratic_is_kept_apart_from_the_contacts_growth(result: Calibration, m
 def test_frictionless_contact_is_chosen(result: Calibration) -> None:
     assert result.finger.contact.model == "frictionless"
     assert result.contacts["hertz"] > 1.5 * result.contacts["frictionless"]
-    assert result.contacts["adhesion 1"] > 1.2 * result.contacts["frictionless"]
+    assert result.contacts["adhesion 0.8"] > 1.2 * result.contacts["frictionless"]
 
 
 def test_calibrated_finger_measures(result: Calibration, made) -> None:  # type: ignore[no-untyped-def]
@@ -78,7 +79,7 @@ def test_residuals_are_those_of_left_out_touches(result: Calibration, made) -> N
 def test_half_a_finger_is_left_out_and_said(start: Finger, made) -> None:  # type: ignore[no-untyped-def]
     touches = made.touches()
     half = touches.pick(touches.angle_rad < math.radians(70.0))
-    found = calibrate(start, half)
+    found = calibrate(start, half, Options(identify=False, contact="frictionless"))
     used = np.array(found.finger.elements.used)
     assert not used[:5].any()
     assert used[9:].all()
@@ -162,9 +163,27 @@ def test_average_subtracts_each_touchs_baseline() -> None:
     assert len(join([found, found])) == 4
     with pytest.raises(ValueError, match="average touch 2 of 3: 0 baseline and 0 loaded frames"):
         average(recording, np.zeros(3), np.full(3, 10.0), np.zeros(3), 0.01)
-    raw[7, 1] = np.nan
+    raw[7, 1] = np.nan  # one of five
+    assert average(recording, np.zeros(2), np.full(2, 10.0), np.zeros(2), 0.01).output == pytest.approx(
+        found.output
+    )
+    raw[5:10, 1] = np.nan
     with pytest.raises(ValueError, match="touch 0: element 1 holds a reading that is not finite"):
         average(recording, np.zeros(2), np.full(2, 10.0), np.zeros(2), 0.01)
+
+
+def test_a_mains_line_is_noise_of_frames_but_not_of_their_means() -> None:
+    random, frames, count = np.random.default_rng(4), 40, 50
+    time_s = np.arange(count * frames) / 33.0
+    raw = 0.05 * random.normal(size=(time_s.size, 4)) + 0.3 * np.sin(2 * np.pi * 120.0 * time_s)[:, None]
+    touch, phase = np.repeat(np.arange(count), frames), np.tile(np.repeat([0, 1], frames // 2), count)
+    none = np.full(time_s.size, np.nan)
+    recording = Recording(raw, time_s, touch, phase, none, none, 33.0)
+    found = average(recording, np.zeros(count), np.ones(count), np.zeros(count), 0.01)
+    assert found.noise == pytest.approx(np.full(4, 0.01 * math.hypot(0.05, 0.3 / math.sqrt(2))), rel=0.05)
+    told = float(found.noise.mean()) / math.sqrt(found.averaged)
+    assert float(found.output.std()) / 1.5 < told < 1.5 * float(found.output.std())
+    assert told < 0.3 * float(found.noise.mean()) / math.sqrt(10.0)
 
 
 def test_ramps_give_the_differences_and_series_the_level() -> None:

@@ -57,7 +57,8 @@ def test_adhering_model_narrows_the_response(nominal: Finger) -> None:
     [
         ("core_m = 0.0096", "core_m = 0.0127", r"need 0 < core < outer"),
         ("poisson = 0.46\n", "poisson = 0.6\n", r"Poisson's ratio is 0\.6"),
-        ("adhesion = 0.0", "adhesion = 2.0", r"share of adhesion is 2\.0; need 0 to 1"),
+        ("extent_rad = 0.0", "extent_rad = 3.0", r"extent_rad is 3\.0; need 0 to 0\.2 rad"),
+        ("adhesion = 0.0", "adhesion = 2.0", r"share of adhesion is 2\.0; need 0 to 1\.5"),
         ("scale = 0.01", "scael = 0.01", r"unknown field `scael`"),
         ("sioms finger 1", "sioms finger 9", r"need 'sioms finger 1'"),
         ("lowest = -100.0", "lowest = 200.0", r"lowest reading 200\.0 is not below"),
