@@ -52,6 +52,7 @@ UNPOLISHED = tuple(
     for spread in (0.25, 0.08, 0.025, 0.008)
     for symbol, width in (("gap", 1.0), ("load_fraction", 1.0), ("zeta", 2.0), ("f_contact", 1.0))
 )
+PASSES = 4  # at most so many times more for a new gap, while it gains
 POLISHED = (("gap", 0.08), ("gap", 0.025), ("gap", 0.008))
 #: Fits are kept in memory up to this size: a second search, with terms beside the library, retraces the first.
 KEPT_BYTES = 128_000_000
@@ -127,6 +128,12 @@ class Searcher:
         if effect is not None and iterations > 4:
             known_gap = tuple(model.effects[effect.name].values()) in self._polished
             fit = polish(self.problem, model, self.frozen, POLISHED if known_gap else UNPOLISHED)
+            for _ in range(0 if known_gap else PASSES):
+                again = polish(self.problem, fit.model, self.frozen, UNPOLISHED)
+                gained = again.cost < (1.0 - GAIN) * fit.cost
+                fit = min(fit, again, key=lambda f: f.cost)
+                if not gained:
+                    break
             self._polished.add(tuple(fit.model.effects[effect.name].values()))
             return fit
         return refit(self.problem, model, self.frozen, iterations)
