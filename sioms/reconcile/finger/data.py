@@ -1,8 +1,9 @@
 """Lay touches, courses, untouched frames, ramps and the load cell out as rows for the fit.
 
-Views: ``touch`` (output of every element under every touch), ``course`` (how the touch develops while the load stays),
-``drift`` (level of untouched outputs over temperature), ``ramp``, ``cell``. Nuisances are projected out: the true load of a
-touch within the load cell's noise, zero and scale of a ramp, the level at power-up.
+Views: ``touch`` (what every element has of every touch, the profile), ``course`` (how the touch develops while the load stays),
+``drift`` (level of untouched outputs over temperature), ``ramp``, ``cell``, ``strength`` (how strong every touch is in all, within
+what is known of its load: a view of its own, or the many elements would hide it). Nuisances are projected out: zero and
+scale of a ramp, the level at power-up.
 """
 
 from __future__ import annotations
@@ -18,9 +19,11 @@ from sioms.reconcile.finger.pressures import Floats
 from sioms.reconcile.finger.records import PARTS, Ramped, Touched, Untouched
 from sioms.reconcile.sensors.effect import SensorModel
 
-VIEWS = ("touch", "course", "drift", "ramp", "cell")
-TOUCH, COURSE, DRIFT, RAMP, CELL = range(5)
+VIEWS = ("touch", "course", "drift", "ramp", "cell", "strength")
+TOUCH, COURSE, DRIFT, RAMP, CELL, STRENGTH = range(6)
 GROUP = 6  # touches in a block
+OWN_ERROR = 3e-3  # of a simulated touch
+LEAST_RUNS = 12  # of three like touches one after the other, of which the scatter of loads is told
 _CONTRASTS = np.array([[-3, -1, 1, 3], [1, -1, -1, 1], [-1, 3, -3, 1]]) / np.array(
     [[20**0.5], [2.0], [20**0.5]]
 )
@@ -42,6 +45,8 @@ class FingerData:
     block: NDArray[np.int64]
     element: NDArray[np.int64]
     views: tuple[str, ...] = VIEWS
+    #: A touch's profile alone would be best without any output: its strength goes with it.
+    footing: tuple[int, ...] = (0, 1, 2, 3, 4, 0)
 
     def predict(self, model: SensorModel) -> Floats:
         """See ``sensors.fit.Data``; outputs in units of their noise."""
@@ -56,11 +61,19 @@ class FingerData:
         rows.append(self._ramps(b))
         if np.isfinite(self.cell_spread).all():
             rows.append(t.load * (1.0 + b.cell) / self.cell_spread)
+        rows.append(np.zeros(len(t)))  # strengths are taken of the touches' rows by ``whiten``
         return np.concatenate(rows)
 
     def miss(self, predicted: Floats) -> Floats:
         """See ``sensors.fit.Data``."""
         return self.whiten(predicted - self.measured())
+
+    def doubts(self, model: SensorModel) -> Floats:
+        """See ``sensors.fit.Data``: the simulated touch's own error, and when the load came on between two frames."""
+        said, t = self.predict(model), self.touched
+        own = np.where(self.view == TOUCH, OWN_ERROR * said, 0.0)
+        sooner = replace(t, since=t.since - t.unseen[:, None] / np.sqrt(3.0))
+        return np.stack([own, replace(self, touched=sooner).predict(model) - said], axis=1)
 
     def measured(self) -> Floats:
         """Return the measured rows in the units of ``predict``."""
@@ -76,18 +89,19 @@ class FingerData:
         rows += [r.output / r.noise for r in self.ramps]
         if np.isfinite(self.cell_spread).all():
             rows.append(t.cell / self.cell_spread)
+        rows.append(np.zeros(len(t)))
         return np.concatenate(rows)
 
     def whiten(self, change: Floats) -> Floats:
-        """Project out the nuisances, shape (n,) or (n, k)."""
+        """Split touches into profile and strength, and project out the nuisances, shape (n,) or (n, k)."""
         flat = change.ndim == 1
         c = change[:, None].copy() if flat else change.copy()
         count, ns, k = len(self.touched), len(self.alive), c.shape[1]
         touch = c[: count * ns].reshape(count, ns, k)
-        u = self.touched.output[:, self.alive] / self._sigma
-        n = np.einsum("ji,ji->j", u, u)
-        factor = (1.0 - 1.0 / np.sqrt(1.0 + n * self.load_share**2)) / np.maximum(n, 1e-12)
-        touch -= factor[:, None, None] * u[:, :, None] * np.einsum("ji,jik->jk", u, touch)[:, None]
+        u, size = self._profile
+        along = np.einsum("ji,jik->jk", u, touch)
+        touch -= u[:, :, None] * along[:, None]
+        c[-count:] = along / np.sqrt(1.0 + (size * self.load_share) ** 2)[:, None]
         for begin, stop, basis in self._projected:
             part = c[begin:stop]
             part -= basis @ (basis.T @ part)
@@ -98,6 +112,25 @@ class FingerData:
         """Noise of a touch's output, shape (nt, alive)."""
         out: Floats = np.sqrt(self.touched.share)[:, None] * self.touched.noise[self.alive]
         return out
+
+    @cached_property
+    def _profile(self) -> tuple[Floats, Floats]:
+        """Direction of every touch's measured outputs in units of their noise, shape (nt, alive), and their length, shape (nt,)."""
+        u = self.touched.output[:, self.alive] / self._sigma
+        size = np.maximum(np.sqrt(np.einsum("ji,ji->j", u, u)), 1e-9)
+        return u / size[:, None], size
+
+    def scatter(self, predicted: Floats) -> float:
+        """Return by how much loads scatter from touch to touch, relative, as strengths beside a prediction tell; inf of few."""
+        t = self.touched
+        size = self._profile[1]
+        beside = self.miss(predicted)[-len(t) :] * np.sqrt(1.0 + (size * self.load_share) ** 2) / size
+        same = [n + str(r) for n, r in zip(t.name, t.radius, strict=True)]
+        runs = np.array([a == b == c for a, b, c in zip(same, same[1:], same[2:], strict=False)])
+        if np.count_nonzero(runs) < LEAST_RUNS:
+            return np.inf
+        seen = 1.4826 * np.median(np.abs(np.diff(beside, 2)[runs])) / np.sqrt(6.0)
+        return float(np.sqrt(max(seen**2 - float(np.median(size**-2.0)), 0.0)))
 
     @cached_property
     def _weight(self) -> Floats:
@@ -239,6 +272,7 @@ def lay_out(
         parts.append((RAMP, np.zeros(len(r.load), dtype=np.int64), np.full(len(r.load), r.element)))
     if np.isfinite(cell_spread).all():
         parts.append((CELL, group, np.full(count, -1)))
+    parts.append((STRENGTH, group, np.full(count, -1)))
     blocks, first = [], 0
     for _, own, _ in parts:
         blocks.append(own + first)

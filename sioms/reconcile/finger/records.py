@@ -29,6 +29,7 @@ class Touched:
         output: mean under load less baseline; part: the same for ``PARTS`` parts, shape (nt, PARTS, ns).
         since: middle of each part after the load came on [s], shape (nt, PARTS).
         level: baseline; temperature, temperature_noise: [deg C] of the baseline, nan without; time: [s] of the baseline.
+        unseen: time before the first frame under load of which nothing was recorded [s], shape (nt,).
         share: 1/frames under load + 1/frames of baseline, shape (nt,): variance of a touch's output over that of a frame.
         noise: standard deviation of one frame, shape (ns,).
     """
@@ -46,6 +47,7 @@ class Touched:
     temperature: Floats
     temperature_noise: Floats
     time: Floats
+    unseen: Floats
     share: Floats
     noise: Floats
 
@@ -145,6 +147,7 @@ def reduce_touches(
                 r.temperature_c[before].mean(),
                 np.std(r.temperature_c[before], ddof=1) / np.sqrt(len(before)),
                 r.time_s[before].mean(),
+                r.time_s[under[0]] - r.time_s[mine[mine < under[0]][-1]],
                 1.0 / len(under) + 1.0 / len(before) + more + further,
             )
             for key, value in zip(rows, values, strict=True):

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sioms.reconcile.finger.belief import Belief, outputs
-from sioms.reconcile.finger.data import COURSE, DRIFT, TOUCH, VIEWS, FingerData, warm_known
+from sioms.reconcile.finger.data import (
+    COURSE,
+    DRIFT,
+    OWN_ERROR,
+    STRENGTH,
+    TOUCH,
+    VIEWS,
+    FingerData,
+    only,
+    warm_known,
+)
 from sioms.reconcile.finger.effects import library
 from sioms.reconcile.finger.plan import Bench, indenter, propose
 from sioms.reconcile.finger.pressures import Floats
@@ -17,7 +27,7 @@ from sioms.reconcile.finger.terms import TERMS
 from sioms.reconcile.refuse import hats
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.refuse import knots
-from sioms.reconcile.sensors.subject import Variable, View, untouched
+from sioms.reconcile.sensors.subject import SHARPER, Variable, View, by_chance, untouched
 from sioms.reconcile.sensors.verdict import Curve, Proposal
 from sioms.reconcile.verdict import NamedEffect
 
@@ -60,6 +70,7 @@ class FingerSubject:
                     View("untouched outputs", "%", 100.0 * drift),
                     View("load ramps", "%", 100.0 * ramp),
                     View("load cell", "N/m", float(np.median(d.cell_spread))),
+                    View("strength of touches", "%", 100.0 * float(np.median(d.load_share))),
                 ),
                 strict=True,
             )
@@ -72,16 +83,17 @@ class FingerSubject:
         place, ns = d.scene.place, len(d.alive)
         x = (b.angle[d.alive] - place[:, None]).ravel()
         out = d.touched.output[:, d.alive].ravel()
-        load = np.repeat(np.log(d.scene.load / np.median(d.scene.load)), ns)
+        load = np.log(d.scene.load / np.median(d.scene.load))
         near, level = hats(x, np.radians(np.linspace(-32.0, 32.0, 33))), hats(out, knots(out, 16))
-        per_touch = [hats(place, knots(place, 30)), hats(d.scene.time, knots(d.scene.time, 16))]
         round_ = np.minimum(d.scene.radius, 1.0)
-        kinds = [np.asarray(round_ == v, dtype=np.float64) for v in np.unique(round_)][:12]
-        columns = [near, level, near * load[:, None], out[:, None] * np.stack([load, load**2], axis=1)]
-        columns += [out[:, None] * np.repeat(c, ns, axis=0) for c in per_touch]
-        columns += [near[:, 8:25] * np.repeat(k, ns)[:, None] for k in kinds]
+        kinds = np.stack([round_ == v for v in np.unique(round_)[:12]], axis=1).astype(np.float64)
+        ways = [np.stack([load, load**2], axis=1), hats(place, knots(place, 30)), kinds]
+        ways.append(hats(d.scene.time, knots(d.scene.time, 16)))
         if warm_known(d.touched):
-            columns.append((out * np.repeat(d.scene.temperature, ns))[:, None])
+            ways.append(d.scene.temperature[:, None])
+        scaled = out[:, None] * np.repeat(np.concatenate(ways, axis=1), ns, axis=0)
+        columns = [scaled, near, level, near * np.repeat(load, ns)[:, None]]
+        columns += [near[:, 8:25] * np.repeat(k, ns)[:, None] for k in kinds.T]
         for e in range(ns):
             mine = np.zeros((len(place), ns))
             mine[:, e] = 1.0
@@ -89,7 +101,8 @@ class FingerSubject:
         sigma = np.sqrt(d.touched.share)[:, None] * d.touched.noise[d.alive]
         touch = np.zeros((len(d.view), sum(c.shape[1] for c in columns)))
         touch[d.view == TOUCH] = np.concatenate(columns, axis=1) / sigma.ravel()[:, None]
-        found = {TOUCH: d.whiten(touch)[d.view == TOUCH]}
+        seen = d.whiten(touch)
+        found = {TOUCH: seen[d.view == TOUCH], STRENGTH: seen[d.view == STRENGTH][:, : scaled.shape[1]]}
         count = len(place)
         course = np.concatenate(
             [
@@ -103,13 +116,22 @@ class FingerSubject:
             found[DRIFT] = _drift_features(d, count)
         return found
 
+    def sharpened(self, model: SensorModel, shares: Mapping[int, float]) -> FingerSubject | None:
+        """Return the finger with loads as certain as touches beside a model show them to be, None where that is nothing new."""
+        d = self.training
+        seen = max(d.scatter(d.predict(model)) * by_chance(len(d.touched)), OWN_ERROR)
+        if seen > SHARPER * float(np.median(d.load_share)):
+            return None
+        whole = replace(self.whole, load_share=np.minimum(self.whole.load_share, seen))
+        mine, angle = untouched(len(whole.touched)), self.model.base.angle
+        return replace(self, whole=whole, training=only(whole, ~mine, angle), final=only(whole, mine, angle))
+
     def groups(self) -> NDArray[np.int64]:
         """Touch of each row of the view of touches."""
         return np.repeat(np.arange(len(self.training.touched)), len(self.training.alive))
 
-    def variables(self) -> Sequence[Variable]:
-        """What the disagreement is located by."""
-        d = self.whole
+    def variables(self, d: FingerData) -> Sequence[Variable]:
+        """What a disagreement may go with."""
         b: Belief = self.model.base
         ns, t = len(d.alive), d.touched
         per = {
@@ -132,6 +154,7 @@ class FingerSubject:
             "element, from one side to the other", "1", TOUCH, where, np.unique(which, return_inverse=True)[1]
         )
         out += [(name, unit, TOUCH, np.repeat(v, ns)) for name, (unit, v) in per.items()]
+        out += [(name, unit, STRENGTH, v) for name, (unit, v) in per.items()]
         out.append(("time under load", "1", COURSE, np.tile(np.arange(3.0), len(t))))
         if warm_known(t):
             out.append(("temperature", "K", TOUCH, np.repeat(t.temperature, ns)))

@@ -88,42 +88,49 @@ def late(loads: Loads, tau: float) -> Floats:
 
 
 @lru_cache(maxsize=32)
-def lag(loads: Loads, reach: float, power: float) -> Floats:
-    """Return the lag of known loads, see ``lagged``; the search asks for the same ones again and again."""
-    out = lagged(loads.load, reach, power, loads.record)
+def _lag(loads: Loads, reach: tuple[float, ...], power: float) -> Floats:
+    out = lagged(loads.load, np.array(reach), power, loads.record)
     out.setflags(write=False)
     return out
 
 
+def lag(loads: Loads, reach: Floats, power: float) -> Floats:
+    """Return the lag of known loads, see ``lagged``; the search asks for the same ones again and again."""
+    return _lag(loads, tuple(reach), power)
+
+
 class Plays:
-    """Plays about each of some loads, of widths up to ``reach``: a play follows the load once that has moved its width.
+    """Plays about each of some loads, of widths up to a reach: a play follows the load once that has moved its width.
 
     They weigh with a power of their width; even weights make loops of parabolas, as metal under loads well below yield has
     them (Rayleigh's law). A full loop has height one. One caller at a time.
     Source: M. A. Krasnosel'skii, A. V. Pokrovskii, "Systems with Hysteresis", 1989, sec. 2 and 34 (play, Prandtl-Ishlinskii).
 
     Args:
-        power: of the weights.
+        reach: largest width, shape (n,); power: of the weights.
         load: where they stand at rest, shape (n,).
     """
 
-    def __init__(self, reach: float, power: float, load: Floats) -> None:
+    def __init__(self, reach: Floats, power: float, load: Floats) -> None:
         share = ((np.arange(PLAYS) + 0.5) / PLAYS)[:, None]
         self._width, self._weight = reach * share, share**power / np.sum(share**power)
         self._state = np.repeat(load[None], PLAYS, axis=0)
 
     def follow(self, load: Floats) -> Floats:
-        """Move on to a load; return how far the plays lag behind it in widths, -1 to 1, shape (n,)."""
-        np.clip(self._state, load - self._width, load + self._width, out=self._state)
-        out: Floats = np.sum(self._weight * (self._state - load) / self._width, axis=0)
+        """Move on through loads, shape (t, n); return how far the plays lag behind each in widths, -1 to 1, shape (t, n)."""
+        here = load[:, None]
+        low, high = here - self._width, here + self._width
+        states, last = np.empty_like(low), self._state
+        for state, least, most in zip(states, low, high, strict=True):
+            np.maximum(last, least, out=state)
+            np.minimum(state, most, out=state)
+            last = state
+        self._state = last
+        out: Floats = np.sum(self._weight * (states - here) / self._width, axis=1)
         return out
 
 
-def lagged(load: Floats, reach: float, power: float, record: NDArray[np.int64]) -> Floats:
+def lagged(load: Floats, reach: Floats, power: float, record: NDArray[np.int64]) -> Floats:
     """Return how far every column lags behind itself, see ``Plays``; at rest in every record's first row."""
-    out = np.empty_like(load)
-    for i, here in enumerate(load):
-        if i == 0 or record[i] != record[i - 1]:
-            plays = Plays(reach, power, here)
-        out[i] = plays.follow(here)
-    return out
+    parts = np.split(load, np.flatnonzero(np.diff(record)) + 1)
+    return np.concatenate([Plays(reach, power, p[0]).follow(p) for p in parts])

@@ -45,8 +45,9 @@ def softening(reading: Floats, loads: Loads, p: Floats) -> Floats:
 
 
 def lagging(reading: Floats, loads: Loads, p: Floats) -> Floats:
-    """Add b times the lag of each component's own load; b per component, reach r and power a of the plays last."""
-    return reading + p[:-2] * lag(loads, float(p[-2]), float(p[-1]))
+    """Add b times the lag of each component's own load; b and reach r per component, power a of the plays last."""
+    n = reading.shape[1]
+    return reading + p[:n] * lag(loads, p[n : 2 * n], float(p[-1]))
 
 
 GAIN = SensorEffect(
@@ -114,11 +115,18 @@ HYSTERESIS = SensorEffect(
     title="hysteresis",
     channel=MECHANICS,
     change=responding(lagging, "b", "r", "a"),
-    equation="reading_i = l_i + b_i mean over w of (z_w - l_i)/w weighed with w^a, z_w the play of width w about l_i, w up to r",
+    equation="reading_i = l_i + b_i mean over w of (z_w - l_i)/w weighed with w^a, z_w the play of width w about l_i, w up to r_i",
     parameters=(
         Quantity("b", "1", 0.0, 0.5, 5e-3, "half width of the loop, of each component", each=True),
         Quantity(
-            "r", "1", 5e-3, 0.5, 0.05, "change of load over which it turns round", starts=(0.03, 0.1, 0.3)
+            "r",
+            "1",
+            5e-3,
+            0.5,
+            0.05,
+            "change of load over which it turns round, of each component",
+            each=True,
+            starts=(0.03, 0.1, 0.3),
         ),
         Quantity("a", "1", -0.9, 3.0, 0.5, "form of the loop: 0 parabolas, larger fuller at its ends"),
     ),
@@ -182,14 +190,27 @@ def following(reading: Floats, loads: Loads, p: Floats) -> Floats:
     return reading - p[:-1] * late(loads, float(p[-1]))
 
 
+def creeping(reading: Floats, loads: Loads, p: Floats) -> Floats:
+    """Add c of the load as it comes through a lag of tau; c per component, tau last."""
+    return reading + p[:-1] * (loads.load - late(loads, float(p[-1])))
+
+
 def bent(reading: Floats, loads: Loads, p: Floats) -> Floats:
-    """Take off c of what is beyond s, either way; c per component, s last."""
-    return reading - p[:-1] * (reading - np.clip(reading, -p[-1], p[-1]))
+    """Take off c of what is beyond s, either way; c and s per component."""
+    c, s = np.split(p, 2)
+    return reading - c * (reading - np.clip(reading, -s, s))
 
 
 def dulled(reading: Floats, loads: Loads, p: Floats) -> Floats:
-    """Take off c of what is within s, either way; c per component, s last."""
-    return reading - p[:-1] * np.clip(reading, -p[-1], p[-1])
+    """Take off c of what is within s, either way; c and s per component."""
+    c, s = np.split(p, 2)
+    return reading - c * np.clip(reading, -s, s)
+
+
+def swelling(reading: Floats, loads: Loads, p: Floats) -> Floats:
+    """Add k about a load of m, within w of it; k per component, m and w last."""
+    out: Floats = reading + p[:-2] * np.exp(-(((loads.load - p[-2]) / p[-1]) ** 2))
+    return out
 
 
 TERMS = (
@@ -199,23 +220,40 @@ TERMS = (
         following,
         Quantity("c", "1", -1.2, 1.2, 0.01, "what comes late, of each component", each=True),
         Quantity("tau", "s", 1e-3, 1e5, 1.0, "time constant", starts=(2.0, 0.02, 0.1, 0.5, 10.0, 60.0)),
-        lookalikes=("hysteresis",),
+        lookalikes=("hysteresis", "term_creep"),
+    ),
+    term(
+        "creep",
+        "reading_i = l_i + c_i (l_i through a lag of tau)",
+        creeping,
+        Quantity("c", "1", -1.2, 1.2, 0.01, "what is added in time, of each component", each=True),
+        Quantity("tau", "s", 1e-3, 1e5, 1.0, "time constant", starts=(2.0, 0.02, 0.1, 0.5, 10.0, 60.0)),
+        lookalikes=("hysteresis", "gain", "term_late"),
     ),
     term(
         "knee",
-        "reading_i = l_i - c_i (|l_i| - s) sign(l_i) beyond |l_i| = s",
+        "reading_i = l_i - c_i (|l_i| - s_i) sign(l_i) beyond |l_i| = s_i",
         bent,
         Quantity("c", "1", -1.2, 1.2, 0.02, "slope that is lost there, of each component", each=True),
-        Quantity("s", "1", 0.01, 1.0, 0.02, "of full range", starts=(0.3, 0.45, 0.6, 0.75, 0.9)),
-        lookalikes=("gain", "quadratic"),
+        Quantity("s", "1", 0.2, 1.0, 0.02, "of full range", each=True, starts=(0.3, 0.45, 0.6, 0.75, 0.9)),
+        lookalikes=("gain", "quadratic", "term_dull"),
     ),
     term(
         "dull",
-        "reading_i = l_i - c_i l_i up to |l_i| = s, less c_i s beyond",
+        "reading_i = l_i - c_i l_i up to |l_i| = s_i, less c_i s_i beyond",
         dulled,
         Quantity("c", "1", -1.2, 1.2, 0.02, "slope that is lost there, of each component", each=True),
-        Quantity("s", "1", 1e-3, 0.3, 5e-3, "of full range", starts=(0.01, 0.03, 0.1)),
-        lookalikes=("gain", "hysteresis"),
+        Quantity("s", "1", 1e-3, 0.3, 5e-3, "of full range", each=True, starts=(0.01, 0.03, 0.1)),
+        lookalikes=("gain", "hysteresis", "term_knee"),
+    ),
+    term(
+        "swelling",
+        "reading_i = l_i + k_i exp(-((l_i - m)/w)^2)",
+        swelling,
+        Quantity("k", "1", -1.0, 1.0, 0.01, "size, of each component", each=True),
+        Quantity("m", "1", -1.0, 1.0, 0.02, "load", starts=(0.3, -0.9, -0.6, -0.3, 0.0, 0.6, 0.9)),
+        Quantity("w", "1", 0.03, 1.0, 0.05, "width", starts=(0.1, 0.25)),
+        lookalikes=("gain", "quadratic"),
     ),
     term(
         "cube",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,8 +15,9 @@ from sioms.reconcile.force.plan import Plan, catalogue, propose
 from sioms.reconcile.refuse import hats
 from sioms.reconcile.sensors.analyse import Options, analyse
 from sioms.reconcile.sensors.effect import TERM_PREFIX, SensorModel
+from sioms.reconcile.sensors.fit import ratios
 from sioms.reconcile.sensors.refuse import knots
-from sioms.reconcile.sensors.subject import Variable, View
+from sioms.reconcile.sensors.subject import SHARPER, Variable, View, by_chance
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
 from sioms.reconcile.verdict import NamedEffect
 
@@ -67,6 +68,11 @@ class ForceData:
         """Component of each row."""
         return self.view
 
+    @property
+    def footing(self) -> tuple[int, ...]:
+        """Every component stands on its own."""
+        return tuple(range(len(self.views)))
+
     @cached_property
     def block(self) -> NDArray[np.int64]:
         """Blocks of consecutive rows of each component."""
@@ -77,6 +83,10 @@ class ForceData:
         """Readings in units of their noise."""
         said = readings(model.belief(), self.loads)
         return np.asarray((said / self.sigma)[self.which].T.ravel())
+
+    def doubts(self, model: SensorModel) -> Floats:
+        """None: what a model reads is exact."""
+        return np.zeros((len(self.view), 0))
 
     def miss(self, predicted: Floats) -> Floats:
         """Predicted less measured, the zero of every record projected out."""
@@ -143,12 +153,24 @@ class ForceSubject:
         full = full - full.mean(0)
         return {i: full / s for i, s in enumerate(d.sigma)}
 
+    def sharpened(self, model: SensorModel, shares: Mapping[int, float]) -> ForceSubject | None:
+        """Return the sensor with the noise told beside a model; a loop of another form would then be no noise: the same."""
+        d = self.whole
+        seen = floor_of(d.measured, d.measured - readings(model.belief(), d.loads)) / d.sigma
+        quiet = ratios(d, model) * np.sqrt([1.0 - shares.get(i, 0.0) for i in range(len(d.views))])
+        lower = np.minimum(seen, quiet) * by_chance(len(d.measured))
+        if "hysteresis" in model.effects or not (lower < SHARPER).any():
+            return None
+        sigma = d.sigma * np.where(lower < SHARPER, lower, 1.0)
+        parts = [replace(p, sigma=sigma) for p in (d, self.training, self.final)]
+        return replace(self, whole=parts[0], training=parts[1], final=parts[2])
+
     def groups(self) -> NDArray[np.int64]:
         """Row of time of each row of the first component."""
         return np.arange(int(self.training.which.sum()))
 
-    def variables(self) -> Sequence[Variable]:
-        """What the disagreement is located by."""
+    def variables(self, d: ForceData) -> Sequence[Variable]:
+        """What a disagreement may go with."""
         out: list[tuple[str, str, int, Floats]] = []
         r = self.records
         for i in range(len(r.names)):
@@ -157,7 +179,7 @@ class ForceSubject:
             out.append(("time", "s", i, r.time - r.time[0]))
             if np.isfinite(r.temperature).all():
                 out.append(("temperature", "K", i, r.temperature))
-        return [Variable(*v) for v in out]
+        return [Variable(name, unit, view, values[d.which]) for name, unit, view, values in out]
 
     def propose(self, models: Sequence[SensorModel]) -> tuple[Proposal, ...]:
         """Rank the programmes of loads by how far the models differ on them; those of the stand where there is one."""
@@ -247,8 +269,13 @@ def noise_of(loads: Loads, measured: Floats) -> Floats:
     size = np.linalg.norm(a, axis=0)
     a = a[:, size > 0.0] / size[size > 0.0]
     rest = measured - a @ np.linalg.lstsq(a, measured, rcond=1e-9)[0]
-    second = np.diff(rest, 2, axis=0)
-    noise = 1.4826 * np.median(np.abs(second), axis=0) / np.sqrt(6.0)
+    return floor_of(measured, rest)
+
+
+def floor_of(measured: Floats, rest: Floats) -> Floats:
+    """Return how far each column scatters from row to row beside what is known of it; no less than its digits allow."""
+    n = len(measured)
+    noise = 1.4826 * np.median(np.abs(np.diff(rest, 2, axis=0)), axis=0) / np.sqrt(6.0)
     steps = [np.diff(np.unique(np.round(measured[:, i], 12))) for i in range(measured.shape[1])]
     floor = np.array([float(s.min()) / np.sqrt(12.0) if len(s) and len(s) < n // 2 else 0.0 for s in steps])
     out: Floats = np.maximum(np.maximum(noise, floor), 1e-9)

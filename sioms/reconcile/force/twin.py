@@ -24,7 +24,7 @@ class ForceTwin:
         self._belief: ForceBelief = model.belief()
         at_rest = np.zeros(model.count)
         self._plays = {
-            i: Plays(float(p[-2]), float(p[-1]), at_rest)
+            i: Plays(p[model.count : -1], float(p[-1]), at_rest)
             for i, (response, p) in enumerate(self._belief.responses)
             if response is lagging
         }
@@ -39,5 +39,9 @@ class ForceTwin:
         row = Loads(share[None], np.array([time_s - self._began_s]), np.zeros(1), _ONE)
         out = row.load @ b.total.T
         for i, (response, p) in enumerate(b.responses):
-            out = out + p[:-2] * self._plays[i].follow(share) if i in self._plays else response(out, row, p)
+            out = (
+                out + p[: len(share)] * self._plays[i].follow(row.load)
+                if i in self._plays
+                else response(out, row, p)
+            )
         return np.asarray(out[0] * b.full)

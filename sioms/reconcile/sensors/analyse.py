@@ -7,21 +7,21 @@ writes nothing.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sioms.reconcile.blocks import intervals
 from sioms.reconcile.excitation import SAME
 from sioms.reconcile.locate import Place
 from sioms.reconcile.noise import effective_samples
-from sioms.reconcile.search import GAIN
 from sioms.reconcile.sensors.effect import TERM_PREFIX, Array, SensorEffect, SensorModel
-from sioms.reconcile.sensors.fit import Data, Fit, refit
+from sioms.reconcile.sensors.fit import Fit, half_intervals, on_one_footing, ratios, refit
 from sioms.reconcile.sensors.locate import locate
-from sioms.reconcile.sensors.refuse import burst_share, smoother_share
+from sioms.reconcile.sensors.refuse import burst_share, smoother_shares
+from sioms.reconcile.sensors.rules import GAIN, negligible
 from sioms.reconcile.sensors.screen import screening_columns
 from sioms.reconcile.sensors.search import Found, Rival, Searcher
+from sioms.reconcile.sensors.steady import changes
 from sioms.reconcile.sensors.subject import Subject
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
 from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome
@@ -30,6 +30,10 @@ UNEXPLAINED = 0.2  # share that a generic smoother explains beyond the named mod
 LEAST_ODD = 1.15  # multiple of the floor below which nothing is called unexplained
 BURSTS = 0.8
 QUIET = 1.6
+UNSTEADY = 0.5  # share by which an effect may change along a variable
+SURELY = 2.0  # half intervals by which a change must differ from none
+REFUSED = 3  # names that are refused one after the other
+LARGEST = 30.0  # natural sizes that an effect may have to be searched for
 LEAST_TRACE = 6.0  # an effect of natural size must change the rows by this many standard deviations in all
 
 
@@ -47,37 +51,98 @@ def analyse(subject: Subject, options: Options | None = None) -> SensorVerdict:
     o = options or Options()
     frozen = tuple(e.name for e in subject.settled)
     o.progress("excitation: what can these records show")
-    missing, pairs = gate(subject)
-    names = tuple(n for n in subject.names if n not in missing)
+    missing, pairs, names = gate(subject)
     searcher = Searcher(subject.training, names, frozen, o.progress, subject.terms)
-    found = searcher.run(subject.model)
-    features = subject.features()
-    share, where = smoother_share(subject.training, found.fit, searcher.weights, features)
+    subject, found = _search(subject, searcher, subject.model)
+    share, where = _smoothed(subject, searcher, found)
     bursts = _bursts(subject, searcher, found)
-    rejected: tuple[str, ...] = ()
-    if _odd(searcher, found, share, where) or searcher.displaced(found):
+    before = tuple(found.fit.model.effects)
+    if (
+        _odd(searcher, found, share, where)
+        or searcher.displaced(found)
+        or _unsteady(subject, searcher, found, names)
+    ):
         o.progress(
             f"what remains has no name (a smoother explains {100 * share:.0f} %): searching for a term"
         )
-        before = found
         searcher.names = names + subject.terms
-        found = searcher.run(subject.model)
-        rejected = tuple(n for n in before.fit.model.effects if n not in found.fit.model.effects)
-        share, where = smoother_share(subject.training, found.fit, searcher.weights, features)
+        subject, found = _search(subject, searcher, subject.model)
+        found, names = _without_unsteady(subject, searcher, found, names)
         searcher.names = names
     o.progress("identifiability: look-alikes in the place of each effect")
     found, others = searcher.settle(found, pairs)
     missing = {n: text for n, text in missing.items() if n not in found.fit.model.effects}
-    share, where = smoother_share(subject.training, found.fit, searcher.weights, features)
+    share, where = _smoothed(subject, searcher, found)
     left = _odd(searcher, found, share, where)
+    if left:
+        found = searcher.credible(found)
+        others = [r for r in others if r.effect in found.fit.model.effects]
+    rejected = tuple(n for n in before if n not in found.fit.model.effects)
     return _conclude(subject, o, searcher, found, others, missing, pairs, share, left, bursts, rejected)
 
 
-def gate(subject: Subject) -> tuple[dict[str, str], tuple[tuple[str, str, float], ...]]:
-    """Score the records before fitting: effects not excited, and pairs that these records cannot tell apart."""
+def _search(subject: Subject, searcher: Searcher, start: SensorModel) -> tuple[Subject, Found]:
+    """Search from a model; where the floor is lower beside what was found, search on."""
+    found = searcher.run(start)
+    shares = smoother_shares(subject.training, found.fit, searcher.weights, subject.features())
+    sharper = subject.sharpened(found.fit.model, shares)
+    if sharper is None:
+        return subject, found
+    searcher.data = sharper.training
+    further = searcher.run(found.fit.model)
+    return sharper, replace(further, ladder=(*found.ladder, *further.ladder[1:]))
+
+
+def _smoothed(subject: Subject, searcher: Searcher, found: Found) -> tuple[float, str]:
+    """Return the largest share of a view that a smoother explains, and the name of that view."""
+    shares = smoother_shares(subject.training, found.fit, searcher.weights, subject.features())
+    view = max(shares, key=lambda v: shares[v])
+    return shares[view], subject.training.views[view] if shares[view] > 0.0 else ""
+
+
+def _without_unsteady(
+    subject: Subject, searcher: Searcher, found: Found, names: tuple[str, ...]
+) -> tuple[Found, tuple[str, ...]]:
+    """Search without names that are not the same everywhere; where that does as well, they are refused.
+
+    Returns:
+        What was found, and the names that were not refused.
+    """
+    asked = names
+    for _ in range(REFUSED):
+        bent = _unsteady(subject, searcher, found, asked)
+        if not bent:
+            break
+        searcher.progress(f"{bent} is not the same everywhere: searching without it")
+        asked = tuple(n for n in asked if n != bent)
+        searcher.names = tuple(n for n in names if n != bent) + subject.terms
+        other = searcher.run(subject.model)
+        worse = searcher.lost(other.losses, found.losses)
+        if negligible(worse.share, worse.errors):
+            found, names = other, tuple(n for n in names if n != bent)
+    return found, names
+
+
+def _unsteady(subject: Subject, searcher: Searcher, found: Found, names: Sequence[str]) -> str:
+    """Return which of these names changes most surely with something, "" where all are the same everywhere."""
+    names = [n for n in names if n in found.fit.model.effects]
+    seen = changes(subject.training, found.fit, searcher.weights, names, subject.variables(subject.training))
+    sure = [c for c in seen if abs(c.share) > max(UNSTEADY, SURELY * c.half)]
+    return max(sure, key=lambda c: abs(c.share) / c.half).effect if sure else ""
+
+
+def gate(subject: Subject) -> tuple[dict[str, str], tuple[tuple[str, str, float], ...], tuple[str, ...]]:
+    """Score the records before fitting.
+
+    Returns:
+        Effects that are not excited, pairs that these records cannot tell apart, and what is worth a try: an effect that would
+        not show at its natural size may be larger.
+    """
     model, data = subject.model, subject.training
     columns = {n: screening_columns(data, model, model.library[n]) for n in subject.names}
-    missing = {n: model.library[n].separate for n, c in columns.items() if np.linalg.norm(c) < LEAST_TRACE}
+    trace = {n: float(np.linalg.norm(c)) for n, c in columns.items()}
+    missing = {n: model.library[n].separate for n in columns if trace[n] < LEAST_TRACE}
+    names = tuple(n for n in columns if trace[n] * _largest(model.library[n]) > LEAST_TRACE)
     pairs = []
     shown = [n for n in columns if n not in missing]
     for i, a in enumerate(shown):
@@ -92,7 +157,13 @@ def gate(subject: Subject) -> tuple[dict[str, str], tuple[tuple[str, str, float]
                 same = min(_shared(columns[a], columns[b]), _shared(columns[b], columns[a]))
                 if same > SAME:
                     pairs.append((a, b, same))
-    return missing, tuple(sorted(pairs, key=lambda p: -p[2]))
+    return missing, tuple(sorted(pairs, key=lambda p: -p[2])), names
+
+
+def _largest(effect: SensorEffect) -> float:
+    """How many times its natural size an effect may have."""
+    q = effect.primary
+    return min(max(q.upper - effect.neutral, effect.neutral - q.lower) / q.size, LARGEST)
 
 
 def _shared(a: Array, b: Array) -> float:
@@ -132,7 +203,7 @@ def _conclude(
     o.progress("untouched rows: gap before and after")
     start = found.ladder[0].model
     gaps = _gaps(subject, start, found.fit.model)
-    weights = 1.0 / np.maximum(_ratios(subject.whole, found.fit.model), 1.0)[subject.whole.view]
+    weights = on_one_footing(subject.whole, found.fit.model)
     fit = refit(subject.whole, found.fit.model, weights, searcher.frozen)
     named, terms = _describe(subject, fit, found, searcher, others, rng)
     open_rivals = [r for r in others if r.open]
@@ -167,9 +238,7 @@ def _conclude(
         o.progress("locating the disagreement")
         places = tuple(locate(subject, start, rng))
         curves = subject.curves(start, fit.model)
-    floors = dict(
-        zip(subject.whole.views, (float(v) for v in _ratios(subject.whole, fit.model)), strict=True)
-    )
+    floors = dict(zip(subject.whole.views, (float(v) for v in ratios(subject.whole, fit.model)), strict=True))
     mine = subject.whole.view == 0
     e = subject.whole.miss(subject.whole.predict(fit.model))
     return SensorVerdict(
@@ -197,23 +266,18 @@ def _conclude(
     )
 
 
-def _ratios(data: Data, model: SensorModel) -> Array:
-    e = data.miss(data.predict(model))
-    count = np.bincount(data.view, minlength=len(data.views))
-    square = np.bincount(data.view, weights=e**2, minlength=len(data.views))
-    return np.asarray(np.sqrt(square / np.maximum(count, 1)))
-
-
 def _gaps(subject: Subject, before: SensorModel, after: SensorModel) -> tuple[Gap, ...]:
-    """Compare on the rows that took no part in any choice."""
-    old, new = _ratios(subject.final, before), _ratios(subject.final, after)
-    told = subject.views()
-    present = np.bincount(subject.final.view, minlength=len(subject.final.views)) > 0
-    return tuple(
-        Gap(told[v].title, told[v].unit, float(b) * told[v].floor, float(a) * told[v].floor, told[v].floor)
-        for v, b, a, here in zip(subject.final.views, old, new, present, strict=True)
-        if here
-    )
+    """Compare on the rows that took no part in any choice; views of one footing together."""
+    data, told, out = subject.final, subject.views(), []
+    group = np.array(data.footing)[data.view]
+    old, new = (data.miss(data.predict(m)) for m in (before, after))
+    for i, name in enumerate(data.views):
+        mine = group == i
+        if mine.any():
+            v = told[name]
+            was, left = (v.floor * float(np.sqrt(np.mean(e[mine] ** 2))) for e in (old, new))
+            out.append(Gap(v.title, v.unit, was, left, v.floor))
+    return tuple(out)
 
 
 def _describe(
@@ -225,7 +289,7 @@ def _describe(
     rng: np.random.Generator,
 ) -> tuple[list[NamedEffect], list[NamedEffect]]:
     """Describe every effect, the largest first; terms apart."""
-    half = intervals(fit, subject.whole.block) * np.array([f.quantity.size for f in fit.free])
+    half = half_intervals(subject.whole, fit, on_one_footing(subject.whole, found.fit.model))
     spread = {(f.effect, f.quantity.symbol, f.index): float(s) for f, s in zip(fit.free, half, strict=True)}
     out: list[tuple[float, NamedEffect]] = [(np.inf, e) for e in subject.settled]
     for name in [n for n in fit.model.effects if n not in searcher.frozen]:

@@ -125,10 +125,10 @@ class SensorModel:
     name: str = "sensor"
 
     def belief(self) -> Any:
-        """Return the belief with all effects switched on."""
+        """Return the belief with all effects switched on; nameless terms act on what the others leave."""
         out = self.base
-        for name, values in self.effects.items():
-            out = self.library[name].change(out, values)
+        for name in sorted(self.effects, key=lambda n: n.startswith(TERM_PREFIX)):
+            out = self.library[name].change(out, self.effects[name])
         return out
 
     def with_effect(self, name: str, values: Values) -> SensorModel:

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.reconcile.blocks import intervals
 from sioms.reconcile.descent import descend
 from sioms.reconcile.sensors.effect import Array, Quantity, SensorModel
 
@@ -24,6 +25,7 @@ class Data(Protocol):
         views: names of the views.
         block: block of each row, rising from 0, shape (n,); blocks are what is held out.
         element: element that a row belongs to, -1 for rows that mix elements, shape (n,).
+        footing: first view of the group of each view; those of one group are brought to the floor and reported together.
     """
 
     @property
@@ -35,6 +37,9 @@ class Data(Protocol):
     @property
     def element(self) -> NDArray[np.int64]: ...
 
+    @property
+    def footing(self) -> tuple[int, ...]: ...
+
     def predict(self, model: SensorModel) -> Array:
         """Return what the model says, in the units of the rows, shape (n,)."""
         ...
@@ -43,9 +48,41 @@ class Data(Protocol):
         """Return predicted less measured in units of the floor, nuisances projected out, shape (n,)."""
         ...
 
+    def doubts(self, model: SensorModel) -> Array:
+        """Return changes of the prediction by a standard deviation of what is not known but systematic, shape (n, k)."""
+        ...
+
     def whiten(self, change: Array) -> Array:
         """Return a change of the prediction as ``miss`` sees it, shape (n,) or (n, k)."""
         ...
+
+
+def ratios(data: Data, model: SensorModel) -> Array:
+    """Return the root mean square of each view in units of its floor."""
+    square, count = _squares(data, model)
+    return np.asarray(np.sqrt(square / np.maximum(count, 1)))
+
+
+def on_one_footing(data: Data, model: SensorModel) -> Array:
+    """Return weights of the rows that bring every group of views which is far from the floor down to it, shape (n,)."""
+    square, count = (np.bincount(data.footing, weights=v) for v in _squares(data, model))
+    group = 1.0 / np.maximum(np.sqrt(square / np.maximum(count, 1.0)), 1.0)
+    out: Array = group[np.array(data.footing)[data.view]]
+    return out
+
+
+def _squares(data: Data, model: SensorModel) -> tuple[Array, Array]:
+    e, n = data.miss(data.predict(model)), len(data.views)
+    square, count = (np.bincount(data.view, weights=w, minlength=n) for w in (e**2, np.ones(len(e))))
+    return square.astype(np.float64), count.astype(np.float64)
+
+
+def half_intervals(data: Data, fit: Fit, weights: Array) -> Array:
+    """Half-widths of the 95 % intervals of the free numbers: by blocks left out, and by what is systematic."""
+    doubts = weights[:, None] * data.whiten(data.doubts(fit.model))
+    moved = np.linalg.lstsq(fit.jacobian, doubts, rcond=1e-10)[0]
+    size = np.array([f.quantity.size for f in fit.free])
+    return np.asarray(size * np.hypot(intervals(fit, data.block), 1.96 * np.linalg.norm(moved, axis=1)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ def locate(subject: Subject, model: SensorModel, rng: np.random.Generator, shift
     e = -data.miss(data.predict(model))
     out = []
     told = subject.views()
-    for name, unit, view, values, own in subject.variables():
+    for name, unit, view, values, own in subject.variables(data):
         mine = np.flatnonzero(data.view == view)
         r = e[mine]
         if len(r) < 40 or np.ptp(values) == 0.0:

@@ -26,7 +26,7 @@ def screen(
     data: Data, fit: Fit, weights: Array, effect: SensorEffect, frozen: tuple[str, ...] = ()
 ) -> list[Start]:
     """Regress the residual on what a little of the effect would change; one start per trial shape, the best of all views first."""
-    out = []
+    out, lefts = [], []
     known, r = fit.jacobian, fit.residual
     for shape in _shapes(fit.model, effect):
         columns = [weights[:, None] * _columns(data, fit.model, effect, values) for values in shape]
@@ -42,10 +42,30 @@ def screen(
         values = _settled(effect, shape, d[known.shape[1] :], fit.model.count)
         if values is not None:
             left = r + full @ d
+            lefts.append(left)
             out.append(
                 Start(effect.name, values, _gain(data, r, left), 1.0 - float(left @ left) / float(r @ r))
             )
+    if len(out) > 1 and any(q.each and len(q.starts) > 1 for q in effect.parameters):
+        out.append(_elementwise(data, effect, out, lefts, r))
     return sorted(out, key=lambda s: -s.total)
+
+
+def _elementwise(
+    data: Data, effect: SensorEffect, starts: list[Start], lefts: list[Array], before: Array
+) -> Start:
+    """Put the best shape of every element together, where elements have shapes of their own."""
+    count = int(data.element.max()) + 1
+    squares = np.array([np.bincount(data.element, weights=e**2, minlength=count) for e in lefts])
+    best, which = max(starts, key=lambda s: s.total), squares.argmin(0)
+    values = {q.symbol: np.array(best.values[q.symbol]) for q in effect.parameters}
+    for q in effect.parameters:
+        if q.each:
+            values[q.symbol] = np.array([starts[k].values[q.symbol][i] for i, k in enumerate(which)])
+    left = np.stack(lefts)[which[data.element], np.arange(len(before))]
+    return Start(
+        effect.name, values, _gain(data, before, left), 1.0 - float(left @ left) / float(before @ before)
+    )
 
 
 def _gain(data: Data, before: Array, after: Array) -> float:

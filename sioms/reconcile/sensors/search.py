@@ -14,15 +14,17 @@ import numpy as np
 
 from sioms.reconcile.ambiguity import ALIKE, AMBIGUOUS, SWAPS
 from sioms.reconcile.blocks import better, heldout
-from sioms.reconcile.search import DOUBTFUL, FLOOR, GAIN, NEARLY, PAIRS, SPECIFIC, SURE, negligible
 from sioms.reconcile.sensors.effect import TERM_PREFIX, Array, SensorEffect, SensorModel
-from sioms.reconcile.sensors.fit import Data, Fit, refit
+from sioms.reconcile.sensors.fit import Data, Fit, on_one_footing, ratios, refit
+from sioms.reconcile.sensors.rules import DOUBTFUL, FLOOR, GAIN, NEARLY, SPECIFIC, SURE, negligible
 from sioms.reconcile.sensors.screen import Start, screen
 
 TRIES = 5
 STEPS = 8
 MOST_INSIDE = 0.7  # share of the elements whose own number must be one that the effect can have
-PAIRED = 1.3  # two effects are tried at once only where a view is above this multiple of its floor
+CLEAR = 0.9  # share of a view that a name must save where the view stays above its floor
+#: Two effects are tried at once only where a view is above this multiple of its floor, so many firsts and seconds.
+PAIRED, PAIRS = 1.3, 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,19 +111,9 @@ class Searcher:
         """Held-out loss per block."""
         return heldout(fit, self.data.block)
 
-    def level(self, model: SensorModel) -> Array:
-        """Bring every view that is far from the floor down to it; return root mean squares per view."""
-        ratios = self.ratios(model)
-        self.weights = 1.0 / np.maximum(ratios, 1.0)[self.data.view]
-        return ratios
-
     def ratios(self, model: SensorModel) -> Array:
         """Return the root mean square of each view in units of its floor."""
-        e = self.data.miss(self.data.predict(model))
-        count = np.maximum(np.bincount(self.data.view, minlength=len(self.data.views)), 1)
-        return np.asarray(
-            np.sqrt(np.bincount(self.data.view, weights=e**2, minlength=len(self.data.views)) / count)
-        )
+        return ratios(self.data, model)
 
     def saving(self, new: Array, old: Array, among: Collection[str] = ()) -> Saving:
         """Compare held-out losses by view: of all views, or of some."""
@@ -165,9 +157,9 @@ class Searcher:
 
     def _levelled(self, model: SensorModel) -> Fit:
         """Fit, bring the views to one footing, and fit again."""
-        self.level(model)
+        self.weights = on_one_footing(self.data, model)
         fit = self.fit(model)
-        self.level(fit.model)
+        self.weights = on_one_footing(self.data, fit.model)
         return self.fit(fit.model)
 
     def _ratio(self, fit: Fit) -> float:
@@ -251,18 +243,18 @@ class Searcher:
     def _simplest(self, good: dict[str, tuple[Fit, Array, Saving]]) -> str:
         """Of those within one standard error and ``GAIN`` of the best, the one with the fewest numbers."""
         best = max(good, key=lambda n: good[n][2].total)
-        if _termed(good[best][0].model):
-            return best  # where something has no name, a name is no better than another term
         near = []
         for n, (_, loss, _) in good.items():
             gap = self.lost(loss, good[best][1])
             if negligible(gap.share, gap.errors):
                 near.append(n)
         model = good[best][0].model
-        return min(
-            near or [best],
-            key=lambda n: (n.startswith(TERM_PREFIX), model.library[n].size(model.count), -good[n][2].total),
-        )
+        named = not _termed(model)  # where something has no name, a name is no better than another term
+
+        def order(n: str) -> tuple[bool, int, float]:
+            return named and n.startswith(TERM_PREFIX), model.library[n].size(model.count), -good[n][2].total
+
+        return min(near or [best], key=order)
 
     def _eliminate(self, fit: Fit, losses: Array, ladder: list[Rung]) -> tuple[Fit, Array]:
         """Let effects leave that no longer save their share."""
@@ -278,18 +270,15 @@ class Searcher:
         return fit, losses
 
     def _simplify(self, fit: Fit, losses: Array, ladder: list[Rung]) -> tuple[Fit, Array]:
-        """Put a simpler look-alike in the place of a richer effect where it does as well."""
+        """Put a look-alike of fewer numbers in the place of an effect, or of all that it is like, where it does as well."""
         for name in [n for n in fit.model.effects if n not in self.frozen]:
-            lib, count = fit.model.library, fit.model.count
-            for other in lib[name].lookalikes:
-                if (
-                    other not in self.names
-                    or other in fit.model.effects
-                    or lib[other].size(count) >= lib[name].size(count)
-                ):
-                    continue
-                bare = self.fit(fit.model.without_effect(name), 3)
-                start = next(iter(screen(self.data, bare, self.weights, lib[other], self.frozen)), None)
+            for other, gone in self._simpler(fit.model, name):
+                bare = self.fit(
+                    without(fit.model, gone), 0
+                )  # the others stay where they are, or they make up for it
+                start = next(
+                    iter(screen(self.data, bare, self.weights, fit.model.library[other], self.frozen)), None
+                )
                 if start is None:
                     continue
                 new = self.fit(bare.model.with_effect(other, start.values))
@@ -297,11 +286,22 @@ class Searcher:
                 gap = self.lost(loss, losses)
                 if negligible(gap.share, gap.errors) and physical(new.model, other):
                     fit, losses = new, loss
-                    ladder.append(
-                        Rung("simplify", f"{name} to {other}", self._ratio(fit), -gap.share, fit.model)
-                    )
+                    said = f"{' and '.join(gone)} to {other}"
+                    ladder.append(Rung("simplify", said, self._ratio(fit), -gap.share, fit.model))
                     break
         return fit, losses
+
+    def _simpler(self, model: SensorModel, name: str) -> list[tuple[str, tuple[str, ...]]]:
+        """Look-alikes of an effect with what each could take the place of, of more numbers in all."""
+        lib, out = model.library, []
+        if name not in model.effects:
+            return []
+        for other in [n for n in lib[name].lookalikes if n in self.names and n not in model.effects]:
+            like = tuple(n for n in model.effects if n in lib[other].lookalikes and n not in self.frozen)
+            for gone in ((name,), tuple(dict.fromkeys((name, *like)))):
+                if lib[other].size(model.count) < sum(lib[n].size(model.count) for n in gone):
+                    out.append((other, gone))
+        return list(dict.fromkeys(out))
 
     def displaced(self, found: Found) -> bool:
         """Say whether a nameless look-alike, of no more numbers, does surely better in the place of something named."""
@@ -317,6 +317,19 @@ class Searcher:
                     if new.share > GAIN and new.errors > SURE and new.total > 0.0:
                         return True
         return False
+
+    def credible(self, found: Found) -> Found:
+        """Keep only names that explain nearly all of a view in which something has no name: less may be a part of that."""
+        ratios = dict(zip(self.data.views, self.ratios(found.fit.model), strict=True))
+        model = found.fit.model
+        for name in [n for n in model.effects if n in self.names and n not in self.frozen]:
+            gap = self.lost(self.loss(self.fit(found.fit.model.without_effect(name), 4)), found.losses)
+            if ratios[gap.view] > FLOOR and gap.share < CLEAR:
+                model = model.without_effect(name)
+        if model is found.fit.model:
+            return found
+        fit = self._levelled(model)
+        return Found(fit, self.loss(fit), found.ladder)
 
     def candidates(self, fit: Fit) -> list[Start]:
         """Screen every effect that is not in the model; the best few, look-alikes of the best among them."""
@@ -437,7 +450,12 @@ def without(model: SensorModel, names: tuple[str, ...]) -> SensorModel:
 
 
 def physical(model: SensorModel, name: str) -> bool:
-    """Say whether the first parameter lies inside its bounds (of the elements' own, most) and away from doing nothing."""
+    """Say whether the first parameter lies inside its bounds (of the elements' own, most) and away from doing nothing.
+
+    A nameless term claims nothing physical.
+    """
+    if name.startswith(TERM_PREFIX):
+        return True
     effect, q = model.library[name], model.library[name].primary
     value = model.effects[name][q.symbol]
     span = 1e-3 * (q.upper - q.lower)

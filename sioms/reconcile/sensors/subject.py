@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from sioms.reconcile.sensors.effect import Array, SensorModel
 from sioms.reconcile.sensors.fit import Data
 from sioms.reconcile.sensors.verdict import Curve, Proposal
 from sioms.reconcile.verdict import NamedEffect
+
+SHARPER = 0.6  # share of a stated floor below which the one told beside a model counts
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +31,7 @@ class Variable(NamedTuple):
 
     Attributes:
         view: number of the view whose rows it is given for.
-        values: for each row of that view of the subject's ``whole``.
+        values: for each row of that view.
         bins: of the rows, from 0; None for bins of equal counts.
     """
 
@@ -79,8 +81,16 @@ class Subject(Protocol):
         """Return the number of the touch or sample of each row of view 0 of ``training``."""
         ...
 
-    def variables(self) -> Sequence[Variable]:
-        """Return what the disagreement is located by."""
+    def variables(self, data: Any) -> Sequence[Variable]:
+        """Return what a disagreement may go with, for the rows of ``whole`` or ``training``."""
+        ...
+
+    def sharpened(self, model: SensorModel, shares: Mapping[int, float]) -> Subject | None:
+        """Return the subject with its floor told beside a model that explains more than the nominal one; None for the same.
+
+        Args:
+            shares: of what the model leaves in each view, that which a smoother explains: it is no noise.
+        """
         ...
 
     def propose(self, models: Sequence[SensorModel]) -> tuple[Proposal, ...]:
@@ -99,3 +109,8 @@ class Subject(Protocol):
 def untouched(count: int) -> NDArray[np.bool_]:
     """Say which of a number of touches (or samples) take no part in any choice: every fifth."""
     return np.asarray(np.arange(count) % 5 == 2)
+
+
+def by_chance(count: int) -> float:
+    """Return how many times too low a scatter told of so many differences may be by chance."""
+    return float(1.0 + 2.0 / np.sqrt(count))

@@ -26,13 +26,13 @@ SENSOR = {"sensor": {"name": "s", "components": ["fx", "tz"], "full_range": [100
 def test_the_lag_is_odd_full_after_its_reach_and_remembers_where_a_loop_began() -> None:
     load = np.array([0.0, 0.05, 0.3, 0.26, 0.29, 0.26, 0.3, 0.1, -0.4])[:, None]
     record = np.zeros(len(load), dtype=np.int64)
-    lag = lagged(load, 0.1, 0.0, record)[:, 0]
-    assert np.allclose(lagged(-load, 0.1, 0.0, record)[:, 0], -lag)
+    lag = lagged(load, np.array([0.1]), 0.0, record)[:, 0]
+    assert np.allclose(lagged(-load, np.array([0.1]), 0.0, record)[:, 0], -lag)
     assert lag[0] == 0.0 and -1.0 < lag[1] < -0.5
     assert lag[2] == pytest.approx(-1.0)  # beyond the reach every part has given way
     assert lag[7:] == pytest.approx(1.0)  # and after twice the reach back, the other way
     assert lag[5] == pytest.approx(lag[3]) and lag[6] == pytest.approx(lag[2])  # a loop within a loop closes
-    again = lagged(np.concatenate([load, load]), 0.1, 0.0, np.repeat([0, 1], len(load)))[:, 0]
+    again = lagged(np.concatenate([load, load]), np.array([0.1]), 0.0, np.repeat([0, 1], len(load)))[:, 0]
     assert np.allclose(again[len(load) :], lag)  # every record begins at rest
 
 
@@ -47,7 +47,7 @@ def test_a_twin_reads_what_the_model_says_row_by_row() -> None:
     model, _ = from_table(SENSOR, "x")
     model = model.with_effect("gain", {"g": np.array([0.02, -0.03])})
     model = model.with_effect("offset_drift", {"d": np.array([1e-4, -2e-4])})
-    shape = {"r": np.array([0.1]), "a": np.array([0.7])}
+    shape = {"r": np.array([0.1, 0.2]), "a": np.array([0.7])}
     model = model.with_effect("hysteresis", {"b": np.array([0.02, 0.01]), **shape})
     walk = np.cumsum(np.random.default_rng(3).normal(0.0, 0.1, (60, 2)), axis=0)
     load = np.concatenate([np.zeros((1, 2)), walk])
