@@ -175,6 +175,7 @@ class ForceSubject:
         r = self.records
         for i in range(len(r.names)):
             out += [(f"load {n}", unit_of(n), i, r.load[:, j]) for j, n in enumerate(r.names)]
+            out.append(("size of its load", unit_of(r.names[i]), i, np.abs(r.load[:, i])))
             out.append(("direction of its load", "1", i, np.sign(np.gradient(r.load[:, i]))))
             out.append(("time", "s", i, r.time - r.time[0]))
             if np.isfinite(r.temperature).all():

@@ -16,7 +16,7 @@ from sioms.reconcile.sensors.effect import Array
 from sioms.reconcile.sensors.fit import Data, Fit
 from sioms.reconcile.sensors.subject import Variable
 
-LEAST_TRACE = 6.0  # standard deviations that such a change of the whole effect must make for it to be looked at
+LEAST_TRACE = 6.0  # standard deviations that such a change must make for it to be looked at
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from sioms.plant.finger import FingerShape, TactileArray
 from sioms.reconcile.descent import descend
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.finger.belief import Belief, late, outputs, scene_of
-from sioms.reconcile.finger.data import CELL, behind
+from sioms.reconcile.finger.data import CELL, STRENGTH, TOUCH, behind
 from sioms.reconcile.finger.effects import library
 from sioms.reconcile.finger.model_file import from_table, to_toml
 from sioms.reconcile.finger.plan import Bench, catalogue, first, one_place, propose
@@ -25,6 +25,7 @@ from sioms.reconcile.finger.records import Line, Ramped, find_lines, without_lin
 from sioms.reconcile.finger.twin import FingerTwin
 from sioms.reconcile.sensors.analyse import gate
 from sioms.reconcile.sensors.effect import SensorModel
+from sioms.reconcile.sensors.fit import half_intervals, refit
 from sioms.reconcile_selftest.finger_draw import HiddenFinger, draw_finger
 from sioms.reconcile_selftest.finger_world import FingerWorld
 from sioms.reconcile_selftest.layer import Body, Indenters, strain_factors
@@ -390,6 +391,30 @@ def test_loads_told_by_the_load_cell_alone_do_not_judge_its_scale(folder: Path) 
     assert not np.any(subject.whole.view == CELL)
     assert any("its scale is not judged" in note for note in subject.notes)
     assert "force_gain" in gate(subject)[0]
+
+
+def test_a_load_that_is_off_shows_in_the_strength_of_touches_and_nowhere_else(folder: Path) -> None:
+    nominal, name, stated = read_model(folder / "nominal.toml", folder)
+    data = prepare(read_experiments(folder), nominal, name, refine_extent=not stated).whole
+    louder = data.whiten(np.where(data.view == TOUCH, 0.01 * data.measured(), 0.0))
+    assert np.allclose(louder[data.view != STRENGTH], 0.0, atol=1e-9)
+    assert np.all(louder[data.view == STRENGTH] > 0.0)
+    assert np.all(louder[data.view == STRENGTH] < 0.01 / data.load_share)
+    assert data.footing[STRENGTH] == data.footing[TOUCH]
+
+
+def test_an_interval_knows_of_the_simulation_s_own_error(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sioms.reconcile.finger.data.OWN_ERROR", 0.05)
+    nominal, name, stated = read_model(folder / "nominal.toml", folder)
+    subject = prepare(read_experiments(folder), nominal, name, refine_extent=not stated)
+    data = subject.whole
+    model = subject.model.with_effect("gain_scatter", subject.model.plain("gain_scatter"))
+    fit = refit(data, model, np.ones(len(data.view)))
+    half = half_intervals(data, fit, np.ones(len(data.view)))
+    mine = [f.effect == "gain_scatter" for f in fit.free]
+    assert np.median(half[mine]) == pytest.approx(1.96 * 0.05, rel=0.3)  # 5 % too strong is 5 % of gain
 
 
 def test_the_fit_finds_the_bottom_of_a_bent_valley_within_its_bounds() -> None:

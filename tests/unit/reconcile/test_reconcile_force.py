@@ -15,7 +15,8 @@ from sioms.reconcile.force.model_file import from_table, to_toml
 from sioms.reconcile.force.subject import ForceRecords, prepare
 from sioms.reconcile.force.twin import ForceTwin
 from sioms.reconcile.sensors.analyse import Options, analyse
-from sioms.reconcile.sensors.search import Saving
+from sioms.reconcile.sensors.search import Saving, Searcher
+from sioms.reconcile.sensors.steady import changes
 from sioms.reconcile_selftest.force_world import COMPONENTS, draw_sensor, record
 from sioms.tools import reconcile
 from sioms.tools.reconcile_selftest_sensors import COLUMNS
@@ -100,6 +101,46 @@ def test_a_saturation_and_a_dead_band_are_refused_and_pass_for_no_gain(dull: boo
     assert found.outcome.value == "unexplained"
     assert not found.effects
     assert found.symbolic[0].name == ("term_dull" if dull else "term_knee")
+
+
+def random_loads(noise: float, bend: Callable[[np.ndarray], np.ndarray]) -> ForceRecords:
+    """Random loads of one component, seed 8; a reading that bends, with noise."""
+    rng = np.random.default_rng(8)
+    load = rng.uniform(-90.0, 90.0, (300, 1))
+    reading = bend(load) + rng.normal(0.0, noise, load.shape)
+    return ForceRecords(
+        ("fx",), load, reading, 5.0 * np.arange(300.0), np.full(300, np.nan), np.zeros(300, np.int64)
+    )
+
+
+ONE = {"sensor": {"components": ["fx"], "full_range": [100.0]}}
+
+
+def test_what_a_model_explains_is_no_noise_any_more() -> None:
+    """Row after row jumps through a dead band: without a model of it that passes for noise."""
+    records = random_loads(0.05, lambda true: np.sign(true) * np.maximum(np.abs(true) - 2.0, 0.0))
+    model = from_table(ONE, "x")[0]
+    subject = prepare(records, model)
+    assert subject.whole.sigma[0] > 4 * 5e-4
+    known = model.with_effect("term_dull", {"c": np.ones(1), "s": np.full(1, 0.02)})
+    sharper = subject.sharpened(known, {})
+    assert sharper is not None and sharper.whole.sigma == pytest.approx(5e-4, rel=0.3)
+    assert sharper.sharpened(known, {}) is None
+
+
+@pytest.mark.parametrize("power", [1, 3])
+def test_a_stand_in_is_larger_at_some_loads_and_a_true_gain_is_not(power: int) -> None:
+    records = random_loads(0.05, lambda true: true + 3.0 * (true / 100.0) ** power)
+    subject = prepare(records, from_table(ONE, "x")[0])
+    searcher = Searcher(subject.whole, ())
+    fit = searcher.fit(subject.model.with_effect("gain", {"g": np.zeros(1)}))
+    seen = {
+        c.variable: c
+        for c in changes(subject.whole, fit, searcher.weights, ["gain"], subject.variables(subject.whole))
+    }
+    size = seen["size of its load"]
+    assert (abs(size.share) > 0.3 and abs(size.share) > 5 * size.half) == (power == 3)
+    assert abs(seen["time"].share) < max(0.2, 2 * seen["time"].half)
 
 
 def test_a_look_alike_too_weak_by_nature_to_be_searched_is_not_ruled_out_by_that() -> None:
