@@ -22,7 +22,6 @@ from sioms.tactile.estimator import Estimator, Load, ShapeEstimate
 from sioms.tactile.finger import Finger, from_toml, to_toml
 from sioms.tactile.identify import series_of
 from sioms.tactile.linearity import linearise
-from sioms.tactile.preparation import HIGHEST
 from sioms.tactile.touches import Recording, Touches, join, ramps_of
 from sioms.tools.report_page import Page
 from sioms.tools.tactile import Progress
@@ -179,7 +178,7 @@ def _predictions(result: Calibration, which: NDArray[np.bool_] | NDArray[np.intp
     out = {"model": np.stack(columns, axis=1)}
     if result.finger.identified is not None:
         normal, shear = series_of(touches, loads)
-        matrix = result.finger.e_map()[:, 2 * HIGHEST + 1 :]
+        matrix = np.split(result.finger.e_map(), 2, axis=1)[1]
         out["identified map"] = normal @ np.array(result.finger.identified.rows).T + share * shear @ matrix.T
     return out
 

@@ -21,7 +21,6 @@ from sioms.tactile.estimator import Estimator, Load
 from sioms.tactile.finger import ContactModel, Finger, IdentifiedMap
 from sioms.tactile.identify import series_of, truncated
 from sioms.tactile.linearity import linearise
-from sioms.tactile.preparation import HIGHEST
 from sioms.tactile.together import Common, fit_together
 from sioms.tactile.touches import LOADED, Touches, TouchLoads, join, ramps_of, touch_loads
 from sioms.tactile.width import hertz_table
@@ -149,7 +148,7 @@ class Tables:
 
     def by_contact(self) -> Iterator[tuple[str, TouchLoads, float]]:
         """Return the contact models with their tractions and share of adhesion."""
-        half = touch_loads(self.body, hertz_table(self.body), self.result.touches, HIGHEST)
+        half = touch_loads(self.body, hertz_table(self.body), self.result.touches, self.result.loads.highest)
         yield "Hertz", half, 0.0
         yield "frictionless", self.result.loads, 0.0
         yield "full adhesion", self.result.loads, 1.0
@@ -191,7 +190,9 @@ class Tables:
         e = self.result.finger.elements
         pressure, shear = series_of(touches, tractions)
         tangential = np.split(
-            e_map(self.body, e.angle_rad, e.radius_m, HIGHEST, self.body.poisson, self.extent), 2, axis=1
+            e_map(self.body, e.angle_rad, e.radius_m, tractions.highest, self.body.poisson, self.extent),
+            2,
+            axis=1,
         )[1]
         strain = -touches.output * np.array(e.gain) - share * shear @ tangential.T
         found = truncated(pressure, strain)

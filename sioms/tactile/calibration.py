@@ -24,12 +24,12 @@ from sioms.tactile.calibrate import (
 )
 from sioms.tactile.contact import width_for_load
 from sioms.tactile.cylinder import Cylinder, respond
-from sioms.tactile.emap import e_map, felt
+from sioms.tactile.emap import e_map, felt, highest_needed
 from sioms.tactile.finger import ContactKind, ContactModel, Elements, Finger, Geometry, IdentifiedMap
 from sioms.tactile.identify import Identified, corrected, series_of, truncated
 from sioms.tactile.indenter import Wedge
 from sioms.tactile.linearity import Quadratic
-from sioms.tactile.preparation import HIGHEST, Faults, Fits, begin_at, clean_outputs
+from sioms.tactile.preparation import Faults, Fits, begin_at, clean_outputs
 from sioms.tactile.together import Common, fit_together
 from sioms.tactile.touches import Ramp, Touches, TouchLoads, touch_loads
 from sioms.tactile.width import WidthTable, hertz_table, rigid_core_table
@@ -47,7 +47,9 @@ _BETTER = 0.97  # a richer model must bring the left-out residual below this sha
 _POISSON_DEVIATION = 0.03
 _STANDS_OUT = 5.0  # standard deviations of the square of the elements' extent
 _ROUNDS = 3
+_PEAK_WAVES = 60
 _POISSON_MATTERS = 4e-3
+_QUADRATIC_MATTERS = 0.15  # 1/output
 _FAR_GAIN = 5.0  # from nominal, either way: rather a wrong unit than scatter
 
 
@@ -144,13 +146,15 @@ def calibrate(
         )
         own, nu = _together(body, begin, touches, tractions, adhesion, warnings)
         tick("element fit")
-        if abs(nu - body.poisson) < _POISSON_MATTERS:
+        straight, again = faults.straightened(body, own, tractions, adhesion)
+        if abs(nu - body.poisson) < _POISSON_MATTERS and not _bent(again.quadratic, faults.quadratic):
             break
-        # the contact's width goes with Poisson's ratio
+        # the contact's width goes with Poisson's ratio, and with both how the outputs grow with the load
+        touches, faults = straight, again
         body = Cylinder(body.core_m, body.outer_m, nu, body.shear_pa)
         widths, begin = rigid_core_table(body), own
         loads = touch_loads(
-            body, widths, touches, HIGHEST, options.edge_half_angle_rad, faults.wider(touches)
+            body, widths, touches, loads.highest, options.edge_half_angle_rad, faults.wider(touches)
         )
         tick("loads of the touches")
     loads, widths = tractions, table
@@ -252,7 +256,9 @@ def _contact(
 ) -> tuple[ContactKind, float, dict[str, float], TouchLoads, WidthTable]:  # fmt: skip
     """Choose the contact model by the residual of a fit with free depths."""
     half = hertz_table(body)
-    other = touch_loads(body, half, touches, HIGHEST, options.edge_half_angle_rad, faults.wider(touches))
+    other = touch_loads(
+        body, half, touches, loads.highest, options.edge_half_angle_rad, faults.wider(touches)
+    )
     tried: dict[str, tuple[ContactKind, float, TouchLoads, WidthTable]] = {
         "hertz": ("hertz", 0.0, other, half)
     }
@@ -288,12 +294,19 @@ def _between(score: dict[float, float], best: float) -> float:
 
 def edge_peak(body: Cylinder, fits: Fits, half_angle: float) -> float:
     """Return the mean over elements of the model strain right under a 200 N/m edge, positive."""
-    series = width_for_load(body, Wedge(half_angle), REFERENCE_LOAD).series(0.0, HIGHEST)[
-        : 2 * HIGHEST + 1 : 2
-    ]
     known = [fit for fit in fits if fit is not None]
-    factors = respond(body, np.arange(HIGHEST + 1), [fit.radius_m for fit in known]).e_rr[:, :, 0].T
-    return float(-np.mean(factors @ (series * felt(HIGHEST, known[0].extent_rad))))
+    highest = max(highest_needed(body, max(fit.radius_m for fit in known), 1e-3), _PEAK_WAVES)
+    series = width_for_load(body, Wedge(half_angle), REFERENCE_LOAD).series(0.0, highest)[
+        : 2 * highest + 1 : 2
+    ]
+    factors = respond(body, np.arange(highest + 1), [fit.radius_m for fit in known]).e_rr[:, :, 0].T
+    return float(-np.mean(factors @ (series * felt(highest, known[0].extent_rad))))
+
+
+def _bent(new: Quadratic | None, old: Quadratic | None) -> bool:
+    if new is None or old is None:
+        return False
+    return bool(np.max(np.abs(new.value - old.value)) > _QUADRATIC_MATTERS)
 
 
 def _with_extent(body: Cylinder, begin: Fits, touches: Touches, loads: TouchLoads) -> Fits:
@@ -374,7 +387,8 @@ def _identify(
     strain = -touches.output[:, [element for element, _ in known]] * gain
     pressure, shear = series_of(touches, loads)
     full = e_map(
-        body, [fit.angle_rad for _, fit in known], [fit.radius_m for _, fit in known], HIGHEST, body.poisson,
+        body, [fit.angle_rad for _, fit in known], [fit.radius_m for _, fit in known], loads.highest,
+        body.poisson,
         known[0][1].extent_rad,
     )  # fmt: skip
     normal, tangential = np.split(full, 2, axis=1)

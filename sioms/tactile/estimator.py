@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from sioms.tactile.finger import Finger
 from sioms.tactile.kernel import MOST_STEPS, NOT_DRAWN, Products, Solve, Status, compiled, drawn_frame, plain
 from sioms.tactile.linearity import linearise
-from sioms.tactile.posterior import Averager
+from sioms.tactile.posterior import DEVIATIONS, Averager
 from sioms.tactile.proximity import Proximity
 
 Floats = NDArray[np.float64]
@@ -63,6 +63,10 @@ _PROXIMITY_STARTS = 3
 _APART = math.radians(6.0)
 _HOLD_PASSES = 8
 _SURE = math.radians(2.0) / 4.0  # standard deviation of the place above which IMPRECISE is set
+_RATHER_ROUND = (
+    9.0  # chi square by which a hollow touch beside the last elements must be more likely than a round one
+)
+_HOLLOW = 1.2  # R in units of rb, beyond which noise alone does not make a flat
 _NOTHING = Quality.NO_CONTACT | Quality.TOO_FEW_ELEMENTS | Quality.WRONG_SIGN | Quality.NO_BASELINE
 _DOUBT = Quality.POOR_FIT | Quality.OUT_OF_ARC | Quality.OVERLOAD | Quality.NOT_CONVERGED | Quality.IMPRECISE
 
@@ -174,7 +178,7 @@ class Estimator:
         self._quadratic = np.asarray(finger.elements.quadratic, dtype=np.float64)
         near = Proximity(finger.signal.proximity, finger.signal.proximity_range_rad)
         self._drawn = near if conductor and near.amplitude != 0.0 else None
-        pitch = float(np.ptp(angles)) / max(angles.size - 1, 1)
+        pitch = self._pitch = float(np.ptp(angles)) / max(angles.size - 1, 1)
         self._arc = float(angles.min()) - 0.5 * pitch, float(angles.max()) + 0.5 * pitch
         self._radius = finger.cylinder.outer_m
         self._largest = most_hollow * self._radius
@@ -259,9 +263,46 @@ class Estimator:
         if found[0] == Status.WRONG_SIGN:
             return nothing(quality | Quality.WRONG_SIGN)
         shape = self._describe(*found[1:], value, weight, count, quality)
-        if not shape.covariance[0][0] < _SURE**2:
-            return self._averaged(shape, y, noise, pull, value, weight)
-        return shape
+        if Quality.FLAT_OR_HOLLOW in shape.quality and self._at_end(shape.angle_rad) and not pull.shape[1]:
+            other = self._search(
+                noise, 0.0, y, value, weight, start=self._narrow_start(y, noise, shape.angle_rad)
+            )
+            if (
+                other[0] == Status.FITTED
+                and _chi(other, value, weight) < _chi(found, value, weight) + _RATHER_ROUND
+            ):
+                convex = self._describe(*other[1:], value, weight, count, quality)
+                shape = shape if Quality.FLAT_OR_HOLLOW in convex.quality else convex
+        deviation = self._open(shape)
+        return self._averaged(shape, deviation, y, noise, pull, value, weight) if deviation else shape
+
+    def _open(self, shape: ShapeEstimate) -> float:
+        """Return the deviation of the place [rad] over which to average, 0 where the best fit stands.
+
+        A hollow touch beside the last elements may as well be a narrow one within half a pitch, whatever its covariance.
+        """
+        variance = shape.covariance[0][0]
+        if not variance < _SURE**2:
+            return math.sqrt(variance) if variance > 0.0 else math.inf
+        if self._at_end(shape.angle_rad) and shape.equivalent_radius_m > _HOLLOW * self._radius:
+            return max(math.sqrt(variance), 0.5 * self._pitch / DEVIATIONS)
+        return 0.0
+
+    def _at_end(self, angle: float) -> bool:
+        """Return whether a place lies within a pitch of the outermost elements."""
+        return not self._arc[0] + 1.5 * self._pitch < angle < self._arc[1] - 1.5 * self._pitch
+
+    def _narrow_start(self, y: Floats, noise: Floats, angle: float) -> tuple[float, float]:
+        """Return place and width of the narrow pattern, some way off, that explains most.
+
+        Few elements feel what lies between the last two: a narrow touch there looks like a hollow one further out.
+        """
+        bank, places = self._fixed[4], self._fixed[6]
+        apart = np.abs(places[:, 0] - angle)
+        near = (places[:, 1] == places[:, 1].min()) & (apart > 0.1 * self._pitch) & (apart < self._pitch)
+        score = np.maximum(bank @ (y / noise), 0.0) ** 2 / (bank**2 @ (1.0 / noise))
+        best = int(np.argmax(np.where(near, score, -1.0)))
+        return float(places[best, 0]), float(places[best, 1])
 
     def _search(
         self, noise: Floats, least: float, y: Floats, load: float, load_weight: float, pull: Floats = NOT_DRAWN,
@@ -338,13 +379,12 @@ class Estimator:
         return best
 
     def _averaged(
-        self, shape: ShapeEstimate, y: Floats, noise: Floats, pull: Floats, load: float, load_weight: float
-    ) -> ShapeEstimate:
+        self, shape: ShapeEstimate, deviation: float, y: Floats, noise: Floats, pull: Floats, load: float, load_weight: float
+    ) -> ShapeEstimate:  # fmt: skip
         """Return the mean over all touches that the frame allows, in place of a best fit whose place is hardly known."""
         t, arc = shape.angle_rad, self._averager.arc
         mean = None
         if arc[0] <= t <= arc[1]:
-            deviation = math.sqrt(shape.covariance[0][0]) if shape.covariance[0][0] > 0.0 else math.inf
             there = np.where(noise < _HUGE, self._left(pull, y, np.array([t]))[0], 0.0)
             weights = 1.0 / (noise + self._share * float(np.max(there**2)))
             mean = self._averager.average(
@@ -411,6 +451,12 @@ class Estimator:
             yield self.frame(strains, load)
             if progress is not None:
                 progress(done)
+
+
+def _chi(found: Found, load: float, load_weight: float) -> float:
+    """Return the chi square of a fit, but for what all fits of the frame have in common."""
+    at = found[3]
+    return at[9] - (at[3] + load_weight * load) ** 2 / (at[0] + load_weight)
 
 
 def _covariance(

@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 
 _PLACES = 31
 _ROWS = 2  # every second half width of the table
-_REACH = 5.0  # standard deviations of the best fit's place, both ways
+DEVIATIONS = 5.0  # standard deviations of the best fit's place, both ways
 _FALL = 1.5  # hollows count fully up to a third of the way from a flat to the most hollow, which does not count at all
 _FARTHEST = np.radians(10.0)
 
@@ -67,7 +67,7 @@ class Averager:
             angle: of the best fit [rad], on the arc.
             deviation: of that [rad].
         """
-        reach = min(_REACH * deviation, _FARTHEST)
+        reach = min(DEVIATIONS * deviation, _FARTHEST)
         t = np.linspace(max(angle - reach, self.arc[0]), min(angle + reach, self.arc[1]), _PLACES)
         y, f = left(t), self._strains(t)
         ff = np.square(f) @ weights + load_weight

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sioms.tactile.calibrate import ElementFit, Freedom, fit_elements, starts, strain_of
 from sioms.tactile.cylinder import Cylinder
+from sioms.tactile.emap import highest_needed
 from sioms.tactile.finger import Finger
 from sioms.tactile.linearity import Quadratic, find_quadratic, linearise, ramp_quadratic, with_ramps
 from sioms.tactile.proximity import Proximity, find_proximity
@@ -21,18 +22,40 @@ from sioms.tactile.width import WidthTable, rigid_core_table
 Floats = NDArray[np.float64]
 Fits = list[ElementFit | None]
 
-HIGHEST = 60  # wave numbers of calibration
+_WAVES, _MOST_WAVES = 60, 250  # of calibration: the least, and the most for elements just below the surface
+_MISSED = 1e-3  # of a line load's peak
 _WIDER = 0.02  # of the half width, for a difference quotient
 _FOLLOWS = 0.3  # correlation of touches and load cell above which the cell is believed
 
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """Hold what was taken off the outputs; None where there was nothing of the kind."""
+    """Hold what was taken off the outputs; None where there was nothing of the kind.
+
+    Args:
+        quadratic, proximity, strips: what was found.
+        recorded: the touches with the loads that are believed.
+        undrawn: without a conductor's pull.
+        ramped: the load ramps.
+    """
 
     quadratic: Quadratic | None
     proximity: Proximity | None
     strips: Strips | None
+    recorded: Touches
+    undrawn: Touches
+    ramped: _Ramps
+
+    def straightened(
+        self, body: Cylinder, fits: Fits, loads: TouchLoads, adhesion: float
+    ) -> tuple[Touches, Faults]:
+        """Return touches and faults with the quadratic found anew, by what is known of elements and contact by now."""
+        drawn = self.proximity is not None
+        source = self.recorded if drawn else self.undrawn
+        series = find_quadratic(source, _model(body, fits, source, loads, adhesion), drawn)
+        found = self.ramped.join(fits, series, drawn, adhesion)
+        output = self.undrawn.output if found is None else linearise(self.undrawn.output, found.value)
+        return self.evened(self.undrawn.with_output(output)), replace(self, quadratic=found)
 
     def wider(self, touches: Touches) -> Floats | float:
         """Return by what the strips make each contact wider."""
@@ -43,6 +66,12 @@ class Faults:
         if self.strips is None:
             return touches
         return touches.with_output(touches.output / self.strips.strain_factor(touches.angle_rad)[:, None])
+
+
+def waves_needed(nominal: Finger) -> int:
+    """Return how many wave numbers calibration keeps: enough for the shallowest element."""
+    needed = highest_needed(nominal.cylinder, max(nominal.elements.radius_m), _MISSED)
+    return min(max(needed, _WAVES), _MOST_WAVES)
 
 
 def begin_at(nominal: Finger, touches: Touches) -> Fits:
@@ -61,22 +90,23 @@ def clean_outputs(
     finds; with a conductor's pull beside the quadratic there is a third.
     """
     body, recorded = nominal.cylinder, touches
-    loads = touch_loads(body, widths, touches, HIGHEST, edge_half_angle)
+    highest = waves_needed(nominal)
+    loads = touch_loads(body, widths, touches, highest, edge_half_angle)
     fits = begin_at(nominal, touches)
     distance = np.array(nominal.angles_rad) - touches.angle_rad[:, None]
-    ramped, quadratic, proximity = _Ramps(body, ramps, edge_half_angle), None, None
+    ramped, quadratic, proximity = _Ramps(body, ramps, highest, edge_half_angle), None, None
     known = np.array([fit is not None for fit in fits])
     for number in range(3):
         expected = _expected(body, fits, recorded, loads, quadratic)
         proximity = find_proximity(recorded.output[:, known], expected[:, known], distance[:, known])
         pull = 0.0 if proximity is None else proximity.output(distance)
-        touches = recorded.with_output(recorded.output - pull)
+        touches = undrawn = recorded.with_output(recorded.output - pull)
         drawn = proximity is not None
         last = number == (2 if drawn else 1)
         if number == 0 and _cell_is_better(nominal, touches, loads):
             recorded = _cell_loads(recorded)
-            touches = recorded.with_output(touches.output)
-            loads = touch_loads(body, widths, recorded, HIGHEST, edge_half_angle)
+            touches = undrawn = recorded.with_output(touches.output)
+            loads = touch_loads(body, widths, recorded, highest, edge_half_angle)
             warnings.append(
                 "the outputs follow the load cell from touch to touch: its variation was used, at the commanded level"
             )
@@ -90,17 +120,18 @@ def clean_outputs(
             break
         fits = fit_elements(body, fits, touches, loads, 0.0, Freedom(True, True), lambda: tick("first fit"))
     _tell(quadratic, proximity, bool(ramps), warnings)
-    wider = touch_loads(body, widths, touches, HIGHEST, edge_half_angle, 1.0 + _WIDER)
-    faults, uneven = Faults(quadratic, proximity, _strips(body, fits, touches, loads, wider)), touches
+    wider = touch_loads(body, widths, touches, highest, edge_half_angle, 1.0 + _WIDER)
+    strips = _strips(body, fits, touches, loads, wider)
+    faults, uneven = Faults(quadratic, proximity, strips, recorded, undrawn, ramped), touches
     if faults.strips is not None:
         # once more with depths and gains that the strips have not bent
         even = faults.evened(uneven)
-        bent = touch_loads(body, widths, even, HIGHEST, edge_half_angle, faults.wider(even))
+        bent = touch_loads(body, widths, even, highest, edge_half_angle, faults.wider(even))
         fits = fit_elements(body, fits, even, bent, 0.0, Freedom(True, True), lambda: tick("strips"))
         faults = replace(faults, strips=_strips(body, fits, uneven, loads, wider))
     if (strips := faults.strips) is not None:
         touches = faults.evened(uneven)
-        loads = touch_loads(body, widths, touches, HIGHEST, edge_half_angle, faults.wider(touches))
+        loads = touch_loads(body, widths, touches, highest, edge_half_angle, faults.wider(touches))
         warnings.append(
             f"the finger answers unevenly along the arc, as over strips {math.degrees(strips.period_rad):.2f} deg apart: "
             f"strains +-{100 * strips.gain:.1f} %, width +-{100 * strips.width:.1f} %; the finger's file undoes it"
@@ -117,15 +148,20 @@ def _strips(
     angles = [fit.angle_rad for fit in fits if fit is not None]
     inside = (touches.angle_rad > min(angles)) & (touches.angle_rad < max(angles))
     even, broad = (-_model(body, fits, touches, p)[inside][:, known] / gain for p in (loads, wider))
-    # one scale for loads within a quarter and each indenter: how the contact model errs over them is no matter of place
+    broad = (broad - even) / _WIDER
+    # one scale and one width for loads within a quarter and each indenter: how the contact model errs over them is no
+    # matter of place, though touches on an even grid make it look like one
     output, load, radius = touches.output[inside][:, known], touches.load[inside], touches.radius_m[inside]
     kinds = np.stack([np.round(4.0 * np.log(load)), np.minimum(radius, 1e3)], axis=1)
+    rest = np.empty_like(output)
     for kind in np.unique(kinds, axis=0):
         mine = np.all(kinds == kind, axis=1)
-        scale = np.sum(output[mine] * even[mine]) / np.sum(even[mine] ** 2)
+        basis = np.stack([even[mine].ravel(), broad[mine].ravel()], axis=1)
+        scale, wide = np.linalg.lstsq(basis, output[mine].ravel(), rcond=1e-6)[0]
+        rest[mine] = output[mine] - scale * even[mine] - wide * broad[mine]
         even[mine] *= scale
         broad[mine] *= scale
-    return find_strips(output - even, even, (broad - even) / _WIDER, touches.angle_rad[inside])
+    return find_strips(rest, even, broad, touches.angle_rad[inside])
 
 
 def _tell(quadratic: Quadratic | None, proximity: Proximity | None, ramps: bool, warnings: list[str]) -> None:
@@ -148,13 +184,15 @@ def _tell(quadratic: Quadratic | None, proximity: Proximity | None, ramps: bool,
         )
 
 
-def _model(body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads) -> Floats:
+def _model(body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, adhesion: float = 0.0) -> Floats:
     """Return the strain of every touch and element [1], zero for elements without touches."""
     silent = np.zeros(len(touches))
     columns = [
         silent
         if fit is None
-        else strain_of(body, fit.angle_rad, fit.radius_m, fit.poisson, touches, loads, 0.0, fit.extent_rad)
+        else strain_of(
+            body, fit.angle_rad, fit.radius_m, fit.poisson, touches, loads, adhesion, fit.extent_rad
+        )
         for fit in fits
     ]
     return np.stack(columns, axis=1)
@@ -207,7 +245,7 @@ class _Ramps:
 
     _LOADS = 9
 
-    def __init__(self, body: Cylinder, ramps: list[Ramp], edge_half_angle: float) -> None:
+    def __init__(self, body: Cylinder, ramps: list[Ramp], highest: int, edge_half_angle: float) -> None:
         self._body, self._ramps = body, ramps
         if not ramps:
             return
@@ -216,9 +254,11 @@ class _Ramps:
         none = np.zeros(self._LOADS)
         self._touches = Touches(none[:, None], none, self._load, none, self._load, np.zeros(1))
         widths = rigid_core_table(body)
-        self._loads = touch_loads(body, widths, self._touches, HIGHEST, edge_half_angle)
+        self._loads = touch_loads(body, widths, self._touches, highest, edge_half_angle)
 
-    def join(self, fits: Fits, series: Quadratic | None, drawn: bool) -> Quadratic | None:
+    def join(
+        self, fits: Fits, series: Quadratic | None, drawn: bool, adhesion: float = 0.0
+    ) -> Quadratic | None:
         """Return the quadratic of load series and ramps together; drawn: by a conductor."""
         found = np.full(len(fits), np.nan)
         for ramp in self._ramps:
@@ -231,7 +271,7 @@ class _Ramps:
                     fit.poisson,
                     self._touches,
                     self._loads,
-                    0.0,
+                    adhesion,
                     fit.extent_rad,
                 )
                 # strain per load is nearly constant: interpolate that

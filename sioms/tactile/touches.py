@@ -26,6 +26,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 BASELINE, LOADED = 0, 1
+_ALIKE_FRAMES = 3  # under load, that must read the same
+_FULL = 10  # touches under which an element reads the same: saturated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,13 +121,14 @@ def average(recording: Recording, angle_rad: Floats, load: Floats, radius_m: Flo
         scale: output per raw unit.
 
     Raises:
-        ValueError: a touch lacks frames or holds values that are not finite.
+        ValueError: a touch lacks frames or holds values that are not finite, or an element was at the end of its range.
     """
     count = angle_rad.size
     output, force = np.empty((count, recording.raw.shape[1])), np.empty(count)
     spread: list[Floats] = []
     slow: list[Floats] = []
     shares, living = np.empty(count), np.isfinite(recording.raw).any(axis=0)
+    stuck_at = np.full(output.shape, np.nan)
     for number in range(count):
         mine = recording.touch == number
         before, under = mine & (recording.phase == BASELINE), mine & (recording.phase == LOADED)
@@ -136,10 +139,15 @@ def average(recording: Recording, angle_rad: Floats, load: Floats, radius_m: Flo
             )
         shares[number] = 1.0 / before.sum() + 1.0 / under.sum()
         output[number] = _mean(recording.raw[under]) - _mean(recording.raw[before])
+        if under.sum() >= _ALIKE_FRAMES:
+            stuck_at[number] = np.where(
+                np.ptp(recording.raw[under], axis=0) == 0.0, recording.raw[under][0], np.nan
+            )
         force[number] = recording.force[under].mean() - recording.force[before].mean()
         if before.sum() > 2 and np.isfinite(recording.raw[before][:, living]).all():
             spread.append(recording.raw[before].var(0, ddof=1))
             slow.append(_slow(recording.raw[before]))
+    _check_range(recording.raw, stuck_at)
     output[:, ~np.isfinite(output).any(axis=0)] = 0.0  # an element that is not there is silent
     if not np.isfinite(output).all():
         touch, element = np.argwhere(~np.isfinite(output))[0]
@@ -153,6 +161,18 @@ def average(recording: Recording, angle_rad: Floats, load: Floats, radius_m: Flo
         felt = float(np.mean(slow, axis=0)[alive].sum())
         averaged *= float(np.sum(noise[alive] ** 2)) / felt if felt > 0.0 else 1.0
     return Touches(output * scale, angle_rad, load, radius_m, force, noise * scale, averaged)
+
+
+def _check_range(raw: Floats, stuck_at: Floats) -> None:
+    """Refuse elements that read the same largest value, without any noise, under many touches."""
+    for element in np.flatnonzero(np.isfinite(raw).any(axis=0)):
+        top = np.nanmax(raw[:, element])
+        full = int(np.count_nonzero(stuck_at[:, element] == top))
+        if full >= _FULL and top > np.nanmin(raw[:, element]):
+            raise ValueError(
+                f"average touches: element {element} reads exactly {top:g} in all frames of {full} touches, and never more: "
+                "it is at the end of its range; press less hard, or lower the gain of the electronics"
+            )
 
 
 def _mean(frames: Floats) -> Floats:
@@ -209,6 +229,11 @@ class TouchLoads:
 
     normal: Floats
     shear: Floats
+
+    @property
+    def highest(self) -> int:
+        """Return nc."""
+        return int(self.normal.shape[1]) - 1
 
 
 def touch_loads(

@@ -172,6 +172,27 @@ def test_average_subtracts_each_touchs_baseline() -> None:
         average(recording, np.zeros(2), np.full(2, 10.0), np.zeros(2), 0.01)
 
 
+def test_an_element_at_the_end_of_its_range_is_refused() -> None:
+    random, count = np.random.default_rng(5), 40
+    touch, phase = np.repeat(np.arange(count), 8), np.tile(np.repeat([0, 1], 4), count)
+    pressed = np.where(phase == 1, 3.0 + np.sin(touch), 0.0)[:, None]
+    raw = np.round(pressed + 0.05 * random.normal(size=(touch.size, 3)), 2)
+    none = np.full(touch.size, np.nan)
+
+    def averaged(readings: np.ndarray) -> Touches:
+        recording = Recording(readings, np.arange(touch.size) / 33.0, touch, phase, none, none, 33.0)
+        return average(recording, np.zeros(count), np.ones(count), np.zeros(count), 0.01)
+
+    stuck = raw.copy()
+    stuck[:, 1] = 1.5  # never answers: for calibration to say
+    assert averaged(stuck).output.shape == (count, 3)
+    raw[:, 2] = np.minimum(raw[:, 2], 2.5)
+    with pytest.raises(
+        ValueError, match=r"element 2 reads exactly 2\.5 in all frames of \d+ touches.*end of its range"
+    ):
+        averaged(raw)
+
+
 def test_a_mains_line_is_noise_of_frames_but_not_of_their_means() -> None:
     random, frames, count = np.random.default_rng(4), 40, 50
     time_s = np.arange(count * frames) / 33.0
