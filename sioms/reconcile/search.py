@@ -300,9 +300,12 @@ class Searcher:
         return self._possible(new, fit) and self.follows(new.model, fit.model)
 
     def _possible(self, new: Fit, fit: Fit) -> bool:
-        """Say whether every number is one that its effect can have, where it was before."""
-        mine = [n for n in new.model.effects if n not in self.frozen]
-        return all(physical(new, n) or (n in fit.model.effects and not physical(fit, n)) for n in mine)
+        """Say whether what is new can be, and what could be before still can, or vanishes: it stood for the new."""
+        kept = [n for n in new.model.effects if n not in self.frozen]
+        return all(
+            physical(new, n) or (n in fit.model.effects and (small(new.model, n) or not physical(fit, n)))
+            for n in kept
+        )
 
     def _with(self, fit: Fit, start: Start, iterations: int) -> Fit:
         """Switch a candidate on, what it replaces off, and refit."""
