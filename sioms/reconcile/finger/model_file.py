@@ -14,7 +14,7 @@ from sioms.reconcile.finger.effects import library
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.model_file import effects_from, effects_to_toml, number_or_list, numbers
 from sioms.tactile.cylinder import Cylinder
-from sioms.tactile.finger import ContactModel, Finger, nominal_finger
+from sioms.tactile.finger import MOST_ADHESION, ContactModel, Finger, nominal_finger
 
 KEYS = (
     "name",
@@ -44,6 +44,7 @@ def belief_of(finger: Finger) -> Belief:
         np.array(e.gain),
         np.array(e.quadratic),
         np.zeros(len(e.angle_rad)),
+        extent=g.extent_rad,
         hertz=float(c.model == "hertz"),
         adhesion=c.adhesion if c.model == "adhering" else 0.0,
     )
@@ -158,12 +159,12 @@ def corrected(model: SensorModel, nominal: Finger | None, dead: tuple[int, ...] 
         )
     contact = ContactModel(
         "adhering" if b.adhesion > 0.0 else "hertz" if b.hertz > 0.5 else "frictionless",
-        min(b.adhesion, 1.0),
+        min(b.adhesion, MOST_ADHESION),
         (),
         (),
         nominal.contact.most_load_n_per_m,
     )
-    geometry = msgspec.structs.replace(nominal.geometry, poisson=b.poisson)
+    geometry = msgspec.structs.replace(nominal.geometry, poisson=b.poisson, extent_rad=b.extent)
     return msgspec.structs.replace(
         nominal,
         elements=elements,
