@@ -171,7 +171,7 @@ def _worth(report: Report, finger: Finger, count: int) -> None:
                  float(np.nanmax(error[inner])), "deg", bars=[Bar("value", 2.0)])  # fmt: skip
     report.value(f"worst place of {int(sure.sum())} without a flag, whole arc", float(np.nanmax(error[sure])), "deg",
                  bars=[Bar("value", 2.0)], notes=f"{100 * np.mean(~sure):.1f} % flagged")  # fmt: skip
-    report.value(f"worst place of all {len(error)}", float(np.nanmax(error)), "deg")
+    report.value(f"worst place of all {len(error)}", float(np.nanmax(error)), "deg", bars=[Bar("value", 2.0)])
     report.value("frames without an estimate", float(np.isnan(error).sum()), "", bars=[Bar("value", 0.0)])
     for column, what in ((3, "place"), (4, "load"), (5, "R")):
         # a robust width: R of small touches is far from normal
