@@ -231,7 +231,11 @@ def _check(nominal: Finger, touches: Touches, warnings: list[str]) -> None:
             "calibrate finger: pressing lowers the output; compression must be positive: change its sign"
         )
     ratio = float(np.median(touches.force / touches.load)) if np.isfinite(touches.force).all() else 1.0
-    if abs(ratio - 1.0) > 0.02:
+    if ratio < 0.0:
+        warnings.append(
+            "the load cell reads less under load than before: its sign is wrong; the commanded load was used"
+        )
+    elif abs(ratio - 1.0) > 0.02:
         warnings.append(
             f"the load cell reads {100 * (ratio - 1):+.1f} % of the commanded load: one of them is out of scale; "
             "the commanded load was used"
