@@ -24,14 +24,14 @@ def bent(output: Floats, scene: Scene, p: Floats) -> Floats:
 
 
 def fading(output: Floats, scene: Scene, p: Floats) -> Floats:
-    """Multiply by 1 + k (t - mean t)."""
-    out: Floats = output * (1.0 + p[0] * scene.time)[:, None]
+    """Multiply by 1 + c + k (t - mean t): as it was when the gains were stated is not known."""
+    out: Floats = output * (1.0 + p[1] + p[0] * scene.time)[:, None]
     return out
 
 
 def warming(output: Floats, scene: Scene, p: Floats) -> Floats:
-    """Multiply by 1 + k (T - mean T)."""
-    out: Floats = output * (1.0 + p[0] * scene.temperature)[:, None]
+    """Multiply by 1 + c + k (T - mean T): at what temperature the gains were stated is not known."""
+    out: Floats = output * (1.0 + p[1] + p[0] * scene.temperature)[:, None]
     return out
 
 
@@ -42,8 +42,8 @@ def lifted(output: Floats, scene: Scene, p: Floats) -> Floats:
 
 
 def stiffening(output: Floats, scene: Scene, p: Floats) -> Floats:
-    """Multiply by (P / 200 N/m)^k."""
-    out: Floats = output * (np.maximum(scene.load, 1e-3) / _LOAD)[:, None] ** p[0]
+    """Multiply by (1 + c) (P / 200 N/m)^k: at what load the gains were stated is not known."""
+    out: Floats = output * (1.0 + p[1]) * (np.maximum(scene.load, 1e-3) / _LOAD)[:, None] ** p[0]
     return out
 
 
@@ -80,8 +80,20 @@ TERMS = (
         Quantity("s", "1", 1e-3, 1.0, 5e-3, "output", starts=(0.01, 0.02, 0.04, 0.07, 0.12, 0.2)),
         lookalikes=("quadratic",),
     ),
-    term("time", "d = l (1 + k (t - mean t))", fading, Quantity("k", "1/s", -0.1, 0.1, 1e-5, "size")),
-    term("warmth", "d = l (1 + k (T - mean T))", warming, Quantity("k", "1/K", -1.0, 1.0, 0.01, "size")),
+    term(
+        "time",
+        "d = l (1 + c + k (t - mean t))",
+        fading,
+        Quantity("k", "1/s", -0.1, 0.1, 1e-5, "size"),
+        Quantity("c", "1", -0.5, 0.5, 0.02, "in the middle of the time"),
+    ),
+    term(
+        "warmth",
+        "d = l (1 + c + k (T - mean T))",
+        warming,
+        Quantity("k", "1/K", -1.0, 1.0, 0.01, "size"),
+        Quantity("c", "1", -0.5, 0.5, 0.02, "at the mean temperature"),
+    ),
     term(
         "offset",
         "d = l + k under any touch",
@@ -91,9 +103,10 @@ TERMS = (
     ),
     term(
         "load",
-        "d = l (P / 200 N/m)^k",
+        "d = l (1 + c) (P / 200 N/m)^k",
         stiffening,
         Quantity("k", "1", -1.0, 1.0, 0.02, "exponent"),
+        Quantity("c", "1", -0.5, 0.5, 0.02, "at 200 N/m"),
         lookalikes=("quadratic", "hertz"),
     ),
     term(

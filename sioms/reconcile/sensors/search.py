@@ -22,7 +22,7 @@ from sioms.reconcile.sensors.screen import Start, screen
 TRIES = 5
 STEPS = 8
 MOST_INSIDE = 0.7  # share of the elements whose own number must be one that the effect can have
-CLEAR = 0.9  # share of a view that a name must save where the view stays above its floor
+CLEAR = 0.95  # share of a view that a name must save where the view stays above its floor
 #: Two effects are tried at once only where a view is above this multiple of its floor, so many firsts and seconds.
 PAIRED, PAIRS = 1.3, 3
 
