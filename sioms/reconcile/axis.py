@@ -216,7 +216,10 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     problem = Problem(session, noise, skip, end=1.0 if session.final else 1.0 - UNTOUCHED, mapper=o.mapper)
     check_scale(problem, nominal)
     problem = calibrated(problem, session, model)
-    excluded = {"encoder_quantisation"}
+    refitted = {"inertia": "payload", "viscous": "viscous"}
+    excluded = {"encoder_quantisation"} | {
+        refitted[symbol] for symbol in nominal.refine if symbol in refitted
+    }
     if index_fit(session, nominal) is not None:
         excluded.add("encoder_scale")
     if any(r.force_measured is not None for r in session.records):

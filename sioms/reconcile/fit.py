@@ -164,7 +164,8 @@ def free_parameters(model: AxisModel, frozen: Sequence[str] = ()) -> tuple[Free,
                 out.append(_free(model, name, p, given[p.symbol]))
     for symbol in model.refine:
         value = getattr(model, symbol)
-        out.append(Free(BASE, symbol, max(abs(value), 1e-12), 0.0, np.inf))
+        least = 0.01 * value if symbol == "inertia" else 0.0  # without inertia there is no motion to predict
+        out.append(Free(BASE, symbol, max(abs(value), 1e-12), least, np.inf))
     return tuple(out)
 
 
