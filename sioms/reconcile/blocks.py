@@ -13,12 +13,15 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import digamma, polygamma
 from scipy.stats import t as student
 
 from sioms.reconcile.effect import Array
 from sioms.reconcile.fit import Problem
 
 BLOCK_S = 0.5
+#: Variances from which on it makes sense to ask how they scatter, and half the most degrees of freedom that the others lend.
+LEAST_MODERATED, MOST_PRIOR = 4, 500.0
 
 
 class Fitted(Protocol):
@@ -88,10 +91,12 @@ def intervals(fit: Fitted, ids: NDArray[np.int64], level: float = 0.95) -> Array
     """Half-widths of confidence intervals, in units of the parameters' scale, shape (k,).
 
     The parameters are moved by leaving out each block in turn (the jackknife, which does not count on the blocks
-    weighing alike), and Student's t is of as many blocks as the information on a parameter comes from.
+    weighing alike), and Student's t is of as many blocks as the information on a parameter comes from. Where two blocks tell
+    a parameter, its own spread says next to nothing: it is drawn towards what the spreads of all are, in units of the formal ones.
     Source: A. C. Cameron, D. L. Miller, "A practitioner's guide to cluster-robust inference", J. Human Resources 50
     (2015), sec. VI; A. V. Carter, K. T. Schnepel, D. G. Steigerwald, "Asymptotic behavior of a t-test robust to cluster
-    heterogeneity", Rev. Econ. Stat. 99 (2017) 698-709.
+    heterogeneity", Rev. Econ. Stat. 99 (2017) 698-709; G. K. Smyth, "Linear models and empirical Bayes methods", Stat. Appl.
+    Genet. Mol. Biol. 3 (2004), sec. 6.
     """
     h, g, _ = _normal(fit, ids)
     b, k = g.shape
@@ -99,11 +104,38 @@ def intervals(fit: Fitted, ids: NDArray[np.int64], level: float = 0.95) -> Array
         return np.full(k, np.inf)
     total = h.sum(0) + 1e-9 * np.trace(h.sum(0)) * np.eye(k)
     moves = np.stack([np.linalg.solve(total - inside, -own) for inside, own in zip(h, g, strict=True)])
-    errors = np.sqrt((b - 1) / b * np.sum((moves - moves.mean(0)) ** 2, axis=0))
+    variance = (b - 1) / b * np.sum((moves - moves.mean(0)) ** 2, axis=0)
     inverse = np.linalg.inv(total)
     share = np.einsum("ij,bjk,ki->bi", inverse, h, inverse)
     effective = share.sum(0) ** 2 / np.maximum(np.sum(share**2, axis=0), 1e-300)
-    return np.asarray(student.ppf(0.5 + 0.5 * level, np.maximum(effective - 1.0, 1.0)) * errors)
+    variance, freedom = _moderated(variance, np.diag(inverse), np.maximum(effective - 1.0, 1.0))
+    return np.asarray(student.ppf(0.5 + 0.5 * level, freedom) * np.sqrt(variance))
+
+
+def _moderated(variance: Array, formal: Array, freedom: Array) -> tuple[Array, Array]:
+    """Draw variances towards a common multiple of the formal ones, as strongly as they scatter less than chance would have it.
+
+    Returns:
+        Variances and degrees of freedom; both as given where fewer than ``LEAST_MODERATED`` are told.
+    """
+    told = variance > 1e-12 * formal
+    if told.sum() < LEAST_MODERATED:
+        return variance, freedom
+    half = 0.5 * freedom[told]
+    level = np.log(variance[told] / formal[told]) - digamma(half) + np.log(half)
+    excess = float(np.var(level, ddof=1) - np.mean(polygamma(1, half)))
+    prior = 2.0 * _inverse_trigamma(max(excess, polygamma(1, MOST_PRIOR)))
+    common = np.exp(level.mean() + digamma(0.5 * prior) - np.log(0.5 * prior))
+    return (prior * common * formal + freedom * variance) / (prior + freedom), prior + freedom
+
+
+def _inverse_trigamma(y: float) -> float:
+    """Solve polygamma(1, x) = y by Newton's method on 1/y (Smyth 2004, appendix)."""
+    x = 0.5 + 1.0 / y
+    for _ in range(20):
+        t = float(polygamma(1, x))
+        x += t * (1.0 - t / y) / float(polygamma(2, x))
+    return x
 
 
 def better(loss_a: Array, loss_b: Array) -> tuple[float, float]:
