@@ -14,7 +14,7 @@ import numpy as np
 from sioms.reconcile.ambiguity import Rival, settle
 from sioms.reconcile.blocks import better, block_ids, intervals
 from sioms.reconcile.calibrate import calibrated
-from sioms.reconcile.channels import Finding, drive, index_fit, index_scale, lattice
+from sioms.reconcile.channels import Finding, drive, drive_output, index_fit, index_scale, lattice
 from sioms.reconcile.checks import check, check_scale
 from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import known, library
@@ -206,11 +206,21 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     for f in findings:
         model = model.with_effect(f.effect, dict(f.values))
     factor = coarse.values["factor"] if coarse is not None else 1.0
-    late = next((f.values["delay"] for f in driven if f.effect == "delay"), 0.0)
+    known = {symbol: value for f in driven for symbol, value in f.values.items()}
     noise = observer(
         nominal,
         sensor_noise(session, nominal.resolution * factor),
-        drive_noise(session, nominal.rated_force, round(late / nominal.sample_time_s)),
+        drive_noise(
+            session,
+            nominal.rated_force,
+            lambda force: drive_output(
+                force,
+                known.get("delay", 0.0),
+                known.get("tau", 0.0),
+                known.get("limit", np.inf),
+                nominal.sample_time_s,
+            ),
+        ),
     )
     skip = max(SKIP, round(SKIP_S / nominal.sample_time_s))
     problem = Problem(session, noise, skip, end=1.0 if session.final else 1.0 - UNTOUCHED, mapper=o.mapper)

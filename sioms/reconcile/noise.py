@@ -6,6 +6,7 @@ drive noise off measured minus commanded force, and both give the steady Kalman 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,12 +72,18 @@ def sensor_noise(session: Session, resolution: float) -> float:
     return float(max(white, resolution / np.sqrt(12.0)))
 
 
-def drive_noise(session: Session, rated_force: float, delay_samples: int = 0) -> float:
-    """Standard deviation of measured minus commanded force above the control bandwidth."""
+def drive_noise(
+    session: Session, rated_force: float, delivered: Callable[[Array], Array] = lambda force: force
+) -> float:
+    """Standard deviation of measured minus delivered force above the control bandwidth.
+
+    Args:
+        delivered: what a drive without noise makes of a command: late, slow or limited.
+    """
     found = []
     for r in session.records:
         if r.force_measured is not None:
-            second = np.diff(r.force_measured - np.roll(r.force, delay_samples), 2)[delay_samples:]
+            second = np.diff(r.force_measured - delivered(r.force), 2)
             found.append(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
     floor = 1e-4 * rated_force
     return float(max(np.median(found), floor)) if found else DRIVE_NOISE_DEFAULT * rated_force
