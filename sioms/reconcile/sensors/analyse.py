@@ -94,9 +94,10 @@ def _search(subject: Subject, searcher: Searcher, start: SensorModel) -> tuple[S
 
 
 def _smoothed(subject: Subject, searcher: Searcher, found: Found) -> tuple[float, str]:
-    """Return the largest share of a view that a smoother explains, and the name of that view."""
+    """Return the largest share of a view that a smoother explains, and the name of that view; one above its floor first."""
     shares = smoother_shares(subject.training, found.fit, searcher.weights, subject.features())
-    view = max(shares, key=lambda v: shares[v])
+    ratios = searcher.ratios(found.fit.model)
+    view = max(shares, key=lambda v: (bool(ratios[v] > LEAST_ODD and shares[v] > UNEXPLAINED), shares[v]))
     return shares[view], subject.training.views[view] if shares[view] > 0.0 else ""
 
 
