@@ -164,6 +164,8 @@ def run_node(args: argparse.Namespace, say: Any) -> int:
     settings = Live(args.travel, args.lap, args.first, args.yes, args.socket, args.seed)
     try:
         verdict, session, seconds = live(node, read_model(args.model), settings, say)
+    except FileNotFoundError as e:
+        raise BadInputError(f"{e.strerror}; nor is there a file or folder {node}") from None
     except (ExperimentStopped, OSError) as e:
         print(f"stopped: {getattr(e, 'strerror', None) or e}", file=sys.stderr)
         return EXIT_STOPPED

@@ -144,6 +144,8 @@ def run_node(args: argparse.Namespace, progress: Any) -> int:
     run, install = _touching(args) if args.subject == "tactile" else _loading(args)
     try:
         verdict, seconds = run(args.out / "records", progress)
+    except FileNotFoundError as e:
+        raise BadInputError(f"{e.strerror}; nor is there a file or folder {args.data}") from None
     except (ExperimentStopped, OSError) as e:
         print(f"stopped: {getattr(e, 'strerror', None) or e}", file=sys.stderr)
         return EXIT_STOPPED

@@ -10,14 +10,15 @@ fit, that two effects leave one and the same trace, more than that is needed: ``
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
+from sioms.reconcile import rules
 from sioms.reconcile.blocks import better
 from sioms.reconcile.effects import library
 from sioms.reconcile.fit import Fit
-from sioms.reconcile.plausible import DOUBTFUL, GAIN, physical, size, without
+from sioms.reconcile.plausible import physical, size, without
+from sioms.reconcile.rules import GAIN, SURE
 from sioms.reconcile.screen import screen
-from sioms.reconcile.search import SURE, Found, Searcher, Step
+from sioms.reconcile.search import Found, Searcher, Step
 
 AMBIGUOUS = 0.015
 #: What a look-alike must miss whose trace has this share of its energy in common with that of the named effect.
@@ -25,37 +26,14 @@ ALIKE, SAME_TRACE = 0.05, 0.98
 #: Look-alikes that take the place of what is named, one after the other.
 SWAPS = 2
 
+Rival = rules.Rival[Fit]
 
-@dataclass(frozen=True, slots=True)
-class Rival:
-    """A look-alike put in the place of a named effect.
 
-    Attributes:
-        missed: share of the contribution of ``effect`` that it cannot reproduce.
-        allowed: share below which it is not ruled out.
-        errors: by how many standard errors it is worse on held-out blocks.
-        excess: by how much more than the named model it leaves, as a share of what that leaves.
-    """
-
-    effect: str
-    rival: str
-    missed: float
-    allowed: float
-    errors: float
-    excess: float
-    fit: Fit
-
-    @property
-    def open(self) -> bool:
-        """True where the data do not rule the rival out."""
-        return self.missed < self.allowed or (self.errors < 1.0 and self.excess < DOUBTFUL)
-
-    @property
-    def wins(self) -> bool:
-        """True where the rival does better: with more numbers, surely and by as much as an effect must save."""
-        if size(self.rival) <= size(self.effect):
-            return self.missed < 0.0
-        return self.excess < -GAIN and self.errors < -SURE
+def _wins(r: Rival) -> bool:
+    """Say whether the rival does better: with more numbers, surely and by as much as an effect must save."""
+    if size(r.rival) <= size(r.effect):
+        return r.missed < 0.0
+    return r.excess < -GAIN and r.errors < -SURE
 
 
 def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]] = ()) -> list[Rival]:
@@ -111,7 +89,7 @@ def settle(
     """
     others = rivals(searcher, found, pairs)
     for _ in range(SWAPS):
-        best = next((r for r in others if r.wins and searcher.follows(r.fit.model, found.fit.model)), None)
+        best = next((r for r in others if _wins(r) and searcher.follows(r.fit.model, found.fit.model)), None)
         if best is None:
             break
         searcher.progress(f"{best.rival} does better than {best.effect}: searching on from it")

@@ -26,10 +26,10 @@ from sioms.reconcile.gaps import measure, rungs, session_states
 from sioms.reconcile.locate import Place, Spectrum, locate, spectra
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, effective_samples, observer, sensor_noise
-from sioms.reconcile.plausible import GAIN
 from sioms.reconcile.records import Session
 from sioms.reconcile.refuse import bursts, smoother_share
-from sioms.reconcile.search import SPECIFIC, SURE, Found, Searcher, Step
+from sioms.reconcile.rules import GAIN, SPECIFIC, SURE, told_apart
+from sioms.reconcile.search import Found, Searcher, Step
 from sioms.reconcile.simulate import replay
 from sioms.reconcile.timing import on_grid
 from sioms.reconcile.verdict import Estimate, NamedEffect, Outcome, Trace, Verdict
@@ -419,26 +419,7 @@ def _describe(
         evidence.append(
             f"without it {100 * saved:.1f} % of the residual energy would come back ({errors:.1f} standard errors)"
         )
-        ruled = {
-            r.rival: f"reproduces all but {100 * r.missed:.1f} % of it, {r.errors:.1f} standard errors worse"
-            for r in others
-            if r.effect == name and not r.open
-        }
-        ruled.update(
-            {
-                rival: f"saved {100 * gain:.0f} % where this saved {100 * s.saved:.0f} %"
-                for s in found.ladder
-                if s.effect == name
-                for rival, gain in s.rivals.items()
-                if rival in effect.lookalikes and rival not in ruled and rival not in fit.model.effects
-            }
-        )
-        still = {
-            r.rival: f"leaves only {100 * r.missed:.1f} % of it unexplained"
-            for r in others
-            if r.effect == name and r.open
-        }
-        ruled = {k: v for k, v in ruled.items() if k not in still}
+        ruled, still = told_apart(name, effect.lookalikes, others, found.ladder, fit.model.effects)
         named.append(
             NamedEffect(
                 name,

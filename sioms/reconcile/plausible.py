@@ -9,12 +9,8 @@ from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import known, library
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.model import AxisModel
+from sioms.reconcile.rules import NEARLY, negligible
 
-GAIN = 0.05  # least share of what remains that an effect must save on held-out blocks
-#: An unrelated effect that saves this share as much leaves the residual without a name.
-NEARLY = 0.5
-#: A larger loss than this is one, however unevenly it falls on the blocks.
-DOUBTFUL = 0.2
 #: A refitted candidate: fit, held-out losses, share saved, standard errors.
 Tried = tuple[Fit, Array, float, float]
 
@@ -58,11 +54,6 @@ def unspecific(name: str, gains: dict[str, float]) -> bool:
         *(n for n in lib if name in lib[n].lookalikes),
     }
     return any(g > NEARLY * gains[name] for n, g in gains.items() if n not in family)
-
-
-def negligible(lost: float, errors: float) -> bool:
-    """Say whether a loss counts for nothing: small, or not large and within one standard error."""
-    return lost < GAIN or (errors < 1.0 and lost < DOUBTFUL)
 
 
 def simplest(good: dict[str, Tried]) -> str:

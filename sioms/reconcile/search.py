@@ -19,9 +19,7 @@ from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Fit, Problem, closed_errors, refit
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.plausible import (
-    GAIN,
     Tried,
-    negligible,
     physical,
     plainer,
     replaced,
@@ -31,14 +29,12 @@ from sioms.reconcile.plausible import (
     unspecific,
     without,
 )
+from sioms.reconcile.rules import GAIN, SPECIFIC, SURE, negligible
 from sioms.reconcile.screen import Start, screen
 
-SURE = 2.0  # least number of standard errors of that saving
 FLOOR = 1.05  # stop at this multiple of the expected innovation
 TRIES = 4  # candidates refitted per step
 STEPS = 6
-#: A saving below this counts only where no unrelated effect saves nearly as much.
-SPECIFIC = 0.3
 #: A step that saves this much needs no second look at the friction law.
 CLEAR = 0.5
 #: Two effects are tried at once only above this multiple of the expected innovation, so many firsts and seconds.

@@ -14,11 +14,11 @@ import numpy as np
 from sioms.reconcile.excitation import SAME
 from sioms.reconcile.locate import Place
 from sioms.reconcile.noise import effective_samples
+from sioms.reconcile.rules import GAIN, negligible, told_apart
 from sioms.reconcile.sensors.effect import TERM_PREFIX, Array, SensorEffect, SensorModel
 from sioms.reconcile.sensors.fit import Fit, half_intervals, on_one_footing, ratios, refit
 from sioms.reconcile.sensors.locate import locate
 from sioms.reconcile.sensors.refuse import burst_share, smoother_shares
-from sioms.reconcile.sensors.rules import GAIN, negligible
 from sioms.reconcile.sensors.screen import screening_columns
 from sioms.reconcile.sensors.search import Found, Rival, Searcher
 from sioms.reconcile.sensors.steady import changes
@@ -305,26 +305,7 @@ def _describe(
             f"without it the squared residual of the {title} would be {1.0 / max(1.0 - gap.share, 1e-3):.3g} times as large "
             f"({gap.errors:.1f} standard errors, on blocks held out)"
         ]
-        ruled = {
-            r.rival: f"reproduces all but {100 * r.missed:.1f} % of it, {r.errors:.1f} standard errors worse"
-            for r in others
-            if r.effect == name and not r.open
-        }
-        ruled.update(
-            {
-                n: f"saved {100 * g:.0f} % where this saved {100 * s.saved:.0f} %"
-                for s in found.ladder
-                if s.effect == name
-                for n, g in s.rivals.items()
-                if n in effect.lookalikes and n not in ruled and n not in fit.model.effects
-            }
-        )
-        still = {
-            r.rival: f"leaves only {100 * r.missed:.1f} % of it unexplained"
-            for r in others
-            if r.effect == name and r.open
-        }
-        ruled = {k: v for k, v in ruled.items() if k not in still}
+        ruled, still = told_apart(name, effect.lookalikes, others, found.ladder, fit.model.effects)
         out.append(
             (
                 bare.cost - found.fit.cost,

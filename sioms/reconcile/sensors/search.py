@@ -12,13 +12,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sioms.reconcile import rules
 from sioms.reconcile.ambiguity import ALIKE, AMBIGUOUS, SWAPS
 from sioms.reconcile.blocks import better, heldout
+from sioms.reconcile.rules import GAIN, NEARLY, SPECIFIC, SURE, negligible
 from sioms.reconcile.sensors.effect import TERM_PREFIX, Array, SensorEffect, SensorModel
 from sioms.reconcile.sensors.fit import Data, Fit, on_one_footing, ratios, refit
-from sioms.reconcile.sensors.rules import DOUBTFUL, FLOOR, GAIN, NEARLY, SPECIFIC, SURE, negligible
 from sioms.reconcile.sensors.screen import Start, screen
 
+FLOOR = 1.15  # stop at this multiple of the noise floor, which is of a sensor's own rows
 TRIES = 5
 STEPS = 8
 MOST_INSIDE = 0.7  # share of the elements whose own number must be one that the effect can have
@@ -55,22 +57,7 @@ class Rung:
     rivals: dict[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class Rival:
-    """A look-alike refitted in the place of a named effect; see ``sioms.reconcile.ambiguity.Rival``."""
-
-    effect: str
-    rival: str
-    missed: float
-    allowed: float
-    errors: float
-    excess: float
-    fit: Fit
-
-    @property
-    def open(self) -> bool:
-        """True where the data do not rule the rival out."""
-        return self.missed < self.allowed or (self.errors < 1.0 and self.excess < DOUBTFUL)
+Rival = rules.Rival[Fit]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,92 @@
+"""When an effect counts, and when a look-alike is ruled out (decision 0063): alike for axes and sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+F = TypeVar("F")
+
+GAIN = 0.05  # least share of what remains that an effect must save on held-out blocks
+SURE = 2.0  # least number of standard errors of that saving
+#: A saving below ``SPECIFIC`` counts only where no unrelated effect saves ``NEARLY`` as much.
+SPECIFIC = 0.3
+NEARLY = 0.5
+#: A larger loss than this is one, however unevenly it falls on the blocks.
+DOUBTFUL = 0.2
+
+
+def negligible(lost: float, errors: float) -> bool:
+    """Say whether a loss counts for nothing: small, or not large and within one standard error."""
+    return lost < GAIN or (errors < 1.0 and lost < DOUBTFUL)
+
+
+@dataclass(
+    frozen=True
+)  # with slots, calling Rival[Fit] fails in Python 3.11: typing sets an attribute of its own
+class Rival(Generic[F]):
+    """A look-alike refitted in the place of a named effect.
+
+    Attributes:
+        missed: share of the contribution of ``effect`` that it cannot reproduce.
+        allowed: share below which it is not ruled out.
+        errors: by how many standard errors it is worse on held-out blocks.
+        excess: by how much more than the named model it leaves, as a share of what that leaves.
+    """
+
+    effect: str
+    rival: str
+    missed: float
+    allowed: float
+    errors: float
+    excess: float
+    fit: F
+
+    @property
+    def open(self) -> bool:
+        """True where the data do not rule the rival out."""
+        return self.missed < self.allowed or (self.errors < 1.0 and self.excess < DOUBTFUL)
+
+
+class Tried(Protocol):
+    """One step of a search: what entered, the share that it saved, and what its rivals saved."""
+
+    @property
+    def effect(self) -> str: ...
+    @property
+    def saved(self) -> float: ...
+    @property
+    def rivals(self) -> Mapping[str, float]: ...
+
+
+def told_apart(
+    name: str,
+    lookalikes: Container[str],
+    rivals: Iterable[Rival[F]],
+    ladder: Iterable[Tried],
+    present: Container[str],
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Say of each look-alike of a named effect why it is ruled out, or why it is not.
+
+    Args:
+        present: effects of the model, which rule nothing out.
+
+    Returns:
+        Reasons of those ruled out, and of those left open, by name.
+    """
+    mine = [r for r in rivals if r.effect == name]
+    still = {r.rival: f"leaves only {100 * r.missed:.1f} % of it unexplained" for r in mine if r.open}
+    ruled = {
+        rival: f"saved {100 * gain:.0f} % where this saved {100 * step.saved:.0f} %"
+        for step in ladder
+        if step.effect == name
+        for rival, gain in step.rivals.items()
+        if rival in lookalikes and rival not in present and rival not in still
+    }
+    refitted = {
+        r.rival: f"reproduces all but {100 * r.missed:.1f} % of it, {r.errors:.1f} standard errors worse"
+        for r in mine
+        if not r.open
+    }
+    return {**refitted, **{rival: why for rival, why in ruled.items() if rival not in refitted}}, still
