@@ -49,6 +49,8 @@ from .tick_engine import TickEngine
 
 STOP_GRACE_NS = 2_000_000_000
 """How long axes may take to stop before the process ends all the same."""
+SETTLE_NS = 20_000_000
+"""An axis whose loop is closed here follows its command by so much; only then is the loop given up."""
 FAIL_GRACE_NS = 500_000_000
 """How long a failed driver's line may take to send the stops."""
 PACKETS_A_TURN = 8
@@ -113,6 +115,7 @@ class Runtime:
         self._daemon_lease_ns = int(float(options["daemon_lease_s"]) * 1e9)
         self._daemon_late = False
         self._ending_ns = 0
+        self._moved_ns = 0
         self.driver = driver.variant(settings)(device, settings, self)
         self.blocks = list(self.driver.blocks)
         set_alarms(self.blocks, options["alarms"])
@@ -355,10 +358,12 @@ class Runtime:
         """Go on ticking until the axes rest, then close the device, then leave."""
         late = now_ns - self._ending_ns > STOP_GRACE_NS
         if not self._closing:
-            moving = any(isinstance(b, AxisBlock) and not b.bank.is_idle(np.arange(b.n)) for b in self.blocks)
-            if moving and not late:
+            axes = [b for b in self.blocks if isinstance(b, AxisBlock)]
+            if any(not b.bank.is_idle(np.arange(b.n)) for b in axes):
+                self._moved_ns = now_ns
+            if now_ns - self._moved_ns < SETTLE_NS and not late:
                 return
-            self.engine.stop([b for b in self.blocks if isinstance(b, AxisBlock)])
+            self.engine.stop(axes)
             self.engine.close()
             self._closing = True
         if self.engine.is_quiet() or late:

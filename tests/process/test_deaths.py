@@ -168,11 +168,12 @@ def test_killed_daemon_stops_all_drivers(
     axis, other = cell.open("mod0.xaxis", "rw"), cell.open("mod1", "rw")
     axis.command(velocity=0.3)
     other.command(velocity=0.3)
+    wait_for(lambda: axis.read().velocity[0] > 0.2 and other.read().velocity[0] > 0.2, "speed")
     os.kill(daemon.pid, signal.SIGKILL)
     killed = time.monotonic()
     for node in (axis, other):
         last = _last(node)
-        assert not any(last.in_motion) and abs(last.velocity[0]) < 0.1, "the last thing published is rest"
+        assert not any(last.in_motion) and abs(last.velocity[0]) < 0.005, "the last thing published is rest"
         with raises(errno.EIO, node.name):
             node.read()
         with raises(errno.EIO, node.name):
