@@ -18,6 +18,7 @@ from sioms.reconcile.noise import response
 from sioms.reconcile.screen import (
     STATE_SLOTS,
     dead_band,
+    longest,
     shapes,
     smoothed_motion,
     state_columns,
@@ -75,9 +76,9 @@ def _trace(problem: Problem, model: AxisModel, effect: Effect) -> Array | None:
     size = effect.primary.start * model.scale(effect.primary)
     if effect.slot in STATE_SLOTS:
         motions, dead = smoothed_motion(problem, model), dead_band(problem, model)
-        shape = next(
-            iter(shapes(effect, model, 1)), {p.symbol: p.start * model.scale(p) for p in effect.parameters}
-        )
+        shape = next(shapes(effect, model, longest(motions)), None)
+        if shape is None:  # the range holds no period of any order
+            return None
         parts = [
             response(model, problem.noise, size * state_columns(effect, model, m, shape, dead))
             for m in motions

@@ -131,24 +131,27 @@ def amplitudes(effect: Effect) -> list[tuple[Parameter, Parameter | None]]:
     return out
 
 
-def shapes(effect: Effect, model: AxisModel, largest_order: int) -> Iterator[dict[str, float]]:
-    """Yield trial values of the parameters in which a state effect is not linear."""
+def shapes(effect: Effect, model: AxisModel, span: float) -> Iterator[dict[str, float]]:
+    """Yield trial values of the parameters in which a state effect is not linear.
+
+    Args:
+        span: range of motion; of the orders those are tried of which it holds (nearly) one period.
+    """
     linear = {p.symbol for p, _ in amplitudes(effect)}
     order = next((p for p in effect.parameters if p.fixed), None)
     shape = next(
         (p for p in effect.parameters if p.symbol not in linear and not p.fixed and not p.phase), None
     )
     if order is not None:
-        first = 1 if not model.rotary else max(int(order.lower), 2 if effect.slot is Slot.FORCE else 1)
-        for n in range(first, largest_order + 1):
+        first = 2 if model.rotary and effect.slot is Slot.FORCE else 1
+        for n in range(max(first, int(model.pitch / span)), int(order.upper) + 1):
             yield {order.symbol: float(n)}
     elif shape is not None:
         if shape.ref is not Ref.SPEED:
             for s in np.geomspace(shape.lower, shape.upper, 2 * SPEED_STEPS):
                 yield {shape.symbol: float(s * model.scale(shape))}
             return
-        span = np.geomspace(max(shape.lower, 1e-3), min(shape.upper, 0.3), SPEED_STEPS)
-        for s in span:
+        for s in np.geomspace(max(shape.lower, 1e-3), min(shape.upper, 0.3), SPEED_STEPS):
             yield {shape.symbol: float(s * model.scale(shape))}
     else:
         yield {}
@@ -172,16 +175,20 @@ def screen(
     q = _orthonormal(fit.jacobian[rows])
     rest = fit.residual[rows] - q @ (q.T @ fit.residual[rows])
     dead = dead_band(problem, fit.model)
-    span = max(float(np.ptp(m.x)) for m in motions)
-    largest = int(np.clip(60.0, 1, 60)) if span > 0.5 * fit.model.pitch else 1
+    span = longest(motions)
     out = []
     for name in names:
         effect = lib[name]
         if effect.slot in STATE_SLOTS:
-            out.append(_screen_state(problem, fit, effect, motions, q, rest, dead, largest, levels or {}))
+            out.append(_screen_state(problem, fit, effect, motions, q, rest, dead, span, levels or {}))
         else:
             out.extend(_screen_trials(problem, fit, effect, q, rest))
     return sorted((s for s in out if s is not None), key=lambda s: -s.gain)
+
+
+def longest(motions: list[Motion]) -> float:
+    """Range of motion of the record that moves farthest, [{x}]."""
+    return max(max(float(np.ptp(m.x)) for m in motions), 1e-300)
 
 
 def instrument_motion(problem: Problem, model: AxisModel) -> list[Motion]:
@@ -270,11 +277,11 @@ def _screen_state(
     q: Array,
     rest: Array,
     dead: float,
-    largest: int,
+    span: float,
     levels: Mapping[str, float],
 ) -> Start | None:
     best: Start | None = None
-    for shape in shapes(effect, fit.model, largest):
+    for shape in shapes(effect, fit.model, span):
         f = _filtered(
             problem, fit.model, [state_columns(effect, fit.model, m, shape, dead) for m in motions]
         )[thinned(len(fit.residual))]
@@ -288,20 +295,20 @@ def _screen_state(
         coefficient[keep] = np.linalg.lstsq(unit.T @ unit, unit.T @ rest, rcond=1e-8)[0] / size[keep]
         gain = 1.0 - float(np.sum((rest - f @ coefficient) ** 2)) / float(rest @ rest)
         values = _values(effect, fit.model, shape, coefficient, levels)
-        if (best is None or gain > best.gain) and not _overtone(effect, values, largest):
+        if (best is None or gain > best.gain) and not _overtone(effect, values):
             best = Start(effect.name, gain, values)
     return best
 
 
-def _overtone(effect: Effect, values: Mapping[str, float], largest: int) -> bool:
+def _overtone(effect: Effect, values: Mapping[str, float]) -> bool:
     """Say whether the second harmonic is the larger: then the wave is one of twice the order, which is tried too."""
-    order = next((p.symbol for p in effect.parameters if p.fixed), None)
+    order = next((p for p in effect.parameters if p.fixed), None)
     waves = [a.symbol for a, phase in amplitudes(effect) if phase is not None]
     return (
         order is not None
         and len(waves) == 2
         and values[waves[1]] > values[waves[0]]
-        and 2 * values[order] <= largest
+        and 2 * values[order.symbol] <= order.upper
     )
 
 

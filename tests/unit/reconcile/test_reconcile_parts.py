@@ -94,6 +94,14 @@ def test_screening_puts_the_hidden_effect_first_and_starts_near_it() -> None:
     assert best.values["phase"] == pytest.approx(0.8, abs=0.1)
 
 
+def test_many_periods_a_turn_are_found_within_a_third_of_a_turn() -> None:
+    hidden = AXIS.with_effect("torque_ripple", {"depth": 0.15, "phase": 0.8, "n": 22.0})
+    p = problem(session(hidden, 0.27 * COMMAND))
+    assert np.ptp(p.session.records[0].position) < 0.36 * AXIS.pitch
+    best = screen(p, refit(p, AXIS), ["torque_ripple", "cogging", "gravity", "spring"])[0]
+    assert (best.effect, best.values["n"]) == ("torque_ripple", 22.0)
+
+
 def test_a_refit_finds_the_parameters() -> None:
     hidden = AXIS.with_effect("coulomb", {"Fc": 0.06}).with_effect("payload", {"J_extra": 4e-4})
     p = problem(session(hidden))
