@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import inspect
 import os
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from importlib import import_module
 from typing import Any, TypeVar
 
+import numpy as np
+
 F = TypeVar("F", bound=Callable[..., Any])
 
-#: Signature of every state function of an effect: (x, v, u, temperature, parameters) -> value.
-STATE_SIGNATURE = "float64(float64, float64, float64, float64, float64[::1])"
+#: Signature of every state function of an effect: (x, v, u, temperature, parameters) -> value, as C code takes it.
+STATE_SIGNATURE = "float64(float64, float64, float64, float64, CPointer(float64))"
 STATE_ARGUMENTS = 5
 
 
@@ -26,24 +27,62 @@ def numba() -> Any:
     """Return the module numba, None where it is not installed or SIOMS_PLAIN is set."""
     if os.environ.get("SIOMS_PLAIN") is not None:
         return None
-    # State functions are handed to the kernel as values, which numba calls experimental; the tests hold it to it.
-    warnings.filterwarnings("ignore", message="First-class function type feature is experimental")
     try:
         return import_module("numba")
     except ImportError:
         return None
 
 
-def typed_list() -> Any:
-    """Return the list type that compiled code takes."""
-    return list if numba() is None else import_module("numba.typed").List
+def addresses(functions: Sequence[Callable[..., Any]]) -> Any:
+    """Return what ``caller`` finds state functions in: compiled, their addresses; as they are, themselves."""
+    ready = [compiled(f) for f in functions]
+    return ready if numba() is None else np.array([f.address for f in ready], dtype=np.int64)
+
+
+def caller() -> Callable[..., float]:
+    """Return the call of state function k of several with row k of parameters: ``(functions, k, rows, x, v, u, temperature)``.
+
+    Compiled, it is a jump to an address. Functions as numba's own values cost ten times as much, arrays as arguments are counted.
+    """
+    if numba() is None:
+        return lambda functions, k, rows, *state: float(functions[k](*state, rows[k]))
+    ir = import_module("llvmlite.ir")
+    types = import_module("numba.core.types")
+
+    @import_module("numba.extending").intrinsic  # type: ignore[untyped-decorator]
+    def call(typing: Any, functions: Any, k: Any, rows: Any, x: Any, v: Any, u: Any, temperature: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            codes, index, table, *state = arguments
+            code = builder.load(
+                builder.gep(context.make_array(functions)(context, builder, codes).data, [index])
+            )
+            place = context.make_array(rows)(context, builder, table)
+            offset = builder.mul(builder.extract_value(place.strides, 0), index)
+            start = builder.ptrtoint(place.data, offset.type)
+            row = builder.inttoptr(builder.add(start, offset), place.data.type)
+            number = ir.DoubleType()
+            kind = ir.FunctionType(number, [*[number] * len(state), row.type]).as_pointer()
+            return builder.call(builder.inttoptr(code, kind), [*state, row])
+
+        return types.float64(functions, types.intp, rows, *[types.float64] * (STATE_ARGUMENTS - 1)), generate
+
+    return call  # type: ignore[no-any-return]
 
 
 def kernel(function: F) -> F:
     """Compile a loop over samples (cached on disk)."""
+    return _compiled(function)
+
+
+def inlined(function: F) -> F:
+    """Compile a part of a kernel into its caller."""
+    return _compiled(function, forceinline=True)
+
+
+def _compiled(function: F, **options: bool) -> F:
     if numba() is None:
         return function
-    done: F = numba().njit(cache=True, nogil=True)(function)
+    done: F = numba().njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     return done
 
 
@@ -65,4 +104,8 @@ def state_function(function: F) -> F:
 @cache
 def compiled(function: Callable[..., Any]) -> Any:
     """Return the compiled form of a state function; all of them have one type."""
-    return function if numba() is None else numba().njit(STATE_SIGNATURE, cache=True)(function)
+    return (
+        function
+        if numba() is None
+        else numba().cfunc(STATE_SIGNATURE, cache=True, error_model="numpy")(function)
+    )

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from sioms.reconcile.effect import Array
-from sioms.reconcile.jit import kernel, typed_list
+from sioms.reconcile.jit import caller, inlined, kernel
 
-TypedList = typed_list()
+call = caller()
 
 # Places in the plant row.
 (
@@ -60,31 +60,19 @@ PATIENCE, MEASURED = 20, 10
 LEAST_GAIN = 0.05
 
 
-@kernel
-def listed(functions: Any) -> Any:
-    """Put state functions into the container that a compiled kernel takes at no cost per call."""
-    out = TypedList()
-    for f in functions:
-        out.append(f)
-    return out
-
-
-@kernel
-def smooth(forces: Any, n: int, p: Array, x: float, v: float, u: float, t: float) -> float:
-    """Sum the FORCE effects."""
+@inlined
+def summed(functions: Any, p: Array, x: float, v: float, u: float, t: float) -> float:
+    """Sum state functions, each with its row of p."""
     total = 0.0
-    for i in range(n):
-        total += forces[i](x, v, u, t, p[i])
+    for k in range(len(p)):
+        total += call(functions, k, p, x, v, u, t)
     return total
 
 
-@kernel
-def friction(levels: Any, n: int, p: Array, x: float, v: float, u: float, t: float) -> float:
+@inlined
+def friction(levels: Any, p: Array, x: float, v: float, u: float, t: float) -> float:
     """Sum the FRICTION levels in the direction of v, never negative."""
-    total = 0.0
-    for i in range(n):
-        total += levels[i](x, v, u, t, p[i])
-    return max(total, 0.0)
+    return max(summed(levels, p, x, v, u, t), 0.0)
 
 
 @kernel
@@ -113,38 +101,30 @@ def delayed(u: Array, n: int, start: float, end: float, delay: float, dt: float)
     return (ui * (cut - a) + uj * (b - cut)) / (b - a)
 
 
-@kernel
-def slide(
-    x: float,
-    v: float,
-    a: float,
-    level: float,
-    mass: float,
-    force: float,
-    h: float,
-    break_p: float,
-    break_m: float,
-) -> tuple[float, float]:
-    """Advance one step under constant ``force`` and dry friction, splitting at rest.
+@inlined
+def slide(x: float, v: float, a: float, h: float) -> tuple[float, float, float]:
+    """Advance one step under constant acceleration, or to where the speed crosses zero.
 
-    Args:
-        a: acceleration while sliding in the present direction.
-        break_p, break_m: friction levels that hold against forward and backward motion.
+    Returns:
+        Position, speed and what is left of the step.
     """
-    if v != 0.0:
-        v1 = v + a * h
-        if v1 * v > 0.0:
-            return x + 0.5 * (v + v1) * h, v1
-        t0 = h * v / (v - v1) if v1 != v else h
-        x += 0.5 * v * t0
-        h -= t0
+    if v == 0.0:
+        return x, v, h
+    v1 = v + a * h
+    if v1 * v > 0.0:
+        return x + 0.5 * (v + v1) * h, v1, 0.0
+    t0 = h * v / (v - v1) if v1 != v else h
+    return x + 0.5 * v * t0, 0.0, h - t0
+
+
+@inlined
+def leave(force: float, break_p: float, break_m: float) -> float:
+    """Return the force that is left of one at rest, against friction that holds forward and backward."""
     if force > break_p:
-        a = (force - break_p) / mass
-    elif force < -break_m:
-        a = (force + break_m) / mass
-    else:
-        return x, 0.0
-    return x + 0.5 * a * h * h, a * h
+        return force - break_p
+    if force < -break_m:
+        return force + break_m
+    return 0.0
 
 
 @kernel
@@ -157,13 +137,10 @@ def march(
     ctl: Array,
     plant: Array,
     forces: Any,
-    nf: int,
     pf: Array,
     levels: Any,
-    nl: int,
     pl: Array,
     gains: Any,
-    ng: int,
     pg: Array,
     l1: float,
     l2: float,
@@ -182,17 +159,18 @@ def march(
         start: x, v, temperature, and error and force of the controller at the sample before the first.
         out: shape (n, OUT_SIZE), filled.
     """
-    # Local tuples: picking a function out of a list costs ten times as much, handing tuples in a millisecond.
-    force_of = (forces[0], forces[1], forces[2], forces[3], forces[4], forces[5])
-    level_of = (levels[0], levels[1], levels[2], levels[3], levels[4], levels[5])
-    gain_of = (gains[0], gains[1], gains[2], gains[3], gains[4], gains[5])
     n = command.shape[0]
     dt = plant[DT]
     h = dt / sub
-    two = plant[LOAD] > 0.0
+    two, dry = plant[LOAD] > 0.0, len(pl) > 0
     total = plant[INERTIA]
     jl = total * plant[LOAD]
     jm = total - jl
+    # Local copies: a function that is called by its address might have changed an array.
+    viscous, limit, delay, lag, loss = plant[VISCOUS], plant[LIMIT], plant[DELAY], plant[LAG], plant[LOSS]
+    hyst_f, mod, gain_y = plant[HYST_F], plant[MOD_A], plant[GAIN_Y]
+    decay = np.exp(-h / lag) if lag > 0.0 else 0.0
+    l1, l2, per_mass = l1 / gain_y, l2 / gain_y, 1.0 / jm
     x, v, temp = start[0], start[1], start[2]
     xl, vl = x, v
     lagged = 0.0
@@ -201,7 +179,9 @@ def march(
     off = 0
     u_all = np.zeros(n)
     for i in range(n):
-        y = plant[GAIN_Y] * x + plant[ECC_AMP] * np.sin(plant[TURN_X] * x + plant[ECC_PHASE])
+        y = gain_y * x
+        if plant[ECC_AMP] != 0.0:
+            y += plant[ECC_AMP] * np.sin(plant[TURN_X] * x + plant[ECC_PHASE])
         if closed:
             if plant[QUANTUM] > 0.0:
                 y = np.round(y / plant[QUANTUM]) * plant[QUANTUM]
@@ -228,8 +208,8 @@ def march(
         else:
             u = force_in[i]
             innovation = measured[i] - y
-            dx = l1 * innovation / plant[GAIN_Y]
-            dv = l2 * innovation / plant[GAIN_Y]
+            dx = l1 * innovation
+            dv = l2 * innovation
             x += dx
             v += dv
             if plant[GAP] > 0.0 and np.abs(x - xl) < 0.5 * plant[GAP]:
@@ -238,7 +218,7 @@ def march(
             vl += dv
             off = off + 1 if np.abs(innovation) > lost else 0
             if off >= PATIENCE and i >= MEASURED:
-                v = (measured[i] - measured[i - MEASURED]) / (MEASURED * dt * plant[GAIN_Y])
+                v = (measured[i] - measured[i - MEASURED]) / (MEASURED * dt * gain_y)
                 vl = v
                 off = 0
         u_all[i] = u
@@ -251,48 +231,46 @@ def march(
         applied = 0.0
         for s in range(sub):
             ua = u
-            if plant[DELAY] > 0.0:
-                ua = delayed(u_all, i, s * h, (s + 1) * h, plant[DELAY], dt)
-            if plant[LAG] > 0.0:
-                decay = np.exp(-h / plant[LAG])
+            if delay > 0.0:
+                ua = delayed(u_all, i, s * h, (s + 1) * h, delay, dt)
+            if lag > 0.0:
                 nxt = ua + (lagged - ua) * decay
-                ua = ua + (lagged - ua) * (1.0 - decay) * plant[LAG] / h
+                ua = ua + (lagged - ua) * (1.0 - decay) * lag / h
                 lagged = nxt
-            ua = min(max(ua, -plant[LIMIT]), plant[LIMIT])
+            ua = min(max(ua, -limit), limit)
             applied += ua
-            if plant[LOSS] > 0.0:
+            if loss > 0.0:
                 heat = (ua / plant[RATED]) ** 2
                 temp = heat + (temp - heat) * np.exp(-h / plant[TAU_T])
             # Midpoint prediction.
-            drive = ua * max(1.0 - plant[LOSS] * temp, LEAST_GAIN)
+            drive = ua * max(1.0 - loss * temp, LEAST_GAIN)
             xp = x + 0.5 * h * v
-            for k in range(ng):
-                drive *= gain_of[k](xp, v, ua, temp, pg[k])
+            for k in range(len(pg)):
+                drive *= call(gains, k, pg, xp, v, ua, temp)
             sign = 1.0 if v > 0.0 else -1.0
             level = 0.0
-            if v != 0.0 and nl > 0:
-                level = sign * friction(level_of, nl, pl, x, v, ua, temp)
-            base = drive + external[i] + smooth(force_of, nf, pf, x, v, ua, temp) - hyst
+            if v != 0.0 and dry:
+                level = sign * friction(levels, pl, x, v, ua, temp)
+            here = summed(forces, pf, x, v, ua, temp)
+            base = drive + external[i] + here - hyst
             link = coupling(plant, x - xl, v - vl) if two else 0.0
-            a0 = (base - plant[VISCOUS] * v - level - link) / jm
+            a0 = (base - viscous * v - level - link) * per_mass
             vp = v + 0.5 * h * a0
             if v != 0.0 and vp * v < 0.0:
                 vp = 0.0
-            if plant[HYST_F] > 0.0:
+            if hyst_f > 0.0:
                 way = np.exp(-np.abs(vp) * h / plant[HYST_X])
-                goal = plant[HYST_F] if vp > 0.0 else -plant[HYST_F]
+                goal = hyst_f if vp > 0.0 else -hyst_f
                 before = hyst
                 hyst = goal + (hyst - goal) * way
                 base += before - 0.5 * (before + hyst)
-            force = (
-                base - smooth(force_of, nf, pf, x, v, ua, temp) + smooth(force_of, nf, pf, xp, vp, ua, temp)
-            )
-            force -= plant[VISCOUS] * vp
-            if plant[MOD_A] != 0.0:
+            force = base - here + summed(forces, pf, xp, vp, ua, temp)
+            force -= viscous * vp
+            if mod != 0.0:
                 w = plant[MOD_N] * plant[TURN_X]
-                jm = total - jl + plant[MOD_A] * np.sin(w * xp + plant[MOD_PHASE])
-                jm = max(jm, 0.05 * total)
-                force -= 0.5 * vp * vp * plant[MOD_A] * w * np.cos(w * xp + plant[MOD_PHASE])
+                jm = total - jl + mod * np.sin(w * xp + plant[MOD_PHASE])
+                per_mass = 1.0 / max(jm, 0.05 * total)
+                force -= 0.5 * vp * vp * mod * w * np.cos(w * xp + plant[MOD_PHASE])
             if two:
                 al0 = (link - plant[LOAD_VISCOUS] * vl) / jl
                 xlp = xl + 0.5 * h * vl
@@ -302,24 +280,18 @@ def march(
                 xl += h * vlp
                 vl += h * al
                 force -= link
-            if nl > 0:
+            if dry:
                 if v != 0.0:
-                    level = sign * friction(
-                        level_of, nl, pl, xp, vp if vp != 0.0 else sign * TINY_SPEED, ua, temp
-                    )
-                x, v = slide(
-                    x,
-                    v,
-                    (force - level) / jm,
-                    level,
-                    jm,
-                    force,
-                    h,
-                    friction(level_of, nl, pl, x, TINY_SPEED, ua, temp),
-                    friction(level_of, nl, pl, x, -TINY_SPEED, ua, temp),
-                )
+                    level = sign * friction(levels, pl, xp, vp if vp != 0.0 else sign * TINY_SPEED, ua, temp)
+                xs = x
+                x, v, rest = slide(x, v, (force - level) * per_mass, h)
+                if rest > 0.0:
+                    break_p = friction(levels, pl, xs, TINY_SPEED, ua, temp)
+                    break_m = friction(levels, pl, xs, -TINY_SPEED, ua, temp)
+                    v = leave(force, break_p, break_m) * per_mass * rest
+                    x += 0.5 * v * rest
             else:
-                a = force / jm
+                a = force * per_mass
                 x += h * (v + 0.5 * h * a)
                 v += h * a
         out[i, OUT_APPLIED] = applied / sub

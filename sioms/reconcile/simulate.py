@@ -7,36 +7,25 @@ exist, only on their slots.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from sioms.reconcile import kernel as k
-from sioms.reconcile.effect import ROW, Array, Number, Slot
+from sioms.reconcile.effect import ROW, Array, Slot
 from sioms.reconcile.effects import known
-from sioms.reconcile.jit import compiled, numba, state_function
+from sioms.reconcile.jit import addresses
 from sioms.reconcile.model import AxisModel, controller_row
 from sioms.reconcile.records import Record
-
-#: Places for effects of one kind; the kernel unpacks as many.
-SLOTS = 6
-
-
-@state_function
-def _nothing(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
-    """Fill an empty place."""
-    return 0.0 * x
 
 
 @dataclass(frozen=True, slots=True)
 class Packed:
-    """A model as the kernel reads it."""
+    """A model as the kernel reads it: its numbers, and per kind of state function the functions and their rows (n, ROW)."""
 
     plant: Array
     functions: dict[Slot, Any]
     rows: dict[Slot, Array]
-    counts: dict[Slot, int]
     substeps: int
 
 
@@ -71,9 +60,6 @@ def pack(model: AxisModel, substeps: int = 0) -> Packed:
 
     Args:
         substeps: steps in a sample; 0 chooses 2, or 4 with a transmission, 6 in contact.
-
-    Raises:
-        ValueError: more effects in one slot than the kernel holds.
     """
     lib = known()
     plant = np.zeros(k.PLANT_SIZE)
@@ -82,18 +68,13 @@ def pack(model: AxisModel, substeps: int = 0) -> Packed:
     plant[k.TURN_X], plant[k.LIMIT] = 2.0 * np.pi / model.pitch, np.inf
     plant[k.RATED], plant[k.TAU_T], plant[k.HYST_X] = model.rated_force, 1.0, 1.0
     functions: dict[Slot, list[Any]] = {Slot.FORCE: [], Slot.FRICTION: [], Slot.GAIN: []}
-    rows = {s: np.zeros((SLOTS, ROW)) for s in functions}
+    rows: dict[Slot, list[Array]] = {s: [] for s in functions}
     transmission: tuple[Slot, Array] | None = None
     for name, given in model.effects.items():
         effect = lib[name]
         p = effect.values(given)
         if effect.slot in functions:
-            place = len(functions[effect.slot])
-            if place >= SLOTS:
-                raise ValueError(
-                    f"simulate {model.name}: more than {SLOTS} effects of kind {effect.slot.value}"
-                )
-            rows[effect.slot][place] = effect.row(p, model.pitch)
+            rows[effect.slot].append(effect.row(p, model.pitch))
             functions[effect.slot].append(effect.function)
         elif effect.slot in (Slot.ELASTIC, Slot.BACKLASH):
             transmission = (effect.slot, p)
@@ -102,15 +83,12 @@ def pack(model: AxisModel, substeps: int = 0) -> Packed:
     if transmission is not None:
         _couple(plant, *transmission)
     steps = substeps or _steps(transmission)
-    filled = {s: _container((*f, *[_nothing] * (SLOTS - len(f)))) for s, f in functions.items()}
-    return Packed(plant, filled, rows, {s: len(f) for s, f in functions.items()}, steps)
-
-
-@lru_cache(maxsize=1024)
-def _container(functions: tuple[Any, ...]) -> Any:
-    """Keep one container per set of functions."""
-    ready = tuple(compiled(f) for f in functions)
-    return ready if numba() is None else k.listed(ready)
+    return Packed(
+        plant,
+        {s: addresses(f) for s, f in functions.items()},
+        {s: np.array(r).reshape(-1, ROW) for s, r in rows.items()},
+        steps,
+    )
 
 
 def _steps(transmission: tuple[Slot, Array] | None) -> int:
@@ -180,13 +158,10 @@ def _march(
         ctl,
         p.plant,
         p.functions[f],
-        p.counts[f],
         p.rows[f],
         p.functions[lv],
-        p.counts[lv],
         p.rows[lv],
         p.functions[g],
-        p.counts[g],
         p.rows[g],
         gain[0],
         gain[1],

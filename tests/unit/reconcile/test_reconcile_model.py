@@ -9,6 +9,7 @@ import pytest
 
 from sioms.reconcile.effect import Slot
 from sioms.reconcile.effects import known, library
+from sioms.reconcile.kernel import summed
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.model_file import model_from, write_model
 from sioms.reconcile.records import Record, Session
@@ -91,13 +92,17 @@ def test_unknown_parameters_are_refused() -> None:
         AXIS.with_effect("coulomb", {"fc": 1.0})
 
 
-def test_more_effects_than_places_are_refused() -> None:
+def test_any_number_of_forces_act_at_once() -> None:
+    forces = [e for e in known().values() if e.slot is Slot.FORCE]
     model = AXIS
-    forces = [e for e in known().values() if e.slot is Slot.FORCE][:7]
     for e in forces:
         model = model.with_effect(e.name, {p.symbol: p.start for p in e.parameters})
-    with pytest.raises(ValueError, match="more than 6"):
-        pack(model)
+    packed, state = pack(model), (0.3, -0.2, 0.1, 0.5)
+    total = summed(packed.functions[Slot.FORCE], packed.rows[Slot.FORCE], *state)
+    arrays = [np.array([s]) for s in state]
+    each = [e.evaluate(*arrays, e.row(e.values(model.effects[e.name]), AXIS.pitch))[0] for e in forces]
+    assert len(forces) > 7
+    assert total == pytest.approx(sum(each), rel=1e-12)
 
 
 def test_a_model_survives_its_file(tmp_path: Path) -> None:
