@@ -209,12 +209,16 @@ def replay(model: AxisModel, record: Record, temperature: float = 0.0) -> Run:
     command = np.ascontiguousarray(record.command, dtype=np.float64)
     p = pack(model)
     y = record.position[0]
-    turned = y / p.plant[k.GAIN_Y] * p.plant[k.TURN_X] + p.plant[k.ECC_PHASE]
-    x = (y - p.plant[k.ECC_AMP] * np.sin(turned)) / p.plant[k.GAIN_Y]
     added = record.feedforward
     held = record.force[0] - (0.0 if added is None else added[0])
-    start = np.array([x, 0.0, temperature, command[0] - y, held])
+    start = np.array([_true_place(p.plant, y), 0.0, temperature, command[0] - y, held])
     return _march(p, True, command, command, added, record.external, controller_row(model), (0.0, 0.0), start)
+
+
+def _true_place(plant: Array, y: float) -> float:
+    """Where the axis is when its sensor reads ``y``."""
+    turned = y / plant[k.GAIN_Y] * plant[k.TURN_X] + plant[k.ECC_PHASE]
+    return float((y - plant[k.ECC_AMP] * np.sin(turned)) / plant[k.GAIN_Y])
 
 
 def _first_speed(position: Array, dt: float) -> float:
@@ -249,7 +253,7 @@ def track(
     p = packed or pack(model)
     start = np.array(
         [
-            y[0] / p.plant[k.GAIN_Y],
+            _true_place(p.plant, y[0]),
             _first_speed(y, model.sample_time_s) / p.plant[k.GAIN_Y],
             temperature,
             0.0,
