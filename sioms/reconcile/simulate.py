@@ -6,7 +6,9 @@ exist, only on their slots.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,9 @@ from sioms.reconcile.effects import known
 from sioms.reconcile.jit import addresses
 from sioms.reconcile.model import AxisModel, controller_row
 from sioms.reconcile.records import Record
+
+#: Steps in a millisecond without a transmission, with one, and with contact in one.
+STEPS = {None: 2, Slot.ELASTIC: 4, Slot.BACKLASH: 6}
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +64,7 @@ def pack(model: AxisModel, substeps: int = 0) -> Packed:
     """Pack a model for the kernel.
 
     Args:
-        substeps: steps in a sample; 0 chooses 2, or 4 with a transmission, 6 in contact.
+        substeps: steps in a sample; 0 chooses by ``STEPS``.
     """
     lib = known()
     plant = np.zeros(k.PLANT_SIZE)
@@ -82,7 +87,7 @@ def pack(model: AxisModel, substeps: int = 0) -> Packed:
             _place(plant, effect.slot, p)
     if transmission is not None:
         _couple(plant, *transmission)
-    steps = substeps or _steps(transmission)
+    steps = substeps or _steps(transmission, model.sample_time_s)
     return Packed(
         plant,
         {s: addresses(f) for s, f in functions.items()},
@@ -91,10 +96,10 @@ def pack(model: AxisModel, substeps: int = 0) -> Packed:
     )
 
 
-def _steps(transmission: tuple[Slot, Array] | None) -> int:
-    if transmission is None:
-        return 2
-    return 4 if transmission[0] is Slot.ELASTIC else 6
+def _steps(transmission: tuple[Slot, Array] | None, sample_time_s: float) -> int:
+    """Steps in a sample: as many as the fastest motion needs, at slow rates no more than at 1 kHz."""
+    most = STEPS[transmission[0] if transmission else None]
+    return min(most, math.ceil(most * sample_time_s / 1e-3 - 1e-9))
 
 
 def _place(plant: Array, slot: Slot, p: Array) -> None:
@@ -224,7 +229,13 @@ def _true_place(plant: Array, y: float) -> float:
 def _first_speed(position: Array, dt: float) -> float:
     """Speed at the first sample of a record, which may begin in motion: of a parabola through the first 20 ms."""
     n = min(max(8, round(0.02 / dt)), len(position))
-    return float(np.polyfit(np.arange(n) * dt, position[:n] - position[0], 2)[1]) if n > 2 else 0.0
+    return float(_slope_weights(n) @ (position[:n] - position[0])) / dt if n > 2 else 0.0
+
+
+@lru_cache(maxsize=16)
+def _slope_weights(n: int) -> Array:
+    """Weights of n samples in the slope at the first of them of the parabola that fits them best."""
+    return np.asarray(np.linalg.pinv(np.vander(np.arange(n), 3))[1])
 
 
 def track(
