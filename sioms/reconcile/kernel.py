@@ -4,9 +4,10 @@ Two uses of the same plant. *Closed*: the controller sees the simulated, quantis
 force (what a user sees). *Tracking*: the recorded force drives the plant and a steady Kalman gain (l1, l2)
 pulls the state to the recorded position; the innovation is what the model cannot predict over a short window.
 
-Integration: every sample is cut into ``sub`` steps; smooth forces by the midpoint rule, dry friction by
-exact splitting at the moment the speed crosses zero (then either stick or slip the other way), so that the
-order is two away from events and the error of an event is of the order of one step's change of force.
+Integration: every sample is cut into ``sub`` steps; smooth forces by the midpoint rule, its prediction with the forces
+of the middle of the step before (of second order still, with half the evaluations), dry friction by exact splitting at
+the moment the speed crosses zero (then either stick or slip the other way), so that the order is two away from events
+and the error of an event is of the order of one step's change of force.
 Contact of a backlash is a stiff spring-damper whose frequency the caller chooses.
 """
 
@@ -177,6 +178,7 @@ def march(
     hyst = 0.0
     e_old, u_old, y_old, y_older, v_f = start[3], start[4], 0.0, 0.0, 0.0
     off = 0
+    level, acting = 0.0, summed(forces, pf, x, v, u_old, temp)
     u_all = np.zeros(n)
     for i in range(n):
         y = gain_y * x
@@ -248,11 +250,11 @@ def march(
             for k in range(len(pg)):
                 drive *= call(gains, k, pg, xp, v, ua, temp)
             sign = 1.0 if v > 0.0 else -1.0
-            level = 0.0
-            if v != 0.0 and dry:
+            if v == 0.0:
+                level = 0.0
+            elif dry and level * v <= 0.0:
                 level = sign * friction(levels, pl, x, v, ua, temp)
-            here = summed(forces, pf, x, v, ua, temp)
-            base = drive + external[i] + here - hyst
+            base = drive + external[i] + acting - hyst
             link = coupling(plant, x - xl, v - vl) if two else 0.0
             a0 = (base - viscous * v - level - link) * per_mass
             vp = v + 0.5 * h * a0
@@ -264,7 +266,9 @@ def march(
                 before = hyst
                 hyst = goal + (hyst - goal) * way
                 base += before - 0.5 * (before + hyst)
-            force = base - here + summed(forces, pf, xp, vp, ua, temp)
+            force = base - acting
+            acting = summed(forces, pf, xp, vp, ua, temp)
+            force += acting
             force -= viscous * vp
             if mod != 0.0:
                 w = plant[MOD_N] * plant[TURN_X]
