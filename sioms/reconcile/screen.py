@@ -26,8 +26,11 @@ from sioms.reconcile.simulate import replay
 GRID_DELAY = (0.5e-3, 2e-3, 5e-3)
 GRID_RESONANCE = (7.0, 11.0, 16.0, 24.0, 36.0, 55.0)
 GRID_GAP = tuple(float(g) for g in np.geomspace(3e-4, 6e-2, 20))
+#: A contact that bounces makes a cost of many minima; started with one that does not, it would not find all that do.
+GRID_ZETA = (0.05, 0.3)
 GRID_LIMIT = (0.95, 0.85, 0.7, 0.5, 0.3)
 GRID_TAU = (3.0, 10.0, 40.0)
+GRID_PHASE = np.linspace(-np.pi, np.pi, 9)[1:]
 SPEED_STEPS = 7
 #: Below this the measured motion stands for one without noise; a command is followed up to COMMAND_HZ, if to this share.
 SLOW_HZ, COMMAND_HZ, FOLLOWED = 5.0, 30.0, 0.2
@@ -344,7 +347,12 @@ def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator
         case Slot.ELASTIC:
             grid = tuple({first: g, "load_fraction": f} for g in GRID_RESONANCE for f in (0.3, 0.6))
         case Slot.BACKLASH:
-            grid = tuple({first: g * model.pitch, "load_fraction": f} for g in GRID_GAP for f in (0.4, 0.6))
+            grid = tuple(
+                {first: g * model.pitch, "load_fraction": f, "zeta": z}
+                for g in GRID_GAP
+                for f in (0.4, 0.6)
+                for z in GRID_ZETA
+            )
         case Slot.LIMIT:
             grid = tuple({first: g * peak} for g in GRID_LIMIT)
         case Slot.THERMAL:
@@ -355,7 +363,7 @@ def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator
         case Slot.SCALE:
             grid = ({first: 1.01},)
         case Slot.ECCENTRICITY:
-            grid = tuple({"phase": g} for g in (0.0, np.pi / 2))
+            grid = tuple({"phase": float(g)} for g in GRID_PHASE)
         case _:
             grid = ({},)
     for g in grid:

@@ -8,7 +8,7 @@ the place of a richer one. The search stops when nothing saves ``GAIN`` of what 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sioms.reconcile.blocks import better, block_ids, heldout
 from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import known
-from sioms.reconcile.fit import Fit, Problem, closed_errors, refit
+from sioms.reconcile.fit import BASE, Fit, Problem, closed_errors, refit
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.plausible import (
     Tried,
@@ -48,6 +48,7 @@ UNPOLISHED = tuple(
     for spread in (0.25, 0.08, 0.025, 0.008)
     for symbol, width in (("gap", 1.0), ("load_fraction", 1.0), ("zeta", 2.0), ("f_contact", 1.0))
 )
+BOUNCE = 3.0  # in units of the median residual
 PASSES = 4  # at most so many times more for a new gap, while it gains
 POLISHED = (("gap", 0.08), ("gap", 0.025), ("gap", 0.008))
 #: Fits are kept in memory up to this size: a second search, with terms beside the library, retraces the first.
@@ -126,8 +127,9 @@ class Searcher:
             fit = polish(self.problem, model, self.frozen, POLISHED if known_gap else UNPOLISHED)
             for _ in range(0 if known_gap else PASSES):
                 again = polish(self.problem, fit.model, self.frozen, UNPOLISHED)
-                gained = again.cost < (1.0 - GAIN) * fit.cost
-                fit = min(fit, again, key=lambda f: f.cost)
+                scale = spread(fit.residual)
+                gained = rough(again.residual, scale) < (1.0 - GAIN) * rough(fit.residual, scale)
+                fit = min(fit, again, key=lambda f: rough(f.residual, scale))
                 if not gained:
                     break
             self._polished.add(tuple(fit.model.effects[effect.name].values()))
@@ -135,10 +137,11 @@ class Searcher:
         return refit(self.problem, model, self.frozen, iterations)
 
     def loss(self, fit: Fit) -> Array:
-        """Held-out loss per block."""
+        """Held-out loss per block; the numbers of a gap, whose rough cost has no slope to go by, stay as they are."""
         if len(self.ids) != len(fit.residual):
             self.ids = block_ids(self.problem, fit.model.sample_time_s)
-        losses = heldout(fit, self.ids)
+        smooth = [f.effect == BASE or known()[f.effect].slot is not Slot.BACKLASH for f in fit.free]
+        losses = heldout(replace(fit, jacobian=fit.jacobian[:, smooth]), self.ids)
         return (
             losses
             if self.problem.weights is None
@@ -253,8 +256,12 @@ class Searcher:
         return new, loss, Step("add", name, new.ratio, gain, new.model, rivals)
 
     def _good(self, tried: dict[str, Tried], fit: Fit) -> tuple[dict[str, Tried], dict[str, Tried]]:
-        """Pick those that save enough, surely; and of them those that can be."""
-        sure = {n: t for n, t in tried.items() if t[2] >= GAIN and t[3] >= self._sure(n)}
+        """Pick those that save enough, surely; and of them those that can be.
+
+        Beside a gap, whose bounces fall out otherwise with any other number, a small saving says nothing.
+        """
+        least = SPECIFIC if rattles(fit.model) else GAIN
+        sure = {n: t for n, t in tried.items() if t[2] >= least and t[3] >= self._sure(n)}
         return sure, {n: t for n, t in sure.items() if self._sound(t[0], fit)}
 
     def _add_pair(self, fit: Fit, losses: Array) -> tuple[Fit, Array, Step] | None:
@@ -364,6 +371,11 @@ class Searcher:
         return fit, losses
 
 
+def rattles(model: AxisModel) -> bool:
+    """Say whether there is a gap, whose bounces leave more than noise does."""
+    return any(known()[n].slot is Slot.BACKLASH for n in model.effects)
+
+
 def values_of(model: AxisModel) -> Hashable:
     """Return all that a search may change of a model, to look it up by."""
     return (
@@ -377,19 +389,30 @@ def polish(
 ) -> Fit:
     """Fit a backlash: its cost is rough, so search by steps of given relative widths before the smooth fit of the rest."""
     name = next(n for n in model.effects if known()[n].slot is Slot.BACKLASH)
-    best, cost = model, np.inf
+    first = problem.residual(model)
+    scale = spread(first)
+    best, cost = model, rough(first, scale)
     for symbol, width in widths:
         here = best.effects[name]
-        trials = [best] if cost == np.inf else []
-        trials += [
+        trials = [
             best.with_effect(name, {**here, symbol: here[symbol] * (1.0 + width * sign)})
             for sign in (1.0, -1.0, 0.4, -0.4)
         ]
         trials = [t for t in trials if _inside(t, name)]
-        costs = list(problem.mapper(lambda t: float(np.sum(problem.residual(t) ** 2)), trials))
+        costs = list(problem.mapper(lambda t: rough(problem.residual(t), scale), trials))
         if costs and min(costs) < cost:
             best, cost = trials[int(np.argmin(costs))], min(costs)
     return refit(problem, best, frozen, 4)
+
+
+def spread(residual: Array) -> float:
+    """Size beyond which a residual counts less: of a bounce that comes a little late or early."""
+    return BOUNCE * max(float(np.median(np.abs(residual))), 1.0)
+
+
+def rough(residual: Array, scale: float) -> float:
+    """Sum of squares to which a missed bounce adds little more than a bounce nearly hit (Cauchy's loss)."""
+    return float(np.sum(np.log1p((residual / scale) ** 2)))
 
 
 def _inside(model: AxisModel, name: str) -> bool:
