@@ -29,9 +29,10 @@ from sioms.reconcile.noise import drive_noise, effective_samples, observer, sens
 from sioms.reconcile.records import Session
 from sioms.reconcile.refuse import bursts, smoother_share
 from sioms.reconcile.rules import GAIN, SPECIFIC, SURE, told_apart
-from sioms.reconcile.search import Found, Searcher, Step
+from sioms.reconcile.search import Found, Searcher, Step, rattles
 from sioms.reconcile.simulate import replay
 from sioms.reconcile.timing import on_grid
+from sioms.reconcile.tones import Tone, as_term, hum, known_beside
 from sioms.reconcile.verdict import Estimate, NamedEffect, Outcome, Trace, Verdict
 
 #: Share at the end of every record that takes no part in any choice.
@@ -79,7 +80,11 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """State after channels and gate, before any mechanics."""
+    """State after channels and gate, before any mechanics.
+
+    Attributes:
+        tones: forces of one frequency in time, by now among the known ones of the problems' records.
+    """
 
     model: AxisModel
     problem: Problem
@@ -87,6 +92,7 @@ class Prepared:
     findings: tuple[Finding, ...]
     names: tuple[str, ...]
     notes: tuple[str, ...]
+    tones: tuple[Tone, ...] = ()
 
 
 def analyse(session: Session, nominal: AxisModel, options: Options | None = None) -> Verdict:
@@ -114,7 +120,7 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
         found = _run_with_terms(searcher, ready.model)
         rejected = tuple(n for n in before.fit.model.effects if n not in found.fit.model.effects)
         share = smoother_share(ready.problem, found.fit)
-    elif found.fit.ratio > LOUD and not _rattles(found.fit.model):
+    elif found.fit.ratio > LOUD and not rattles(found.fit.model):
         o.progress(f"{found.fit.ratio:.1f} times what is expected remains: searching for a term")
         other = _run_with_terms(searcher, ready.model)
         gain, sure = better(other.losses, found.losses)
@@ -153,11 +159,6 @@ def _run_with_terms(searcher: Searcher, model: AxisModel) -> Found:
     return found
 
 
-def _rattles(model: AxisModel) -> bool:
-    """Say whether there is a gap, whose bounces leave more than noise does."""
-    return any(known()[n].slot is Slot.BACKLASH for n in model.effects)
-
-
 def _search(ready: Prepared, o: Options) -> tuple[Prepared, Gate, Searcher, Found]:
     """Search among what the records can show; the noise may look smaller under a better model: then they show more."""
     start, earlier = ready.model, tuple[Step, ...]()
@@ -174,6 +175,16 @@ def _search(ready: Prepared, o: Options) -> tuple[Prepared, Gate, Searcher, Foun
                 found,
                 ladder=(*earlier, replace(found.ladder[0], action="noise read again"), *found.ladder[1:]),
             )
+        if turn < AGAIN and (beside := _beside(ready, searcher, found)) is not None:
+            o.progress(f"a force of {beside.frequency_hz:.3f} Hz keeps time: searching anew beside it")
+            ready = replace(
+                ready,
+                problem=known_beside(ready.problem, beside),
+                final=ready.final if ready.final.session.final else known_beside(ready.final, beside),
+                tones=(*ready.tones, beside),
+            )
+            start, earlier = ready.model, ()
+            continue
         start = found.fit.model
         anew = calibrated(ready.problem, ready.problem.session, start)
         if turn == AGAIN or anew.noise.drive > FELL * ready.problem.noise.drive:
@@ -187,6 +198,16 @@ def _search(ready: Prepared, o: Options) -> tuple[Prepared, Gate, Searcher, Foun
         )
         ready = replace(ready, problem=anew, final=final)
     return ready, excited, searcher, found
+
+
+def _beside(ready: Prepared, searcher: Searcher, found: Found) -> Tone | None:
+    """Return the force of one frequency that most of what remains is, or that explains more than all that was named."""
+    if found.fit.ratio < LEAST_ODD:
+        return None
+    fits = (found.fit, searcher.fit(ready.model))
+    lines = [(line, (1.0 - line.share) * f.cost) for f in fits if (line := hum(ready.problem, f)) is not None]
+    best, left = min(lines, key=lambda q: q[1], default=(None, np.inf))
+    return best if left < found.fit.cost else None
 
 
 def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
@@ -270,16 +291,24 @@ def _conclude(
     o.progress("untouched samples: gap before and after")
     states = session_states(ready.final, found.fit.model)
     gaps = measure(ready.final, nominal, found.fit.model, states)
+    if ready.tones and not ready.final.session.final:
+        plain = ready.final
+        for beside in ready.tones:
+            plain = known_beside(plain, beside, -1.0)
+        gaps = tuple(
+            replace(g, before=p.before) for g, p in zip(gaps, measure(plain, nominal, nominal), strict=True)
+        )
     whole = replace(ready.problem, end=1.0, weights=None)
     fit = refit(whole, found.fit.model, searcher.frozen, 12)
     if fit.cost > float(np.sum(whole.residual(found.fit.model) ** 2)):
         fit = replace(fit, model=found.fit.model)
     spans = _intervals(whole, fit, o.replicates, rng)
     named, terms = _describe(ready, fit, found, searcher, others, spans, rng)
+    terms += [as_term(beside, nominal) for beside in ready.tones]
     open_rivals = [r for r in others if r.open]
-    rattles = _rattles(found.fit.model)
-    disturbance = found.fit.ratio > QUIET and burst > BURSTS and share < UNEXPLAINED and not rattles
-    large = found.fit.ratio > LARGE and not rattles
+    gap = rattles(found.fit.model)
+    disturbance = found.fit.ratio > QUIET and burst > BURSTS and share < UNEXPLAINED and not gap
+    large = found.fit.ratio > LARGE and not gap
     outcome = _outcome(
         bool(named),
         bool(terms) or disturbance or large or (found.fit.ratio > LEAST_ODD and share > UNEXPLAINED),

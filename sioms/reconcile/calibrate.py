@@ -17,6 +17,7 @@ from sioms.reconcile.noise import Noise, observer, sensor_noise
 from sioms.reconcile.records import Session
 from sioms.reconcile.refuse import smoother_rest
 from sioms.reconcile.screen import thinned
+from sioms.reconcile.tones import hum
 
 #: Bandwidth of the observer where no force was measured: with the colour of the drive noise unknown, what
 #: happens above it would drown the mechanics below.
@@ -56,6 +57,8 @@ def calibrated(problem: Problem, session: Session, model: AxisModel) -> Problem:
             excess = float(np.sqrt(np.median(energy)))
         else:
             fit = refit(problem, model, iterations=3)
+            if (line := hum(problem, fit)) is not None:  # no noise, however much it drowns
+                fit = replace(fit, residual=fit.residual - line.trace)
             ids = block_ids(problem, model.sample_time_s, 0.1)[thinned(len(fit.residual))]
             energy = np.bincount(ids, weights=smoother_rest(problem, fit) ** 2) / np.bincount(ids)
             excess = float(np.sqrt(np.quantile(energy, 0.25)))

@@ -161,7 +161,7 @@ TERMS = (
         _size("amp", "{F}", Ref.FORCE),
         PHASE,
         Parameter("kappa", "1/pitch", Ref.ONE, 0.02, 3.0, 0.5, "periods in a pitch, any number"),
-        lookalikes=("offset",),
+        lookalikes=("gravity", "spring", "offset"),
     ),
     _term(
         "place_friction",

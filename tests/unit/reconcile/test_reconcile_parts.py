@@ -24,7 +24,8 @@ from sioms.reconcile.plausible import unspecific
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.screen import screen
 from sioms.reconcile.search import Found, Searcher
-from sioms.reconcile.simulate import simulate
+from sioms.reconcile.simulate import replay, simulate
+from sioms.reconcile.tones import TONE, hum, known_beside, tone
 
 AXIS = AxisModel(
     True, 1e-3, 2e-3, 1e-3, 2e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)
@@ -166,6 +167,23 @@ def test_a_look_alike_that_does_better_takes_the_place_of_what_was_named() -> No
 def test_a_residual_that_suits_everything_has_no_name() -> None:
     assert unspecific("saturation", {"saturation": 0.15, "cogging": 0.13})
     assert not unspecific("coulomb", {"coulomb": 0.15, "stribeck": 0.16, "offset": 0.02})
+
+
+def test_a_force_that_keeps_time_is_told_from_what_the_motion_does() -> None:
+    beside = 0.05 * np.sin(2 * np.pi * 12.37 * T + 0.4)
+    shaken = Record("shaken", np.zeros(len(T)), beside, COMMAND, external=beside)
+    run = replay(AXIS, replace(shaken, force=np.zeros(len(T))))
+    p = problem(Session((Record("shaken", run.position, run.force, COMMAND),)))
+    found = hum(p, refit(p, AXIS))
+    assert found is not None
+    assert found.frequency_hz == pytest.approx(12.37, abs=0.005)
+    assert found.amplitude == pytest.approx(0.05, rel=0.02)
+    alone = refit(known_beside(p, found), AXIS)
+    assert alone.ratio < 0.1 * refit(p, AXIS).ratio
+    lap = 3.5 * np.sin(2 * np.pi * 0.7 * T)
+    heavy = problem(session(AXIS.with_effect("payload", {"J_extra": 4e-4}), lap))
+    assert tone(heavy, refit(heavy, AXIS)).share > TONE
+    assert hum(heavy, refit(heavy, AXIS)) is None
 
 
 def test_blocks_agree_with_refitting() -> None:
