@@ -18,7 +18,7 @@ from sioms.reconcile.noise import response
 from sioms.reconcile.screen import (
     STATE_SLOTS,
     dead_band,
-    longest,
+    range_of,
     shapes,
     smoothed_motion,
     state_columns,
@@ -76,7 +76,7 @@ def _trace(problem: Problem, model: AxisModel, effect: Effect) -> Array | None:
     size = effect.primary.start * model.scale(effect.primary)
     if effect.slot in STATE_SLOTS:
         motions, dead = smoothed_motion(problem, model), dead_band(problem, model)
-        shape = next(shapes(effect, model, longest(motions)), None)
+        shape = next(shapes(effect, model, range_of(motions)), None)
         if shape is None:  # the range holds no period of any order
             return None
         parts = [

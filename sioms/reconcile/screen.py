@@ -31,7 +31,7 @@ GRID_ZETA = (0.05, 0.3)
 GRID_LIMIT = (0.95, 0.85, 0.7, 0.5, 0.3)
 GRID_TAU = (3.0, 10.0, 40.0)
 GRID_PHASE = np.linspace(-np.pi, np.pi, 9)[1:]
-SPEED_STEPS = 7
+SPEED_STEPS, PLACES = 7, 15
 #: Below this the measured motion stands for one without noise; a command is followed up to COMMAND_HZ, if to this share.
 SLOW_HZ, COMMAND_HZ, FOLLOWED = 5.0, 30.0, 0.2
 #: A regression on more rows than this leaves some out.
@@ -134,11 +134,11 @@ def amplitudes(effect: Effect) -> list[tuple[Parameter, Parameter | None]]:
     return out
 
 
-def shapes(effect: Effect, model: AxisModel, span: float) -> Iterator[dict[str, float]]:
+def shapes(effect: Effect, model: AxisModel, travel: tuple[float, float]) -> Iterator[dict[str, float]]:
     """Yield trial values of the parameters in which a state effect is not linear.
 
     Args:
-        span: range of motion; of the orders those are tried of which it holds (nearly) one period.
+        travel: range of motion; of the orders those are tried of which it holds (nearly) one period, of places those within.
     """
     linear = {p.symbol for p, _ in amplitudes(effect)}
     order = next((p for p in effect.parameters if p.fixed), None)
@@ -147,9 +147,13 @@ def shapes(effect: Effect, model: AxisModel, span: float) -> Iterator[dict[str, 
     )
     if order is not None:
         first = 2 if model.rotary and effect.slot is Slot.FORCE else 1
-        for n in range(max(first, int(model.pitch / span)), int(order.upper) + 1):
+        for n in range(max(first, int(model.pitch / (travel[1] - travel[0]))), int(order.upper) + 1):
             yield {order.symbol: float(n)}
     elif shape is not None:
+        if shape.lower < 0.0:
+            for s in np.linspace(*travel, PLACES + 2)[1:-1]:
+                yield {shape.symbol: float(s)}
+            return
         if shape.ref is not Ref.SPEED:
             for s in np.geomspace(shape.lower, shape.upper, 2 * SPEED_STEPS):
                 yield {shape.symbol: float(s * model.scale(shape))}
@@ -178,20 +182,21 @@ def screen(
     q = _orthonormal(fit.jacobian[rows])
     rest = fit.residual[rows] - q @ (q.T @ fit.residual[rows])
     dead = dead_band(problem, fit.model)
-    span = longest(motions)
+    travel = range_of(motions)
     out = []
     for name in names:
         effect = lib[name]
         if effect.slot in STATE_SLOTS:
-            out.append(_screen_state(problem, fit, effect, motions, q, rest, dead, span, levels or {}))
+            out.append(_screen_state(problem, fit, effect, motions, q, rest, dead, travel, levels or {}))
         else:
             out.extend(_screen_trials(problem, fit, effect, q, rest))
     return sorted((s for s in out if s is not None), key=lambda s: -s.gain)
 
 
-def longest(motions: list[Motion]) -> float:
-    """Range of motion of the record that moves farthest, [{x}]."""
-    return max(max(float(np.ptp(m.x)) for m in motions), 1e-300)
+def range_of(motions: list[Motion]) -> tuple[float, float]:
+    """Lowest and highest place of all records, [{x}]."""
+    low, high = min(float(m.x.min()) for m in motions), max(float(m.x.max()) for m in motions)
+    return low, max(high, low + 1e-300)
 
 
 def instrument_motion(problem: Problem, model: AxisModel) -> list[Motion]:
@@ -280,11 +285,11 @@ def _screen_state(
     q: Array,
     rest: Array,
     dead: float,
-    span: float,
+    travel: tuple[float, float],
     levels: Mapping[str, float],
 ) -> Start | None:
     best: Start | None = None
-    for shape in shapes(effect, fit.model, span):
+    for shape in shapes(effect, fit.model, travel):
         f = _filtered(
             problem, fit.model, [state_columns(effect, fit.model, m, shape, dead) for m in motions]
         )[thinned(len(fit.residual))]

@@ -68,6 +68,18 @@ def wave(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Numb
 
 
 @state_function
+def stop_above(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
+    """-k (x - x0) beyond x0."""
+    return -0.5 * p[0] * (x - p[1] + np.abs(x - p[1]))
+
+
+@state_function
+def stop_below(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
+    """-k (x - x0) short of x0."""
+    return -0.5 * p[0] * (x - p[1] - np.abs(x - p[1]))
+
+
+@state_function
 def load_square(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-g u |u|, with g per unit of force."""
     return -p[0] * u * np.abs(u)
@@ -87,6 +99,7 @@ def dull_force(x: Number, v: Number, u: Number, temperature: Number, p: Array) -
 
 PHASE = Parameter("phase", "rad", Ref.ANGLE, -np.pi, np.pi, 0.0, "phase at position zero", phase=True)
 ORDER = Parameter("n", "1/pitch", Ref.ONE, 1.0, 12.0, 1.0, "periods in a pitch", fixed=True)
+PLACE = Parameter("x0", "{x}", Ref.PITCH, -1e6, 1e6, 0.01, "place of the bend")
 SPEED = Parameter("v0", "{x}/s", Ref.SPEED, 2e-3, 1.0, 0.1, "speed of the bend")
 
 
@@ -121,6 +134,22 @@ def _term(
 TERMS = (
     _term("x2", "F = -k x^2", square, _size("k", "{F}/{x}^2", Ref.STIFFNESS)),
     _term("x3", "F = -k x^3", cube, _size("k", "{F}/{x}^3", Ref.STIFFNESS), lookalikes=("spring",)),
+    _term(
+        "stop_above",
+        "F = -k (x - x0) where x > x0",
+        stop_above,
+        _size("k", "{F}/{x}", Ref.STIFFNESS, "stiffness of the stop"),
+        PLACE,
+        lookalikes=("spring",),
+    ),
+    _term(
+        "stop_below",
+        "F = -k (x - x0) where x < x0",
+        stop_below,
+        _size("k", "{F}/{x}", Ref.STIFFNESS, "stiffness of the stop"),
+        PLACE,
+        lookalikes=("spring",),
+    ),
     _term("v2", "F = -c v^2", even_drag, _size("c", "{F} s^2/{x}^2", Ref.DRAG)),
     _term(
         "v3",
