@@ -62,7 +62,7 @@ def heldout(fit: Fitted, ids: NDArray[np.int64], folds: int = 10) -> Array:
     if fit.jacobian.shape[1] == 0:
         return c
     total_h, total_g = h.sum(0), g.sum(0)
-    ridge = 1e-9 * np.trace(total_h) * np.eye(len(total_g))
+    ridge = (1e-9 * np.trace(total_h) or 1.0) * np.eye(len(total_g))
     out = np.empty(len(c))
     fold = np.arange(len(c)) % max(min(folds, len(c)), 2)
     for f in range(fold.max() + 1):
@@ -102,7 +102,7 @@ def intervals(fit: Fitted, ids: NDArray[np.int64], level: float = 0.95) -> Array
     b, k = g.shape
     if k == 0 or b < 3:
         return np.full(k, np.inf)
-    total = h.sum(0) + 1e-9 * np.trace(h.sum(0)) * np.eye(k)
+    total = h.sum(0) + (1e-9 * np.trace(h.sum(0)) or 1.0) * np.eye(k)
     moves = np.stack([np.linalg.solve(total - inside, -own) for inside, own in zip(h, g, strict=True)])
     variance = (b - 1) / b * np.sum((moves - moves.mean(0)) ** 2, axis=0)
     inverse = np.linalg.inv(total)

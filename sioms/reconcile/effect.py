@@ -52,6 +52,7 @@ class Slot(Enum):
     SCALE = "scale"  # measured = p[0] * true
     ECCENTRICITY = "eccentricity"  # measured = true + p[0] sin(theta + p[1])
     MODULATION = "modulation"  # inertia J + p[0] sin(p[2] theta + p[1])
+    WARMING = "warming"  # friction level p[0] T beside the others, T' = (|v| - T) / p[1]
     LATTICE = "lattice"  # counts come in multiples of p[0]
 
 

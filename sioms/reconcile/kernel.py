@@ -48,8 +48,9 @@ call = caller()
     MOD_A,
     MOD_PHASE,
     MOD_N,
+    WARMING,
     PLANT_SIZE,
-) = range(25)
+) = range(26)
 # Places in the controller row.
 CTL_K, CTL_KZ, CTL_KP, CTL_KB, CTL_OFFSET, CTL_MAX, CTL_ALPHA, CTL_MEAN, CTL_SIZE = range(9)
 # Columns of the output.
@@ -241,8 +242,8 @@ def march(
                 lagged = nxt
             ua = min(max(ua, -limit), limit)
             applied += ua
-            if loss > 0.0:
-                heat = (ua / plant[RATED]) ** 2
+            if loss > 0.0 or plant[WARMING] > 0.0:
+                heat = (ua / plant[RATED]) ** 2 if plant[WARMING] == 0.0 else np.abs(v)
                 temp = heat + (temp - heat) * np.exp(-h / plant[TAU_T])
             # Midpoint prediction.
             drive = ua * max(1.0 - loss * temp, LEAST_GAIN)

@@ -79,7 +79,7 @@ def _known_force(model: AxisModel, m: Motion, dead: float) -> Array:
         if effect.function is None:
             continue
         f = effect.evaluate(m.x, m.v, m.u, m.temperature, effect.row(effect.values(given), model.pitch))
-        if effect.slot is Slot.FRICTION:
+        if effect.slot in (Slot.FRICTION, Slot.WARMING):
             f = -f * direction(m.v, dead)
         elif effect.slot is Slot.GAIN:
             f = m.u * (f - 1.0)

@@ -360,6 +360,8 @@ def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator
             )
         case Slot.LIMIT:
             grid = tuple({first: g * peak} for g in GRID_LIMIT)
+        case Slot.WARMING:
+            grid = tuple({"tau": g} for g in GRID_TAU)
         case Slot.THERMAL:
             grid = tuple({"tau": g, "loss": 0.1} for g in GRID_TAU)
         case Slot.HYSTERESIS:

@@ -78,9 +78,12 @@ def pack(model: AxisModel, substeps: int = 0) -> Packed:
     for name, given in model.effects.items():
         effect = lib[name]
         p = effect.values(given)
-        if effect.slot in functions:
-            rows[effect.slot].append(effect.row(p, model.pitch))
-            functions[effect.slot].append(effect.function)
+        if effect.slot is Slot.WARMING:
+            plant[k.WARMING], plant[k.TAU_T] = 1.0, p[1]
+        slot = Slot.FRICTION if effect.slot is Slot.WARMING else effect.slot
+        if slot in functions:
+            rows[slot].append(effect.row(p, model.pitch))
+            functions[slot].append(effect.function)
         elif effect.slot in (Slot.ELASTIC, Slot.BACKLASH):
             transmission = (effect.slot, p)
         else:

@@ -95,7 +95,7 @@ def twins(
     for i, model in models.items():
         for name, values in model.effects.items():
             effect = known()[name]
-            if effect.function is not None:
+            if effect.function is not None and effect.slot is not Slot.WARMING:
                 acting.setdefault(name, []).append((i, effect.row(effect.values(values), model.pitch)))
             elif effect.slot not in (Slot.THERMAL, Slot.INERTIA):
                 table.setdefault(names[i], {}).update(_slot(effect, values, model))

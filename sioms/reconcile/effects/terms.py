@@ -92,6 +92,12 @@ def place_level(x: Number, v: Number, u: Number, temperature: Number, p: Array) 
 
 
 @state_function
+def warm_level(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
+    """g T."""
+    return p[0] * temperature
+
+
+@state_function
 def dull_force(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-f tanh(u/u0)."""
     return -p[0] * np.tanh(u / p[1])
@@ -198,6 +204,15 @@ TERMS = (
         place_level,
         _size("g", "{F}/{x}", Ref.STIFFNESS, "slope of dry friction along the range"),
         slot=Slot.FRICTION,
+    ),
+    _term(
+        "warm_friction",
+        "F = -g T sign(v), tau dT/dt = |v| - T",
+        warm_level,
+        _size("g", "{F} s/{x}", Ref.DAMPING, "what friction gains where the axis has moved of late"),
+        Parameter("tau", "s", Ref.TIME, 0.5, 1e4, 10.0, "time over which it does"),
+        slot=Slot.WARMING,
+        replaces=("thermal_gain",),
     ),
     _term("load_square", "F = -g u |u|", load_square, _size("g", "1/({F})", Ref.ONE)),
     _term(
