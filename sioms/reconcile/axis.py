@@ -120,7 +120,7 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
         found = _run_with_terms(searcher, ready.model)
         rejected = tuple(n for n in before.fit.model.effects if n not in found.fit.model.effects)
         share = smoother_share(ready.problem, found.fit)
-    elif found.fit.ratio > LOUD and not rattles(found.fit.model):
+    elif found.fit.ratio > LOUD and not rattles(found.fit.model) and _promising(searcher, ready.model, found):
         o.progress(f"{found.fit.ratio:.1f} times what is expected remains: searching for a term")
         other = _run_with_terms(searcher, ready.model)
         gain, sure = better(other.losses, found.losses)
@@ -150,10 +150,22 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
     return _conclude(ready, nominal, o, excited, found, searcher, others, odd, share, burst, rejected)
 
 
+def _terms(model: AxisModel) -> tuple[str, ...]:
+    return tuple(t.name for t in TERMS if model.applicable(t))
+
+
+def _promising(searcher: Searcher, model: AxisModel, found: Found) -> bool:
+    """Say whether a nameless term, beside what was found or in the place of one of it, could save enough to be worth a search."""
+    named = [n for n in found.fit.model.effects if n not in searcher.frozen]
+    bare = [found.fit, *(searcher.fit(found.fit.model.without_effect(n), 6) for n in named)]
+    left = [(1.0 - s.gain) * fit.cost for fit in bare for s in searcher.screen(fit, _terms(model))]
+    return min(left, default=np.inf) < (1.0 - 0.5 * SPECIFIC) * found.fit.cost
+
+
 def _run_with_terms(searcher: Searcher, model: AxisModel) -> Found:
     """Search anew with nameless terms beside the library."""
     names = searcher.names
-    searcher.names = names + tuple(t.name for t in TERMS if model.applicable(t))
+    searcher.names = names + _terms(model)
     found = searcher.run(model)
     searcher.names = names
     return found

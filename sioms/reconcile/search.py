@@ -50,6 +50,7 @@ UNPOLISHED = tuple(
 )
 BOUNCE = 3.0  # in units of the median residual
 PASSES = 4  # at most so many times more for a new gap, while it gains
+WORTH = 2.0  # and not where another candidate leaves less by this factor
 POLISHED = (("gap", 0.08), ("gap", 0.025), ("gap", 0.008))
 #: Fits are kept in memory up to this size: a second search, with terms beside the library, retraces the first.
 KEPT_BYTES = 128_000_000
@@ -94,17 +95,22 @@ class Searcher:
     _fits: dict[Hashable, Fit] = field(init=False, default_factory=dict)
     _starts: dict[Hashable, list[Start]] = field(init=False, default_factory=dict)
     _polished: set[Hashable] = field(init=False, default_factory=set)
+    _rough: set[Hashable] = field(init=False, default_factory=set)
     _loops: dict[Hashable, float] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         """Number the blocks."""
         self.ids = np.empty(0, dtype=np.int64)
 
-    def fit(self, model: AxisModel, iterations: int = 8) -> Fit:
-        """Refit with the channel effects frozen; what was fitted before is looked up."""
+    def fit(self, model: AxisModel, iterations: int = 8, best: float = np.inf) -> Fit:
+        """Refit with the channel effects frozen; what was fitted before is looked up.
+
+        Args:
+            best: cost of what the model competes with; a gap that is far from it is not polished to the end.
+        """
         key = (values_of(model), iterations)
-        if key not in self._fits:
-            self._fits[key] = fit = self._fit(model, iterations)
+        if key not in self._fits or (key in self._rough and self._fits[key].cost < WORTH * best):
+            self._fits[key] = fit = self._fit(model, iterations, best)
             most = KEPT_BYTES // (8 * len(fit.residual) * (len(fit.free) + 1))
             while len(self._fits) > max(most, 1):
                 del self._fits[next(iter(self._fits))]
@@ -120,21 +126,25 @@ class Searcher:
         self._starts.update({(key, n): [s for s in found if s.effect == n] for n in fresh})
         return sorted((s for n in names for s in self._starts[key, n]), key=lambda s: -s.gain)
 
-    def _fit(self, model: AxisModel, iterations: int) -> Fit:
-        effect = next((known()[n] for n in model.effects if known()[n].slot is Slot.BACKLASH), None)
-        if effect is not None and iterations > 4:
-            known_gap = tuple(model.effects[effect.name].values()) in self._polished
-            fit = polish(self.problem, model, self.frozen, POLISHED if known_gap else UNPOLISHED)
-            for _ in range(0 if known_gap else PASSES):
-                again = polish(self.problem, fit.model, self.frozen, UNPOLISHED)
-                scale = spread(fit.residual)
-                gained = rough(again.residual, scale) < (1.0 - GAIN) * rough(fit.residual, scale)
-                fit = min(fit, again, key=lambda f: rough(f.residual, scale))
-                if not gained:
-                    break
-            self._polished.add(tuple(fit.model.effects[effect.name].values()))
-            return fit
-        return refit(self.problem, model, self.frozen, iterations)
+    def _fit(self, model: AxisModel, iterations: int, best: float) -> Fit:
+        gap = next((n for n in model.effects if known()[n].slot is Slot.BACKLASH), None)
+        if gap is None or iterations <= 4:
+            return refit(self.problem, model, self.frozen, iterations)
+        new = tuple(model.effects[gap].values()) not in self._polished
+        fit = polish(self.problem, model, self.frozen, UNPOLISHED if new else POLISHED)
+        for _ in range(PASSES if new else 0):
+            if fit.cost > WORTH * best:
+                self._rough.add((values_of(model), iterations))
+                return fit
+            again = polish(self.problem, fit.model, self.frozen, UNPOLISHED)
+            scale = spread(fit.residual)
+            gained = rough(again.residual, scale) < (1.0 - GAIN) * rough(fit.residual, scale)
+            fit = min(fit, again, key=lambda f: rough(f.residual, scale))
+            if not gained:
+                break
+        self._rough.discard((values_of(model), iterations))
+        self._polished.add(tuple(fit.model.effects[gap].values()))
+        return fit
 
     def loss(self, fit: Fit) -> Array:
         """Held-out loss per block; the numbers of a gap, whose rough cost has no slope to go by, stay as they are."""
@@ -236,8 +246,10 @@ class Searcher:
         with it started afresh too.
         """
         tried: dict[str, Tried] = {}
-        for i, s in enumerate(self._candidates(fit)):
-            self._try(tried, s.effect, self._with(fit, s, 8 if i == 0 else 5), losses)
+        chosen = self._candidates(fit)
+        for s in sorted(chosen, key=lambda s: known()[s.effect].slot is Slot.BACKLASH):
+            best = min((t[0].cost for t in tried.values()), default=np.inf)
+            self._try(tried, s.effect, self._with(fit, s, 8 if s is chosen[0] else 5, best), losses)
         if max((t[2] for t in tried.values()), default=0.0) < CLEAR:
             for effect, new in self._afresh(fit):
                 self._try(tried, effect, new, losses)
@@ -273,12 +285,14 @@ class Searcher:
         if fit.ratio < PAIRED:
             return None
         for first in self._candidates(fit)[:PAIRS]:
-            middle = self._with(fit, first, 5)
+            middle = self._with(fit, first, 5, fit.cost)
+            if middle.cost > fit.cost:  # it only takes the place of something better
+                continue
             inner = self.loss(middle)
             for second in [
                 s for s in self._candidates(middle) if s.effect not in known()[first.effect].replaces
             ][:PAIRS]:
-                new = self._with(middle, second, 8)
+                new = self._with(middle, second, 8, middle.cost if best is None else best[0].cost)
                 if first.effect not in new.model.effects:
                     continue
                 loss = self.loss(new)
@@ -310,10 +324,10 @@ class Searcher:
             for n in kept
         )
 
-    def _with(self, fit: Fit, start: Start, iterations: int) -> Fit:
+    def _with(self, fit: Fit, start: Start, iterations: int, best: float = np.inf) -> Fit:
         """Switch a candidate on, what it replaces off, and refit."""
         model = without(fit.model, known()[start.effect].replaces)
-        return self.fit(model.with_effect(start.effect, start.values), iterations)
+        return self.fit(model.with_effect(start.effect, start.values), iterations, best)
 
     def _try(self, tried: dict[str, Tried], effect: str, new: Fit, losses: Array) -> None:
         """Score a refitted candidate; keep the better of two ways to the same effect."""
