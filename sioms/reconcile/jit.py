@@ -1,7 +1,7 @@
 """Compile the scalar kernels with numba where it is installed, else run them as they are.
 
 numba is loaded when the first kernel is compiled, not before: a simulated device that only evaluates effects
-never pays for it. The plain path gives the same numbers some sixty times slower (docs/reconcile.md, "Time").
+never pays for it. The plain path gives the same numbers some hundred times slower (decision 0061).
 """
 
 from __future__ import annotations
