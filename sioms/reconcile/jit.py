@@ -103,9 +103,19 @@ def state_function(function: F) -> F:
 
 @cache
 def compiled(function: Callable[..., Any]) -> Any:
-    """Return the compiled form of a state function; all of them have one type."""
-    return (
-        function
-        if numba() is None
-        else numba().cfunc(STATE_SIGNATURE, cache=True, error_model="numpy")(function)
-    )
+    """Return the compiled form of a state function; all of them have one type.
+
+    Raises:
+        TypeError: it does more than numba can make of numbers.
+    """
+    if numba() is None:
+        return function
+    try:
+        return numba().cfunc(STATE_SIGNATURE, cache=True, error_model="numpy")(function)
+    except import_module("numba.core.errors").NumbaError as error:
+        lines = str(error).splitlines()
+        reason = lines[min(1, len(lines) - 1)]  # the first line says which step of numba's
+        raise TypeError(
+            f"compile state function {function.__name__} of {function.__module__}: {reason}; "
+            "needs arithmetic and numpy's functions of x, v, u, temperature and single p[i]"
+        ) from error

@@ -9,6 +9,7 @@ import pytest
 
 from sioms.reconcile.effect import Slot
 from sioms.reconcile.effects import known, library
+from sioms.reconcile.jit import compiled
 from sioms.reconcile.kernel import summed
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.model_file import model_from, write_model
@@ -87,6 +88,14 @@ def test_an_effect_without_state_function_cannot_be_evaluated() -> None:
         library()["delay"].evaluate(z, z, z, z, z)
 
 
+def test_a_state_function_that_cannot_be_compiled_says_what_it_may_do() -> None:
+    def summed(x: float, v: float, u: float, temperature: float, p: np.ndarray) -> float:
+        return -x * float(p[1:3].sum())
+
+    with pytest.raises(TypeError, match=r"compile state function summed .* single p\[i\]"):
+        compiled(summed)
+
+
 def test_unknown_parameters_are_refused() -> None:
     with pytest.raises(ValueError, match="Fc"):
         AXIS.with_effect("coulomb", {"fc": 1.0})
@@ -99,8 +108,8 @@ def test_any_number_of_forces_act_at_once() -> None:
         model = model.with_effect(e.name, {p.symbol: p.start for p in e.parameters})
     packed, state = pack(model), (0.3, -0.2, 0.1, 0.5)
     total = summed(packed.functions[Slot.FORCE], packed.rows[Slot.FORCE], *state)
-    arrays = [np.array([s]) for s in state]
-    each = [e.evaluate(*arrays, e.row(e.values(model.effects[e.name]), AXIS.pitch))[0] for e in forces]
+    x, v, u, t = (np.array([s]) for s in state)
+    each = [e.evaluate(x, v, u, t, e.row(e.values(model.effects[e.name]), AXIS.pitch))[0] for e in forces]
     assert len(forces) > 7
     assert total == pytest.approx(sum(each), rel=1e-12)
 
