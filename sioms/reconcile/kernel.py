@@ -158,7 +158,8 @@ def march(
             is the whole force when tracking, and what is added to the controller's when closed.
         external: force on the axis beside the drive's, shape (n,).
         lost: innovation at which, held for ``PATIENCE`` samples, the speed is taken from the measurement.
-        start: x, v, temperature, and error and force of the controller at the sample before the first.
+        start: x, v, temperature, error and force of the controller at the sample before the first, and by how much the
+            load is behind the motor, and slower.
         out: shape (n, OUT_SIZE), filled.
     """
     n = command.shape[0]
@@ -174,7 +175,7 @@ def march(
     decay = np.exp(-h / lag) if lag > 0.0 else 0.0
     l1, l2, per_mass = l1 / gain_y, l2 / gain_y, 1.0 / jm
     x, v, temp = start[0], start[1], start[2]
-    xl, vl = x, v
+    xl, vl = x - start[5], v - start[6]
     lagged = 0.0
     hyst = 0.0
     e_old, u_old, y_old, y_older, v_f = start[3], start[4], 0.0, 0.0, 0.0

@@ -22,6 +22,9 @@ from sioms.reconcile.records import Record
 
 #: Steps in a millisecond without a transmission, with one, and with contact in one.
 STEPS = {None: 2, Slot.ELASTIC: 4, Slot.BACKLASH: 6}
+#: A record begins in motion that at first makes more way than this share of the largest speed would. Its start is fitted
+#: over so many periods of an elastic transmission, and samples.
+MOVING, PERIODS, FEWEST = 0.01, 4.0, 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +203,7 @@ def simulate(model: AxisModel, command: Array, temperature: float = 0.0, substep
         The run; ``position`` lies on the count lattice.
     """
     command = np.ascontiguousarray(command, dtype=np.float64)
-    start = np.array([model.start_position, 0.0, temperature, 0.0, 0.0])
+    start = np.array([model.start_position, 0.0, temperature, 0.0, 0.0, 0.0, 0.0])
     return _march(
         pack(model, substeps), True, command, command, None, None, controller_row(model), (0.0, 0.0), start
     )
@@ -219,7 +222,7 @@ def replay(model: AxisModel, record: Record, temperature: float = 0.0) -> Run:
     y = record.position[0]
     added = record.feedforward
     held = record.force[0] - (0.0 if added is None else added[0])
-    start = np.array([_true_place(p.plant, y), 0.0, temperature, command[0] - y, held])
+    start = np.array([_true_place(p.plant, y), 0.0, temperature, command[0] - y, held, 0.0, 0.0])
     return _march(p, True, command, command, added, record.external, controller_row(model), (0.0, 0.0), start)
 
 
@@ -231,14 +234,54 @@ def _true_place(plant: Array, y: float) -> float:
 
 def _first_speed(position: Array, dt: float) -> float:
     """Speed at the first sample of a record, which may begin in motion: of a parabola through the first 20 ms."""
-    n = min(max(8, round(0.02 / dt)), len(position))
+    n = _at_first(position, dt)
     return float(_slope_weights(n) @ (position[:n] - position[0])) / dt if n > 2 else 0.0
+
+
+def _moves(position: Array, model: AxisModel) -> bool:
+    """Say whether a record begins in motion, or on its way into it."""
+    n = _at_first(position, model.sample_time_s)
+    return bool(np.ptp(position[:n]) > MOVING * model.max_speed * n * model.sample_time_s)
+
+
+def _at_first(position: Array, dt: float) -> int:
+    """Number of samples that the first 20 ms hold."""
+    return min(max(8, round(0.02 / dt)), len(position))
 
 
 @lru_cache(maxsize=16)
 def _slope_weights(n: int) -> Array:
     """Weights of n samples in the slope at the first of them of the parabola that fits them best."""
     return np.asarray(np.linalg.pinv(np.vander(np.arange(n), 3))[1])
+
+
+def _wound_up(
+    p: Packed,
+    y: Array,
+    force: Array,
+    external: Array | None,
+    gain: tuple[float, float],
+    start: Array,
+    slow: float,
+) -> Array:
+    """Start in motion with the speed, the wind-up of the transmission and its rate that leave least of the first periods."""
+    r, j = p.plant[k.LOAD], p.plant[k.INERTIA]
+    turn = float(np.sqrt(p.plant[k.STIFF] / (j * r * (1.0 - r))))
+    n = min(len(y), max(FEWEST, int(PERIODS * 2.0 * np.pi / (turn * p.plant[k.DT]))))
+
+    def innovation(at: Array) -> Array:
+        outer = None if external is None else external[:n]
+        return _march(p, False, y[:n], y[:n], force[:n], outer, np.zeros(k.CTL_SIZE), gain, at).innovation
+
+    first = innovation(start)
+    steps = np.zeros((3, len(start)))
+    steps[0, 1], steps[1, 5], steps[2, 6] = slow, slow / turn, slow
+    moved = np.stack([innovation(start + step) - first for step in steps], axis=1)
+    if not np.all(np.isfinite(moved)):
+        return start
+    better: Array = start - steps.T @ np.linalg.lstsq(moved, first, rcond=1e-6)[0]
+    after = innovation(better)
+    return better if float(after @ after) < float(first @ first) else start
 
 
 def track(
@@ -270,8 +313,9 @@ def track(
             _true_place(p.plant, y[0]),
             _first_speed(y, model.sample_time_s) / p.plant[k.GAIN_Y],
             temperature,
-            0.0,
-            0.0,
+            *(0.0, 0.0, 0.0, 0.0),
         ]
     )
+    if p.plant[k.LOAD] > 0.0 and p.plant[k.GAP] == 0.0 and _moves(y, model):
+        start = _wound_up(p, y, force, external, gain, start, MOVING * model.max_speed)
     return _march(p, False, y, y, force, external, np.zeros(k.CTL_SIZE), gain, start, lost)

@@ -169,6 +169,14 @@ def test_a_residual_that_suits_everything_has_no_name() -> None:
     assert not unspecific("coulomb", {"coulomb": 0.15, "stribeck": 0.16, "offset": 0.02})
 
 
+def test_a_record_that_begins_in_motion_begins_with_the_transmission_wound_up() -> None:
+    hidden = AXIS.with_effect("elastic", {"f_res": 9.0, "load_fraction": 0.5, "zeta": 0.03})
+    whole = session(hidden).records[0]
+    later = Session((whole.cut(620, 2200),))
+    p = Problem(later, problem(Session((whole,))).noise)
+    assert np.sqrt(np.mean(p.residual(hidden) ** 2)) < 1.3
+
+
 def test_a_force_that_keeps_time_is_told_from_what_the_motion_does() -> None:
     beside = 0.05 * np.sin(2 * np.pi * 12.37 * T + 0.4)
     shaken = Record("shaken", np.zeros(len(T)), beside, COMMAND, external=beside)
