@@ -216,7 +216,7 @@ def _beside(ready: Prepared, searcher: Searcher, found: Found) -> Tone | None:
     """Return the force of one frequency that most of what remains is, or that explains more than all that was named."""
     if found.fit.ratio < LEAST_ODD:
         return None
-    fits = (found.fit, searcher.fit(ready.model))
+    fits = [found.fit, *(searcher.fit(step.model) for step in found.ladder)]
     lines = [(line, (1.0 - line.share) * f.cost) for f in fits if (line := hum(ready.problem, f)) is not None]
     best, left = min(lines, key=lambda q: q[1], default=(None, np.inf))
     return best if left < found.fit.cost else None

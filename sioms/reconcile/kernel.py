@@ -91,14 +91,14 @@ def coupling(plant: Array, dx: float, dv: float) -> float:
 
 
 @kernel
-def delayed(u: Array, n: int, start: float, end: float, delay: float, dt: float) -> float:
-    """Mean over [start, end] inside sample n of the held command, late by ``delay``."""
+def delayed(u: Array, before: float, n: int, start: float, end: float, delay: float, dt: float) -> float:
+    """Mean over [start, end] inside sample n of the held command, late by ``delay``; ``before`` is that before the first."""
     a, b = n * dt + start - delay, n * dt + end - delay
     i, j = int(np.floor(a / dt + 1e-9)), int(np.floor(b / dt - 1e-9))
-    ui = u[i] if i >= 0 else 0.0
+    ui = u[i] if i >= 0 else before
     if j <= i:
         return ui
-    uj = u[j] if j >= 0 else 0.0
+    uj = u[j] if j >= 0 else before
     cut = j * dt
     return (ui * (cut - a) + uj * (b - cut)) / (b - a)
 
@@ -176,7 +176,8 @@ def march(
     l1, l2, per_mass = l1 / gain_y, l2 / gain_y, 1.0 / jm
     x, v, temp = start[0], start[1], start[2]
     xl, vl = x - start[5], v - start[6]
-    lagged = 0.0
+    held = 0.0 if closed else force_in[0]  # a recorded force did not begin with its record
+    lagged = held
     hyst = 0.0
     e_old, u_old, y_old, y_older, v_f = start[3], start[4], 0.0, 0.0, 0.0
     off = 0
@@ -236,7 +237,7 @@ def march(
         for s in range(sub):
             ua = u
             if delay > 0.0:
-                ua = delayed(u_all, i, s * h, (s + 1) * h, delay, dt)
+                ua = delayed(u_all, held, i, s * h, (s + 1) * h, delay, dt)
             if lag > 0.0:
                 nxt = ua + (lagged - ua) * decay
                 ua = ua + (lagged - ua) * (1.0 - decay) * lag / h

@@ -24,6 +24,8 @@ def swapped(model: AxisModel, name: str, other: str) -> AxisModel:
     """Put another effect in the place of one, keeping the values of parameters that both have."""
     plain = {p.symbol: p.start * model.scale(p) for p in known()[other].parameters}
     shared = {k: v for k, v in model.effects[name].items() if k in plain}
+    if known()[name].slot is Slot.BACKLASH and known()[other].slot is Slot.ELASTIC:
+        shared["f_res"] = model.effects[name]["f_contact"]  # a contact that is never left
     return model.without_effect(name).with_effect(other, {**plain, **shared})
 
 

@@ -253,11 +253,11 @@ class Searcher:
         if max((t[2] for t in tried.values()), default=0.0) < CLEAR:
             for effect, new in self._afresh(fit):
                 self._try(tried, effect, new, losses)
-        sure, good = self._good(tried, fit)
+        sure, good = self._good(tried, fit, losses)
         if sure and not good:  # what cannot be has taken the places of what can
             for s in self._candidates(fit, TRIES):
                 self._try(tried, s.effect, self._with(fit, s, 5), losses)
-            sure, good = self._good(tried, fit)
+            sure, good = self._good(tried, fit, losses)
         if not good:
             return None
         name = simplest(good)
@@ -267,14 +267,31 @@ class Searcher:
         rivals = {n: t[2] for n, t in tried.items() if n != name}
         return new, loss, Step("add", name, new.ratio, gain, new.model, rivals)
 
-    def _good(self, tried: dict[str, Tried], fit: Fit) -> tuple[dict[str, Tried], dict[str, Tried]]:
+    def _good(
+        self, tried: dict[str, Tried], fit: Fit, losses: Array
+    ) -> tuple[dict[str, Tried], dict[str, Tried]]:
         """Pick those that save enough, surely; and of them those that can be.
 
         Beside a gap, whose bounces fall out otherwise with any other number, a small saving says nothing.
         """
         least = SPECIFIC if rattles(fit.model) else GAIN
         sure = {n: t for n, t in tried.items() if t[2] >= least and t[3] >= self._sure(n)}
-        return sure, {n: t for n, t in sure.items() if self._sound(t[0], fit)}
+        good = {n: t for n, t in sure.items() if self._sound(t[0], fit)}
+        best = max(sure, key=lambda n: sure[n][2], default=None)
+        if best is not None and best not in good:
+            for new in self._plainer_beside(sure[best][0], fit):
+                if self._sound(new, fit):
+                    self._try(good, best, new, losses)
+        return sure, {n: t for n, t in good.items() if t[2] >= least and t[3] >= self._sure(n)}
+
+    def _plainer_beside(self, new: Fit, fit: Fit) -> list[Fit]:
+        """Put a plainer effect, or none, in the place of each that can no longer be beside a new one: it stood for both."""
+        out = []
+        for name in [n for n in new.model.effects if n in fit.model.effects and not self._stays(new, fit, n)]:
+            others = [o for o in plainer(name, self.names) if o not in new.model.effects]
+            out += [self.fit(swapped(new.model, name, o), 6) for o in others]
+            out.append(self.fit(new.model.without_effect(name), 6))
+        return out
 
     def _add_pair(self, fit: Fit, losses: Array) -> tuple[Fit, Array, Step] | None:
         """Add two effects at once where neither saves enough alone: each hides what the other would save.
@@ -319,9 +336,11 @@ class Searcher:
     def _possible(self, new: Fit, fit: Fit) -> bool:
         """Say whether what is new can be, and what could be before still can, or vanishes: it stood for the new."""
         kept = [n for n in new.model.effects if n not in self.frozen]
-        return all(
-            physical(new, n) or (n in fit.model.effects and (small(new.model, n) or not physical(fit, n)))
-            for n in kept
+        return all(self._stays(new, fit, n) for n in kept)
+
+    def _stays(self, new: Fit, fit: Fit, name: str) -> bool:
+        return physical(new, name) or (
+            name in fit.model.effects and (small(new.model, name) or not physical(fit, name))
         )
 
     def _with(self, fit: Fit, start: Start, iterations: int, best: float = np.inf) -> Fit:
