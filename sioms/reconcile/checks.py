@@ -22,7 +22,7 @@ from sioms.reconcile.records import Record, Session
 from sioms.reconcile.screen import dead_band, direction, smoothed_motion
 from sioms.reconcile.verdict import BadInputError
 
-LEAST_SAMPLES = 500
+LEAST_SAMPLES = 250
 LEAST_COUNTS = 20
 LEAST_TOTAL_S = 2.0
 #: The inertia the data show may differ from the nominal one by a payload, hardly by this factor.

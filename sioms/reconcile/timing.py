@@ -17,7 +17,7 @@ from sioms.reconcile.effect import Array
 from sioms.reconcile.records import Record, Session
 
 #: Longest gap that is interpolated [samples], largest share of all samples, and least length of what a gap leaves.
-LONGEST, MOST, LEAST = 5, 0.2, 500
+LONGEST, MOST, LEAST = 5, 0.2, 250
 #: Share of a stamp's deviation by which the clock that counts the samples follows the stamps.
 FOLLOW = 0.05
 

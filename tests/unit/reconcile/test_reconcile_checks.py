@@ -51,7 +51,7 @@ def _jump(r: Record) -> Record:
 
 
 BAD = {
-    "too short": (lambda r: r.cut(0, 300), "too few"),
+    "too short": (lambda r: r.cut(0, 200), "too few"),
     "no motion": (lambda r: replace(r, position=np.zeros(len(r)), command=None), "no motion"),
     "constant force": (lambda r: replace(r, force=np.ones(len(r))), "force is constant"),
     "constant command": (lambda r: replace(r, command=np.zeros(len(r))), "command is constant"),
