@@ -9,7 +9,7 @@ scale of a ramp, the level at power-up.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,7 +177,10 @@ class FingerData:
     def _ramps(self, b: Belief) -> Floats:
         if self.ramp_scene is None:
             return np.empty(0)
-        full, at, out = outputs(b, self.ramp_scene), 0, []
+        told = (
+            b.cell if np.isfinite(self.cell_spread).all() else 0.0
+        )  # else nothing but the ramps would tell it
+        full, at, out = outputs(b, _true_loads(self.ramp_scene, told)), 0, []
         for r in self.ramps:
             n = len(r.load)
             own = full[at : at + n, r.element]
@@ -205,6 +208,12 @@ class FingerData:
             out.append((at, at + n, np.linalg.qr(np.stack([np.ones(n), r.output], axis=1))[0]))
             at += n
         return out
+
+
+@lru_cache(maxsize=4)
+def _true_loads(scene: Scene, cell: float) -> Scene:
+    """Return touches with the loads that a cell with this relative error has felt."""
+    return replace(scene, load=scene.load / (1.0 + cell)) if cell else scene
 
 
 def behind(own: Floats, r: Ramped, tau: float) -> Floats:

@@ -35,6 +35,13 @@ def warming(output: Floats, scene: Scene, p: Floats) -> Floats:
     return out
 
 
+def rising(output: Floats, scene: Scene, p: Floats) -> Floats:
+    """Multiply by 1 + c + k (place - mean place): where the gains were stated is not known."""
+    along = scene.place - scene.place.mean()
+    out: Floats = output * (1.0 + p[1] + p[0] * along)[:, None]
+    return out
+
+
 def lifted(output: Floats, scene: Scene, p: Floats) -> Floats:
     """Add k, wherever the touch is."""
     out: Floats = output + p[0]
@@ -86,6 +93,7 @@ TERMS = (
         fading,
         Quantity("k", "1/s", -0.1, 0.1, 1e-5, "size"),
         Quantity("c", "1", -0.5, 0.5, 0.02, "in the middle of the time"),
+        lookalikes=("gain_scatter",),
     ),
     term(
         "warmth",
@@ -93,6 +101,15 @@ TERMS = (
         warming,
         Quantity("k", "1/K", -1.0, 1.0, 0.01, "size"),
         Quantity("c", "1", -0.5, 0.5, 0.02, "at the mean temperature"),
+        lookalikes=("gain_scatter",),
+    ),
+    term(
+        "place",
+        "d = l (1 + c + k (t_c - mean t_c))",
+        rising,
+        Quantity("k", "1/rad", -1.0, 1.0, 0.02, "size"),
+        Quantity("c", "1", -0.5, 0.5, 0.02, "at the mean place"),
+        lookalikes=("gain_scatter",),
     ),
     term(
         "offset",
@@ -107,7 +124,7 @@ TERMS = (
         stiffening,
         Quantity("k", "1", -1.0, 1.0, 0.02, "exponent"),
         Quantity("c", "1", -0.5, 0.5, 0.02, "at 200 N/m"),
-        lookalikes=("quadratic", "hertz"),
+        lookalikes=("quadratic", "hertz", "gain_scatter"),
     ),
     term(
         "lopsided",

@@ -88,49 +88,71 @@ def late(loads: Loads, tau: float) -> Floats:
 
 
 @lru_cache(maxsize=32)
-def _lag(loads: Loads, reach: tuple[float, ...], power: float) -> Floats:
-    out = lagged(loads.load, np.array(reach), power, loads.record)
+def _lag(loads: Loads, reach: tuple[float, ...], power: float, forgets: float) -> Floats:
+    out = lagged(loads.load, np.array(reach), power, loads.record, forgets)
     out.setflags(write=False)
     return out
 
 
-def lag(loads: Loads, reach: Floats, power: float) -> Floats:
+def lag(loads: Loads, reach: Floats, power: float, forgets: float) -> Floats:
     """Return the lag of known loads, see ``lagged``; the search asks for the same ones again and again."""
-    return _lag(loads, tuple(reach), power)
+    return _lag(loads, tuple(reach), power, forgets)
 
 
-class Plays:
-    """Plays about each of some loads, of widths up to a reach: a play follows the load once that has moved its width.
+class Loops:
+    """Loops about each of some loads: of plays, which remember where they turned round, and of one law that forgets it.
 
-    They weigh with a power of their width; even weights make loops of parabolas, as metal under loads well below yield has
-    them (Rayleigh's law). A full loop has height one. One caller at a time.
-    Source: M. A. Krasnosel'skii, A. V. Pokrovskii, "Systems with Hysteresis", 1989, sec. 2 and 34 (play, Prandtl-Ishlinskii).
+    A play follows the load once that has moved its width. They weigh with a power of their width; even weights make loops of
+    parabolas, as metal under loads well below yield has them (Rayleigh's law). The other law is that of Bouc and Wen: straight
+    back to the middle, and from there on as an exponential of a third of the reach. A full loop of either has height one. One caller at a time.
+    Source: M. A. Krasnosel'skii, A. V. Pokrovskii, "Systems with Hysteresis", 1989, sec. 2 and 34 (play, Prandtl-Ishlinskii);
+    Y. K. Wen, "Method for random vibration of hysteretic systems", J. Eng. Mech. Div. ASCE 102 (1976), eq. 3 (n = 1, beta = gamma).
 
     Args:
-        reach: largest width, shape (n,); power: of the weights.
+        reach: largest width, shape (n,); power: of the weights; forgets: share of the law that does.
         load: where they stand at rest, shape (n,).
     """
 
-    def __init__(self, reach: Floats, power: float, load: Floats) -> None:
+    def __init__(self, reach: Floats, power: float, forgets: float, load: Floats) -> None:
         share = ((np.arange(PLAYS) + 0.5) / PLAYS)[:, None]
         self._width, self._weight = reach * share, share**power / np.sum(share**power)
-        self._state = np.repeat(load[None], PLAYS, axis=0)
+        self._plays = np.repeat(load[None], PLAYS, axis=0)
+        self._forgets, self._slope = forgets, 3.0 / reach
+        self._load, self._ahead = load, np.zeros(len(load))
 
     def follow(self, load: Floats) -> Floats:
-        """Move on through loads, shape (t, n); return how far the plays lag behind each in widths, -1 to 1, shape (t, n)."""
+        """Move on through loads, shape (t, n); return how far the loops lag behind each in their height, -1 to 1, shape (t, n)."""
+        out = (1.0 - self._forgets) * self._follow_plays(load)
+        if self._forgets:
+            out -= self._forgets * self._follow_forgetful(load)
+        return out
+
+    def _follow_plays(self, load: Floats) -> Floats:
         here = load[:, None]
         low, high = here - self._width, here + self._width
-        states, last = np.empty_like(low), self._state
+        states, last = np.empty_like(low), self._plays
         for state, least, most in zip(states, low, high, strict=True):
             np.maximum(last, least, out=state)
             np.minimum(state, most, out=state)
             last = state
-        self._state = last
+        self._plays = last
         out: Floats = np.sum(self._weight * (states - here) / self._width, axis=1)
         return out
 
+    def _follow_forgetful(self, load: Floats) -> Floats:
+        steps = np.diff(load, axis=0, prepend=self._load[None]) * self._slope
+        out = np.empty_like(load)
+        for i, (way, far) in enumerate(zip(np.where(steps < 0.0, -1.0, 1.0), np.abs(steps), strict=True)):
+            ahead = self._ahead * way
+            back = np.clip(-ahead, 0.0, far)
+            out[i] = self._ahead = way * (1.0 - (1.0 - ahead - back) * np.exp(back - far))
+        self._load = load[-1]
+        return out
 
-def lagged(load: Floats, reach: Floats, power: float, record: NDArray[np.int64]) -> Floats:
-    """Return how far every column lags behind itself, see ``Plays``; at rest in every record's first row."""
+
+def lagged(
+    load: Floats, reach: Floats, power: float, record: NDArray[np.int64], forgets: float = 0.0
+) -> Floats:
+    """Return how far every column lags behind itself, see ``Loops``; at rest in every record's first row."""
     parts = np.split(load, np.flatnonzero(np.diff(record)) + 1)
-    return np.concatenate([Plays(reach, power, p[0]).follow(p) for p in parts])
+    return np.concatenate([Loops(reach, power, forgets, p[0]).follow(p) for p in parts])

@@ -45,9 +45,9 @@ def softening(reading: Floats, loads: Loads, p: Floats) -> Floats:
 
 
 def lagging(reading: Floats, loads: Loads, p: Floats) -> Floats:
-    """Add b times the lag of each component's own load; b and reach r per component, power a of the plays last."""
+    """Add b times the lag of each component's own load; b and reach r per component, power a and share m last."""
     n = reading.shape[1]
-    return reading + p[:n] * lag(loads, p[n : 2 * n], float(p[-1]))
+    return reading + p[:n] * lag(loads, p[n : 2 * n], float(p[-2]), float(p[-1]))
 
 
 GAIN = SensorEffect(
@@ -114,8 +114,11 @@ HYSTERESIS = SensorEffect(
     name="hysteresis",
     title="hysteresis",
     channel=MECHANICS,
-    change=responding(lagging, "b", "r", "a"),
-    equation="reading_i = l_i + b_i mean over w of (z_w - l_i)/w weighed with w^a, z_w the play of width w about l_i, w up to r_i",
+    change=responding(lagging, "b", "r", "a", "m"),
+    equation=(
+        "reading_i = l_i + b_i ((1 - m) mean over w of (z_w - l_i)/w weighed with w^a - m y_i), z_w the play of width w about l_i, "
+        "w up to r_i, y' = 3/r_i l_i' where it falls to 0, 3/r_i l_i' (1 - |y|) beyond"
+    ),
     parameters=(
         Quantity("b", "1", 0.0, 0.5, 5e-3, "half width of the loop, of each component", each=True),
         Quantity(
@@ -129,6 +132,7 @@ HYSTERESIS = SensorEffect(
             starts=(0.03, 0.1, 0.3),
         ),
         Quantity("a", "1", -0.9, 3.0, 0.5, "form of the loop: 0 parabolas, larger fuller at its ends"),
+        Quantity("m", "1", 0.0, 1.0, 0.2, "share that forgets where the load turned round"),
     ),
     signature="off one way while the load rises and the other way while it falls",
     lookalikes=("quadratic", "gain"),
@@ -260,8 +264,15 @@ TERMS = (
         "reading_i = l_i + k_i l_i^3",
         cubed,
         Quantity("k", "1", -2.0, 2.0, 0.01, "at full range", each=True),
+        lookalikes=("gain", "quadratic"),
     ),
-    term("time", "reading = l (1 + k t)", fading, Quantity("k", "1/s", -0.1, 0.1, 1e-5, "size")),
+    term(
+        "time",
+        "reading = l (1 + k t)",
+        fading,
+        Quantity("k", "1/s", -0.1, 0.1, 1e-5, "size"),
+        lookalikes=("gain", "temperature_gain"),
+    ),
     term(
         "settling",
         "reading_i = l_i + d_i (1 - exp(-t/tau))",

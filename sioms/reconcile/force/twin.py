@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sioms.reconcile.force.belief import Floats, ForceBelief, Loads, Plays
+from sioms.reconcile.force.belief import Floats, ForceBelief, Loads, Loops
 from sioms.reconcile.force.effects import lagging
 from sioms.reconcile.sensors.effect import SensorModel
 
@@ -23,8 +23,8 @@ class ForceTwin:
     def __init__(self, model: SensorModel) -> None:
         self._belief: ForceBelief = model.belief()
         at_rest = np.zeros(model.count)
-        self._plays = {
-            i: Plays(p[model.count : -1], float(p[-1]), at_rest)
+        self._loops = {
+            i: Loops(p[model.count : -2], float(p[-2]), float(p[-1]), at_rest)
             for i, (response, p) in enumerate(self._belief.responses)
             if response is lagging
         }
@@ -40,8 +40,8 @@ class ForceTwin:
         out = row.load @ b.total.T
         for i, (response, p) in enumerate(b.responses):
             out = (
-                out + p[: len(share)] * self._plays[i].follow(row.load)
-                if i in self._plays
+                out + p[: len(share)] * self._loops[i].follow(row.load)
+                if i in self._loops
                 else response(out, row, p)
             )
         return np.asarray(out[0] * b.full)

@@ -60,14 +60,14 @@ def analyse(subject: Subject, options: Options | None = None) -> SensorVerdict:
     if (
         _odd(searcher, found, share, where)
         or searcher.displaced(found)
-        or _unsteady(subject, searcher, found, names)
+        or _stand_ins(subject, searcher, found, names)
     ):
         o.progress(
             f"what remains has no name (a smoother explains {100 * share:.0f} %): searching for a term"
         )
         searcher.names = names + subject.terms
         subject, found = _search(subject, searcher, subject.model)
-        found, names = _without_unsteady(subject, searcher, found, names)
+        found, names = _without_stand_ins(subject, searcher, found, names)
         searcher.names = names
     o.progress("identifiability: look-alikes in the place of each effect")
     found, others = searcher.settle(found, pairs)
@@ -101,35 +101,42 @@ def _smoothed(subject: Subject, searcher: Searcher, found: Found) -> tuple[float
     return shares[view], subject.training.views[view] if shares[view] > 0.0 else ""
 
 
-def _without_unsteady(
+def _without_stand_ins(
     subject: Subject, searcher: Searcher, found: Found, names: tuple[str, ...]
 ) -> tuple[Found, tuple[str, ...]]:
-    """Search without names that are not the same everywhere; where that does as well, they are refused.
+    """Search without names that may stand for something else; where that does as well, they are refused.
 
     Returns:
         What was found, and the names that were not refused.
     """
     asked = names
     for _ in range(REFUSED):
-        bent = _unsteady(subject, searcher, found, asked)
+        bent = _stand_ins(subject, searcher, found, asked)
         if not bent:
             break
-        searcher.progress(f"{bent} is not the same everywhere: searching without it")
-        asked = tuple(n for n in asked if n != bent)
-        searcher.names = tuple(n for n in names if n != bent) + subject.terms
+        searcher.progress(f"{' and '.join(bent)} may stand for something else: searching without")
+        asked = tuple(n for n in asked if n not in bent)
+        searcher.names = tuple(n for n in names if n not in bent) + subject.terms
+        footing = searcher.weights
         other = searcher.run(subject.model)
-        worse = searcher.lost(other.losses, found.losses)
+        own, searcher.weights = searcher.weights, footing  # losses compare on one footing only
+        worse = searcher.lost(searcher.loss(searcher.fit(other.fit.model)), found.losses)
         if negligible(worse.share, worse.errors):
-            found, names = other, tuple(n for n in names if n != bent)
+            found, names, searcher.weights = other, tuple(n for n in names if n not in bent), own
     return found, names
 
 
-def _unsteady(subject: Subject, searcher: Searcher, found: Found, names: Sequence[str]) -> str:
-    """Return which of these names changes most surely with something, "" where all are the same everywhere."""
+def _stand_ins(subject: Subject, searcher: Searcher, found: Found, names: Sequence[str]) -> tuple[str, ...]:
+    """Return those of these names that are not the same everywhere, or of which one nameless rule does as well."""
+    return _unsteady(subject, searcher, found, names) or searcher.ruled(found, names)
+
+
+def _unsteady(subject: Subject, searcher: Searcher, found: Found, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the one of these names that changes most surely with something, none where all are the same everywhere."""
     names = [n for n in names if n in found.fit.model.effects]
     seen = changes(subject.training, found.fit, searcher.weights, names, subject.variables(subject.training))
     sure = [c for c in seen if abs(c.share) > max(UNSTEADY, SURELY * c.half)]
-    return max(sure, key=lambda c: abs(c.share) / c.half).effect if sure else ""
+    return (max(sure, key=lambda c: abs(c.share) / c.half).effect,) if sure else ()
 
 
 def gate(subject: Subject) -> tuple[dict[str, str], tuple[tuple[str, str, float], ...], tuple[str, ...]]:

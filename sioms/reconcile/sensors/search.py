@@ -7,7 +7,7 @@ view where it shows most.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,13 +17,15 @@ from sioms.reconcile.ambiguity import ALIKE, AMBIGUOUS, SWAPS
 from sioms.reconcile.blocks import better, heldout
 from sioms.reconcile.rules import GAIN, NEARLY, SPECIFIC, SURE, negligible
 from sioms.reconcile.sensors.effect import TERM_PREFIX, Array, SensorEffect, SensorModel
-from sioms.reconcile.sensors.fit import Data, Fit, on_one_footing, ratios, refit
+from sioms.reconcile.sensors.fit import Data, Fit, half_intervals, on_one_footing, ratios, refit
 from sioms.reconcile.sensors.screen import Start, screen
 
 FLOOR = 1.15  # stop at this multiple of the noise floor, which is of a sensor's own rows
 TRIES = 5
 STEPS = 8
 MOST_INSIDE = 0.7  # share of the elements whose own number must be one that the effect can have
+DEEP = 3.0  # standard errors of a saving below the floor
+FEWER = 2  # times as few numbers has a nameless rule that takes the place of elements' own numbers
 CLEAR = 0.95  # share of a view that a name must save where the view stays above its floor
 #: Two effects are tried at once only where a view is above this multiple of its floor, so many firsts and seconds.
 PAIRED, PAIRS = 1.3, 3
@@ -31,12 +33,13 @@ PAIRED, PAIRS = 1.3, 3
 
 @dataclass(frozen=True, slots=True)
 class Saving:
-    """What one model saves against another: share and standard errors in its best view, and share of all."""
+    """What one model saves against another: share and standard errors in its best view, and those of all views together."""
 
     share: float
     errors: float
     view: str
     total: float
+    surely: float
 
     @property
     def weight(self) -> float:
@@ -106,13 +109,13 @@ class Searcher:
         """Compare held-out losses by view: of all views, or of some."""
         of_block = np.zeros(len(new), dtype=np.int64)
         of_block[self.data.block] = self.data.view
-        best = Saving(-np.inf, 0.0, "", float((old - new).sum() / old.sum()))
+        best = Saving(-np.inf, 0.0, "", *better(new, old))
         for i, view in enumerate(self.data.views):
             mine = of_block == i
             if np.count_nonzero(mine) < 2 or (among and view not in among):
                 continue
             share, errors = better(new[mine], old[mine])
-            new_one = Saving(share, errors, view, best.total)
+            new_one = Saving(share, errors, view, best.total, best.surely)
             if best.view == "" or new_one.weight > best.weight:
                 best = new_one
         return best
@@ -124,14 +127,27 @@ class Searcher:
     # -- search
 
     def run(self, start: SensorModel) -> Found:
-        """Search from a model."""
+        """Search from a model; where the floor is not reached, again without the first step, which led astray if that reaches it."""
+        found = self._run(start)
+        steps = [r for r in found.ladder if r.action == "add"]
+        if len(steps) < 2 or not self._loud(found.fit) or set(self.terms) & set(self.names):
+            return found
+        names, footing = self.names, self.weights
+        self.names = tuple(n for n in names if n != steps[0].effect)
+        other = self._run(start)
+        self.names = names
+        if not self._loud(other.fit):
+            self.progress(f"{steps[0].effect} led astray: what is found without it reaches the floor")
+            return other
+        self.weights = footing
+        return found
+
+    def _run(self, start: SensorModel) -> Found:
         fit = self._levelled(start)
         losses = self.loss(fit)
         ladder = [Rung("start", "", self._ratio(fit), 0.0, fit.model)]
         for _ in range(STEPS):
-            if np.all(self.ratios(fit.model) <= FLOOR):
-                break
-            step = self._add(fit, losses) or self._add_pair(fit, losses)
+            step = self._add(fit, losses) or self._add_pair(fit, losses) or self._restart(fit)
             if step is None:
                 break
             ladder.append(step)
@@ -149,15 +165,21 @@ class Searcher:
         self.weights = on_one_footing(self.data, fit.model)
         return self.fit(fit.model)
 
+    def _loud(self, fit: Fit) -> list[str]:
+        """Views that are above their floor."""
+        return [v for v, ratio in zip(self.data.views, self.ratios(fit.model), strict=True) if ratio > FLOOR]
+
     def _ratio(self, fit: Fit) -> float:
         """Root mean square over all rows, in units of the floor."""
         return float(np.sqrt(np.mean((fit.residual / self.weights) ** 2)))
 
     def _add(self, fit: Fit, losses: Array) -> Rung | None:
-        """Refit the best candidates and take the simplest of those that save most."""
+        """Refit the best candidates and take the simplest of those that save most.
+
+        Below the floor, which is an estimate, only what saves much on blocks held out is no noise.
+        """
         tried: dict[str, tuple[Fit, Array, Saving]] = {}
-        ratios = zip(self.data.views, self.ratios(fit.model), strict=True)
-        loud = [view for view, ratio in ratios if ratio > FLOOR]
+        loud = self._loud(fit)
         for start in self.candidates(fit):
             new = self.fit(self._with(fit, start))
             loss = self.loss(new)
@@ -165,7 +187,8 @@ class Searcher:
         good = {
             n: t
             for n, t in tried.items()
-            if t[2].share >= GAIN and t[2].errors >= SURE and t[2].total > 0.0 and physical(t[0].model, n)
+            if (_sure(t[2], GAIN) if loud else _beyond_noise(t[2]) and not _termed(t[0].model))
+            and physical(t[0].model, n)
         }
         if not good:
             return None
@@ -199,7 +222,7 @@ class Searcher:
                     continue
                 loss = self.loss(new)
                 saved, more = self.saving(loss, losses), self.saving(loss, inner)
-                sure = all(s.share >= SPECIFIC and s.errors >= SURE and s.total > 0.0 for s in (saved, more))
+                sure = _sure(saved, SPECIFIC) and _sure(more, SPECIFIC)
                 good = sure and physical(new.model, first.effect) and physical(new.model, second.effect)
                 if good and (best is None or new.cost < best[1].cost):
                     best = saved, new, f"{first.effect} and {second.effect}"
@@ -207,6 +230,39 @@ class Searcher:
             return None
         saved, new, name = best
         return Rung("add", name, self._ratio(new), saved.share, new.model)
+
+    def _restart(self, fit: Fit) -> Rung | None:
+        """Let shapes of the elements' own, of which some may have stuck, begin again; each keeps what is best for it."""
+        count = fit.model.count
+        own = [
+            (name, q.symbol, start)
+            for name in fit.model.effects
+            if name not in self.frozen and self._loud(fit)
+            for q in fit.model.library[name].parameters[1:]
+            for start in (q.starts if q.each else ())
+        ]
+        best = fit
+        for name, symbol, start in own:
+            held = best.model.effects[name]
+            moved = self.fit(best.model.with_effect(name, {**held, symbol: np.full(count, start)}))
+            better_there = self._squares(moved) < (1.0 - GAIN) * self._squares(best)
+            values = {
+                s: np.where(better_there, v, held[s]) if len(v) == count > 1 else v
+                for s, v in moved.model.effects[name].items()
+            }
+            new = self.fit(best.model.with_effect(name, values))
+            best = new if new.cost < (1.0 - GAIN) * best.cost else best
+        if best is fit:
+            return None
+        return Rung("restart", "shapes", self._ratio(best), 1.0 - best.cost / fit.cost, best.model)
+
+    def _squares(self, fit: Fit) -> Array:
+        """Sum of squares of each element."""
+        own = self.data.element >= 0
+        out: Array = np.bincount(self.data.element[own], fit.residual[own] ** 2, fit.model.count).astype(
+            np.float64
+        )
+        return out
 
     def _with(self, fit: Fit, start: Start) -> SensorModel:
         """Switch a candidate on, and off what it replaces."""
@@ -291,32 +347,78 @@ class Searcher:
         return list(dict.fromkeys(out))
 
     def displaced(self, found: Found) -> bool:
-        """Say whether a nameless look-alike, of no more numbers, does surely better in the place of something named."""
-        lib, count = found.fit.model.library, found.fit.model.count
-        for name in [n for n in found.fit.model.effects if n not in self.frozen and n in self.names]:
-            like = [
-                n for n in alike(lib, name, count) if n in self.terms and n not in found.fit.model.effects
-            ]
-            bare = self.fit(found.fit.model.without_effect(name), 4) if like else found.fit
-            for other in like:
-                for start in screen(self.data, bare, self.weights, lib[other], self.frozen)[:1]:
-                    new = self.saving(self.loss(self.fit(self._with(bare, start))), found.losses)
-                    if new.share > GAIN and new.errors > SURE and new.total > 0.0:
-                        return True
+        """Say whether a term without a name saves much beside what is named, or does surely better in the place of a name."""
+        model, count = found.fit.model, found.fit.model.count
+        loud = self._loud(found.fit)
+        for term in self.terms if loud else ():
+            new = self._tried(found.fit, term)
+            if new and _sure(self.saving(self.loss(new), found.losses, loud), SPECIFIC):
+                return True
+        for gone, bare, term in self._nameless_alike(found, self.names):
+            new = self._tried(bare, term) if len(gone) == 1 else None
+            richer = model.library[term].size(count) > model.library[gone[0]].size(count) + 1
+            if new and not richer and _sure(self.saving(self.loss(new), found.losses), GAIN):
+                return True
         return False
 
+    def ruled(self, found: Found, names: Sequence[str]) -> tuple[str, ...]:
+        """Return those of these names in the place of which one nameless rule of far fewer numbers does as well."""
+        model, count = found.fit.model, found.fit.model.count
+        for gone, bare, term in self._nameless_alike(found, names):
+            numbers = sum(model.library[n].size(count) for n in gone)
+            if FEWER * model.library[term].size(count) > numbers:
+                continue
+            new = self._tried(bare, term)
+            worse = self.lost(self.loss(new), found.losses) if new else None
+            if new and worse and negligible(worse.share, worse.errors) and self._told(new, term):
+                return gone
+        return ()
+
+    def _nameless_alike(
+        self, found: Found, names: Sequence[str]
+    ) -> Iterator[tuple[tuple[str, ...], Fit, str]]:
+        """Yield names of a model, one or all that a nameless look-alike could take the place of, the fit without, and that."""
+        model, lib = found.fit.model, found.fit.model.library
+        held = [n for n in model.effects if n in names and n not in self.frozen]
+        for term in [n for n in self.terms if n not in model.effects]:
+            like = tuple(n for n in held if n in lib[term].lookalikes or term in lib[n].lookalikes)
+            for gone in dict.fromkeys((*((n,) for n in like), like) if like else ()):
+                yield gone, self.fit(without(model, gone), 4), term
+
+    def _tried(self, fit: Fit, name: str) -> Fit | None:
+        """Switch an effect on from its best start, and refit; None where there is none, or it is on."""
+        starts = (
+            []
+            if name in fit.model.effects
+            else screen(self.data, fit, self.weights, fit.model.library[name], self.frozen)
+        )
+        return self.fit(self._with(fit, starts[0])) if starts else None
+
+    def _told(self, fit: Fit, name: str) -> bool:
+        """Say whether the first number of an effect is surely not neutral."""
+        half = half_intervals(self.data, fit, self.weights)
+        effect = fit.model.library[name]
+        own = [
+            h for f, h in zip(fit.free, half, strict=True) if (f.effect, f.quantity) == (name, effect.primary)
+        ]
+        return bool(np.any(np.abs(fit.model.effects[name][effect.primary.symbol] - effect.neutral) > own))
+
     def credible(self, found: Found) -> Found:
-        """Keep only names that explain nearly all of a view in which something has no name: less may be a part of that."""
-        ratios = dict(zip(self.data.views, self.ratios(found.fit.model), strict=True))
-        model = found.fit.model
+        """Keep only names that explain nearly all of a view in which something has no name: less may be a part of that.
+
+        What has no name in one view may have a part in all views of its footing.
+        """
+        model, views, group = found.fit.model, self.data.views, self.data.footing
+        odd = {group[views.index(view)] for view in self._loud(found.fit)}
         for name in [n for n in model.effects if n in self.names and n not in self.frozen]:
             gap = self.lost(self.loss(self.fit(found.fit.model.without_effect(name), 4)), found.losses)
-            if ratios[gap.view] > FLOOR and gap.share < CLEAR:
+            if group[views.index(gap.view)] in odd and gap.share < CLEAR:
                 model = model.without_effect(name)
         if model is found.fit.model:
             return found
         fit = self._levelled(model)
-        return Found(fit, self.loss(fit), found.ladder)
+        fit, losses = self._eliminate(fit, self.loss(fit), [])  # what only served the others
+        return Found(fit, losses, found.ladder)
 
     def candidates(self, fit: Fit) -> list[Start]:
         """Screen every effect that is not in the model; the best few, look-alikes of the best among them."""
@@ -406,6 +508,16 @@ class Searcher:
             if (r.effect, r.rival) not in best or r.missed < best[r.effect, r.rival].missed:
                 best[r.effect, r.rival] = r
         return sorted(best.values(), key=lambda r: r.missed)
+
+
+def _sure(saved: Saving, least: float) -> bool:
+    """Say whether at least a share is saved, surely there or in all views together, and nothing lost in all."""
+    return saved.share >= least and max(saved.errors, saved.surely) >= SURE and saved.total > 0.0
+
+
+def _beyond_noise(saved: Saving) -> bool:
+    """Say whether what is saved below the floor is too much, and too sure, for noise."""
+    return saved.share >= SPECIFIC and saved.errors >= DEEP and saved.total >= GAIN
 
 
 def _termed(model: SensorModel) -> bool:

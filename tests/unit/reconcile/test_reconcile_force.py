@@ -37,6 +37,20 @@ def test_the_lag_is_odd_full_after_its_reach_and_remembers_where_a_loop_began() 
     assert np.allclose(again[len(load) :], lag)  # every record begins at rest
 
 
+def test_the_law_that_forgets_goes_straight_back_to_the_middle_and_on_as_an_exponential() -> None:
+    load = np.array([0.0, 0.02, 0.07, 0.04, 0.0, -0.4, -0.37, -0.4])[:, None]
+    record = np.zeros(len(load), dtype=np.int64)
+    lag = lagged(load, np.array([0.3]), 0.0, record, 1.0)[:, 0]  # a third of the reach is 0.1
+    top = 1.0 - np.exp(-0.7)
+    middle = 0.07 - 0.1 * top
+    assert -lag[:3] == pytest.approx([0.0, 1.0 - np.exp(-0.2), top])
+    assert -lag[3] == pytest.approx(top - 0.3)
+    assert -lag[4] == pytest.approx(np.exp(-10.0 * middle) - 1.0)
+    assert -lag[5] == pytest.approx(-1.0, abs=0.02)
+    assert -lag[6] == pytest.approx(-lag[5] + 0.3)
+    assert -lag[7] > -lag[5] + 0.1  # a loop within a loop stays open
+
+
 def test_what_comes_late_decays_with_its_time_constant_and_begins_anew_with_every_record() -> None:
     time = np.array([0.0, 1.0, 2.0, 4.0, 0.0, 1.0])
     load = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])[:, None]
@@ -48,7 +62,7 @@ def test_a_twin_reads_what_the_model_says_row_by_row() -> None:
     model, _ = from_table(SENSOR, "x")
     model = model.with_effect("gain", {"g": np.array([0.02, -0.03])})
     model = model.with_effect("offset_drift", {"d": np.array([1e-4, -2e-4])})
-    shape = {"r": np.array([0.1, 0.2]), "a": np.array([0.7])}
+    shape = {"r": np.array([0.1, 0.2]), "a": np.array([0.7]), "m": np.array([0.4])}
     model = model.with_effect("hysteresis", {"b": np.array([0.02, 0.01]), **shape})
     walk = np.cumsum(np.random.default_rng(3).normal(0.0, 0.1, (60, 2)), axis=0)
     load = np.concatenate([np.zeros((1, 2)), walk])
@@ -60,8 +74,8 @@ def test_a_twin_reads_what_the_model_says_row_by_row() -> None:
 
 
 def test_a_saving_and_an_error_that_both_lose_are_no_gain() -> None:
-    assert Saving(-1.6, -5.0, "touch", 0.0).weight < Saving(0.01, 0.5, "ramp", 0.0).weight
-    assert Saving(0.3, -1.0, "touch", 0.0).weight < 0.0
+    assert Saving(-1.6, -5.0, "touch", 0.0, 0.0).weight < Saving(0.01, 0.5, "ramp", 0.0, 0.0).weight
+    assert Saving(0.3, -1.0, "touch", 0.0, 0.0).weight < 0.0
 
 
 def staircase(n: int) -> ForceRecords:
@@ -70,7 +84,7 @@ def staircase(n: int) -> ForceRecords:
     load = np.concatenate([np.outer(up, np.eye(n)[i]) for i in range(n)])
     time = 10.0 * np.arange(len(load))
     nothing = np.full(len(load), np.nan)
-    names = ("fx", "fy", "fz")[:n]
+    names = ("fx", "fy", "fz", "tx", "ty", "tz")[:n]
     return ForceRecords(names, 100.0 * load, 0.0 * load, time, nothing, np.zeros(len(load), dtype=np.int64))
 
 
@@ -101,6 +115,21 @@ def test_a_saturation_and_a_dead_band_are_refused_and_pass_for_no_gain(dull: boo
     assert found.outcome.value == "unexplained"
     assert not found.effects
     assert found.symbolic[0].name == ("term_dull" if dull else "term_knee")
+
+
+def test_gains_that_only_tell_the_time_of_their_components_are_refused() -> None:
+    """Every component is loaded in its own turn while the sensitivity ages."""
+    records = staircase(6)
+    noise = np.random.default_rng(7).normal(0.0, 0.05, records.load.shape)
+    records.reading[:] = records.load * (1.0 + 4e-5 * records.time)[:, None] + noise
+    names = list(records.names)
+    found = analyse(
+        prepare(records, from_table({"sensor": {"components": names, "full_range": [100.0] * 6}}, "x")[0]),
+        Options(pictures=False),
+    )
+    assert found.outcome.value == "unexplained" and not found.effects
+    assert found.symbolic[0].name == "term_time"
+    assert found.symbolic[0].parameters[0].value == pytest.approx(4e-5, rel=0.05)
 
 
 def random_loads(noise: float, bend: Callable[[np.ndarray], np.ndarray]) -> ForceRecords:
