@@ -335,9 +335,12 @@ def _conclude(
             "of the axis orders: a disturbance from outside, not an effect"
         )
     elif large:
-        notes.append(
-            f"what remains is {found.fit.ratio:.1f} times what noise would leave, and no state of the axis orders it"
+        ordered = (
+            f"the state of the axis orders {100 * share:.0f} % of it, in no form that is known"
+            if share > UNEXPLAINED
+            else "no state of the axis orders it"
         )
+        notes.append(f"what remains is {found.fit.ratio:.1f} times what noise would leave; {ordered}")
     places: tuple[Place, ...] = ()
     spectrum: tuple[Spectrum, Spectrum] | None = None
     traces: tuple[Trace, ...] = ()
