@@ -304,12 +304,8 @@ def _conclude(
     states = session_states(ready.final, found.fit.model)
     gaps = measure(ready.final, nominal, found.fit.model, states)
     if ready.tones and not ready.final.session.final:
-        plain = ready.final
-        for beside in ready.tones:
-            plain = known_beside(plain, beside, -1.0)
-        gaps = tuple(
-            replace(g, before=p.before) for g, p in zip(gaps, measure(plain, nominal, nominal), strict=True)
-        )
+        before = measure(_as_recorded(ready.final, ready.tones), nominal, nominal)
+        gaps = tuple(replace(g, before=p.before) for g, p in zip(gaps, before, strict=True))
     whole = replace(ready.problem, end=1.0, weights=None)
     fit = refit(whole, found.fit.model, searcher.frozen, 12)
     if fit.cost > float(np.sum(whole.residual(found.fit.model) ** 2)):
@@ -346,9 +342,10 @@ def _conclude(
     traces: tuple[Trace, ...] = ()
     if o.pictures:
         o.progress("locating the disagreement")
-        places = tuple(locate(whole, nominal, rng))
-        spectrum = spectra(whole, nominal)
-        traces = _traces(whole, nominal, fit.model)
+        plain = _as_recorded(whole, ready.tones)
+        places = tuple(locate(plain, nominal, rng))
+        spectrum = spectra(plain, nominal)
+        traces = _traces((plain, whole), (nominal, fit.model))
     return Verdict(
         outcome,
         nominal,
@@ -512,20 +509,28 @@ def _seen(session: Session, model: AxisModel) -> Envelope:
     return Envelope.of(model, centre, max(reach, 1.1 * model.pitch) if model.rotary else reach)
 
 
-def _traces(problem: Problem, nominal: AxisModel, model: AxisModel) -> tuple[Trace, ...]:
-    """Keep force curves for the pictures: in closed loop where it can be, else what short windows leave."""
-    out, heat = [], [0.0, 0.0]
-    unit = problem.noise.drive / problem.noise.innovation
-    tracked = [problem.runs(m) for m in (nominal, model)]
-    for i, r in enumerate(problem.session.records):
-        curves = []
-        for j, m in enumerate((nominal, model)):
-            if m.controller is None or r.command is None:
-                curves.append(r.force + tracked[j][i].innovation * unit)
+def _as_recorded(problem: Problem, tones: Sequence[Tone]) -> Problem:
+    """Take the forces that keep time out of those that are known."""
+    for beside in tones:
+        problem = known_beside(problem, beside, -1.0)
+    return problem
+
+
+def _traces(problems: tuple[Problem, Problem], models: tuple[AxisModel, AxisModel]) -> tuple[Trace, ...]:
+    """Keep force curves for the pictures, before and after: in closed loop where it can be, else what short windows leave."""
+    curves: list[list[Array]] = []
+    for problem, model in zip(problems, models, strict=True):
+        unit, heat = problem.noise.drive / problem.noise.innovation, 0.0
+        own: list[Array] = []
+        for r, tracked in zip(problem.session.records, problem.runs(model), strict=True):
+            if model.controller is None or r.command is None:
+                own.append(r.force + tracked.innovation * unit)
                 continue
-            run = replay(m, r, heat[j])
-            heat[j] = run.end_temperature
-            curves.append(run.force)
-        time = np.arange(len(r), dtype=np.float64) * nominal.sample_time_s
-        out.append(Trace(r.name, time, r.force, curves[0], curves[1]))
-    return tuple(out)
+            run = replay(model, r, heat)
+            heat = run.end_temperature
+            own.append(run.force)
+        curves.append(own)
+    return tuple(
+        Trace(r.name, np.arange(len(r), dtype=np.float64) * models[0].sample_time_s, r.force, before, after)
+        for r, before, after in zip(problems[0].session.records, *curves, strict=True)
+    )
