@@ -215,7 +215,8 @@ def _gap_picture(figure: Figure, v: Verdict) -> Figure:
             label="simulated - measured, before",
         )
         ax.plot(t.time_s[::step], (t.after - t.measured)[::step], color="#08a", lw=0.7, label="after")
-        reach = float(np.quantile(np.abs(t.before - t.measured), 0.998)) * 1.4 or 1.0
+        settled = np.abs(t.before - t.measured)[len(t.measured) // 10 :]  # a record may begin in motion
+        reach = float(np.quantile(settled, 0.998)) * 1.4 or 1.0
         ax.set_ylim(-reach, reach)
         ax.set_ylabel(f"force, {v.nominal.force_unit}")
         ax.set_title(f"{t.name} (shaded: untouched)", fontsize=9, loc="left")
