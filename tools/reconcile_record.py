@@ -32,7 +32,7 @@ AHEAD = 400
 #: So many periods without a tick are filled in; a record that lost more counts up to there if this share of it is left, else
 #: it is run again, so many times.
 MOST_FILLED = 4
-ENOUGH, TRIES = 0.6, 3
+ENOUGH, TRIES = 0.6, 6
 
 
 def perform(

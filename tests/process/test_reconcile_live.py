@@ -111,7 +111,7 @@ def test_a_hidden_friction_is_named_and_the_twin_takes_the_model(daemon: Daemon,
     twin_file = daemon.folder / "twin.toml"
     options = ("--yes", "--first", "one_speed", "--lap", "2", "--install", str(twin_file))
     run = workflow(daemon, tmp_path, *options)
-    assert run.wait_exit(200.0) == NAMED
+    assert run.wait_exit(200.0) == NAMED, said(run)
     found = json.loads((tmp_path / "report" / "verdict.json").read_text())
     assert found["effects"] == ["coulomb"]
     friction = found["parameters"]["coulomb"]["Fc"]
