@@ -158,7 +158,7 @@ def march(
             is the whole force when tracking, and what is added to the controller's when closed.
         external: force on the axis beside the drive's, shape (n,).
         lost: innovation at which, held for ``PATIENCE`` samples, the speed is taken from the measurement.
-        start: x, v, temperature, error and force of the controller at the sample before the first, and by how much the
+        start: x, v, temperature, error of the controller and force at the sample before the first, and by how much the
             load is behind the motor, and slower.
         out: shape (n, OUT_SIZE), filled.
     """
@@ -176,7 +176,7 @@ def march(
     l1, l2, per_mass = l1 / gain_y, l2 / gain_y, 1.0 / jm
     x, v, temp = start[0], start[1], start[2]
     xl, vl = x - start[5], v - start[6]
-    held = 0.0 if closed else force_in[0]  # a recorded force did not begin with its record
+    held = start[4]
     lagged = held
     hyst = 0.0
     e_old, u_old, y_old, y_older, v_f = start[3], start[4], 0.0, 0.0, 0.0

@@ -13,6 +13,7 @@ from sioms.reconcile.rules import NEARLY, negligible
 
 #: A refitted candidate: fit, held-out losses, share saved, standard errors.
 Tried = tuple[Fit, Array, float, float]
+AND = " and "
 
 
 def plainer(name: str, names: Sequence[str]) -> list[str]:
@@ -61,7 +62,7 @@ def unspecific(name: str, gains: dict[str, float]) -> bool:
 def simplest(good: dict[str, Tried]) -> str:
     """Of the candidates within one standard error and ``GAIN`` of the best, the one with the fewest parameters.
 
-    A named effect goes before a nameless term that does no better.
+    A named effect goes before a nameless term that does no better. Names may be of several effects at once, joined by ``AND``.
     """
     best = max(good, key=lambda n: good[n][2])
     near = []
@@ -69,7 +70,12 @@ def simplest(good: dict[str, Tried]) -> str:
         lost, sure = better(good[best][1], loss)
         if negligible(lost, sure):
             near.append(n)
-    return min(near, key=lambda n: (n not in library(), size(n), -good[n][2]))
+
+    def plain(joined: str) -> tuple[bool, int, float]:
+        names = joined.split(AND)
+        return any(n not in library() for n in names), sum(map(size, names)), -good[joined][2]
+
+    return min(near, key=plain)
 
 
 def physical(fit: Fit, name: str) -> bool:

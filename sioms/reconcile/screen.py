@@ -30,6 +30,7 @@ GRID_GAP = tuple(float(g) for g in np.geomspace(3e-4, 6e-2, 20))
 GRID_ZETA = (0.05, 0.3)
 GRID_LIMIT = (0.95, 0.85, 0.7, 0.5, 0.3)
 GRID_TAU = (3.0, 10.0, 40.0)
+STEP_LENGTH = 3.5  # from one trial of a length to the next
 GRID_PHASE = np.linspace(-np.pi, np.pi, 9)[1:]
 SPEED_STEPS, PLACES = 7, 15
 #: Below this the measured motion stands for one without noise; a command is followed up to COMMAND_HZ, if to this share.
@@ -365,8 +366,11 @@ def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator
         case Slot.THERMAL:
             grid = tuple({"tau": g, "loss": 0.1} for g in GRID_TAU)
         case Slot.HYSTERESIS:
-            low, high = (effect.parameters[1].lower, effect.parameters[1].upper)
-            grid = tuple({"xs": float(g) * model.pitch} for g in np.geomspace(10.0 * low, 0.8 * high, 4))
+            reach = 0.5 * max(float(np.ptp(r.position)) for r in problem.session.records)
+            low = 10.0 * effect.parameters[1].lower * model.pitch
+            high = max(min(0.8 * effect.parameters[1].upper * model.pitch, reach), low)
+            steps = 1 + int(np.ceil(np.log(high / low) / np.log(STEP_LENGTH)))
+            grid = tuple({"xs": float(g)} for g in np.geomspace(low, high, steps))
         case Slot.SCALE:
             grid = ({first: 1.01},)
         case Slot.ECCENTRICITY:

@@ -19,6 +19,7 @@ from sioms.reconcile.effects import known
 from sioms.reconcile.fit import BASE, Fit, Problem, closed_errors, refit
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.plausible import (
+    AND,
     Tried,
     physical,
     plainer,
@@ -298,7 +299,7 @@ class Searcher:
 
         Both must be sure together, and each must earn its place beside the other.
         """
-        best: tuple[Fit, Array, Step] | None = None
+        pairs: dict[str, Tried] = {}
         if fit.ratio < PAIRED:
             return None
         for first in self._candidates(fit)[:PAIRS]:
@@ -309,7 +310,9 @@ class Searcher:
             for second in [
                 s for s in self._candidates(middle) if s.effect not in known()[first.effect].replaces
             ][:PAIRS]:
-                new = self._with(middle, second, 8, middle.cost if best is None else best[0].cost)
+                new = self._with(
+                    middle, second, 8, min((t[0].cost for t in pairs.values()), default=middle.cost)
+                )
                 if first.effect not in new.model.effects:
                     continue
                 loss = self.loss(new)
@@ -321,13 +324,13 @@ class Searcher:
                     and more >= SPECIFIC
                     and surer >= self._sure(second.effect)
                 )
-                if good and self._sound(new, fit) and (best is None or new.cost < best[0].cost):
-                    best = (
-                        new,
-                        loss,
-                        Step("add", f"{first.effect} and {second.effect}", new.ratio, gain, new.model),
-                    )
-        return best
+                if good and self._sound(new, fit):
+                    pairs[f"{first.effect}{AND}{second.effect}"] = new, loss, gain, sure
+        if not pairs:
+            return None
+        both = simplest(pairs)
+        new, loss, gain, _ = pairs[both]
+        return new, loss, Step("add", both, new.ratio, gain, new.model)
 
     def _sound(self, new: Fit, fit: Fit) -> bool:
         """Say whether a model can be, and the closed loop does not suffer by it."""

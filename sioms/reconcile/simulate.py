@@ -313,7 +313,7 @@ def track(
             _true_place(p.plant, y[0]),
             _first_speed(y, model.sample_time_s) / p.plant[k.GAIN_Y],
             temperature,
-            *(0.0, 0.0, 0.0, 0.0),
+            *(0.0, force[0], 0.0, 0.0),  # a recorded force did not begin with its record
         ]
     )
     if p.plant[k.LOAD] > 0.0 and p.plant[k.GAP] == 0.0 and _moves(y, model):

@@ -45,6 +45,7 @@ CASES: dict[str, dict[str, float]] = {
 
 def driven(model: AxisModel, force: np.ndarray = FORCE) -> tuple[np.ndarray, np.ndarray]:
     """Return the true positions of the twin (second of two motors) and of the simulation."""
+    force = np.concatenate([[0.0], force])  # what is recorded from the first sample on may act from before
     motors, effects, laws = twins({1: model}, [Motor(1.0), Motor(1.0, coulomb=5.0)], ["other", "axis"], DT)
     bank, x = MotorBank(motors, DT, effects, laws=laws), []
     for f in force:

@@ -228,7 +228,7 @@ TERMS = (
         "dF/dx = (f sign(v) - F)/length, force -F",
         None,
         Parameter("f", "{F}", Ref.FORCE, 0.0, 1.5, 0.05, "level long after a reversal"),
-        Parameter("xs", "{x}", Ref.PITCH, 5e-3, 1.0, 0.05, "displacement over which it builds up"),
+        Parameter("xs", "{x}", Ref.PITCH, 5e-3, 100.0, 0.05, "displacement over which it builds up"),
         slot=Slot.HYSTERESIS,
         replaces=("presliding", "coulomb", "stribeck", "coulomb_position"),
         lookalikes=("coulomb",),
