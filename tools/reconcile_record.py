@@ -9,8 +9,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 import sioms
 from sioms.client.node import AxisNode
@@ -29,9 +31,9 @@ POLL_S = 0.02
 SETTLE_S, LEAD_S = 0.4, 0.1
 #: Commands written ahead of the motion.
 AHEAD = 400
-#: So many periods without a tick are filled in; a record that lost more counts up to there if this share of it is left, else
-#: it is run again, so many times.
-MOST_FILLED = 4
+#: So many periods without a tick are filled in; where more were lost, one record ends and another begins. The run is made again,
+#: so many times, unless this share of it is left in records of so many samples at least.
+MOST_FILLED, LEAST = 4, 250
 ENOUGH, TRIES = 0.6, 6
 
 
@@ -52,7 +54,7 @@ def perform(
         recorder, out = Recorder(axis, envelope), []
         for e in experiments:
             say(f"running {e.name} ({len(e.command) / axis.info.tick_hz:.0f} s)")
-            out.append(recorder.run(e))
+            out += recorder.run(e)
         return out
 
 
@@ -68,11 +70,11 @@ class Recorder:
     node: AxisNode
     envelope: Envelope
 
-    def run(self, experiment: Experiment) -> Record:
+    def run(self, experiment: Experiment) -> list[Record]:
         """Run one experiment from rest at its first position.
 
         Returns:
-            Position, force and command at the rate of the axis, without a gap.
+            Position, force and command at the rate of the axis, without a gap; several records where the machine lost ticks.
 
         Raises:
             ExperimentStopped: by a stop, a fault, a refusal, or because the machine loses ticks.
@@ -86,9 +88,9 @@ class Recorder:
                 raise ExperimentStopped(
                     f"run {experiment.name} on {self.node.name}: {error.strerror or error}"
                 ) from error
-            record = uniform(experiment.name, seen, 1.0 / self.node.info.tick_hz)
-            if len(record) >= ENOUGH * len(experiment.command):
-                return record
+            records = uniform(experiment.name, seen, 1.0 / self.node.info.tick_hz)
+            if sum(map(len, records)) >= ENOUGH * len(experiment.command):
+                return records
             lost += 1
         raise ExperimentStopped(
             f"record {experiment.name} on {self.node.name}: ticks were missing in {lost} runs; the machine is too busy to "
@@ -161,16 +163,21 @@ def knots(command: Array, dt: float, max_velocity: float, max_acceleration: floa
     return [sioms.command(**w) for w in words]
 
 
-def uniform(name: str, seen: Sequence[AxisSnapshot], dt: float) -> Record:
-    """Lay snapshots on the grid of the axis's rate, by their time stamps.
+def uniform(name: str, seen: Sequence[AxisSnapshot], dt: float) -> list[Record]:
+    """Lay snapshots on the grid of the axis's rate, by their time stamps, from one long hole to the next.
 
-    On a busy machine a tick comes late and the next one early. Of two in one period the later counts, a period
-    without one is filled in (its force is the one that was held), and a longer hole ends the record.
+    On a busy machine a tick comes late and the next one early. Of two in one period the later counts, and a period without one
+    is filled in (its force is the one that was held).
     """
     periods = np.rint(np.diff([s.stamp_ns for s in seen]) * 1e-9 / dt).astype(np.int64)
-    holes = np.flatnonzero(periods > MOST_FILLED)
-    count = int(holes[0]) + 1 if len(holes) else len(seen)
-    at = np.concatenate([[0], np.cumsum(periods[: count - 1])])
+    edges = [0, *(np.flatnonzero(periods > MOST_FILLED) + 1).tolist(), len(seen)]
+    parts = [(a, b) for a, b in pairwise(edges) if np.sum(periods[a : b - 1]) >= LEAST]
+    names = [name] if len(parts) == 1 else [f"{name}_{i + 1}" for i in range(len(parts))]
+    return [_even(n, seen[a:b], periods[a : b - 1], dt) for n, (a, b) in zip(names, parts, strict=True)]
+
+
+def _even(name: str, seen: Sequence[AxisSnapshot], periods: NDArray[np.int64], dt: float) -> Record:
+    at = np.concatenate([[0], np.cumsum(periods)])
     last = np.flatnonzero(np.diff(at, append=at[-1] + 1) > 0)
     at, kept = at[last], [seen[i] for i in last.tolist()]
     grid = np.arange(at[-1] + 1)

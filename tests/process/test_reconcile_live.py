@@ -117,7 +117,7 @@ def test_a_hidden_friction_is_named_and_the_twin_takes_the_model(daemon: Daemon,
     friction = found["parameters"]["coulomb"]["Fc"]
     assert friction == pytest.approx(LEVEL, rel=0.05)
     records = sorted(p.name for p in (tmp_path / "report" / "records").glob("*.csv"))
-    assert "one_speed.csv" in records
+    assert any(name.startswith("one_speed") for name in records)
     for name in records:  # the axis stayed well within its limits
         positions = [
             float(line.split(",")[1])
@@ -173,7 +173,7 @@ def test_two_effects_that_look_alike_are_told_apart_by_the_experiment_it_designs
     assert found["parameters"]["gravity"]["phase"] == pytest.approx(-math.pi / 2, abs=0.03)
     assert "offset" in {**found["details"][0]["ruled_out"]}
     records = {p.stem for p in (tmp_path / "report" / "records").glob("*.csv")}
-    assert "one_speed" in records
+    assert any(name.startswith("one_speed") for name in records)
     assert any(name.startswith("separate_") for name in records)
 
 
