@@ -67,6 +67,7 @@ class Belief:
         apex: share of the apex's shift under sliding (0: the commanded place is the middle of contact).
         around: Poisson's ratio about which contacts are solved, 0 for ``poisson`` itself.
         strip: half widths of contact vary by amplitude [1] and phase [rad] over a period of the place [rad].
+        uneven: the linear output varies by amplitude [1] and phase [rad] over a period of the place [rad].
         creep, creep_time: share of a step that comes late, and its time constant [s].
         cell: relative error of the load cell.
         temperature: drift of the output [1/K], shape (ns,).
@@ -90,6 +91,7 @@ class Belief:
     apex: float = 0.0
     around: float = 0.0
     strip: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    uneven: tuple[float, float, float] = (0.0, 0.0, 1.0)
     creep: float = 0.0
     creep_time: float = 1.0
     cell: float = 0.0
@@ -214,6 +216,9 @@ def outputs(b: Belief, scene: Scene) -> Floats:
     """Return the output of every element under every touch, without creep, shape (nt, ns)."""
     seen = replace(scene, distance=b.angle - (scene.place + b.offset)[:, None])
     linear = -strains(b, scene) / b.gain
+    amplitude, phase, period = b.uneven
+    if amplitude:
+        linear = linear * (1.0 + amplitude * np.sin(2.0 * np.pi * scene.place / period + phase))[:, None]
     out: Floats = linear + b.quadratic * linear**2
     for response, parameters in b.responses:
         out = response(out, seen, parameters)

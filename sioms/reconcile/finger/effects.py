@@ -61,16 +61,10 @@ def pulled(output: Floats, scene: Scene, p: Floats) -> Floats:
     return out
 
 
-def waved(output: Floats, scene: Scene, p: Floats) -> Floats:
-    """Multiply by 1 + G sin(2 pi place / period + phase)."""
-    out: Floats = output * (1.0 + p[0] * np.sin(2.0 * np.pi * scene.place / p[2] + p[1]))[:, None]
-    return out
-
-
 def _strip(b: Belief, v: Values) -> Belief:
-    return replace(b, strip=(float(v["W"][0]), float(v["turn"][0]), float(v["period"][0]))).responding(
-        waved, np.concatenate([v["G"], v["phase"], v["period"]])
-    )
+    period = float(v["period"][0])
+    loud, wide = ((float(v[a][0]), float(v[turn][0]), period) for a, turn in (("G", "phase"), ("W", "turn")))
+    return replace(b, uneven=loud, strip=wide)
 
 
 def leaked(output: Floats, scene: Scene, p: Floats) -> Floats:
@@ -222,7 +216,7 @@ STRIP = SensorEffect(
     title="copper strips make the layer uneven",
     channel=MECHANICS,
     change=_strip,
-    equation="d = d (1 + G sin(2 pi t_c/period + phase)), half width (1 + W sin(2 pi t_c/period + turn))",
+    equation="l = l (1 + G sin(2 pi t_c/period + phase)), half width (1 + W sin(2 pi t_c/period + turn))",
     parameters=(
         Quantity("G", "1", 0.0, 0.5, 0.02, "amplitude of the gain over the place of touch"),
         Quantity("phase", "rad", -np.pi, np.pi, 0.3, "phase at angle zero", phase=True),

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sioms.reconcile.jit import kernel
 
 Floats = NDArray[np.float64]
 PLAYS = 8
@@ -140,14 +142,30 @@ class Loops:
         return out
 
     def _follow_forgetful(self, load: Floats) -> Floats:
-        steps = np.diff(load, axis=0, prepend=self._load[None]) * self._slope
-        out = np.empty_like(load)
-        for i, (way, far) in enumerate(zip(np.where(steps < 0.0, -1.0, 1.0), np.abs(steps), strict=True)):
-            ahead = self._ahead * way
-            back = np.clip(-ahead, 0.0, far)
-            out[i] = self._ahead = way * (1.0 - (1.0 - ahead - back) * np.exp(back - far))
-        self._load = load[-1]
+        out = np.diff(load, axis=0, prepend=self._load[None]) * self._slope
+        if len(out) > 1:
+            _compiled()(self._ahead, out)
+        else:
+            forget(self._ahead, out)
+        self._load, self._ahead = load[-1], out[-1].copy()
         return out
+
+
+def forget(ahead: Floats, steps: Floats) -> None:
+    """Put how far ahead the loops are, -1 to 1, in the place of steps of the load in units of their slope, shape (t, n)."""
+    for j in range(steps.shape[1]):
+        here = ahead[j]
+        for i in range(steps.shape[0]):
+            step = steps[i, j]
+            way, far = (-1.0, -step) if step < 0.0 else (1.0, step)
+            back = min(max(-here * way, 0.0), far)
+            here = way * (1.0 - (1.0 - here * way - back) * np.exp(back - far))
+            steps[i, j] = here
+
+
+@cache
+def _compiled() -> Callable[[Floats, Floats], None]:
+    return kernel(forget)
 
 
 def lagged(

@@ -24,7 +24,7 @@ FLOOR = 1.15  # stop at this multiple of the noise floor, which is of a sensor's
 TRIES = 5
 STEPS = 8
 MOST_INSIDE = 0.7  # share of the elements whose own number must be one that the effect can have
-DEEP = 3.0  # standard errors of a saving below the floor
+DEEP = 3.0  # standard errors, over all blocks, of a saving below the floor
 FEWER = 2  # times as few numbers has a nameless rule that takes the place of elements' own numbers
 CLEAR = 0.95  # share of a view that a name must save where the view stays above its floor
 #: Two effects are tried at once only where a view is above this multiple of its floor, so many firsts and seconds.
@@ -406,13 +406,13 @@ class Searcher:
     def credible(self, found: Found) -> Found:
         """Keep only names that explain nearly all of a view in which something has no name: less may be a part of that.
 
-        What has no name in one view may have a part in all views of its footing.
+        What has no name in one view may have a part in all views of its footing, and a small one in any.
         """
         model, views, group = found.fit.model, self.data.views, self.data.footing
         odd = {group[views.index(view)] for view in self._loud(found.fit)}
         for name in [n for n in model.effects if n in self.names and n not in self.frozen]:
             gap = self.lost(self.loss(self.fit(found.fit.model.without_effect(name), 4)), found.losses)
-            if group[views.index(gap.view)] in odd and gap.share < CLEAR:
+            if gap.share < (CLEAR if group[views.index(gap.view)] in odd else SPECIFIC):
                 model = model.without_effect(name)
         if model is found.fit.model:
             return found
@@ -516,8 +516,8 @@ def _sure(saved: Saving, least: float) -> bool:
 
 
 def _beyond_noise(saved: Saving) -> bool:
-    """Say whether what is saved below the floor is too much, and too sure, for noise."""
-    return saved.share >= SPECIFIC and saved.errors >= DEEP and saved.total >= GAIN
+    """Say whether what is saved of everything below the floor is too much, and too sure, for noise."""
+    return saved.total >= GAIN and saved.surely >= DEEP
 
 
 def _termed(model: SensorModel) -> bool:
