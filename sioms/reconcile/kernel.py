@@ -179,7 +179,7 @@ def march(
     held = start[4]
     lagged = held
     hyst = 0.0
-    e_old, u_old, y_old, y_older, v_f = start[3], start[4], 0.0, 0.0, 0.0
+    e_old, u_old, y_old, y_older, v_f = start[3], start[4], 0.0, 0.0, gain_y * v
     off = 0
     level, acting = 0.0, summed(forces, pf, x, v, u_old, temp)
     u_all = np.zeros(n)
@@ -191,8 +191,8 @@ def march(
             if plant[QUANTUM] > 0.0:
                 y = np.round(y / plant[QUANTUM]) * plant[QUANTUM]
             if i == 0:
-                y_old = y
-                y_older = y
+                y_old = y - v_f * dt
+                y_older = y_old - v_f * dt
             if ctl[CTL_MEAN] > 0.0:
                 v_f = 0.5 * (y - y_older) / dt
             else:

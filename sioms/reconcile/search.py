@@ -259,10 +259,16 @@ class Searcher:
             for s in self._candidates(fit, TRIES):
                 self._try(tried, s.effect, self._with(fit, s, 5), losses)
             sure, good = self._good(tried, fit, losses)
-        if not good:
+        while good:
+            name = simplest(good)
+            new = self.fit(good[name][0].model)  # settled, it may be what cannot be
+            if self._sound(new, fit):
+                break
+            del good[name]
+        else:
             return None
-        name = simplest(good)
-        new, loss, gain, _ = good[name]
+        loss = self.loss(new)
+        gain, _ = better(loss, losses)
         if gain < SPECIFIC and unspecific(name, {n: t[2] for n, t in tried.items()}):
             return None
         rivals = {n: t[2] for n, t in tried.items() if n != name}

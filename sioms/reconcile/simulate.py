@@ -210,7 +210,7 @@ def simulate(model: AxisModel, command: Array, temperature: float = 0.0, substep
 
 
 def replay(model: AxisModel, record: Record, temperature: float = 0.0) -> Run:
-    """Simulate the closed loop over a record: its command, from rest where it began, under the force that held it.
+    """Simulate the closed loop over a record: its command, from where and as fast as it began, under the force of then.
 
     Raises:
         ValueError: the record has no command, or the model no controller.
@@ -222,7 +222,9 @@ def replay(model: AxisModel, record: Record, temperature: float = 0.0) -> Run:
     y = record.position[0]
     added = record.feedforward
     held = record.force[0] - (0.0 if added is None else added[0])
-    start = np.array([_true_place(p.plant, y), 0.0, temperature, command[0] - y, held, 0.0, 0.0])
+    speed = _first_speed(record.position, model.sample_time_s) if _moves(record.position, model) else 0.0
+    x, v = _true_place(p.plant, y), speed / p.plant[k.GAIN_Y]
+    start = np.array([x, v, temperature, command[0] - y, held, 0.0, 0.0])
     return _march(p, True, command, command, added, record.external, controller_row(model), (0.0, 0.0), start)
 
 
