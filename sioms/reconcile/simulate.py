@@ -218,14 +218,20 @@ def replay(model: AxisModel, record: Record, temperature: float = 0.0) -> Run:
     if record.command is None:
         raise ValueError(f"simulate record {record.name}: it has no command; a closed loop needs one")
     command = np.ascontiguousarray(record.command, dtype=np.float64)
-    p = pack(model)
-    y = record.position[0]
-    added = record.feedforward
+    p, y, added = pack(model), record.position, record.feedforward
     held = record.force[0] - (0.0 if added is None else added[0])
-    speed = _first_speed(record.position, model.sample_time_s) if _moves(record.position, model) else 0.0
-    x, v = _true_place(p.plant, y), speed / p.plant[k.GAIN_Y]
-    start = np.array([x, v, temperature, command[0] - y, held, 0.0, 0.0])
-    return _march(p, True, command, command, added, record.external, controller_row(model), (0.0, 0.0), start)
+    start = np.array([_true_place(p.plant, y[0]), 0.0, temperature, command[0] - y[0], held, 0.0, 0.0])
+
+    def run(at: Array, n: int) -> Run:
+        force, outer = (None if a is None else a[:n] for a in (added, record.external))
+        return _march(p, True, command[:n], command[:n], force, outer, controller_row(model), (0.0, 0.0), at)
+
+    if _moves(y, model):
+        n = _at_first(y, model.sample_time_s)
+        moving = start.copy()
+        moving[1] = _first_speed(y, model.sample_time_s) / p.plant[k.GAIN_Y]
+        start = min((start, moving), key=lambda at: float(np.sum((run(at, n).position - y[:n]) ** 2)))
+    return run(start, len(command))
 
 
 def _true_place(plant: Array, y: float) -> float:
