@@ -251,6 +251,8 @@ class Searcher:
         for s in sorted(chosen, key=lambda s: known()[s.effect].slot is Slot.BACKLASH):
             best = min((t[0].cost for t in tried.values()), default=np.inf)
             self._try(tried, s.effect, self._with(fit, s, 8 if s is chosen[0] else 5, best), losses)
+        for effect, new in self._enriched(tried):
+            self._try(tried, effect, new, losses)
         if max((t[2] for t in tried.values()), default=0.0) < CLEAR:
             for effect, new in self._afresh(fit):
                 self._try(tried, effect, new, losses)
@@ -363,6 +365,17 @@ class Searcher:
         gain, sure = better(loss, losses)
         if effect not in tried or gain > tried[effect][2]:
             tried[effect] = (new, loss, gain, sure)
+
+    def _enriched(self, tried: Mapping[str, Tried]) -> list[tuple[str, Fit]]:
+        """Start rich effects from their plain form too, where both were tried: from far the speed of a drop is not found."""
+        pairs = [
+            (n, o) for n in tried for o in plainer(n, self.names) if o in tried and o in known()[n].replaces
+        ]
+        return [
+            (name, self._with(tried[other][0], start, 5))
+            for name, other in pairs
+            for start in self._upgrades(tried[other][0], [name])[:1]
+        ]
 
     def _afresh(self, fit: Fit) -> list[tuple[str, Fit]]:
         """Add the best candidates to the plain form of each rich friction law, then enrich it afresh."""
