@@ -73,11 +73,7 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
                     fit,
                 )
             )
-    best: dict[tuple[str, str], Rival] = {}
-    for r in out:
-        if (r.effect, r.rival) not in best or r.missed < best[r.effect, r.rival].missed:
-            best[r.effect, r.rival] = r
-    return sorted(best.values(), key=lambda r: r.missed)
+    return rules.closest(out)
 
 
 def settle(

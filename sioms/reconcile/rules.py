@@ -60,6 +60,15 @@ class Tried(Protocol):
     def rivals(self) -> Mapping[str, float]: ...
 
 
+def closest(rivals: Iterable[Rival[F]]) -> list[Rival[F]]:
+    """Keep of each look-alike of each effect the fit that misses least, the closest first."""
+    best: dict[tuple[str, str], Rival[F]] = {}
+    for r in rivals:
+        if (r.effect, r.rival) not in best or r.missed < best[r.effect, r.rival].missed:
+            best[r.effect, r.rival] = r
+    return sorted(best.values(), key=lambda r: r.missed)
+
+
 def told_apart(
     name: str,
     lookalikes: Container[str],

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.reconcile import ladder
 from sioms.reconcile.blocks import better, block_ids, heldout
 from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import known
@@ -57,25 +58,8 @@ POLISHED = (("gap", 0.08), ("gap", 0.025), ("gap", 0.008))
 KEPT_BYTES = 128_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
-    """One step of the ladder: what was done, what it saved, what remained, in units of the expected innovation."""
-
-    action: str
-    effect: str
-    ratio: float
-    saved: float
-    model: AxisModel
-    rivals: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """Result of a search."""
-
-    fit: Fit
-    losses: Array
-    ladder: tuple[Step, ...]
+Step = ladder.Step[AxisModel]
+Found = ladder.Found[Fit, AxisModel]
 
 
 @dataclass(slots=True)
@@ -175,25 +159,23 @@ class Searcher:
         """Search from a model."""
         fit = self.fit(start)
         losses = self.loss(fit)
-        ladder = [Step("start", "", fit.ratio, 0.0, fit.model)]
+        steps = [Step("start", "", fit.ratio, 0.0, fit.model)]
         for _ in range(STEPS):
             if fit.ratio <= FLOOR:
                 break
             step = self._add(fit, losses) or self._add_pair(fit, losses)
             if step is None:
                 break
-            ladder.append(step[2])
+            steps.append(step[2])
             fit, losses = step[0], step[1]
-            self.progress(
-                f"{ladder[-1].action} {ladder[-1].effect}: residual {fit.ratio:.2f} of the expected"
-            )
-            fit, losses = self._simplify(fit, losses, ladder)
-            fit, losses = self._eliminate(fit, losses, ladder)
-        return Found(fit, losses, tuple(ladder))
+            self.progress(f"{steps[-1].action} {steps[-1].effect}: residual {fit.ratio:.2f} of the expected")
+            fit, losses = self._simplify(fit, losses, steps)
+            fit, losses = self._eliminate(fit, losses, steps)
+        return Found(fit, losses, tuple(steps))
 
     def plainly(self, found: Found) -> Found:
         """Take back what a searched order enriched, unless it saves half: where much is unexplained some order always fits."""
-        fit, losses, ladder = found.fit, found.losses, list(found.ladder)
+        fit, losses, steps = found.fit, found.losses, list(found.ladder)
         for name in [n for n in fit.model.effects if n not in self.frozen and self._enrichment(n)]:
             other = next(o for o in plainer(name, self.names) if o in known()[name].replaces)
             new = self.fit(swapped(fit.model, name, other), 6)
@@ -201,8 +183,8 @@ class Searcher:
             lost, _ = better(losses, loss)
             if lost < CLEAR:
                 fit, losses = new, loss
-                ladder.append(Step("simplify", f"{name} to {other}", fit.ratio, -lost, fit.model))
-        return Found(fit, losses, tuple(ladder))
+                steps.append(Step("simplify", f"{name} to {other}", fit.ratio, -lost, fit.model))
+        return Found(fit, losses, tuple(steps))
 
     def _candidates(self, fit: Fit, passed: int = 0) -> list[Start]:
         """Screen what may be added: the best few after so many, and their look-alikes."""
@@ -397,7 +379,7 @@ class Searcher:
     def _sure(self, name: str) -> float:
         return PERIODIC_SURE if any(p.fixed for p in known()[name].parameters) else SURE
 
-    def _eliminate(self, fit: Fit, losses: Array, ladder: list[Step]) -> tuple[Fit, Array]:
+    def _eliminate(self, fit: Fit, losses: Array, steps: list[Step]) -> tuple[Fit, Array]:
         """Let effects leave that no longer save their share."""
         for name in [n for n in fit.model.effects if n not in self.frozen]:
             if len([n for n in fit.model.effects if n not in self.frozen]) < 2:
@@ -407,10 +389,10 @@ class Searcher:
             gain, sure = better(losses, loss)
             if (negligible(gain, sure) and self._possible(without, fit)) or small(fit.model, name):
                 fit, losses = without, loss
-                ladder.append(Step("leave", name, fit.ratio, -gain, fit.model))
+                steps.append(Step("leave", name, fit.ratio, -gain, fit.model))
         return fit, losses
 
-    def _simplify(self, fit: Fit, losses: Array, ladder: list[Step]) -> tuple[Fit, Array]:
+    def _simplify(self, fit: Fit, losses: Array, steps: list[Step]) -> tuple[Fit, Array]:
         """Put a simpler look-alike in the place of a richer effect where it does as well."""
         for name in [n for n in fit.model.effects if n not in self.frozen]:
             for other in plainer(name, self.names):
@@ -421,7 +403,7 @@ class Searcher:
                 lost, sure = better(losses, loss)
                 if negligible(lost, sure):
                     fit, losses = new, loss
-                    ladder.append(Step("simplify", f"{name} to {other}", fit.ratio, -lost, fit.model))
+                    steps.append(Step("simplify", f"{name} to {other}", fit.ratio, -lost, fit.model))
                     break
         return fit, losses
 

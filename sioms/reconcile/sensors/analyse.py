@@ -15,12 +15,14 @@ from sioms.reconcile.excitation import SAME
 from sioms.reconcile.locate import Place
 from sioms.reconcile.noise import effective_samples
 from sioms.reconcile.rules import GAIN, negligible, told_apart
+from sioms.reconcile.sensors.ambiguity import Rival, settle
 from sioms.reconcile.sensors.effect import TERM_PREFIX, Array, SensorEffect, SensorModel
 from sioms.reconcile.sensors.fit import Fit, half_intervals, on_one_footing, ratios, refit
 from sioms.reconcile.sensors.locate import locate
 from sioms.reconcile.sensors.refuse import burst_share, smoother_shares
 from sioms.reconcile.sensors.screen import screening_columns
-from sioms.reconcile.sensors.search import Found, Rival, Searcher
+from sioms.reconcile.sensors.search import Found, Searcher
+from sioms.reconcile.sensors.stand_ins import credible, displaced, ruled
 from sioms.reconcile.sensors.steady import changes
 from sioms.reconcile.sensors.subject import Subject
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
@@ -59,7 +61,7 @@ def analyse(subject: Subject, options: Options | None = None) -> SensorVerdict:
     before = tuple(found.fit.model.effects)
     if (
         _odd(searcher, found, share, where)
-        or searcher.displaced(found)
+        or displaced(searcher, found)
         or _stand_ins(subject, searcher, found, names)
     ):
         o.progress(
@@ -70,12 +72,12 @@ def analyse(subject: Subject, options: Options | None = None) -> SensorVerdict:
         found, names = _without_stand_ins(subject, searcher, found, names)
         searcher.names = names
     o.progress("identifiability: look-alikes in the place of each effect")
-    found, others = searcher.settle(found, pairs)
+    found, others = settle(searcher, found, pairs)
     missing = {n: text for n, text in missing.items() if n not in found.fit.model.effects}
     share, where = _smoothed(subject, searcher, found)
     left = _odd(searcher, found, share, where)
     if left:
-        found = searcher.credible(found)
+        found = credible(searcher, found)
         others = [r for r in others if r.effect in found.fit.model.effects]
     rejected = tuple(n for n in before if n not in found.fit.model.effects)
     return _conclude(subject, o, searcher, found, others, missing, pairs, share, left, bursts, rejected)
@@ -128,7 +130,7 @@ def _without_stand_ins(
 
 def _stand_ins(subject: Subject, searcher: Searcher, found: Found, names: Sequence[str]) -> tuple[str, ...]:
     """Return those of these names that are not the same everywhere, or of which one nameless rule does as well."""
-    return _unsteady(subject, searcher, found, names) or searcher.ruled(found, names)
+    return _unsteady(subject, searcher, found, names) or ruled(searcher, found, names)
 
 
 def _unsteady(subject: Subject, searcher: Searcher, found: Found, names: Sequence[str]) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sioms.reconcile.locate import Place
 from sioms.reconcile.sensors.effect import Array, SensorModel
-from sioms.reconcile.sensors.search import Rung
+from sioms.reconcile.sensors.search import Step
 from sioms.reconcile.verdict import Gap, NamedEffect, Outcome
 
 
@@ -60,7 +60,7 @@ class SensorVerdict:
     alternatives: tuple[tuple[str, ...], ...]
     symbolic: tuple[NamedEffect, ...]
     gaps: tuple[Gap, ...]
-    ladder: tuple[Rung, ...]
+    ladder: tuple[Step, ...]
     floors: dict[str, float]
     missing: dict[str, str]
     pairs: tuple[tuple[str, str, float], ...]
