@@ -20,6 +20,7 @@ from sioms.client.snapshot import AxisSnapshot
 from sioms.reconcile.effect import Array
 from sioms.reconcile.experiment import Envelope, Experiment
 from sioms.reconcile.records import Record
+from sioms.reconcile.timing import LEAST_SAMPLES
 from sioms.tools.stopping import ExperimentStopped as ExperimentStopped
 from sioms.tools.stopping import check_running
 
@@ -32,8 +33,8 @@ SETTLE_S, LEAD_S = 0.4, 0.1
 #: Commands written ahead of the motion.
 AHEAD = 400
 #: So many periods without a tick are filled in; where more were lost, one record ends and another begins. The run is made again,
-#: so many times, unless this share of it is left in records of so many samples at least.
-MOST_FILLED, LEAST = 4, 250
+#: so many times, unless this share of it is left in records that are long enough.
+MOST_FILLED = 4
 ENOUGH, TRIES = 0.6, 6
 
 
@@ -171,7 +172,7 @@ def uniform(name: str, seen: Sequence[AxisSnapshot], dt: float) -> list[Record]:
     """
     periods = np.rint(np.diff([s.stamp_ns for s in seen]) * 1e-9 / dt).astype(np.int64)
     edges = [0, *(np.flatnonzero(periods > MOST_FILLED) + 1).tolist(), len(seen)]
-    parts = [(a, b) for a, b in pairwise(edges) if np.sum(periods[a : b - 1]) >= LEAST]
+    parts = [(a, b) for a, b in pairwise(edges) if np.sum(periods[a : b - 1]) >= LEAST_SAMPLES]
     names = [name] if len(parts) == 1 else [f"{name}_{i + 1}" for i in range(len(parts))]
     return [_even(n, seen[a:b], periods[a : b - 1], dt) for n, (a, b) in zip(names, parts, strict=True)]
 

@@ -20,9 +20,9 @@ from sioms.reconcile.kernel import (
 from sioms.reconcile.model import AxisModel, controller_row
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.screen import dead_band, direction, smoothed_motion
+from sioms.reconcile.timing import LEAST_SAMPLES
 from sioms.reconcile.verdict import BadInputError
 
-LEAST_SAMPLES = 250
 LEAST_COUNTS = 20
 LEAST_TOTAL_S = 2.0
 #: The inertia the data show may differ from the nominal one by a payload, hardly by this factor.

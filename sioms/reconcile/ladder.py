@@ -16,7 +16,7 @@ class Step(Generic[M]):
     """One step: what was done, what it saved, what remained.
 
     Attributes:
-        action: "start", "add", "leave", "simplify", "swap" or "noise read again".
+        action: "start", "add", "leave", "simplify", "restart", "swap" or "noise read again".
         effect: what it was done with.
         ratio: root mean square of the residual, in units of what noise leaves.
         saved: share of the residual's energy on held-out blocks.

@@ -16,8 +16,8 @@ from scipy.interpolate import CubicSpline
 from sioms.reconcile.effect import Array
 from sioms.reconcile.records import Record, Session
 
-#: Longest gap that is interpolated [samples], largest share of all samples, and least length of what a gap leaves.
-LONGEST, MOST, LEAST = 5, 0.2, 250
+#: Longest gap that is interpolated [samples], largest share of all samples, and least length of a record, or of what a gap leaves of one.
+LONGEST, MOST, LEAST_SAMPLES = 5, 0.2, 250
 #: Share of a stamp's deviation by which the clock that counts the samples follows the stamps.
 FOLLOW = 0.05
 
@@ -51,7 +51,7 @@ def _pieces(record: Record, dt: float, notes: list[str]) -> list[Record]:
         )
         if a is not None
     ]
-    usable = len(record) >= LEAST and all(
+    usable = len(record) >= LEAST_SAMPLES and all(
         len(a) == len(record) and np.all(np.isfinite(a)) for a in (record.position, *arrays)
     )
     if record.time_s is None or not usable:
@@ -62,7 +62,7 @@ def _pieces(record: Record, dt: float, notes: list[str]) -> list[Record]:
     gaps = np.diff(place) - 1
     cuts = np.flatnonzero(gaps > LONGEST) + 1
     edges = [0, *cuts.tolist(), len(record)]
-    kept = [(a, b) for a, b in pairwise(edges) if place[b - 1] - place[a] + 1 >= LEAST]
+    kept = [(a, b) for a, b in pairwise(edges) if place[b - 1] - place[a] + 1 >= LEAST_SAMPLES]
     lost = int(sum(gaps[a : b - 1].sum() for a, b in kept))
     if not kept or lost > MOST * len(record):
         return [record]

@@ -177,6 +177,39 @@ def test_a_record_that_begins_in_motion_begins_with_the_transmission_wound_up() 
     assert np.sqrt(np.mean(p.residual(hidden) ** 2)) < 1.3
 
 
+def test_a_closed_loop_over_a_record_cut_in_motion_goes_on_as_the_whole() -> None:
+    """From rest the controller would throw the axis after its command: errors some fifty times as large."""
+    whole = session().records[0]
+    later = whole.cut(500, 2500)
+    assert abs(later.position[8] - later.position[0]) > 0.02
+    off = replay(AXIS, later).position - replay(AXIS, whole).position[500:2500]
+    assert np.abs(off).max() < 0.02 * np.abs(whole.position - COMMAND).max()
+    early = session(AXIS, 3.5 * (1.0 - np.cos(2 * np.pi * T))).records[0]
+    assert np.abs(replay(AXIS, early).position - early.position).max() < 5.0 * AXIS.resolution
+
+
+def test_a_stop_is_found_where_it_is() -> None:
+    hidden = AXIS.with_effect("term_stop_above", {"k": 0.05, "x0": 1.3})
+    p = problem(session(hidden))
+    best = screen(p, refit(p, AXIS), ["term_stop_above", "term_stop_below", "spring", "gravity"])[0]
+    assert best.effect == "term_stop_above"
+    found = refit(p, AXIS.with_effect(best.effect, best.values)).model.effects[best.effect]
+    assert found == pytest.approx({"k": 0.05, "x0": 1.3}, rel=0.02)
+
+
+def test_friction_that_follows_the_motion_is_told_from_one_that_stays() -> None:
+    slow = np.repeat([0.2, 1.0, 0.2, 1.0], 1000) * COMMAND / 1.4
+    slow = np.convolve(np.concatenate([np.zeros(100), slow]), np.ones(101) / 101, "valid")
+    values = {"g": 0.02, "tau": 0.8}
+    p = problem(session(AXIS.with_effect("term_warm_friction", values), slow))
+    fits = [
+        refit(p, AXIS.with_effect(*s))
+        for s in (("coulomb", {"Fc": 0.05}), ("term_warm_friction", {"g": 0.01, "tau": 2.0}))
+    ]
+    assert fits[1].model.effects["term_warm_friction"] == pytest.approx(values, rel=0.03)
+    assert fits[0].ratio > 3.0 * fits[1].ratio
+
+
 def test_a_force_that_keeps_time_is_told_from_what_the_motion_does() -> None:
     beside = 0.05 * np.sin(2 * np.pi * 12.37 * T + 0.4)
     shaken = Record("shaken", np.zeros(len(T)), beside, COMMAND, external=beside)
