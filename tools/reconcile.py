@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sioms.tools.arguments import positive, whole
 from sioms.tools.reconcile_sensors import add_parsers as add_sensors
 from sioms.tools.reconcile_sensors import run_sensor
 
@@ -41,11 +42,11 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "--columns", type=Path, metavar="FILE", help="column description (default: columns.toml beside DATA)"
     )
     axis.add_argument("--out", type=Path, default=Path("report"), metavar="DIR", help="where the report goes")
-    axis.add_argument("--seed", type=int, default=1, help="of permutations and bootstrap")
-    axis.add_argument("--jobs", type=int, default=0, help="cores to use (default: all)")
+    axis.add_argument("--seed", type=whole(), default=1, help="of permutations and bootstrap")
+    axis.add_argument("--jobs", type=whole(), default=0, help="cores to use (default: all)")
     axis.add_argument(
         "--resample",
-        type=int,
+        type=whole(),
         default=None,
         metavar="SEED",
         help="draw the blocks of time anew: does the verdict stand?",
@@ -61,14 +62,19 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         default="axis",
         help="what is generated (default axis)",
     )
-    test.add_argument("--axes", "--count", type=int, default=20, help="number of axes or sensors")
-    test.add_argument("--seed", type=int, default=1, help="of the generator")
+    test.add_argument("--axes", "--count", type=whole(1), default=20, help="number of axes or sensors")
+    test.add_argument("--seed", type=whole(), default=1, help="of the generator")
     test.add_argument(
         "--out", type=Path, default=None, metavar="DIR", help="keep what was generated and the answers here"
     )
-    test.add_argument("--jobs", type=int, default=0, help="solvers at a time (default: one for each core)")
     test.add_argument(
-        "--replicates", type=int, default=0, help="solve each so many times more with its blocks drawn anew"
+        "--jobs", type=whole(), default=0, help="solvers at a time (default: one for each core)"
+    )
+    test.add_argument(
+        "--replicates",
+        type=whole(),
+        default=0,
+        help="solve each so many times more with its blocks drawn anew",
     )
     effects = kinds.add_parser("effects", help="print the library of effects")
     effects.add_argument(
@@ -114,10 +120,14 @@ def _live_arguments(axis: argparse.ArgumentParser) -> None:
     group = axis.add_argument_group("with a node")
     group.add_argument("--yes", action="store_true", help="move without asking")
     group.add_argument(
-        "--travel", type=float, metavar="X", help="largest distance to either side of the present position"
+        "--travel", type=positive, metavar="X", help="largest distance to either side of the present position"
     )
     group.add_argument(
-        "--lap", type=float, default=3.0, metavar="S", help="length of a lap of each experiment (default 3)"
+        "--lap",
+        type=positive,
+        default=3.0,
+        metavar="S",
+        help="length of a lap of each experiment (default 3)",
     )
     group.add_argument(
         "--first",

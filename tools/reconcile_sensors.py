@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sioms.tools.arguments import positive, whole
+
 if TYPE_CHECKING:
     from sioms.reconcile.sensors.verdict import SensorVerdict
 
@@ -43,7 +45,7 @@ def add_parsers(kinds: Any) -> None:
         parser.add_argument(
             "--out", type=Path, default=Path("report"), metavar="DIR", help="where the report goes"
         )
-        parser.add_argument("--seed", type=int, default=1, help="of permutations and bootstrap")
+        parser.add_argument("--seed", type=whole(), default=1, help="of permutations and bootstrap")
         parser.add_argument("--quiet", action="store_true", help="no progress")
     score = kinds.add_parser("score", help="solve a folder of fingers whose truth is known")
     score.add_argument("data", type=Path, metavar="PUBLIC", help="one folder for each finger")
@@ -64,7 +66,11 @@ def _live_arguments(tactile: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--force", default="force0.fz", metavar="NODE", help="force on the finger (force0.fz)")
     group.add_argument(
-        "--length", type=float, default=0.012, metavar="M", help="length of contact along the finger (0.012)"
+        "--length",
+        type=positive,
+        default=0.012,
+        metavar="M",
+        help="length of contact along the finger (0.012)",
     )
     group.add_argument(
         "--indenters",
@@ -74,9 +80,9 @@ def _live_arguments(tactile: argparse.ArgumentParser) -> None:
         metavar="R",
         help="radii at hand in m, 0 an edge, inf a flat; the first is mounted, the others are asked for (0)",
     )
-    group.add_argument("--load", type=float, default=200.0, metavar="N/M", help="usual load (200)")
-    group.add_argument("--most-load", type=float, default=250.0, metavar="N/M", help="largest load (250)")
-    group.add_argument("--step", type=float, default=2.0, metavar="DEG", help="from place to place (2)")
+    group.add_argument("--load", type=positive, default=200.0, metavar="N/M", help="usual load (200)")
+    group.add_argument("--most-load", type=positive, default=250.0, metavar="N/M", help="largest load (250)")
+    group.add_argument("--step", type=positive, default=2.0, metavar="DEG", help="from place to place (2)")
     group.add_argument(
         "--first",
         choices=("full", "one_place"),
@@ -100,7 +106,11 @@ def _loading_arguments(force: argparse.ArgumentParser) -> None:
         "--first", choices=("full", "one"), default="full", help="what is applied before anything is decided"
     )
     group.add_argument(
-        "--rest", type=float, default=120.0, metavar="S", help="time without a load, where that decides (120)"
+        "--rest",
+        type=positive,
+        default=120.0,
+        metavar="S",
+        help="time without a load, where that decides (120)",
     )
     group.add_argument(
         "--install", type=Path, metavar="FILE", help="write the model there, for a simulated twin, and reload"
