@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Iterable
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
+
+from sioms.reconcile.ladder import Step
 
 F = TypeVar("F")
 
@@ -49,17 +51,6 @@ class Rival(Generic[F]):
         return self.missed < self.allowed or (self.errors < 1.0 and self.excess < DOUBTFUL)
 
 
-class Tried(Protocol):
-    """One step of a search: what entered, the share that it saved, and what its rivals saved."""
-
-    @property
-    def effect(self) -> str: ...
-    @property
-    def saved(self) -> float: ...
-    @property
-    def rivals(self) -> Mapping[str, float]: ...
-
-
 def closest(rivals: Iterable[Rival[F]]) -> list[Rival[F]]:
     """Keep of each look-alike of each effect the fit that misses least, the closest first."""
     best: dict[tuple[str, str], Rival[F]] = {}
@@ -73,7 +64,7 @@ def told_apart(
     name: str,
     lookalikes: Container[str],
     rivals: Iterable[Rival[F]],
-    ladder: Iterable[Tried],
+    ladder: Iterable[Step[Any]],
     present: Container[str],
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Say of each look-alike of a named effect why it is ruled out, or why it is not.
