@@ -14,6 +14,10 @@ from typing import Any
 import pytest
 from device_rigs import RIGS
 
+from sioms.protocol.flags import AxisStatus
+from sioms.tools.author import motion_trials
+from sioms.tools.author.station import Station, wait_for
+from sioms.tools.author.trial import Trial, Verdict, attempt
 from sioms.tools.counterparts.rigs import MAP_RIGS
 
 pytestmark = pytest.mark.timeout(300)
@@ -111,6 +115,29 @@ def test_a_driver_that_does_not_stop_fails() -> None:
     assert status == 1, said
     for name in ("stop running", "kill client"):
         assert trials[name]["verdict"] == "FAILED" and "rest" in trials[name]["expected"], trials[name]
+
+
+@pytest.mark.parametrize(("times", "verdict"), [(1, Verdict.PASSED), (9, Verdict.FAILED)])
+def test_a_trial_whose_device_faults_by_itself_is_tried_again_and_says_so(
+    times: int, verdict: Verdict
+) -> None:
+    (rig,) = (rig for rig in MAP_RIGS if rig.title == "oriental_az")
+    alarms = iter(range(times))
+
+    def to_be_stopped(station: Station, full: bool) -> str:
+        axis = station.rig.axes[0]
+        with station.cell.open(axis.node, "rw", timeout=5.0) as node:
+            motion_trials.run(station, node, axis)
+            motion_trials.wait_moving(station, node.read, axis)
+            if next(alarms, None) is not None and station.counterpart is not None:
+                station.counterpart.tell("alarm 133")  # its communication time-out, as of a host held up
+                assert wait_for(lambda: node.read().status[0] & AxisStatus.FAULT, 3.0)
+            return f"speed {motion_trials.wait_moving(station, node.read, axis):g}"
+
+    with Station(rig) as station:
+        result = attempt(Trial("to be stopped", "in motion", to_be_stopped), station, False)
+    assert result.verdict is verdict, result
+    assert "alarm 0x85" in result.seen and "oriental_az in fault at" in result.seen
 
 
 def test_a_report_is_a_page(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from sioms.protocol.flags import AxisStatus, ControlMode
 
 from ..counterparts.rigs import Axis, Output
 from .station import Station, wait_for
-from .trial import Failed, NotApplicable, Trial
+from .trial import Disturbed, Failed, NotApplicable, Trial
 
 REST_S = 3.0
 """Longest time from a stop to rest [s]; braking from the rig's velocity takes a small part of it."""
@@ -46,11 +46,19 @@ def wait_moving(station: Station, read: Callable[[], Any], axis: Axis) -> float:
     """Wait until an axis really moves; return how fast its device says that it does."""
     start = read().position[0]
     far = max(4 * axis.tolerance, 0.02 * axis.reach)
-    if not wait_for(lambda: abs(read().position[0] - start) > far, 5.0):
+
+    def ends() -> bool:
         seen = read()
-        told = (
-            f"{AxisStatus(int(seen.status[0]))!s}, in_motion {seen.in_motion[0]}, {seen.buffered[0]} buffered"
-        )
+        return abs(seen.position[0] - start) > far or bool(seen.status[0] & AxisStatus.FAULT)
+
+    wait_for(ends, 5.0)
+    seen = read()
+    if seen.status[0] & AxisStatus.FAULT:
+        what = f"{axis.node} in fault at {seen.position[0]:.6g}: {station.last_fault() or 'no reason in the log'}"
+        raise Disturbed("motion after the command", what, station.exchanges(12))
+    if abs(seen.position[0] - start) <= far:
+        status = AxisStatus(int(seen.status[0])).name
+        told = f"status {status or 0}, in_motion {seen.in_motion[0]}, {seen.buffered[0]} buffered"
         text = f"{axis.node} stays at {seen.position[0]:.6g} ({told})"
         raise Failed("motion after the command", text, station.exchanges(12))
     return abs(station.speed() or 0.0)

@@ -316,6 +316,12 @@ class Station:
                 if wait_for(lambda: node.read().stamp_ns > began_ns, 0.5):
                     return (time.monotonic_ns() - began_ns) / 1e9
 
+    def last_fault(self) -> str:
+        """Return the last fault of an axis that the daemon has logged, '' when there is none."""
+        log = self.daemon.log() if self.daemon is not None else ""
+        found = re.findall(r'text="(fault of .*)"$', log, re.MULTILINE)
+        return str(found[-1]) if found else ""
+
     def has(self, mode: ControlMode) -> bool:
         """Whether the first axis has a control mode."""
         return bool(self.rig.axes and self.cell.info(self.rig.axes[0].node).channels[0].modes & mode)

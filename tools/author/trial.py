@@ -33,8 +33,16 @@ class Failed(Exception):
         self.expected, self.seen, self.traffic = expected, seen, traffic
 
 
+class Disturbed(Failed):
+    """The device went into fault by itself before anything was done to it: mostly its dead-man, of a host held up."""
+
+
 class NotApplicable(Exception):
     """The trial has nothing to try here; the text says why."""
+
+
+TRIES = 3
+"""Of a trial that was disturbed; what disturbed it is told also when a later one passes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +103,7 @@ def attempt(trial: Trial, station: Station, full: bool) -> Result:
     if trial.wire and not station.wires:
         return result(Verdict.NOT_APPLICABLE, "the driver has no line")
     try:
-        seen = trial.run(station, full)
+        seen = _run(trial, station, full)
     except NotApplicable as error:
         return result(Verdict.NOT_APPLICABLE, str(error))
     except Failed as error:
@@ -105,6 +113,18 @@ def attempt(trial: Trial, station: Station, full: bool) -> Result:
         what = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         return result(Verdict.FAILED, what, "the trial to end by itself", _traffic(station))
     return result(Verdict.PASSED, seen)
+
+
+def _run(trial: Trial, station: Station, full: bool) -> str:
+    """Run a trial, again after calm where it was disturbed."""
+    disturbed = ""
+    for _ in range(TRIES - 1):
+        try:
+            return trial.run(station, full) + disturbed
+        except Disturbed as error:
+            disturbed += f"; tried again after {error.seen}"
+            station.settle()
+    return trial.run(station, full) + disturbed
 
 
 def _traffic(station: Station) -> list[str]:
