@@ -19,7 +19,6 @@ from sioms.reconcile.effect import Array, Effect, Parameter, Ref, Slot
 from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.noise import response
 from sioms.reconcile.simulate import replay
 
 #: Trial values, as multiples of a parameter's scale, of effects that are not forces of the state.
@@ -274,7 +273,7 @@ def _orthonormal(j: Array) -> Array:
 
 def _filtered(problem: Problem, model: AxisModel, columns: list[Array]) -> Array:
     """Pass force columns of every record into the domain of the residual, shape (n, k)."""
-    e: Array = problem.join([response(model, problem.noise, c) for c in columns]) / problem.noise.innovation
+    e: Array = problem.join([problem.answer(model, c) for c in columns]) / problem.noise.innovation
     return e if problem.weights is None else e * problem.weights[:, None]
 
 
