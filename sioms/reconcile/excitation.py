@@ -14,7 +14,6 @@ from sioms.reconcile.effect import Array, Effect, Slot
 from sioms.reconcile.effects import library
 from sioms.reconcile.fit import Problem
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.noise import response
 from sioms.reconcile.screen import (
     STATE_SLOTS,
     dead_band,
@@ -79,10 +78,7 @@ def _trace(problem: Problem, model: AxisModel, effect: Effect) -> Array | None:
         shape = next(shapes(effect, model, range_of(motions)), None)
         if shape is None:  # the range holds no period of any order
             return None
-        parts = [
-            response(model, problem.noise, size * state_columns(effect, model, m, shape, dead))
-            for m in motions
-        ]
+        parts = [problem.answer(model, size * state_columns(effect, model, m, shape, dead)) for m in motions]
         trace = problem.join(parts) / problem.noise.innovation
     else:
         values = next(iter(trial_values(effect, model, problem)))

@@ -17,9 +17,9 @@ from sioms.reconcile.descent import descend
 from sioms.reconcile.effect import Array, Parameter, Slot
 from sioms.reconcile.effects import known
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.noise import Noise
+from sioms.reconcile.noise import Noise, response
 from sioms.reconcile.records import Record, Session
-from sioms.reconcile.simulate import Run, pack, replay, track
+from sioms.reconcile.simulate import Run, pack, replay, ringing, track
 
 #: ``map``, or the like of an executor.
 Mapper = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
@@ -74,14 +74,16 @@ class Problem:
         packed, falling = pack(model), _falls(model)
         temperature, out = 0.0, []
         for r in self.session.records:
-            run = track(model, r.position, r.force, self.noise.gain, temperature, packed, external=r.external)
+            run = track(model, r.position, r.force, self.noise, temperature, packed, external=r.external)
             if falling and (level := self._lost(run)) < np.inf:
-                run = track(
-                    model, r.position, r.force, self.noise.gain, temperature, packed, level, r.external
-                )
+                run = track(model, r.position, r.force, self.noise, temperature, packed, level, r.external)
             temperature = run.end_temperature if self.session.continuous else 0.0
             out.append(run)
         return out
+
+    def answer(self, model: AxisModel, force: Array) -> Array:
+        """Return the innovation [{x}] that an unmodelled force on the motor, shape (n,) or (n, k), leaves."""
+        return response(model, self.noise, force, ringing(pack(model)))
 
     def _lost(self, run: Run) -> float:
         """Return the innovation beyond which a run has lost the measurement; infinite where it never has."""

@@ -1,7 +1,7 @@
 """The time step of an axis: one scalar loop that closes the loop or follows a measurement.
 
 Two uses of the same plant. *Closed*: the controller sees the simulated, quantised position and computes the
-force (what a user sees). *Tracking*: the recorded force drives the plant and a steady Kalman gain (l1, l2)
+force (what a user sees). *Tracking*: the recorded force drives the plant and a steady Kalman gain
 pulls the state to the recorded position; the innovation is what the model cannot predict over a short window.
 
 Integration: every sample is cut into ``sub`` steps; smooth forces by the midpoint rule, its prediction with the forces
@@ -144,8 +144,7 @@ def march(
     pl: Array,
     gains: Any,
     pg: Array,
-    l1: float,
-    l2: float,
+    gain: Array,
     lost: float,
     start: Array,
     sub: int,
@@ -157,6 +156,7 @@ def march(
         command, measured, force_in: shape (n,); ``command`` is read when closed, ``measured`` when tracking; ``force_in``
             is the whole force when tracking, and what is added to the controller's when closed.
         external: force on the axis beside the drive's, shape (n,).
+        gain: corrections of place and speed of the motor, and of the load, by the innovation, shape (4,).
         lost: innovation at which, held for ``PATIENCE`` samples, the speed is taken from the measurement.
         start: x, v, temperature, error of the controller and force at the sample before the first, and by how much the
             load is behind the motor, and slower.
@@ -173,7 +173,8 @@ def march(
     viscous, limit, delay, lag, loss = plant[VISCOUS], plant[LIMIT], plant[DELAY], plant[LAG], plant[LOSS]
     hyst_f, mod, gain_y = plant[HYST_F], plant[MOD_A], plant[GAIN_Y]
     decay = np.exp(-h / lag) if lag > 0.0 else 0.0
-    l1, l2, per_mass = l1 / gain_y, l2 / gain_y, 1.0 / jm
+    l1, l2, l3, l4 = gain[0] / gain_y, gain[1] / gain_y, gain[2] / gain_y, gain[3] / gain_y
+    per_mass = 1.0 / jm
     x, v, temp = start[0], start[1], start[2]
     xl, vl = x - start[5], v - start[6]
     held = start[4]
@@ -213,14 +214,11 @@ def march(
         else:
             u = force_in[i]
             innovation = measured[i] - y
-            dx = l1 * innovation
-            dv = l2 * innovation
-            x += dx
-            v += dv
-            if plant[GAP] > 0.0 and np.abs(x - xl) < 0.5 * plant[GAP]:
-                dv = 0.0
-            xl += dx
-            vl += dv
+            x += l1 * innovation
+            v += l2 * innovation
+            if plant[GAP] == 0.0 or np.abs(x - xl) >= 0.5 * plant[GAP]:
+                vl += l4 * innovation
+            xl += l3 * innovation
             off = off + 1 if np.abs(innovation) > lost else 0
             if off >= PATIENCE and i >= MEASURED:
                 v = (measured[i] - measured[i - MEASURED]) / (MEASURED * dt * gain_y)

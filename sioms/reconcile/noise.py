@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
-from scipy.signal import lfilter
+from scipy.linalg import LinAlgError, expm, solve_discrete_are
+from scipy.signal import lfilter, ss2tf
 
 from sioms.reconcile.effect import Array
 from sioms.reconcile.model import AxisModel
@@ -51,18 +52,66 @@ def rigid(model: AxisModel) -> tuple[Array, Array]:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Two masses and what is between them: inertia of both, share of the load in it, stiffness, damping, and the motor's viscous friction."""
+
+    inertia: float
+    share: float
+    stiffness: float
+    damping: float
+    viscous: float
+
+
+@lru_cache(maxsize=16)
+def coupled(pair: Pair, sample_time_s: float) -> tuple[Array, Array]:
+    """Return the exact sampled pair: state matrix (4, 4) and force input (4,); motor place and speed, load place and speed."""
+    motor, load = pair.inertia * (1.0 - pair.share), pair.inertia * pair.share
+    k, d = pair.stiffness, pair.damping
+    rates = np.zeros((5, 5))
+    rates[0, 1] = rates[2, 3] = 1.0
+    rates[1] = np.array([-k, -d - pair.viscous, k, d, 1.0]) / motor
+    rates[3] = np.array([k, d, -k, -d, 0.0]) / load
+    step = expm(rates * sample_time_s)
+    return step[:4, :4], step[:4, 4]
+
+
 def observer(model: AxisModel, sensor: float, drive: float) -> Noise:
     """Design the steady Kalman gain of the rigid axis for given noises."""
-    a, b = rigid(model)
-    scale = sensor  # solve in units of the sensor noise, so that the Riccati equation is well scaled
-    speed = sensor / model.sample_time_s
-    d = np.array([scale, speed])
+    (place, speed), innovation = _kalman(*rigid(model), model.sample_time_s, sensor, drive)
+    return Noise(sensor, drive, (place, speed), innovation)
+
+
+@lru_cache(maxsize=64)
+def corrections(noise: Noise, pair: Pair | None, sample_time_s: float) -> tuple[float, float, float, float]:
+    """Corrections of place [1] and speed [1/s] of motor and load by the innovation.
+
+    A transmission that rings is corrected as a Kalman filter of its own does it. Corrected alike, its masses would ring on from what
+    noise did to them long ago: the innovation keeps their tone, damping comes out too large, and the cost has a minimum at every beat.
+    """
+    if pair is not None:
+        try:
+            gain, _ = _kalman(*coupled(pair, sample_time_s), sample_time_s, noise.sensor, noise.drive)
+            return gain[0], gain[1], gain[2], gain[3]
+        except (LinAlgError, ValueError):
+            pass
+    return *noise.gain, *noise.gain
+
+
+def _kalman(a: Array, b: Array, dt: float, sensor: float, drive: float) -> tuple[tuple[float, ...], float]:
+    """Solve the Riccati equation in units of the sensor noise, in which it is well scaled.
+
+    Returns:
+        Gain of every state, and standard deviation of the innovation, [{x}].
+    """
+    n = len(b)
+    d = np.tile([sensor, sensor / dt], n // 2)
     an, bn = a * d[None, :] / d[:, None], b / d * drive
-    p = solve_discrete_are(an.T, np.array([[1.0], [0.0]]), np.outer(bn, bn) + 1e-12 * np.eye(2), np.eye(1))
-    s = p[0, 0] + 1.0
-    return Noise(
-        sensor, drive, (float(p[0, 0] / s), float(p[1, 0] / s * speed / scale)), float(np.sqrt(s)) * sensor
-    )
+    seen = np.zeros((n, 1))
+    seen[0] = 1.0
+    p = solve_discrete_are(an.T, seen, np.outer(bn, bn) + 1e-12 * np.eye(n), np.eye(1))
+    s = float(p[0, 0]) + 1.0
+    return tuple(float(g) for g in p[:, 0] / s * d / sensor), float(np.sqrt(s)) * sensor
 
 
 def sensor_noise(session: Session, resolution: float) -> float:
@@ -89,22 +138,23 @@ def drive_noise(
     return float(max(np.median(found), floor)) if found else DRIVE_NOISE_DEFAULT * rated_force
 
 
-def response(model: AxisModel, noise: Noise, force: Array) -> Array:
-    """Innovation that an unmodelled force leaves: the linear filter from force to innovation.
+def response(model: AxisModel, noise: Noise, force: Array, pair: Pair | None = None) -> Array:
+    """Innovation that an unmodelled force on the motor leaves: the linear filter from force to innovation.
 
     Args:
         force: shape (n,) or (n, k), [{F}].
+        pair: the transmission that rings, if there is one.
 
     Returns:
         Same shape, [{x}].
     """
-    a, b = rigid(model)
-    l1, l2 = noise.gain
+    a, b = rigid(model) if pair is None else coupled(pair, model.sample_time_s)
+    n = len(b)
+    gain = np.array(corrections(noise, pair, model.sample_time_s))[:n]
+    seen = np.eye(1, n)
     # error state after prediction: eps+ = A (I - L C) eps + B f, innovation = C eps
-    m = a @ np.array([[1.0 - l1, 0.0], [-l2, 1.0]])
-    den = np.array([1.0, -np.trace(m), np.linalg.det(m)])
-    num = np.array([0.0, b[0], -m[1, 1] * b[0] + m[0, 1] * b[1]])
-    out: Array = lfilter(num, den, force, axis=0)
+    num, den = ss2tf(a @ (np.eye(n) - np.outer(gain, seen)), b[:, None], seen, np.zeros((1, 1)))
+    out: Array = lfilter(num[0], den, force, axis=0)
     return out
 
 

@@ -13,7 +13,6 @@ from sioms.reconcile.blocks import block_ids
 from sioms.reconcile.effect import Array
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.noise import response
 from sioms.reconcile.screen import Motion, dead_band, direction, instrument_motion, thinned
 
 KNOTS = 14
@@ -102,10 +101,7 @@ def smoother_rest(problem: Problem, fit: Fit, folds: int = 5) -> Array:
     rows = thinned(len(fit.residual))
     motions = instrument_motion(problem, fit.model)
     columns = basis(motions, fit.model, dead_band(problem, fit.model))
-    f = (
-        problem.join([response(fit.model, problem.noise, c) for c in columns])[rows]
-        / problem.noise.innovation
-    )
+    f = problem.join([problem.answer(fit.model, c) for c in columns])[rows] / problem.noise.innovation
     size = np.sqrt(np.mean(f**2, axis=0))
     f = f[:, size > 1e-12] / size[size > 1e-12]
     fold = block_ids(problem, fit.model.sample_time_s)[rows] % folds

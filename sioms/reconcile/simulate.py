@@ -18,8 +18,11 @@ from sioms.reconcile.effect import ROW, Array, Slot
 from sioms.reconcile.effects import known
 from sioms.reconcile.jit import addresses
 from sioms.reconcile.model import AxisModel, controller_row
+from sioms.reconcile.noise import Noise, Pair, corrections
 from sioms.reconcile.records import Record
 
+#: Corrections of an observer that follows nothing.
+IDLE = (0.0, 0.0, 0.0, 0.0)
 #: Steps in a millisecond without a transmission, with one, and with contact in one.
 STEPS = {None: 2, Slot.ELASTIC: 4, Slot.BACKLASH: 6}
 #: A record begins in motion that at first makes more way than this share of the largest speed would. Its start is fitted
@@ -102,6 +105,14 @@ def pack(model: AxisModel, substeps: int = 0) -> Packed:
     )
 
 
+def ringing(packed: Packed) -> Pair | None:
+    """Return the transmission of a model that is never out of contact, if it has one."""
+    row = packed.plant
+    if row[k.LOAD] == 0.0 or row[k.GAP] > 0.0:
+        return None
+    return Pair(*(float(row[i]) for i in (k.INERTIA, k.LOAD, k.STIFF, k.DAMP, k.VISCOUS)))
+
+
 def _steps(transmission: tuple[Slot, Array] | None, sample_time_s: float) -> int:
     """Steps in a sample: as many as the fastest motion needs, at slow rates no more than at 1 kHz."""
     most = STEPS[transmission[0] if transmission else None]
@@ -153,7 +164,7 @@ def _march(
     force: Array | None,
     external: Array | None,
     ctl: Array,
-    gain: tuple[float, float],
+    gain: tuple[float, ...],
     start: Array,
     lost: float = np.inf,
 ) -> Run:
@@ -174,8 +185,7 @@ def _march(
         p.rows[lv],
         p.functions[g],
         p.rows[g],
-        gain[0],
-        gain[1],
+        np.array(gain),
         lost,
         start,
         p.substeps,
@@ -205,7 +215,7 @@ def simulate(model: AxisModel, command: Array, temperature: float = 0.0, substep
     command = np.ascontiguousarray(command, dtype=np.float64)
     start = np.array([model.start_position, 0.0, temperature, 0.0, 0.0, 0.0, 0.0])
     return _march(
-        pack(model, substeps), True, command, command, None, None, controller_row(model), (0.0, 0.0), start
+        pack(model, substeps), True, command, command, None, None, controller_row(model), IDLE, start
     )
 
 
@@ -224,7 +234,7 @@ def replay(model: AxisModel, record: Record, temperature: float = 0.0) -> Run:
 
     def run(at: Array, n: int) -> Run:
         force, outer = (None if a is None else a[:n] for a in (added, record.external))
-        return _march(p, True, command[:n], command[:n], force, outer, controller_row(model), (0.0, 0.0), at)
+        return _march(p, True, command[:n], command[:n], force, outer, controller_row(model), IDLE, at)
 
     if _moves(y, model):
         n = _at_first(y, model.sample_time_s)
@@ -268,7 +278,7 @@ def _wound_up(
     y: Array,
     force: Array,
     external: Array | None,
-    gain: tuple[float, float],
+    gain: tuple[float, ...],
     start: Array,
     slow: float,
 ) -> Array:
@@ -296,7 +306,7 @@ def track(
     model: AxisModel,
     position: Array,
     force: Array,
-    gain: tuple[float, float],
+    noise: Noise | None,
     temperature: float = 0.0,
     packed: Packed | None = None,
     lost: float = np.inf,
@@ -307,7 +317,7 @@ def track(
     Args:
         position: measured, shape (n,), [{x}].
         force: command to the drive, shape (n,), held over each sample, [{F}].
-        gain: correction of position [1] and speed [1/s] by the innovation.
+        noise: for which the observer is made; None: nothing holds the plant.
         lost: innovation beyond which the model has lost the measurement and takes its speed from it, [{x}].
         external: force on the axis beside the drive's, shape (n,), [{F}]; None: none.
 
@@ -324,6 +334,8 @@ def track(
             *(0.0, force[0], 0.0, 0.0),  # a recorded force did not begin with its record
         ]
     )
-    if p.plant[k.LOAD] > 0.0 and p.plant[k.GAP] == 0.0 and _moves(y, model):
+    pair = ringing(p)
+    gain = IDLE if noise is None else corrections(noise, pair, model.sample_time_s)
+    if pair is not None and _moves(y, model):
         start = _wound_up(p, y, force, external, gain, start, MOVING * model.max_speed)
     return _march(p, False, y, y, force, external, np.zeros(k.CTL_SIZE), gain, start, lost)

@@ -15,7 +15,6 @@ from sioms.reconcile.effect import Array
 from sioms.reconcile.effects.terms import TERM_PREFIX
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.noise import response
 from sioms.reconcile.screen import instrument_motion
 from sioms.reconcile.verdict import Estimate, NamedEffect
 
@@ -124,7 +123,7 @@ def _line(problem: Problem, fit: Fit, frequency_hz: float) -> Tone:
     traces, forces = [], []
     for record, e in zip(problem.session.records, _per_record(problem, fit.residual), strict=True):
         wave = _waves(len(record), frequency_hz, fit.model.sample_time_s)
-        columns = response(fit.model, problem.noise, wave)[problem.span(record)] / problem.noise.innovation
+        columns = problem.answer(fit.model, wave)[problem.span(record)] / problem.noise.innovation
         size = np.linalg.lstsq(columns, e, rcond=None)[0]
         traces.append(columns @ size)
         forces.append(wave @ size)

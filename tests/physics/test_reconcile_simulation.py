@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from sioms.reconcile.model import AxisModel, Controller
-from sioms.reconcile.noise import observer, response, rigid
+from sioms.reconcile.noise import Pair, corrections, coupled, observer, response, rigid
 from sioms.reconcile.records import Record
 from sioms.reconcile.simulate import replay, simulate, track
 
@@ -128,7 +128,7 @@ def test_coulomb_friction_stops_where_energy_says_and_holds() -> None:
     coast = replace(AXIS, viscous=0.0, controller=None).with_effect("coulomb", {"Fc": 0.05})
     push, level = 0.4, 0.05
     force = np.concatenate([np.full(20, push), np.zeros(400), np.full(100, 0.9 * level)])
-    run = track(coast, np.zeros(len(force)), force, (0.0, 0.0))
+    run = track(coast, np.zeros(len(force)), force, None)
     a = (push - level) / 2e-3
     x0, v0 = 0.5 * a * 0.02**2, a * 0.02
     stop = x0 + 0.5 * 2e-3 * v0**2 / level
@@ -141,9 +141,9 @@ def test_stribeck_friction_holds_up_to_breakaway_and_then_runs_away(force: float
     model = replace(AXIS, viscous=0.0, controller=None).with_effect(
         "stribeck", {"Fc": 0.05, "Fs": 0.1, "vs": 0.1}
     )
-    held = track(model, np.zeros(200), np.full(200, 0.9 * force), (0.0, 0.0))
+    held = track(model, np.zeros(200), np.full(200, 0.9 * force), None)
     assert np.all(held.x == 0.0)
-    free = track(model, np.zeros(200), np.full(200, force), (0.0, 0.0))
+    free = track(model, np.zeros(200), np.full(200, force), None)
     assert np.sign(free.v[-1]) == np.sign(force)
     assert abs(free.v[-1]) > 0.15 * (abs(force) - 0.05) / 2e-3
 
@@ -152,7 +152,7 @@ def test_dahl_friction_builds_up_exponentially_over_its_length() -> None:
     """Pushed slowly one way, F = Fc (1 - exp(-x / xs)): the closed solution of Dahl's equation."""
     model = replace(AXIS, viscous=0.0, controller=None).with_effect("presliding", {"Fc": 0.05, "xs": 1e-2})
     ramp = 0.04 * np.arange(4000) / 4000
-    run = track(model, np.zeros(4000), ramp, (0.0, 0.0))
+    run = track(model, np.zeros(4000), ramp, None)
     wanted = -1e-2 * np.log(1.0 - ramp / 0.05)
     assert np.all(run.v[500:] > 0.0)
     np.testing.assert_allclose(run.x[1000:], wanted[1000:], rtol=0.04)
@@ -163,7 +163,7 @@ def test_backlash_conserves_momentum_and_hides_the_load() -> None:
         "backlash", {"gap": 0.5, "load_fraction": 0.6, "f_contact": 120.0, "zeta": 0.1}
     )
     push = np.concatenate([np.full(20, 0.2), np.zeros(4000)])
-    run = track(model, np.zeros(len(push)), push, (0.0, 0.0))
+    run = track(model, np.zeros(len(push)), push, None)
     assert run.v[21] == pytest.approx(0.2 * 0.02 / (0.4 * 2e-3), rel=1e-6)  # the motor alone
     assert np.mean(run.v[-2000:]) == pytest.approx(0.2 * 0.02 / 2e-3, rel=0.02)  # both together
 
@@ -172,7 +172,7 @@ def test_a_delay_moves_the_force_by_its_time() -> None:
     model = replace(AXIS, controller=None).with_effect("delay", {"delay": 2.4e-3})
     force = np.zeros(20)
     force[5] = 1.0
-    run = track(model, np.zeros(20), force, (0.0, 0.0))
+    run = track(model, np.zeros(20), force, None)
     np.testing.assert_allclose(run.applied[7:9], [0.6, 0.4], atol=1e-9)
     assert np.sum(np.arange(20) * run.applied) == pytest.approx(5 + 2.4, abs=1e-9)
 
@@ -187,7 +187,7 @@ def test_the_linear_filter_is_the_answer_of_the_observer_to_a_missing_force() ->
     for f in known_force + extra:
         y.append(s[0])
         s = a @ s + b * f
-    run = track(replace(AXIS, controller=None), np.array(y), known_force, noise.gain)
+    run = track(replace(AXIS, controller=None), np.array(y), known_force, noise)
     expected = response(AXIS, noise, extra)
     forgotten = slice(100, None)  # the first speed is read off the motion, not known to be none
     np.testing.assert_allclose(
@@ -204,6 +204,78 @@ def test_the_expected_innovation_is_what_a_right_model_leaves() -> None:
     for f in 2e-3 * rng.standard_normal(n):
         y.append(s[0] + 1e-4 * rng.standard_normal())
         s = a @ s + b * f
-    e = track(replace(AXIS, controller=None), np.array(y), np.zeros(n), noise.gain).innovation[200:]
+    e = track(replace(AXIS, controller=None), np.array(y), np.zeros(n), noise).innovation[200:]
     assert np.std(e) == pytest.approx(noise.innovation, rel=0.03)
     assert abs(np.corrcoef(e[1:], e[:-1])[0, 1]) < 0.03
+
+
+PAIR = Pair(2e-3, 0.55, (2 * np.pi * 18) ** 2 * 2e-3 * 0.55 * 0.45, 1.2e-3, 1e-3)
+
+
+def shaken_pair(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Drive two masses by a force of many steps and by noise; return position with noise and force without."""
+    rng = np.random.default_rng(seed)
+    a, b = coupled(PAIR, DT)
+    force = np.repeat(0.2 * rng.standard_normal(n // 100), 100)
+    s, y = np.zeros(4), np.zeros(n)
+    for i, f in enumerate(force + 2e-3 * rng.standard_normal(n)):
+        y[i] = s[0] + 1e-4 * rng.standard_normal()
+        s = a @ s + b * f
+    return y, force
+
+
+def test_a_sampled_pair_is_the_solution_of_its_differential_equation() -> None:
+    a, b = coupled(PAIR, DT)
+    start = np.array([0.01, 0.3, -0.02, 0.1])
+    s = solve_ivp(
+        lambda t, s: [s[1], (0.3 - link(s) - 1e-3 * s[1]) / 0.9e-3, s[3], link(s) / 1.1e-3],
+        (0, DT),
+        start,
+        method="DOP853",
+        rtol=1e-11,
+        atol=1e-13,
+    ).y[:, -1]
+    np.testing.assert_allclose(a @ start + b * 0.3, s, rtol=1e-8)
+
+
+def link(s: np.ndarray) -> float:
+    return float(PAIR.stiffness * (s[0] - s[2]) + PAIR.damping * (s[1] - s[3]))
+
+
+def test_the_observer_of_a_transmission_that_rings_leaves_no_tone() -> None:
+    """With both masses corrected alike, what noise set ringing rings on for a second in the innovation."""
+    y, force = shaken_pair(3, 20000)
+    noise = observer(AXIS, 1e-4, 2e-3)
+    zeta = PAIR.damping / (2.0 * np.sqrt(PAIR.stiffness * 2e-3 * 0.55 * 0.45))
+    model = replace(AXIS, controller=None).with_effect(
+        "elastic", {"f_res": 18.0, "load_fraction": 0.55, "zeta": zeta}
+    )
+    e = track(model, y, force, noise).innovation[500:]
+    alike = innovations(y, force, np.array([*noise.gain, *noise.gain]))[500:]
+    own = innovations(y, force, np.array(corrections(noise, PAIR, DT)))[500:]
+    np.testing.assert_allclose(e, own, atol=0.1 * np.std(own))  # of second order in the step
+    lags = range(1, 120)
+    assert max(abs(np.corrcoef(e[k:], e[:-k])[0, 1]) for k in lags) < 0.03
+    assert max(abs(np.corrcoef(alike[k:], alike[:-k])[0, 1]) for k in lags) > 0.2
+
+
+def innovations(y: np.ndarray, force: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """Follow a measured pair by a recursion of its own."""
+    a, b = coupled(PAIR, DT)
+    s, out = np.zeros(4), np.zeros(len(y))
+    for i, f in enumerate(force):
+        out[i] = y[i] - s[0]
+        s = a @ (s + gain * out[i]) + b * f
+    return out
+
+
+def test_a_missing_force_on_a_pair_leaves_what_the_linear_filter_says() -> None:
+    noise = observer(AXIS, 1e-4, 2e-3)
+    extra = 0.02 * np.sin(11 * np.arange(2000) * DT + 1)
+    a, b = coupled(PAIR, DT)
+    s, y = np.zeros(4), np.zeros(2000)
+    for i, f in enumerate(extra):
+        y[i] = s[0]
+        s = a @ s + b * f
+    e = innovations(y, np.zeros(2000), np.array(corrections(noise, PAIR, DT)))
+    np.testing.assert_allclose(response(AXIS, noise, extra, PAIR), e, atol=1e-6 * np.max(np.abs(e)))

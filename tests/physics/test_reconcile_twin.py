@@ -51,7 +51,7 @@ def driven(model: AxisModel, force: np.ndarray = FORCE) -> tuple[np.ndarray, np.
     for f in force:
         x.append(bank.position[1])
         bank.advance(np.array([0.3, f]))
-    run = track(replace(model, controller=None), np.zeros(len(force)), force, (0.0, 0.0))
+    run = track(replace(model, controller=None), np.zeros(len(force)), force, None)
     return np.array(x), run.x
 
 

@@ -43,7 +43,7 @@ def test_noise_of_the_current_sensor_is_not_that_of_the_drive() -> None:
     run = simulate(AXIS, COMMAND)
     shaken = replace(AXIS, controller=None)
     u = run.force + force * rng.standard_normal(len(T))
-    moved = track(shaken, run.position, u, (0.0, 0.0))
+    moved = track(shaken, run.position, u, None)
     position = np.round(moved.x / AXIS.resolution) * AXIS.resolution
     record = Record("r", position, run.force, force_measured=u + measured * rng.standard_normal(len(T)))
     ready = prepare(Session((record,)), shaken, Options())
