@@ -23,6 +23,7 @@ has them.
 from __future__ import annotations
 
 import json
+import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -35,7 +36,7 @@ from numpy.typing import NDArray
 
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.model import AxisModel, Controller
-from sioms.reconcile.model_file import only, parse_model
+from sioms.reconcile.model_file import check_model, only, parse_model
 from sioms.reconcile.records import Record, Session
 from sioms.tools.reconcile_table import SUFFIXES, UNITS, load_table, measures, named, unit_of
 
@@ -182,14 +183,26 @@ def _convert(
             f"{where}: {unit} is a unit of {kind}, the {quantity} of a {'rotary' if model.rotary else 'linear'} axis is "
             f"{'an' if right == 'angle' else 'a'} {right}; {hint}"
         )
-    factor = model.resolution if kind == "count" else UNITS[kind][unit]
-    if kind == "count" and factor <= 0.0:
+    scale, offset = (_number(spec, where, key, instead) for key, instead in (("scale", 1.0), ("offset", 0.0)))
+    factor = UNITS[kind][unit] if kind != "count" else _per_count(where, spec, scale, model)
+    return np.asarray((raw * scale + offset) * factor, dtype=np.float64)
+
+
+def _per_count(where: str, spec: Mapping[str, Any], scale: float, model: AxisModel) -> float:
+    """Return what a count that has been scaled is worth; 1 where the scale is the size of a count itself."""
+    itself = "scale" in spec and (model.resolution <= 0.0 or 0.99 < abs(scale) / model.resolution < 1.01)
+    if model.resolution <= 0.0 and not itself:
         raise BadInputError(
             f"{where}: it is in counts, and the model states no resolution; give resolution = ... in [axis]"
         )
-    return np.asarray(
-        (raw * float(spec.get("scale", 1.0)) + float(spec.get("offset", 0.0))) * factor, dtype=np.float64
-    )
+    return 1.0 if itself else model.resolution
+
+
+def _number(spec: Mapping[str, Any], where: str, key: str, instead: float) -> float:
+    value = spec.get(key, instead)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise BadInputError(f"{where}: {key} is {value!r}; needs a finite number")
+    return float(value)
 
 
 def _draft(files: Sequence[Path], description: Path) -> str:
@@ -244,11 +257,13 @@ def read_model(path: Path) -> AxisModel:
     if path.suffix != ".json":
         return parse_model(path.read_text(), str(path))
     try:
-        return _layout_model(json.loads(path.read_text()))
+        model = _layout_model(json.loads(path.read_text()))
+        check_model(model)
     except (KeyError, TypeError) as e:
         raise BadInputError(f"read model {path}: missing or wrong key {e}") from e
     except ValueError as e:
         raise BadInputError(f"read model {path}: {e}") from e
+    return model
 
 
 def _layout_model(n: Mapping[str, Any]) -> AxisModel:

@@ -192,6 +192,7 @@ def check_scale(problem: Problem, model: AxisModel) -> None:
     """
     motions = smoothed_motion(problem, model)
     dead = dead_band(problem, model)
+    turn = 1.0 if model.rotary else 2.0 * np.pi / model.pitch  # gravity, or cogging
     columns = [
         np.stack(
             [
@@ -200,8 +201,8 @@ def check_scale(problem: Problem, model: AxisModel) -> None:
                 direction(m.v, dead),
                 m.x,
                 np.ones_like(m.x),
-                np.sin(2 * np.pi * m.x / model.pitch),
-                np.cos(2 * np.pi * m.x / model.pitch),
+                np.sin(turn * m.x),
+                np.cos(turn * m.x),
             ],
             axis=1,
         )

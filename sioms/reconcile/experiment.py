@@ -19,6 +19,8 @@ from sioms.reconcile.simulate import simulate
 DURATION_S = 5.0
 #: Shortest average over the acceleration.
 SMOOTH_S = 0.02
+#: A turn of a rotary axis, rad.
+WHOLE = 2.0 * np.pi
 #: Share of a lap at rest before it begins.
 REST = 0.04
 
@@ -79,8 +81,8 @@ def catalogue(model: AxisModel, envelope: Envelope, duration_s: float = DURATION
         "cruises at " + _list(cruise, e.speed) + f" {unit}/s, both ways",
         _shuttle(cruise, e, dt, duration_s),
     )
-    half = min(0.55 * model.pitch, e.reach) if model.rotary else e.reach
-    turn = ", one full turn" if model.rotary and half >= 0.5 * model.pitch else ""
+    half = min(0.55 * WHOLE, e.reach) if model.rotary else e.reach
+    turn = ", one full turn" if model.rotary and half >= 0.5 * WHOLE else ""
     speed = min(4.2 * half / duration_s, e.speed)
     path = np.concatenate(
         [_move(half, speed, e, dt), _move(-2.0 * half, speed, e, dt), _move(half, speed, e, dt)]

@@ -146,7 +146,8 @@ def shapes(effect: Effect, model: AxisModel, travel: tuple[float, float]) -> Ite
         (p for p in effect.parameters if p.symbol not in linear and not p.fixed and not p.phase), None
     )
     if order is not None:
-        first = 2 if model.rotary and effect.slot is Slot.FORCE else 1
+        a_turn = model.rotary and effect.slot is Slot.FORCE and model.pitch > 6.0  # that is gravity
+        first = 2 if a_turn else 1
         for n in range(max(first, int(model.pitch / (travel[1] - travel[0]))), int(order.upper) + 1):
             yield {order.symbol: float(n)}
     elif shape is not None:

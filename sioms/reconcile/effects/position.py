@@ -16,8 +16,8 @@ def offset_force(x: Number, v: Number, u: Number, temperature: Number, p: Array)
 
 @state_function
 def gravity_force(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
-    """amp sin(theta + phase)."""
-    return p[0] * np.sin(p[TURN] * x + p[1])
+    """amp sin(x + phase), x the angle of the axis: marks may come more often than once a turn."""
+    return p[0] * np.sin(x + p[1])
 
 
 @state_function
@@ -51,7 +51,7 @@ GRAVITY = Effect(
     channel=Channel.MECHANICS,
     slot=Slot.FORCE,
     function=gravity_force,
-    equation="F = amp sin(theta + phase)",
+    equation="F = amp sin(x + phase)",
     parameters=(
         Parameter("amp", "{F}", Ref.FORCE, 0.0, 2.0, 0.05, "largest gravity force"),
         Parameter("phase", "rad", Ref.ANGLE, -np.pi, np.pi, 0.0, "phase at position zero", phase=True),

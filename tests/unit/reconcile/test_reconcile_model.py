@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +135,12 @@ def test_an_effect_can_be_switched_off_in_the_file(tmp_path: Path) -> None:
     [
         ({"kind": "round"}, "rotary or linear"),
         ({"speling": 1}, "nobody reads speling"),
+        ({"inertia": -1.0}, "inertia is -1; needs above zero"),
+        ({"pitch": 0}, "pitch is 0; needs above zero"),
+        ({"viscous": "2"}, "viscous is '2'; needs a finite number"),
+        ({"rated_force": float("nan")}, "rated_force is nan"),
+        ({"max_speed": None}, "has no max_speed"),
+        ({"refine": ["mass"]}, "refine is"),
     ],
 )
 def test_a_model_file_is_checked(change: dict[str, object], says: str) -> None:
@@ -149,6 +157,26 @@ def test_a_model_file_is_checked(change: dict[str, object], says: str) -> None:
     }
     with pytest.raises(ValueError, match=says):
         model_from({"axis": axis | change})
+
+
+def test_a_controller_is_checked_and_may_have_no_limit() -> None:
+    axis = tomllib.loads(write_model(AXIS))
+    none = {**axis["controller"], "limit": float("inf")}
+    assert AXIS.controller is not None
+    assert model_from(axis | {"controller": none}).controller == replace(AXIS.controller, limit=float("inf"))
+    with pytest.raises(ValueError, match=r"\[controller\] has no kb"):
+        model_from(axis | {"controller": {k: v for k, v in none.items() if k != "kb"}})
+    with pytest.raises(ValueError, match="limit is 0"):
+        model_from(axis | {"controller": none | {"limit": 0.0}})
+
+
+def test_gravity_comes_once_a_turn_of_the_axis_however_many_marks_a_turn_has() -> None:
+    model = replace(AXIS, pitch=2.0 * np.pi / 100)
+    effect = known()["gravity"]
+    angles, still = np.linspace(0.0, 2.0 * np.pi, 9), np.zeros(9)
+    row = effect.row(effect.values({"amp": 14.0, "phase": 0.0}), model.pitch)
+    force = effect.evaluate(angles, still, still, still, row)
+    np.testing.assert_allclose(force, [0, 9.8995, 14, 9.8995, 0, -9.8995, -14, -9.8995, 0], atol=1e-4)
 
 
 def _write(folder: Path, columns: str, data: str = "t,x,f\n0,0,1\n0.001,1,2\n0.002,2,3\n") -> None:
@@ -177,12 +205,32 @@ def test_columns_are_converted(tmp_path: Path) -> None:
             "nobody reads speed",
         ),
         ("[columns\n", "columns.toml"),
+        ('[columns]\nposition = { name = "x", scale = "a" }\nforce = { name = "f" }\n', "scale is 'a'"),
     ],
 )
 def test_bad_column_files_say_what_is_wrong(tmp_path: Path, columns: str, says: str) -> None:
     _write(tmp_path, columns)
     with pytest.raises(BadInputError, match=says):
         read_data(tmp_path, AXIS)
+
+
+@pytest.mark.parametrize(
+    ("resolution", "scale", "per_count"),
+    [
+        (0.0, "0.01", 0.01),
+        (0.01, "0.01", 0.01),
+        (0.01, "-0.01", -0.01),
+        (0.01, "0.25", 0.0025),
+        (0.01, "1", 0.01),
+    ],
+)
+def test_a_count_is_worth_its_resolution_or_the_scale_that_says_so(
+    tmp_path: Path, resolution: float, scale: str, per_count: float
+) -> None:
+    columns = f'position = {{ name = "x", unit = "count", scale = {scale} }}\nforce = {{ name = "f" }}\n'
+    _write(tmp_path, "[columns]\n" + columns)
+    record = read_data(tmp_path, replace(AXIS, resolution=resolution)).records[0]
+    np.testing.assert_allclose(record.position, np.array([0.0, 1.0, 2.0]) * per_count)
 
 
 def test_missing_data_say_so(tmp_path: Path) -> None:
