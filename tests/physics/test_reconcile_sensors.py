@@ -51,7 +51,7 @@ def test_a_finger_is_judged_right(tmp_path: Path, kind: str, only: str, exit_sta
 
 
 def test_one_place_cannot_tell_gain_from_depth(tmp_path: Path) -> None:
-    hidden = draw_finger("f", "confounded", np.random.default_rng(5))
+    hidden = draw_finger("f", "confounded", np.random.default_rng([900, 7]))
     status, answer = solve(hidden, tmp_path / "f")
     assert status == 4
     named = set(answer["effects"]), *(set(a) for a in answer["alternatives"])  # type: ignore[attr-defined]

@@ -55,8 +55,12 @@ class FingerData:
         out = outputs(b, self.scene)[:, self.alive]
         course = late(b, t.since)
         mean = course.mean(1)
-        rows = [(out * mean[:, None] / self._sigma).ravel()]
-        rows.append((((course - mean[:, None]) @ _CONTRASTS.T) / self.course_sigma[:, None]).ravel())
+        # the zero goes on drifting between baseline and touch
+        drift = b.temperature[self.alive]
+        warmed = t.warmed.mean(1)
+        rows = [((out * mean[:, None] + drift * warmed[:, None]) / self._sigma).ravel()]
+        late_ = course - mean[:, None] + (self._weight @ drift)[:, None] * (t.warmed - warmed[:, None])
+        rows.append(((late_ @ _CONTRASTS.T) / self.course_sigma[:, None]).ravel())
         rows.append(self._drift(b))
         rows.append(self._ramps(b))
         if np.isfinite(self.cell_spread).all():

@@ -34,7 +34,8 @@ from sioms.reconcile.sensors.verdict import SensorVerdict
 from sioms.reconcile.verdict import Estimate, NamedEffect
 from sioms.tactile.touches import Recording
 
-EXTENT = Quantity("extent", "rad", 0.0, 0.16, 0.01, "half angle that an element averages over")
+#: Not down to 0, where nothing of first order changes with it, and a fit that came there would stay.
+EXTENT = Quantity("extent", "rad", 2e-3, 0.16, 0.01, "half angle that an element averages over")
 START_EXTENT = 0.25  # of the elements' pitch: where the fit of an extent that is not stated begins
 LOAD_MARGIN = 1.15  # the load cell's noise during a touch is a little more than its frames say
 LOAD_SPREAD = 0.02  # of a touch's load where no load cell tells it
@@ -196,9 +197,7 @@ def _rows(
     elif told:
         level = float(np.median(t.cell / t.load))
         ratio = t.cell / t.load / level
-        # beyond its own noise the cell scatters in proportion to the load; 0.455 is the median of a normal deviate squared
-        seen, own = (np.median((v / t.load) ** 2) for v in (t.cell - level * t.load, t.cell_noise))
-        spread = np.sqrt(t.cell_noise**2 + max(float(seen / 0.455 - own), 0.0) * t.load**2)
+        spread = cell_spread(t, level)
         if _follows(t, ratio, base, alive):
             load, share = t.cell / level, LOAD_MARGIN * t.cell_noise / t.cell
         else:
@@ -212,6 +211,22 @@ def _rows(
             f"no load cell: the commanded load was used, {100 * LOAD_SPREAD:.0f} % of it taken as uncertain"
         )
     return lay_out(t, alive, still, ramps, base.angle, share, load, spread)
+
+
+def cell_spread(t: Touched, level: float) -> Floats:
+    """Return how far the load cell scatters about the commanded loads [N/m]: beyond its own noise alike, or in proportion to them.
+
+    The likelier of the two; touches far off count no more than at three standard deviations.
+    """
+    off, least, best = t.cell - level * t.load, np.inf, t.cell_noise
+    for size in (np.ones(len(t)), t.load):
+        # 0.455 is the median of a normal deviate squared
+        seen, own = (np.median((v / size) ** 2) for v in (off, t.cell_noise))
+        spread = np.sqrt(t.cell_noise**2 + max(float(seen / 0.455 - own), 0.0) * size**2)
+        unlikely = float(np.sum(np.log(spread) + 0.5 * np.minimum((off / spread) ** 2, 9.0)))
+        if unlikely < least:
+            least, best = unlikely, spread
+    return best
 
 
 def _follows(t: Touched, ratio: Floats, base: Belief, alive: NDArray[np.intp]) -> bool:

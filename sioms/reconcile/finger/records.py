@@ -15,6 +15,7 @@ from sioms.tactile.touches import BASELINE, LOADED, Recording
 PARTS = 4  # of the course of a touch under load
 LEAST_TOUCHES = 24
 RAMP_BINS = 16
+NEIGHBOURS = 9  # touches over which the temperature is taken for a straight line
 TOLD = 0.15  # root mean square of a unit sine over a run of frames from which on it is no constant
 
 
@@ -29,6 +30,7 @@ class Touched:
         output: mean under load less baseline; part: the same for ``PARTS`` parts, shape (nt, PARTS, ns).
         since: middle of each part after the load came on [s], shape (nt, PARTS).
         level: baseline; temperature, temperature_noise: [deg C] of the baseline, nan without; time: [s] of the baseline.
+        warmed: temperature of each part less that of the baseline [K], 0 without, shape (nt, PARTS).
         unseen: time before the first frame under load of which nothing was recorded [s], shape (nt,).
         share: 1/frames under load + 1/frames of baseline, shape (nt,): variance of a touch's output over that of a frame.
         noise: standard deviation of one frame, shape (ns,).
@@ -47,6 +49,7 @@ class Touched:
     temperature: Floats
     temperature_noise: Floats
     time: Floats
+    warmed: Floats
     unseen: Floats
     share: Floats
     noise: Floats
@@ -115,7 +118,7 @@ def reduce_touches(
     variances: list[Floats] = []
     notes: list[str] = []
     for name, r, place, load, radius in experiments:
-        left = 0
+        left, rate = 0, _warming(r, len(place))
         for number in range(len(place)):
             mine = np.flatnonzero(r.touch == number)
             before, under = mine[r.phase[mine] == BASELINE], mine[r.phase[mine] == LOADED]
@@ -147,6 +150,7 @@ def reduce_touches(
                 r.temperature_c[before].mean(),
                 np.std(r.temperature_c[before], ddof=1) / np.sqrt(len(before)),
                 r.time_s[before].mean(),
+                [rate[number] * (r.time_s[under[p]].mean() - r.time_s[before].mean()) for p in parts],
                 r.time_s[under[0]] - r.time_s[mine[mine < under[0]][-1]],
                 1.0 / len(under) + 1.0 / len(before) + more + further,
             )
@@ -162,6 +166,18 @@ def reduce_touches(
     arrays = {k: np.array(v, dtype=np.float64) for k, v in rows.items() if k != "name"}
     noise = np.sqrt(np.mean(variances, axis=0))
     return Touched(name=tuple(str(n) for n in rows["name"]), noise=noise, **arrays), notes
+
+
+def _warming(r: Recording, count: int) -> Floats:
+    """Return how fast the temperature rises at each touch [K/s], of its neighbours as well: one touch tells little; 0 without."""
+    out = np.zeros(count)
+    told = np.isfinite(r.temperature_c) & (r.touch >= 0)
+    for number in range(count):
+        mine = told & (np.abs(r.touch - number) <= NEIGHBOURS // 2)
+        if np.any(mine):
+            since = r.time_s[mine] - r.time_s[mine].mean()
+            out[number] = since @ r.temperature_c[mine] / max(float(since @ since), 1e-12)
+    return out
 
 
 def _onset(r: Recording, mine: NDArray[np.intp], before: NDArray[np.intp], under: NDArray[np.intp]) -> float:

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from sioms.reconcile import rules
 from sioms.reconcile.ambiguity import ALIKE, AMBIGUOUS, SWAPS
 from sioms.reconcile.blocks import better
-from sioms.reconcile.sensors.effect import TERM_PREFIX
+from sioms.reconcile.sensors.effect import TERM_PREFIX, SensorEffect
 from sioms.reconcile.sensors.fit import Fit
 from sioms.reconcile.sensors.plausible import alike, physical
 from sioms.reconcile.sensors.screen import screen
 from sioms.reconcile.sensors.search import Found, Searcher, Step
 
 Rival = rules.Rival[Fit]
+
+PATIENCE = 30  # steps of a look-alike's fit: one that stopped short would be ruled out
+FELT = 3.0  # standard deviations that an element's own number must make
+ELSEWHERE = (-3.0, -1.0, 1.0, 3.0)  # natural sizes at which numbers of the elements' own begin again
 
 
 def settle(
@@ -63,14 +69,23 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
             if other.startswith(TERM_PREFIX) or not lib[other].rankable or other in found.fit.model.effects:
                 continue
             for start in screen(searcher.data, bare, searcher.weights, lib[other], searcher.frozen)[:2]:
-                fit = searcher.fit(searcher.switched_on(bare, start))
+                fit = searcher.fit(searcher.switched_on(bare, start), PATIENCE)
+                if frozenset((name, other)) in same:
+                    fit = searcher.restarted(fit, _elsewhere(lib[other]))
                 if physical(fit.model, other):
                     _, errors = better(found.losses, searcher.loss(fit))
+                    missed = (fit.cost - found.fit.cost) / contribution
+                    if (
+                        frozenset((name, other)) in same
+                        and lib[name].primary.each
+                        and lib[other].primary.each
+                    ):
+                        missed = min(missed, max(_missed_by_most(searcher, found.fit, bare, fit), 0.0))
                     out.append(
                         Rival(
                             name,
                             other,
-                            (fit.cost - found.fit.cost) / contribution,
+                            missed,
                             ALIKE if frozenset((name, other)) in same else AMBIGUOUS,
                             errors,
                             fit.cost / found.fit.cost - 1.0,
@@ -78,3 +93,17 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
                         )
                     )
     return rules.closest(out)
+
+
+def _missed_by_most(searcher: Searcher, good: Fit, bare: Fit, rival: Fit) -> float:
+    """Return the share that a rival misses at the middle one of the elements: one that tells its kind does not for the others."""
+    own = searcher.squares(bare) - searcher.squares(good)
+    felt = own > FELT**2
+    missed = (searcher.squares(rival) - searcher.squares(good))[felt] / own[felt]
+    return float(np.median(missed)) if len(missed) else np.inf
+
+
+def _elsewhere(effect: SensorEffect) -> list[tuple[str, str, float]]:
+    """Return where numbers of the elements' own begin again: the side of a touch on which an element lies is either."""
+    q = effect.primary
+    return [(effect.name, q.symbol, effect.neutral + k * q.size) for k in ELSEWHERE] if q.each else []

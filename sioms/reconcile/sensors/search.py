@@ -7,7 +7,7 @@ view where it shows most.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -209,8 +209,7 @@ class Searcher:
         return Step("add", name, self.ratio(new), saved.share, new.model)
 
     def _restart(self, fit: Fit) -> Step | None:
-        """Let shapes of the elements' own, of which some may have stuck, begin again; each keeps what is best for it."""
-        count = fit.model.count
+        """Let shapes of the elements' own, of which some may have stuck, begin again."""
         own = [
             (name, q.symbol, start)
             for name in fit.model.effects
@@ -218,23 +217,35 @@ class Searcher:
             for q in fit.model.library[name].parameters[1:]
             for start in (q.starts if q.each else ())
         ]
-        best = fit
+        best = self.restarted(fit, own)
+        if best is fit:
+            return None
+        return Step("restart", "shapes", self.ratio(best), 1.0 - best.cost / fit.cost, best.model)
+
+    def restarted(self, fit: Fit, own: Iterable[tuple[str, str, float]]) -> Fit:
+        """Let numbers of the elements' own begin again at some values; each element keeps what is best for it.
+
+        Args:
+            own: effect, symbol and where all elements begin.
+
+        Returns:
+            The given fit where nothing is better by ``GAIN``.
+        """
+        count, best = fit.model.count, fit
         for name, symbol, start in own:
             held = best.model.effects[name]
             moved = self.fit(best.model.with_effect(name, {**held, symbol: np.full(count, start)}))
-            better_there = self._squares(moved) < (1.0 - GAIN) * self._squares(best)
+            better_there = self.squares(moved) < (1.0 - GAIN) * self.squares(best)
             values = {
                 s: np.where(better_there, v, held[s]) if len(v) == count > 1 else v
                 for s, v in moved.model.effects[name].items()
             }
             new = self.fit(best.model.with_effect(name, values))
             best = new if new.cost < (1.0 - GAIN) * best.cost else best
-        if best is fit:
-            return None
-        return Step("restart", "shapes", self.ratio(best), 1.0 - best.cost / fit.cost, best.model)
+        return best
 
-    def _squares(self, fit: Fit) -> Array:
-        """Sum of squares of each element."""
+    def squares(self, fit: Fit) -> Array:
+        """Sum of squares of each element, shape (count,)."""
         own = self.data.element >= 0
         out: Array = np.bincount(self.data.element[own], fit.residual[own] ** 2, fit.model.count).astype(
             np.float64

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,11 +16,11 @@ from sioms.plant.finger import FingerShape, TactileArray
 from sioms.reconcile.descent import descend
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.finger.belief import Belief, late, outputs, scene_of
-from sioms.reconcile.finger.data import CELL, STRENGTH, TOUCH, behind
+from sioms.reconcile.finger.data import CELL, COURSE, STRENGTH, TOUCH, behind
 from sioms.reconcile.finger.effects import library
 from sioms.reconcile.finger.model_file import from_table, to_toml
 from sioms.reconcile.finger.plan import Bench, catalogue, first, one_place, propose
-from sioms.reconcile.finger.prepare import prepare
+from sioms.reconcile.finger.prepare import EXTENT, cell_spread, prepare
 from sioms.reconcile.finger.pressures import WAVES, hertz, sheet
 from sioms.reconcile.finger.records import Line, Ramped, find_lines, without_lines
 from sioms.reconcile.finger.twin import FingerTwin
@@ -415,6 +416,56 @@ def test_an_interval_knows_of_the_simulation_s_own_error(
     half = half_intervals(data, fit, np.ones(len(data.view)))
     mine = [f.effect == "gain_scatter" for f in fit.free]
     assert np.median(half[mine]) == pytest.approx(1.96 * 0.05, rel=0.3)  # 5 % too strong is 5 % of gain
+
+
+def _rewritten(folder: Path, change: Callable[[dict[str, np.ndarray]], None]) -> None:
+    for path in folder.glob("*.npz"):
+        with np.load(path) as file:
+            arrays = {k: file[k].copy() for k in file.files}
+        change(arrays)
+        np.savez(path, **arrays)
+
+
+def test_the_zero_goes_on_drifting_between_baseline_and_touch(folder: Path) -> None:
+    nominal, name, stated = read_model(folder / "nominal.toml", folder)
+
+    def warm(a: dict[str, np.ndarray]) -> None:
+        a["temperature"] = 20.0 + 0.02 * a["time"]
+
+    def drift(a: dict[str, np.ndarray]) -> None:
+        a["raw"] = a["raw"] + 100.0 * 0.01 * (a["temperature"][:, None] - 20.0)
+
+    missed = []
+    for change, k in ((warm, 0.0), (drift, 0.01), (None, 0.0)):
+        if change:
+            _rewritten(folder, change)
+        subject = prepare(read_experiments(folder), nominal, name, refine_extent=not stated)
+        values = {"k": np.array([k])}
+        data = subject.whole
+        missed.append(data.miss(data.predict(subject.model.with_effect("temperature_drift", values))))
+    still, drifting, unknown = (m[(data.view == TOUCH) | (data.view == COURSE)] for m in missed)
+    assert np.sqrt(np.mean((drifting - still) ** 2)) < 0.05
+    assert np.sqrt(np.mean((unknown - still) ** 2)) > 0.5
+
+
+@pytest.mark.parametrize("proportional", [False, True])
+def test_the_load_cell_scatters_alike_or_in_proportion_as_it_shows(folder: Path, proportional: bool) -> None:
+    nominal, name, stated = read_model(folder / "nominal.toml", folder)
+    touched = prepare(read_experiments(folder), nominal, name, refine_extent=not stated).whole.touched
+    load = np.resize([50.0, 100.0, 200.0, 300.0], len(touched))
+    expected = 0.03 * load if proportional else np.full(len(load), 4.0)
+    cell = 1.1 * load + expected * np.random.default_rng(3).standard_normal(len(load))
+    found = cell_spread(replace(touched, load=load, cell=cell, cell_noise=np.full(len(load), 0.1)), 1.1)
+    assert np.allclose(found / found.mean(), expected / expected.mean(), atol=0.05)
+    assert found.mean() == pytest.approx(expected.mean(), rel=0.3)
+
+
+def test_a_fit_leaves_the_least_width_of_the_elements(folder: Path) -> None:
+    nominal, name, _ = read_model(folder / "nominal.toml", folder)
+    subject = prepare(read_experiments(folder), nominal, name)
+    least = replace(subject.model, base=replace(subject.model.base, extent=EXTENT.lower))
+    fit = refit(subject.whole, least, np.ones(len(subject.whole.view)), iterations=20)
+    assert 0.02 < fit.model.base.extent < 0.06  # what the generator draws
 
 
 def test_the_fit_finds_the_bottom_of_a_bent_valley_within_its_bounds() -> None:
