@@ -9,6 +9,7 @@ H. R. Kuensch, "The jackknife and the bootstrap for general stationary observati
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -20,6 +21,8 @@ from sioms.reconcile.effect import Array
 from sioms.reconcile.fit import Problem
 
 BLOCK_S = 0.5
+#: A step without a fold that moves a parameter by more than this share of its size is tried, as long or shorter, not extrapolated.
+NEAR, SHORTER = 0.1, (1.0, 0.3)
 #: Variances from which on it makes sense to ask how they scatter, and half the most degrees of freedom that the others lend.
 LEAST_MODERATED, MOST_PRIOR = 4, 500.0
 
@@ -56,8 +59,15 @@ def _normal(fit: Fitted, ids: NDArray[np.int64]) -> tuple[Array, Array, Array]:
     return h, g, c
 
 
-def heldout(fit: Fitted, ids: NDArray[np.int64], folds: int = 10) -> Array:
-    """Sum of squares of each block when the parameters come from the other folds, shape (blocks,)."""
+def heldout(
+    fit: Fitted, ids: NDArray[np.int64], folds: int = 10, moved: Callable[[Array], Array] | None = None
+) -> Array:
+    """Sum of squares of each block when the parameters come from the other folds, shape (blocks,).
+
+    Args:
+        moved: residual with the parameters changed by so many of their sizes. Where one fold tells most of a parameter the others
+            would move it far, to where the slopes of here say nothing; None: they are believed.
+    """
     h, g, c = _normal(fit, ids)
     if fit.jacobian.shape[1] == 0:
         return c
@@ -69,7 +79,11 @@ def heldout(fit: Fitted, ids: NDArray[np.int64], folds: int = 10) -> Array:
         inside = fold == f
         d = np.linalg.solve(total_h - h[inside].sum(0) + ridge, -(total_g - g[inside].sum(0)))
         d = np.clip(d, -1.0, 1.0)
-        out[inside] = c[inside] + 2.0 * g[inside] @ d + np.einsum("i,bij,j->b", d, h[inside], d)
+        if moved is not None and np.max(np.abs(d)) > NEAR:
+            tried = [c, *(np.bincount(ids, weights=moved(share * d) ** 2) for share in SHORTER)]
+            out[inside] = min(tried, key=lambda e: float(e[~inside].sum()))[inside]
+        else:
+            out[inside] = c[inside] + 2.0 * g[inside] @ d + np.einsum("i,bij,j->b", d, h[inside], d)
     return out
 
 

@@ -27,6 +27,8 @@ BASE = "base"
 #: Samples, and seconds, at the start of a record in which the observer finds the state.
 SKIP, SKIP_S = 50, 0.05
 
+#: A change of the residual by the small step of a slope may be a jump from this size on, and where it is so many times the usual one.
+JUMP, PEAK = 1.0, 8.0
 #: Share of a positive number that a step of a fit leaves at least.
 LEFT = 0.3
 #: A model whose friction falls with speed has two speeds at which it agrees with a force. It has lost the measurement
@@ -201,17 +203,37 @@ def put(model: AxisModel, free: Sequence[Free], values: Array) -> AxisModel:
     return replace(model, effects=effects, **base)  # type: ignore[arg-type]
 
 
+def shifted(model: AxisModel, free: Sequence[Free], sizes: Array) -> AxisModel:
+    """Return the model with the free numbers changed by so many of their sizes, within their bounds."""
+    at = get(model, free) + sizes * np.array([f.scale for f in free])
+    return put(model, free, np.clip(at, [f.lower for f in free], [f.upper for f in free]))
+
+
 def jacobian(
     problem: Problem, model: AxisModel, free: Sequence[Free], at: Array, base: Array, step: float = 2e-3
 ) -> Array:
-    """Forward differences in the scaled parameters, stepping away from a bound."""
+    """Differences in the scaled parameters.
+
+    Where so small a step moves some innovation by more than noise, the axis may have stuck, slipped or lost contact otherwise: a jump,
+    which is no slope, however large. There the step is taken the other way, too, and what both agree on is kept.
+    """
+
+    def difference(i: int, h: float) -> Array:
+        moved = at.copy()
+        moved[i] += h
+        return problem.residual(put(model, free, moved)) - base
 
     def column(i: int) -> Array:
         f = free[i]
         h = step * f.scale if at[i] + step * f.scale <= f.upper else -step * f.scale
-        moved = at.copy()
-        moved[i] += h
-        return (problem.residual(put(model, free, moved)) - base) * (f.scale / h)
+        slope = difference(i, h)
+        peak = float(np.max(np.abs(slope)))
+        if peak > max(JUMP, PEAK * float(np.sqrt(np.mean(slope**2)))) and f.lower <= at[i] - h <= f.upper:
+            back = -difference(i, -h)
+            slope = np.where(
+                slope * back > 0.0, np.sign(slope) * np.minimum(np.abs(slope), np.abs(back)), 0.0
+            )
+        return slope * (f.scale / h)
 
     return np.stack(list(problem.mapper(column, range(len(free)))), axis=1)
 

@@ -17,7 +17,7 @@ from sioms.reconcile import ladder
 from sioms.reconcile.blocks import better, block_ids, heldout
 from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import known
-from sioms.reconcile.fit import BASE, Fit, Problem, closed_errors, refit
+from sioms.reconcile.fit import BASE, Fit, Problem, closed_errors, refit, shifted
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.plausible import (
     AND,
@@ -136,7 +136,12 @@ class Searcher:
         if len(self.ids) != len(fit.residual):
             self.ids = block_ids(self.problem, fit.model.sample_time_s)
         smooth = [f.effect == BASE or known()[f.effect].slot is not Slot.BACKLASH for f in fit.free]
-        losses = heldout(replace(fit, jacobian=fit.jacobian[:, smooth]), self.ids)
+        free = [f for f, kept in zip(fit.free, smooth, strict=True) if kept]
+        losses = heldout(
+            replace(fit, jacobian=fit.jacobian[:, smooth]),
+            self.ids,
+            moved=lambda d: self.problem.residual(shifted(fit.model, free, d)),
+        )
         return (
             losses
             if self.problem.weights is None
@@ -195,7 +200,11 @@ class Searcher:
             and n not in self.frozen
             and not any(f in known()[n].replaces for f in self.frozen)
         ]
-        fresh = [n for n in names if not replaced(fit.model, n) and not self._enrichment(n)]
+        fresh = [
+            n
+            for n in names
+            if not replaced(fit.model, n) and not self._enrichment(n) and not known()[n].joins
+        ]
         starts = [s for s in self.screen(fit, fresh) if s.gain > 0.5 * GAIN]
         starts += self._upgrades(fit, [n for n in names if replaced(fit.model, n)])
         starts.sort(key=lambda s: -s.gain)
@@ -216,6 +225,9 @@ class Searcher:
         """Screen richer forms of an effect in the model, on top of the level it has."""
         out = []
         for name in names:
+            joins = known()[name].joins
+            if joins and not any(n in fit.model.effects for n in joins):
+                continue
             old = next(n for n in known()[name].replaces if n in fit.model.effects)
             level = next(iter(fit.model.effects[old].values()))
             levels = {p.symbol: level for p in known()[name].parameters if p.symbol in ("Fc", "Fs", "f")}

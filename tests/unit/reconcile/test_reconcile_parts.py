@@ -16,7 +16,7 @@ from sioms.reconcile.channels import drive, drive_output, index_fit, lattice
 from sioms.reconcile.descent import descend
 from sioms.reconcile.excitation import common, gate
 from sioms.reconcile.experiment import Envelope, catalogue, demands, one_speed, repeated, separate
-from sioms.reconcile.fit import LEFT, Problem, refit
+from sioms.reconcile.fit import LEFT, Problem, free_parameters, get, jacobian, refit
 from sioms.reconcile.locate import locate
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
@@ -237,6 +237,39 @@ def test_blocks_agree_with_refitting() -> None:
     assert loss.sum() == pytest.approx(fit.cost, rel=0.02)
     spread = np.std(bootstrap(fit, ids, 300, np.random.default_rng(1))[:, 0]) * fit.free[0].scale
     assert abs(fit.model.effects["viscous"]["b_extra"] - 5e-3) < 5.0 * spread + 5e-5
+
+
+def test_a_fold_that_tells_a_parameter_is_tried_without_it() -> None:
+    """Straight at the fit, level away from it: without the only block that tells it, the parameter is thrown a long way."""
+    ids = np.repeat(np.arange(10), 50)
+    noise = np.random.default_rng(5).standard_normal(500)
+    alone = np.where(ids == 3, 40.0, 0.02)
+    noise += np.where(ids == 3, 0.0, 0.016)
+
+    def moved(d: np.ndarray) -> np.ndarray:
+        return noise + alone * np.tanh(d[0] / 0.05) * 0.05
+
+    fit = Linear(noise, alone[:, None])
+    believed, tried = heldout(fit, ids), heldout(fit, ids, moved=moved)
+    assert believed[3] > 20.0 * np.sum(noise[ids == 3] ** 2)
+    assert tried[3] < 5.0 * np.sum(noise[ids == 3] ** 2)
+    np.testing.assert_allclose(np.delete(tried, 3), np.delete(believed, 3))
+
+
+def test_a_jump_of_the_residual_is_no_slope() -> None:
+    """A residual that jumps where friction passes a level, beside one that grows with it."""
+
+    class Sticks(Problem):
+        def residual(self, model: AxisModel) -> np.ndarray:
+            level = model.effects["coulomb"]["Fc"]
+            return np.array([*np.full(200, 3.0 * level), 8.0 * (level > 0.1001), 900.0 * level])
+
+    p = Sticks(session(), observer(AXIS, 1e-4, 2e-3))
+    model = AXIS.with_effect("coulomb", {"Fc": 0.1})
+    free = free_parameters(model)
+    at = get(model, free)
+    slopes = jacobian(p, model, free, at, p.residual(model), 0.02)[:, 0] / free[0].scale
+    np.testing.assert_allclose(slopes, [*np.full(200, 3.0), 0.0, 900.0], atol=1e-6)
 
 
 @dataclass
