@@ -190,8 +190,14 @@ CATALOGUE: Mapping[str, Kind] = {
     ),
     "presliding": Kind(
         Place.MOTOR,
-        "further friction that first yields like a spring (Dahl): dz/dt = v - |v| z/(level/stiffness)",
-        {"level": _SIZE, "stiffness": Parameter("force/position", low=1e-12, neutral=1.0)},
+        "further friction that first yields like a spring (LuGre; Dahl without rise): dz/dt = v - |v| z/(g/stiffness), "
+        "g = level + rise exp(-(v/velocity)^2)",
+        {
+            "level": _SIZE,
+            "stiffness": Parameter("force/position", low=1e-12, neutral=1.0),
+            "rise": Parameter("force", default=0.0),
+            "velocity": Parameter("position/s", low=1e-12, default=1.0, neutral=1.0),
+        },
     ),
     "elastic": Kind(
         Place.TRANSMISSION,

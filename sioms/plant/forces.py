@@ -130,27 +130,33 @@ class Spring:
 
 
 class Presliding:
-    """Dahl friction with exact relaxation of its deflection z at the velocity of the substep."""
+    """LuGre friction without its damping, Dahl's where the level does not rise: relaxed exactly at the velocity of the substep."""
 
     def __init__(self, effect: Effect, substep_s: float) -> None:
-        self._level = effect.values["level"]
-        self._rate = substep_s * effect.values["stiffness"] / np.where(effect.active, self._level, 1.0)
-        # Friction in units of the level: -1 to 1.
-        self._share, self._decay, self._work = np.zeros((3, effect.active.size))
+        self._level, self._rise = effect.values["level"], effect.values["rise"]
+        self._inverse = 1 / effect.values["velocity"]
+        self._rate = np.where(effect.active, substep_s * effect.values["stiffness"], 0.0)
+        self._force, self._goal, self._decay = np.zeros((3, effect.active.size))
 
     def add(self, motion: Motion, total: Array) -> None:
-        """Relax towards the direction of motion and add the friction."""
-        share, decay, work = self._share, self._decay, self._work
+        """Relax towards the level in the direction of motion and add the friction."""
+        force, goal, decay = self._force, self._goal, self._decay
+        np.multiply(motion.velocity, self._inverse, out=goal)
+        np.multiply(goal, goal, out=goal)
+        np.negative(goal, out=goal)
+        np.exp(goal, out=goal)
+        np.multiply(goal, self._rise, out=goal)
+        np.add(goal, self._level, out=goal)
         np.abs(motion.velocity, out=decay)
         np.multiply(decay, self._rate, out=decay)
+        np.divide(decay, goal, out=decay, where=goal > 0.0)
         np.negative(decay, out=decay)
         np.exp(decay, out=decay)
-        np.sign(motion.velocity, out=work)
-        np.subtract(share, work, out=share)
-        np.multiply(share, decay, out=share)
-        np.add(share, work, out=share)
-        np.multiply(share, self._level, out=work)
-        np.subtract(total, work, out=total)
+        np.copysign(goal, motion.velocity, out=goal)
+        np.subtract(force, goal, out=force)
+        np.multiply(force, decay, out=force)
+        np.add(force, goal, out=force)
+        np.subtract(total, force, out=total)
 
 
 class Stribeck:

@@ -46,7 +46,8 @@ class Slot(Enum):
     LAG = "lag"  # p[0] time constant of the drive [s]
     LIMIT = "limit"  # p[0] largest actuator force [force]
     THERMAL = "thermal"  # gain 1 - p[0] T, T' = ((u / rated)^2 - T) / p[1]
-    HYSTERESIS = "hysteresis"  # friction p[0] that builds up over the displacement p[1] after reversal
+    # friction p[0] that builds up over the displacement p[1] after reversal; at rest of level p[2], dropping over the speed p[3]
+    HYSTERESIS = "hysteresis"
     ELASTIC = "elastic"  # two masses: resonance p[0] [Hz], load fraction p[1], damping ratio p[2]
     BACKLASH = "backlash"  # two masses: gap p[0], load fraction p[1]
     SCALE = "scale"  # measured = p[0] * true
@@ -104,6 +105,7 @@ class Effect:
         rotary, linear: kinds of axis on which it makes sense.
         rankable: False where moving data can never tell it from its look-alike.
         replaces: effects that this one contains or excludes; switching it on switches them off.
+        joins: effects of which this one is both at once: it is tried where one of them is in the model already.
         ratios: (symbol, symbol, most): the first number is at most so many times the second.
         session: parameters that belong to the session and not to the axis.
     """
@@ -123,6 +125,7 @@ class Effect:
     rankable: bool = True
     session: tuple[str, ...] = ()
     replaces: tuple[str, ...] = ()
+    joins: tuple[str, ...] = ()
     ratios: tuple[tuple[str, str, float], ...] = ()
 
     @property

@@ -44,13 +44,15 @@ call = caller()
     GAP,
     HYST_F,
     HYST_X,
+    HYST_S,
+    HYST_V,
     LOAD_VISCOUS,
     MOD_A,
     MOD_PHASE,
     MOD_N,
     WARMING,
     PLANT_SIZE,
-) = range(26)
+) = range(28)
 # Places in the controller row.
 CTL_K, CTL_KZ, CTL_KP, CTL_KB, CTL_OFFSET, CTL_MAX, CTL_ALPHA, CTL_MEAN, CTL_SIZE = range(9)
 # Columns of the output.
@@ -171,7 +173,7 @@ def march(
     jm = total - jl
     # Local copies: a function that is called by its address might have changed an array.
     viscous, limit, delay, lag, loss = plant[VISCOUS], plant[LIMIT], plant[DELAY], plant[LAG], plant[LOSS]
-    hyst_f, mod, gain_y = plant[HYST_F], plant[MOD_A], plant[GAIN_Y]
+    hyst_f, hyst_s, mod, gain_y = plant[HYST_F], plant[HYST_S], plant[MOD_A], plant[GAIN_Y]
     decay = np.exp(-h / lag) if lag > 0.0 else 0.0
     l1, l2, l3, l4 = gain[0] / gain_y, gain[1] / gain_y, gain[2] / gain_y, gain[3] / gain_y
     per_mass = 1.0 / jm
@@ -262,8 +264,12 @@ def march(
             if v != 0.0 and vp * v < 0.0:
                 vp = 0.0
             if hyst_f > 0.0:
-                way = np.exp(-np.abs(vp) * h / plant[HYST_X])
-                goal = hyst_f if vp > 0.0 else -hyst_f
+                goal, path = hyst_f, np.abs(vp) * h / plant[HYST_X]
+                if hyst_s > 0.0:
+                    goal += (hyst_s - hyst_f) * np.exp(-((vp / plant[HYST_V]) ** 2))
+                    path *= hyst_s / goal
+                way = np.exp(-path)
+                goal = goal if vp > 0.0 else -goal
                 before = hyst
                 hyst = goal + (hyst - goal) * way
                 base += before - 0.5 * (before + hyst)

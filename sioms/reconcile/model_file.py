@@ -61,9 +61,7 @@ def model_from(table: Mapping[str, Any]) -> AxisModel:
     only(a, AXIS_KEYS, "model, [axis]")
     if a.get("kind") not in ("rotary", "linear"):
         raise ValueError(f"[axis] kind is {a.get('kind')!r}; rotary or linear")
-    numbers: dict[str, Any] = {
-        key: _number(a, "[axis]", key, *about) for key, about in AXIS_NUMBERS.items()
-    }
+    numbers: dict[str, Any] = {key: _number(a, "[axis]", key, *about) for key, about in AXIS_NUMBERS.items()}
     model = AxisModel(
         rotary=a["kind"] == "rotary",
         controller=_controller(_table(table, "controller")) if "controller" in table else None,

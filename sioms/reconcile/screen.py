@@ -24,12 +24,14 @@ from sioms.reconcile.simulate import replay
 #: Trial values, as multiples of a parameter's scale, of effects that are not forces of the state.
 GRID_DELAY = (0.5e-3, 2e-3, 5e-3)
 GRID_RESONANCE = (7.0, 11.0, 16.0, 24.0, 36.0, 55.0)
-GRID_GAP = tuple(float(g) for g in np.geomspace(3e-4, 6e-2, 20))
+GRID_GAP = tuple(float(g) for g in np.geomspace(3e-4, 0.18, 24))
 #: A contact that bounces makes a cost of many minima; started with one that does not, it would not find all that do.
 GRID_ZETA = (0.05, 0.3)
 GRID_LIMIT = (0.95, 0.85, 0.7, 0.5, 0.3)
 GRID_TAU = (3.0, 10.0, 40.0)
 STEP_LENGTH = 3.5  # from one trial of a length to the next
+GRID_DROP = (0.003, 0.01, 0.03, 0.1)  # speeds of a drop, of the largest
+RISE = 1.4  # first guess of a breakaway level, of the level at speed
 GRID_PHASE = np.linspace(-np.pi, np.pi, 9)[1:]
 SPEED_STEPS, PLACES = 7, 15
 #: Below this the measured motion stands for one without noise; a command is followed up to COMMAND_HZ, if to this share.
@@ -370,7 +372,9 @@ def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator
             low = 10.0 * effect.parameters[1].lower * model.pitch
             high = max(min(0.8 * effect.parameters[1].upper * model.pitch, reach), low)
             steps = 1 + int(np.ceil(np.log(high / low) / np.log(STEP_LENGTH)))
-            grid = tuple({"xs": float(g)} for g in np.geomspace(low, high, steps))
+            lengths = tuple({"xs": float(g)} for g in np.geomspace(low, high, steps))
+            speeds = [{"vs": g * model.max_speed} for g in GRID_DROP] if "vs" in start else [{}]
+            grid = tuple({**length, **speed} for length in lengths for speed in speeds)
         case Slot.SCALE:
             grid = ({first: 1.01},)
         case Slot.ECCENTRICITY:
@@ -388,6 +392,8 @@ def _screen_trials(problem: Problem, fit: Fit, effect: Effect, q: Array, rest: A
     for name in effect.replaces:
         model = model.without_effect(name) if name in model.effects else model
     trials = list(trial_values(effect, model, problem))
+    if effect.joins:
+        trials = _beside(trials, fit.model, effect)
     least = -9.0 if effect.slot is Slot.SCALE or effect.primary.lower < 0.0 else 0.0
     for values, tried in zip(
         trials,
@@ -406,13 +412,21 @@ def _screen_trials(problem: Problem, fit: Fit, effect: Effect, q: Array, rest: A
     return best[: 2 if effect.slot in (Slot.ELASTIC, Slot.BACKLASH) else 1]
 
 
+def _beside(trials: list[dict[str, float]], model: AxisModel, effect: Effect) -> list[dict[str, float]]:
+    """Give trials of an effect that joins two the numbers of the one that is in the model, each once."""
+    given = {k: v for n in effect.joins if n in model.effects for k, v in model.effects[n].items()}
+    if "Fc" in given and "Fs" not in given:
+        given["Fs"] = RISE * given["Fc"]
+    return list({tuple(t.items()): t for t in ({**trial, **given} for trial in trials)}.values())
+
+
 def _stretched(
     effect: Effect, model: AxisModel, values: dict[str, float], stretch: float
 ) -> dict[str, float]:
     """Scale the amplitude where the effect is linear in it."""
     p = effect.parameters[0]
     neutral = {Slot.SCALE: 1.0}.get(effect.slot, 0.0)
-    if effect.slot in (Slot.ELASTIC, Slot.BACKLASH, Slot.LIMIT):
+    if effect.joins or effect.slot in (Slot.ELASTIC, Slot.BACKLASH, Slot.LIMIT):
         return values
     s = model.scale(p)
     amplitude = neutral + (values[p.symbol] - neutral) * stretch

@@ -133,7 +133,7 @@ def _place(plant: Array, slot: Slot, p: Array) -> None:
         case Slot.THERMAL:
             plant[k.LOSS], plant[k.TAU_T] = p
         case Slot.HYSTERESIS:
-            plant[k.HYST_F], plant[k.HYST_X] = p
+            plant[k.HYST_F : k.HYST_F + len(p)] = p
         case Slot.SCALE:
             plant[k.GAIN_Y] = p[0]
         case Slot.ECCENTRICITY:

@@ -142,7 +142,9 @@ def _slot(effect: Effect, values: Mapping[str, float], model: AxisModel) -> dict
         case Slot.LIMIT:
             return {"saturation": {"limit": p[0]}}
         case Slot.HYSTERESIS:
-            return {"presliding": {"level": p[0], "stiffness": p[0] / p[1]}}
+            rise, speed = (p[2] - p[0], p[3]) if len(p) > 2 else (0.0, 1.0)
+            stiffness = (p[0] + rise) / p[1]
+            return {"presliding": {"level": p[0], "stiffness": stiffness, "rise": rise, "velocity": speed}}
         case Slot.ELASTIC:
             return {"elastic": {"frequency_hz": p[0], "load_fraction": p[1], "damping": p[2]}}
         case Slot.BACKLASH:

@@ -158,6 +158,31 @@ def test_dahl_friction_builds_up_exponentially_over_its_length() -> None:
     np.testing.assert_allclose(run.x[1000:], wanted[1000:], rtol=0.04)
 
 
+@pytest.mark.parametrize("speed", [0.02, 0.4])
+def test_lugre_friction_agrees_with_an_ordinary_solver(speed: float) -> None:
+    """Driven to and fro so that it yields, breaks away and drops: LuGre's equation without damping, solved by scipy."""
+    fc, fs, vs, xs, b, j = 0.05, 0.08, 0.15, 1e-2, 1e-3, 2e-3
+    values = {"Fc": fc, "xs": xs, "Fs": fs, "vs": vs}
+    model = replace(AXIS, viscous=b, controller=None).with_effect("lugre", values)
+    t = np.arange(1500) * DT
+    force = (fs + speed * 0.1) * np.sin(2 * np.pi * 1.5 * t)
+
+    def slopes(time: float, y: np.ndarray) -> list[float]:
+        _, v, f = y
+        g = fc + (fs - fc) * np.exp(-((v / vs) ** 2))
+        u = force[min(int(time / DT + 1e-9), len(force) - 1)]
+        return [v, (u - f - b * v) / j, fs / xs * (v - abs(v) * f / g)]
+
+    y, wanted = np.zeros(3), []
+    for k in range(len(t)):
+        wanted.append(y)
+        y = solve_ivp(slopes, (t[k], t[k] + DT * (1 - 1e-6)), y, rtol=1e-8, atol=1e-10).y[:, -1]
+    x = np.array(wanted)[:, 0]
+    run = track(model, np.zeros(len(t)), force, None)
+    assert np.ptp(x) > 20 * xs
+    np.testing.assert_allclose(run.x, x, atol=2e-3 * np.ptp(x))
+
+
 def test_backlash_conserves_momentum_and_hides_the_load() -> None:
     model = replace(AXIS, viscous=0.0, controller=None).with_effect(
         "backlash", {"gap": 0.5, "load_fraction": 0.6, "f_contact": 120.0, "zeta": 0.1}

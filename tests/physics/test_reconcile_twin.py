@@ -28,6 +28,7 @@ CASES: dict[str, dict[str, float]] = {
     "coulomb_position": {"Fc": 0.03, "Fm": 0.01, "phase": 0.4, "n": 3.0},
     "stribeck": {"Fc": 0.03, "Fs": 0.05, "vs": 0.3},
     "presliding": {"Fc": 0.03, "xs": 5e-3},
+    "lugre": {"Fc": 0.03, "xs": 5e-3, "Fs": 0.05, "vs": 0.3},
     "load_friction": {"mu": 0.2},
     "offset": {"off": 0.02},
     "gravity": {"amp": 0.03, "phase": 0.4},

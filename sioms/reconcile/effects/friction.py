@@ -2,7 +2,9 @@
 
 Sources: B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit, "A survey of models, analysis tools and
 compensation methods for the control of machines with friction", Automatica 30 (1994) 1083-1138,
-for viscous, Coulomb, Stribeck; P. R. Dahl, "A solid friction model", 1968, for presliding.
+for viscous, Coulomb, Stribeck; P. R. Dahl, "A solid friction model", 1968, for presliding; C. Canudas de Wit, H. Olsson,
+K. J. Astrom, P. Lischinsky, "A new model for control of systems with friction", IEEE Trans. Automatic Control 40 (1995)
+419-425, for both at once.
 """
 
 from __future__ import annotations
@@ -112,7 +114,7 @@ COULOMB = Effect(
     signature="force residual steps with the direction of motion and does not depend on speed",
     lookalikes=("stribeck", "viscous", "offset", "presliding"),
     separate="slow reversals and cruise at several speeds both ways",
-    replaces=("stribeck", "presliding", "coulomb_position"),
+    replaces=("stribeck", "presliding", "lugre", "coulomb_position"),
 )
 COULOMB_POSITION = Effect(
     name="coulomb_position",
@@ -130,7 +132,7 @@ COULOMB_POSITION = Effect(
     signature="periodic force residual whose sign follows the direction of motion",
     lookalikes=("coulomb", "cogging", "torque_ripple"),
     separate="one full turn at constant speed, both ways",
-    replaces=("coulomb", "stribeck", "presliding"),
+    replaces=("coulomb", "stribeck", "presliding", "lugre"),
 )
 STRIBECK = Effect(
     name="stribeck",
@@ -148,7 +150,7 @@ STRIBECK = Effect(
     lookalikes=("coulomb", "presliding", "backlash"),
     separate="reversals at several low speeds",
     ratios=(("Fs", "Fc", 5.0),),
-    replaces=("coulomb", "presliding", "coulomb_position"),
+    replaces=("coulomb", "presliding", "lugre", "coulomb_position"),
 )
 PRESLIDING = Effect(
     name="presliding",
@@ -164,7 +166,27 @@ PRESLIDING = Effect(
     lookalikes=("coulomb", "stribeck", "backlash"),
     separate="small reversals of several amplitudes",
     session=("state at the start",),
-    replaces=("coulomb", "stribeck", "coulomb_position"),
+    replaces=("coulomb", "stribeck", "lugre", "coulomb_position"),
+)
+LUGRE = Effect(
+    name="lugre",
+    title="friction with presliding and low-speed drop (LuGre)",
+    channel=Channel.MECHANICS,
+    slot=Slot.HYSTERESIS,
+    equation="dF/dx = (g sign(v) - F) Fs/(xs g), force -F, g = Fc + (Fs - Fc) exp(-(v/vs)^2)",
+    parameters=(
+        Parameter("Fc", "{F}", Ref.FORCE, 0.0, 1.5, 0.05, "level at speed"),
+        Parameter("xs", "{x}", Ref.PITCH, 1e-5, 2e-2, 1e-3, "presliding displacement"),
+        Parameter("Fs", "{F}", Ref.FORCE, 0.0, 3.0, 0.08, "breakaway level"),
+        Parameter("vs", "{x}/s", Ref.SPEED, 2e-4, 0.5, 0.02, "speed over which the level drops"),
+    ),
+    signature="friction force builds up over a displacement after every reversal and drops with the speed",
+    lookalikes=("stribeck", "presliding", "coulomb", "backlash"),
+    separate="small reversals of several amplitudes, and reversals at several low speeds",
+    session=("state at the start",),
+    ratios=(("Fs", "Fc", 5.0),),
+    replaces=("coulomb", "stribeck", "presliding", "coulomb_position"),
+    joins=("stribeck", "presliding"),
 )
 LOAD_FRICTION = Effect(
     name="load_friction",
@@ -187,5 +209,6 @@ EFFECTS = (
     COULOMB_POSITION,
     STRIBECK,
     PRESLIDING,
+    LUGRE,
     LOAD_FRICTION,
 )

@@ -230,7 +230,7 @@ TERMS = (
         Parameter("f", "{F}", Ref.FORCE, 0.0, 1.5, 0.05, "level long after a reversal"),
         Parameter("xs", "{x}", Ref.PITCH, 5e-3, 100.0, 0.05, "displacement over which it builds up"),
         slot=Slot.HYSTERESIS,
-        replaces=("presliding", "coulomb", "stribeck", "coulomb_position"),
+        replaces=("presliding", "lugre", "coulomb", "stribeck", "coulomb_position"),
         lookalikes=("coulomb",),
     ),
     _term(
