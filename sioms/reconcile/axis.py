@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.stats import binom
 
 from sioms.reconcile.ambiguity import Rival, settle
 from sioms.reconcile.blocks import better, block_ids, intervals
@@ -27,7 +28,7 @@ from sioms.reconcile.locate import Place, Spectrum, locate, spectra
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, effective_samples, observer, sensor_noise
 from sioms.reconcile.records import Session
-from sioms.reconcile.refuse import bursts, smoother_share
+from sioms.reconcile.refuse import bursts, loud_turns, smoother_share
 from sioms.reconcile.rules import GAIN, SPECIFIC, SURE, told_apart
 from sioms.reconcile.search import Found, Searcher, Step, rattles
 from sioms.reconcile.simulate import replay
@@ -47,6 +48,8 @@ LARGE = 3.0
 HOPELESS, HALF = 5.0, 0.33
 #: Multiples of a parameter of the bounces in a gap that are tried for its interval.
 ROUGH_GRID = tuple(float(x) for x in np.linspace(0.9, 1.1, 17))
+#: So large a share of the bursts at turns of the motion belongs to them, if chance brings it no oftener than this.
+MOSTLY, CHANCE = 0.5, 0.01
 #: Below these multiples of the expected innovation nothing is called unexplained, or a burst.
 LEAST_ODD = 1.25
 QUIET = 1.6
@@ -326,10 +329,7 @@ def _conclude(
     plan = _plan(ready, o, fit.model, open_rivals) if outcome is Outcome.AMBIGUOUS else None
     notes = list(ready.notes)
     if disturbance:
-        notes.append(
-            f"the residual comes in bursts ({100 * burst:.0f} % of its energy in a tenth of the time) that no state "
-            "of the axis orders: a disturbance from outside, not an effect"
-        )
+        notes.append(_of_bursts(ready.problem, found.fit, burst))
     elif large:
         ordered = (
             f"the state of the axis orders {100 * share:.0f} % of it, in no form that is known"
@@ -371,6 +371,18 @@ def _conclude(
         tuple((r.name, s) for r, s in zip(ready.final.session.records, states, strict=True)),
         rejected,
     )
+
+
+def _of_bursts(problem: Problem, fit: Fit, burst: float) -> str:
+    """Say what bursts of the residual are, as far as that shows."""
+    text = f"the residual comes in bursts ({100 * burst:.0f} % of its energy in a tenth of the time)"
+    turning, loud, usual = loud_turns(problem, fit)
+    if turning > MOSTLY * loud and binom.sf(turning - 1, loud, usual) < CHANCE:
+        return (
+            f"{text}, {turning} of {loud} where the motion turns, starts or stops (which is {100 * usual:.0f} % of the time): "
+            "play, presliding or stick-slip in a form that no effect of the library has, rather than a disturbance from outside"
+        )
+    return f"{text} that no state of the axis orders: a disturbance from outside, not an effect"
 
 
 def _outcome(named: bool, unexplained: bool, ambiguous: bool) -> Outcome:

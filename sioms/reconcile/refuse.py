@@ -8,12 +8,13 @@ displacement since reversal. It names nothing; it only keeps the named model hon
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sioms.reconcile.blocks import block_ids
 from sioms.reconcile.effect import Array
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.screen import Motion, dead_band, direction, instrument_motion, thinned
+from sioms.reconcile.screen import Motion, dead_band, direction, instrument_motion, smoothed_motion, thinned
 
 KNOTS = 14
 HARMONICS = 4
@@ -119,6 +120,30 @@ def smoother_rest(problem: Problem, fit: Fit, folds: int = 5) -> Array:
     return best
 
 
+def loud_turns(problem: Problem, fit: Fit) -> tuple[int, int, float]:
+    """Count the bursts of the residual that come while the motion turns, starts or stops.
+
+    Returns:
+        Loud tenths of a second that hold such a moment or follow one, all loud ones, and the share of all tenths that do.
+    """
+    ids, energy, loud = _loud(problem, fit)
+    dead, length = dead_band(problem, fit.model), max(int(BURST_S / fit.model.sample_time_s), 1)
+    turns = []
+    for m in smoothed_motion(problem, fit.model):
+        way = np.sign(np.where(np.abs(direction(m.v, dead)) > 0.5, m.v, 0.0))
+        changed = np.diff(way, prepend=way[0]) != 0.0
+        turns.append(np.convolve(changed, np.ones(length), "full")[: len(way)])
+    near = np.bincount(ids, weights=problem.join(turns), minlength=len(energy)) > 0.5
+    return int(np.sum(loud & near)), int(np.sum(loud)), float(np.mean(near))
+
+
+def _loud(problem: Problem, fit: Fit) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
+    """Return the tenth of a second that each sample of the residual is in, the energy of each, and whether it is loud."""
+    ids = block_ids(problem, fit.model.sample_time_s, BURST_S)
+    energy = np.bincount(ids, weights=fit.residual**2) / np.bincount(ids)
+    return ids, energy, energy > LOUD * float(np.median(energy))
+
+
 def bursts(problem: Problem, fit: Fit) -> float:
     """Measure how far the residual comes in bursts.
 
@@ -126,10 +151,8 @@ def bursts(problem: Problem, fit: Fit) -> float:
         The share of the energy above the quiet level that lies in loud tenths of a second; 0 where more than a
         third of the time is loud.
     """
-    ids = block_ids(problem, fit.model.sample_time_s, BURST_S)
-    energy = np.bincount(ids, weights=fit.residual**2) / np.bincount(ids)
-    quiet = float(np.median(energy))
-    above, loud = np.clip(energy - quiet, 0.0, None), energy > LOUD * quiet
+    _, energy, loud = _loud(problem, fit)
+    above = np.clip(energy - float(np.median(energy)), 0.0, None)
     if np.mean(loud) > MOST_LOUD:
         return 0.0
     return float(above[loud].sum() / max(above.sum(), 1e-300))

@@ -22,6 +22,7 @@ from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
 from sioms.reconcile.plausible import unspecific
 from sioms.reconcile.records import Record, Session
+from sioms.reconcile.refuse import loud_turns
 from sioms.reconcile.screen import screen
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.simulate import replay, simulate
@@ -46,6 +47,24 @@ def session(model: AxisModel = AXIS, command: np.ndarray = COMMAND) -> Session:
 
 def problem(s: Session) -> Problem:
     return Problem(s, observer(AXIS, sensor_noise(s, AXIS.resolution), drive_noise(s, AXIS.rated_force)))
+
+
+@pytest.mark.parametrize("at_turns", [True, False])
+def test_bursts_at_turns_of_the_motion_are_told_from_those_at_any_time(at_turns: bool) -> None:
+    """Pushes nobody recorded, 10 ms long: just after the command turns (every second), or at times that keep away from it."""
+    command = 3.5 * np.sin(np.pi * np.arange(8000) * 1e-3)
+    push = np.zeros(8000)
+    for second in range(8):
+        start = 1000 * second + (520 if at_turns else 70 + 37 * second)
+        push[start : start + 10] = 0.3
+    quiet = session(command=command).records[0]
+    run = replay(AXIS, replace(quiet, external=push))
+    pushed = replace(quiet, position=run.position, force=run.force)
+    made = problem(Session((pushed,)))
+    turning, loud, usual = loud_turns(made, refit(made, AXIS, (), 4))
+    assert 6 <= loud <= 24
+    assert 0.1 < usual < 0.35
+    assert (turning >= 0.7 * loud) if at_turns else (turning <= 0.35 * loud)
 
 
 def test_the_lattice_of_a_coarse_encoder_is_seen() -> None:
