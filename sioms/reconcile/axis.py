@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import binom
 
 from sioms.reconcile.ambiguity import Rival, settle
-from sioms.reconcile.blocks import better, block_ids, intervals
+from sioms.reconcile.blocks import better, block_ids, formal, intervals
 from sioms.reconcile.calibrate import calibrated
 from sioms.reconcile.channels import Finding, drive, drive_output, index_fit, index_scale, lattice
 from sioms.reconcile.checks import check, check_scale
@@ -401,9 +401,8 @@ def _intervals(
     problem: Problem, fit: Fit, replicates: int, rng: np.random.Generator
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """95 % intervals per (effect, symbol), by leaving out each block of time, within the bounds of the parameters."""
-    spread = intervals(fit, block_ids(problem, fit.model.sample_time_s)) * np.array(
-        [f.scale for f in fit.free]
-    )
+    half = np.maximum(intervals(fit, block_ids(problem, fit.model.sample_time_s)), formal(fit))
+    spread = half * np.array([f.scale for f in fit.free])
     out = {}
     for f, s in zip(fit.free, spread, strict=True):
         value = getattr(fit.model, f.symbol) if f.effect == BASE else fit.model.effects[f.effect][f.symbol]

@@ -126,6 +126,19 @@ def intervals(fit: Fitted, ids: NDArray[np.int64], level: float = 0.95) -> Array
     return np.asarray(student.ppf(0.5 + 0.5 * level, freedom) * np.sqrt(variance))
 
 
+def formal(fit: Fitted, level: float = 0.95) -> Array:
+    """Half-widths of the intervals of least squares under white noise, in units of the parameters' scale, shape (k,).
+
+    Noise that is alike for a while only makes the truth wider: where the blocks say less, they are few, and it is chance. The larger
+    of both is the safer. Source: J. D. Angrist, J.-S. Pischke, "Mostly Harmless Econometrics", 2009, sec. 8.2.
+    """
+    n, k = fit.jacobian.shape
+    h = fit.jacobian.T @ fit.jacobian
+    inverse = np.linalg.inv(h + (1e-9 * np.trace(h) or 1.0) * np.eye(k))
+    each = float(fit.residual @ fit.residual) / max(n - k, 1)
+    return np.asarray(student.ppf(0.5 + 0.5 * level, max(n - k, 1)) * np.sqrt(each * np.diag(inverse)))
+
+
 def _moderated(variance: Array, formal: Array, freedom: Array) -> tuple[Array, Array]:
     """Draw variances towards a common multiple of the formal ones, as strongly as they scatter less than chance would have it.
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sioms.reconcile.ambiguity import settle
-from sioms.reconcile.blocks import better, block_ids, bootstrap, heldout, intervals
+from sioms.reconcile.blocks import better, block_ids, bootstrap, formal, heldout, intervals
 from sioms.reconcile.channels import drive, drive_output, index_fit, lattice
 from sioms.reconcile.descent import descend
 from sioms.reconcile.excitation import common, gate
@@ -297,6 +297,18 @@ class Linear:
 
     residual: np.ndarray
     jacobian: np.ndarray
+
+
+def test_formal_intervals_cover_nineteen_of_twenty_under_white_noise() -> None:
+    """Two thousand linear fits of two correlated columns to forty samples."""
+    rng, n = np.random.default_rng(8), 40
+    columns = np.stack([np.sin(0.3 * np.arange(n)), np.sin(0.3 * np.arange(n) + 0.5)], axis=1)
+    hits = np.zeros(2)
+    for _ in range(2000):
+        noise = rng.standard_normal(n)
+        moved = np.linalg.lstsq(columns, noise, rcond=None)[0]  # the truth is zero
+        hits += np.abs(moved) <= formal(Linear(columns @ moved - noise, columns))
+    assert np.all(np.abs(hits / 2000 - 0.95) < 0.015)
 
 
 def test_intervals_cover_where_few_blocks_tell_a_parameter() -> None:
