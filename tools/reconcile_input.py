@@ -97,7 +97,7 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
             table = tomllib.load(f)
         except tomllib.TOMLDecodeError as e:
             raise BadInputError(f"read {description}: {e}") from e
-    only(table, ("sample_time_s", "files", "continuous", "final", "columns"), str(description))
+    _check_description(table, str(description))
     given = float(table.get("sample_time_s", model.sample_time_s))
     if not 0.98 < given / model.sample_time_s < 1.02:
         raise BadInputError(
@@ -122,6 +122,30 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
                 f"read {data}: no file has a column {table['columns'][quantity].get('name')!r} for {quantity}"
             )
     return Session(records, bool(table.get("continuous", True)), final)
+
+
+def _check_description(table: Mapping[str, Any], where: str) -> None:
+    """Check that all in a column description is of its kind.
+
+    Raises:
+        BadInputError: names what is not.
+    """
+    only(table, ("sample_time_s", "files", "continuous", "final", "columns"), where)
+    _number(table, f"read {where}", "sample_time_s", 0.0)
+    for key in ("files", "final"):
+        names = table.get(key, [])
+        if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+            raise BadInputError(f"read {where}: {key} is {names!r}; needs a list of names of files")
+    if not isinstance(table.get("continuous", True), bool):
+        raise BadInputError(f"read {where}: continuous is {table['continuous']!r}; true or false")
+    columns = table.get("columns", {})
+    if not isinstance(columns, Mapping):
+        raise BadInputError(f"read {where}: columns is no table; needs [columns]")
+    for quantity, spec in columns.items():
+        if not isinstance(spec, Mapping) or not isinstance(spec.get("name"), str):
+            raise BadInputError(
+                f'read {where}: {quantity} is {spec!r}; needs {{ name = "COLUMN", unit = "UNIT" }}'
+            )
 
 
 def _files(data: Path) -> list[Path]:

@@ -65,18 +65,20 @@ def model_from(table: Mapping[str, Any]) -> AxisModel:
     model = AxisModel(
         rotary=a["kind"] == "rotary",
         controller=_controller(_table(table, "controller")) if "controller" in table else None,
-        refine=tuple(a.get("refine", ())),
+        refine=_refined(a.get("refine", [])),
         name=str(a.get("name", "axis")),
         **numbers,
     )
-    check_model(model)
     effects = _table(table, "effects") if "effects" in table else {}
     for name in effects:
         if name not in known():
             raise ValueError(f"effect {name!r} is not known; known are {', '.join(sorted(known()))}")
         given, where = _table(effects, name), f"[effects.{name}]"
+        if not isinstance(given.get("on", True), bool):
+            raise ValueError(f"{where} on is {given['on']!r}; true or false")
         if given.get("on", True):
             model = model.with_effect(name, {k: _number(given, where, k) for k in given if k != "on"})
+    check_model(model)
     return model
 
 
@@ -91,12 +93,22 @@ def check_model(model: AxisModel) -> None:
         if value < 0.0 or (value == 0.0 and key in ABOVE_ZERO):
             wants = "above zero" if key in ABOVE_ZERO else "zero or more"
             raise ValueError(f"[axis] {key} is {value:g}; needs {wants} ({AXIS_NUMBERS[key][0]})")
-    if not set(model.refine) <= set(REFINED):
-        raise ValueError(f"[axis] refine is {list(model.refine)}; of {', '.join(REFINED)}")
+    for name, values in model.effects.items():
+        for p in known()[name].parameters:
+            if p.lower >= 0.0 and values[p.symbol] < 0.0:
+                raise ValueError(
+                    f"[effects.{name}] {p.symbol} is {values[p.symbol]:g}; needs zero or more, {p.text}"
+                )
     if model.controller is not None and not model.controller.limit > 0.0:
         raise ValueError(
             f"[controller] limit is {model.controller.limit:g}; needs the largest force, above zero"
         )
+
+
+def _refined(given: object) -> tuple[str, ...]:
+    if not isinstance(given, list) or not all(name in REFINED for name in given):
+        raise ValueError(f"[axis] refine is {given!r}; a list of {', '.join(REFINED)}")
+    return tuple(given)
 
 
 def _controller(table: Mapping[str, Any]) -> Controller:
@@ -108,7 +120,9 @@ def _controller(table: Mapping[str, Any]) -> Controller:
 
 def _table(table: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     if not isinstance(table.get(key), Mapping):
-        raise ValueError(f"there is no table [{key}]" if key not in table else f"{key} is no table")
+        raise ValueError(
+            f"there is no table [{key}]" if key not in table else f"{key} is {table[key]!r}; needs a table"
+        )
     return dict(table[key])
 
 

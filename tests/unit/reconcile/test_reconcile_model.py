@@ -141,6 +141,7 @@ def test_an_effect_can_be_switched_off_in_the_file(tmp_path: Path) -> None:
         ({"rated_force": float("nan")}, "rated_force is nan"),
         ({"max_speed": None}, "has no max_speed"),
         ({"refine": ["mass"]}, "refine is"),
+        ({"refine": "inertia"}, "refine is 'inertia'; a list"),
     ],
 )
 def test_a_model_file_is_checked(change: dict[str, object], says: str) -> None:
@@ -157,6 +158,22 @@ def test_a_model_file_is_checked(change: dict[str, object], says: str) -> None:
     }
     with pytest.raises(ValueError, match=says):
         model_from({"axis": axis | change})
+
+
+@pytest.mark.parametrize(
+    ("effects", "says"),
+    [
+        ({"coulomb": 3}, "coulomb is 3; needs a table"),
+        ({"coulomb": {"Fc": "a"}}, "Fc is 'a'"),
+        ({"coulomb": {"Fc": -5.0}}, "Fc is -5; needs zero or more"),
+        ({"coulomb": {"on": "no", "Fc": 1.0}}, "true or false"),
+        ({"coulomb": {"on": True}}, "Fc"),
+        ({"glue": {"Fc": 1.0}}, "'glue' is not known"),
+    ],
+)
+def test_effects_of_a_model_file_are_checked(effects: dict[str, object], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        model_from(tomllib.loads(write_model(AXIS)) | {"effects": effects})
 
 
 def test_a_controller_is_checked_and_may_have_no_limit() -> None:
@@ -205,6 +222,11 @@ def test_columns_are_converted(tmp_path: Path) -> None:
             "nobody reads speed",
         ),
         ("[columns\n", "columns.toml"),
+        ("columns = 3\n", "columns is no table"),
+        ('[columns]\nposition = "x"\nforce = { name = "f" }\n', "position is 'x'"),
+        ('files = "run.csv"\n[columns]\n', "needs a list of names"),
+        ('sample_time_s = "a"\n[columns]\n', "sample_time_s is 'a'"),
+        ('continuous = "yes"\n[columns]\n', "true or false"),
         ('[columns]\nposition = { name = "x", scale = "a" }\nforce = { name = "f" }\n', "scale is 'a'"),
     ],
 )
