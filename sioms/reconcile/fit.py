@@ -19,7 +19,7 @@ from sioms.reconcile.effects import known
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import Noise, response
 from sioms.reconcile.records import Record, Session
-from sioms.reconcile.simulate import Run, pack, replay, ringing, track
+from sioms.reconcile.simulate import Run, linked, pack, replay, track
 
 #: ``map``, or the like of an executor.
 Mapper = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
@@ -85,7 +85,7 @@ class Problem:
 
     def answer(self, model: AxisModel, force: Array) -> Array:
         """Return the innovation [{x}] that an unmodelled force on the motor, shape (n,) or (n, k), leaves."""
-        return response(model, self.noise, force, ringing(pack(model)))
+        return response(model, self.noise, force, linked(pack(model)))
 
     def _lost(self, run: Run) -> float:
         """Return the innovation beyond which a run has lost the measurement; infinite where it never has."""
@@ -259,15 +259,25 @@ def refit(
     if not free:
         r = problem.residual(model)
         return Fit(model, free, r, np.empty((len(r), 0)))
-    scale = np.array([f.scale for f in free])
-    lower, upper = np.array([f.lower for f in free]), np.array([f.upper for f in free])
+    fit = _descended(problem, model, free, iterations, tolerance)
+    smooth = tuple(f for f in free if f.effect == BASE or known()[f.effect].slot is not Slot.BACKLASH)
+    if 0 < len(smooth) < len(free):  # whose steps fail wherever a gap is to take part in them
+        model = _descended(problem, fit.model, smooth, 2 * iterations, 0.1 * tolerance).model
+        r = problem.residual(model)
+        fit = Fit(model, free, r, jacobian(problem, model, free, get(model, free), r))
+    return fit
+
+
+def _descended(
+    problem: Problem, model: AxisModel, free: tuple[Free, ...], iterations: int, tolerance: float
+) -> Fit:
     at, r, j = descend(
         lambda x: problem.residual(put(model, free, x)),
         lambda x, r: jacobian(problem, model, free, x, r),
         get(model, free),
-        scale,
-        lower,
-        upper,
+        np.array([f.scale for f in free]),
+        np.array([f.lower for f in free]),
+        np.array([f.upper for f in free]),
         iterations,
         tolerance,
         left=LEFT,

@@ -158,7 +158,7 @@ def march(
         command, measured, force_in: shape (n,); ``command`` is read when closed, ``measured`` when tracking; ``force_in``
             is the whole force when tracking, and what is added to the controller's when closed.
         external: force on the axis beside the drive's, shape (n,).
-        gain: corrections of place and speed of the motor, and of the load, by the innovation, shape (4,).
+        gain: corrections of place and speed of the motor, and of the load, by the innovation: in contact, and out of it; shape (8,).
         lost: innovation at which, held for ``PATIENCE`` samples, the speed is taken from the measurement.
         start: x, v, temperature, error of the controller and force at the sample before the first, and by how much the
             load is behind the motor, and slower.
@@ -175,7 +175,6 @@ def march(
     viscous, limit, delay, lag, loss = plant[VISCOUS], plant[LIMIT], plant[DELAY], plant[LAG], plant[LOSS]
     hyst_f, hyst_s, mod, gain_y = plant[HYST_F], plant[HYST_S], plant[MOD_A], plant[GAIN_Y]
     decay = np.exp(-h / lag) if lag > 0.0 else 0.0
-    l1, l2, l3, l4 = gain[0] / gain_y, gain[1] / gain_y, gain[2] / gain_y, gain[3] / gain_y
     per_mass = 1.0 / jm
     x, v, temp = start[0], start[1], start[2]
     xl, vl = x - start[5], v - start[6]
@@ -216,11 +215,12 @@ def march(
         else:
             u = force_in[i]
             innovation = measured[i] - y
-            x += l1 * innovation
-            v += l2 * innovation
-            if plant[GAP] == 0.0 or np.abs(x - xl) >= 0.5 * plant[GAP]:
-                vl += l4 * innovation
-            xl += l3 * innovation
+            at = 4 if plant[GAP] > 0.0 and np.abs(x - xl) < 0.5 * plant[GAP] else 0
+            moved = innovation / gain_y
+            x += gain[at] * moved
+            v += gain[at + 1] * moved
+            xl += gain[at + 2] * moved
+            vl += gain[at + 3] * moved
             off = off + 1 if np.abs(innovation) > lost else 0
             if off >= PATIENCE and i >= MEASURED:
                 v = (measured[i] - measured[i - MEASURED]) / (MEASURED * dt * gain_y)

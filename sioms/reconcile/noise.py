@@ -41,14 +41,18 @@ class Noise:
 
 def rigid(model: AxisModel) -> tuple[Array, Array]:
     """Return the exact sampled rigid axis: state matrix (2, 2) and force input (2,)."""
-    t = model.sample_time_s
-    a = model.viscous / model.inertia
+    return alone(model.inertia, model.viscous, model.sample_time_s)
+
+
+def alone(inertia: float, viscous: float, t: float) -> tuple[Array, Array]:
+    """Return one mass, sampled exactly: state matrix (2, 2) and force input (2,)."""
+    a = viscous / inertia
     if a * t < 1e-9:
-        return np.array([[1.0, t], [0.0, 1.0]]), np.array([0.5 * t * t, t]) / model.inertia
+        return np.array([[1.0, t], [0.0, 1.0]]), np.array([0.5 * t * t, t]) / inertia
     decay = np.exp(-a * t)
     return (
         np.array([[1.0, (1.0 - decay) / a], [0.0, decay]]),
-        np.array([(t - (1.0 - decay) / a) / model.viscous, (1.0 - decay) / model.viscous]),
+        np.array([(t - (1.0 - decay) / a) / viscous, (1.0 - decay) / viscous]),
     )
 
 
@@ -83,19 +87,24 @@ def observer(model: AxisModel, sensor: float, drive: float) -> Noise:
 
 
 @lru_cache(maxsize=64)
-def corrections(noise: Noise, pair: Pair | None, sample_time_s: float) -> tuple[float, float, float, float]:
-    """Corrections of place [1] and speed [1/s] of motor and load by the innovation.
+def corrections(noise: Noise, pair: Pair | None, sample_time_s: float) -> tuple[float, ...]:
+    """Corrections of place [1] and speed [1/s] of motor and load by the innovation: in contact, and out of it.
 
     A transmission that rings is corrected as a Kalman filter of its own does it. Corrected alike, its masses would ring on from what
     noise did to them long ago: the innovation keeps their tone, damping comes out too large, and the cost has a minimum at every beat.
+    Out of contact nothing tells of the load.
     """
     if pair is not None:
         try:
             gain, _ = _kalman(*coupled(pair, sample_time_s), sample_time_s, noise.sensor, noise.drive)
-            return gain[0], gain[1], gain[2], gain[3]
+            motor = pair.inertia * (1.0 - pair.share)
+            free, _ = _kalman(
+                *alone(motor, pair.viscous, sample_time_s), sample_time_s, noise.sensor, noise.drive
+            )
+            return *gain, *free, 0.0, 0.0
         except (LinAlgError, ValueError):
             pass
-    return *noise.gain, *noise.gain
+    return *noise.gain, *noise.gain, *noise.gain, noise.gain[0], 0.0
 
 
 def _kalman(a: Array, b: Array, dt: float, sensor: float, drive: float) -> tuple[tuple[float, ...], float]:

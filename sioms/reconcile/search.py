@@ -117,18 +117,26 @@ class Searcher:
             return refit(self.problem, model, self.frozen, iterations)
         new = tuple(model.effects[gap].values()) not in self._polished
         fit = polish(self.problem, model, self.frozen, UNPOLISHED if new else POLISHED)
-        for _ in range(PASSES if new else 0):
+        if new:
+            fit = self._searched(fit, best)
             if fit.cost > WORTH * best:
                 self._rough.add((values_of(model), iterations))
                 return fit
+        self._rough.discard((values_of(model), iterations))
+        self._polished.add(tuple(fit.model.effects[gap].values()))
+        return fit
+
+    def _searched(self, fit: Fit, best: float = np.inf) -> Fit:
+        """Search the numbers of a gap, if there is one, until that no longer gains, or is too far from the best."""
+        for _ in range(PASSES if rattles(fit.model) else 0):
+            if fit.cost > WORTH * best:
+                break
             again = polish(self.problem, fit.model, self.frozen, UNPOLISHED)
             scale = spread(fit.residual)
             gained = rough(again.residual, scale) < (1.0 - GAIN) * rough(fit.residual, scale)
             fit = min(fit, again, key=lambda f: rough(f.residual, scale))
             if not gained:
                 break
-        self._rough.discard((values_of(model), iterations))
-        self._polished.add(tuple(fit.model.effects[gap].values()))
         return fit
 
     def loss(self, fit: Fit) -> Array:
@@ -173,6 +181,9 @@ class Searcher:
                 break
             steps.append(step[2])
             fit, losses = step[0], step[1]
+            if rattles(fit.model):  # beside what is new its numbers may be others
+                fit = self._searched(fit)
+                losses = self.loss(fit)
             self.progress(f"{steps[-1].action} {steps[-1].effect}: residual {fit.ratio:.2f} of the expected")
             fit, losses = self._simplify(fit, losses, steps)
             fit, losses = self._eliminate(fit, losses, steps)
@@ -396,7 +407,7 @@ class Searcher:
         for name in [n for n in fit.model.effects if n not in self.frozen]:
             if len([n for n in fit.model.effects if n not in self.frozen]) < 2:
                 break
-            without = self.fit(fit.model.without_effect(name), 6)
+            without = self._searched(self.fit(fit.model.without_effect(name), 6), fit.cost)
             loss = self.loss(without)
             gain, sure = better(losses, loss)
             if (negligible(gain, sure) and self._possible(without, fit)) or small(fit.model, name):

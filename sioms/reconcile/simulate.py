@@ -22,7 +22,7 @@ from sioms.reconcile.noise import Noise, Pair, corrections
 from sioms.reconcile.records import Record
 
 #: Corrections of an observer that follows nothing.
-IDLE = (0.0, 0.0, 0.0, 0.0)
+IDLE = (0.0,) * 8
 #: Steps in a millisecond without a transmission, with one, and with contact in one.
 STEPS = {None: 2, Slot.ELASTIC: 4, Slot.BACKLASH: 6}
 #: A record begins in motion that at first makes more way than this share of the largest speed would. Its start is fitted
@@ -105,10 +105,10 @@ def pack(model: AxisModel, substeps: int = 0) -> Packed:
     )
 
 
-def ringing(packed: Packed) -> Pair | None:
-    """Return the transmission of a model that is never out of contact, if it has one."""
+def linked(packed: Packed) -> Pair | None:
+    """Return the two masses of a model in contact, if it has two."""
     row = packed.plant
-    if row[k.LOAD] == 0.0 or row[k.GAP] > 0.0:
+    if row[k.LOAD] == 0.0:
         return None
     return Pair(*(float(row[i]) for i in (k.INERTIA, k.LOAD, k.STIFF, k.DAMP, k.VISCOUS)))
 
@@ -334,8 +334,8 @@ def track(
             *(0.0, force[0], 0.0, 0.0),  # a recorded force did not begin with its record
         ]
     )
-    pair = ringing(p)
+    pair = linked(p)
     gain = IDLE if noise is None else corrections(noise, pair, model.sample_time_s)
-    if pair is not None and _moves(y, model):
+    if pair is not None and p.plant[k.GAP] == 0.0 and _moves(y, model):
         start = _wound_up(p, y, force, external, gain, start, MOVING * model.max_speed)
     return _march(p, False, y, y, force, external, np.zeros(k.CTL_SIZE), gain, start, lost)
