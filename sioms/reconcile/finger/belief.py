@@ -190,8 +190,10 @@ def _turn(scene: Scene) -> Complex:
 
 def strains(b: Belief, scene: Scene) -> Floats:
     """Return the strain of every element under every touch, shape (nt, ns)."""
+    # what acts on nothing is left out of the key
+    apex, strip = b.apex if b.friction else 0.0, b.strip if b.strip[0] else (0.0, 0.0, 1.0)
     contact = _Contact(
-        b.core, b.outer, b.shear, b.poisson, b.hertz, b.adhesion, b.friction, b.apex, b.around, b.strip
+        b.core, b.outer, b.shear, b.poisson, b.hertz, b.adhesion, b.friction, apex, b.around, strip
     )
     return _strains(contact, scene, b.angle.tobytes(), tuple(np.round(b.radius, 10)), b.extent, b.offset)
 

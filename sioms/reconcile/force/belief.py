@@ -79,14 +79,19 @@ def late(loads: Loads, tau: float) -> Floats:
         tau: time constant [s]. A load is taken to have come right after the row before, as weights do.
     """
     out = np.zeros_like(loads.load)
-    ease = np.exp(-np.maximum(np.diff(loads.time), 0.0) / tau)
-    new = np.diff(loads.record) != 0
-    step = np.diff(loads.load, axis=0)
-    for i in range(len(ease)):
-        if not new[i]:
-            out[i + 1] = (out[i] + step[i]) * ease[i]
+    if len(out) > 1:
+        ease = np.exp(-np.maximum(np.diff(loads.time), 0.0) / tau)
+        _compiled(catch_up)(np.diff(loads.load, axis=0), ease, np.diff(loads.record) != 0, out)
     out.setflags(write=False)
     return out
+
+
+def catch_up(step: Floats, ease: Floats, new: NDArray[np.bool_], out: Floats) -> None:
+    """Fill rows 1 and on of ``out`` with how far a load is ahead of itself; ``new`` records begin at 0."""
+    for i in range(step.shape[0]):
+        if not new[i]:
+            for j in range(step.shape[1]):
+                out[i + 1, j] = (out[i, j] + step[i, j]) * ease[i]
 
 
 @lru_cache(maxsize=32)
@@ -117,7 +122,7 @@ class Loops:
 
     def __init__(self, reach: Floats, power: float, forgets: float, load: Floats) -> None:
         share = ((np.arange(PLAYS) + 0.5) / PLAYS)[:, None]
-        self._width, self._weight = reach * share, share**power / np.sum(share**power)
+        self._width, self._weight = reach * share, (share**power / np.sum(share**power))[:, 0]
         self._plays = np.repeat(load[None], PLAYS, axis=0)
         self._forgets, self._slope = forgets, 3.0 / reach
         self._load, self._ahead = load, np.zeros(len(load))
@@ -130,25 +135,27 @@ class Loops:
         return out
 
     def _follow_plays(self, load: Floats) -> Floats:
-        here = load[:, None]
-        low, high = here - self._width, here + self._width
-        states, last = np.empty_like(low), self._plays
-        for state, least, most in zip(states, low, high, strict=True):
-            np.maximum(last, least, out=state)
-            np.minimum(state, most, out=state)
-            last = state
-        self._plays = last
-        out: Floats = np.sum(self._weight * (states - here) / self._width, axis=1)
+        out = np.empty_like(load)
+        _of_rows(load, play)(self._plays, self._width, self._weight, load, out)
         return out
 
     def _follow_forgetful(self, load: Floats) -> Floats:
         out = np.diff(load, axis=0, prepend=self._load[None]) * self._slope
-        if len(out) > 1:
-            _compiled()(self._ahead, out)
-        else:
-            forget(self._ahead, out)
+        _of_rows(load, forget)(self._ahead, out)
         self._load, self._ahead = load[-1], out[-1].copy()
         return out
+
+
+def play(plays: Floats, width: Floats, weight: Floats, load: Floats, out: Floats) -> None:
+    """Move plays, shape (plays, n), on through loads; fill ``out`` with how far they lag behind each, shape (t, n)."""
+    for i in range(load.shape[0]):
+        for j in range(load.shape[1]):
+            here, total = load[i, j], 0.0
+            for k in range(len(weight)):
+                state = min(max(plays[k, j], here - width[k, j]), here + width[k, j])
+                plays[k, j] = state
+                total += weight[k] * (state - here) / width[k, j]
+            out[i, j] = total
 
 
 def forget(ahead: Floats, steps: Floats) -> None:
@@ -164,8 +171,13 @@ def forget(ahead: Floats, steps: Floats) -> None:
 
 
 @cache
-def _compiled() -> Callable[[Floats, Floats], None]:
-    return kernel(forget)
+def _compiled(loop: Callable[..., None]) -> Callable[..., None]:
+    return kernel(loop)
+
+
+def _of_rows(load: Floats, loop: Callable[..., None]) -> Callable[..., None]:
+    """Return a loop over rows: compiled, for a single one (a device reads row by row) as it is."""
+    return _compiled(loop) if len(load) > 1 else loop
 
 
 def lagged(

@@ -95,12 +95,17 @@ class ForceData:
     def whiten(self, change: Floats) -> Floats:
         """Take the mean of every record and component off, shape (n,) or (n, k)."""
         c = change.reshape(len(self.views), int(self.which.sum()), -1)
-        record = self.loads.record[self.which]
-        out = c.copy()
-        for number in np.unique(record):
-            mine = record == number
-            out[:, mine] -= c[:, mine].mean(1, keepdims=True)
+        out = np.empty_like(c)
+        for record in self._records:
+            out[:, record] = c[:, record] - c[:, record].mean(1, keepdims=True)
         return out.reshape(change.shape)
+
+    @cached_property
+    def _records(self) -> list[slice]:
+        """Rows of each record among those that count."""
+        ends = np.flatnonzero(np.diff(self.loads.record[self.which])) + 1
+        count = int(self.which.sum())
+        return [slice(a, b) for a, b in zip([0, *ends], [*ends, count], strict=True)]
 
 
 def blocks_of(count: int) -> NDArray[np.int64]:

@@ -28,20 +28,24 @@ def screen(
     """Regress the residual on what a little of the effect would change; one start per trial shape, the best of all views first."""
     out, lefts = [], []
     known, r = fit.jacobian, fit.residual
+    gram, pull = known.T @ known, known.T @ r
     for shape in _shapes(fit.model, effect):
-        columns = [weights[:, None] * _columns(data, fit.model, effect, values) for values in shape]
-        full = np.concatenate([known, *columns], axis=1)
-        size = np.sqrt(np.einsum("ij,ij->j", full, full))
+        columns = weights[:, None] * np.concatenate(
+            [_columns(data, fit.model, effect, values) for values in shape], axis=1
+        )
+        beside = known.T @ columns
+        h = np.block([[gram, beside], [beside.T, columns.T @ columns]])
+        size = np.sqrt(np.diag(h))
         live = size > 1e-9
-        if not live[known.shape[1] :].any():
+        if not live[len(gram) :].any():
             continue
-        scaled = full[:, live] / size[live]
-        h = scaled.T @ scaled
+        scaled = h[np.ix_(live, live)] / np.outer(size[live], size[live]) + 1e-9 * np.eye(live.sum())
+        slope = np.concatenate([pull, columns.T @ r])[live] / size[live]
         d = np.zeros(len(size))
-        d[live] = np.linalg.lstsq(h + 1e-9 * np.eye(len(h)), -scaled.T @ r, rcond=1e-10)[0] / size[live]
-        values = _settled(effect, shape, d[known.shape[1] :], fit.model.count)
+        d[live] = np.linalg.lstsq(scaled, -slope, rcond=1e-10)[0] / size[live]
+        values = _settled(effect, shape, d[len(gram) :], fit.model.count)
         if values is not None:
-            left = r + full @ d
+            left = r + known @ d[: len(gram)] + columns @ d[len(gram) :]
             lefts.append(left)
             out.append(
                 Start(effect.name, values, _gain(data, r, left), 1.0 - float(left @ left) / float(r @ r))

@@ -7,7 +7,7 @@ view where it shows most.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -164,23 +164,36 @@ class Searcher:
         good = {
             n: t
             for n, t in tried.items()
-            if (surely(t[2], GAIN) if loud else _beyond_noise(t[2]) and not termed(t[0].model))
+            if (surely(t[2], GAIN) if loud else beyond_noise(t[2]) and not termed(fit.model))
             and physical(t[0].model, n)
         }
         if not good:
             return None
         name = self._simplest(good)
         new, _, saved = good[name]
-        others = {n: t[2].share for n, t in tried.items() if n != name}
-        if saved.share < SPECIFIC and any(
-            t[2].share > NEARLY * saved.share and t[2].view == saved.view and n not in family(new.model, name)
-            for n, t in tried.items()
-            if n != name
-        ):
+        if saved.share < SPECIFIC and self._may_be_another(fit, losses, name, tried):
             return None
-        if saved.share < SPECIFIC and (termed(new.model) or self._nameless(fit, losses, saved)):
-            return None  # what is left where a term stands may be what the term does not fit
+        others = {n: t[2].share for n, t in tried.items() if n != name}
         return Step("add", name, self.ratio(new), saved.share, new.model, others)
+
+    def _may_be_another(
+        self, fit: Fit, losses: Array, name: str, tried: Mapping[str, tuple[Fit, Array, Saving]]
+    ) -> bool:
+        """Say whether what an effect saves may be a part of what another saves, of what a term does not fit, or of what has no name.
+
+        Effects are compared on what they count by: their share of one view, below the floor that of everything.
+        """
+        new, _, saved = tried[name]
+        if termed(new.model):
+            return termed(fit.model) or not beyond_noise(saved)
+        below, alike = not self.loud(fit), family(new.model, name)
+        for n, (_, _, other) in tried.items():
+            nearly = (
+                other.total / saved.total if below else (other.view == saved.view) * other.share / saved.share
+            )
+            if n not in alike and nearly > NEARLY:
+                return True
+        return self._nameless(fit, losses, saved)
 
     def _add_pair(self, fit: Fit, losses: Array) -> Step | None:
         """Add two effects at once where neither is sure alone: each hides what the other would save.
@@ -357,6 +370,6 @@ def surely(saved: Saving, least: float) -> bool:
     return saved.share >= least and max(saved.errors, saved.surely) >= SURE and saved.total > 0.0
 
 
-def _beyond_noise(saved: Saving) -> bool:
+def beyond_noise(saved: Saving) -> bool:
     """Say whether what is saved of everything below the floor is too much, and too sure, for noise."""
     return saved.total >= GAIN and saved.surely >= DEEP

@@ -10,20 +10,25 @@ from sioms.reconcile.rules import GAIN, SPECIFIC, negligible
 from sioms.reconcile.sensors.fit import Fit, half_intervals
 from sioms.reconcile.sensors.plausible import without
 from sioms.reconcile.sensors.screen import screen
-from sioms.reconcile.sensors.search import Found, Searcher, surely
+from sioms.reconcile.sensors.search import Found, Searcher, beyond_noise, surely
 
 FEWER = 2  # times as few numbers has a nameless rule that takes the place of elements' own numbers
 CLEAR = 0.95  # share of a view that a name must save where the view stays above its floor
 
 
 def displaced(searcher: Searcher, found: Found) -> bool:
-    """Say whether a term without a name saves much beside what is named, or does surely better in the place of a name."""
+    """Say whether a term without a name saves much beside what is named, or does surely better in the place of a name.
+
+    Much is three tenths of a view above its floor, or of everything what is no noise.
+    """
     model, count = found.fit.model, found.fit.model.count
     loud = searcher.loud(found.fit)
-    for term in searcher.terms if loud else ():
-        new = _tried(searcher, found.fit, term)
-        if new and surely(searcher.saving(searcher.loss(new), found.losses, loud), SPECIFIC):
-            return True
+    for term in searcher.terms:
+        new = _tried(searcher, found.fit, term, 0.0 if loud else GAIN)
+        if new:
+            saved = searcher.saving(searcher.loss(new), found.losses, loud)
+            if beyond_noise(saved) or (loud and surely(saved, SPECIFIC)):
+                return True
     for gone, bare, term in _nameless_alike(searcher, found, searcher.names):
         new = _tried(searcher, bare, term) if len(gone) == 1 else None
         richer = model.library[term].size(count) > model.library[gone[0]].size(count) + 1
@@ -58,14 +63,14 @@ def _nameless_alike(
             yield gone, searcher.fit(without(model, gone), 4), term
 
 
-def _tried(searcher: Searcher, fit: Fit, name: str) -> Fit | None:
-    """Switch an effect on from its best start, and refit; None where there is none, or it is on."""
+def _tried(searcher: Searcher, fit: Fit, name: str, least: float = 0.0) -> Fit | None:
+    """Switch an effect on from its best start, and refit; None where there is none that saves the least, or it is on."""
     starts = (
         []
         if name in fit.model.effects
         else screen(searcher.data, fit, searcher.weights, fit.model.library[name], searcher.frozen)
     )
-    return searcher.fit(searcher.switched_on(fit, starts[0])) if starts else None
+    return searcher.fit(searcher.switched_on(fit, starts[0])) if starts and starts[0].total >= least else None
 
 
 def _told(searcher: Searcher, fit: Fit, name: str) -> bool:

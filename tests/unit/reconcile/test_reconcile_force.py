@@ -132,14 +132,13 @@ def test_gains_that_only_tell_the_time_of_their_components_are_refused() -> None
     assert found.symbolic[0].parameters[0].value == pytest.approx(4e-5, rel=0.05)
 
 
-def random_loads(noise: float, bend: Callable[[np.ndarray], np.ndarray]) -> ForceRecords:
+def random_loads(noise: float, bend: Callable[[np.ndarray], np.ndarray], rows: int = 300) -> ForceRecords:
     """Random loads of one component, seed 8; a reading that bends, with noise."""
     rng = np.random.default_rng(8)
-    load = rng.uniform(-90.0, 90.0, (300, 1))
+    load = rng.uniform(-90.0, 90.0, (rows, 1))
     reading = bend(load) + rng.normal(0.0, noise, load.shape)
-    return ForceRecords(
-        ("fx",), load, reading, 5.0 * np.arange(300.0), np.full(300, np.nan), np.zeros(300, np.int64)
-    )
+    time, nothing = 5.0 * np.arange(float(rows)), np.full(rows, np.nan)
+    return ForceRecords(("fx",), load, reading, time, nothing, np.zeros(rows, np.int64))
 
 
 ONE = {"sensor": {"components": ["fx"], "full_range": [100.0]}}
@@ -155,6 +154,16 @@ def test_what_a_model_explains_is_no_noise_any_more() -> None:
     sharper = subject.sharpened(known, {})
     assert sharper is not None and sharper.whole.sigma == pytest.approx(5e-4, rel=0.3)
     assert sharper.sharpened(known, {}) is None
+
+
+@pytest.mark.parametrize("size", [0.0, 0.022])
+def test_a_cube_that_hides_in_the_margin_of_the_floor_is_seen_and_noise_is_none(size: float) -> None:
+    """Beside a gain it adds a tenth to the noise; so many rows tell it by ten standard deviations."""
+    records = random_loads(0.5, lambda true: 1.02 * true + size * 100.0 * (true / 100.0) ** 3, 600)
+    found = analyse(prepare(records, from_table(ONE, "x")[0]), Options(pictures=False))
+    assert next(s for s in found.ladder if s.effect == "gain").ratio < 1.15
+    assert [e.name for e in found.symbolic] == (["term_cube"] if size else [])
+    assert {e.name for e in found.effects} == {"gain"}
 
 
 @pytest.mark.parametrize("power", [1, 3])
