@@ -39,7 +39,7 @@ TRIES = 4  # candidates refitted per step
 STEPS = 6
 #: A step that saves this much needs no second look at the friction law.
 CLEAR = 0.5
-#: Two effects are tried at once only above this multiple of the expected innovation, so many firsts and seconds.
+#: Two effects are tried at once only above this multiple of the expected innovation, so many firsts with ``TRIES`` seconds.
 PAIRED = 1.5
 PAIRS = 3
 LOOSE = 2.0  # an effect does not make the error of the simulated closed loop this many times larger
@@ -322,7 +322,7 @@ class Searcher:
             inner = self.loss(middle)
             for second in [
                 s for s in self._candidates(middle) if s.effect not in known()[first.effect].replaces
-            ][:PAIRS]:
+            ][:TRIES]:
                 new = self._with(
                     middle, second, 8, min((t[0].cost for t in pairs.values()), default=middle.cost)
                 )
