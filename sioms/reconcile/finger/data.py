@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sioms.reconcile.finger.belief import Belief, Scene, late, outputs, scene_of
 from sioms.reconcile.finger.pressures import Floats
 from sioms.reconcile.finger.records import PARTS, Ramped, Touched, Untouched
+from sioms.reconcile.finger.terms import GROWING
 from sioms.reconcile.sensors.effect import SensorModel
 
 VIEWS = ("touch", "course", "drift", "ramp", "cell", "strength")
@@ -73,11 +74,19 @@ class FingerData:
         return self.whiten(predicted - self.measured())
 
     def doubts(self, model: SensorModel) -> Floats:
-        """See ``sensors.fit.Data``: the simulated touch's own error, and when the load came on between two frames."""
+        """See ``sensors.fit.Data``: the simulated touch's own error, when the load came on between two frames, when gains were stated."""
         said, t = self.predict(model), self.touched
-        own = np.where(self.view == TOUCH, OWN_ERROR * said, 0.0)
+        touch = np.where(self.view == TOUCH, said, 0.0)
         sooner = replace(t, since=t.since - t.unseen[:, None] / np.sqrt(3.0))
-        return np.stack([own, replace(self, touched=sooner).predict(model) - said], axis=1)
+        columns = [OWN_ERROR * touch, replace(self, touched=sooner).predict(model) - said]
+        columns += [self._growth(model, name) * touch for name in model.effects if name in GROWING]
+        return np.stack(columns, axis=1)
+
+    def _growth(self, model: SensorModel, name: str) -> float:
+        """Return half the range over the touches of what a term multiplies by: gains may have been stated at its beginning."""
+        grown = model.with_effect(name, {**model.effects[name], "c": np.zeros(1)})
+        own, without = (outputs(m.belief(), self.scene) for m in (grown, model.without_effect(name)))
+        return 0.5 * float(np.ptp(np.sum(own * without, axis=1) / np.sum(without**2, axis=1)))
 
     def measured(self) -> Floats:
         """Return the measured rows in the units of ``predict``."""

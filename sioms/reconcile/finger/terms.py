@@ -6,7 +6,7 @@ import numpy as np
 
 from sioms.reconcile.finger.belief import Scene
 from sioms.reconcile.finger.pressures import Floats
-from sioms.reconcile.sensors.effect import Quantity, term
+from sioms.reconcile.sensors.effect import TERM_PREFIX, Quantity, term
 
 _LOAD = 200.0
 
@@ -143,3 +143,5 @@ TERMS = (
         Quantity("n", "1", 0.5, 20.0, 0.3, "order", starts=(1.0, 2.0, 4.0, 8.0)),
     ),
 )
+#: Terms that multiply by what grows with a variable: with what value of it the gains were stated is not known.
+GROWING = tuple(f"{TERM_PREFIX}{n}" for n in ("time", "warmth", "place", "load"))

@@ -468,6 +468,28 @@ def test_a_fit_leaves_the_least_width_of_the_elements(folder: Path) -> None:
     assert 0.02 < fit.model.base.extent < 0.06  # what the generator draws
 
 
+def test_gains_beside_a_sensitivity_that_ages_are_as_uncertain_as_when_they_were_stated(folder: Path) -> None:
+    rate = 2e-3
+
+    def age(a: dict[str, np.ndarray]) -> None:
+        untouched = a["raw"][a["phase"] == 0].mean(0)
+        a["raw"] = untouched + (a["raw"] - untouched) * (1.0 + rate * (a["time"] - a["time"].mean()))[:, None]
+
+    halves = []
+    for change, k in ((lambda a: None, 0.0), (age, rate)):
+        _rewritten(folder, change)
+        nominal, name, stated = read_model(folder / "nominal.toml", folder)
+        subject = prepare(read_experiments(folder), nominal, name, refine_extent=not stated)
+        data, weights = subject.whole, np.ones(len(subject.whole.view))
+        model = subject.model.with_effect("gain_scatter", subject.model.plain("gain_scatter"))
+        fit = refit(data, model.with_effect("term_time", {"k": np.array([k]), "c": np.zeros(1)}), weights)
+        half = half_intervals(data, fit, weights)
+        halves.append(np.median(half[[f.effect == "gain_scatter" for f in fit.free]]))
+    span = 0.5 * rate * float(np.ptp(data.scene.time))
+    assert 0.5 < halves[1] / (1.96 * span) < 1.5
+    assert halves[0] < 0.5 * halves[1]
+
+
 def test_the_fit_finds_the_bottom_of_a_bent_valley_within_its_bounds() -> None:
     """Rosenbrock's valley: the lowest point is (1, 1), or at the bound beside it."""
 
