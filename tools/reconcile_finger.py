@@ -22,6 +22,7 @@ import numpy as np
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.finger.belief import Belief
 from sioms.reconcile.finger.model_file import belief_of, check, corrected, from_table, to_toml
+from sioms.reconcile.given import columns_in, only, parsed
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.tactile.finger import Finger, from_toml
 from sioms.tactile.finger import to_toml as finger_to_toml
@@ -134,18 +135,12 @@ def read_experiments(data: Path) -> list[Experiment]:
     return out
 
 
-def _columns(path: Path) -> Mapping[str, Any]:
+def _columns(path: Path) -> Mapping[str, Mapping[str, Any]]:
     if not path.exists():
         return {}
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as e:
-        raise BadInputError(f"read {path}: {e}") from e
-    odd = sorted((set(table) - {"columns"}) | (set(table.get("columns", {})) - set(ARRAYS)))
-    if odd:
-        raise BadInputError(f"read {path}: nobody reads {', '.join(odd)}; known are {', '.join(ARRAYS)}")
-    found: Mapping[str, Any] = table.get("columns", {})
-    return found
+    table = parsed(path.read_bytes(), f"read {path}")
+    only(table, ("columns",), f"read {path}")
+    return columns_in(table, "columns", ARRAYS, f"read {path}", keys=("name", "unit"), named=False)
 
 
 def _named(arrays: Mapping[str, Any], columns: Mapping[str, Any], where: str) -> dict[str, Any]:

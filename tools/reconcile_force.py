@@ -17,7 +17,6 @@ A column that the data do not have, or a key that nobody reads, is an error.
 from __future__ import annotations
 
 import time
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.force.model_file import from_table
 from sioms.reconcile.force.plan import Plan
 from sioms.reconcile.force.subject import ForceRecords, unit_of
+from sioms.reconcile.given import columns_in, only, parsed, words
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.verdict import SensorVerdict
 from sioms.tools.reconcile_table import SUFFIXES, load_columns
@@ -49,6 +49,8 @@ UNITS = {
     "K": 1.0,
     "1": 1.0,
 }
+#: Descriptions of columns, by quantity.
+Specs = Mapping[str, Mapping[str, Any]]
 FORCES, TORQUES = ("N", "mN", "kN", "kgf", "1"), ("N m", "mN m", "N mm", "N cm", "1")
 
 
@@ -90,10 +92,7 @@ def read_model(path: Path) -> tuple[SensorModel, tuple[str, ...]]:
 def _toml(path: Path, what: str) -> dict[str, Any]:
     if not path.exists():
         raise BadInputError(f"read {what} {path}: no such file")
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
-        raise BadInputError(f"read {what} {path}: {e}") from e
+    return parsed(path.read_bytes(), f"read {what} {path}")
 
 
 def read_loads(data: Path, names: tuple[str, ...], columns: Path | None = None) -> ForceRecords:
@@ -107,50 +106,43 @@ def read_loads(data: Path, names: tuple[str, ...], columns: Path | None = None) 
     folder = data if data.is_dir() else data.parent
     description = columns or folder / "columns.toml"
     table = _toml(description, "column description")
-    _only(table, ("files", "columns", "load", "reading"), str(description))
-    for part in ("load", "reading"):
-        _only(table.get(part, {}), names, f"{description}, [{part}]")
-    missing = [n for n in names if n not in table.get("reading", {})]
+    where = f"read {description}"
+    only(table, ("files", "columns", "load", "reading"), where)
+    own = columns_in(table, "columns", ("time", "temperature"), where)
+    loads, readings = (columns_in(table, part, names, where) for part in ("load", "reading"))
+    missing = [n for n in names if n not in readings]
     if missing:
         raise BadInputError(
             f"read {description}: no reading of {', '.join(missing)}; every component of the model needs one"
         )
+    chosen = words(table, "files", where, "names of files")
     files = (
-        [folder / n for n in table["files"]]
-        if "files" in table
+        [folder / n for n in chosen]
+        if chosen is not None
         else ([data] if data.is_file() else sorted(p for p in data.iterdir() if p.suffix in SUFFIXES))
     )
     if not files:
         raise BadInputError(f"read {data}: no data files; expects one of {', '.join(SUFFIXES)}")
-    parts = [_record(f, table, names) for f in files]
+    parts = [_record(f, own, loads, readings, names) for f in files]
     load, reading, clock, warm = (np.concatenate([p[i] for p in parts]) for i in range(4))
     record = np.concatenate([np.full(len(p[2]), i) for i, p in enumerate(parts)])
     return ForceRecords(names, load, reading, clock, warm, record)
 
 
-def _only(table: Mapping[str, Any], allowed: tuple[str, ...], where: str) -> None:
-    odd = sorted(set(table) - set(allowed))
-    if odd:
-        raise BadInputError(f"read {where}: nobody reads {', '.join(odd)}; known are {', '.join(allowed)}")
-
-
-def _record(path: Path, table: Mapping[str, Any], names: tuple[str, ...]) -> tuple[Any, Any, Any, Any]:
+def _record(path: Path, own: Specs, load: Specs, reading: Specs, names: tuple[str, ...]) -> tuple[Any, ...]:
     raw = load_columns(path)
-    own = table.get("columns", {})
-    _only(own, ("time", "temperature"), "the column description, [columns]")
     count = len(next(iter(raw.values()))) if raw else 0
-    loads = [_column(raw, table.get("load", {}), n, path, count) for n in names]
-    readings = [_column(raw, table["reading"], n, path, count) for n in names]
+    loads = [_column(raw, load, n, path, count) for n in names]
+    readings = [_column(raw, reading, n, path, count) for n in names]
     clock = _column(raw, own, "time", path, count) if "time" in own else np.arange(count, dtype=np.float64)
     warm = _column(raw, own, "temperature", path, count) if "temperature" in own else np.full(count, np.nan)
     return np.stack(loads, axis=1), np.stack(readings, axis=1), clock, warm
 
 
-def _column(raw: Mapping[str, Any], specs: Mapping[str, Any], name: str, path: Path, count: int) -> Any:
+def _column(raw: Mapping[str, Any], specs: Specs, name: str, path: Path, count: int) -> Any:
     if name not in specs:
         return np.zeros(count)
     spec = specs[name]
-    _only(spec, ("name", "unit", "scale", "offset"), f"column {name}")
     if spec.get("name") not in raw:
         raise BadInputError(
             f"read {path.name}: no column {spec.get('name')!r} for {name}; has {', '.join(sorted(raw))}"

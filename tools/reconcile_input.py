@@ -23,9 +23,7 @@ has them.
 from __future__ import annotations
 
 import json
-import math
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -35,8 +33,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.given import columns_in, number, only, parsed, truth, words
 from sioms.reconcile.model import AxisModel, Controller
-from sioms.reconcile.model_file import check_model, only, parse_model
+from sioms.reconcile.model_file import check_model, parse_model
 from sioms.reconcile.records import Record, Session
 from sioms.tools.reconcile_table import SUFFIXES, UNITS, load_table, measures, named, unit_of
 
@@ -92,60 +91,28 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
         raise BadInputError(
             f"read {data}: no column description (or give --columns): {_draft(files, description)}"
         )
-    with description.open("rb") as f:
-        try:
-            table = tomllib.load(f)
-        except tomllib.TOMLDecodeError as e:
-            raise BadInputError(f"read {description}: {e}") from e
-    _check_description(table, str(description))
-    given = float(table.get("sample_time_s", model.sample_time_s))
+    where = f"read {description}"
+    table = parsed(description.read_bytes(), where)
+    only(table, ("sample_time_s", "files", "continuous", "final", "columns"), where)
+    columns_of = columns_in(table, "columns", QUANTITIES, where)
+    given = number(table, "sample_time_s", where, model.sample_time_s)
     if not 0.98 < given / model.sample_time_s < 1.02:
         raise BadInputError(
             f"read {description}: sample_time_s is {given:g}, the model says {model.sample_time_s:g}; needs the same"
         )
-    last = [folder / n for n in table.get("final", ())]
-    files = (
-        [folder / n for n in table["files"]]
-        if "files" in table
-        else [f for f in _files(data) if f not in last]
-    )
+    continuous = truth(table, "continuous", where, True)
+    last = [folder / n for n in words(table, "final", where, "names of files") or ()]
+    chosen = words(table, "files", where, "names of files")
+    files = [f for f in _files(data) if f not in last] if chosen is None else [folder / n for n in chosen]
     if not files:
         raise BadInputError(f"read {data}: no data files; expects one of {', '.join(SUFFIXES)}")
-    records, final = (
-        tuple(_record(f, table.get("columns", {}), model) for f in some) for some in (files, last)
-    )
+    records, final = (tuple(_record(f, columns_of, model) for f in some) for some in (files, last))
     for quantity in SOMETIMES:
-        if quantity in table.get("columns", {}) and all(
-            getattr(r, quantity) is None for r in records + final
-        ):
+        if quantity in columns_of and all(getattr(r, quantity) is None for r in records + final):
             raise BadInputError(
-                f"read {data}: no file has a column {table['columns'][quantity].get('name')!r} for {quantity}"
+                f"read {data}: no file has a column {columns_of[quantity]['name']!r} for {quantity}"
             )
-    return Session(records, bool(table.get("continuous", True)), final)
-
-
-def _check_description(table: Mapping[str, Any], where: str) -> None:
-    """Check that all in a column description is of its kind.
-
-    Raises:
-        BadInputError: names what is not.
-    """
-    only(table, ("sample_time_s", "files", "continuous", "final", "columns"), where)
-    _number(table, f"read {where}", "sample_time_s", 0.0)
-    for key in ("files", "final"):
-        names = table.get(key, [])
-        if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
-            raise BadInputError(f"read {where}: {key} is {names!r}; needs a list of names of files")
-    if not isinstance(table.get("continuous", True), bool):
-        raise BadInputError(f"read {where}: continuous is {table['continuous']!r}; true or false")
-    columns = table.get("columns", {})
-    if not isinstance(columns, Mapping):
-        raise BadInputError(f"read {where}: columns is no table; needs [columns]")
-    for quantity, spec in columns.items():
-        if not isinstance(spec, Mapping) or not isinstance(spec.get("name"), str):
-            raise BadInputError(
-                f'read {where}: {quantity} is {spec!r}; needs {{ name = "COLUMN", unit = "UNIT" }}'
-            )
+    return Session(records, continuous, final)
 
 
 def _files(data: Path) -> list[Path]:
@@ -154,13 +121,11 @@ def _files(data: Path) -> list[Path]:
 
 def _record(path: Path, columns: Mapping[str, Any], model: AxisModel) -> Record:
     table = load_table(path)
-    only(columns, QUANTITIES, "the column description")
     for needed in ("position", "force"):
         if needed not in columns:
             raise BadInputError(f"read {path.name}: the column description names no {needed}; it is needed")
     found: dict[str, Array] = {}
     for quantity, spec in columns.items():
-        only(spec, ("name", "unit", "scale", "offset"), f"column {quantity}")
         head = table.find(str(spec.get("name")))
         if head is None and quantity in SOMETIMES:
             continue
@@ -207,7 +172,7 @@ def _convert(
             f"{where}: {unit} is a unit of {kind}, the {quantity} of a {'rotary' if model.rotary else 'linear'} axis is "
             f"{'an' if right == 'angle' else 'a'} {right}; {hint}"
         )
-    scale, offset = (_number(spec, where, key, instead) for key, instead in (("scale", 1.0), ("offset", 0.0)))
+    scale, offset = (float(spec.get(key, instead)) for key, instead in (("scale", 1.0), ("offset", 0.0)))
     factor = UNITS[kind][unit] if kind != "count" else _per_count(where, spec, scale, model)
     return np.asarray((raw * scale + offset) * factor, dtype=np.float64)
 
@@ -220,13 +185,6 @@ def _per_count(where: str, spec: Mapping[str, Any], scale: float, model: AxisMod
             f"{where}: it is in counts, and the model states no resolution; give resolution = ... in [axis]"
         )
     return 1.0 if itself else model.resolution
-
-
-def _number(spec: Mapping[str, Any], where: str, key: str, instead: float) -> float:
-    value = spec.get(key, instead)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise BadInputError(f"{where}: {key} is {value!r}; needs a finite number")
-    return float(value)
 
 
 def _draft(files: Sequence[Path], description: Path) -> str:
@@ -282,7 +240,9 @@ def read_model(path: Path) -> AxisModel:
         return parse_model(path.read_text(), str(path))
     try:
         model = _layout_model(json.loads(path.read_text()))
-        check_model(model)
+        check_model(model, f"read model {path}")
+    except BadInputError:
+        raise
     except (KeyError, TypeError) as e:
         raise BadInputError(f"read model {path}: missing or wrong key {e}") from e
     except ValueError as e:

@@ -11,6 +11,7 @@ import numpy as np
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.finger.belief import Belief
 from sioms.reconcile.finger.effects import library
+from sioms.reconcile.given import only, table_in
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.model_file import effects_from, effects_to_toml, number_or_list, numbers
 from sioms.tactile.cylinder import Cylinder
@@ -61,10 +62,8 @@ def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, bool]
         raise BadInputError(
             f"read model {where}: needs the tables finger and effects; got {', '.join(sorted(table)) or 'nothing'}"
         )
-    t = table["finger"]
-    odd = sorted(set(t) - set(KEYS))
-    if odd:
-        raise BadInputError(f"read model {where}: nobody reads {', '.join(odd)}; known are {', '.join(KEYS)}")
+    t = table_in(table, "finger", f"read model {where}")
+    only(t, KEYS, f"read model {where}, [finger]")
     angle = numbers(t, "angle_rad", where)
     count = len(angle)
     core, outer, shear, ratio = (
@@ -85,7 +84,7 @@ def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, bool]
     )
     check(b, where)
     model = SensorModel(b, count, library(), {}, (), str(t.get("name", "finger")))
-    return effects_from(model, table.get("effects", {}), where), "extent_rad" in t
+    return effects_from(model, table, where), "extent_rad" in t
 
 
 def check(b: Belief, where: str) -> None:
@@ -110,6 +109,12 @@ def check(b: Belief, where: str) -> None:
         )
     if not np.all(b.gain > 0.0):
         raise BadInputError(f"read model {where}: gain {float(b.gain.min()):g}; needs strain per output, > 0")
+    if not b.shear > 0.0:
+        raise BadInputError(f"read model {where}: shear modulus is {b.shear:g} Pa; needs one above zero")
+    if not 0.0 <= b.extent < 1.0:
+        raise BadInputError(
+            f"read model {where}: extent_rad is {b.extent:g}; needs the half angle of an element, 0 to 1"
+        )
     if not 0.3 <= b.poisson <= 0.5:
         raise BadInputError(f"read model {where}: Poisson's ratio is {b.poisson:g}; rubber needs 0.3 to 0.5")
 

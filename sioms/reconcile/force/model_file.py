@@ -17,6 +17,7 @@ import numpy as np
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.force.belief import ForceBelief
 from sioms.reconcile.force.effects import library
+from sioms.reconcile.given import only, table_in, words
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.model_file import effects_from, effects_to_toml, numbers
 
@@ -33,12 +34,10 @@ def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, tuple
         raise BadInputError(
             f"read model {where}: needs the tables sensor and effects; got {', '.join(sorted(table)) or 'nothing'}"
         )
-    t = table["sensor"]
-    odd = sorted(set(t) - set(KEYS))
-    if odd:
-        raise BadInputError(f"read model {where}: nobody reads {', '.join(odd)}; known are {', '.join(KEYS)}")
-    names = tuple(t.get("components", ()))
-    if not names or not all(isinstance(n, str) for n in names) or len(set(names)) != len(names):
+    t = table_in(table, "sensor", f"read model {where}")
+    only(t, KEYS, f"read model {where}, [sensor]")
+    names = words(t, "components", f"read model {where}, [sensor]", "different names") or ()
+    if not names or len(set(names)) != len(names):
         raise BadInputError(
             f"read model {where}: components is {t.get('components')!r}; needs a list of different names"
         )
@@ -52,7 +51,7 @@ def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, tuple
     if "matrix" in t:
         try:
             matrix = np.asarray(t["matrix"], dtype=np.float64)
-        except ValueError as e:
+        except (TypeError, ValueError) as e:
             raise BadInputError(
                 f"read model {where}: matrix holds what is no number, or rows of different lengths"
             ) from e
@@ -62,7 +61,7 @@ def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, tuple
             )
     belief = ForceBelief(full, matrix * full[None, :] / full[:, None])
     model = SensorModel(belief, count, library(names), {}, (), str(t.get("name", "sensor")))
-    return effects_from(model, table.get("effects", {}), where), names
+    return effects_from(model, table, where), names
 
 
 def to_toml(model: SensorModel) -> str:

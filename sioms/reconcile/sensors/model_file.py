@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.given import table_in, truth
 from sioms.reconcile.sensors.effect import SensorModel
 
 
@@ -23,19 +24,21 @@ def effects_to_toml(model: SensorModel) -> str:
 
 
 def effects_from(model: SensorModel, table: Mapping[str, Any], where: str) -> SensorModel:
-    """Switch on the effects of a parsed model file; those with ``on = false`` are left out.
+    """Switch on the effects of a parsed model file ([effects.NAME]); those with ``on = false`` are left out.
 
     Raises:
         BadInputError: an effect or a parameter is unknown or missing.
     """
-    for name, given in table.items():
+    effects = table_in(table, "effects", f"read model {where}", needed=False)
+    for name in effects:
         if name not in model.library:
             raise BadInputError(
                 f"read model {where}: effect {name!r} is not known; known are {', '.join(sorted(model.library))}"
             )
-        if not given.get("on", True):
+        given, of_effect = table_in(effects, name, f"read model {where}"), f"{where}, [effects.{name}]"
+        if not truth(given, "on", f"read model {of_effect}", True):
             continue
-        values = {k: np.atleast_1d(np.asarray(v, dtype=np.float64)) for k, v in given.items() if k != "on"}
+        values = {k: numbers(given, k, of_effect) for k in given if k != "on"}
         try:
             model = model.with_effect(name, values)
         except ValueError as e:

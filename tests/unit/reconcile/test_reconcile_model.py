@@ -141,7 +141,7 @@ def test_an_effect_can_be_switched_off_in_the_file(tmp_path: Path) -> None:
         ({"rated_force": float("nan")}, "rated_force is nan"),
         ({"max_speed": None}, "has no max_speed"),
         ({"refine": ["mass"]}, "refine is"),
-        ({"refine": "inertia"}, "refine is 'inertia'; a list"),
+        ({"refine": "inertia"}, "refine is 'inertia'; needs a list"),
     ],
 )
 def test_a_model_file_is_checked(change: dict[str, object], says: str) -> None:
@@ -222,7 +222,7 @@ def test_columns_are_converted(tmp_path: Path) -> None:
             "nobody reads speed",
         ),
         ("[columns\n", "columns.toml"),
-        ("columns = 3\n", "columns is no table"),
+        ("columns = 3\n", "columns is 3; needs a table"),
         ('[columns]\nposition = "x"\nforce = { name = "f" }\n', "position is 'x'"),
         ('files = "run.csv"\n[columns]\n', "needs a list of names"),
         ('sample_time_s = "a"\n[columns]\n', "sample_time_s is 'a'"),
