@@ -129,7 +129,8 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
         gain, sure = better(other.losses, found.losses)
         if gain > SPECIFIC and sure > SURE:
             found, share = other, smoother_share(ready.problem, other.fit)
-    if found.fit.ratio > LARGE or (found.fit.ratio > LEAST_ODD and share > UNEXPLAINED):
+    large = found.fit.ratio > LARGE and not rattles(found.fit.model)
+    if large or (found.fit.ratio > LEAST_ODD and share > UNEXPLAINED):
         found = searcher.plainly(found)
     burst = bursts(ready.problem, found.fit)
     hopeless = found.fit.ratio > HOPELESS and found.fit.cost > HALF * searcher.fit(ready.model).cost
