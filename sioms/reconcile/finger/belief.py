@@ -70,7 +70,7 @@ class Belief:
         uneven: the linear output varies by amplitude [1] and phase [rad] over a period of the place [rad].
         creep, creep_time: share of a step that comes late, and its time constant [s].
         cell: relative error of the load cell.
-        temperature: drift of the output [1/K], shape (ns,).
+        temperature: drift of the output [1/K], shape (ns,); common: the part of it that all elements have.
         responses: further changes of the output with their parameters, in order.
     """
 
@@ -83,6 +83,7 @@ class Belief:
     gain: Floats
     quadratic: Floats
     temperature: Floats
+    common: float = 0.0
     extent: float = 0.0
     offset: float = 0.0
     hertz: float = 0.0

@@ -56,11 +56,11 @@ class FingerData:
         out = outputs(b, self.scene)[:, self.alive]
         course = late(b, t.since)
         mean = course.mean(1)
-        # the zero goes on drifting between baseline and touch
-        drift = b.temperature[self.alive]
-        warmed = t.warmed.mean(1)
-        rows = [((out * mean[:, None] + drift * warmed[:, None]) / self._sigma).ravel()]
-        late_ = course - mean[:, None] + (self._weight @ drift)[:, None] * (t.warmed - warmed[:, None])
+        # the zero goes on drifting between baseline and touch; of the elements' own drifts that few K tell nothing
+        warmed = b.common * t.warmed
+        drift = warmed.mean(1)[:, None]
+        rows = [((out * mean[:, None] + drift) / self._sigma).ravel()]
+        late_ = course - mean[:, None] + self._weight.sum(1)[:, None] * (warmed - drift)
         rows.append(((late_ @ _CONTRASTS.T) / self.course_sigma[:, None]).ravel())
         rows.append(self._drift(b))
         rows.append(self._ramps(b))

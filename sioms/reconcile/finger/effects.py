@@ -45,6 +45,10 @@ def _poisson(b: Belief, v: Values) -> Belief:
     return replace(b, poisson=float(np.clip(b.poisson + v["dnu"][0], 0.0, 0.5)))
 
 
+def _drift(b: Belief, v: Values) -> Belief:
+    return replace(b, temperature=b.temperature + v["k"], common=b.common + float(v["k"][0]))
+
+
 def _creep(b: Belief, v: Values) -> Belief:
     return replace(b, creep=float(v["c"][0]), creep_time=float(v["tau"][0]))
 
@@ -160,7 +164,7 @@ TEMPERATURE = SensorEffect(
     name="temperature_drift",
     title="drift with temperature, alike for all elements",
     channel=SENSOR,
-    change=_added("temperature", "k"),
+    change=_drift,
     equation="d = d + k (T - T0)",
     parameters=(Quantity("k", "1/K", -0.5, 0.5, 2e-3, "drift of the output"),),
     signature="untouched outputs move together with the temperature",
