@@ -89,6 +89,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> int:
     """Do what the command line asks; return the exit status."""
+    # matrices are small: more threads only wait for each other, and badly so on a busy machine
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if args.subject == "effects":
         from sioms.tools import reconcile_effects
 
@@ -204,12 +206,11 @@ def reconcile_axis(
         BadInputError: data or model cannot be used.
     """
     from sioms.reconcile.axis import Options, analyse
-    from sioms.tools.reconcile_input import read_data, read_model, with_resolution
+    from sioms.tools.reconcile_input import read_data, read_model
 
     start = time.monotonic()
     nominal = read_model(model or data / "nominal.json")
     session = read_data(data, nominal, columns)
-    nominal = with_resolution(nominal, session)
     verdict = analyse(session, nominal, Options(**options))
     return verdict, time.monotonic() - start
 

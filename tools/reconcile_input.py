@@ -25,7 +25,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -265,15 +264,3 @@ def _layout_model(n: Mapping[str, Any]) -> AxisModel:
         name=n.get("scenario", "axis"),
         controller=Controller(c["k"], c["kz"], c["kp"], c["kb"], c["tau_o"], c["tau_m"], c["vel_filter_hz"]),
     )
-
-
-def with_resolution(model: AxisModel, session: Session) -> AxisModel:
-    """Fill in a resolution of zero by the smallest step of the recorded position."""
-    if model.resolution > 0.0:
-        return model
-    steps = np.abs(np.concatenate([np.diff(r.position) for r in session.records]))
-    top = float(np.max([np.max(np.abs(r.position)) for r in session.records]))
-    moved = steps[steps > 1e-9 * max(top, 1e-12)]
-    if not len(moved):
-        raise BadInputError("read records: position is constant; needs motion")
-    return replace(model, resolution=float(np.min(moved)))

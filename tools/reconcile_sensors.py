@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -120,8 +119,6 @@ def _loading_arguments(force: argparse.ArgumentParser) -> None:
 
 def run_sensor(args: argparse.Namespace) -> int:
     """Reconcile one sensor from recordings, or score many; return the exit status."""
-    # matrices are small: more threads only wait for each other, and badly so on a busy machine
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if args.subject == "score":
         from sioms.tools.reconcile_score import score
 

@@ -15,7 +15,15 @@ from scipy.stats import binom
 from sioms.reconcile.ambiguity import Rival, settle
 from sioms.reconcile.blocks import better, block_ids, formal, intervals
 from sioms.reconcile.calibrate import calibrated
-from sioms.reconcile.channels import Finding, drive, drive_output, index_fit, index_scale, lattice
+from sioms.reconcile.channels import (
+    Finding,
+    drive,
+    drive_output,
+    index_fit,
+    index_scale,
+    lattice,
+    with_resolution,
+)
 from sioms.reconcile.checks import check, check_scale
 from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import known, library
@@ -103,7 +111,8 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
 
     Args:
         session: recordings of one axis, in order.
-        nominal: the model to be corrected; effects already in it may be re-estimated and may leave.
+        nominal: the model to be corrected; effects already in it may be re-estimated and may leave. A resolution of zero
+            is the smallest step of the recorded position.
 
     Returns:
         The verdict with its evidence.
@@ -112,6 +121,7 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
         BadInputError: the data cannot be used.
     """
     o = options or Options()
+    nominal = with_resolution(nominal, session)
     ready = prepare(session, nominal, o)
     ready, excited, searcher, found = _search(ready, o)
     share = smoother_share(ready.problem, found.fit)

@@ -7,13 +7,14 @@ found here is measured directly, so the later fits keep it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from sioms.reconcile.effect import Array
+from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.records import Record, Session
 
@@ -37,6 +38,22 @@ class Finding:
     values: Mapping[str, float]
     errors: Mapping[str, float]
     evidence: str
+
+
+def with_resolution(model: AxisModel, session: Session) -> AxisModel:
+    """Fill in a resolution of zero by the smallest step of the recorded position.
+
+    Raises:
+        BadInputError: there is no step.
+    """
+    if model.resolution > 0.0:
+        return model
+    steps = np.abs(np.concatenate([np.diff(r.position) for r in session.records]))
+    top = float(np.max([np.max(np.abs(r.position)) for r in session.records]))
+    moved = steps[steps > 1e-9 * max(top, 1e-12)]
+    if not len(moved):
+        raise BadInputError("read records: position is constant; needs motion")
+    return replace(model, resolution=float(np.min(moved)))
 
 
 def lattice(session: Session, model: AxisModel) -> Finding | None:

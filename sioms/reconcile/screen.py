@@ -25,8 +25,12 @@ from sioms.reconcile.simulate import replay
 GRID_DELAY = (0.5e-3, 2e-3, 5e-3)
 GRID_RESONANCE = (7.0, 11.0, 16.0, 24.0, 36.0, 55.0)
 GRID_GAP = tuple(float(g) for g in np.geomspace(3e-4, 0.18, 24))
-#: A contact that bounces makes a cost of many minima; started with one that does not, it would not find all that do.
-GRID_ZETA = (0.05, 0.3)
+#: A contact that bounces makes a cost of many minima; started with one that does not, it would not find all that do. The best
+#: few gaps of the first contact are tried with the others.
+CONTACTS = tuple(
+    {"load_fraction": f, "zeta": z} for f, z in ((0.4, 0.3), (0.6, 0.3), (0.4, 0.05), (0.6, 0.05))
+)
+FEW = 4
 GRID_LIMIT = (0.95, 0.85, 0.7, 0.5, 0.3)
 GRID_TAU = (3.0, 10.0, 40.0)
 STEP_LENGTH = 3.5  # from one trial of a length to the next
@@ -355,12 +359,7 @@ def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator
         case Slot.ELASTIC:
             grid = tuple({first: g, "load_fraction": f} for g in GRID_RESONANCE for f in (0.3, 0.6))
         case Slot.BACKLASH:
-            grid = tuple(
-                {first: g * model.pitch, "load_fraction": f, "zeta": z}
-                for g in GRID_GAP
-                for f in (0.4, 0.6)
-                for z in GRID_ZETA
-            )
+            grid = tuple({first: g * model.pitch, **CONTACTS[0]} for g in GRID_GAP)
         case Slot.LIMIT:
             grid = tuple({first: g * peak} for g in GRID_LIMIT)
         case Slot.WARMING:
@@ -387,13 +386,30 @@ def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator
 
 def _screen_trials(problem: Problem, fit: Fit, effect: Effect, q: Array, rest: Array) -> list[Start]:
     """Try an effect on a grid in the simulation; the change it makes may be stretched, and turned round where its size has a sign."""
-    best: list[Start] = []
     model = fit.model
     for name in effect.replaces:
         model = model.without_effect(name) if name in model.effects else model
     trials = list(trial_values(effect, model, problem))
     if effect.joins:
         trials = _beside(trials, fit.model, effect)
+    best = _scored(problem, fit, model, effect, trials, q, rest)
+    if effect.slot is Slot.BACKLASH:
+        others = [{**s.values, **contact} for s in best[:FEW] for contact in CONTACTS[1:]]
+        best = sorted(best + _scored(problem, fit, model, effect, others, q, rest), key=lambda s: -s.gain)
+    return best[: 2 if effect.slot in (Slot.ELASTIC, Slot.BACKLASH) else 1]
+
+
+def _scored(
+    problem: Problem,
+    fit: Fit,
+    model: AxisModel,
+    effect: Effect,
+    trials: list[dict[str, float]],
+    q: Array,
+    rest: Array,
+) -> list[Start]:
+    """Simulate trials beside a model and say what each could explain, the best first."""
+    best: list[Start] = []
     least = -9.0 if effect.slot is Slot.SCALE or effect.primary.lower < 0.0 else 0.0
     for values, tried in zip(
         trials,
@@ -408,8 +424,7 @@ def _screen_trials(problem: Problem, fit: Fit, effect: Effect, q: Array, rest: A
         stretch = float(np.clip(-(d @ rest) / size, least, 9.0))
         gain = 1.0 - float(np.sum((rest + stretch * d) ** 2)) / float(rest @ rest)
         best.append(Start(effect.name, gain, _stretched(effect, model, values, stretch)))
-    best.sort(key=lambda s: -s.gain)
-    return best[: 2 if effect.slot in (Slot.ELASTIC, Slot.BACKLASH) else 1]
+    return sorted(best, key=lambda s: -s.gain)
 
 
 def _beside(trials: list[dict[str, float]], model: AxisModel, effect: Effect) -> list[dict[str, float]]:
