@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import binom
 
 from sioms.reconcile.ambiguity import Rival, settle
-from sioms.reconcile.blocks import better, block_ids, formal, intervals
+from sioms.reconcile.blocks import better, block_ids
 from sioms.reconcile.calibrate import calibrated
 from sioms.reconcile.channels import (
     Finding,
@@ -25,24 +25,25 @@ from sioms.reconcile.channels import (
     with_resolution,
 )
 from sioms.reconcile.checks import check, check_scale
-from sioms.reconcile.effect import Array, Slot
-from sioms.reconcile.effects import known, library
-from sioms.reconcile.effects.terms import TERM_PREFIX, TERMS
+from sioms.reconcile.effect import Array
+from sioms.reconcile.effects import library
+from sioms.reconcile.effects.terms import TERMS
+from sioms.reconcile.evidence import describe, spans_of
 from sioms.reconcile.excitation import Gate, gate
 from sioms.reconcile.experiment import Envelope, Experiment, separate
-from sioms.reconcile.fit import BASE, SKIP, SKIP_S, Fit, Mapper, Problem, refit
+from sioms.reconcile.fit import SKIP, SKIP_S, Fit, Mapper, Problem, refit
 from sioms.reconcile.gaps import measure, rungs, session_states
 from sioms.reconcile.locate import Place, Spectrum, locate, spectra
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, effective_samples, observer, sensor_noise
 from sioms.reconcile.records import Session
 from sioms.reconcile.refuse import bursts, loud_turns, smoother_share
-from sioms.reconcile.rules import GAIN, SPECIFIC, SURE, told_apart
+from sioms.reconcile.rules import SPECIFIC, SURE
 from sioms.reconcile.search import Found, Searcher, Step, rattles
 from sioms.reconcile.simulate import replay
 from sioms.reconcile.timing import on_grid
 from sioms.reconcile.tones import Tone, as_term, hum, known_beside
-from sioms.reconcile.verdict import Estimate, NamedEffect, Outcome, Trace, Verdict
+from sioms.reconcile.verdict import Outcome, Trace, Verdict
 
 #: Share at the end of every record that takes no part in any choice.
 UNTOUCHED = 0.2
@@ -54,8 +55,6 @@ BURSTS = 0.8
 LARGE = 3.0
 #: Above this multiple, and with this share of the disagreement left, nothing is named at all.
 HOPELESS, HALF = 5.0, 0.33
-#: Multiples of a parameter of the bounces in a gap that are tried for its interval.
-ROUGH_GRID = tuple(float(x) for x in np.linspace(0.9, 1.1, 17))
 #: So large a share of the bursts at turns of the motion belongs to them, if chance brings it no oftener than this.
 MOSTLY, CHANCE = 0.5, 0.01
 #: Below these multiples of the expected innovation nothing is called unexplained, or a burst.
@@ -324,8 +323,8 @@ def _conclude(
     fit = refit(whole, found.fit.model, searcher.frozen, 12)
     if fit.cost > float(np.sum(whole.residual(found.fit.model) ** 2)):
         fit = replace(fit, model=found.fit.model)
-    spans = _intervals(whole, fit, o.replicates, rng)
-    named, terms = _describe(ready, fit, found, searcher, others, spans, rng)
+    spans = spans_of(whole, fit, o.replicates, rng)
+    named, terms = describe(ready.findings, fit, found, searcher, others, spans, rng)
     terms += [as_term(beside, nominal) for beside in ready.tones]
     open_rivals = [r for r in others if r.open]
     gap = rattles(found.fit.model)
@@ -406,116 +405,6 @@ def _outcome(named: bool, unexplained: bool, ambiguous: bool) -> Outcome:
 
 def _set(r: Rival, model: AxisModel) -> tuple[str, ...]:
     return tuple(r.rival if n == r.effect else n for n in model.effects)
-
-
-def _intervals(
-    problem: Problem, fit: Fit, replicates: int, rng: np.random.Generator
-) -> dict[tuple[str, str], tuple[float, float]]:
-    """95 % intervals per (effect, symbol), by leaving out each block of time, within the bounds of the parameters."""
-    half = np.maximum(intervals(fit, block_ids(problem, fit.model.sample_time_s)), formal(fit))
-    spread = half * np.array([f.scale for f in fit.free])
-    out = {}
-    for f, s in zip(fit.free, spread, strict=True):
-        value = getattr(fit.model, f.symbol) if f.effect == BASE else fit.model.effects[f.effect][f.symbol]
-        if f.effect != BASE and known()[f.effect].slot is Slot.BACKLASH:
-            s = max(float(s), value * _rough_spread(problem, fit, f.effect, f.symbol, replicates, rng))
-        out[f.effect, f.symbol] = (
-            max(value - float(s), min(f.lower, value)),
-            min(value + float(s), max(f.upper, value)),
-        )
-    return out
-
-
-def _rough_spread(
-    problem: Problem, fit: Fit, name: str, symbol: str, replicates: int, rng: np.random.Generator
-) -> float:
-    """95 % half-width, relative, of a parameter whose cost is rough: where the best of a grid falls, over bootstrap replicates."""
-    here = fit.model.effects[name]
-    ids = block_ids(problem, fit.model.sample_time_s)
-    count = int(ids.max()) + 1
-
-    def energy(factor: float) -> Array:
-        e = problem.residual(fit.model.with_effect(name, {**here, symbol: here[symbol] * factor}))
-        return np.asarray(np.bincount(ids, weights=e**2, minlength=count), dtype=np.float64)
-
-    costs = np.stack(list(problem.mapper(energy, ROUGH_GRID)))
-    draws = rng.multinomial(count, np.full(count, 1.0 / count), size=replicates)
-    best = np.asarray(ROUGH_GRID)[np.argmin(draws @ costs.T, axis=1)]
-    step = ROUGH_GRID[1] - ROUGH_GRID[0]
-    return float(1.96 * np.sqrt(np.mean((best - 1.0) ** 2) + step**2 / 12.0))
-
-
-def _describe(
-    ready: Prepared,
-    fit: Fit,
-    found: Found,
-    searcher: Searcher,
-    others: Sequence[Rival],
-    given: dict[tuple[str, str], tuple[float, float]],
-    rng: np.random.Generator,
-) -> tuple[list[NamedEffect], list[NamedEffect]]:
-    """Describe every effect of the model, the largest first; terms apart."""
-    named: list[NamedEffect] = []
-    for name in fit.model.effects:
-        saved, errors, frequency = _worth(found, searcher, name, rng)
-        effect = known()[name]
-        finding = next((f for f in ready.findings if f.effect == name), None)
-        spans = dict(given)
-        if finding is not None:
-            spans.update(
-                {
-                    (name, s): (finding.values[s] - 1.96 * e, finding.values[s] + 1.96 * e)
-                    for s, e in finding.errors.items()
-                }
-            )
-        estimates = tuple(
-            Estimate(
-                p.symbol,
-                fit.model.effects[name][p.symbol],
-                *spans.get((name, p.symbol), (fit.model.effects[name][p.symbol],) * 2),
-                fit.model.unit(p),
-                p.text,
-            )
-            for p in effect.parameters
-        )
-        evidence = [finding.evidence] if finding is not None else []
-        evidence.append(
-            f"without it {100 * saved:.1f} % of the residual energy would come back ({errors:.1f} standard errors)"
-        )
-        ruled, still = told_apart(name, effect.lookalikes, others, found.ladder, fit.model.effects)
-        named.append(
-            NamedEffect(
-                name,
-                effect.title,
-                effect.equation,
-                effect.channel.value,
-                estimates,
-                saved,
-                errors,
-                frequency,
-                tuple(evidence),
-                ruled,
-                still,
-            )
-        )
-    named.sort(key=lambda e: -e.saved)
-    return (
-        [e for e in named if not e.name.startswith(TERM_PREFIX)],
-        [e for e in named if e.name.startswith(TERM_PREFIX)],
-    )
-
-
-def _worth(
-    found: Found, searcher: Searcher, name: str, rng: np.random.Generator
-) -> tuple[float, float, float]:
-    """How much an effect saves beyond the others, in how many standard errors and bootstrap replicates."""
-    bare = refit(searcher.problem, found.fit.model.without_effect(name), searcher.frozen, 4)
-    loss = searcher.loss(bare)
-    saved, errors = better(found.losses, loss)
-    d, n = loss - found.losses, len(loss)
-    draws = rng.integers(0, n, (200, n))
-    frequency = float(np.mean(d[draws].sum(1) > GAIN * loss[draws].sum(1)))
-    return saved, errors, frequency
 
 
 def _plan(ready: Prepared, o: Options, model: AxisModel, open_rivals: Sequence[Rival]) -> Experiment | None:
