@@ -80,7 +80,7 @@ def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, bool]
         numbers(t, "gain", where, count),
         np.zeros(count),
         np.zeros(count),
-        extent,
+        extent=extent,
     )
     check(b, where)
     model = SensorModel(b, count, library(), {}, (), str(t.get("name", "finger")))

@@ -63,7 +63,7 @@ def test_a_sensor_model_is_checked(table: dict[str, object], says: str) -> None:
     ],
 )
 def test_a_finger_model_is_checked(change: dict[str, object], says: str) -> None:
-    assert finger_from({"finger": FINGER}, "m.toml")[0].count == 3
+    assert finger_from({"finger": FINGER | {"extent_rad": 0.047}}, "m.toml")[0].base.extent == 0.047
     with pytest.raises(BadInputError, match=says):
         finger_from({"finger": FINGER | change}, "m.toml")
 
