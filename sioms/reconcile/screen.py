@@ -35,7 +35,8 @@ GRID_LIMIT = (0.95, 0.85, 0.7, 0.5, 0.3)
 GRID_TAU = (3.0, 10.0, 40.0)
 STEP_LENGTH = 3.5  # from one trial of a length to the next
 GRID_DROP = (0.003, 0.01, 0.03, 0.1)  # speeds of a drop, of the largest
-RISE = 1.4  # first guess of a breakaway level, of the level at speed
+#: First guesses of the level at speed and of the breakaway level, of a level that stood for both.
+DROPS = ((1.0, 1.4), (0.85, 1.05))
 GRID_PHASE = np.linspace(-np.pi, np.pi, 9)[1:]
 SPEED_STEPS, PLACES = 7, 15
 #: Below this the measured motion stands for one without noise; a command is followed up to COMMAND_HZ, if to this share.
@@ -430,9 +431,11 @@ def _scored(
 def _beside(trials: list[dict[str, float]], model: AxisModel, effect: Effect) -> list[dict[str, float]]:
     """Give trials of an effect that joins two the numbers of the one that is in the model, each once."""
     given = {k: v for n in effect.joins if n in model.effects for k, v in model.effects[n].items()}
+    levels: list[dict[str, float]] = [{}]
     if "Fc" in given and "Fs" not in given:
-        given["Fs"] = RISE * given["Fc"]
-    return list({tuple(t.items()): t for t in ({**trial, **given} for trial in trials)}.values())
+        levels = [{"Fc": low * given["Fc"], "Fs": high * given["Fc"]} for low, high in DROPS]
+    made = ({**trial, **given, **level} for trial in trials for level in levels)
+    return list({tuple(t.items()): t for t in made}.values())
 
 
 def _stretched(

@@ -310,7 +310,7 @@ class Searcher:
     def _add_pair(self, fit: Fit, losses: Array) -> tuple[Fit, Array, Step] | None:
         """Add two effects at once where neither saves enough alone: each hides what the other would save.
 
-        Both must be sure together, and each must earn its place beside the other.
+        Both must be sure together, and each must earn its place beside the other. One that joins the first with another counts as both.
         """
         pairs: dict[str, Tried] = {}
         if fit.ratio < PAIRED:
@@ -320,13 +320,17 @@ class Searcher:
             if middle.cost > fit.cost:  # it only takes the place of something better
                 continue
             inner = self.loss(middle)
-            for second in [
-                s for s in self._candidates(middle) if s.effect not in known()[first.effect].replaces
-            ][:TRIES]:
+            beside = [
+                s
+                for s in self._candidates(middle)
+                if s.effect not in known()[first.effect].replaces or first.effect in known()[s.effect].joins
+            ]
+            for second in beside[:TRIES]:
                 new = self._with(
                     middle, second, 8, min((t[0].cost for t in pairs.values()), default=middle.cost)
                 )
-                if first.effect not in new.model.effects:
+                joined = first.effect in known()[second.effect].joins
+                if first.effect not in new.model.effects and not joined:
                     continue
                 loss = self.loss(new)
                 gain, sure = better(loss, losses)
@@ -338,7 +342,8 @@ class Searcher:
                     and surer >= self._sure(second.effect)
                 )
                 if good and self._sound(new, fit):
-                    pairs[f"{first.effect}{AND}{second.effect}"] = new, loss, gain, sure
+                    name = second.effect if joined else f"{first.effect}{AND}{second.effect}"
+                    pairs[name] = new, loss, gain, sure
         if not pairs:
             return None
         both = simplest(pairs)
