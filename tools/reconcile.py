@@ -92,18 +92,13 @@ def run(args: argparse.Namespace) -> int:
     # matrices are small: more threads only wait for each other, and badly so on a busy machine
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if args.subject == "effects":
-        from sioms.tools import reconcile_effects
+        from sioms.tools import reconcile_effects, reconcile_effects_sensors
 
-        if args.of == "sensors":
-            from sioms.tools.reconcile_effects_sensors import page
-
-            print(page(), end="")
-            return 0
-
+        library = reconcile_effects_sensors if args.of == "sensors" else reconcile_effects
         if args.out is None:
-            print(reconcile_effects.page(), end="")
+            print(library.page(), end="")
         else:
-            reconcile_effects.write(args.out)
+            library.write(args.out)
         return 0
     if args.subject == "selftest":
         if args.kind != "axis":
@@ -205,7 +200,8 @@ def reconcile_axis(
     Raises:
         BadInputError: data or model cannot be used.
     """
-    from sioms.reconcile.axis import Options, analyse
+    from sioms.reconcile.axis import analyse
+    from sioms.reconcile.prepare import Options
     from sioms.tools.reconcile_input import read_data, read_model
 
     start = time.monotonic()

@@ -26,7 +26,7 @@ import numpy as np
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.force.model_file import from_table
 from sioms.reconcile.force.plan import Plan
-from sioms.reconcile.force.subject import ForceRecords, unit_of
+from sioms.reconcile.force.records import ForceRecords, unit_of
 from sioms.reconcile.given import columns_in, only, parsed, words
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.verdict import SensorVerdict
@@ -134,7 +134,7 @@ def _record(path: Path, own: Specs, load: Specs, reading: Specs, names: tuple[st
     count = len(next(iter(raw.values()))) if raw else 0
     loads = [_column(raw, load, n, path, count) for n in names]
     readings = [_column(raw, reading, n, path, count) for n in names]
-    clock = _column(raw, own, "time", path, count) if "time" in own else np.arange(count, dtype=np.float64)
+    clock = _column(raw, own, "time", path, count) if "time" in own else np.full(count, np.nan)
     warm = _column(raw, own, "temperature", path, count) if "temperature" in own else np.full(count, np.nan)
     return np.stack(loads, axis=1), np.stack(readings, axis=1), clock, warm
 

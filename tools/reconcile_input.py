@@ -32,9 +32,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.reconcile.errors import BadInputError
-from sioms.reconcile.given import columns_in, number, only, parsed, truth, words
-from sioms.reconcile.model import AxisModel, Controller
-from sioms.reconcile.model_file import check_model, parse_model
+from sioms.reconcile.given import columns_in, number, only, parsed, table_in, truth, words
+from sioms.reconcile.model import AxisModel
+from sioms.reconcile.model_file import model_from, parse_model
 from sioms.reconcile.records import Record, Session
 from sioms.tools.reconcile_table import SUFFIXES, UNITS, load_table, measures, named, unit_of
 
@@ -51,6 +51,24 @@ WORDS = {
 QUANTITIES = ("time", "position", "command", "force", "force_measured", "index", "feedforward", "external")
 #: Those which some files of a session may be without: there was none.
 SOMETIMES = ("feedforward", "external")
+#: Keys of ``nominal.json`` by those of a model file.
+LAYOUT_AXIS = {
+    "name": "scenario",
+    "kind": "kind",
+    "sample_time_s": "sample_time",
+    "inertia": "inertia",
+    "viscous": "viscous",
+    "resolution": "encoder_resolution",
+    "pitch": "index_pitch",
+    "max_speed": "position_max_speed",
+    "start_position": "start_position",
+}
+LAYOUT_CONTROLLER = {
+    **{key: key for key in ("k", "kz", "kp", "kb")},
+    "offset": "tau_o",
+    "limit": "tau_m",
+    "velocity_filter_hz": "vel_filter_hz",
+}
 #: What each quantity may be measured in, on a rotary and on a linear axis.
 ROTARY = {
     "time": "time",
@@ -237,30 +255,22 @@ def read_model(path: Path) -> AxisModel:
         raise BadInputError(f"read model {path}: no such file")
     if path.suffix != ".json":
         return parse_model(path.read_text(), str(path))
+    where = f"read model {path}"
     try:
-        model = _layout_model(json.loads(path.read_text()))
-        check_model(model, f"read model {path}")
-    except BadInputError:
-        raise
-    except (KeyError, TypeError) as e:
-        raise BadInputError(f"read model {path}: missing or wrong key {e}") from e
+        given = json.loads(path.read_text())
     except ValueError as e:
-        raise BadInputError(f"read model {path}: {e}") from e
-    return model
+        raise BadInputError(f"{where}: {e}") from e
+    if not isinstance(given, Mapping):
+        raise BadInputError(f"{where}: it holds {given!r:.40}; needs an object")
+    return model_from(_of_layout(given, where), where)
 
 
-def _layout_model(n: Mapping[str, Any]) -> AxisModel:
-    c = n["controller"]
-    return AxisModel(
-        rotary=n["kind"] == "rotary",
-        sample_time_s=n["sample_time"],
-        inertia=n["inertia"],
-        viscous=n["viscous"],
-        resolution=n["encoder_resolution"],
-        pitch=n["index_pitch"],
-        rated_force=n["inertia"] * n["max_acceleration"],
-        max_speed=n["position_max_speed"],
-        start_position=n.get("start_position", 0.0),
-        name=n.get("scenario", "axis"),
-        controller=Controller(c["k"], c["kz"], c["kp"], c["kb"], c["tau_o"], c["tau_m"], c["vel_filter_hz"]),
-    )
+def _of_layout(n: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Put ``nominal.json`` into the tables of a model file."""
+    axis = {key: n[name] for key, name in LAYOUT_AXIS.items() if name in n}
+    axis["rated_force"] = number(n, "inertia", where) * number(n, "max_acceleration", where)
+    c = table_in(n, "controller", where)
+    return {
+        "axis": axis,
+        "controller": {key: c[name] for key, name in LAYOUT_CONTROLLER.items() if name in c},
+    }

@@ -17,11 +17,12 @@ import sioms
 from sioms.client.reading import AxisReading
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
-from sioms.reconcile.axis import Options, analyse
+from sioms.reconcile.axis import analyse
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.experiment import Envelope, Experiment, catalogue, one_speed, repeated
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.model_file import write_model
+from sioms.reconcile.prepare import Options
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.simulate import simulate
 from sioms.reconcile.verdict import Outcome, Verdict

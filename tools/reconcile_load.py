@@ -36,7 +36,7 @@ from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.force.plan import LAPS, UP_AND_DOWN, Push, rest
-from sioms.reconcile.force.subject import unit_of
+from sioms.reconcile.force.records import unit_of
 from sioms.reconcile.sensors.verdict import Proposal, SensorVerdict
 from sioms.tools.experiments import Say, agree, decide, have_done, kept
 from sioms.tools.presser import Presser

@@ -6,13 +6,13 @@ import base64
 import html
 import io
 import json
+import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from sioms.reconcile.sensors.verdict import SensorVerdict
-from sioms.reconcile.verdict import Gap, NamedEffect, Outcome, Verdict
+from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome, Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,8 +29,11 @@ h1{font-size:1.5rem;margin-bottom:.2rem} h2{font-size:1.15rem;margin-top:2rem;bo
 .verdict{padding:.8rem 1rem;border-left:6px solid #2a7;background:#eef8f3} .unexplained{border-color:#c50;background:#fdf2ea}
 .ambiguous{border-color:#c90;background:#fdf8e6} table{border-collapse:collapse;margin:.6rem 0} td,th{padding:.2rem .7rem;
 border-bottom:1px solid #dde4ea;text-align:left} td.n{text-align:right;white-space:nowrap;font-variant-numeric:tabular-nums}
-code{background:#eef2f5;padding:0 .3em} img{max-width:100%} .small{font-size:.85rem;color:#52606d}
+code{background:#eef2f5;padding:0 .3em} img{width:100%} .small{font-size:.85rem;color:#52606d}
 """
+LINES = 10
+#: Permutations do as well no oftener than this: a variable orders a disagreement.
+CHANCE = 0.05
 NO_PICTURES = {"gap": "<p class=small>Pictures need matplotlib (the extra <code>report</code>).</p>"}
 AnyVerdict = Verdict | SensorVerdict
 Titles = Callable[[str], str | None]
@@ -49,40 +52,65 @@ def number(value: float) -> str:
     return f"{value:.4g}"
 
 
+def span(p: Estimate) -> tuple[str, str, str]:
+    """Value and interval of a number, with as many digits as tell the ends apart, four at least."""
+    width = abs(p.high - p.low)
+    size = max(abs(p.low), abs(p.high))
+    digits = (
+        4 if not 0.0 < width < size < math.inf else min(max(4, 2 + math.ceil(math.log10(size / width))), 9)
+    )
+    return f"{p.value:.{digits}g}", f"{p.low:.{digits}g}", f"{p.high:.{digits}g}"
+
+
 def summary(v: AnyVerdict, gap: Gap, out: str) -> list[str]:
     """Say the verdict in at most ten lines; ``gap`` is the one that speaks for all."""
     lines = [f"verdict: {v.outcome.value} - {headline(v)}"]
     lines += ["  " + in_words(e) for e in v.effects[:4]]
     lines += [f"  unexplained part looks like {in_words(e)}" for e in v.symbolic[:2]]
+    more = []
     if v.alternatives:
         sets = [[e.name for e in v.effects], *v.alternatives]
-        lines.append("  not told apart: " + " or ".join(" + ".join(s) or "nothing" for s in sets))
+        more.append("  not told apart: " + " or ".join(" + ".join(s) or "nothing" for s in sets))
     if v.experiment is not None:
         apart = f"rivals differ by {v.experiment.separation:.0f} times the noise"
-        lines.append(f"  decide by: {v.experiment.text} ({apart})")
-    lines.append(
-        f"gap on untouched data, {gap.channel}: {number(gap.before)} before, {number(gap.after)} after, floor "
-        f"{number(gap.floor)} {gap.unit}"
-    )
-    if v.notes:
-        lines.append(f"note: {v.notes[-1]}")
-    lines.append(f"report: {out}")
-    return lines[:10]
+        more.append(f"  decide by: {v.experiment.text} ({apart})")
+    if where := places(v, 3):
+        more.append(f"where: of the disagreement goes {where}")
+    if v.effects:
+        ruled = ", ".join(v.effects[0].ruled_out)
+        more.append(f"why: {v.effects[0].evidence[-1]}" + (f"; ruled out: {ruled}" if ruled else ""))
+    more += [f"note: {note}" for note in reversed(v.notes)]
+    last = [f"gap on untouched data, {shrunk(gap)}", f"report: {out}"]
+    return [*lines, *more[: LINES - len(lines) - len(last)], *last]
+
+
+def shrunk(gap: Gap) -> str:
+    """Say how far a gap shrank."""
+    return f"{gap.channel}: {number(gap.before)} before, {number(gap.after)} after, floor {number(gap.floor)} {gap.unit}"
+
+
+def places(v: AnyVerdict, most: int) -> str:
+    """Say with which variables the disagreement goes, the strongest first; empty where with none."""
+    shown = [p for p in v.places if p.p <= CHANCE][:most]
+    parts = [f"{100 * p.explained:.0f} % with {p.variable}" for p in shown]
+    return f"{', '.join(parts)} (permutation p <= {max(p.p for p in shown):.2f})" if shown else ""
 
 
 def in_words(e: NamedEffect) -> str:
     """Name an effect with its values; of a number for every element, the spread."""
-    parts = [
-        _with_unit(f"{p.symbol} = {number(p.value)}", p.unit) + f" [{number(p.low)}, {number(p.high)}]"
-        for p in e.parameters
-        if "[" not in p.symbol
-    ]
-    each = [p for p in e.parameters if "[" in p.symbol]
-    if each:
-        values = np.array([p.value for p in each])
-        span = f"from {number(float(values.min()))} to {number(float(values.max()))}"
-        name = each[0].symbol.split("[")[0]
-        parts.insert(0, _with_unit(f"{name} {span}", each[0].unit) + f", mean {number(float(values.mean()))}")
+    parts = []
+    for p in e.parameters:
+        if "[" not in p.symbol:
+            value, low, high = span(p)
+            parts.append(_with_unit(f"{p.symbol} = {value}", p.unit) + f" [{low}, {high}]")
+    each: dict[str, list[Estimate]] = {}
+    for p in e.parameters:
+        if "[" in p.symbol:
+            each.setdefault(re.split(r"[_\[]", p.symbol)[0], []).append(p)
+    for mine in each.values():
+        least, largest = (pick(mine, key=lambda p: p.value) for pick in (min, max))
+        ends = " to ".join(f"{p.symbol} = {number(p.value)}" for p in (least, largest))
+        parts.insert(0, _with_unit(ends, mine[0].unit))
     return f"{e.title}: {', '.join(parts[:4])}"
 
 
@@ -139,15 +167,19 @@ def gap_of(g: Gap) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def opening(v: AnyVerdict) -> str:
-    """Begin the page: its head, and the verdict."""
+def opening(v: AnyVerdict, gap: Gap, title: Titles) -> str:
+    """Begin the page: its head, and the verdict with where it disagreed and how far the gap shrank."""
     name = html.escape(v.nominal.name)
-    found = html.escape("; ".join(e.title for e in v.effects))
+    sets = [[e.name for e in v.effects], *v.alternatives]
+    found = html.escape("; or ".join(" and ".join(title(n) or n for n in s) or "nothing" for s in sets))
+    lines = [f"<b>{v.outcome.value}</b> - {headline(v)}"]
+    lines += [f"<b>{found}</b>"] if v.effects or v.alternatives else []
+    lines += [f"Of the disagreement goes {html.escape(where)}"] if (where := places(v, 2)) else []
+    lines.append(f"On data that took no part, {html.escape(shrunk(gap))}")
     return (
         f"<!doctype html><html lang=en><meta charset=utf-8><title>{name}: reconcile</title><style>{STYLE}</style>"
         f"<h1>{name}: simulation against measurement</h1>"
-        f"<p class='verdict {v.outcome.value}'><b>{v.outcome.value}</b> - {headline(v)}"
-        f"{'<br>' if found else ''}<b>{found}</b></p>"
+        f"<p class='verdict {v.outcome.value}'>{'<br>'.join(lines)}</p>"
     )
 
 
@@ -158,7 +190,8 @@ def why(effects: Sequence[NamedEffect], title: Titles) -> str:
 
 def _why(e: NamedEffect, title: Titles) -> str:
     items = [html.escape(text) for text in e.evidence]
-    items.append(f"it earns its place in {100 * e.frequency:.0f} % of block bootstrap replicates")
+    if e.frequency is not None:
+        items.append(f"it earns its place in {100 * e.frequency:.0f} % of block bootstrap replicates")
     items += [
         f"{html.escape(t)}: ruled out, {html.escape(x)}" for n, x in e.ruled_out.items() if (t := title(n))
     ]
@@ -207,5 +240,25 @@ def what_next(
 def image(figure: Figure) -> str:
     """Return a picture as a part of the page."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=80)
+    figure.savefig(buffer, format="png", dpi=96)
     return f"<img alt='' src='data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}'>"
+
+
+def gap_picture(figure: Figure, gaps: Sequence[Gap]) -> Figure:
+    """Draw every channel's gap before and after in units of its noise floor."""
+    ax = figure.subplots()
+    for i, g in enumerate(reversed(gaps)):
+        ends = [g.before / g.floor, g.after / g.floor]
+        ax.plot(ends, [i, i], color="#cfd8e0", lw=6, solid_capstyle="butt", zorder=1)
+        ax.plot(ends[0], i, "o", color="#c50", label="before" if i == 0 else None)
+        ax.plot(ends[1], i, "o", color="#08a", label="after" if i == 0 else None)
+    ax.axvline(1.0, color="#1c2733", lw=1, ls="--", label="noise floor")
+    ax.set_xscale("log")
+    sizes = [share / g.floor for g in gaps for share in (g.before, g.after)]
+    ax.set_xlim(min(0.5, 0.7 * min(sizes)), 2.0 * max(2.0, *sizes))
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.set_yticks(range(len(gaps)), [g.channel for g in reversed(gaps)], fontsize=8)
+    ax.set_ylim(-0.6, len(gaps) - 0.4)
+    ax.set_xlabel("simulated - measured over the noise floor, on what took no part", fontsize=8)
+    figure.legend(loc="outside right upper", fontsize=8)
+    return figure

@@ -12,15 +12,22 @@ from sioms.reconcile.effects import library
 from sioms.reconcile.session import knobs
 from sioms.reconcile.verdict import Gap, Verdict
 from sioms.tools import reconcile_page
-from sioms.tools.reconcile_page import NO_PICTURES, gap_of, image, number
+from sioms.tools.reconcile_page import CHANCE, NO_PICTURES, gap_of, gap_picture, image, number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+#: Of the largest density, below which a spectrum shows the filter that made the residual and not the residual.
+SHOWN = 1e-4
+
 
 def summary(v: Verdict, out: str) -> list[str]:
     """Say the verdict in at most ten lines; the gap in force, or of the one channel there is."""
-    return reconcile_page.summary(v, v.gaps[min(1, len(v.gaps) - 1)], out)
+    return reconcile_page.summary(v, _speaking(v), out)
+
+
+def _speaking(v: Verdict) -> Gap:
+    return v.gaps[min(1, len(v.gaps) - 1)]
 
 
 def as_json(v: Verdict, seconds: float) -> str:
@@ -51,25 +58,17 @@ def as_json(v: Verdict, seconds: float) -> str:
 def page(v: Verdict, seconds: float) -> str:
     """Make the self-contained HTML page."""
     pictures = _pictures(v)
-    parts = [reconcile_page.opening(v)]
-    parts.append(_what(v))
-    parts.append(
-        "<h2>How far the gap shrank</h2><p>Root mean square on samples that took no part in any choice.</p>"
-        + _gaps(v.gaps)
-    )
-    parts.append(_session(v))
-    parts.append(pictures.get("gap", ""))
-    parts.append(
-        "<h2>Where it disagreed</h2>" + _where(v) + pictures.get("places", "") + pictures.get("spectra", "")
-    )
-    parts.append(
-        "<h2>Why we believe it, and what else it could have been</h2>"
-        + reconcile_page.why((*v.effects, *v.symbolic), _title)
-    )
-    parts.append(
-        reconcile_page.what_next(v, "their forces then differ", v.gate.missing, v.gate.pairs, _title)
-    )
-    parts.append("<h2>How it was found</h2>" + _ladder(v))
+    parts = [
+        reconcile_page.opening(v, _speaking(v), _title),
+        "<h2>Where it disagreed</h2>" + _where(v) + pictures.get("places", "") + pictures.get("spectra", ""),
+        _what(v),
+        "<h2>How far the gap shrank</h2><p>Root mean square on samples that took no part in any choice.</p>",
+        _gaps(v.gaps) + pictures.get("floors", "") + pictures.get("gap", ""),
+        "<h2>Why we believe it, and what else it could have been</h2>",
+        reconcile_page.why((*v.effects, *v.symbolic), _title),
+        reconcile_page.what_next(v, "their forces then differ", v.gate.missing, v.gate.pairs, _title),
+    ]
+    parts.append("<h2>How it was found</h2>" + _ladder(v) + _session(v))
     parts.append(
         f"<p class=small>{v.samples} samples count as {v.effective_samples:.0f} independent ones; the residual of the final "
         f"model is {v.ratio:.2f} of the expected innovation; a generic smoother over the state explains "
@@ -94,8 +93,9 @@ def _what(v: Verdict) -> str:
                 if i == 0
                 else ""
             )
+            value, low, high = reconcile_page.span(p)
             rows.append(
-                f"<tr>{first}<td>{p.symbol}<td class=n>{number(p.value)}<td class=n>{number(p.low)} to {number(p.high)}"
+                f"<tr>{first}<td>{p.symbol}<td class=n>{value}<td class=n>{low} to {high}"
                 f"<td>{html.escape(p.unit)}<td>{html.escape(p.text)}"
             )
     return (
@@ -156,7 +156,7 @@ def _session(v: Verdict) -> str:
 
 
 def _where(v: Verdict) -> str:
-    shown = [p for p in v.places if p.p <= 0.05][:4]
+    shown = [p for p in v.places if p.p <= CHANCE][:4]
     if not shown:
         return "<p>No variable of the state orders the force residual of the old model (permutation p &gt; 0.05).</p>"
     text = "; ".join(
@@ -189,7 +189,11 @@ def _pictures(v: Verdict) -> dict[str, str]:
         from matplotlib.figure import Figure
     except ImportError:
         return NO_PICTURES
-    out = {}
+    out = {
+        "floors": image(
+            gap_picture(Figure(figsize=(11, 0.6 + 0.35 * len(v.gaps)), layout="constrained"), v.gaps)
+        )
+    }
     if v.traces:
         out["gap"] = image(
             _gap_picture(Figure(figsize=(11, 1.9 * min(len(v.traces), 4) + 1), layout="constrained"), v)
@@ -202,7 +206,7 @@ def _pictures(v: Verdict) -> dict[str, str]:
 
 
 def _gap_picture(figure: Figure, v: Verdict) -> Figure:
-    shown = v.traces[:4]
+    shown, floor = v.traces[:4], _speaking(v).floor
     rows = figure.subplots(len(shown), 1, squeeze=False)[:, 0]
     for ax, t in zip(rows, shown, strict=True):
         step = max(len(t.time_s) // 3000, 1)
@@ -215,12 +219,16 @@ def _gap_picture(figure: Figure, v: Verdict) -> Figure:
             label="simulated - measured, before",
         )
         ax.plot(t.time_s[::step], (t.after - t.measured)[::step], color="#08a", lw=0.7, label="after")
+        for side in (-1.0, 1.0):
+            ax.axhline(
+                side * floor, color="#1c2733", lw=0.6, ls="--", label="noise floor" if side > 0 else None
+            )
         settled = np.abs(t.before - t.measured)[len(t.measured) // 10 :]  # a record may begin in motion
         reach = float(np.quantile(settled, 0.998)) * 1.4 or 1.0
         ax.set_ylim(-reach, reach)
         ax.set_ylabel(f"force, {v.nominal.force_unit}")
         ax.set_title(f"{t.name} (shaded: untouched)", fontsize=9, loc="left")
-    rows[0].legend(loc="upper right", fontsize=8, ncols=2)
+    rows[0].legend(loc="upper right", fontsize=8, ncols=3)
     rows[-1].set_xlabel("time, s")
     return figure
 
@@ -233,7 +241,7 @@ def _place_picture(figure: Figure, v: Verdict) -> Figure:
             p.centres[order], p.means[order], p.spread[order], fmt=".-", color="#c50", ecolor="#e9c5ae", lw=1
         )
         ax.axhline(0.0, color="#888", lw=0.6)
-        ax.set_xlabel(f"{p.variable}, {p.unit}")
+        ax.set_xlabel(f"{p.variable}, {p.unit}".removesuffix(", 1"))
         ax.set_title(f"orders {100 * p.explained:.0f} %", fontsize=9)
     figure.axes[0].set_ylabel(f"missing force, {v.nominal.force_unit}")
     return figure
@@ -245,6 +253,9 @@ def _spectrum_picture(figure: Figure, v: Verdict) -> Figure:
     a, b = figure.subplots(1, 2)
     time, space = v.spectra
     a.loglog(time.axis[1:], time.density[1:], color="#c50", lw=0.8)
+    a.set_ylim(SHOWN * float(time.density[1:].max()), 2.0 * float(time.density[1:].max()))
+    a.set_title("missing force in time", fontsize=9)
+    b.set_title("missing force in place", fontsize=9)
     a.set_xlabel("frequency, Hz")
     a.set_ylabel(f"{v.nominal.force_unit}/sqrt(Hz)")
     b.stem(space.axis, space.density, linefmt="#c50", markerfmt=".", basefmt=" ")

@@ -8,7 +8,7 @@ import numpy as np
 
 from sioms.reconcile.sensors.verdict import SensorVerdict
 from sioms.reconcile.verdict import Estimate, NamedEffect
-from sioms.tools.reconcile_page import NO_PICTURES, image
+from sioms.tools.reconcile_page import NO_PICTURES, gap_picture, image
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,7 +37,9 @@ def pictures(v: SensorVerdict) -> dict[str, str]:
     except ImportError:
         return NO_PICTURES
     out = {
-        "gap": image(_gap_picture(Figure(figsize=(11, 0.6 + 0.35 * len(v.gaps)), layout="constrained"), v))
+        "gap": image(
+            gap_picture(Figure(figsize=(11, 0.6 + 0.35 * len(v.gaps)), layout="constrained"), v.gaps)
+        )
     }
     each = [
         (e.title, mine)
@@ -52,32 +54,6 @@ def pictures(v: SensorVerdict) -> dict[str, str]:
     if v.places:
         out["places"] = image(_place_picture(Figure(figsize=(11, 3.2), layout="constrained"), v))
     return out
-
-
-def _gap_picture(figure: Figure, v: SensorVerdict) -> Figure:
-    """Draw every channel's gap before and after in units of its noise floor."""
-    ax = figure.subplots()
-    for i, g in enumerate(reversed(v.gaps)):
-        ax.plot(
-            [g.before / g.floor, g.after / g.floor],
-            [i, i],
-            color="#cfd8e0",
-            lw=6,
-            solid_capstyle="butt",
-            zorder=1,
-        )
-        ax.plot(g.before / g.floor, i, "o", color="#c50", label="before" if i == 0 else None)
-        ax.plot(g.after / g.floor, i, "o", color="#08a", label="after" if i == 0 else None)
-    ax.axvline(1.0, color="#1c2733", lw=1, ls="--", label="noise floor")
-    ax.set_xscale("log")
-    sizes = [share / g.floor for g in v.gaps for share in (g.before, g.after)]
-    ax.set_xlim(min(0.5, 0.7 * min(sizes)), 2.0 * max(2.0, *sizes))
-    ax.xaxis.set_major_formatter("{x:g}")
-    ax.set_yticks(range(len(v.gaps)), [g.channel for g in reversed(v.gaps)], fontsize=8)
-    ax.set_ylim(-0.6, len(v.gaps) - 0.4)
-    ax.set_xlabel("simulated - measured over the noise floor, on what took no part", fontsize=8)
-    figure.legend(loc="outside right upper", fontsize=8)
-    return figure
 
 
 def _each_picture(figure: Figure, each: list[tuple[str, list[Estimate]]]) -> Figure:

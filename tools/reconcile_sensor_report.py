@@ -9,7 +9,7 @@ import numpy as np
 
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.verdict import SensorVerdict
-from sioms.reconcile.verdict import Estimate
+from sioms.reconcile.verdict import Estimate, Gap
 from sioms.tools import reconcile_page
 from sioms.tools.reconcile_page import gap_of, number
 from sioms.tools.reconcile_sensor_pictures import columns, groups, pictures
@@ -17,7 +17,11 @@ from sioms.tools.reconcile_sensor_pictures import columns, groups, pictures
 
 def summary(v: SensorVerdict, out: str) -> list[str]:
     """Say the verdict in at most ten lines; the largest gap before."""
-    return reconcile_page.summary(v, max(v.gaps, key=lambda g: g.before / g.floor), out)
+    return reconcile_page.summary(v, _speaking(v), out)
+
+
+def _speaking(v: SensorVerdict) -> Gap:
+    return max(v.gaps, key=lambda g: g.before / g.floor)
 
 
 def as_json(v: SensorVerdict, seconds: float) -> str:
@@ -39,8 +43,15 @@ def as_json(v: SensorVerdict, seconds: float) -> str:
 def page(v: SensorVerdict, seconds: float) -> str:
     """Make the self-contained HTML page."""
     drawn = pictures(v)
+
+    def title(name: str) -> str | None:
+        return v.nominal.library[name].title if name in v.nominal.library else None
+
     parts = [
-        reconcile_page.opening(v),
+        reconcile_page.opening(v, _speaking(v), title),
+        "<h2>Where it disagreed</h2>",
+        _where(v),
+        drawn.get("places", ""),
         _what(v),
         drawn.get("each", ""),
         "<h2>How far the gap shrank</h2><p>Root mean square on touches or loads that took no part in any choice (every fifth). The "
@@ -49,14 +60,9 @@ def page(v: SensorVerdict, seconds: float) -> str:
         _gaps(v),
         drawn.get("gap", ""),
         drawn.get("curves", ""),
-        "<h2>Where it disagreed</h2>",
-        _where(v),
-        drawn.get("places", ""),
         "<h2>Why we believe it, and what else it could have been</h2>",
-        reconcile_page.why((*v.effects, *v.symbolic), lambda name: v.nominal.library[name].title),
-        reconcile_page.what_next(
-            v, "they then differ", v.missing, v.pairs, lambda name: v.nominal.library[name].title
-        ),
+        reconcile_page.why((*v.effects, *v.symbolic), title),
+        reconcile_page.what_next(v, "they then differ", v.missing, v.pairs, title),
         "<h2>How it was found</h2>",
         _ladder(v),
     ]
@@ -99,7 +105,8 @@ def _row(mine: list[Estimate]) -> str:
     """Lay one quantity out: its value, or from where to where the values of the elements go."""
     p = mine[0]
     if len(mine) == 1:
-        value, interval, symbol = number(p.value), f"{number(p.low)} to {number(p.high)}", p.symbol
+        value, low, high = reconcile_page.span(p)
+        interval, symbol = f"{low} to {high}", p.symbol
     else:
         values = [q.value for q in mine]
         value = f"{number(min(values))} to {number(max(values))}"
@@ -124,7 +131,7 @@ def _closed(before: float, floor: float, closed: float) -> str:
 
 
 def _where(v: SensorVerdict) -> str:
-    shown = [p for p in v.places if p.p <= 0.05][:4]
+    shown = [p for p in v.places if p.p <= reconcile_page.CHANCE][:4]
     if not shown:
         return "<p>No variable orders the residual of the old model (permutation p &gt; 0.05).</p>"
     text = "; ".join(

@@ -1,7 +1,8 @@
 """Read tables as instruments and spreadsheets write them: CSV of any dialect, NPZ, MAT.
 
 A CSV may part its columns by comma, semicolon, tab or blanks, write 1,5 for 1.5, carry lines of remarks before its head, a
-unit in each name (``pos [deg]``, ``pos (deg)``, ``pos/deg``, ``pos_deg``) or a line of units below the head.
+unit in each name (``pos [deg]``, ``pos (deg)``, ``pos/deg``, ``pos_deg``) or a line of units below the head. A time of day,
+with or without a date before it (``2024-02-01 12:30:00.125``), is read as seconds since midnight.
 """
 
 from __future__ import annotations
@@ -62,6 +63,7 @@ SPELLINGS = {
 REMARKS = 60
 _IN_BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]$")
 _AFTER_SLASH = re.compile(r"^(.*?)\s*/\s*([^/]+)$")
+_CLOCK = re.compile(r"^(?:\S+[ T])?(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)Z?$")
 _AFTER_BAR = re.compile(r"^(.+)_([^_\W]+)$")
 
 
@@ -195,10 +197,20 @@ def _numbers(lines: Sequence[str]) -> Array | None:
     sign = _sign(lines[0])
     text = [line.replace(",", ".") for line in lines] if sign != "," else lines
     try:
-        rows = [[float(c) if c else np.nan for c in _cells(line, sign)] for line in text]
+        rows = [[_value(c) for c in _cells(line, sign)] for line in text]
     except ValueError:
         return None
     return np.array(rows) if len({len(r) for r in rows}) == 1 else None
+
+
+def _value(cell: str) -> float:
+    """Read a number or a time of day; nan for an empty cell."""
+    try:
+        return float(cell) if cell else np.nan
+    except ValueError:
+        if (m := _CLOCK.match(cell)) is None:
+            raise
+        return 3600.0 * int(m[1]) + 60.0 * int(m[2]) + float(m[3])
 
 
 def _head(above: Sequence[str], count: int) -> tuple[list[str], list[str | None]]:

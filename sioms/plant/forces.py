@@ -147,6 +147,7 @@ class Presliding:
         np.exp(goal, out=goal)
         np.multiply(goal, self._rise, out=goal)
         np.add(goal, self._level, out=goal)
+        np.maximum(goal, 0.0, out=goal)  # a rise below minus the level would drive
         np.abs(motion.velocity, out=decay)
         np.multiply(decay, self._rate, out=decay)
         np.divide(decay, goal, out=decay, where=goal > 0.0)

@@ -13,18 +13,18 @@ from collections.abc import Sequence
 
 from sioms.reconcile import rules
 from sioms.reconcile.blocks import better
+from sioms.reconcile.bounces import rattles
 from sioms.reconcile.effects import library
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.plausible import physical, size, without
 from sioms.reconcile.rules import GAIN, SURE
-from sioms.reconcile.screen import screen
-from sioms.reconcile.search import Found, Searcher, Step
+from sioms.reconcile.search import Found, Searcher
 
 AMBIGUOUS = 0.015
 #: What a look-alike must miss whose trace has this share of its energy in common with that of the named effect.
 ALIKE, SAME_TRACE = 0.05, 0.98
-#: Look-alikes that take the place of what is named, one after the other.
-SWAPS = 2
+#: And beside a gap, whose bounces fall out otherwise with every other number.
+ROUGH = 0.1
 
 Rival = rules.Rival[Fit]
 
@@ -53,15 +53,17 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
         contribution = bare.cost - found.fit.cost
         if contribution <= 0.0:
             continue
-        for start in screen(searcher.problem, bare, names):
+        for start in searcher.screen(bare, names):
             if start.gain * bare.cost < 0.3 * contribution:
                 continue
             model = without(bare.model, lib[start.effect].replaces)
-            fit = searcher.fit(model.with_effect(start.effect, start.values))
+            fit = searcher.searched(searcher.fit(model.with_effect(start.effect, start.values)))
             if not physical(fit, start.effect):
                 continue
             _, errors = better(found.losses, searcher.loss(fit))
             allowed = ALIKE if frozenset((name, start.effect)) in same else AMBIGUOUS
+            if rattles(found.fit.model):
+                allowed = ROUGH
             out.append(
                 Rival(
                     name,
@@ -79,27 +81,15 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
 def settle(
     searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]]
 ) -> tuple[Found, list[Rival]]:
-    """Find the rivals; where one does better than what is named, search on from it.
-
-    A step adds what saves most beside the effects of that moment; what came later may have made a look-alike the better one.
-    """
-    others = rivals(searcher, found, pairs)
-    for _ in range(SWAPS):
-        best = next((r for r in others if _wins(r) and searcher.follows(r.fit.model, found.fit.model)), None)
-        if best is None:
-            break
-        searcher.progress(f"{best.rival} does better than {best.effect}: searching on from it")
-        further = searcher.run(best.fit.model)
-        step = Step(
-            "swap",
-            f"{best.effect} to {best.rival}",
-            best.fit.ratio,
-            1.0 - best.fit.cost / found.fit.cost,
-            best.fit.model,
-        )
-        found = Found(further.fit, further.losses, (*found.ladder, step, *further.ladder[1:]))
-        others = rivals(searcher, found, pairs)
-    return found, others
+    """Find the rivals; where one does better than what is named, and the closed loop agrees, search on from it."""
+    return rules.settle(
+        found,
+        lambda f: rivals(searcher, f, pairs),
+        lambda r, f: _wins(r) and searcher.follows(r.fit.model, f.fit.model),
+        searcher.run,
+        lambda fit: fit.ratio,
+        searcher.progress,
+    )
 
 
 def _alike(name: str) -> list[str]:

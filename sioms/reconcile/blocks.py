@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import digamma, polygamma
 from scipy.stats import t as student
 
+from sioms.reconcile.descent import within
 from sioms.reconcile.effect import Array
 from sioms.reconcile.fit import Problem
 
@@ -73,12 +74,11 @@ def heldout(
         return c
     total_h, total_g = h.sum(0), g.sum(0)
     ridge = (1e-9 * np.trace(total_h) or 1.0) * np.eye(len(total_g))
-    out = np.empty(len(c))
+    out, size = np.empty(len(c)), np.ones(len(total_g))
     fold = np.arange(len(c)) % max(min(folds, len(c)), 2)
     for f in range(fold.max() + 1):
         inside = fold == f
-        d = np.linalg.solve(total_h - h[inside].sum(0) + ridge, -(total_g - g[inside].sum(0)))
-        d = np.clip(d, -1.0, 1.0)
+        d = within(total_h - h[inside].sum(0) + ridge, total_g - g[inside].sum(0), -size, size)
         if moved is not None and np.max(np.abs(d)) > NEAR:
             tried = [c, *(np.bincount(ids, weights=moved(share * d) ** 2) for share in SHORTER)]
             out[inside] = min(tried, key=lambda e: float(e[~inside].sum()))[inside]

@@ -49,7 +49,7 @@ def with_resolution(model: AxisModel, session: Session) -> AxisModel:
     if model.resolution > 0.0:
         return model
     steps = np.abs(np.concatenate([np.diff(r.position) for r in session.records]))
-    top = float(np.max([np.max(np.abs(r.position)) for r in session.records]))
+    top = float(np.nanmax([np.nanmax(np.abs(r.position)) for r in session.records]))
     moved = steps[steps > 1e-9 * max(top, 1e-12)]
     if not len(moved):
         raise BadInputError("read records: position is constant; needs motion")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 from scipy.signal import lfilter
 
 from sioms.reconcile.effect import Array
@@ -20,13 +21,28 @@ from sioms.reconcile.kernel import (
 from sioms.reconcile.model import AxisModel, controller_row
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.screen import dead_band, direction, smoothed_motion
-from sioms.reconcile.timing import LEAST_SAMPLES
+from sioms.reconcile.timing import LEAST_SAMPLES, MOST
 from sioms.reconcile.verdict import BadInputError
 
 LEAST_COUNTS = 20
 LEAST_TOTAL_S = 2.0
-#: The inertia the data show may differ from the nominal one by a payload, hardly by this factor.
-UNIT_FACTOR = 60.0
+#: The inertia the data show may be between these multiples of the nominal one, by a payload; beyond them it is a unit.
+LEAST_INERTIA, MOST_INERTIA = 0.125, 21.0
+#: Beyond these it is said.
+UNLIKELY_INERTIA = 0.25, 4.0
+#: A channel that is so many times another one that should be like it is in another unit.
+OTHER_UNIT = 30.0
+#: Mistakes of units by their factor, which is met within a tenth.
+MISTAKES = {
+    1000.0: "m against mm, N against mN, A against mA",
+    180.0 / np.pi: "degrees against radians",
+    2.0 * np.pi: "turns against radians",
+    25.4: "inches against millimetres",
+    39.37: "inches against metres",
+    9.80665: "kgf against N, or ten",
+}
+#: Measured may be so many times the commanded force; samples it is judged on, their share of the largest force, and seconds of a mean.
+FORCE_SCALE, LEAST_SLOW, SLOW_SHARE, SLOW_S = 1.33, 200, 0.8, 0.05
 #: Share of samples at the controller's limit above which nothing is left to learn.
 SATURATED = 0.5
 #: Share of the force above which what feedback does not explain is told, and samples until a filter of speed has settled.
@@ -57,6 +73,7 @@ def check(session: Session, model: AxisModel) -> tuple[str, ...]:
             f"read records: no motion, position stays within {travel:.3g} {model.position_unit} "
             f"({travel / model.resolution:.0f} counts); record moves of {LEAST_COUNTS} counts and far more"
         )
+    _check_measured(session, model)
     return tuple(_notes(session, model))
 
 
@@ -80,7 +97,8 @@ def _check_record(r: Record, model: AxisModel) -> None:
             )
         if not np.all(np.isfinite(a)):
             raise BadInputError(
-                f"{where}: {name} has {int(np.sum(~np.isfinite(a)))} values that are no numbers"
+                f"{where}: {name} has {int(np.sum(~np.isfinite(a)))} of {len(a)} values that are no numbers; needs a number in "
+                f"{100 * (1 - MOST):.0f} % of the rows (gaps are then interpolated), or no such column"
             )
     for name, a, what in (
         ("force", r.force, "the force that moved the axis"),
@@ -95,7 +113,13 @@ def _check_record(r: Record, model: AxisModel) -> None:
             raise BadInputError(f"{where}: {name} is constant at {a[0]:.6g}; needs {what}, or no such column")
     if r.time_s is not None:
         _check_time(r, r.time_s, model.sample_time_s)
-    limit = model.controller.limit if model.controller is not None else float(np.max(np.abs(r.force)))
+    top = float(np.max(np.abs(r.force)))
+    limit = model.controller.limit if model.controller is not None else top
+    if top > OTHER_UNIT * limit:
+        raise BadInputError(
+            f"{where}: force reaches {top:.4g}, the controller's limit is {limit:.4g} {model.force_unit}; "
+            f"{_in_another_unit(top / limit)}"
+        )
     share = float(np.mean(np.abs(r.force) >= 0.999 * limit))
     if share > SATURATED:
         raise BadInputError(
@@ -104,6 +128,14 @@ def _check_record(r: Record, model: AxisModel) -> None:
         )
     if r.command is not None:
         _check_command(r, r.command, model)
+
+
+def _in_another_unit(factor: float) -> str:
+    """Say what a factor between two numbers that should be alike looks like."""
+    size = max(abs(factor), 1.0 / abs(factor))
+    known = next((f" ({said})" for f, said in MISTAKES.items() if 0.9 < size / f < 1.1), "")
+    shown = f"{10.0 ** round(np.log10(size)):g}" if size > 100.0 else f"{size:.3g}"
+    return f"is one of them in another unit, by a factor of {shown}{known}?"
 
 
 def _check_time(r: Record, time: Array, dt: float) -> None:
@@ -130,13 +162,46 @@ def _check_time(r: Record, time: Array, dt: float) -> None:
 
 def _check_command(r: Record, command: Array, model: AxisModel) -> None:
     y, c = r.position - r.position.mean(), command - command.mean()
-    if np.ptp(command) < LEAST_COUNTS * model.resolution:
+    if min(np.ptp(command), np.ptp(r.position)) < LEAST_COUNTS * model.resolution:
         return
     ratio = float(np.sqrt(np.mean(y**2) / max(np.mean(c**2), 1e-300)))
-    if ratio > 30.0 or ratio < 1.0 / 30.0:
+    if not 1.0 / OTHER_UNIT < ratio < OTHER_UNIT:
         raise BadInputError(
-            f"read record {r.name}: position is {ratio:.4g} times the command; is one of them in another unit "
-            f"(a factor of {10.0 ** round(np.log10(ratio)):g})? needs both in {model.position_unit}"
+            f"read record {r.name}: position is {ratio:.4g} times the command; {_in_another_unit(ratio)} "
+            f"needs both in {model.position_unit}"
+        )
+
+
+def _check_measured(session: Session, model: AxisModel) -> None:
+    """Compare measured with commanded force where both are slow and far from a limit, so that no drive effect passes for a scale.
+
+    Raises:
+        BadInputError: the measured force is of another scale or sign; its noise and its limit would be misread.
+    """
+    pairs = [(r.force, r.force_measured) for r in session.records if r.force_measured is not None]
+    if not pairs:
+        return
+    size = [float(np.sqrt(np.mean(np.concatenate(a) ** 2))) for a in zip(*pairs, strict=True)]
+    ratio = size[1] / size[0]
+    if 1.0 / OTHER_UNIT < ratio < OTHER_UNIT:
+        top = SLOW_SHARE * max(float(np.max(np.abs(m))) for _, m in pairs)
+        span = max(round(SLOW_S / model.sample_time_s), 1)
+        calm = [maximum_filter1d(np.abs(u), 2 * span) < top for u, _ in pairs]
+        u, m = (
+            np.concatenate([uniform_filter1d(p[i], span)[k] for p, k in zip(pairs, calm, strict=True)])
+            for i in (0, 1)
+        )
+        if len(u) < LEAST_SLOW or np.ptp(u) == 0.0 or abs(np.corrcoef(u, m)[0, 1]) < 0.9:
+            return
+        ratio = float(np.polyfit(u, m, 1)[0])
+    if not 1.0 / FORCE_SCALE < ratio < FORCE_SCALE:
+        raise BadInputError(
+            f"compare force_measured with force: it is {ratio:.4g} times the commanded force"
+            + (
+                f"; {_in_another_unit(ratio)}"
+                if not 1.0 / OTHER_UNIT < ratio < OTHER_UNIT
+                else ", also where nothing limits it; needs the same sign and scale (a scale in columns.toml), or no such column"
+            )
         )
 
 
@@ -184,12 +249,38 @@ def _beyond_feedback(r: Record, model: AxisModel) -> float:
     return float(np.quantile(off, 0.98) / max(float(np.quantile(np.abs(own), 0.98)), 1e-300))
 
 
-def check_scale(problem: Problem, model: AxisModel) -> None:
+def check_scale(problem: Problem, model: AxisModel) -> list[str]:
     """Compare the force with what the nominal inertia needs, whatever friction and position forces there are.
+
+    Returns:
+        What is to be said of a factor that a payload may make, but a unit more likely.
 
     Raises:
         BadInputError: they differ by a factor that no payload makes: units, or another axis.
     """
+    ratio = inertia_seen(problem, model)
+    if ratio is None:
+        return []
+    if ratio < -0.05:
+        raise BadInputError(
+            f"compare force with motion: force is {ratio:.3g} times what the nominal inertia needs; the sign "
+            "of force or position is turned round"
+        )
+    if not LEAST_INERTIA < ratio < MOST_INERTIA:
+        raise BadInputError(
+            f"compare force with motion: force is {ratio:.4g} times what the nominal inertia of {model.inertia:.4g} needs; "
+            f"{_in_another_unit(ratio)} check the units of force, position and inertia, or the model is of another axis"
+        )
+    if UNLIKELY_INERTIA[0] < ratio < UNLIKELY_INERTIA[1]:
+        return []
+    return [
+        f"force is {ratio:.3g} times what the nominal inertia of {model.inertia:.4g} needs: a heavy payload, or a wrong unit (turns for "
+        "radians make 6.3)"
+    ]
+
+
+def inertia_seen(problem: Problem, model: AxisModel) -> float | None:
+    """Return the inertia that force and motion show, as a multiple of the nominal one; None where too little tells."""
     motions = smoothed_motion(problem, model)
     dead = dead_band(problem, model)
     turn = 1.0 if model.rotary else 2.0 * np.pi / model.pitch  # gravity, or cogging
@@ -214,17 +305,4 @@ def check_scale(problem: Problem, model: AxisModel) -> None:
     c = np.linalg.lstsq(a / size, u, rcond=1e-10)[0] / size
     share = 1.0 - float(np.sum((u - a @ c) ** 2) / np.sum(u**2))
     inertial = float(np.linalg.norm(a[:, 0] * c[0]) / np.linalg.norm(u))
-    if inertial < 0.02 or share < 0.2:
-        return
-    if c[0] < -0.05:
-        raise BadInputError(
-            f"compare force with motion: force is {c[0]:.3g} times what the nominal inertia needs; the sign "
-            "of force or position is turned round"
-        )
-    if c[0] > UNIT_FACTOR or c[0] < 1.0 / UNIT_FACTOR:
-        near = 10.0 ** round(np.log10(c[0]))
-        raise BadInputError(
-            f"compare force with motion: force is {c[0]:.4g} times what the nominal inertia of "
-            f"{model.inertia:.4g} needs (about {near:g}); check the units of force, position and inertia "
-            f"(m against mm, N against mN), or the model is of another axis"
-        )
+    return None if inertial < 0.02 or share < 0.2 else float(c[0])

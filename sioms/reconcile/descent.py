@@ -55,8 +55,10 @@ def descend(
         gained = False
         for _ in range(TRIALS):
             more = damping * np.diag(np.diag(h) + 1e-12 * np.trace(h) + 1e-30)
-            step = np.linalg.lstsq(h + more, -g, rcond=1e-12)[0]
-            trial = np.clip(at + np.clip(step, -LONGEST, LONGEST) * size, least, upper)
+            low, high = np.maximum((least - at) / size, -LONGEST), np.minimum((upper - at) / size, LONGEST)
+            trial = np.clip(
+                at + within(h + more, g, np.minimum(low, 0.0), np.maximum(high, 0.0)) * size, least, upper
+            )
             rt = residual(trial)
             ct = float(rt @ rt)
             if ct < cost:
@@ -72,3 +74,21 @@ def descend(
         if done:
             break
     return at, r, j
+
+
+def within(h: Array, g: Array, low: Array, high: Array) -> Array:
+    """Minimise d'hd/2 + g'd over low <= d <= high, which hold 0; the furthest outside is held at its end first, the others freed again.
+
+    Numbers that trade against each other go far together: cut off one by one, they would no longer make up for each other.
+    """
+    d, free = np.linalg.lstsq(h, -g, rcond=1e-12)[0], np.ones(len(g), dtype=bool)
+    while True:
+        end = np.where(d > 0.0, high, low)
+        beyond = np.where(free & (np.abs(d) > np.abs(end)), np.abs(d) / np.maximum(np.abs(end), 1e-12), 0.0)
+        far = int(np.argmax(beyond))
+        if beyond[far] == 0.0:
+            return np.asarray(d)
+        free[far], d[far] = False, end[far]
+        d[free] = np.linalg.lstsq(
+            h[np.ix_(free, free)], -(g[free] + h[np.ix_(free, ~free)] @ d[~free]), rcond=1e-12
+        )[0]

@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+#: Begins the name of a nameless term, of axes and sensors alike.
+TERM_PREFIX = "term_"
 #: Width of a parameter row handed to a state function; the last place holds 2 pi / pitch.
 ROW = 8
 TURN = ROW - 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,11 +12,10 @@ from sioms.reconcile.blocks import better, block_ids, formal, intervals
 from sioms.reconcile.channels import Finding
 from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import known
-from sioms.reconcile.effects.terms import TERM_PREFIX
-from sioms.reconcile.fit import BASE, Fit, Problem, refit
+from sioms.reconcile.fit import BASE, Fit, Problem, get, jacobian, refit
 from sioms.reconcile.rules import GAIN, told_apart
 from sioms.reconcile.search import Found, Searcher
-from sioms.reconcile.verdict import Estimate, NamedEffect
+from sioms.reconcile.verdict import Estimate, NamedEffect, apart
 
 #: Multiples of a parameter of the bounces in a gap that are tried for its interval.
 ROUGH_GRID = tuple(float(x) for x in np.linspace(0.9, 1.1, 17))
@@ -24,7 +24,16 @@ ROUGH_GRID = tuple(float(x) for x in np.linspace(0.9, 1.1, 17))
 def spans_of(
     problem: Problem, fit: Fit, replicates: int, rng: np.random.Generator
 ) -> dict[tuple[str, str], tuple[float, float]]:
-    """Return the 95 % interval of every free number by (effect, symbol): by leaving out each block of time, within its bounds."""
+    """Return the 95 % interval of every free number by (effect, symbol): by leaving out each block of time, within its bounds.
+
+    Bounces that count little in a fit say how uncertain it is: the residual is taken as it is.
+    """
+    if problem.bend < np.inf:
+        problem = replace(problem, bend=np.inf)
+        r = problem.residual(fit.model)
+        fit = replace(
+            fit, residual=r, jacobian=jacobian(problem, fit.model, fit.free, get(fit.model, fit.free), r)
+        )
     half = np.maximum(intervals(fit, block_ids(problem, fit.model.sample_time_s)), formal(fit))
     spread = half * np.array([f.scale for f in fit.free])
     out = {}
@@ -119,11 +128,7 @@ def describe(
                 still,
             )
         )
-    named.sort(key=lambda e: -e.saved)
-    return (
-        [e for e in named if not e.name.startswith(TERM_PREFIX)],
-        [e for e in named if e.name.startswith(TERM_PREFIX)],
-    )
+    return apart(sorted(named, key=lambda e: -e.saved))
 
 
 def _worth(

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sioms.reconcile.descent import descend
 from sioms.reconcile.effect import Array, Parameter, Slot
@@ -19,7 +20,7 @@ from sioms.reconcile.effects import known
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import Noise, response
 from sioms.reconcile.records import Record, Session
-from sioms.reconcile.simulate import Run, linked, pack, replay, track
+from sioms.reconcile.simulate import Run, inertia, linked, pack, replay, track
 
 #: ``map``, or the like of an executor.
 Mapper = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
@@ -55,6 +56,7 @@ class Problem:
     Attributes:
         begin, end: share of each record that counts; the rest is simulated but not looked at.
         weights: factor on each residual, shape (n,), for resampled blocks; None: all alike.
+        bend: residuals beyond this count little more than it (Cauchy's loss): bounces in a gap that come a little late or early.
         mapper: applies a function to many trials, in order, as ``map`` does; one that uses all cores may be given.
     """
 
@@ -64,6 +66,7 @@ class Problem:
     begin: float = 0.0
     end: float = 1.0
     weights: Array | None = None
+    bend: float = np.inf
     mapper: Mapper = map
 
     def span(self, record: Record) -> slice:
@@ -85,24 +88,48 @@ class Problem:
 
     def answer(self, model: AxisModel, force: Array) -> Array:
         """Return the innovation [{x}] that an unmodelled force on the motor, shape (n,) or (n, k), leaves."""
-        return response(model, self.noise, force, linked(pack(model)))
+        packed = pack(model)
+        return response(replace(model, inertia=inertia(packed)), self.noise, force, linked(packed))
 
     def _lost(self, run: Run) -> float:
         """Return the innovation beyond which a run has lost the measurement; infinite where it never has."""
         size = np.abs(np.nan_to_num(run.innovation))
-        level = max(LOST * self.noise.innovation, LOST_SHARE * float(np.median(size)))
-        quiet = np.flatnonzero(np.concatenate([[True], size <= level, [True]]))
-        return level if np.max(np.diff(quiet)) > LOST_SAMPLES else np.inf
+        level = LOST * self.noise.innovation
+        if _longest(size > level) <= LOST_SAMPLES:
+            return np.inf
+        level = max(level, LOST_SHARE * float(np.median(size)))
+        return level if _longest(size > level) > LOST_SAMPLES else np.inf
 
     def residual(self, model: AxisModel) -> Array:
         """Innovations over their expected standard deviation, all records in a row, without the starts."""
         e = self.join([r.innovation for r in self.runs(model)]) / self.noise.innovation
         e = np.clip(np.nan_to_num(e, nan=1e6, posinf=1e6, neginf=-1e6), -1e6, 1e6)
+        if self.bend < np.inf:
+            e = self.bend * np.sign(e) * np.sqrt(np.log1p((e / self.bend) ** 2))
         return e if self.weights is None else e * self.weights
+
+    def slope(self, residual: Array) -> Array:
+        """How a residual, as ``residual`` gives it, goes with the innovation over its expected standard deviation, shape (n,)."""
+        weights = np.ones_like(residual) if self.weights is None else self.weights
+        if self.bend == np.inf:
+            return weights
+        bent = (residual / np.where(weights > 0.0, weights, 1.0) / self.bend) ** 2
+        straight = np.expm1(bent)
+        return (
+            weights
+            * np.sqrt(np.where(bent > 0.0, straight / np.maximum(bent, 1e-300), 1.0))
+            / (1.0 + straight)
+        )
 
     def join(self, parts: Sequence[Array]) -> Array:
         """Lay per-record arrays out as ``residual`` does."""
         return np.concatenate([p[self.span(r)] for p, r in zip(parts, self.session.records, strict=True)])
+
+
+def _longest(loud: NDArray[np.bool_]) -> int:
+    """Number of samples from a quiet one to the next, at most."""
+    quiet = np.flatnonzero(np.concatenate([[True], ~loud, [True]]))
+    return int(np.max(np.diff(quiet)))
 
 
 def closed_errors(problem: Problem, model: AxisModel) -> tuple[float, float]:

@@ -92,7 +92,7 @@ def measure(
     before, after = _rms(problem.residual(nominal)) * k, _rms(problem.residual(model)) * k
     late = [_late_errors(problem, model, s) for s in ([], states)] if states else [(None,) * 3] * 2
     frozen, session = late
-    out = [Gap("force, short windows", unit, before, after, k, frozen[0], session[0])]
+    out = [Gap("force, short windows", unit, before, after, min(k, after), frozen[0], session[0])]
     if nominal.controller is None or any(r.command is None for r in problem.session.records):
         return tuple(out)
     errors = [closed_errors(problem, m) for m in (nominal, model)]
@@ -102,6 +102,10 @@ def measure(
         if floors
         else loop_floor(nominal, problem.noise)
     )
+    force, place = (
+        min(force, errors[1][0]),
+        min(place, errors[1][1]),
+    )  # what is reached was not below the floor
     out.append(Gap("force, closed loop", unit, errors[0][0], errors[1][0], force, frozen[1], session[1]))
     out.append(
         Gap(

@@ -60,6 +60,8 @@ OUT_Y, OUT_FORCE, OUT_INNOVATION, OUT_X, OUT_V, OUT_APPLIED, OUT_T, OUT_SIZE = r
 TINY_SPEED = 1e-12
 #: Samples for which a tracking model may be off before its speed is set anew, and over which speed is measured.
 PATIENCE, MEASURED = 20, 10
+#: Friction that drops with speed keeps this share of its breakaway level in what it divides by.
+LEAST_LEVEL = 1e-6
 #: A hot drive keeps at least this share of its force constant; keeps a wild trial value harmless.
 LEAST_GAIN = 0.05
 
@@ -263,11 +265,11 @@ def march(
             vp = v + 0.5 * h * a0
             if v != 0.0 and vp * v < 0.0:
                 vp = 0.0
-            if hyst_f > 0.0:
+            if hyst_f > 0.0 or hyst_s > 0.0:
                 goal, path = hyst_f, np.abs(vp) * h / plant[HYST_X]
                 if hyst_s > 0.0:
                     goal += (hyst_s - hyst_f) * np.exp(-((vp / plant[HYST_V]) ** 2))
-                    path *= hyst_s / goal
+                    path *= hyst_s / max(goal, LEAST_LEVEL * hyst_s)
                 way = np.exp(-path)
                 goal = goal if vp > 0.0 else -goal
                 before = hyst

@@ -126,7 +126,8 @@ def locate(problem: Problem, model: AxisModel, rng: np.random.Generator, shifts:
         v = problem.join(parts)
         bins = bins_of(v)
         share = explained(r, bins)
-        chance = [explained(np.roll(r, int(s)), bins) for s in rng.integers(len(r) // 20, len(r), shifts)]
+        least = len(r) // 20  # a turn by less, either way round, is hardly one
+        chance = [explained(np.roll(r, int(s)), bins) for s in rng.integers(least, len(r) - least, shifts)]
         p = (1 + sum(c >= share for c in chance)) / (shifts + 1)
         count = np.maximum(np.bincount(bins), 1)
         mean = np.bincount(bins, weights=r) / count

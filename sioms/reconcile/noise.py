@@ -157,14 +157,23 @@ def response(model: AxisModel, noise: Noise, force: Array, pair: Pair | None = N
     Returns:
         Same shape, [{x}].
     """
-    a, b = rigid(model) if pair is None else coupled(pair, model.sample_time_s)
+    sampled = model.inertia, model.viscous, model.sample_time_s
+    out: Array = lfilter(*_transfer(noise, pair, *sampled), force, axis=0)
+    return out
+
+
+@lru_cache(maxsize=16)
+def _transfer(
+    noise: Noise, pair: Pair | None, inertia: float, viscous: float, sample_time_s: float
+) -> tuple[Array, Array]:
+    """Return numerator and denominator of ``response``."""
+    a, b = alone(inertia, viscous, sample_time_s) if pair is None else coupled(pair, sample_time_s)
     n = len(b)
-    gain = np.array(corrections(noise, pair, model.sample_time_s))[:n]
+    gain = np.array(corrections(noise, pair, sample_time_s))[:n]
     seen = np.eye(1, n)
     # error state after prediction: eps+ = A (I - L C) eps + B f, innovation = C eps
     num, den = ss2tf(a @ (np.eye(n) - np.outer(gain, seen)), b[:, None], seen, np.zeros((1, 1)))
-    out: Array = lfilter(num[0], den, force, axis=0)
-    return out
+    return num[0], den
 
 
 def effective_samples(residual: Array, longest: int = 400) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sioms.reconcile.blocks import better
-from sioms.reconcile.effect import Array, Slot
+from sioms.reconcile.effect import Array, Ref, Slot
 from sioms.reconcile.effects import known, library
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.model import AxisModel
@@ -81,12 +81,15 @@ def simplest(good: dict[str, Tried]) -> str:
 def physical(fit: Fit, name: str) -> bool:
     """Say whether an effect stays within its bounds: a number that leans on one belongs to something else.
 
-    The stiffness and damping of a contact may: harder than what is seen is as good as hard. So may a time constant.
+    The stiffness and damping of a contact may: harder than what is seen is as good as hard. So may a time constant that is longer
+    than the records.
     """
     effect, given = known()[name], fit.model.effects[name]
     if any(given[a] > most * given[b] for a, b, most in effect.ratios):
         return False
     free = [q for q in effect.parameters if not q.phase and not q.fixed]
+    if any(q.ref is Ref.TIME and 0.0 < given[q.symbol] < 1.02 * q.lower for q in free):
+        return False
     for q in [effect.primary] if effect.slot in (Slot.BACKLASH, Slot.THERMAL) else free:
         low, high = (bound * fit.model.scale(q) for bound in (q.lower, q.upper))
         if given[q.symbol] > 0.98 * high or (q.lower < 0.0 and given[q.symbol] < 0.98 * low):
@@ -101,4 +104,6 @@ def small(model: AxisModel, name: str) -> bool:
         return False
     p = effect.primary
     least = max(p.lower, p.least, 1e-4 * p.start) * model.scale(p)
+    if effect.slot is Slot.BACKLASH:  # within a step of the sensor nothing is seen of a gap
+        least = max(least, model.resolution)
     return abs(model.effects[name][p.symbol]) <= 1.01 * least

@@ -42,11 +42,18 @@ class Record:
     def __len__(self) -> int:
         return len(self.position)
 
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the channels that there are, by their names."""
+        named = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
+        return {name: a for name, a in named.items() if a is not None}
+
     def cut(self, start: int, stop: int) -> Record:
         """Return samples start..stop."""
+        return self.only(slice(start, stop))
 
-        arrays: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
-        parts: dict[str, Any] = {k: None if a is None else a[start:stop] for k, a in arrays.items()}
+    def only(self, which: slice | NDArray[np.bool_]) -> Record:
+        """Return some of the samples."""
+        parts: dict[str, Any] = {name: a[which] for name, a in self.arrays().items()}
         return Record(self.name, **parts)
 
 

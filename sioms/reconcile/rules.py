@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
-from sioms.reconcile.ladder import Step
+from sioms.reconcile.ladder import Found, Step
 
-F = TypeVar("F")
+
+class Fitted(Protocol):
+    """A fit: its model, and the squares that it leaves."""
+
+    @property
+    def model(self) -> Any: ...
+
+    @property
+    def cost(self) -> float: ...
+
+
+F = TypeVar("F", bound=Fitted)
+M = TypeVar("M")
 
 GAIN = 0.05  # least share of what remains that an effect must save on held-out blocks
 SURE = 2.0  # least number of standard errors of that saving
@@ -17,6 +29,8 @@ SPECIFIC = 0.3
 NEARLY = 0.5
 #: A larger loss than this is one, however unevenly it falls on the blocks.
 DOUBTFUL = 0.2
+#: Look-alikes that take the place of what is named, one after the other.
+SWAPS = 2
 
 
 def negligible(lost: float, errors: float) -> bool:
@@ -78,15 +92,47 @@ def told_apart(
     mine = [r for r in rivals if r.effect == name]
     still = {r.rival: f"leaves only {100 * r.missed:.1f} % of it unexplained" for r in mine if r.open}
     ruled = {
-        rival: f"saved {100 * gain:.0f} % where this saved {100 * step.saved:.0f} %"
+        rival: f"saved {100 * gain:.3g} % where this saved {100 * step.saved:.3g} %"
         for step in ladder
         if step.effect == name
         for rival, gain in step.rivals.items()
         if rival in lookalikes and rival not in present and rival not in still
     }
     refitted = {
-        r.rival: f"reproduces all but {100 * r.missed:.1f} % of it, {r.errors:.1f} standard errors worse"
+        r.rival: f"leaves {100 * r.missed:.1f} % of it unexplained, {r.errors:.1f} standard errors worse"
         for r in mine
         if not r.open
     }
     return {**refitted, **{rival: why for rival, why in ruled.items() if rival not in refitted}}, still
+
+
+def settle(
+    found: Found[F, M],
+    rivals: Callable[[Found[F, M]], list[Rival[F]]],
+    wins: Callable[[Rival[F], Found[F, M]], bool],
+    search: Callable[[M], Found[F, M]],
+    ratio: Callable[[F], float],
+    progress: Callable[[str], None],
+) -> tuple[Found[F, M], list[Rival[F]]]:
+    """Find the rivals; where one does better than what is named, search on from it, ``SWAPS`` times at most.
+
+    A step adds what saves most beside the effects of that moment; what came later may have made a look-alike the better one.
+
+    Args:
+        rivals: of what was found, refitted.
+        wins: whether one does better.
+        search: from a model.
+        ratio: residual of a fit in units of what noise leaves.
+    """
+    others = rivals(found)
+    for _ in range(SWAPS):
+        best = next((r for r in others if wins(r, found)), None)
+        if best is None:
+            break
+        progress(f"{best.rival} does better than {best.effect}: searching on from it")
+        further = search(best.fit.model)
+        saved = 1.0 - best.fit.cost / found.fit.cost
+        step = Step("swap", f"{best.effect} to {best.rival}", ratio(best.fit), saved, best.fit.model)
+        found = Found(further.fit, further.losses, (*found.ladder, step, *further.ladder[1:]))
+        others = rivals(found)
+    return found, others

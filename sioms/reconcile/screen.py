@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
+from sioms.reconcile.bounces import rattles
 from sioms.reconcile.effect import Array, Effect, Parameter, Ref, Slot
 from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Fit, Problem
@@ -38,6 +39,7 @@ GRID_DROP = (0.003, 0.01, 0.03, 0.1)  # speeds of a drop, of the largest
 #: First guesses of the level at speed and of the breakaway level, of a level that stood for both.
 DROPS = ((1.0, 1.4), (0.85, 1.05))
 GRID_PHASE = np.linspace(-np.pi, np.pi, 9)[1:]
+SIZES = (1.0, 0.7, 0.4)  # where bounces fall out otherwise with each
 SPEED_STEPS, PLACES = 7, 15
 #: Below this the measured motion stands for one without noise; a command is followed up to COMMAND_HZ, if to this share.
 SLOW_HZ, COMMAND_HZ, FOLLOWED = 5.0, 30.0, 0.2
@@ -67,21 +69,25 @@ class Start:
     values: dict[str, float]
 
 
+def bandwidth(problem: Problem, model: AxisModel) -> float:
+    """Frequency up to which the measured motion is used: three times the observer's bandwidth, within 10 and 150 Hz."""
+    hz = 3.0 * np.sqrt(problem.noise.gain[1] / model.sample_time_s) / (2.0 * np.pi)
+    return float(np.clip(hz, 10.0, 150.0))
+
+
 def smoothed_motion(problem: Problem, model: AxisModel, cutoff_hz: float = 0.0) -> list[Motion]:
     """Return zero-phase filtered position, speed and acceleration of every record.
 
     Args:
-        cutoff_hz: 0 takes three times the observer's bandwidth, within 10 and 150 Hz.
+        cutoff_hz: 0 takes ``bandwidth``.
     """
-    dt = model.sample_time_s
-    if cutoff_hz <= 0.0:
-        cutoff_hz = float(np.clip(3.0 * np.sqrt(problem.noise.gain[1] / dt) / (2.0 * np.pi), 10.0, 150.0))
+    dt, cutoff_hz = model.sample_time_s, cutoff_hz or bandwidth(problem, model)
     out = []
     for record, run in zip(problem.session.records, problem.runs(model), strict=True):
-        x = _low_passed(record.position, cutoff_hz, dt)
+        x = low_passed(record.position, cutoff_hz, dt)
         v = np.gradient(x, dt)
         a = np.gradient(v, dt)
-        force = run.applied if cutoff_hz > SLOW_HZ else _low_passed(run.applied, cutoff_hz, dt)
+        force = run.applied if cutoff_hz > SLOW_HZ else low_passed(run.applied, cutoff_hz, dt)
         outer = np.zeros(len(record)) if record.external is None else record.external
         out.append(Motion(x, v, a, force, run.temperature, outer))
     return out
@@ -153,10 +159,11 @@ def shapes(effect: Effect, model: AxisModel, travel: tuple[float, float]) -> Ite
         (p for p in effect.parameters if p.symbol not in linear and not p.fixed and not p.phase), None
     )
     if order is not None:
-        a_turn = model.rotary and effect.slot is Slot.FORCE and model.pitch > 6.0  # that is gravity
-        first = 2 if a_turn else 1
-        for n in range(max(first, int(model.pitch / (travel[1] - travel[0]))), int(order.upper) + 1):
-            yield {order.symbol: float(n)}
+        # a wave of one period in a turn of the axis is gravity
+        turn = model.pitch / (2.0 * np.pi) if model.rotary and effect.slot is Slot.FORCE else 0.0
+        for n in range(max(1, int(model.pitch / (travel[1] - travel[0]))), int(order.upper) + 1):
+            if abs(n - turn) > 1e-3:
+                yield {order.symbol: float(n)}
     elif shape is not None:
         if shape.lower < 0.0:
             for s in np.linspace(*travel, PLACES + 2)[1:-1]:
@@ -187,7 +194,7 @@ def screen(
     motions = smoothed_motion(problem, fit.model)
     lib = known()
     rows = thinned(len(fit.residual))
-    q = _orthonormal(fit.jacobian[rows])
+    q = orthonormal(fit.jacobian[rows])
     rest = fit.residual[rows] - q @ (q.T @ fit.residual[rows])
     dead = dead_band(problem, fit.model)
     travel = range_of(motions)
@@ -242,14 +249,15 @@ def instrument_motion(problem: Problem, model: AxisModel) -> list[Motion]:
 def _moved_by(model: AxisModel, command: Array) -> Motion:
     """Motion, and force of the rigid axis, of an axis that follows its command."""
     dt = model.sample_time_s
-    x = _low_passed(command, COMMAND_HZ, dt)
+    x = low_passed(command, COMMAND_HZ, dt)
     v = np.gradient(x, dt)
     a = np.gradient(v, dt)
     nothing = np.zeros_like(x)
     return Motion(x, v, a, model.inertia * a + model.viscous * v, nothing, nothing)
 
 
-def _low_passed(x: Array, cutoff_hz: float, dt: float) -> Array:
+def low_passed(x: Array, cutoff_hz: float, dt: float) -> Array:
+    """Filter forth and back, shape (n,)."""
     sos = butter(3, min(2.0 * cutoff_hz * dt, 0.8), output="sos")
     out: Array = sosfiltfilt(
         sos, x, padtype="odd", padlen=min(int(max(300, 0.5 / (cutoff_hz * dt))), len(x) - 1)
@@ -267,7 +275,7 @@ def thinned(count: int) -> slice:
     return slice(None, None, max(count // MOST_ROWS, 1))
 
 
-def _orthonormal(j: Array) -> Array:
+def orthonormal(j: Array) -> Array:
     if j.shape[1] == 0:
         return j
     norms = np.linalg.norm(j, axis=0)
@@ -279,10 +287,10 @@ def _orthonormal(j: Array) -> Array:
     return basis
 
 
-def _filtered(problem: Problem, model: AxisModel, columns: list[Array]) -> Array:
+def _filtered(problem: Problem, fit: Fit, columns: list[Array]) -> Array:
     """Pass force columns of every record into the domain of the residual, shape (n, k)."""
-    e: Array = problem.join([problem.answer(model, c) for c in columns]) / problem.noise.innovation
-    return e if problem.weights is None else e * problem.weights[:, None]
+    e: Array = problem.join([problem.answer(fit.model, c) for c in columns]) / problem.noise.innovation
+    return e * problem.slope(fit.residual)[:, None]
 
 
 def _screen_state(
@@ -298,9 +306,9 @@ def _screen_state(
 ) -> Start | None:
     best: Start | None = None
     for shape in shapes(effect, fit.model, travel):
-        f = _filtered(
-            problem, fit.model, [state_columns(effect, fit.model, m, shape, dead) for m in motions]
-        )[thinned(len(fit.residual))]
+        f = _filtered(problem, fit, [state_columns(effect, fit.model, m, shape, dead) for m in motions])[
+            thinned(len(fit.residual))
+        ]
         f = f - q @ (q.T @ f)
         size = np.linalg.norm(f, axis=0)
         keep = size > 1e-9
@@ -378,7 +386,10 @@ def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator
         case Slot.SCALE:
             grid = ({first: 1.01},)
         case Slot.ECCENTRICITY:
-            grid = tuple({"phase": float(g)} for g in GRID_PHASE)
+            sizes = SIZES if rattles(model) else SIZES[:1]
+            grid = tuple(
+                {first: share * start[first], "phase": float(g)} for share in sizes for g in GRID_PHASE
+            )
         case _:
             grid = ({},)
     for g in grid:

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from sioms.reconcile import ladder
 from sioms.reconcile.blocks import better, block_ids, heldout
+from sioms.reconcile.bounces import POLISHED, UNPOLISHED, bent, polish, rattles, rough, spread
 from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import known
-from sioms.reconcile.fit import BASE, Fit, Problem, closed_errors, refit, shifted
+from sioms.reconcile.fit import Fit, Problem, closed_errors, refit, shifted
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.plausible import (
     AND,
@@ -44,16 +45,9 @@ PAIRED = 1.5
 PAIRS = 3
 LOOSE = 2.0  # an effect does not make the error of the simulated closed loop this many times larger
 PERIODIC_SURE = 3.0  # for effects whose order is searched over tens of values
-#: Relative steps in which the numbers of a gap are searched: when it is new, and when it was found beside other effects.
-UNPOLISHED = tuple(
-    (symbol, width * spread)
-    for spread in (0.25, 0.08, 0.025, 0.008)
-    for symbol, width in (("gap", 1.0), ("load_fraction", 1.0), ("zeta", 2.0), ("f_contact", 1.0))
-)
-BOUNCE = 3.0  # in units of the median residual
 PASSES = 4  # at most so many times more for a new gap, while it gains
+BEST = 2  # of the candidates beside a gap are judged with its numbers searched anew
 WORTH = 2.0  # and not where another candidate leaves less by this factor
-POLISHED = (("gap", 0.08), ("gap", 0.025), ("gap", 0.008))
 #: Fits are kept in memory up to this size: a second search, with terms beside the library, retraces the first.
 KEPT_BYTES = 128_000_000
 
@@ -67,6 +61,7 @@ class Searcher:
     """Search over one problem. Not thread-safe.
 
     Attributes:
+        problem: as given; beside a gap, bent for its bounces.
         frozen: effects measured by a channel of their own; they stay, with their values.
         excluded: effects that must not be tried (ruled out by a channel, or not applicable).
         progress: told what is being done.
@@ -77,6 +72,7 @@ class Searcher:
     names: tuple[str, ...] = ()
     progress: Callable[[str], None] = lambda text: None
     ids: NDArray[np.int64] = field(init=False)
+    _given: Problem = field(init=False)
     _fits: dict[Hashable, Fit] = field(init=False, default_factory=dict)
     _starts: dict[Hashable, list[Start]] = field(init=False, default_factory=dict)
     _polished: set[Hashable] = field(init=False, default_factory=set)
@@ -85,7 +81,7 @@ class Searcher:
 
     def __post_init__(self) -> None:
         """Number the blocks."""
-        self.ids = np.empty(0, dtype=np.int64)
+        self.ids, self._given = np.empty(0, dtype=np.int64), self.problem
 
     def fit(self, model: AxisModel, iterations: int = 8, best: float = np.inf) -> Fit:
         """Refit with the channel effects frozen; what was fitted before is looked up.
@@ -116,9 +112,9 @@ class Searcher:
         if gap is None or iterations <= 4:
             return refit(self.problem, model, self.frozen, iterations)
         new = tuple(model.effects[gap].values()) not in self._polished
-        fit = polish(self.problem, model, self.frozen, UNPOLISHED if new else POLISHED)
+        fit = polish(self._given, self.problem, model, self.frozen, UNPOLISHED if new else POLISHED)
         if new:
-            fit = self._searched(fit, best)
+            fit = self.searched(fit, best)
             if fit.cost > WORTH * best:
                 self._rough.add((values_of(model), iterations))
                 return fit
@@ -126,12 +122,12 @@ class Searcher:
         self._polished.add(tuple(fit.model.effects[gap].values()))
         return fit
 
-    def _searched(self, fit: Fit, best: float = np.inf) -> Fit:
+    def searched(self, fit: Fit, best: float = np.inf) -> Fit:
         """Search the numbers of a gap, if there is one, until that no longer gains, or is too far from the best."""
         for _ in range(PASSES if rattles(fit.model) else 0):
             if fit.cost > WORTH * best:
                 break
-            again = polish(self.problem, fit.model, self.frozen, UNPOLISHED)
+            again = polish(self._given, self.problem, fit.model, self.frozen, UNPOLISHED)
             scale = spread(fit.residual)
             gained = rough(again.residual, scale) < (1.0 - GAIN) * rough(fit.residual, scale)
             fit = min(fit, again, key=lambda f: rough(f.residual, scale))
@@ -140,15 +136,13 @@ class Searcher:
         return fit
 
     def loss(self, fit: Fit) -> Array:
-        """Held-out loss per block; the numbers of a gap, whose rough cost has no slope to go by, stay as they are."""
+        """Held-out loss per block; beside a gap, whose rough cost has no slope to go by, with all numbers as they are."""
         if len(self.ids) != len(fit.residual):
             self.ids = block_ids(self.problem, fit.model.sample_time_s)
-        smooth = [f.effect == BASE or known()[f.effect].slot is not Slot.BACKLASH for f in fit.free]
-        free = [f for f, kept in zip(fit.free, smooth, strict=True) if kept]
         losses = heldout(
-            replace(fit, jacobian=fit.jacobian[:, smooth]),
+            replace(fit, jacobian=fit.jacobian[:, :0]) if rattles(fit.model) else fit,
             self.ids,
-            moved=lambda d: self.problem.residual(shifted(fit.model, free, d)),
+            moved=lambda d: self.problem.residual(shifted(fit.model, fit.free, d)),
         )
         return (
             losses
@@ -170,8 +164,7 @@ class Searcher:
 
     def run(self, start: AxisModel) -> Found:
         """Search from a model."""
-        fit = self.fit(start)
-        losses = self.loss(fit)
+        fit, losses = self._on_one_footing(self.fit(start))
         steps = [Step("start", "", fit.ratio, 0.0, fit.model)]
         for _ in range(STEPS):
             if fit.ratio <= FLOOR:
@@ -182,12 +175,23 @@ class Searcher:
             steps.append(step[2])
             fit, losses = step[0], step[1]
             if rattles(fit.model):  # beside what is new its numbers may be others
-                fit = self._searched(fit)
-                losses = self.loss(fit)
+                fit, losses = self._on_one_footing(self.searched(fit))
             self.progress(f"{steps[-1].action} {steps[-1].effect}: residual {fit.ratio:.2f} of the expected")
             fit, losses = self._simplify(fit, losses, steps)
             fit, losses = self._eliminate(fit, losses, steps)
+            if not rattles(fit.model) and self.problem is not self._given:
+                fit, losses = self._on_one_footing(fit)
         return Found(fit, losses, tuple(steps))
+
+    def _on_one_footing(self, fit: Fit) -> tuple[Fit, Array]:
+        """Bend the residual as the bounces of this model ask for; where there is no gap, leave it straight."""
+        if rattles(fit.model) or self.problem is not self._given:
+            self.problem = bent(self._given, fit.model) if rattles(fit.model) else self._given
+            self._fits.clear()
+            self._starts.clear()
+            self._rough.clear()
+            fit = self.fit(fit.model)
+        return fit, self.loss(fit)
 
     def plainly(self, found: Found) -> Found:
         """Take back what a searched order enriched, unless it saves half: where much is unexplained some order always fits."""
@@ -258,6 +262,8 @@ class Searcher:
             self._try(tried, s.effect, self._with(fit, s, 8 if s is chosen[0] else 5, best), losses)
         for effect, new in self._enriched(tried):
             self._try(tried, effect, new, losses)
+        for effect in sorted(tried, key=lambda n: -tried[n][2])[:BEST] if rattles(fit.model) else ():
+            self._try(tried, effect, self.searched(tried[effect][0]), losses)
         if max((t[2] for t in tried.values()), default=0.0) < CLEAR:
             for effect, new in self._afresh(fit):
                 self._try(tried, effect, new, losses)
@@ -412,7 +418,7 @@ class Searcher:
         for name in [n for n in fit.model.effects if n not in self.frozen]:
             if len([n for n in fit.model.effects if n not in self.frozen]) < 2:
                 break
-            without = self._searched(self.fit(fit.model.without_effect(name), 6), fit.cost)
+            without = self.searched(self.fit(fit.model.without_effect(name), 6), fit.cost)
             loss = self.loss(without)
             gain, sure = better(losses, loss)
             if (negligible(gain, sure) and self._possible(without, fit)) or small(fit.model, name):
@@ -436,52 +442,9 @@ class Searcher:
         return fit, losses
 
 
-def rattles(model: AxisModel) -> bool:
-    """Say whether there is a gap, whose bounces leave more than noise does."""
-    return any(known()[n].slot is Slot.BACKLASH for n in model.effects)
-
-
 def values_of(model: AxisModel) -> Hashable:
     """Return all that a search may change of a model, to look it up by."""
     return (
         tuple(getattr(model, symbol) for symbol in model.refine),
         tuple((n, *v.items()) for n, v in model.effects.items()),
-    )
-
-
-def polish(
-    problem: Problem, model: AxisModel, frozen: Sequence[str], widths: Sequence[tuple[str, float]]
-) -> Fit:
-    """Fit a backlash: its cost is rough, so search by steps of given relative widths before the smooth fit of the rest."""
-    name = next(n for n in model.effects if known()[n].slot is Slot.BACKLASH)
-    first = problem.residual(model)
-    scale = spread(first)
-    best, cost = model, rough(first, scale)
-    for symbol, width in widths:
-        here = best.effects[name]
-        trials = [
-            best.with_effect(name, {**here, symbol: here[symbol] * (1.0 + width * sign)})
-            for sign in (1.0, -1.0, 0.4, -0.4)
-        ]
-        trials = [t for t in trials if _inside(t, name)]
-        costs = list(problem.mapper(lambda t: rough(problem.residual(t), scale), trials))
-        if costs and min(costs) < cost:
-            best, cost = trials[int(np.argmin(costs))], min(costs)
-    return refit(problem, best, frozen, 4)
-
-
-def spread(residual: Array) -> float:
-    """Size beyond which a residual counts less: of a bounce that comes a little late or early."""
-    return BOUNCE * max(float(np.median(np.abs(residual))), 1.0)
-
-
-def rough(residual: Array, scale: float) -> float:
-    """Sum of squares to which a missed bounce adds little more than a bounce nearly hit (Cauchy's loss)."""
-    return float(np.sum(np.log1p((residual / scale) ** 2)))
-
-
-def _inside(model: AxisModel, name: str) -> bool:
-    return all(
-        p.lower * model.scale(p) <= model.effects[name][p.symbol] <= p.upper * model.scale(p)
-        for p in known()[name].parameters
     )

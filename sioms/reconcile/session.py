@@ -93,11 +93,14 @@ def applied(model: AxisModel, record: Record, state: State) -> tuple[AxisModel, 
 def estimate(problem: Problem, model: AxisModel, record: Record, stop: int, heat: float = 0.0) -> State:
     """Estimate the session parameters of a record on its samples up to ``stop``, by damped Gauss-Newton.
 
+    What they gain must be worth their number (G. Schwarz, 1978); else they stay what the frozen model assumes.
+
     Args:
         problem: whose observer and start apply.
         heat: state at the first sample that the frozen model assumes.
     """
-    moving, state = _knobs(model), State(heat=heat)
+    moving, assumed = _knobs(model), State(heat=heat)
+    state = assumed
     span = slice(problem.span(record).start, stop)
 
     def residual(s: State) -> Array:
@@ -105,14 +108,12 @@ def estimate(problem: Problem, model: AxisModel, record: Record, stop: int, heat
         e = track(m, r.position, r.force, problem.noise, s.heat, external=r.external).innovation[span]
         return np.clip(np.nan_to_num(e / problem.noise.innovation, nan=1e6), -1e6, 1e6)
 
-    r = residual(state)
+    first = r = residual(state)
     for _ in range(STEPS):
         columns = [_slope(residual, state, k, r) for k in moving]
         j = np.stack(columns, axis=1)
         # As many independent samples, each as noisy as the residual is: against them the expected spread counts.
-        off = np.array(
-            [(getattr(state, k.name) - getattr(State(heat=heat), k.name)) / k.spread for k in moving]
-        )
+        off = np.array([(getattr(state, k.name) - getattr(assumed, k.name)) / k.spread for k in moving])
         weight = effective_samples(r) / float(r @ r)
         step = np.linalg.solve(weight * j.T @ j + np.eye(len(moving)), -(weight * j.T @ r + off))
         trial = _moved(state, moving, step)
@@ -120,7 +121,9 @@ def estimate(problem: Problem, model: AxisModel, record: Record, stop: int, heat
         if not after @ after < r @ r * (1.0 - 1e-4):
             break
         state, r = trial, after
-    return state
+    count = effective_samples(first)
+    worth = count * np.log(float(first @ first) / float(r @ r)) > len(moving) * np.log(max(count, 2.0))
+    return state if worth else assumed
 
 
 def _slope(residual: Callable[[State], Array], state: State, knob: _Knob, base: Array) -> Array:

@@ -105,6 +105,11 @@ def pack(model: AxisModel, substeps: int = 0) -> Packed:
     )
 
 
+def inertia(packed: Packed) -> float:
+    """Return the whole inertia, with what is added to that of the axis."""
+    return float(packed.plant[k.INERTIA])
+
+
 def linked(packed: Packed) -> Pair | None:
     """Return the two masses of a model in contact, if it has two."""
     row = packed.plant

@@ -1,7 +1,8 @@
 """Lay records on the grid of the sample time by their time stamps: stamps jitter, samples are lost.
 
-Stamps that lie beside the grid by less than half a step are taken for late notes of samples that were in time. A few
-lost samples are interpolated, a longer gap parts the record.
+Stamps that lie beside the grid by less than half a step are taken for late notes of samples that were in time, and so are
+worse ones where as many samples share a place as places are empty. A few lost samples, or rows with a value that is no
+number, are interpolated, a longer gap parts the record.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from sioms.reconcile.records import Record, Session
 
 #: Longest gap that is interpolated [samples], largest share of all samples, and least length of a record, or of what a gap leaves of one.
 LONGEST, MOST, LEAST_SAMPLES = 5, 0.2, 250
+#: As many samples more or fewer than their stamps say are the jitter of the first and the last of them.
+WANDER = 2
 #: Share of a stamp's deviation by which the clock that counts the samples follows the stamps.
 FOLLOW = 0.05
 
@@ -39,45 +42,58 @@ def on_grid(session: Session, sample_time_s: float) -> tuple[Session, list[str]]
 
 
 def _pieces(record: Record, dt: float, notes: list[str]) -> list[Record]:
-    arrays = [
-        a
-        for a in (
-            record.force,
-            record.command,
-            record.force_measured,
-            record.time_s,
-            record.feedforward,
-            record.external,
-        )
-        if a is not None
-    ]
-    usable = len(record) >= LEAST_SAMPLES and all(
-        len(a) == len(record) and np.all(np.isfinite(a)) for a in (record.position, *arrays)
-    )
-    if record.time_s is None or not usable:
+    where = f"record {record.name}"
+    whole = _whole(record, dt)
+    if whole is None or whole.time_s is None or (place := places(whole.time_s, dt)) is None:
         return [record]
-    place = places(record.time_s, dt)
-    if place is None:
-        return [record]
+    place, said = _told_apart(whole, place)
     gaps = np.diff(place) - 1
     cuts = np.flatnonzero(gaps > LONGEST) + 1
-    edges = [0, *cuts.tolist(), len(record)]
+    edges = [0, *cuts.tolist(), len(whole)]
     kept = [(a, b) for a, b in pairwise(edges) if place[b - 1] - place[a] + 1 >= LEAST_SAMPLES]
-    lost = int(sum(gaps[a : b - 1].sum() for a, b in kept))
-    if not kept or lost > MOST * len(record):
+    lost = int(sum(np.maximum(gaps[a : b - 1], 0).sum() for a, b in kept))
+    if not kept or lost > MOST * len(whole):
         return [record]
+    if said:
+        notes.append(f"{where}: {said}")
     if lost:
-        notes.append(
-            f"record {record.name}: {lost} of {len(record) + lost} samples were lost and are interpolated"
-        )
+        notes.append(f"{where}: {lost} of {len(whole) + lost} samples were lost and are interpolated")
     if len(cuts):
-        notes.append(
-            f"record {record.name}: {len(cuts)} gaps of more than {LONGEST} samples; read as {len(kept)} records"
-        )
+        longer = "one gap" if len(cuts) == 1 else f"{len(cuts)} gaps"
+        notes.append(f"{where}: {longer} of more than {LONGEST} samples; read as {len(kept)} records")
     return [
-        _filled(record.cut(a, b), place[a:b] - place[a], "" if len(kept) == 1 else f".{i + 1}", dt)
+        _filled(whole.cut(a, b), place[a:b] - place[a], "" if len(kept) == 1 else f".{i + 1}", dt)
         for i, (a, b) in enumerate(kept)
     ]
+
+
+def _whole(record: Record, dt: float) -> Record | None:
+    """Return the rows whose values are all numbers; None where they tell of no time, or are too few."""
+    arrays = record.arrays()
+    if len(record) < LEAST_SAMPLES or any(len(a) != len(record) for a in arrays.values()):
+        return None
+    good = np.all([np.isfinite(a) for a in arrays.values()], axis=0)
+    if good.mean() < 1.0 - MOST or (good.all() and record.time_s is None):
+        return None
+    if record.time_s is None:
+        record = replace(record, time_s=dt * np.arange(len(record), dtype=np.float64))
+    return record if good.all() else record.only(good)
+
+
+def _told_apart(record: Record, place: NDArray[np.int64]) -> tuple[NDArray[np.int64], str]:
+    """Say what samples are whose stamps put them in one place: rows written twice, or late stamps.
+
+    Returns:
+        The places, and a sentence, empty where no two samples share one.
+    """
+    shared = np.flatnonzero(np.diff(place) == 0)
+    if not len(shared):
+        return place, ""
+    twice = np.all([a[shared] == a[shared + 1] for a in record.arrays().values()], axis=0)
+    if not twice.any() and abs(int(place[-1]) - len(place) + 1) <= WANDER:
+        even = np.arange(len(place))
+        return even, "the time stamps jitter by more than half a step; no sample is taken to be lost"
+    return place, f"{len(shared)} rows are of the same time as the row before, which counts"
 
 
 def places(time: Array, dt: float) -> NDArray[np.int64] | None:
@@ -100,7 +116,7 @@ def _filled(record: Record, place: NDArray[np.int64], suffix: str, dt: float) ->
     """Interpolate what is missing between the places: position by a cubic spline, the rest by straight lines."""
     place, first = np.unique(place, return_index=True)
     grid = np.arange(place[-1] + 1)
-    if record.time_s is None or len(grid) == len(record):
+    if len(record) == len(place) == len(grid):
         return replace(record, name=record.name + suffix, time_s=grid * dt)
 
     def line(a: Array | None) -> Array | None:

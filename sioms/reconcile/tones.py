@@ -6,16 +6,16 @@ itself to follow it gets a name. Found, it is taken for a known force beside the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import periodogram
 
-from sioms.reconcile.effect import Array
-from sioms.reconcile.effects.terms import TERM_PREFIX
+from sioms.reconcile.effect import TERM_PREFIX, Array
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.screen import instrument_motion
+from sioms.reconcile.timed import Timed, waves
 from sioms.reconcile.verdict import Estimate, NamedEffect
 
 ZOOMS = 6  # each halves the step of frequency
@@ -67,45 +67,28 @@ def hum(problem: Problem, fit: Fit) -> Tone | None:
     return found if found.share > TONE and not _moved(problem, fit.model, found.frequency_hz) else None
 
 
-def known_beside(problem: Problem, found: Tone, sign: float = 1.0) -> Problem:
-    """Take the tone for a known force beside the drive's, or (sign -1) take it out again."""
-    records = tuple(
-        replace(r, external=sign * f + (0.0 if r.external is None else r.external))
-        for r, f in zip(problem.session.records, found.forces, strict=True)
-    )
-    return replace(problem, session=replace(problem.session, records=records))
-
-
-def as_term(found: Tone, model: AxisModel) -> NamedEffect:
-    """Describe the tone as a nameless term, with the intervals of a sine in white noise (D. C. Rife, R. R. Boorstyn, 1974)."""
+def as_timed(found: Tone, fit: Fit) -> Timed:
+    """Describe the tone, with the intervals of a sine in white noise (D. C. Rife, R. R. Boorstyn, 1974)."""
     lengths = np.array([len(f) for f in found.forces], dtype=np.float64)
     noise = (1.0 - found.share) / found.share
     wide = 1.96 * found.amplitude * float(np.sqrt(noise / lengths.sum()))
-    off = 1.96 * float(np.sqrt(12.0 * noise / np.sum(lengths**3))) / (2.0 * np.pi * model.sample_time_s)
-    equation = "F = amp sin(2 pi f t + phase)"
-    return NamedEffect(
+    off = 1.96 * float(np.sqrt(12.0 * noise / np.sum(lengths**3))) / (2.0 * np.pi * fit.model.sample_time_s)
+    equation, size, hz = "F = amp sin(2 pi f t + phase)", found.amplitude, found.frequency_hz
+    term = NamedEffect(
         TERM_PREFIX + "tone",
         equation,
         equation,
         "mechanics",
         (
-            Estimate(
-                "amp",
-                found.amplitude,
-                found.amplitude - wide,
-                found.amplitude + wide,
-                model.force_unit,
-                "amplitude",
-            ),
-            Estimate(
-                "f", found.frequency_hz, found.frequency_hz - off, found.frequency_hz + off, "Hz", "frequency"
-            ),
+            Estimate("amp", size, size - wide, size + wide, fit.model.force_unit, "amplitude"),
+            Estimate("f", hz, hz - off, hz + off, "Hz", "frequency"),
         ),
         found.share,
-        1.96 * found.amplitude / wide,
-        1.0,
+        1.96 * size / wide,
+        None,
         (f"it is {100.0 * found.share:.1f} % of the residual energy and keeps time, whatever the axis does",),
     )
+    return Timed(found.forces, (1.0 - found.share) * fit.cost, term, f"a force of {hz:.3f} Hz keeps time")
 
 
 def _per_record(problem: Problem, residual: Array) -> list[Array]:
@@ -114,15 +97,10 @@ def _per_record(problem: Problem, residual: Array) -> list[Array]:
     return np.split(residual, np.cumsum(lengths)[:-1])
 
 
-def _waves(count: int, frequency_hz: float, dt: float) -> Array:
-    turn = 2.0 * np.pi * frequency_hz * dt * np.arange(count)
-    return np.stack([np.sin(turn), np.cos(turn)], axis=1)
-
-
 def _line(problem: Problem, fit: Fit, frequency_hz: float) -> Tone:
     traces, forces = [], []
     for record, e in zip(problem.session.records, _per_record(problem, fit.residual), strict=True):
-        wave = _waves(len(record), frequency_hz, fit.model.sample_time_s)
+        wave = waves(len(record), frequency_hz, fit.model.sample_time_s)
         columns = problem.answer(fit.model, wave)[problem.span(record)] / problem.noise.innovation
         size = np.linalg.lstsq(columns, e, rcond=None)[0]
         traces.append(columns @ size)
@@ -139,7 +117,7 @@ def _moved(problem: Problem, model: AxisModel, frequency_hz: float) -> bool:
     for part in range(1, OVERTONES + 1):
         lines = 0.0
         for v in speeds:
-            wave = _waves(len(v), frequency_hz / part, model.sample_time_s)
+            wave = waves(len(v), frequency_hz / part, model.sample_time_s)
             line = wave @ np.linalg.lstsq(wave, v, rcond=None)[0]
             lines += float(line @ line)
         if lines > (OWN if part == 1 else PURE) * energy:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
 
 from sioms.reconcile.channels import Finding
-from sioms.reconcile.effect import Array
+from sioms.reconcile.effect import TERM_PREFIX, Array
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.excitation import Gate
 from sioms.reconcile.experiment import Experiment
@@ -16,7 +17,7 @@ from sioms.reconcile.search import Step
 from sioms.reconcile.session import State
 
 __all__ = [
-    "EXIT", "EXIT_BAD_INPUT", "BadInputError", "Estimate", "Gap", "NamedEffect", "Outcome", "Trace", "Verdict",
+    "EXIT", "EXIT_BAD_INPUT", "BadInputError", "Estimate", "Gap", "NamedEffect", "Outcome", "Trace", "Verdict", "apart",
 ]  # fmt: skip
 
 
@@ -53,7 +54,7 @@ class NamedEffect:
     Attributes:
         saved: share of the remaining residual energy that it explains, beyond all the others.
         errors: standard errors of that, over blocks.
-        frequency: share of block bootstrap replicates in which it earns its place.
+        frequency: share of block bootstrap replicates in which it earns its place; None where that was not tried.
         evidence: sentences; ruled_out, open: look-alikes with the reason.
     """
 
@@ -64,10 +65,18 @@ class NamedEffect:
     parameters: tuple[Estimate, ...]
     saved: float
     errors: float
-    frequency: float
+    frequency: float | None
     evidence: tuple[str, ...]
     ruled_out: dict[str, str] = field(default_factory=dict)
     open: dict[str, str] = field(default_factory=dict)
+
+
+def apart(effects: Iterable[NamedEffect]) -> tuple[list[NamedEffect], list[NamedEffect]]:
+    """Part effects into named ones and nameless terms, each in the given order."""
+    parted: tuple[list[NamedEffect], list[NamedEffect]] = [], []
+    for e in effects:
+        parted[e.name.startswith(TERM_PREFIX)].append(e)
+    return parted
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +84,8 @@ class Gap:
     """Disagreement on samples that took no part in any choice, before and after.
 
     Attributes:
-        before, after, floor: root mean square, in ``unit``; frozen model parameters.
+        before, after, floor: root mean square, in ``unit``; frozen model parameters. An estimated floor above what is reached is
+            that.
         frozen, session: on the later half of these samples only, frozen and with the session parameters
             re-estimated on the earlier half; None where that was not done.
     """

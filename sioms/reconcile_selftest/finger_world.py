@@ -78,6 +78,10 @@ class FingerWorld:
             )
             strain += 0.5 * weight * here.sum(1)
         out: Array = -strain / self.gain
+        if "strip_inhomogeneity" in f.named:  # of the layer: before whatever the elements make of its strain
+            e = f.named["strip_inhomogeneity"]
+            turn = 2 * np.pi * place / float(e["period"][0]) + float(e["phase"][0])
+            out = out * (1.0 + float(e["G"][0]) * np.sin(turn))
         out = out + self._value("quadratic", "q", len(out)) * out**2
         if "cubic" in f.nameless:
             out = out + f.nameless["cubic"]["k"] * out**3
@@ -87,12 +91,6 @@ class FingerWorld:
         if "proximity" in f.named:
             out = out + self._one("proximity", "A") * np.exp(
                 -np.abs(self.angle - middle) / self._one("proximity", "range")
-            )
-        if "strip_inhomogeneity" in f.named:
-            e = f.named["strip_inhomogeneity"]
-            out = out * (
-                1.0
-                + float(e["G"][0]) * np.sin(2 * np.pi * place / float(e["period"][0]) + float(e["phase"][0]))
             )
         if "ageing" in f.nameless:
             out = out * (1.0 + f.nameless["ageing"]["share"] * min(time / 2500.0, 1.5))

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sioms.reconcile.axis import Options, analyse
+from sioms.reconcile.axis import analyse
+from sioms.reconcile.prepare import Options
 from sioms.reconcile.verdict import Outcome
 from sioms.tools.reconcile_input import read_data, read_model
 

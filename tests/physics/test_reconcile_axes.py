@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sioms.reconcile.axis import Options, analyse
+from sioms.reconcile.axis import analyse
+from sioms.reconcile.prepare import Options
 from sioms.reconcile.records import Session
 from sioms.reconcile_selftest.draw import draw_axis
 from sioms.reconcile_selftest.score import score

@@ -183,6 +183,17 @@ def test_lugre_friction_agrees_with_an_ordinary_solver(speed: float) -> None:
     np.testing.assert_allclose(run.x, x, atol=2e-3 * np.ptp(x))
 
 
+def test_lugre_friction_that_vanishes_with_speed_still_holds_at_rest() -> None:
+    model = replace(AXIS, viscous=0.0, controller=None).with_effect(
+        "lugre", {"Fc": 0.0, "xs": 1e-3, "Fs": 0.08, "vs": 0.05}
+    )
+    held = track(model, np.zeros(4000), 0.05 * np.arange(4000) / 4000, None)
+    assert 1e-4 < np.ptp(held.x) < 3e-3  # pushed slowly it yields like a spring and no farther
+    free = track(model, np.zeros(400), np.full(400, 0.12), None)
+    assert np.all(np.isfinite(free.x))
+    assert free.v[-1] == pytest.approx(0.12 * 0.4 / 2e-3, rel=0.1)
+
+
 def test_backlash_conserves_momentum_and_hides_the_load() -> None:
     model = replace(AXIS, viscous=0.0, controller=None).with_effect(
         "backlash", {"gap": 0.5, "load_fraction": 0.6, "f_contact": 120.0, "zeta": 0.1}

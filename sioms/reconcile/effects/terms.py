@@ -7,10 +7,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from sioms.reconcile.effect import TURN, Array, Channel, Effect, Number, Parameter, Ref, Slot, StateFunction
+from sioms.reconcile.effect import (
+    TERM_PREFIX,
+    TURN,
+    Array,
+    Channel,
+    Effect,
+    Number,
+    Parameter,
+    Ref,
+    Slot,
+    StateFunction,
+)
 from sioms.reconcile.jit import state_function
-
-TERM_PREFIX = "term_"
 
 
 @state_function

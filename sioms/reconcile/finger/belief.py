@@ -59,7 +59,7 @@ class Belief:
     Attributes:
         core, outer, shear: radii [m] and shear modulus [Pa]; poisson: Poisson's ratio.
         angle, radius, gain: of the elements [rad, m, strain per output], shape (ns,).
-        extent: half angle that an element averages over [rad].
+        blur: square of the half angle that an element averages over [rad^2]: outputs change in proportion to it, from 0 on.
         quadratic: per element [1/output], shape (ns,).
         offset: angle by which every touch is further on than commanded [rad].
         hertz, adhesion: shares of Hertz's widths and of full adhesion.
@@ -84,7 +84,7 @@ class Belief:
     quadratic: Floats
     temperature: Floats
     common: float = 0.0
-    extent: float = 0.0
+    blur: float = 0.0
     offset: float = 0.0
     hertz: float = 0.0
     adhesion: float = 0.0
@@ -97,6 +97,11 @@ class Belief:
     creep_time: float = 1.0
     cell: float = 0.0
     responses: tuple[tuple[Response, Floats], ...] = ()
+
+    @property
+    def extent(self) -> float:
+        """Half angle that an element averages over [rad]."""
+        return float(np.sqrt(self.blur))
 
     def responding(self, response: Response, parameters: Floats) -> Belief:
         """Return the belief with one more response."""

@@ -12,6 +12,13 @@ from sioms.reconcile.finger.records import Touched
 
 LEAST_LIKE = 0.35  # correlation of measured and simulated touches below which it is another finger
 FACTOR = 8.0  # outputs, loads or radii off by more are in another unit
+SATURATED = (
+    0.25  # share of the frames in which an element is at an end of its range from which on little is learnt
+)
+PILE, FEW = (
+    5.0,
+    20,
+)  # readings at the end, times those just below, and least number of them, that make it the end of the range
 DEAD_SHARE = 0.05  # an element that answers with less of what is expected is dead
 
 
@@ -19,7 +26,7 @@ def check_raw(raw: Floats, elements: int, name: str) -> None:
     """Check one recording's readings.
 
     Raises:
-        BadInputError: the number of columns is wrong, or nothing in them moves.
+        BadInputError: the number of columns is wrong, nothing in them moves, or they are saturated.
     """
     if raw.ndim != 2 or raw.shape[1] != elements:
         width = raw.shape[1] if raw.ndim == 2 else 0
@@ -31,6 +38,22 @@ def check_raw(raw: Floats, elements: int, name: str) -> None:
         raise BadInputError(
             f"read {name}: all {elements} elements are constant; needs frames of a living finger"
         )
+    ended = np.any([_at_the_end(column) for column in finite.T], axis=0)
+    if ended.mean() > SATURATED:
+        raise BadInputError(
+            f"read {name}: an element is at an end of its range ({float(np.abs(finite[ended]).max()):.4g} %) in "
+            f"{100 * float(ended.mean()):.0f} % of the frames: the electronics is saturated; press more gently, or widen the range"
+        )
+
+
+def _at_the_end(values: Floats) -> NDArray[np.bool_]:
+    """Say which readings of one element pile up at its largest or smallest, shape (frames,)."""
+    levels, times = np.unique(values, return_counts=True)
+    out = np.zeros(len(values), dtype=bool)
+    for end, near in ((-1, times[-4:-1]), (0, times[1:4])):
+        if len(levels) > 4 and times[end] > max(PILE * float(near.mean()), FEW):
+            out |= values == levels[end]
+    return out
 
 
 def check_commands(place: Floats, load: Floats, radius: Floats, name: str) -> None:

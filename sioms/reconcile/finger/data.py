@@ -24,6 +24,9 @@ VIEWS = ("touch", "course", "drift", "ramp", "cell", "strength")
 TOUCH, COURSE, DRIFT, RAMP, CELL, STRENGTH = range(6)
 GROUP = 6  # touches in a block
 OWN_ERROR = 3e-3  # of a simulated touch
+OWN_LEVEL = 1e-3  # of all simulated touches alike: finite elements of another's hand differ by half of it
+LATEST = 0.95  # of the time without frames before the load: when the load came on at the latest
+_LOAD_STEP = 0.01  # of a load, for a difference
 LEAST_RUNS = 12  # of three like touches one after the other, of which the scatter of loads is told
 _CONTRASTS = np.array([[-3, -1, 1, 3], [1, -1, -1, 1], [-1, 3, -3, 1]]) / np.array(
     [[20**0.5], [2.0], [20**0.5]]
@@ -45,6 +48,10 @@ class FingerData:
     view: NDArray[np.int64]
     block: NDArray[np.int64]
     element: NDArray[np.int64]
+    unsure: float = 0.0  # relative standard deviation of the level of all loads
+    beyond: Floats | float = (
+        0.0  # what outputs change with the logarithm of the load, less themselves, shape (nt, alive)
+    )
     views: tuple[str, ...] = VIEWS
     #: A touch's profile alone would be best without any output: its strength goes with it.
     footing: tuple[int, ...] = (0, 1, 2, 3, 4, 0)
@@ -60,8 +67,8 @@ class FingerData:
         warmed = b.common * t.warmed
         drift = warmed.mean(1)[:, None]
         rows = [((out * mean[:, None] + drift) / self._sigma).ravel()]
-        late_ = course - mean[:, None] + self._weight.sum(1)[:, None] * (warmed - drift)
-        rows.append(((late_ @ _CONTRASTS.T) / self.course_sigma[:, None]).ravel())
+        following = course - mean[:, None] + self._weight.sum(1)[:, None] * (warmed - drift)
+        rows.append(((following @ _CONTRASTS.T) / self.course_sigma[:, None]).ravel())
         rows.append(self._drift(b))
         rows.append(self._ramps(b))
         if np.isfinite(self.cell_spread).all():
@@ -74,11 +81,14 @@ class FingerData:
         return self.whiten(predicted - self.measured())
 
     def doubts(self, model: SensorModel) -> Floats:
-        """See ``sensors.fit.Data``: the simulated touch's own error, when the load came on between two frames, when gains were stated."""
+        """See ``sensors.fit.Data``: the level of all touches, when the load came on between two frames, when gains were stated."""
         said, t = self.predict(model), self.touched
         touch = np.where(self.view == TOUCH, said, 0.0)
-        sooner = replace(t, since=t.since - t.unseen[:, None] / np.sqrt(3.0))
-        columns = [OWN_ERROR * touch, replace(self, touched=sooner).predict(model) - said]
+        later = replace(t, since=t.since + LATEST * t.unseen[:, None])  # creep is less than it seems then
+        columns = [
+            np.hypot(OWN_LEVEL, self.unsure) * touch,
+            (replace(self, touched=later).predict(model) - said) / 1.96,  # no standard deviation: an end
+        ]
         columns += [self._growth(model, name) * touch for name in model.effects if name in GROWING]
         return np.stack(columns, axis=1)
 
@@ -126,24 +136,44 @@ class FingerData:
         out: Floats = np.sqrt(self.touched.share)[:, None] * self.touched.noise[self.alive]
         return out
 
+    def loaded(self, model: SensorModel) -> FingerData:
+        """Return the rows with what the load does to outputs as a model has it: what a quadratic or proximity adds is not in proportion."""
+        b: Belief = model.belief()
+        more = replace(self.scene, load=(1.0 + _LOAD_STEP) * self.scene.load)
+        now, then = (outputs(b, scene)[:, self.alive] for scene in (self.scene, more))
+        grown = (then - now) / _LOAD_STEP - now
+        return replace(self, beyond=late(b, self.touched.since).mean(1)[:, None] * grown)
+
+    def turned(self, other: FingerData) -> float:
+        """Return how far an uncertain load changes profiles less or more than in other rows, in units of their noise (rms of touches)."""
+        off = (np.asarray(self.beyond) - other.beyond) / self._sigma
+        u, size = self._profile
+        off = off - u * np.einsum("ji,ji->j", u, off)[:, None]
+        return float(
+            np.sqrt(
+                np.mean(np.sum(off**2, axis=1) * self.load_share**2 / (1.0 + (size * self.load_share) ** 2))
+            )
+        )
+
     @cached_property
     def _profile(self) -> tuple[Floats, Floats]:
-        """Direction of every touch's measured outputs in units of their noise, shape (nt, alive), and their length, shape (nt,)."""
-        u = self.touched.output[:, self.alive] / self._sigma
+        """What the load changes in outputs in units of their noise, as a direction, shape (nt, alive), and its length, shape (nt,)."""
+        u = (self.touched.output[:, self.alive] + self.beyond) / self._sigma
         size = np.maximum(np.sqrt(np.einsum("ji,ji->j", u, u)), 1e-9)
         return u / size[:, None], size
 
     def scatter(self, predicted: Floats) -> float:
-        """Return by how much loads scatter from touch to touch, relative, as strengths beside a prediction tell; inf of few."""
+        """Return by how much loads scatter from touch to touch, in units of ``load_share``, as strengths beside a prediction tell; inf of few."""
         t = self.touched
         size = self._profile[1]
-        beside = self.miss(predicted)[-len(t) :] * np.sqrt(1.0 + (size * self.load_share) ** 2) / size
+        unit = size * self.load_share
+        beside = self.miss(predicted)[-len(t) :] * np.sqrt(1.0 + unit**2) / unit
         same = [n + str(r) for n, r in zip(t.name, t.radius, strict=True)]
         runs = np.array([a == b == c for a, b, c in zip(same, same[1:], same[2:], strict=False)])
         if np.count_nonzero(runs) < LEAST_RUNS:
             return np.inf
         seen = 1.4826 * np.median(np.abs(np.diff(beside, 2)[runs])) / np.sqrt(6.0)
-        return float(np.sqrt(max(seen**2 - float(np.median(size**-2.0)), 0.0)))
+        return float(np.sqrt(max(seen**2 - float(np.median(unit**-2.0)), 0.0)))
 
     @cached_property
     def _weight(self) -> Floats:
@@ -256,6 +286,7 @@ def lay_out(
     load_share: Floats,
     load: Floats,
     cell_spread: Floats,
+    unsure: float = 0.0,
 ) -> FingerData:
     """Lay out the rows.
 
@@ -264,6 +295,7 @@ def lay_out(
         elements: angles of the elements [rad]; ramps lie over them.
         load: best guess of each touch's load [N/m] and its relative standard deviation beside it.
         cell_spread: spread of the cell about the commanded load by touch [N/m], nan without a cell.
+        unsure: relative standard deviation of the level of all loads.
     """
     warm = (
         np.nan_to_num(touched.temperature - np.nanmean(touched.temperature))
@@ -311,6 +343,7 @@ def lay_out(
         np.concatenate([np.full(len(own), v) for v, own, _ in parts]),
         np.concatenate(blocks),
         np.concatenate([e for _, _, e in parts]).astype(np.int64),
+        unsure,
     )
 
 
@@ -327,7 +360,7 @@ def only(data: FingerData, which: NDArray[np.bool_], elements: Floats) -> Finger
         mine = (np.arange(len(u.temperature)) % 5 == 2) == few
         u = replace(u, output=u.output[mine], temperature=u.temperature[mine])
     ramps = tuple(r for i, r in enumerate(data.ramps) if (i % 5 == 2) == few)
-    return lay_out(
+    rows = lay_out(
         data.touched.pick(which),
         data.alive,
         u,
@@ -336,4 +369,6 @@ def only(data: FingerData, which: NDArray[np.bool_], elements: Floats) -> Finger
         data.load_share[which],
         data.scene.load[which],
         data.cell_spread[which],
+        data.unsure,
     )
+    return replace(rows, beyond=np.broadcast_to(data.beyond, (len(which), len(data.alive)))[which])

@@ -45,7 +45,7 @@ def belief_of(finger: Finger) -> Belief:
         np.array(e.gain),
         np.array(e.quadratic),
         np.zeros(len(e.angle_rad)),
-        extent=g.extent_rad,
+        blur=g.extent_rad**2,
         hertz=float(c.model == "hertz"),
         adhesion=c.adhesion if c.model == "adhering" else 0.0,
     )
@@ -70,17 +70,21 @@ def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, bool]
         float(numbers(t, k, where, 1)[0]) for k in ("core_m", "outer_m", "shear_modulus_pa", "poisson")
     )
     extent = float(numbers(t, "extent_rad", where, 1)[0]) if "extent_rad" in t else 0.0
+    if not 0.0 <= extent < 1.0:
+        raise BadInputError(
+            f"read model {where}: extent_rad is {extent:g}; needs the half angle of an element, 0 to 1"
+        )
     b = Belief(
-        core,
-        outer,
-        shear,
-        ratio,
-        angle,
-        numbers(t, "radius_m", where, count),
-        numbers(t, "gain", where, count),
-        np.zeros(count),
-        np.zeros(count),
-        extent=extent,
+        core=core,
+        outer=outer,
+        shear=shear,
+        poisson=ratio,
+        angle=angle,
+        radius=numbers(t, "radius_m", where, count),
+        gain=numbers(t, "gain", where, count),
+        quadratic=np.zeros(count),
+        temperature=np.zeros(count),
+        blur=extent**2,
     )
     check(b, where)
     model = SensorModel(b, count, library(), {}, (), str(t.get("name", "finger")))
@@ -111,10 +115,6 @@ def check(b: Belief, where: str) -> None:
         raise BadInputError(f"read model {where}: gain {float(b.gain.min()):g}; needs strain per output, > 0")
     if not b.shear > 0.0:
         raise BadInputError(f"read model {where}: shear modulus is {b.shear:g} Pa; needs one above zero")
-    if not 0.0 <= b.extent < 1.0:
-        raise BadInputError(
-            f"read model {where}: extent_rad is {b.extent:g}; needs the half angle of an element, 0 to 1"
-        )
     if not 0.3 <= b.poisson <= 0.5:
         raise BadInputError(f"read model {where}: Poisson's ratio is {b.poisson:g}; rubber needs 0.3 to 0.5")
 

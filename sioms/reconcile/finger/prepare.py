@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.finger.belief import Belief, outputs, scene_of
@@ -34,8 +35,7 @@ from sioms.reconcile.sensors.verdict import SensorVerdict
 from sioms.reconcile.verdict import Estimate, NamedEffect
 from sioms.tactile.touches import Recording
 
-#: Not down to 0, where nothing of first order changes with it, and a fit that came there would stay.
-EXTENT = Quantity("extent", "rad", 2e-3, 0.16, 0.01, "half angle that an element averages over")
+BLUR = Quantity("blur", "rad^2", 0.0, 0.0256, 1e-3, "square of the half angle that an element averages over")
 START_EXTENT = 0.25  # of the elements' pitch: where the fit of an extent that is not stated begins
 LOAD_MARGIN = 1.15  # the load cell's noise during a touch is a little more than its frames say
 LOAD_SPREAD = 0.02  # of a touch's load where no load cell tells it
@@ -92,15 +92,16 @@ def prepare(
     touched, notes = reduce_touches(told, scale, dead, lines)
     alive = check_match(touched, nominal, ~dead)
     after = max(float(e.recording.time_s[-1]) for e in experiments if e.name not in ("thermal", "noise"))
-    still = reduce_untouched(by_name["thermal"], scale, after_s=after) if "thermal" in by_name else None
+    still = (
+        reduce_untouched(by_name["thermal"], scale, lines, after_s=after) if "thermal" in by_name else None
+    )
     ramps = tuple(reduce_ramps(by_name["ramp"], scale, ~alive, lines)) if "ramp" in by_name else ()
-    # from nothing the width of the elements would not move: a little of it changes nothing of first order
-    wide = nominal.extent or (START_EXTENT * _pitch(nominal.angle) if refine_extent else 0.0)
-    base = replace(nominal, angle=np.ascontiguousarray(nominal.angle), around=nominal.poisson, extent=wide)
+    blur = nominal.blur or ((START_EXTENT * _pitch(nominal.angle)) ** 2 if refine_extent else 0.0)
+    base = replace(nominal, angle=np.ascontiguousarray(nominal.angle), around=nominal.poisson, blur=blur)
     library_ = {**library(), **{t.name: t for t in TERMS}}
-    model = SensorModel(base, count, library_, {}, (EXTENT,) if refine_extent else (), name)
+    model = SensorModel(base, count, library_, {}, (BLUR,) if refine_extent else (), name)
     model, settled = _settle(model, lines, alive)
-    whole = _rows(touched, np.flatnonzero(alive), still, ramps, base, notes)
+    whole = _rows(touched, np.flatnonzero(alive), still, ramps, base, notes).loaded(model)
     notes += _missing(by_name, touched, refine_extent)
     mine = untouched(len(touched))
     parts = (whole, only(whole, ~mine, base.angle), only(whole, mine, base.angle))
@@ -129,14 +130,15 @@ def _settle(
         model = model.with_effect(
             "mains_line", {"a": np.array([line.amplitude]), "f": np.array([line.frequency])}
         )
-        e = 1.96 * line.deviation
+        e = float(student.ppf(0.975, np.count_nonzero(alive) - 1)) * line.deviation
+        w = 1.96 * line.frequency_deviation
         told = [f"{100 * q.amplitude:.3g} % at {q.frequency:.3f} Hz" for q in lines]
         settled.append(
             _named(
                 effect,
                 (
                     Estimate("a", line.amplitude, line.amplitude - e, line.amplitude + e, "1", "amplitude"),
-                    Estimate("f", line.frequency, line.frequency, line.frequency, "Hz", "frequency"),
+                    Estimate("f", line.frequency, line.frequency - w, line.frequency + w, "Hz", "frequency"),
                 ),
                 f"stands out of the spectrum of untouched frames: {', '.join(told)}; taken off every touch",
             )
@@ -174,7 +176,7 @@ def _named(effect: SensorEffect, estimates: tuple[Estimate, ...], evidence: str)
         estimates,
         1.0,
         np.inf,
-        1.0,
+        None,
         (evidence,),
     )
 
@@ -191,18 +193,19 @@ def _rows(
     count = len(t)
     told = bool(np.isfinite(t.cell).all() and np.ptp(t.cell) > 0.0 and np.all(t.cell > 0.0))
     load, share, spread = t.load.copy(), np.full(count, LOAD_SPREAD), np.full(count, np.nan)
+    unsure = 0.0
     if told and np.allclose(t.cell, t.load, rtol=1e-6):
         share = LOAD_MARGIN * t.cell_noise / t.cell
         notes.append("the loads are what the load cell says: its scale is not judged")
     elif told:
-        level = float(np.median(t.cell / t.load))
+        level, deviation, spread = cell_level(t)
         ratio = t.cell / t.load / level
-        spread = cell_spread(t, level)
         if _follows(t, ratio, base, alive):
-            load, share = t.cell / level, LOAD_MARGIN * t.cell_noise / t.cell
+            load, share, unsure = t.cell / level, LOAD_MARGIN * t.cell_noise / t.cell, deviation / level
         else:
-            # no load was further from its command than the cell, with its noise, says
-            share = np.minimum(LOAD_SPREAD, LOAD_MARGIN * spread / t.cell)
+            # no load was further from its command than the cell, with its noise, says; light ones are further, for their size
+            share = LOAD_MARGIN * spread / t.cell
+            share *= min(1.0, LOAD_SPREAD / float(np.median(share)))
             notes.append(
                 "the outputs do not follow the load cell from touch to touch: the commanded load was used"
             )
@@ -210,7 +213,20 @@ def _rows(
         notes.append(
             f"no load cell: the commanded load was used, {100 * LOAD_SPREAD:.0f} % of it taken as uncertain"
         )
-    return lay_out(t, alive, still, ramps, base.angle, share, load, spread)
+    return lay_out(t, alive, still, ramps, base.angle, share, load, spread, unsure)
+
+
+def cell_level(t: Touched) -> tuple[float, float, Floats]:
+    """Return what the load cell reads per commanded load, its standard deviation, and the cell's spread by touch [N/m].
+
+    Weighed by the spread; touches far off count as far as three of its standard deviations (Huber 1964).
+    """
+    level = float(np.median(t.cell / t.load))
+    spread = cell_spread(t, level)
+    off = np.abs(t.cell - level * t.load) / spread
+    weight = np.minimum(1.0, 3.0 / np.maximum(off, 1e-9)) / spread**2
+    told = float(np.sum(weight * t.load**2))
+    return float(np.sum(weight * t.load * t.cell)) / told, told**-0.5, spread
 
 
 def cell_spread(t: Touched, level: float) -> Floats:

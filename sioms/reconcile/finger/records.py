@@ -90,11 +90,12 @@ class Ramped:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A line in the spectrum of untouched frames: frequency [Hz], amplitude and its deviation [output]."""
+    """A line in the spectrum of untouched frames: frequency [Hz], amplitude [output], and the deviations of both."""
 
     frequency: float
     amplitude: float
     deviation: float
+    frequency_deviation: float = 0.0
 
 
 def reduce_touches(
@@ -218,9 +219,9 @@ def without_lines(
 
 
 def reduce_untouched(
-    r: Recording, scale: float, skip_s: float = 10.0, after_s: float = -np.inf
+    r: Recording, scale: float, lines: Sequence[Line] = (), skip_s: float = 10.0, after_s: float = -np.inf
 ) -> Untouched | None:
-    """Return untouched frames with their temperature; those whose time reaches back to a touch are left out."""
+    """Return untouched frames with their temperature, without lines; those whose time reaches back to a touch are left out."""
     step = float(np.median(np.diff(r.time_s))) if len(r.time_s) > 1 else 0.0
     good = (
         np.isfinite(r.temperature_c) & np.isfinite(r.raw).all(axis=1) & (r.time_s - step > after_s + skip_s)
@@ -230,10 +231,33 @@ def reduce_untouched(
     output = r.raw[good] * scale
     # what goes with the temperature is no noise, and does not pass for it where it swings fast
     warm = r.temperature_c[good] - r.temperature_c[good].mean()
-    own = np.stack([np.ones_like(warm), warm, warm**2], axis=1)
-    second = np.diff(output - own @ np.linalg.lstsq(own, output, rcond=1e-10)[0], 2, axis=0)
+    own = np.linalg.qr(np.stack([np.ones_like(warm), warm, warm**2], axis=1))[0]
+    for line in lines:
+        output = output - _folded(output, r.time_s[good], own, line)
+    second = np.diff(output - own @ (own.T @ output), 2, axis=0)
     noise = np.sqrt(np.mean(second**2, axis=0) / 6.0)
     return Untouched(output, r.temperature_c[good], np.maximum(noise, 1e-9))
+
+
+def _folded(output: Floats, time: Floats, own: Floats, line: Line) -> Floats:
+    """Return what a line leaves in slow frames beside what is their own, at the likeliest frequency of those that it may have.
+
+    Args:
+        own: orthonormal columns that are no line, shape (n, k).
+    """
+    since = time - time[0]
+    middle, reach, most, found = line.frequency, 3.0 * line.frequency_deviation, 0.0, np.zeros_like(output)
+    count = int(min(np.ceil(4.0 * reach * since[-1]), 100.0))
+    for _ in range(3):  # finer and finer about the best
+        for frequency in middle + reach * np.linspace(-1.0, 1.0, 2 * count + 1):
+            waves = np.stack([f(2.0 * np.pi * frequency * since) for f in (np.sin, np.cos)], axis=1)
+            u, s, v = np.linalg.svd(waves - own @ (own.T @ waves), full_matrices=False)
+            told = u.T @ output
+            saved = float(np.sum(told**2)) if s.min() > TOLD * np.sqrt(len(time)) else 0.0
+            if saved > most:
+                most, middle, found = saved, float(frequency), waves @ (v.T / s) @ told
+        reach, count = reach / max(count, 1), 4
+    return found
 
 
 def reduce_ramps(
@@ -289,7 +313,6 @@ def find_lines(r: Recording, scale: float, outstanding: float = 60.0) -> list[Li
     reach = max(frames // 64, 16)
     padded = np.pad(power, reach, mode="reflect")
     floor = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1), axis=1)
-    frequency = np.fft.rfftfreq(frames, 1.0 / r.rate_hz)
     out: list[Line] = []
     taken = np.zeros(len(power), dtype=bool)
     taken[:8] = True
@@ -297,13 +320,27 @@ def find_lines(r: Recording, scale: float, outstanding: float = 60.0) -> list[Li
         if taken[place] or power[place] < outstanding * floor[place]:
             continue
         taken[max(place - 6, 0) : place + 7] = True
-        near = slice(max(int(place) - 1, 0), int(place) + 2)
-        fine = float(np.sum(frequency[near] * power[near]) / np.sum(power[near]))
-        angle = 2.0 * np.pi * fine * np.arange(frames) / r.rate_hz
-        amplitude = np.hypot(np.cos(angle) @ raw, np.sin(angle) @ raw) * 2.0 / frames
-        out.append(
-            Line(
-                fine, float(np.sqrt(np.mean(amplitude**2))), float(np.std(amplitude) / np.sqrt(raw.shape[1]))
-            )
-        )
+        fine = _peak(raw, float(place))
+        amplitude = _amplitudes(raw, fine)
+        size = float(np.sqrt(np.mean(amplitude**2)))
+        # the least that noise of one bin's power, ``floor``, allows: Rife & Boorstyn 1974, IEEE Trans. Inf. Theory 20, eq. 12
+        noise = floor[place] / (window @ window)
+        unsure = np.sqrt(24.0 * noise / raw.size) / (2.0 * np.pi * size * frames / r.rate_hz)
+        own = float(np.std(amplitude, ddof=1) / np.sqrt(raw.shape[1]))
+        out.append(Line(fine * r.rate_hz / frames, size, own, float(unsure)))
     return out[:4]
+
+
+def _peak(raw: Floats, place: float) -> float:
+    """Return where between bins the spectrum of all columns has its top, beginning at one: parabolas through three places."""
+    for step in (0.5, 0.2, 0.1):
+        low, mid, high = (float(np.sum(_amplitudes(raw, place + k * step) ** 2)) for k in (-1, 0, 1))
+        bend = min(low - 2.0 * mid + high, -1e-300)
+        place += float(np.clip(0.5 * (low - high) / bend, -1.0, 1.0)) * step
+    return place
+
+
+def _amplitudes(raw: Floats, place: float) -> Floats:
+    """Return the amplitude of every column at a place of the spectrum, in bins."""
+    turn = np.exp(-2j * np.pi * place / len(raw) * np.arange(len(raw)))
+    return np.asarray(2.0 * np.abs(turn @ raw) / len(raw))

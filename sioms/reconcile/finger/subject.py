@@ -31,6 +31,7 @@ from sioms.reconcile.sensors.subject import SHARPER, Variable, View, by_chance, 
 from sioms.reconcile.sensors.verdict import Curve, Proposal
 from sioms.reconcile.verdict import NamedEffect
 
+TURNED = 0.3  # of the noise, from which on it counts what else a load does
 NEAR_DEG, ACROSS = 24.0, 8  # from a touch: where an element answers, and bins across it
 
 
@@ -117,12 +118,15 @@ class FingerSubject:
         return found
 
     def sharpened(self, model: SensorModel, shares: Mapping[int, float]) -> FingerSubject | None:
-        """Return the finger with loads as certain as touches beside a model show them to be, None where that is nothing new."""
-        d = self.training
-        seen = max(d.scatter(d.predict(model)) * by_chance(len(d.touched)), OWN_ERROR)
-        if seen > SHARPER * float(np.median(d.load_share)):
+        """Return the finger with loads as certain as touches beside a model show, and what they do as it says; None for nothing new."""
+        d = self.training.loaded(model)
+        seen = d.scatter(d.predict(model)) * by_chance(len(d.touched))
+        if seen > SHARPER and d.turned(self.training) < TURNED:
             return None
-        whole = replace(self.whole, load_share=np.minimum(self.whole.load_share, seen))
+        share = self.whole.load_share
+        if seen < SHARPER:
+            share = np.minimum(share, np.maximum(seen * share, OWN_ERROR))
+        whole = replace(self.whole.loaded(model), load_share=share)
         mine, angle = untouched(len(whole.touched)), self.model.base.angle
         return replace(self, whole=whole, training=only(whole, ~mine, angle), final=only(whole, mine, angle))
 

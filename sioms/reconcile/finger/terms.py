@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from sioms.reconcile.effect import TERM_PREFIX
 from sioms.reconcile.finger.belief import Scene
 from sioms.reconcile.finger.pressures import Floats
-from sioms.reconcile.sensors.effect import TERM_PREFIX, Quantity, term
+from sioms.reconcile.sensors.effect import Quantity, term
 
 _LOAD = 200.0
 

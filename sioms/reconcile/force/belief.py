@@ -40,12 +40,13 @@ class ForceBelief:
     """The sensor as the simulation has it; immutable.
 
     Attributes:
-        full: full range of each component [N, N m]; only for reports.
+        names: of the components; full: full range of each [N, N m]; both only for reports and files.
         matrix: reading per load as stated, both in shares of full range, shape (components, components).
         gain, cross: relative departures of its rows and what is added to it; None for none.
         responses: further changes of the reading with their parameters, in order.
     """
 
+    names: tuple[str, ...]
     full: Floats
     matrix: Floats
     gain: Floats | None = None

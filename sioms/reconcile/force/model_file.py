@@ -59,7 +59,7 @@ def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, tuple
             raise BadInputError(
                 f"read model {where}: matrix has shape {matrix.shape}; needs ({count}, {count}), finite"
             )
-    belief = ForceBelief(full, matrix * full[None, :] / full[:, None])
+    belief = ForceBelief(names, full, matrix * full[None, :] / full[:, None])
     model = SensorModel(belief, count, library(names), {}, (), str(t.get("name", "sensor")))
     return effects_from(model, table, where), names
 
@@ -67,17 +67,12 @@ def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, tuple
 def to_toml(model: SensorModel) -> str:
     """Write a model: nominal sensor and effects."""
     b: ForceBelief = model.base
-    names = (
-        [q.symbol.removeprefix("from_") for q in model.library["cross_talk"].parameters]
-        if model.count > 1
-        else ["fz"]
-    )
     matrix = b.matrix * b.full[:, None] / b.full[None, :]
     rows = ",\n".join("  [" + ", ".join(repr(float(v)) for v in row) + "]" for row in matrix)
     lines = [
         "[sensor]",
         f'name = "{model.name}"',
-        "components = [" + ", ".join(f'"{n}"' for n in names) + "]",
+        "components = [" + ", ".join(f'"{n}"' for n in b.names) + "]",
         "full_range = [" + ", ".join(repr(float(v)) for v in b.full) + "]",
         f"matrix = [\n{rows},\n]",
     ]

@@ -1,4 +1,4 @@
-"""Prepare a force/torque sensor for the workflow: checks, noise floor, rows, and what the report wants."""
+"""Prepare a force/torque sensor for the workflow: noise floor, rows, and what the report wants."""
 
 from __future__ import annotations
 
@@ -9,38 +9,20 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.effect import TERM_PREFIX
 from sioms.reconcile.force.belief import Floats, Loads, readings
 from sioms.reconcile.force.plan import Plan, catalogue, propose
+from sioms.reconcile.force.records import ForceRecords, check, unit_of, whole_rows
 from sioms.reconcile.refuse import hats
 from sioms.reconcile.sensors.analyse import Options, analyse
-from sioms.reconcile.sensors.effect import TERM_PREFIX, SensorModel
+from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.fit import ratios
 from sioms.reconcile.sensors.refuse import knots
 from sioms.reconcile.sensors.subject import SHARPER, Variable, View, by_chance
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
 from sioms.reconcile.verdict import NamedEffect
 
-LEAST_ROWS = 40
 BLOCKS = 40
-FACTOR = 30.0  # a component off by more is in another unit
-LEAST_LIKE = 0.3  # correlation of readings and loads below which it is another sensor
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ForceRecords:
-    """Recorded known loads and readings [N, N m], shape (n, components), in the order of time.
-
-    Attributes:
-        time: [s]; temperature: [deg C], nan without; record: number of the file of each row; shape (n,).
-    """
-
-    names: tuple[str, ...]
-    load: Floats
-    reading: Floats
-    time: Floats
-    temperature: Floats
-    record: NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,11 +200,6 @@ class ForceSubject:
         return next(q.unit for q in self.model.library[effect].parameters if q.symbol == symbol)
 
 
-def unit_of(name: str) -> str:
-    """Return N m for torques (names that begin with t or m), else N."""
-    return "N m" if name[:1].lower() in ("t", "m") else "N"
-
-
 def prepare(records: ForceRecords, model: SensorModel, plans: Sequence[Plan] = ()) -> ForceSubject:
     """Check the recordings and lay them out.
 
@@ -232,7 +209,8 @@ def prepare(records: ForceRecords, model: SensorModel, plans: Sequence[Plan] = (
     Raises:
         BadInputError: they cannot be used; the message says why.
     """
-    notes = check(records, model)
+    records, notes = whole_rows(records)
+    notes += check(records, model)
     full = model.base.full
     t = records.temperature
     known = bool(np.isfinite(t).all() and np.ptp(t) > 0.0)
@@ -286,69 +264,6 @@ def floor_of(measured: Floats, rest: Floats) -> Floats:
     floor = np.array([float(s.min()) / np.sqrt(12.0) if len(s) and len(s) < n // 2 else 0.0 for s in steps])
     out: Floats = np.maximum(np.maximum(noise, floor), 1e-9)
     return out
-
-
-def check(r: ForceRecords, model: SensorModel) -> list[str]:
-    """Check the records by themselves and against the model.
-
-    Raises:
-        BadInputError: with what is wrong and what would be right.
-    """
-    if len(r.load) < LEAST_ROWS:
-        raise BadInputError(f"read loads: {len(r.load)} rows are too few; record {LEAST_ROWS} or more")
-    for what, values in (("load", r.load), ("reading", r.reading), ("time", r.time[:, None])):
-        bad = ~np.isfinite(values)
-        if bad.any():
-            column = int(np.flatnonzero(bad.any(0))[0])
-            name = what if what == "time" else f"{what} {r.names[column]}"
-            raise BadInputError(
-                f"read loads: {name} has {int(bad[:, column].sum())} values that are no numbers"
-            )
-    if np.any(np.diff(r.time)[np.diff(r.record) == 0] < 0.0):
-        raise BadInputError("read loads: time does not rise; needs seconds in the order of recording")
-    notes: list[str] = []
-    moved = np.ptp(r.load, axis=0) > 1e-3 * model.base.full
-    if not moved.any():
-        raise BadInputError("read loads: no load changes by a thousandth of full range; apply known loads")
-    for n, here in zip(r.names, moved, strict=True):
-        if not here:
-            notes.append(f"{n} was never loaded: its gain and what it gives to others are not judged")
-    for i, n in enumerate(r.names):
-        if np.ptp(r.reading[:, i]) == 0.0:
-            raise BadInputError(
-                f"read loads: reading {n} is constant at {r.reading[0, i]:g} {unit_of(n)}; the component is dead or "
-                "the wrong column was named"
-            )
-    _check_match(r, model, moved)
-    return notes
-
-
-def _check_match(r: ForceRecords, model: SensorModel, moved: NDArray[np.bool_]) -> None:
-    loads = Loads(r.load / model.base.full, r.time - r.time[0], np.zeros(len(r.time)), r.record)
-    said = readings(model.belief(), loads) * model.base.full
-    said, got = said - said.mean(0), r.reading - r.reading.mean(0)
-    like = []
-    for i in np.flatnonzero(moved):
-        n, s, g = r.names[i], said[:, i], got[:, i]
-        correlation = float(s @ g / np.sqrt((s @ s) * (g @ g) + 1e-300))
-        like.append(abs(correlation))
-        if abs(correlation) < LEAST_LIKE:
-            continue
-        scale = float(s @ g / (s @ s))
-        if scale < 0.0:
-            raise BadInputError(
-                f"compare readings with loads: {n} falls when its load rises; the sign of one of them is turned round"
-            )
-        if not 1.0 / FACTOR < scale < FACTOR:
-            raise BadInputError(
-                f"compare readings with loads: {n} reads {scale:.4g} times its load (about "
-                f"{10.0 ** round(np.log10(scale)):g}); check the units (N against mN or kN, N m against N mm)"
-            )
-    if np.median(like) < LEAST_LIKE:
-        raise BadInputError(
-            f"compare readings with loads: they agree to {100 * float(np.median(like)):.0f} % (correlation); it is "
-            "another sensor, or columns are exchanged"
-        )
 
 
 def reconcile(records: ForceRecords, model: SensorModel, options: Options | None = None) -> SensorVerdict:

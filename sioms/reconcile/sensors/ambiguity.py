@@ -5,20 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sioms.reconcile import rules
-from sioms.reconcile.ambiguity import ALIKE, AMBIGUOUS, SWAPS
+from sioms.reconcile.ambiguity import ALIKE, AMBIGUOUS
 from sioms.reconcile.blocks import better
-from sioms.reconcile.sensors.effect import TERM_PREFIX, SensorEffect
-from sioms.reconcile.sensors.fit import Fit
+from sioms.reconcile.effect import TERM_PREFIX
+from sioms.reconcile.sensors.effect import SensorEffect
+from sioms.reconcile.sensors.excitation import FELT
+from sioms.reconcile.sensors.fit import Fit, refit
 from sioms.reconcile.sensors.plausible import alike, physical
 from sioms.reconcile.sensors.screen import screen
-from sioms.reconcile.sensors.search import Found, Searcher, Step
+from sioms.reconcile.sensors.search import Found, Searcher
 
 Rival = rules.Rival[Fit]
 
 PATIENCE = 30  # steps of a look-alike's fit: one that stopped short would be ruled out
-FELT = 3.0  # standard deviations that an element's own number must make
 ELSEWHERE = (-3.0, -1.0, 1.0, 3.0)  # natural sizes at which numbers of the elements' own begin again
 
 
@@ -26,27 +28,19 @@ def settle(
     searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]]
 ) -> tuple[Found, list[Rival]]:
     """Find the rivals; where one of no more numbers does better than what is named, search on from it."""
-    others = rivals(searcher, found, pairs)
     lib, count = found.fit.model.library, found.fit.model.count
-    for _ in range(SWAPS):
-        best = next(
-            (r for r in others if r.missed < 0.0 and lib[r.rival].size(count) <= lib[r.effect].size(count)),
-            None,
-        )
-        if best is None:
-            break
-        searcher.progress(f"{best.rival} does better than {best.effect}: searching on from it")
-        further = searcher.run(best.fit.model)
-        step = Step(
-            "swap",
-            f"{best.effect} to {best.rival}",
-            searcher.ratio(best.fit),
-            1.0 - best.fit.cost / found.fit.cost,
-            best.fit.model,
-        )
-        found = Found(further.fit, further.losses, (*found.ladder, step, *further.ladder[1:]))
-        others = rivals(searcher, found, pairs)
-    return found, others
+
+    def wins(r: Rival, found: Found) -> bool:
+        return r.missed < 0.0 and lib[r.rival].size(count) <= lib[r.effect].size(count)
+
+    return rules.settle(
+        found,
+        lambda f: rivals(searcher, f, pairs),
+        wins,
+        searcher.run,
+        searcher.ratio,
+        searcher.progress,
+    )
 
 
 def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]] = ()) -> list[Rival]:
@@ -68,25 +62,24 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
         for other in alike(lib, name, count):
             if other.startswith(TERM_PREFIX) or not lib[other].rankable or other in found.fit.model.effects:
                 continue
+            one_trace = frozenset((name, other)) in same
             for start in screen(searcher.data, bare, searcher.weights, lib[other], searcher.frozen)[:2]:
                 fit = searcher.fit(searcher.switched_on(bare, start), PATIENCE)
-                if frozenset((name, other)) in same:
+                if one_trace:
                     fit = searcher.restarted(fit, _elsewhere(lib[other]))
                 if physical(fit.model, other):
                     _, errors = better(found.losses, searcher.loss(fit))
                     missed = (fit.cost - found.fit.cost) / contribution
-                    if (
-                        frozenset((name, other)) in same
-                        and lib[name].primary.each
-                        and lib[other].primary.each
-                    ):
-                        missed = min(missed, max(_missed_by_most(searcher, found.fit, bare, fit), 0.0))
+                    if one_trace and lib[name].primary.each and lib[other].primary.each:
+                        missed = min(
+                            missed, max(_missed_by_most(searcher, found.fit, bare, fit, name, other), 0.0)
+                        )
                     out.append(
                         Rival(
                             name,
                             other,
                             missed,
-                            ALIKE if frozenset((name, other)) in same else AMBIGUOUS,
+                            ALIKE if one_trace else AMBIGUOUS,
                             errors,
                             fit.cost / found.fit.cost - 1.0,
                             fit,
@@ -95,12 +88,37 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
     return rules.closest(out)
 
 
-def _missed_by_most(searcher: Searcher, good: Fit, bare: Fit, rival: Fit) -> float:
-    """Return the share that a rival misses at the middle one of the elements: one that tells its kind does not for the others."""
-    own = searcher.squares(bare) - searcher.squares(good)
+def _missed_by_most(searcher: Searcher, good: Fit, bare: Fit, rival: Fit, name: str, other: str) -> float:
+    """Return the share that a rival misses at the middle one of the elements: one that tells its kind does not for the others.
+
+    What one element misses spoils the fit of its neighbours: while the middle one misses much, the worst keeps the number it was named
+    with, and the others are fitted again.
+    """
+    least, own = searcher.squares(good), searcher.squares(bare) - searcher.squares(good)
     felt = own > FELT**2
-    missed = (searcher.squares(rival) - searcher.squares(good))[felt] / own[felt]
-    return float(np.median(missed)) if len(missed) else np.inf
+    telling = np.zeros(len(own), dtype=bool)
+    middle = np.inf
+    while np.any(felt & ~telling):
+        beyond = np.where(telling, np.inf, searcher.squares(rival) - least)
+        middle = float(np.median(beyond[felt] / own[felt]))
+        if middle < ALIKE or 2 * np.count_nonzero(telling) >= np.count_nonzero(felt):
+            break
+        telling[int(np.argmax(np.where(felt & ~telling, beyond, -np.inf)))] = True
+        rival = _kept(searcher, good, rival, name, other, telling)
+    return middle
+
+
+def _kept(searcher: Searcher, good: Fit, rival: Fit, name: str, other: str, which: NDArray[np.bool_]) -> Fit:
+    """Refit a rival beside what some of the elements keep of what was named."""
+    model = rival.model
+    for effect, values, here in (
+        (name, good.model.effects[name], which),
+        (other, model.effects[other], ~which),
+    ):
+        first = model.library[effect].primary.symbol
+        kept = np.where(here, values[first], model.library[effect].neutral)
+        model = model.with_effect(effect, {**values, first: kept})
+    return refit(searcher.data, model, searcher.weights, (*searcher.frozen, name), PATIENCE)
 
 
 def _elsewhere(effect: SensorEffect) -> list[tuple[str, str, float]]:

@@ -11,22 +11,21 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sioms.reconcile.excitation import SAME
 from sioms.reconcile.locate import Place
 from sioms.reconcile.noise import effective_samples
 from sioms.reconcile.rules import GAIN, negligible, told_apart
 from sioms.reconcile.sensors.ambiguity import Rival, settle
-from sioms.reconcile.sensors.effect import TERM_PREFIX, Array, SensorEffect, SensorModel
+from sioms.reconcile.sensors.effect import Array, SensorEffect, SensorModel
+from sioms.reconcile.sensors.excitation import gate
 from sioms.reconcile.sensors.fit import Fit, half_intervals, on_one_footing, ratios, refit
 from sioms.reconcile.sensors.locate import locate
 from sioms.reconcile.sensors.refuse import burst_share, smoother_shares
-from sioms.reconcile.sensors.screen import screening_columns
 from sioms.reconcile.sensors.search import Found, Searcher
 from sioms.reconcile.sensors.stand_ins import credible, displaced, ruled
 from sioms.reconcile.sensors.steady import changes
 from sioms.reconcile.sensors.subject import Subject
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
-from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome
+from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome, apart
 
 UNEXPLAINED = 0.2  # share that a generic smoother explains beyond the named model: something is missing
 LEAST_ODD = 1.15  # multiple of the floor below which nothing is called unexplained
@@ -35,8 +34,6 @@ QUIET = 1.6
 UNSTEADY = 0.5  # share by which an effect may change along a variable
 SURELY = 2.0  # half intervals by which a change must differ from none
 REFUSED = 3  # names that are refused one after the other
-LARGEST = 30.0  # natural sizes that an effect may have to be searched for
-LEAST_TRACE = 6.0  # an effect of natural size must change the rows by this many standard deviations in all
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,47 +136,6 @@ def _unsteady(subject: Subject, searcher: Searcher, found: Found, names: Sequenc
     seen = changes(subject.training, found.fit, searcher.weights, names, subject.variables(subject.training))
     sure = [c for c in seen if abs(c.share) > max(UNSTEADY, SURELY * c.half)]
     return (max(sure, key=lambda c: abs(c.share) / c.half).effect,) if sure else ()
-
-
-def gate(subject: Subject) -> tuple[dict[str, str], tuple[tuple[str, str, float], ...], tuple[str, ...]]:
-    """Score the records before fitting.
-
-    Returns:
-        Effects that are not excited, pairs that these records cannot tell apart, and what is worth a try: an effect that would
-        not show at its natural size may be larger.
-    """
-    model, data = subject.model, subject.training
-    columns = {n: screening_columns(data, model, model.library[n]) for n in subject.names}
-    trace = {n: float(np.linalg.norm(c)) for n, c in columns.items()}
-    missing = {n: model.library[n].separate for n in columns if trace[n] < LEAST_TRACE}
-    names = tuple(n for n in columns if trace[n] * _largest(model.library[n]) > LEAST_TRACE)
-    pairs = []
-    shown = [n for n in columns if n not in missing]
-    for i, a in enumerate(shown):
-        for b in shown[i + 1 :]:
-            own, other = model.library[a], model.library[b]
-            alike = (
-                (b in own.lookalikes or a in other.lookalikes)
-                and b not in own.replaces
-                and a not in other.replaces
-            )
-            if alike and columns[a].shape[1] == columns[b].shape[1]:
-                same = min(_shared(columns[a], columns[b]), _shared(columns[b], columns[a]))
-                if same > SAME:
-                    pairs.append((a, b, same))
-    return missing, tuple(sorted(pairs, key=lambda p: -p[2])), names
-
-
-def _largest(effect: SensorEffect) -> float:
-    """How many times its natural size an effect may have."""
-    q = effect.primary
-    return min(max(q.upper - effect.neutral, effect.neutral - q.lower) / q.size, LARGEST)
-
-
-def _shared(a: Array, b: Array) -> float:
-    """Share of the energy of a's columns that lies in the span of b's; of elements that hardly feel either, hardly any."""
-    q = np.linalg.qr(b[:, np.linalg.norm(b, axis=0) > 0.0])[0]
-    return float(np.sum((q.T @ a) ** 2) / np.sum(a**2))
 
 
 def _odd(searcher: Searcher, found: Found, share: float, view: str) -> bool:
@@ -286,7 +242,7 @@ def _gaps(subject: Subject, before: SensorModel, after: SensorModel) -> tuple[Ga
         if mine.any():
             v = told[name]
             was, left = (v.floor * float(np.sqrt(np.mean(e[mine] ** 2))) for e in (old, new))
-            out.append(Gap(v.title, v.unit, was, left, v.floor))
+            out.append(Gap(v.title, v.unit, was, left, min(v.floor, left)))
     return tuple(out)
 
 
@@ -334,11 +290,7 @@ def _describe(
             )
         )
     out.sort(key=lambda e: -e[0])
-    ordered = [e for _, e in out]
-    return (
-        [e for e in ordered if not e.name.startswith(TERM_PREFIX)],
-        [e for e in ordered if e.name.startswith(TERM_PREFIX)],
-    )
+    return apart(e for _, e in out)
 
 
 def _estimates(

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.reconcile.effect import Channel
+from sioms.reconcile.effect import TERM_PREFIX, Channel
 
 Array = NDArray[np.float64]
 Values = Mapping[str, Array]
-TERM_PREFIX = "term_"
 
 
 @dataclass(frozen=True, slots=True)

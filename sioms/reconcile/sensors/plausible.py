@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sioms.reconcile.sensors.effect import TERM_PREFIX, SensorEffect, SensorModel
+from sioms.reconcile.effect import TERM_PREFIX
+from sioms.reconcile.sensors.effect import SensorEffect, SensorModel
 
 MOST_INSIDE = 0.7  # share of the elements whose own number must be one that the effect can have
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from sioms.reconcile import ladder
 from sioms.reconcile.blocks import better, heldout
+from sioms.reconcile.effect import TERM_PREFIX
 from sioms.reconcile.rules import GAIN, NEARLY, SPECIFIC, SURE, negligible
-from sioms.reconcile.sensors.effect import TERM_PREFIX, Array, SensorModel
+from sioms.reconcile.sensors.effect import Array, SensorModel
 from sioms.reconcile.sensors.fit import Data, Fit, on_one_footing, ratios, refit
 from sioms.reconcile.sensors.plausible import family, physical, termed, without
 from sioms.reconcile.sensors.screen import Start, screen

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sioms.reconcile.axis import Options, analyse
+from sioms.reconcile.axis import analyse
 from sioms.reconcile.checks import check
 from sioms.reconcile.gaps import lap, lap_floor
 from sioms.reconcile.model import AxisModel, Controller
+from sioms.reconcile.prepare import Options
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.simulate import simulate
 from sioms.reconcile.verdict import BadInputError, Outcome
@@ -56,10 +57,21 @@ BAD = {
     "constant force": (lambda r: replace(r, force=np.ones(len(r))), "force is constant"),
     "constant command": (lambda r: replace(r, command=np.zeros(len(r))), "command is constant"),
     "constant current": (lambda r: replace(r, force_measured=np.ones(len(r))), "force_measured is constant"),
-    "not a number": (
-        lambda r: replace(r, position=np.where(np.arange(len(r)) == 5, np.nan, r.position)),
-        "no numbers",
+    "hardly a number": (
+        lambda r: replace(r, force_measured=np.where(np.arange(len(r)) % 10 > 0, np.nan, r.force_measured)),
+        "2700 of 3000 values that are no numbers",
     ),
+    "no motion beside a command": (lambda r: replace(r, position=np.full(len(r), 0.3)), "no motion"),
+    "force in milliamperes beside its limit": (lambda r: replace(r, force=r.force * 1000), "factor of 1000"),
+    "current in other units": (
+        lambda r: replace(r, force_measured=r.force_measured * 1e-3),
+        "0.001 times .* factor of 1000",
+    ),
+    "current of half the size": (
+        lambda r: replace(r, force_measured=r.force_measured * 0.5),
+        "times the commanded",
+    ),
+    "current of the other sign": (lambda r: replace(r, force_measured=-r.force_measured), "-1 times"),
     "jumping time": (_jump, "time jumps"),
     "milliseconds as seconds": (lambda r: replace(r, time_s=r.time_s * 1000), "another unit"),
     "saturated throughout": (lambda r: replace(r, force=np.where(r.force > 0, 1.8, -1.8)), "at its limit"),
@@ -78,7 +90,16 @@ def test_bad_records_are_refused(case: str) -> None:
         check(Session((change(GOOD),)), AXIS)
 
 
-@pytest.mark.parametrize(("factor", "says"), [(1000.0, "1000"), (1e-3, "0.001"), (-1.0, "sign")])
+def test_a_saturated_or_late_drive_is_no_other_scale() -> None:
+    limited = np.clip(GOOD.force, -0.4, 0.4) * np.where(np.abs(GOOD.force) > 0.8, 0.99, 1.0)
+    for measured in (limited, np.concatenate([np.zeros(15), GOOD.force[:-15]])):
+        check(Session((replace(GOOD, force_measured=measured),)), AXIS)
+
+
+@pytest.mark.parametrize(
+    ("factor", "says"),
+    [(1000.0, "1000"), (1e-3, "1000"), (-1.0, "sign"), (180.0 / np.pi, "degrees"), (1 / 9.81, "kgf")],
+)
 def test_force_in_wrong_units_is_recognised(factor: float, says: str) -> None:
     limit = replace(AXIS.controller, limit=1e9)  # type: ignore[type-var]
     bad = replace(GOOD, force=GOOD.force * factor, force_measured=GOOD.force_measured * factor)  # type: ignore[operator]

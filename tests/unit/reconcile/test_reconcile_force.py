@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sioms.plant.force_sensor import Contact, Flaws, ForceSensor
+from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.force.belief import Loads, lagged, late, readings
 from sioms.reconcile.force.model_file import from_table, to_toml
-from sioms.reconcile.force.subject import ForceRecords, prepare
+from sioms.reconcile.force.records import ForceRecords
+from sioms.reconcile.force.subject import prepare
 from sioms.reconcile.force.twin import ForceTwin
 from sioms.reconcile.sensors.analyse import Options, analyse
 from sioms.reconcile.sensors.search import Saving, Searcher
@@ -255,7 +258,7 @@ def times(name: str, factor: float) -> Callable[[dict[str, np.ndarray]], None]:
 
 
 def _nan(a: dict[str, np.ndarray]) -> None:
-    a["fy"][7] = np.nan
+    a["fy"][::3] = np.nan
 
 
 def _constant(a: dict[str, np.ndarray]) -> None:
@@ -280,9 +283,9 @@ def _other(a: dict[str, np.ndarray]) -> None:
 
 @pytest.mark.parametrize(("change", "said"), [
     (times("fx", 1000.0), "(about 1000)"),
-    (times("load_tz", 1000.0), "(about 0.001)"),
+    (times("load_tz", 1000.0), "times its full_range"),
     (times("fx", -1.0), "turned round"),
-    (_nan, "reading fy has 1 values that are no numbers"),
+    (_nan, "reading fy has 288 of 864 values that are no numbers"),
     (_constant, "reading fz is constant"),
     (_short, "rows are too few"),
     (_unloaded, "no load changes"),
@@ -320,3 +323,43 @@ def test_files_that_make_no_sense_are_refused(
     assert old in text
     path.write_text(text.replace(old, new))
     assert said in run(folder, capsys)
+
+
+THREE = {"sensor": {"components": ["fx", "fy", "fz"], "full_range": [100.0] * 3}}
+
+
+def honest(**change: object) -> ForceRecords:
+    """A sensor that reads what it is loaded with, but for what is changed."""
+    records = staircase(3)
+    noise = np.random.default_rng(9).normal(0.0, 0.05, records.load.shape)
+    return replace(replace(records, reading=records.load + noise), **change)  # type: ignore[arg-type]
+
+
+GIVEN = honest()
+WRONG = {
+    "millinewton": (GIVEN.reading * np.array([1.0, 1e3, 1.0]), GIVEN.load, "fy reads 1000 times"),
+    "kilogram-force": (GIVEN.reading / 9.81, GIVEN.load, "fx reads 0.1019 times"),
+    "exchanged": (GIVEN.reading[:, [1, 0, 2]], GIVEN.load, "fx does not go with .* that of fy"),
+    "turned round": (GIVEN.reading * np.array([1.0, 1.0, -1.0]), GIVEN.load, "fz falls"),
+    "another range": (GIVEN.reading * 1e-3, GIVEN.load * 1e-3, "times its full_range of 100"),
+}
+
+
+@pytest.mark.parametrize("case", sorted(WRONG))
+def test_columns_that_do_not_belong_together_are_no_flaw_of_the_sensor(case: str) -> None:
+    reading, load, said = WRONG[case]
+    with pytest.raises(BadInputError, match=said):
+        prepare(honest(reading=reading, load=load), from_table(THREE, "x")[0])
+
+
+def test_rows_without_numbers_or_time_are_told() -> None:
+    torn = GIVEN.reading.copy()
+    torn[[3, 30], 1] = np.nan
+    subject = prepare(honest(reading=torn, time=np.full(len(torn), np.nan)), from_table(THREE, "x")[0])
+    assert len(subject.records.load) == len(torn) - 2
+    assert any("no time" in n for n in subject.notes) and any("2 of 63" in n for n in subject.notes)
+
+
+def test_a_model_file_keeps_the_names_of_the_components() -> None:
+    table = {"sensor": {"components": ["load"], "full_range": [100.0]}}
+    assert from_table(tomllib.loads(to_toml(from_table(table, "x")[0])), "x")[1] == ("load",)

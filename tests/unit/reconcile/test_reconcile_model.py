@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from sioms.reconcile.kernel import summed
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.model_file import model_from, write_model
 from sioms.reconcile.records import Record, Session
+from sioms.reconcile.screen import shapes
 from sioms.reconcile.simulate import pack, simulate
 from sioms.reconcile.verdict import BadInputError
 from sioms.tools.reconcile_input import read_data, read_model
@@ -23,6 +25,7 @@ from sioms.tools.reconcile_input import read_data, read_model
 AXIS = AxisModel(
     True, 1e-3, 2e-3, 1e-3, 1e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)
 )
+AXES = Path(__file__).parents[2] / "physics" / "reconcile_axes"
 #: The list of the specification: every one of these must be nameable.
 DEMANDED = {
     "viscous",
@@ -185,6 +188,37 @@ def test_a_controller_is_checked_and_may_have_no_limit() -> None:
         model_from(axis | {"controller": {k: v for k, v in none.items() if k != "kb"}})
     with pytest.raises(ValueError, match="limit is 0"):
         model_from(axis | {"controller": none | {"limit": 0.0}})
+
+
+@pytest.mark.parametrize(("marks", "first"), [(1, 2.0), (100, 1.0)])
+def test_cogging_of_one_period_in_a_turn_of_the_axis_is_gravity_and_not_tried(
+    marks: int, first: float
+) -> None:
+    model = replace(AXIS, pitch=2.0 * np.pi / marks)
+    tried = [s["n"] for s in shapes(known()["cogging"], model, (0.0, 7.0))]
+    assert tried[0] == first
+    assert len(set(tried)) == 61 - first
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"inertia": "a"}, "inertia is 'a'; needs a finite number"),
+        ({"kind": "round"}, "rotary or linear"),
+        ({"controller": 3}, "controller is 3; needs a table"),
+        ({"max_acceleration": None}, "has no max_acceleration"),
+    ],
+)
+def test_a_nominal_json_is_checked_as_a_model_file_is(
+    tmp_path: Path, change: dict[str, object], says: str
+) -> None:
+    given = json.loads((AXES / "s05" / "nominal.json").read_text())
+    path = tmp_path / "nominal.json"
+    path.write_text(json.dumps(given))
+    assert read_model(path).rated_force == pytest.approx(given["inertia"] * given["max_acceleration"])
+    path.write_text(json.dumps(given | change))
+    with pytest.raises(BadInputError, match=says):
+        read_model(path)
 
 
 def test_gravity_comes_once_a_turn_of_the_axis_however_many_marks_a_turn_has() -> None:

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sioms.reconcile.axis import Options, prepare
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.plausible import physical
+from sioms.reconcile.prepare import Options, prepare
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.screen import SLOW_HZ, instrument_motion
 from sioms.reconcile.search import Searcher

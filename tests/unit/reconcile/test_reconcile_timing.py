@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,3 +62,30 @@ def test_stamps_of_another_clock_are_left_for_the_check() -> None:
     backwards = np.arange(N) * DT
     backwards[3000:] -= 0.5
     assert places(backwards, DT) is None
+
+
+def test_stamps_in_whole_steps_that_come_late_hide_no_sample() -> None:
+    late = np.round(np.arange(N) + np.random.default_rng(3).uniform(0.0, 0.7, N)) * DT
+    assert np.any(np.diff(late) == 0.0)
+    session, notes = on_grid(Session((_record(late, np.arange(N)),)), DT)
+    np.testing.assert_allclose(session.records[0].position, np.sin(7.0 * DT * np.arange(N)), atol=1e-12)
+    assert session.records[0].filled is None
+    assert "jitter" in notes[0]
+
+
+def test_rows_that_stand_twice_count_once() -> None:
+    rows = np.sort(np.concatenate([np.arange(N), [500, 3000, 3001, 5000]]))
+    session, notes = on_grid(Session((_record(np.arange(N) * DT, rows),)), DT)
+    np.testing.assert_allclose(session.records[0].position, np.sin(7.0 * DT * np.arange(N)), atol=1e-12)
+    assert "4 rows" in notes[0]
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_values_that_are_no_numbers_are_lost_samples(stamped: bool) -> None:
+    whole = _record(np.arange(N) * DT, np.arange(N))
+    position = whole.position.copy()
+    position[[100, 101, 2500]] = np.nan
+    torn = replace(whole, position=position, time_s=whole.time_s if stamped else None)
+    session, notes = on_grid(Session((torn,)), DT)
+    np.testing.assert_allclose(session.records[0].position, whole.position, atol=1e-6)
+    assert "3 of 6000" in notes[0]

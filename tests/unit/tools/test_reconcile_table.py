@@ -41,6 +41,14 @@ def test_dialects_of_one_table_are_one_record(tmp_path: Path, text: str, encodin
     np.testing.assert_allclose(r.time_s, [0.0, 1e-3, 2e-3])
 
 
+@pytest.mark.parametrize("day", ["2024-02-01 ", "01.02.2024 ", "2024-02-01T", ""])
+def test_a_time_of_day_is_seconds(tmp_path: Path, day: str) -> None:
+    rows = "".join(f"{day}12:30:{9.999 + 1e-3 * i:06.3f};{i};0,5\n".replace(".", ",") for i in range(3))
+    (r,) = read_data(_folder(tmp_path, "t;pos [deg];M [Nm]\n" + rows), AXIS).records
+    assert r.time_s is not None
+    np.testing.assert_allclose(r.time_s, 45009.999 + 1e-3 * np.arange(3), atol=1e-9)
+
+
 @pytest.mark.parametrize(("head", "columns", "said"), [
     ("t [ms];pos [rpm];M [Nm]", COLUMNS, "rpm is a unit of speed"),
     ("t [ms];pos [mm];M [Nm]", COLUMNS, "mm is a unit of length"),

@@ -1,0 +1,228 @@
+"""From what a search ended with to a verdict: figures on untouched samples, intervals, evidence, what to say and to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import binom
+
+from sioms.reconcile.ambiguity import Rival
+from sioms.reconcile.bounces import bent, rattles
+from sioms.reconcile.effect import Array
+from sioms.reconcile.evidence import describe, spans_of
+from sioms.reconcile.excitation import Gate
+from sioms.reconcile.experiment import Envelope, Experiment, separate
+from sioms.reconcile.fit import Fit, Problem, refit
+from sioms.reconcile.gaps import measure, rungs, session_states
+from sioms.reconcile.locate import Place, Spectrum, locate, spectra
+from sioms.reconcile.model import AxisModel
+from sioms.reconcile.noise import effective_samples
+from sioms.reconcile.prepare import Options, Prepared
+from sioms.reconcile.records import Session
+from sioms.reconcile.refuse import loud_turns
+from sioms.reconcile.search import Found, Searcher
+from sioms.reconcile.session import State
+from sioms.reconcile.simulate import replay
+from sioms.reconcile.timed import as_recorded
+from sioms.reconcile.verdict import Gap, Outcome, Trace, Verdict
+
+#: A generic smoother explaining this share more than the named model: something is missing.
+UNEXPLAINED = 0.2
+#: Loudest tenth of the time holds this share of the residual's energy: bursts.
+BURSTS = 0.8
+#: A residual beyond this multiple of the expected innovation is no noise, whatever it looks like.
+LARGE = 3.0
+#: So large a share of the bursts at turns of the motion belongs to them, if chance brings it no oftener than this.
+MOSTLY, CHANCE = 0.5, 0.01
+#: Below these multiples of the expected innovation nothing is called unexplained, or a burst.
+LEAST_ODD = 1.25
+QUIET = 1.6
+#: It is said where the closed loop is beyond this multiple of its floor.
+LOOPS = 2.0
+#: Steps of the last fit.
+LAST = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Searched:
+    """What a search ended with.
+
+    Attributes:
+        share: that a generic smoother explains of what remains.
+        rejected: effects that left when nameless terms came in.
+    """
+
+    ready: Prepared
+    excited: Gate
+    searcher: Searcher
+    found: Found
+    share: float
+    rejected: tuple[str, ...]
+
+
+def conclude(s: Searched, nominal: AxisModel, o: Options, others: Sequence[Rival], burst: float) -> Verdict:
+    """Conclude.
+
+    Args:
+        others: look-alikes in the place of what was found.
+        burst: share of the residual's energy above the quiet level that lies in its loudest tenths of a second.
+    """
+    ready, found, rng = s.ready, s.found, np.random.default_rng(o.seed)
+    o.progress("untouched samples: gap before and after")
+    states = session_states(ready.final, found.fit.model)
+    gaps = _gaps(ready, nominal, found.fit.model, states)
+    whole = replace(ready.problem, end=1.0, weights=None)
+    fit = _last(bent(whole, found.fit.model) if rattles(found.fit.model) else whole, s)
+    spans = spans_of(whole, fit, o.replicates, rng)
+    named, terms = describe(ready.findings, fit, found, s.searcher, others, spans, rng)
+    terms += [force.term for force in ready.timed]
+    open_rivals = [r for r in others if r.open]
+    ratio = found.fit.ratio
+    disturbance = ratio > QUIET and burst > BURSTS and s.share < UNEXPLAINED and not rattles(found.fit.model)
+    odd = ratio > LEAST_ODD and s.share > UNEXPLAINED
+    outcome = _outcome(bool(named), bool(terms) or disturbance or ratio > LARGE or odd, bool(open_rivals))
+    notes = [*ready.notes]
+    if disturbance:
+        notes.append(_of_bursts(ready.problem, found.fit, burst))
+    elif ratio > LARGE:
+        notes.append(_of_much(ratio, s.share))
+    elif outcome is not Outcome.UNEXPLAINED:
+        notes += _of_loops(gaps, ratio)
+    open_now = open_rivals if outcome is Outcome.AMBIGUOUS else []
+    places, spectrum, traces = _pictures(ready, whole, nominal, fit.model, o, rng)
+    return Verdict(
+        outcome=outcome,
+        nominal=nominal,
+        model=fit.model,
+        effects=tuple(named),
+        alternatives=tuple(_set(r, fit.model) for r in open_now),
+        symbolic=tuple(terms),
+        gaps=gaps,
+        ladder=found.ladder,
+        rungs=rungs(ready.final, [step.model for step in found.ladder]),
+        findings=ready.findings,
+        gate=s.excited,
+        places=places,
+        spectra=spectrum,
+        experiment=_plan(ready, o, fit.model, open_now) if open_now else None,
+        ratio=ratio,
+        smoother_share=s.share,
+        burst_share=burst,
+        effective_samples=effective_samples(found.fit.residual),
+        samples=len(found.fit.residual),
+        notes=tuple(notes),
+        traces=traces,
+        states=tuple((r.name, q) for r, q in zip(ready.final.session.records, states, strict=True)),
+        rejected=s.rejected,
+    )
+
+
+def _gaps(ready: Prepared, nominal: AxisModel, model: AxisModel, states: Sequence[State]) -> tuple[Gap, ...]:
+    """Measure the gaps; before, nothing was known of a force in time."""
+    gaps = measure(ready.final, nominal, model, states)
+    if not ready.timed or ready.final.session.final:
+        return gaps
+    before = measure(as_recorded(ready.final, ready.timed), nominal, nominal)
+    return tuple(replace(g, before=p.before) for g, p in zip(gaps, before, strict=True))
+
+
+def _last(problem: Problem, s: Searched) -> Fit:
+    """Fit once more to all samples."""
+    model = s.found.fit.model
+    fit = refit(problem, model, s.searcher.frozen, LAST)
+    return replace(fit, model=model) if fit.cost > float(np.sum(problem.residual(model) ** 2)) else fit
+
+
+def _pictures(
+    ready: Prepared,
+    whole: Problem,
+    nominal: AxisModel,
+    model: AxisModel,
+    o: Options,
+    rng: np.random.Generator,
+) -> tuple[tuple[Place, ...], tuple[Spectrum, Spectrum] | None, tuple[Trace, ...]]:
+    """Localise the disagreement, and keep curves, if pictures are wanted."""
+    if not o.pictures:
+        return (), None, ()
+    o.progress("locating the disagreement")
+    plain = as_recorded(whole, ready.timed)
+    places = tuple(locate(plain, nominal, rng))
+    return places, spectra(plain, nominal), _traces((plain, whole), (nominal, model))
+
+
+def _of_much(ratio: float, share: float) -> str:
+    ordered = (
+        f"the state of the axis orders {100 * share:.0f} % of it, in no form that is known"
+        if share > UNEXPLAINED
+        else "no state of the axis orders it"
+    )
+    return f"what remains is {ratio:.1f} times what noise would leave; {ordered}"
+
+
+def _of_bursts(problem: Problem, fit: Fit, burst: float) -> str:
+    """Say what bursts of the residual are, as far as that shows."""
+    text = f"the residual comes in bursts ({100 * burst:.0f} % of its energy in a tenth of the time)"
+    turning, loud, usual = loud_turns(problem, fit)
+    if turning > MOSTLY * loud and binom.sf(turning - 1, loud, usual) < CHANCE:
+        return (
+            f"{text}, {turning} of {loud} where the motion turns, starts or stops (which is {100 * usual:.0f} % of the time): "
+            "play, presliding or stick-slip in a form that no effect of the library has, rather than a disturbance from outside"
+        )
+    return f"{text} that no state of the axis orders: a disturbance from outside, not an effect"
+
+
+def _of_loops(gaps: Sequence[Gap], ratio: float) -> list[str]:
+    """Say what it means that the closed loop is farther from its floor than short windows are."""
+    return [
+        f"in closed loop {g.after / g.floor:.1f} times the floor remains, in short windows {ratio:.2f} times the noise: what is slow and too small for a "
+        "window, or when the axis sticks, differs each time; repeated laps would show the floor of that"
+        for g in gaps
+        if g.channel == "force, closed loop" and g.after > LOOPS * g.floor
+    ]
+
+
+def _outcome(named: bool, unexplained: bool, ambiguous: bool) -> Outcome:
+    if unexplained:
+        return Outcome.UNEXPLAINED
+    if ambiguous:
+        return Outcome.AMBIGUOUS
+    return Outcome.NAMED if named else Outcome.NONE
+
+
+def _set(r: Rival, model: AxisModel) -> tuple[str, ...]:
+    return tuple(r.rival if n == r.effect else n for n in model.effects)
+
+
+def _plan(ready: Prepared, o: Options, model: AxisModel, open_rivals: Sequence[Rival]) -> Experiment | None:
+    """Choose the experiment that separates the model from its open rivals."""
+    envelope = o.envelope or _seen(ready.problem.session, model)
+    return separate([model, *(q.fit.model for q in open_rivals)], envelope, ready.problem.noise.drive)
+
+
+def _seen(session: Session, model: AxisModel) -> Envelope:
+    """Take the travel that the records show, on a rotary axis a little more than a pitch to either side at least."""
+    centre = float(session.records[0].position[0])
+    reach = max(float(np.max(np.abs(r.position - centre))) for r in session.records)
+    return Envelope.of(model, centre, max(reach, 1.1 * model.pitch) if model.rotary else reach)
+
+
+def _traces(problems: tuple[Problem, Problem], models: tuple[AxisModel, AxisModel]) -> tuple[Trace, ...]:
+    """Keep force curves for the pictures, before and after: in closed loop where it can be, else what short windows leave."""
+    curves: list[list[Array]] = []
+    for problem, model in zip(problems, models, strict=True):
+        unit, heat = problem.noise.drive / problem.noise.innovation, 0.0
+        own: list[Array] = []
+        for r, tracked in zip(problem.session.records, problem.runs(model), strict=True):
+            if model.controller is None or r.command is None:
+                own.append(r.force + tracked.innovation * unit)
+                continue
+            run = replay(model, r, heat)
+            heat = run.end_temperature
+            own.append(run.force)
+        curves.append(own)
+    return tuple(
+        Trace(r.name, np.arange(len(r), dtype=np.float64) * models[0].sample_time_s, r.force, before, after)
+        for r, before, after in zip(problems[0].session.records, *curves, strict=True)
+    )
