@@ -110,10 +110,11 @@ class Server:
     def stop_workcell(self, source: str) -> None:
         """Latch the emergency stop and wake every driver."""
         latch = self.shared.latch
-        if latch.stop(time.monotonic_ns(), source):
+        first = latch.stop(time.monotonic_ns(), source)
+        if first:
             self.log("warning", "emergency stop", source=source)
-        elif latch.source == self.shared.request.source:
-            latch.name_source(source)  # the drivers were faster than the message that tells the reason
+        if first or latch.source == self.shared.request.source:
+            latch.name_source(source)  # drivers see the request page with, or before, the message that says why
         for device in self.devices.values():
             device.tell(DriverVerb.STOP_CHANGED)
 

@@ -14,7 +14,7 @@ This is a software stop (category 1 or 2 of IEC 60204-1 at best), not a safety-r
 LATCH_SIZE = 4096
 REQUEST_SIZE = 4096
 _STOPPED, _RESETS, _ALIVE, _ANSWERED = 0, 1, 2, 3
-_TEXT, _TEXT_SIZE = 64, 256
+_TEXT, _NAMED, _TEXT_SIZE = 64, 320, 256
 
 
 class Latch:
@@ -47,20 +47,20 @@ class Latch:
 
     @property
     def source(self) -> str:
-        """Who stopped and why."""
-        return bytes(self._bytes[_TEXT : _TEXT + _TEXT_SIZE]).split(b"\0")[0].decode("utf-8", "replace")
+        """Who stopped and why; what the daemon knows of it goes before what a driver saw."""
+        return self._text(_NAMED) or self._text(_TEXT)
 
     def stop(self, now_ns: int, source: str) -> bool:
         """Latch the stop; return whether it was not latched before."""
         if self._words[_STOPPED]:
             return False
-        self.name_source(source)
+        self._set_text(_TEXT, source)
         self._words[_STOPPED] = now_ns
         return True
 
     def name_source(self, source: str) -> None:
-        """Say better who stopped, of a stop that is latched already."""
-        self._bytes[_TEXT : _TEXT + _TEXT_SIZE] = source.encode()[: _TEXT_SIZE - 1].ljust(_TEXT_SIZE, b"\0")
+        """Say better who stopped (the daemon's alone: a driver that latches at the same time cannot undo it)."""
+        self._set_text(_NAMED, source)
 
     @property
     def answered_request(self) -> int:
@@ -76,10 +76,17 @@ class Latch:
         self._words[_ANSWERED] = request
         self._words[_RESETS] += 1
         self._words[_STOPPED] = 0
+        self._set_text(_NAMED, "")
 
     def daemon_alive(self, now_ns: int) -> None:
         """Stamp the daemon's loop as alive."""
         self._words[_ALIVE] = now_ns
+
+    def _text(self, at: int) -> str:
+        return bytes(self._bytes[at : at + _TEXT_SIZE]).split(b"\0")[0].decode("utf-8", "replace")
+
+    def _set_text(self, at: int, text: str) -> None:
+        self._bytes[at : at + _TEXT_SIZE] = text.encode()[: _TEXT_SIZE - 1].ljust(_TEXT_SIZE, b"\0")
 
     def release(self) -> None:
         """Drop the views, so that the mapping can be closed."""
