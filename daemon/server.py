@@ -114,7 +114,9 @@ class Server:
         if first:
             self.log("warning", "emergency stop", source=source)
         if first or latch.source == self.shared.request.source:
-            latch.name_source(source)  # drivers see the request page with, or before, the message that says why
+            latch.name_source(
+                source
+            )  # drivers see the request page with, or before, the message that says why
         for device in self.devices.values():
             device.tell(DriverVerb.STOP_CHANGED)
 
