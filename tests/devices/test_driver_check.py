@@ -84,7 +84,10 @@ def broken() -> dict[str, tuple[int, dict[str, dict[str, Any]], str]]:
 
     def one(name: str) -> tuple[int, dict[str, dict[str, Any]], str]:
         more = ["--full"] if name == "hasty" else []  # a late reply must meet the request after the next
-        status, reports, said = run(str(AUTHORS / f"{name}.py"), "--only", trials_of[name], *more)
+        for _ in range(2):  # without a report the machine was too busy for the check to begin
+            status, reports, said = run(str(AUTHORS / f"{name}.py"), "--only", trials_of[name], *more)
+            if reports and reports[0]["trials"]:
+                break
         return status, {t["name"]: t for t in reports[0]["trials"]} if reports else {}, said
 
     with ThreadPoolExecutor(len(trials_of)) as pool:
@@ -106,7 +109,8 @@ def test_a_driver_that_dies_on_noise_fails() -> None:
 
 def test_a_driver_that_takes_a_late_reply_for_the_next_fails() -> None:
     status, trials, said = broken()["hasty"]
-    assert status == 1 and "readings were wrong" in trials["late"]["seen"], said
+    assert status == 1 and "late" in trials, said
+    assert "readings were wrong" in trials["late"]["seen"], said
     assert any("late" in line for line in trials["late"]["traffic"]), "the bytes concerned"
 
 

@@ -279,7 +279,9 @@ def test_a_client_cannot_block_its_driver_by_the_wake_pipe(daemon: Daemon, cell:
         )
         assert daemon.device("mod0")["generation"] == 1
         statistics = node.statistics(5000)
-        assert statistics["skipped"] - skipped < 50, statistics
+        assert statistics["skipped"] - skipped < 500, (
+            f"a driver that waits for a wake skips nearly all: {statistics}"
+        )
         assert len(os.read(wake, 1 << 16)) == 4096
 
 
