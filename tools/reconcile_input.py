@@ -3,6 +3,7 @@
 Column description (``columns.toml`` beside the data, or ``--columns``)::
 
     sample_time_s = 0.001            # or a time column
+    loop_time_s = 0.000125           # optional: period of the loop that makes the force, where the log is slower
     files = ["run1.csv", "run2.npz"] # optional; else every data file of the folder, by name
     continuous = true                # heat carries over from file to file
     final = ["run9.csv"]             # optional: whole records that only the final statement sees
@@ -110,12 +111,18 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
         )
     where = f"read {description}"
     table = parsed(description.read_bytes(), where)
-    only(table, ("sample_time_s", "files", "continuous", "final", "columns"), where)
+    only(table, ("sample_time_s", "loop_time_s", "files", "continuous", "final", "columns"), where)
     columns_of = columns_in(table, "columns", QUANTITIES, where)
     given = number(table, "sample_time_s", where, model.sample_time_s)
     if not 0.98 < given / model.sample_time_s < 1.02:
         raise BadInputError(
             f"read {description}: sample_time_s is {given:g}, the model says {model.sample_time_s:g}; needs the same"
+        )
+    loop = number(table, "loop_time_s", where, None) if "loop_time_s" in table else None
+    if loop is not None and not 0.0 < loop <= 1.02 * model.sample_time_s:
+        raise BadInputError(
+            f"{where}: loop_time_s is {loop:g}; needs the period of the loop that makes the force, more than 0 and at most the "
+            f"{model.sample_time_s:g} between two rows"
         )
     continuous = truth(table, "continuous", where, True)
     last = [folder / n for n in words(table, "final", where, "names of files") or ()]
@@ -129,7 +136,7 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
             raise BadInputError(
                 f"read {data}: no file has a column {columns_of[quantity]['name']!r} for {quantity}"
             )
-    return Session(records, continuous, final)
+    return Session(records, continuous, final, loop)
 
 
 def _files(data: Path) -> list[Path]:

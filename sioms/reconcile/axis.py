@@ -23,7 +23,7 @@ from sioms.reconcile.effects.terms import TERMS
 from sioms.reconcile.excitation import Gate, gate
 from sioms.reconcile.fit import refit
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.prepare import Options, Prepared, prepare
+from sioms.reconcile.prepare import Options, Prepared, prepare, reread
 from sioms.reconcile.records import Session
 from sioms.reconcile.refuse import bursts, smoother_share
 from sioms.reconcile.rules import SPECIFIC, SURE
@@ -59,8 +59,11 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
         BadInputError: the data cannot be used.
     """
     o = options or Options()
-    nominal = with_resolution(nominal, session)
-    s = _explained(prepare(session, nominal, o), o)
+    ready = prepare(session, with_resolution(nominal, session), o)
+    s = _explained(ready, o)
+    if (other := reread(s.ready, s.found.fit.model, s.searcher.frozen, o)) is not None:
+        o.progress("the force is not held from row to row: searching anew")
+        s = _explained(other, o)
     for _ in range(AGAIN):
         if (force := _changed(s)) is None:
             break
@@ -73,7 +76,7 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
     if found is not s.found:
         s = replace(s, found=found, share=smoother_share(s.ready.problem, found.fit))
         burst = bursts(s.ready.problem, found.fit)
-    return conclude(s, nominal, o, others, burst)
+    return conclude(s, o, others, burst)
 
 
 def _plain(s: Searched) -> Searched:
@@ -126,7 +129,9 @@ def _changed(s: Searched) -> Timed | None:
     """
     model = s.found.fit.model
     odd = s.found.fit.ratio > LEAST_ODD
-    if not (odd or warm(model)):
+    if (
+        not (odd or warm(model)) or s.ready.points
+    ):  # what is not known between the rows would pass for changes
         return None
     problem, frozen = s.ready.problem, s.searcher.frozen
     models = [m for m in (*(step.model for step in s.found.ladder), model) if not (warm(m) or rattles(m))]

@@ -230,6 +230,15 @@ def _notes(session: Session, model: AxisModel) -> list[str]:
     return out
 
 
+def runs_the_loop(session: Session, model: AxisModel) -> bool:
+    """Say whether the controller of the model makes the recorded forces: then the rows are those of the loop."""
+    return (
+        model.controller is not None
+        and all(r.command is not None for r in session.records)
+        and all(_beyond_feedback(r, model) <= FOREIGN for r in session.records)
+    )
+
+
 def _beyond_feedback(r: Record, model: AxisModel) -> float:
     """Size of the recorded force that the controller does not explain, over the size of the force; 0 without a command.
 

@@ -62,14 +62,15 @@ class Searched:
     rejected: tuple[str, ...]
 
 
-def conclude(s: Searched, nominal: AxisModel, o: Options, others: Sequence[Rival], burst: float) -> Verdict:
+def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> Verdict:
     """Conclude.
 
     Args:
         others: look-alikes in the place of what was found.
         burst: share of the residual's energy above the quiet level that lies in its loudest tenths of a second.
     """
-    ready, found, rng = s.ready, s.found, np.random.default_rng(o.seed)
+    ready, found, nominal = s.ready, s.found, s.ready.nominal
+    rng = np.random.default_rng(o.seed)
     o.progress("untouched samples: gap before and after")
     states = session_states(ready.final, found.fit.model)
     gaps = _gaps(ready, nominal, found.fit.model, states)

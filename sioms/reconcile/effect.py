@@ -82,7 +82,7 @@ class Parameter:
     ``fixed`` marks numbers that are searched, not differentiated (orders, lattice factors).
     ``phase`` marks an angle: free, wrapped, without bounds that mean anything.
     ``shape`` marks a force in which the effect is not linear.
-    ``least`` is the smallest size, either way, that is named; what is smaller may belong to something else.
+    ``least`` is the smallest size (of a factor: distance from one), either way, that is named; what is smaller may belong to something else.
     """
 
     symbol: str

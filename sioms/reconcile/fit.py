@@ -106,11 +106,20 @@ class Problem:
         e = np.clip(np.nan_to_num(e, nan=1e6, posinf=1e6, neginf=-1e6), -1e6, 1e6)
         if self.bend < np.inf:
             e = self.bend * np.sign(e) * np.sqrt(np.log1p((e / self.bend) ** 2))
-        return e if self.weights is None else e * self.weights
+        return e * self.factors
+
+    @property
+    def factors(self) -> Array | float:
+        """Factors on the residual: of the blocks that are drawn anew, and of samples whose force is known less; shape (n,), or 1."""
+        records = self.session.records
+        if all(r.trust is None for r in records):
+            return 1.0 if self.weights is None else self.weights
+        trust = self.join([np.ones(len(r)) if r.trust is None else r.trust for r in records])
+        return trust if self.weights is None else trust * self.weights
 
     def slope(self, residual: Array) -> Array:
         """How a residual, as ``residual`` gives it, goes with the innovation over its expected standard deviation, shape (n,)."""
-        weights = np.ones_like(residual) if self.weights is None else self.weights
+        weights = np.ones_like(residual) * self.factors
         if self.bend == np.inf:
             return weights
         bent = (residual / np.where(weights > 0.0, weights, 1.0) / self.bend) ** 2

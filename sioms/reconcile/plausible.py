@@ -100,9 +100,11 @@ def physical(fit: Fit, name: str) -> bool:
 def small(model: AxisModel, name: str) -> bool:
     """Say whether an effect has become smaller than it may be to be named."""
     effect = known()[name]
-    if effect.slot in (Slot.SCALE, Slot.LIMIT, Slot.ELASTIC):
+    if effect.slot in (Slot.LIMIT, Slot.ELASTIC):
         return False
     p = effect.primary
+    if effect.slot is Slot.SCALE:
+        return abs(model.effects[name][p.symbol] - p.start) <= p.least
     least = max(p.lower, p.least, 1e-4 * p.start) * model.scale(p)
     if effect.slot is Slot.BACKLASH:  # within a step of the sensor nothing is seen of a gap
         least = max(least, model.resolution)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,18 +10,25 @@ import numpy as np
 from sioms.reconcile.blocks import block_ids
 from sioms.reconcile.calibrate import calibrated
 from sioms.reconcile.channels import Finding, drive, drive_output, index_fit, index_scale, lattice
-from sioms.reconcile.checks import check, check_scale
+from sioms.reconcile.checks import check, check_scale, runs_the_loop
 from sioms.reconcile.effects import library
 from sioms.reconcile.experiment import Envelope
 from sioms.reconcile.fit import SKIP, SKIP_S, Mapper, Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
 from sioms.reconcile.records import Session
-from sioms.reconcile.timed import Timed, known_beside
+from sioms.reconcile.sampling import Sampling, read_as, sampling_of, trusted
+from sioms.reconcile.timed import Timed, as_recorded, known_beside
 from sioms.reconcile.timing import on_grid
 
 #: Share at the end of every record that takes no part in any choice.
 UNTOUCHED = 0.2
+#: How much a sample counts goes by the noise, and the noise by how much each counts: so often.
+TRUSTED = 2
+#: What a little wrong in time would be named.
+TIMES = ("delay", "lag")
+#: Half a period of the loop, in samples of the log, above which the log has its pace.
+SAME = 0.49
 #: What a refined number of the model would be named as.
 REFITTED = {"inertia": "payload", "viscous": "viscous"}
 
@@ -53,15 +60,21 @@ class Prepared:
     """State after channels and gate, before any mechanics.
 
     Attributes:
+        nominal: the model to be corrected, without a controller where that is not what makes the records.
+        held: nobody knows but it seems that the force is held from row to row.
+        points: the force is known at the rows of the log only.
         timed: forces that keep their own time, by now among the known ones of the problems' records.
     """
 
+    nominal: AxisModel
     model: AxisModel
     problem: Problem
     final: Problem
     findings: tuple[Finding, ...]
     names: tuple[str, ...]
     notes: tuple[str, ...]
+    held: bool = False
+    points: bool = False
     timed: tuple[Timed, ...] = ()
 
     def beside(self, force: Timed) -> Prepared:
@@ -73,11 +86,53 @@ class Prepared:
 
 
 def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
-    """Check the input, read the noise floor and go through the channels."""
+    """Check the input, read the noise floor and go through the channels.
+
+    Raises:
+        BadInputError: the data cannot be used.
+    """
     session, notes = on_grid(session, nominal.sample_time_s)
     notes += check(session, nominal)
     if session.final:
         check(Session(session.final), nominal)
+    if session.loop_time_s is not None:
+        late = 0.5 * session.loop_time_s / nominal.sample_time_s
+        if late < SAME:
+            return _read(session, nominal, notes, o, Sampling(late))
+        return _channels(session, nominal, notes, o)
+    ready = replace(_channels(session, nominal, notes, o), held=not runs_the_loop(session, nominal))
+    return reread(ready, ready.model, (), o) or ready
+
+
+def reread(ready: Prepared, model: AxisModel, frozen: Sequence[str], o: Options) -> Prepared | None:
+    """Prepare anew where, beside what a model explains, the force is not what is held from row to row; None: it is, or is known to be."""
+    if not ready.held:
+        return None
+    problem = replace(ready.problem, session=as_recorded(ready.problem, ready.timed).session)
+    sampling = sampling_of(problem, model, frozen)
+    if sampling is None:
+        return None
+    notes = [*ready.notes, sampling.text(model.sample_time_s)]
+    ready = _read(problem.session, ready.nominal, notes, o, sampling)
+    return replace(ready, names=tuple(n for n in ready.names if n not in TIMES))
+
+
+def _read(
+    session: Session, nominal: AxisModel, notes: Sequence[str], o: Options, sampling: Sampling
+) -> Prepared:
+    """Prepare with the force read otherwise; the controller has made none of it row by row."""
+    points = sampling.late is not None
+    return _channels(read_as(session, sampling), replace(nominal, controller=None), notes, o, points)
+
+
+def _channels(
+    session: Session, nominal: AxisModel, notes: Sequence[str], o: Options, points: bool = False
+) -> Prepared:
+    """Read the noise floor and go through the channels.
+
+    Args:
+        points: between the rows of the log the force is not known for certain.
+    """
     o.progress("channels: sensor, then drive")
     findings: list[Finding] = []
     model = nominal
@@ -107,8 +162,10 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     )
     skip = max(SKIP, round(SKIP_S / nominal.sample_time_s))
     problem = Problem(session, noise, skip, end=1.0 if session.final else 1.0 - UNTOUCHED, mapper=o.mapper)
-    notes += check_scale(problem, nominal)
+    notes = list(dict.fromkeys([*notes, *check_scale(problem, nominal)]))
     problem = calibrated(problem, session, model)
+    for _ in range(TRUSTED if points else 0):
+        problem = calibrated(trusted(problem, model), session, model)
     excluded = {"encoder_quantisation"} | {REFITTED[s] for s in nominal.refine if s in REFITTED}
     if index_fit(session, nominal) is not None:
         excluded.add("encoder_scale")
@@ -120,9 +177,10 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     final = replace(problem, begin=1.0 - UNTOUCHED, end=1.0)
     if session.final:
         final = replace(final, session=Session(session.final, continuous=False), begin=0.0)
+        final = trusted(final, model) if points else final
     if o.resample is not None:
         problem = _resampled(problem, model, o.resample)
-    return Prepared(model, problem, final, tuple(findings), names, tuple(notes))
+    return Prepared(nominal, model, problem, final, tuple(findings), names, tuple(notes), points=points)
 
 
 def _resampled(problem: Problem, model: AxisModel, seed: int) -> Problem:

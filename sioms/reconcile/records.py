@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ class Record:
         filled: True where a sample was lost and is interpolated, or None.
         feedforward: the part of ``force`` that is no feedback (a feed-forward, an injected test signal), or None.
         external: known force that acts on the axis beside the drive's, held over each sample, [{F}], or None.
+        trust: factor on the residual of each sample, less than 1 where the force is known to worse than the drive's noise, or None.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Record:
     filled: NDArray[np.bool_] | None = None
     feedforward: Array | None = None
     external: Array | None = None
+    trust: Array | None = None
 
     def __len__(self) -> int:
         return len(self.position)
@@ -65,11 +67,13 @@ class Session:
         continuous: the heat state carries over from each record to the next.
         final: whole records that take no part in any choice, each of a session of its own; without them the
             last part of every record is kept for the final statement.
+        loop_time_s: period of the loop that makes the force; None where nobody said (``sampling``).
     """
 
     records: tuple[Record, ...]
     continuous: bool = True
     final: tuple[Record, ...] = ()
+    loop_time_s: float | None = None
 
     @property
     def samples(self) -> int:
@@ -79,4 +83,9 @@ class Session:
     def subset(self, which: Sequence[int]) -> Session:
         """Return some of the records; the heat state no longer carries over where one is missing."""
         whole = list(which) == list(range(len(self.records)))
-        return Session(tuple(self.records[i] for i in which), self.continuous and whole)
+        return replace(
+            self,
+            records=tuple(self.records[i] for i in which),
+            continuous=self.continuous and whole,
+            final=(),
+        )

@@ -36,8 +36,11 @@ def on_grid(session: Session, sample_time_s: float) -> tuple[Session, list[str]]
     parts = [_pieces(r, sample_time_s, notes) for r in session.records]
     final = [_pieces(r, sample_time_s, notes) for r in session.final]
     whole = all(len(p) == 1 for p in parts)
-    return Session(
-        tuple(r for p in parts for r in p), session.continuous and whole, tuple(r for p in final for r in p)
+    return replace(
+        session,
+        records=tuple(r for p in parts for r in p),
+        continuous=session.continuous and whole,
+        final=tuple(r for p in final for r in p),
     ), notes
 
 

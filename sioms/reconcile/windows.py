@@ -107,11 +107,12 @@ class View:
             [a + np.arange(0, len(s), self.step) for a, s in zip(first, self.spans, strict=False)]
         )
         self.seen = _seen(problem, fit, bool(forces))
+        self.factors = np.broadcast_to(problem.factors, len(fit.residual))[self.rows]
         self.q = orthonormal(fit.jacobian[self.rows])
         rest = fit.residual[self.rows]
         if forces:
             shown = np.concatenate([self.answer(i, f) for i, f in enumerate(forces)])
-            rest = rest + (shown if problem.weights is None else shown * problem.weights[self.rows])
+            rest = rest + shown * self.factors
         self.rest = self._beside(rest)
         self.window = max(round(WINDOW_S / self.dt), total // MOST_WINDOWS)
         self.cuts = [
@@ -139,8 +140,7 @@ class View:
         Returns:
             Sizes and their standard deviations, shape (k,), and the squares that this leaves.
         """
-        w = self.problem.weights
-        f = self._beside(columns if w is None else columns * w[self.rows, None])
+        f = self._beside(columns * self.factors[:, None])
         scale = np.maximum(np.linalg.norm(f, axis=0), 1e-300)
         gram = (f / scale).T @ (f / scale) + 1e-6 * np.eye(f.shape[1])
         size = np.linalg.solve(gram, (f / scale).T @ self.rest)

@@ -12,7 +12,18 @@ ENCODER_SCALE = Effect(
     channel=Channel.SENSOR,
     slot=Slot.SCALE,
     equation="measured = gain * true",
-    parameters=(Parameter("gain", "1", Ref.ONE, 0.8, 1.25, 1.0, "measured over true displacement"),),
+    parameters=(
+        Parameter(
+            "gain",
+            "1",
+            Ref.ONE,
+            0.8,
+            1.25,
+            1.0,
+            "measured over true displacement",
+            least=0.02,  # by the force alone: as of a payload
+        ),
+    ),
     signature="index marks at a wrong spacing; force residual as from a wrong inertia",
     lookalikes=("payload", "thermal_gain"),
     separate="index marks over the whole range, or a known mass",
