@@ -23,6 +23,7 @@ from sioms.reconcile.effects.terms import TERMS
 from sioms.reconcile.excitation import Gate, gate
 from sioms.reconcile.fit import refit
 from sioms.reconcile.model import AxisModel
+from sioms.reconcile.plausible import leans
 from sioms.reconcile.prepare import Options, Prepared, prepare, reread
 from sioms.reconcile.records import Session
 from sioms.reconcile.refuse import bursts, smoother_share
@@ -69,7 +70,7 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
             break
         o.progress(f"{force.text}: searching anew beside it")
         s = _explained(s.ready.beside(force), o)
-    s = _plain(s)
+    s = _plain(_upright(s))
     burst = bursts(s.ready.problem, s.found.fit)
     o.progress("identifiability: look-alikes in the place of each effect")
     found, others = settle(s.searcher, s.found, s.excited.pairs)
@@ -77,6 +78,21 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
         s = replace(s, found=found, share=smoother_share(s.ready.problem, found.fit))
         burst = bursts(s.ready.problem, found.fit)
     return conclude(s, o, others, burst)
+
+
+def _upright(s: Searched) -> Searched:
+    """Let effects leave that have come to lean on the end of what they can be: they stood for something else."""
+    found, searcher = s.found, s.searcher
+    for name in [n for n in found.fit.model.effects if n not in searcher.frozen]:
+        if leans(found.fit.model, name):
+            fit = searcher.fit(found.fit.model.without_effect(name), 6)
+            step = Step("leave", name, fit.ratio, 1.0 - fit.cost / found.fit.cost, fit.model)
+            found = Found(fit, searcher.loss(fit), (*found.ladder, step))
+    return (
+        replace(s, found=found, share=smoother_share(s.ready.problem, found.fit))
+        if found is not s.found
+        else s
+    )
 
 
 def _plain(s: Searched) -> Searched:

@@ -19,7 +19,8 @@ from sioms.reconcile.gaps import measure, rungs, session_states
 from sioms.reconcile.locate import Place, Spectrum, locate, spectra
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import effective_samples
-from sioms.reconcile.prepare import Options, Prepared
+from sioms.reconcile.plausible import leans
+from sioms.reconcile.prepare import TIMES, Options, Prepared
 from sioms.reconcile.records import Session
 from sioms.reconcile.refuse import loud_turns
 from sioms.reconcile.search import Found, Searcher
@@ -41,6 +42,10 @@ LEAST_ODD = 1.25
 QUIET = 1.6
 #: It is said where the closed loop is beyond this multiple of its floor.
 LOOPS = 2.0
+HELD = (
+    "delay and lag are counted from a force that is held from row to row of the log; of a loop much faster than the log they are up to {:.2g} ms longer "
+    "(loop_time_s in columns.toml would tell)"
+)
 #: Steps of the last fit.
 LAST = 12
 
@@ -83,8 +88,14 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     ratio = found.fit.ratio
     disturbance = ratio > QUIET and burst > BURSTS and s.share < UNEXPLAINED and not rattles(found.fit.model)
     odd = ratio > LEAST_ODD and s.share > UNEXPLAINED
-    outcome = _outcome(bool(named), bool(terms) or disturbance or ratio > LARGE or odd, bool(open_rivals))
+    leaning = [e for e in named if e.name not in s.searcher.frozen and leans(fit.model, e.name)]
+    outcome = _outcome(
+        bool(named), bool(terms) or bool(leaning) or disturbance or ratio > LARGE or odd, bool(open_rivals)
+    )
     notes = [*ready.notes]
+    notes += [f"{e.title} leans on the end of what it can be: it stands for something else" for e in leaning]
+    if ready.held and any(e.name in TIMES for e in named):
+        notes.append(HELD.format(0.5e3 * fit.model.sample_time_s))
     if disturbance:
         notes.append(_of_bursts(ready.problem, found.fit, burst))
     elif ratio > LARGE:

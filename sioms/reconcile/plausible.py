@@ -79,22 +79,29 @@ def simplest(good: dict[str, Tried]) -> str:
 
 
 def physical(fit: Fit, name: str) -> bool:
-    """Say whether an effect stays within its bounds: a number that leans on one belongs to something else.
+    """Say whether an effect can be: within its bounds, and not too small to be told."""
+    return not leans(fit.model, name) and not small(fit.model, name)
+
+
+def leans(model: AxisModel, name: str) -> bool:
+    """Say whether a number of an effect leans on its bound: then it belongs to something else.
 
     The stiffness and damping of a contact may: harder than what is seen is as good as hard. So may a time constant that is longer
-    than the records.
+    than the records. Of friction with a path of its own, a drop within no speed or a build-up within no path is another friction.
     """
-    effect, given = known()[name], fit.model.effects[name]
+    effect, given = known()[name], model.effects[name]
     if any(given[a] > most * given[b] for a, b, most in effect.ratios):
-        return False
+        return True
     free = [q for q in effect.parameters if not q.phase and not q.fixed]
-    if any(q.ref is Ref.TIME and 0.0 < given[q.symbol] < 1.02 * q.lower for q in free):
-        return False
+    least = (Ref.TIME, Ref.SPEED, Ref.PITCH) if effect.slot is Slot.HYSTERESIS else (Ref.TIME,)
+    if any(q.ref in least and 0.0 < given[q.symbol] < 1.02 * q.lower * model.scale(q) for q in free):
+        return True
     for q in [effect.primary] if effect.slot in (Slot.BACKLASH, Slot.THERMAL) else free:
-        low, high = (bound * fit.model.scale(q) for bound in (q.lower, q.upper))
-        if given[q.symbol] > 0.98 * high or (q.lower < 0.0 and given[q.symbol] < 0.98 * low):
-            return False
-    return not small(fit.model, name)
+        low, high = (bound * model.scale(q) for bound in (q.lower, q.upper))
+        signed = q.lower < 0.0 or effect.slot is Slot.SCALE
+        if given[q.symbol] > 0.98 * high or (signed and given[q.symbol] < low + 0.02 * abs(low)):
+            return True
+    return False
 
 
 def small(model: AxisModel, name: str) -> bool:

@@ -24,9 +24,9 @@ from sioms.reconcile.rules import SURE
 
 #: What most axes may lack, fitted along so that it does not pass for time.
 USUAL = ("payload", "viscous", "coulomb", "offset", "gravity")
-#: Half periods of the loop that are tried, in samples of the log.
-LATE = (0.0, 0.1, 0.2, 0.3, 0.4)
-#: Reading the rows as points leaves at most this share, and as those of the position before, which few logs do, this one.
+#: Half periods of the loop that are tried, and times by which a log may be late with the force, in samples of the log.
+LATE, BEHIND = (0.0, 0.1, 0.2, 0.3, 0.4), (-8.0, -5.6, -4.0, -2.8, -2.0, -1.4, -1.0)
+#: Reading the rows as points leaves at most this share, and as late ones, which few logs have, this one.
 LESS, MUCH_LESS = 0.85, 0.5
 STEPS = 4
 #: Beyond so many times its median a fourth difference is that of a step.
@@ -40,8 +40,8 @@ class Sampling:
     """How the rows of a log tell the force.
 
     Attributes:
-        late: half a period of the loop, in samples of the log: the force comes so late after the points of the log. None: the
-            row after the present one holds the force.
+        late: half a period of the loop, in samples of the log: the force comes so late after the points of the log; below 0 the log
+            is late with it. None: the row after the present one holds the force.
         left: share of the squares that the force held over its sample leaves.
     """
 
@@ -53,6 +53,11 @@ class Sampling:
         share = f"; read so, {100 * self.left:.0f} % is left of what a force held from row to row leaves"
         if self.late is None:
             return f"the force of a row acts before its position: it is taken from the row after{share}"
+        if self.late < 0.0:
+            return (
+                f"the log tells the force late, by some {-1e3 * self.late * sample_time_s:.2g} ms (a filter?): it is read as a curve that much "
+                f"earlier{share}, and a delay or lag does not show"
+            )
         return (
             f"the log is slower than the loop that makes the force (a period of some {2e3 * self.late * sample_time_s:.2g} ms fits best"
             f"{share}): the force is read as a curve through the rows, and a delay or lag below half a sample does not show. "
@@ -118,30 +123,36 @@ def sampling_of(problem: Problem, model: AxisModel, frozen: Sequence[str] = ()) 
     start = _usual(model)
     held = refit(problem, start, frozen, STEPS)
 
-    def fitted(sampling: Sampling) -> Fit:
-        other = replace(problem, session=read_as(problem.session, sampling))
-        return refit(other, held.model, frozen, STEPS)
+    def tried(lates: Sequence[float | None]) -> list[Fit]:
+        def fitted(late: float | None) -> Fit:
+            other = replace(problem, session=read_as(problem.session, Sampling(late)))
+            return refit(other, held.model, frozen, STEPS)
 
-    tried = [Sampling(late) for late in (*LATE, None)]
-    fits = list(problem.mapper(fitted, tried))
-    costs = [f.cost for f in fits]
-    best = int(np.argmin(costs))
+        return list(problem.mapper(fitted, lates))
+
     ids = block_ids(problem, model.sample_time_s)
-    loss, loss_held = (np.bincount(ids, weights=f.residual**2).astype(np.float64) for f in (fits[best], held))
-    gain, sure = better(loss, loss_held)
-    late = tried[best].late
-    if gain < 1.0 - (MUCH_LESS if late is None else LESS) or sure < SURE:
-        return None
-    if late is not None:
-        late = _lowest(LATE, costs[:-1])
-    return Sampling(late, costs[best] / held.cost)
+    best, late, found = held, None, False
+    readings: tuple[tuple[tuple[float | None, ...], float], ...] = (
+        (LATE, LESS),
+        ((None, *BEHIND), MUCH_LESS),
+    )
+    for lates, most in readings:  # beginning with what is the more likely
+        fits = tried(lates)
+        i = int(np.argmin([f.cost for f in fits]))
+        loss, other = (np.bincount(ids, weights=f.residual**2).astype(np.float64) for f in (fits[i], best))
+        gain, sure = better(loss, other)
+        if gain > 1.0 - most and sure > SURE:
+            best, late, found = fits[i], _between(lates, [f.cost for f in fits], i), True
+    return Sampling(late, best.cost / held.cost) if found else None
 
 
-def _lowest(at: tuple[float, ...], costs: list[float]) -> float:
-    """Place of the least of a parabola through the lowest cost and its neighbours."""
-    i = int(np.clip(np.argmin(costs), 1, len(at) - 2))
-    a, b, _ = np.polyfit(at[i - 1 : i + 2], costs[i - 1 : i + 2], 2)
-    return float(np.clip(-0.5 * b / a, 0.0, 0.5)) if a > 0.0 else at[int(np.argmin(costs))]
+def _between(lates: Sequence[float | None], costs: Sequence[float], i: int) -> float | None:
+    """Place of the least of a parabola through the lowest cost, the i-th, and its neighbours, if it has two."""
+    if not 0 < i < len(lates) - 1 or None in (near := lates[i - 1 : i + 2]):
+        return lates[i]
+    at = np.array(near, dtype=np.float64)
+    a, b, _ = np.polyfit(at, costs[i - 1 : i + 2], 2)
+    return float(np.clip(-0.5 * b / a, at[0], at[2]))
 
 
 def _usual(model: AxisModel) -> AxisModel:
