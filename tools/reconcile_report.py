@@ -47,6 +47,7 @@ def as_json(v: Verdict, seconds: float) -> str:
             }
             for s, e in zip(v.ladder, v.rungs, strict=True)
         ],
+        "alternative_parameters": [{name: dict(values) for name, values in m.items()} for m in v.others],
         "not_excited": v.gate.missing,
         "same_in_these_records": [list(p) for p in v.gate.pairs],
         "residual_over_floor": v.ratio,

@@ -128,6 +128,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         traces=traces,
         states=tuple((r.name, q) for r, q in zip(ready.final.session.records, states, strict=True)),
         rejected=s.rejected,
+        others=tuple(q.fit.model.effects for q in open_now),
     )
 
 

@@ -113,6 +113,7 @@ def describe(
             f"without it {100 * saved:.1f} % of the residual energy would come back ({errors:.1f} standard errors)"
         )
         ruled, still = told_apart(name, effect.lookalikes, others, found.ladder, fit.model.effects)
+        still = {rival: f"{text}, with {_numbers(name, rival, others)}" for rival, text in still.items()}
         named.append(
             NamedEffect(
                 name,
@@ -129,6 +130,16 @@ def describe(
             )
         )
     return apart(sorted(named, key=lambda e: -e.saved))
+
+
+def _numbers(name: str, rival: str, others: Sequence[Rival]) -> str:
+    """Say with which numbers a look-alike stands in the place of an effect."""
+    model = next(r.fit.model for r in others if (r.effect, r.rival) == (name, rival))
+    return ", ".join(
+        f"{p.symbol} = {model.effects[rival][p.symbol]:.4g}"
+        + ("" if model.unit(p) == "1" else f" {model.unit(p)}")
+        for p in known()[rival].parameters
+    )
 
 
 def _worth(

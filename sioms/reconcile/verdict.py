@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -121,6 +121,7 @@ class Verdict:
     """Everything the workflow found out about one axis.
 
     Attributes:
+        others: numbers of each alternative, per symbol per effect.
         states: session parameters of the untouched part of each record.
         rungs: force error on the untouched samples after each step of the ladder, in closed loop where it can be.
     """
@@ -148,3 +149,4 @@ class Verdict:
     traces: tuple[Trace, ...]
     states: tuple[tuple[str, State], ...] = ()
     rejected: tuple[str, ...] = ()
+    others: tuple[Mapping[str, Mapping[str, float]], ...] = ()
