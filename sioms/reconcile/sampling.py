@@ -29,6 +29,8 @@ LATE, BEHIND = (0.0, 0.1, 0.2, 0.3, 0.4), (-8.0, -5.6, -4.0, -2.8, -2.0, -1.4, -
 #: Reading the rows as points leaves at most this share, and as late ones, which few logs have, this one.
 LESS, MUCH_LESS = 0.85, 0.5
 STEPS = 4
+#: A fit is at its end when so many steps more leave more than this share.
+SETTLED, MOST_FITS = 0.98, 5
 #: Beyond so many times its median a fourth difference is that of a step.
 STANDS_OUT = 3.0
 #: For so long an unknown force shows in the innovations.
@@ -121,7 +123,7 @@ def sampling_of(problem: Problem, model: AxisModel, frozen: Sequence[str] = ()) 
         model: what is known; what most axes may lack is fitted along.
     """
     start = _usual(model)
-    held = refit(problem, start, frozen, STEPS)
+    held = _settled(problem, start, frozen)
 
     def tried(lates: Sequence[float | None]) -> list[Fit]:
         def fitted(late: float | None) -> Fit:
@@ -144,6 +146,17 @@ def sampling_of(problem: Problem, model: AxisModel, frozen: Sequence[str] = ()) 
         if gain > 1.0 - most and sure > SURE:
             best, late, found = fits[i], _between(lates, [f.cost for f in fits], i), True
     return Sampling(late, best.cost / held.cost) if found else None
+
+
+def _settled(problem: Problem, model: AxisModel, frozen: Sequence[str]) -> Fit:
+    """Fit until nothing more is gained: what is compared with it begins where it ends."""
+    fit = refit(problem, model, frozen, STEPS)
+    for _ in range(MOST_FITS):
+        further = refit(problem, fit.model, frozen, STEPS)
+        if further.cost > SETTLED * fit.cost:
+            break
+        fit = further
+    return fit
 
 
 def _between(lates: Sequence[float | None], costs: Sequence[float], i: int) -> float | None:
