@@ -33,7 +33,7 @@ AXIS = AxisModel(
 )
 #: Values that show better than the typical ones.
 SHOWN = {"encoder_scale": {"gain": 1.02}, "encoder_quantisation": {"factor": 4e5}, "saturation": {"limit": 0.25},
-         "cogging": {"n": 5.0}, "torque_ripple": {"n": 5.0}, "coulomb_position": {"n": 2.0}, "thermal_gain": {"loss": 1.0, "tau": 3.0},
+         "cogging": {"n": 5.0}, "torque_ripple": {"n": 5.0}, "coulomb_position": {"n": 2.0}, "friction_variation": {"depth": 0.4, "n": 2.0}, "thermal_gain": {"loss": 1.0, "tau": 3.0},
          "backlash": {"gap": 0.02}, "eccentricity": {"amp": 0.02}}  # fmt: skip
 
 
@@ -67,6 +67,8 @@ def section(effect: Effect) -> str:
         f"Where its residual is: {effect.signature}. On {kinds} axes.",
         f"Confused with: {', '.join(effect.lookalikes)}. Told apart by: {effect.separate}.",
     ]
+    if effect.beside:
+        lines.append(f"Only beside {', '.join(effect.beside)}; in the picture beside the first.")
     if effect.session:
         lines.append(f"Belongs to the session: {', '.join(effect.session)}.")
     return "\n".join(lines) + "\n"
@@ -88,8 +90,12 @@ def trace(effect: Effect) -> tuple[Array, Array, Array, Array]:
 
     laps = {e.name: e.command for e in catalogue(AXIS, Envelope.of(AXIS, 0.0, 4.0), 3.0)}
     command = np.concatenate([laps[n] for n in ("slow_reversals", "cruises", "multi_sine")])
-    values = {p.symbol: p.start * AXIS.scale(p) for p in effect.parameters} | SHOWN.get(effect.name, {})
-    run = simulate(replace(AXIS, effects={effect.name: values}), command, substeps=8)
+    shown = [library()[n] for n in effect.beside[:1]] + [effect]
+    effects = {
+        e.name: {p.symbol: p.start * AXIS.scale(p) for p in e.parameters} | SHOWN.get(e.name, {})
+        for e in shown
+    }
+    run = simulate(replace(AXIS, effects=effects), command, substeps=8)
     dt = AXIS.sample_time_s
     v: Array = np.gradient(run.position, dt)
     # The force is held over a sample, so the motion that it makes is seen over the two samples around it.

@@ -38,6 +38,7 @@ class Place(Enum):
     MOTOR = "force on the motor"
     LOAD = "force on the load"
     RESISTANCE = "resistance to motion"
+    VARIATION = "factor on dry friction"
     TRANSMISSION = "between motor and load"
     ENCODER = "position to reading"
 
@@ -182,6 +183,11 @@ CATALOGUE: Mapping[str, Kind] = {
         Place.RESISTANCE,
         "friction that varies with position: level (1 + depth sin(2 pi x/pitch + phase))",
         {"level": _SIZE, "depth": Parameter("1", low=0.0, high=1.0), "pitch": _PITCH, "phase": _PHASE},
+    ),
+    "friction_variation": Kind(
+        Place.VARIATION,
+        "all dry friction varies with position: times 1 + depth sin(2 pi x/pitch + phase)",
+        {"depth": Parameter("1", low=0.0, high=1.0), "pitch": _PITCH, "phase": _PHASE},
     ),
     "eddy_brake": Kind(
         Place.RESISTANCE,

@@ -27,6 +27,7 @@ class Motion:
         position, velocity: of the motor.
         load_position, load_velocity: of the load, the same arrays where no transmission gives.
         drive: force of the drive.
+        variation: factor on dry friction; None where it varies on no axis.
     """
 
     position: Array
@@ -34,6 +35,7 @@ class Motion:
     load_position: Array
     load_velocity: Array
     drive: Array
+    variation: Array | None = None
 
 
 def middle_velocity(velocity: Array, last: Array, flag: NDArray[np.bool_], out: Array) -> None:
@@ -148,6 +150,8 @@ class Presliding:
         np.multiply(goal, self._rise, out=goal)
         np.add(goal, self._level, out=goal)
         np.maximum(goal, 0.0, out=goal)  # a rise below minus the level would drive
+        if motion.variation is not None:  # of the level; the stiffness stays
+            np.multiply(goal, motion.variation, out=goal)
         np.abs(motion.velocity, out=decay)
         np.multiply(decay, self._rate, out=decay)
         np.divide(decay, goal, out=decay, where=goal > 0.0)
@@ -223,6 +227,21 @@ class PositionFriction(_Periodic):
         np.add(total, sine, out=total)
 
 
+class FrictionVariation(_Periodic):
+    """Factor 1 + depth sin(2 pi x/pitch + phase) on dry friction."""
+
+    def __init__(self, effect: Effect) -> None:
+        super().__init__(effect)
+        self._depth = effect.values["depth"]
+
+    def scale(self, motion: Motion, total: Array) -> None:
+        """Multiply total by the factor at the motor's position."""
+        sine = self.sine(motion.position)
+        np.multiply(sine, self._depth, out=sine)
+        np.add(sine, 1.0, out=sine)
+        np.multiply(total, sine, out=total)
+
+
 class EddyBrake:
     """Adds 2 force s/(1 + s^2), s = |v|/velocity, to the dry friction."""
 
@@ -250,11 +269,13 @@ FORCES: dict[str, Callable[[Effect, float], Force]] = {
     "spring": Spring,
     "presliding": Presliding,
 }
-RESISTANCES: dict[str, Callable[[Effect, float], Force]] = {
+DRY: dict[str, Callable[[Effect, float], Force]] = {
     "stribeck": Stribeck,
-    "quadratic_drag": QuadraticDrag,
     "load_friction": LoadFriction,
     "position_friction": PositionFriction,
+}
+DRAGS: dict[str, Callable[[Effect, float], Force]] = {
+    "quadratic_drag": QuadraticDrag,
     "eddy_brake": EddyBrake,
 }
 

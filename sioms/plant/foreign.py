@@ -17,7 +17,7 @@ class Laws:
     Args:
         drive: change the force of the drive once a tick, after the effects of the drive.
         motor: add a force on the motor, in every substep.
-        resistance: add a level of dry friction, at least 0, in every substep.
+        resistance: add a level of dry friction, at least 0, in every substep; it varies as all dry friction of the bank does.
     """
 
     drive: tuple[DriveEffect, ...] = ()

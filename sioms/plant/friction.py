@@ -115,23 +115,25 @@ class FrictionStep:
         self._new, self._part = np.zeros((2, 2, n))
         self._reversed = np.zeros(n, dtype=np.bool_)
         self._resistance: Array | None = None
+        self._variation: Array | None = None
 
-    def step(self, force: Array, resistance: Array | None = None) -> None:
+    def step(self, force: Array, resistance: Array | None = None, variation: Array | None = None) -> None:
         """Advance all masses.
 
         Args:
             force: [N], shape (n,), held over the step.
             resistance: further dry friction [N], at least 0, added to sliding and breakaway.
+            variation: factor on sliding and breakaway, at least 0.
         """
         velocity = self.state[0]
         direction, net, new = self._direction, self._net, self._new
-        self._resistance = resistance
+        self._resistance, self._variation = resistance, variation
         self._find_direction(force, velocity, resistance)
         if self._directed:
             self._select(direction)
         # (F d - c) d is F - c d for a moving mass and 0 for one that sticks (d = 0).
         np.multiply(force, direction, out=net)
-        np.subtract(net, self._level, out=net)
+        np.subtract(net, self._level if variation is None else self._level * variation, out=net)
         if resistance is not None:
             np.subtract(net, resistance, out=net)
         np.multiply(net, direction, out=net)
@@ -148,13 +150,16 @@ class FrictionStep:
     def _find_direction(self, force: Array, velocity: Array, resistance: Array | None) -> None:
         """Set the direction to the sign of the velocity; at rest to that of a force over stiction, else 0."""
         work, direction = self._work, self._direction
+        plus, minus = self._breakaway.plus, self._hold_minus
+        if self._variation is not None:
+            plus, minus = plus * self._variation, minus * self._variation
         if resistance is None:
-            np.minimum(force, self._breakaway.plus, out=work)
-            np.maximum(work, self._hold_minus, out=work)
+            np.minimum(force, plus, out=work)
+            np.maximum(work, minus, out=work)
         else:
-            np.add(self._breakaway.plus, resistance, out=work)
+            np.add(plus, resistance, out=work)
             np.minimum(work, force, out=work)
-            np.subtract(self._hold_minus, resistance, out=direction)
+            np.subtract(minus, resistance, out=direction)
             np.maximum(work, direction, out=work)
         np.subtract(force, work, out=work)
         np.multiply(work, _TINY, out=work)
@@ -175,6 +180,7 @@ class FrictionStep:
         mass, force, net = self._mass[axes], force_all[axes], self._net[axes]
         velocity, position = self.state[:, axes]
         extra = 0.0 if self._resistance is None else self._resistance[axes]
+        times = 1.0 if self._variation is None else self._variation[axes]
         viscous = self._viscous.along(velocity, axes)
         # Time to rest: (m/b) ln(1 - b v/N), which is -m v/N for b = 0.
         z = -viscous * velocity / net
@@ -183,8 +189,8 @@ class FrictionStep:
         _, _, p, q = coefficients(viscous, mass, stop_s)
         stopped_at = position + p * velocity + q * net
         back = np.sign(force)
-        moves = np.abs(force) > self._breakaway.along(back, axes) + extra
-        net_back = np.where(moves, force - back * (self._sliding.along(back, axes) + extra), 0.0)
+        moves = np.abs(force) > times * self._breakaway.along(back, axes) + extra
+        net_back = np.where(moves, force - back * (times * self._sliding.along(back, axes) + extra), 0.0)
         _, g, _, q = coefficients(self._viscous.along(back, axes), mass, self.time_s - stop_s)
         self._new[0, axes] = g * net_back
         self._new[1, axes] = stopped_at + q * net_back

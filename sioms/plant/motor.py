@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .drive import build_drive
 from .effects import Effect, Place
 from .encoder import Encoder
-from .forces import FORCES, RESISTANCES, Motion, middle_velocity
+from .forces import DRAGS, DRY, FORCES, FrictionVariation, Motion, middle_velocity
 from .foreign import Laws
 from .friction import FrictionStep
 from .parameters import Motor, Supply, build_walls, check_motors, choose_substeps, column, mechanics
@@ -112,7 +112,7 @@ class MotorBank:
 
     def _count_substeps(self, wanted: int, tick_s: float, mass: Array) -> int:
         """Return 1 where the exact step covers everything, else what the fastest motion needs."""
-        places = (Place.MOTOR, Place.LOAD, Place.RESISTANCE, Place.TRANSMISSION)
+        places = (Place.MOTOR, Place.LOAD, Place.RESISTANCE, Place.VARIATION, Place.TRANSMISSION)
         effects = [effect for place in places for effect in self._by_place[place]]
         self._nonlinear = bool(effects or self._laws.motor or self._laws.resistance)
         self._bounded = self._walls is not None or self._supply.limits
@@ -126,12 +126,20 @@ class MotorBank:
         self._motor_forces = [FORCES[e.name](e, h) for e in self._by_place[Place.MOTOR]]
         self._motor_forces += self._laws.motor
         self._load_forces = [FORCES[e.name](e, h) for e in self._by_place[Place.LOAD]]
-        self._resistances = [RESISTANCES[e.name](e, h) for e in self._by_place[Place.RESISTANCE]]
-        self._resistances += self._laws.resistance
+        resistances = self._by_place[Place.RESISTANCE]
+        self._dry = [DRY[e.name](e, h) for e in resistances if e.name in DRY]
+        self._dry += self._laws.resistance
+        self._drags = [DRAGS[e.name](e, h) for e in resistances if e.name in DRAGS]
+        self._variations = [FrictionVariation(e) for e in self._by_place[Place.VARIATION]]
         rigid, n = self._transmission is None, self.position.size
         middle, rate = np.zeros(n), np.zeros(n)
         self._motion = Motion(
-            middle, rate, middle if rigid else np.zeros(n), rate if rigid else np.zeros(n), self.drive_force
+            middle,
+            rate,
+            middle if rigid else np.zeros(n),
+            rate if rigid else np.zeros(n),
+            self.drive_force,
+            np.ones(n) if self._variations else None,
         )
 
     def _build_sensors(self, motors: Sequence[Motor]) -> None:
@@ -178,6 +186,10 @@ class MotorBank:
         else:
             np.copyto(force, self.drive_force)
             np.copyto(load, self._load_constant)
+        if motion.variation is not None:
+            motion.variation.fill(1.0)
+            for factor in self._variations:
+                factor.scale(motion, motion.variation)
         for effect in self._motor_forces:
             effect.add(motion, force)
         for effect in self._load_forces:
@@ -186,7 +198,7 @@ class MotorBank:
             self._walls.add(motion.load_position, motion.load_velocity, load, self.contact_force)
         if coupling is not None:
             coupling.couple(motion, force, load)
-        self._friction.step(force, self._sum_resistance())
+        self._friction.step(force, self._sum_resistance(), motion.variation)
         if coupling is not None:
             coupling.kick(load, self._state, h)
         self._hold_at_stops()
@@ -202,12 +214,17 @@ class MotorBank:
             self._transmission.predict(motion, self._substep_s)
 
     def _sum_resistance(self) -> Array | None:
-        if not self._resistances:
+        if not self._dry and not self._drags:
             return None
-        self._resistance.fill(0.0)
-        for effect in self._resistances:
-            effect.add(self._motion, self._resistance)
-        return self._resistance
+        total, motion = self._resistance, self._motion
+        total.fill(0.0)
+        for effect in self._dry:
+            effect.add(motion, total)
+        if motion.variation is not None:
+            np.multiply(total, motion.variation, out=total)
+        for effect in self._drags:
+            effect.add(motion, total)
+        return total
 
     def _hold_at_stops(self) -> None:
         """Put motors that passed an end stop back onto it, at rest."""

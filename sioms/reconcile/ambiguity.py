@@ -16,9 +16,10 @@ from sioms.reconcile.blocks import better
 from sioms.reconcile.bounces import rattles
 from sioms.reconcile.effects import library
 from sioms.reconcile.fit import Fit
-from sioms.reconcile.plausible import physical, size, without
+from sioms.reconcile.plausible import physical, size
 from sioms.reconcile.rules import GAIN, SURE
 from sioms.reconcile.search import Found, Searcher
+from sioms.reconcile.variation import accompanied, exchanged, named
 
 AMBIGUOUS = 0.015
 #: What a look-alike must miss whose trace has this share of its energy in common with that of the named effect.
@@ -49,15 +50,14 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
         names = [n for n in _alike(name) if n in searcher.names and n not in found.fit.model.effects]
         if not names:
             continue
-        bare = searcher.fit(found.fit.model.without_effect(name), 5)
+        bare = searcher.fit(named(found.fit.model.without_effect(name)), 5)
         contribution = bare.cost - found.fit.cost
         if contribution <= 0.0:
             continue
-        for start in searcher.screen(bare, names):
+        for start in searcher.screen(bare, [n for n in names if accompanied(bare.model, n)]):
             if start.gain * bare.cost < 0.3 * contribution:
                 continue
-            model = without(bare.model, lib[start.effect].replaces)
-            fit = searcher.searched(searcher.fit(model.with_effect(start.effect, start.values)))
+            fit = searcher.searched(searcher.fit(exchanged(bare.model, start.effect, start.values)))
             if not physical(fit, start.effect):
                 continue
             _, errors = better(found.losses, searcher.loss(fit))

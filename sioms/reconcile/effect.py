@@ -55,6 +55,9 @@ class Slot(Enum):
     SCALE = "scale"  # measured = p[0] * true
     ECCENTRICITY = "eccentricity"  # measured = true + p[0] sin(theta + p[1])
     MODULATION = "modulation"  # inertia J + p[0] sin(p[2] theta + p[1])
+    VARIATION = (
+        "variation"  # dry friction, of levels and hysteresis alike, times 1 + p[0] sin(p[2] theta + p[1])
+    )
     WARMING = "warming"  # friction level p[0] T beside the others, T' = (|v| - T) / p[1]
     LATTICE = "lattice"  # counts come in multiples of p[0]
 
@@ -108,6 +111,7 @@ class Effect:
         rankable: False where moving data can never tell it from its look-alike.
         replaces: effects that this one contains or excludes; switching it on switches them off.
         joins: effects of which this one is both at once: it is tried where one of them is in the model already.
+        beside: effects one of which must be in the model for this one to be tried; none: it may stand alone.
         ratios: (symbol, symbol, most): the first number is at most so many times the second.
         session: parameters that belong to the session and not to the axis.
     """
@@ -128,6 +132,7 @@ class Effect:
     session: tuple[str, ...] = ()
     replaces: tuple[str, ...] = ()
     joins: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ()
     ratios: tuple[tuple[str, str, float], ...] = ()
 
     @property

@@ -23,6 +23,7 @@ from sioms.reconcile.screen import (
     state_columns,
     trial_values,
 )
+from sioms.reconcile.variation import accompanied
 
 #: An effect of typical size must leave this many times the floor (root mean square) to be ranked.
 LEAST_TRACE = 0.15
@@ -69,8 +70,8 @@ def common(a: Array, b: Array) -> float:
 
 
 def _trace(problem: Problem, model: AxisModel, effect: Effect) -> Array | None:
-    """Trace of the effect at its typical size, one column per amplitude and phase; None for a lattice."""
-    if effect.slot is Slot.LATTICE:
+    """Trace of the effect at its typical size, one column per amplitude and phase; None for a lattice, or beside nothing."""
+    if effect.slot is Slot.LATTICE or not accompanied(model, effect.name):
         return None
     size = effect.primary.start * model.scale(effect.primary)
     if effect.slot in STATE_SLOTS:

@@ -51,8 +51,11 @@ call = caller()
     MOD_PHASE,
     MOD_N,
     WARMING,
+    VARY_A,
+    VARY_PHASE,
+    VARY_N,
     PLANT_SIZE,
-) = range(28)
+) = range(31)
 # Places in the controller row.
 CTL_K, CTL_KZ, CTL_KP, CTL_KB, CTL_OFFSET, CTL_MAX, CTL_ALPHA, CTL_MEAN, CTL_SIZE = range(9)
 # Columns of the output.
@@ -60,7 +63,7 @@ OUT_Y, OUT_FORCE, OUT_INNOVATION, OUT_X, OUT_V, OUT_APPLIED, OUT_T, OUT_SIZE = r
 TINY_SPEED = 1e-12
 #: Samples for which a tracking model may be off before its speed is set anew, and over which speed is measured.
 PATIENCE, MEASURED = 20, 10
-#: Friction that drops with speed keeps this share of its breakaway level in what it divides by.
+#: Friction that drops with speed, or varies over the turn, keeps this share of its level in what it divides by.
 LEAST_LEVEL = 1e-6
 #: A hot drive keeps at least this share of its force constant; keeps a wild trial value harmless.
 LEAST_GAIN = 0.05
@@ -176,6 +179,7 @@ def march(
     # Local copies: a function that is called by its address might have changed an array.
     viscous, limit, delay, lag, loss = plant[VISCOUS], plant[LIMIT], plant[DELAY], plant[LAG], plant[LOSS]
     hyst_f, hyst_s, mod, gain_y = plant[HYST_F], plant[HYST_S], plant[MOD_A], plant[GAIN_Y]
+    vary, waves = plant[VARY_A], plant[VARY_N] * plant[TURN_X]
     decay = np.exp(-h / lag) if lag > 0.0 else 0.0
     per_mass = 1.0 / jm
     x, v, temp = start[0], start[1], start[2]
@@ -185,7 +189,7 @@ def march(
     hyst = 0.0
     e_old, u_old, y_old, y_older, v_f = start[3], start[4], 0.0, 0.0, gain_y * v
     off = 0
-    level, acting = 0.0, summed(forces, pf, x, v, u_old, temp)
+    level, share, acting = 0.0, 1.0, summed(forces, pf, x, v, u_old, temp)
     u_all = np.zeros(n)
     for i in range(n):
         y = gain_y * x
@@ -254,11 +258,13 @@ def march(
             xp = x + 0.5 * h * v
             for k in range(len(pg)):
                 drive *= call(gains, k, pg, xp, v, ua, temp)
+            if vary != 0.0:
+                share = 1.0 + vary * np.sin(waves * xp + plant[VARY_PHASE])
             sign = 1.0 if v > 0.0 else -1.0
             if v == 0.0:
                 level = 0.0
             elif dry and level * v <= 0.0:
-                level = sign * friction(levels, pl, x, v, ua, temp)
+                level = sign * share * friction(levels, pl, x, v, ua, temp)
             base = drive + external[i] + acting - hyst
             link = coupling(plant, x - xl, v - vl) if two else 0.0
             a0 = (base - viscous * v - level - link) * per_mass
@@ -270,6 +276,9 @@ def march(
                 if hyst_s > 0.0:
                     goal += (hyst_s - hyst_f) * np.exp(-((vp / plant[HYST_V]) ** 2))
                     path *= hyst_s / max(goal, LEAST_LEVEL * hyst_s)
+                if vary != 0.0:  # the level varies, the stiffness before it does not
+                    goal *= share
+                    path /= max(share, LEAST_LEVEL)
                 way = np.exp(-path)
                 goal = goal if vp > 0.0 else -goal
                 before = hyst
@@ -295,12 +304,13 @@ def march(
                 force -= link
             if dry:
                 if v != 0.0:
-                    level = sign * friction(levels, pl, xp, vp if vp != 0.0 else sign * TINY_SPEED, ua, temp)
+                    vm = vp if vp != 0.0 else sign * TINY_SPEED
+                    level = sign * share * friction(levels, pl, xp, vm, ua, temp)
                 xs = x
                 x, v, rest = slide(x, v, (force - level) * per_mass, h)
                 if rest > 0.0:
-                    break_p = friction(levels, pl, xs, TINY_SPEED, ua, temp)
-                    break_m = friction(levels, pl, xs, -TINY_SPEED, ua, temp)
+                    break_p = share * friction(levels, pl, xs, TINY_SPEED, ua, temp)
+                    break_m = share * friction(levels, pl, xs, -TINY_SPEED, ua, temp)
                     v = leave(force, break_p, break_m) * per_mass * rest
                     x += 0.5 * v * rest
             else:

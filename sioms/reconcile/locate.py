@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt, welch
 
+from sioms.reconcile.dry import dry_friction
 from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Problem
@@ -73,15 +74,13 @@ def force_residual(problem: Problem, model: AxisModel) -> tuple[list[Motion], li
 
 def _known_force(model: AxisModel, m: Motion, dead: float) -> Array:
     """Sum the forces of the model's state effects on a measured motion."""
-    total = np.zeros_like(m.x)
+    total = dry_friction(model, m.x, m.v, m.u, m.temperature, direction(m.v, dead))
     for name, given in model.effects.items():
         effect = known()[name]
-        if effect.function is None:
+        if effect.function is None or effect.slot in (Slot.FRICTION, Slot.WARMING):
             continue
         f = effect.evaluate(m.x, m.v, m.u, m.temperature, effect.row(effect.values(given), model.pitch))
-        if effect.slot in (Slot.FRICTION, Slot.WARMING):
-            f = -f * direction(m.v, dead)
-        elif effect.slot is Slot.GAIN:
+        if effect.slot is Slot.GAIN:
             f = m.u * (f - 1.0)
         total += f
     return total

@@ -10,6 +10,7 @@ from sioms.reconcile.effects import known, library
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.rules import NEARLY, negligible
+from sioms.reconcile.variation import named
 
 #: A refitted candidate: fit, held-out losses, share saved, standard errors.
 Tried = tuple[Fit, Array, float, float]
@@ -27,14 +28,7 @@ def swapped(model: AxisModel, name: str, other: str) -> AxisModel:
     shared = {k: v for k, v in model.effects[name].items() if k in plain}
     if known()[name].slot is Slot.BACKLASH and known()[other].slot is Slot.ELASTIC:
         shared["f_res"] = model.effects[name]["f_contact"]  # a contact that is never left
-    return model.without_effect(name).with_effect(other, {**plain, **shared})
-
-
-def without(model: AxisModel, names: Sequence[str]) -> AxisModel:
-    """Switch some effects off."""
-    for name in names:
-        model = model.without_effect(name) if name in model.effects else model
-    return model
+    return named(model.without_effect(name).with_effect(other, {**plain, **shared}))
 
 
 def replaced(model: AxisModel, name: str) -> bool:

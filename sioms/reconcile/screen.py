@@ -16,11 +16,13 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from sioms.reconcile.bounces import rattles
+from sioms.reconcile.dry import dry_friction
 from sioms.reconcile.effect import Array, Effect, Parameter, Ref, Slot
 from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.simulate import replay
+from sioms.reconcile.variation import room_for
 
 #: Trial values, as multiples of a parameter's scale, of effects that are not forces of the state.
 GRID_DELAY = (0.5e-3, 2e-3, 5e-3)
@@ -45,7 +47,7 @@ SPEED_STEPS, PLACES = 7, 15
 SLOW_HZ, COMMAND_HZ, FOLLOWED = 5.0, 30.0, 0.2
 #: A regression on more rows than this leaves some out.
 MOST_ROWS = 40_000
-STATE_SLOTS = (Slot.FORCE, Slot.FRICTION, Slot.GAIN, Slot.MODULATION)
+STATE_SLOTS = (Slot.FORCE, Slot.FRICTION, Slot.GAIN, Slot.MODULATION, Slot.VARIATION)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +106,8 @@ def state_columns(
 ) -> Array:
     """Forces per unit of each amplitude of a state effect (two columns where it has a phase), shape (n, k)."""
     columns = []
+    m, way = motion, direction(motion.v, dead)
+    dry = dry_friction(model, m.x, m.v, m.u, m.temperature, way) if effect.slot is Slot.VARIATION else way
     for amplitude, phase in amplitudes(effect):
         for turn in (0.0, np.pi / 2) if phase is not None else (0.0,):
             values = {p.symbol: shape.get(p.symbol, 0.0) for p in effect.parameters}
@@ -112,13 +116,16 @@ def state_columns(
                 values[phase.symbol] = turn
             row = effect.row(effect.values(values), model.pitch)
             if effect.slot is Slot.MODULATION:
-                columns.append(_modulation(model, motion, shape, turn))
+                columns.append(_modulation(model, m, shape, turn))
                 continue
-            f = effect.evaluate(motion.x, motion.v, motion.u, motion.temperature, row)
+            if effect.slot is Slot.VARIATION:
+                columns.append(dry * np.sin(shape["n"] * 2.0 * np.pi / model.pitch * m.x + turn))
+                continue
+            f = effect.evaluate(m.x, m.v, m.u, m.temperature, row)
             if effect.slot is Slot.FRICTION:
-                f = -f * direction(motion.v, dead)
+                f = -f * way
             elif effect.slot is Slot.GAIN:
-                f = motion.u * (f - 1.0)
+                f = m.u * (f - 1.0)
             columns.append(f)
     return np.stack(columns, axis=1)
 
@@ -398,9 +405,7 @@ def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator
 
 def _screen_trials(problem: Problem, fit: Fit, effect: Effect, q: Array, rest: Array) -> list[Start]:
     """Try an effect on a grid in the simulation; the change it makes may be stretched, and turned round where its size has a sign."""
-    model = fit.model
-    for name in effect.replaces:
-        model = model.without_effect(name) if name in model.effects else model
+    model = room_for(fit.model, effect.name)
     trials = list(trial_values(effect, model, problem))
     if effect.joins:
         trials = _beside(trials, fit.model, effect)

@@ -30,10 +30,10 @@ from sioms.reconcile.plausible import (
     small,
     swapped,
     unspecific,
-    without,
 )
 from sioms.reconcile.rules import GAIN, SPECIFIC, SURE, negligible
 from sioms.reconcile.screen import Start, screen
+from sioms.reconcile.variation import accompanied, exchanged, named
 
 FLOOR = 1.05  # stop at this multiple of the expected innovation
 TRIES = 4  # candidates refitted per step
@@ -214,6 +214,7 @@ class Searcher:
             if n not in fit.model.effects
             and n not in self.frozen
             and not any(f in known()[n].replaces for f in self.frozen)
+            and accompanied(fit.model, n)
         ]
         fresh = [
             n
@@ -310,7 +311,7 @@ class Searcher:
         for name in [n for n in new.model.effects if n in fit.model.effects and not self._stays(new, fit, n)]:
             others = [o for o in plainer(name, self.names) if o not in new.model.effects]
             out += [self.fit(swapped(new.model, name, o), 6) for o in others]
-            out.append(self.fit(new.model.without_effect(name), 6))
+            out.append(self.fit(named(new.model.without_effect(name)), 6))
         return out
 
     def _add_pair(self, fit: Fit, losses: Array) -> tuple[Fit, Array, Step] | None:
@@ -372,8 +373,7 @@ class Searcher:
 
     def _with(self, fit: Fit, start: Start, iterations: int, best: float = np.inf) -> Fit:
         """Switch a candidate on, what it replaces off, and refit."""
-        model = without(fit.model, known()[start.effect].replaces)
-        return self.fit(model.with_effect(start.effect, start.values), iterations, best)
+        return self.fit(exchanged(fit.model, start.effect, start.values), iterations, best)
 
     def _try(self, tried: dict[str, Tried], effect: str, new: Fit, losses: Array) -> None:
         """Score a refitted candidate; keep the better of two ways to the same effect."""
@@ -418,7 +418,9 @@ class Searcher:
         for name in [n for n in fit.model.effects if n not in self.frozen]:
             if len([n for n in fit.model.effects if n not in self.frozen]) < 2:
                 break
-            without = self.searched(self.fit(fit.model.without_effect(name), 6), fit.cost)
+            if name not in fit.model.effects:  # it left with what it stood beside
+                continue
+            without = self.searched(self.fit(named(fit.model.without_effect(name)), 6), fit.cost)
             loss = self.loss(without)
             gain, sure = better(losses, loss)
             if (negligible(gain, sure) and self._possible(without, fit)) or small(fit.model, name):
@@ -430,7 +432,7 @@ class Searcher:
         """Put a simpler look-alike in the place of a richer effect where it does as well."""
         for name in [n for n in fit.model.effects if n not in self.frozen]:
             for other in plainer(name, self.names):
-                if other in fit.model.effects:
+                if other in fit.model.effects or name not in fit.model.effects:
                     continue
                 new = self.fit(swapped(fit.model, name, other), 6)
                 loss = self.loss(new)

@@ -145,6 +145,8 @@ def _place(plant: Array, slot: Slot, p: Array) -> None:
             plant[k.ECC_AMP], plant[k.ECC_PHASE] = p
         case Slot.MODULATION:
             plant[k.MOD_A], plant[k.MOD_PHASE], plant[k.MOD_N] = p
+        case Slot.VARIATION:
+            plant[k.VARY_A], plant[k.VARY_PHASE], plant[k.VARY_N] = p
         case Slot.LATTICE:
             plant[k.QUANTUM] *= p[0]
         case _:

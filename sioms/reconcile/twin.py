@@ -153,6 +153,8 @@ def _slot(effect: Effect, values: Mapping[str, float], model: AxisModel) -> dict
             return {"encoder_scale": {"gain": p[0]}}
         case Slot.ECCENTRICITY:
             return {"encoder_eccentricity": {"amplitude": p[0], "pitch": model.pitch, "phase": p[1]}}
+        case Slot.VARIATION:
+            return {"friction_variation": {"depth": p[0], "pitch": model.pitch / p[2], "phase": p[1]}}
         case Slot.LATTICE:
             return {"encoder_quantisation": {"factor": p[0]}}
         case _:

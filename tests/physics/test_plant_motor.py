@@ -250,6 +250,75 @@ def test_presliding_springs_back():
     assert bank.velocity[0] == pytest.approx((12.0 - 2.0) / 50.0, rel=1e-3)
 
 
+@pytest.mark.parametrize(("yielding", "within"), [(0.0, 1e-6), (1.5, 2e-4)])
+def test_all_dry_friction_varies_and_drag_does_not(yielding, within):
+    """Pushed one way over a varying floor, against quadrature: Coulomb, Stribeck and Dahl friction with the factor, drag without."""
+    depth, pitch, phase = 0.4, 0.03, 0.7
+    effects = {
+        "friction_variation": {"depth": depth, "pitch": pitch, "phase": phase},
+        "stribeck": {"rise": 1.0, "velocity": 0.1},
+        "quadratic_drag": {"coefficient": 20.0},
+    }
+    if yielding:
+        effects["presliding"] = {"level": yielding, "stiffness": 4e3}
+    bank = one(effects, mass=2.0, viscous=3.0, coulomb=1.0)
+    run(bank, 9.0, 500)
+
+    def slopes(t, y):
+        share = 1 + depth * np.sin(2 * np.pi * y[0] / pitch + phase)
+        dry = share * (1.0 + np.exp(-((y[1] / 0.1) ** 2))) + y[2]
+        rise = 4e3 * y[1] * (1 - y[2] / (yielding * share)) if yielding else 0.0
+        return [y[1], (9 - 3 * y[1] - 20 * y[1] ** 2 - dry) / 2, rise]
+
+    end = solve_ivp(slopes, (0, 0.5), [0, 0, 0], rtol=1e-10, atol=1e-12).y[:, -1]
+    assert end[0] > 4 * pitch
+    assert bank.position[0] == pytest.approx(end[0], rel=within)
+    assert bank.velocity[0] == pytest.approx(end[1], rel=within)
+
+
+@pytest.mark.parametrize("place", [0.0075, 0.0225])
+def test_friction_that_varies_holds_as_it_is_at_that_place(place):
+    """At the crest 1.5 of the breakaway force hold, in the trough 0.5; a push beyond it moves the axis both ways."""
+    most = 2.0 * (1 + 0.5 * np.sin(2 * np.pi * place / 0.03))
+    for way in (1.0, -1.0):
+        bank = one(
+            {"friction_variation": {"depth": 0.5, "pitch": 0.03}},
+            mass=1.0,
+            coulomb=1.0,
+            stiction=2.0,
+            start=place,
+        )
+        run(bank, 0.98 * way * most, 100)
+        assert bank.position[0] == place
+        run(bank, 1.02 * way * most, 100)
+        assert way * (bank.position[0] - place) > 0
+
+
+def test_a_stop_and_a_return_over_a_varying_floor_agree_with_quadrature():
+    """Thrown against a constant push, the axis stops and comes back under a friction that varies."""
+    bank = one({"friction_variation": {"depth": 0.6, "pitch": 0.02}}, mass=0.5, coulomb=1.0, substeps=8)
+    bank.velocity[:] = 0.5
+    run(bank, -3.0, 200)
+
+    def level(x):
+        return 1 + 0.6 * np.sin(2 * np.pi * x / 0.02)
+
+    def stopped(t, y):
+        return y[1]
+
+    stopped.terminal = True
+    ask = {"rtol": 1e-11, "atol": 1e-14}
+    there = solve_ivp(
+        lambda t, y: [y[1], (-3 - level(y[0])) / 0.5], (0, 0.2), [0, 0.5], events=stopped, **ask
+    )
+    back = solve_ivp(
+        lambda t, y: [y[1], (-3 + level(y[0])) / 0.5], (there.t[-1], 0.2), [there.y[0, -1], 0.0], **ask
+    )
+    assert back.y[0, -1] < 0.8 * there.y[0, -1]
+    assert bank.position[0] == pytest.approx(back.y[0, -1], abs=1e-5)
+    assert bank.velocity[0] == pytest.approx(back.y[1, -1], abs=1e-4)
+
+
 def test_stop_under_viscous_friction_agrees_with_quadrature():
     """One long tick: the velocity comes to zero under b and c together, then the force drives it back."""
     bank = one(mass=0.5, viscous=20.0, coulomb=1.0, tick_s=0.1)

@@ -158,18 +158,21 @@ def test_dahl_friction_builds_up_exponentially_over_its_length() -> None:
     np.testing.assert_allclose(run.x[1000:], wanted[1000:], rtol=0.04)
 
 
+@pytest.mark.parametrize("depth", [0.0, 0.3])
 @pytest.mark.parametrize("speed", [0.02, 0.4])
-def test_lugre_friction_agrees_with_an_ordinary_solver(speed: float) -> None:
-    """Driven to and fro so that it yields, breaks away and drops: LuGre's equation without damping, solved by scipy."""
+def test_lugre_friction_agrees_with_an_ordinary_solver(speed: float, depth: float) -> None:
+    """Driven to and fro so that it yields, breaks away and drops, over a level that varies or not: LuGre's equation by scipy."""
     fc, fs, vs, xs, b, j = 0.05, 0.08, 0.15, 1e-2, 1e-3, 2e-3
     values = {"Fc": fc, "xs": xs, "Fs": fs, "vs": vs}
     model = replace(AXIS, viscous=b, controller=None).with_effect("lugre", values)
+    if depth > 0.0:
+        model = model.with_effect("friction_variation", {"depth": depth, "phase": 0.8, "n": 7.0})
     t = np.arange(1500) * DT
     force = (fs + speed * 0.1) * np.sin(2 * np.pi * 1.5 * t)
 
     def slopes(time: float, y: np.ndarray) -> list[float]:
-        _, v, f = y
-        g = fc + (fs - fc) * np.exp(-((v / vs) ** 2))
+        x, v, f = y
+        g = (fc + (fs - fc) * np.exp(-((v / vs) ** 2))) * (1.0 + depth * np.sin(7.0 * x + 0.8))
         u = force[min(int(time / DT + 1e-9), len(force) - 1)]
         return [v, (u - f - b * v) / j, fs / xs * (v - abs(v) * f / g)]
 
@@ -181,6 +184,44 @@ def test_lugre_friction_agrees_with_an_ordinary_solver(speed: float) -> None:
     run = track(model, np.zeros(len(t)), force, None)
     assert np.ptp(x) > 20 * xs
     np.testing.assert_allclose(run.x, x, atol=2e-3 * np.ptp(x))
+
+
+@pytest.mark.parametrize("law", ["presliding", "stribeck"])
+def test_friction_that_varies_over_the_turn_agrees_with_an_ordinary_solver(law: str) -> None:
+    """Pushed one way by a force that swings, over three waves: level and hysteresis times the factor, solved by scipy."""
+    fc, fs, vs, xs, b, j = 0.05, 0.09, 2.0, 5e-2, 1e-3, 2e-3
+    values = {"Fc": fc, "Fs": fs, "vs": vs} if law == "stribeck" else {"Fc": fc, "xs": xs}
+    model = replace(AXIS, viscous=b, controller=None).with_effect(law, values)
+    model = model.with_effect("friction_variation", {"depth": 0.35, "phase": 0.8, "n": 3.0})
+    force = 0.14 + 0.04 * np.sin(2 * np.pi * 3.0 * np.arange(600) * DT)
+
+    def slopes(t: float, y: np.ndarray, u: float) -> list[float]:
+        x, v, f = y
+        share = 1.0 + 0.35 * np.sin(3.0 * x + 0.8)
+        if law == "stribeck":
+            return [v, (u - share * (fc + (fs - fc) * np.exp(-((v / vs) ** 2))) - b * v) / j, 0.0]
+        return [v, (u - f - b * v) / j, (share * fc - f) * abs(v) / (share * xs)]
+
+    y, wanted = np.zeros(3), []
+    for u in force:
+        wanted.append(y)
+        y = solve_ivp(slopes, (0, DT), y, args=(u,), method="DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
+    x = np.array(wanted)[:, 0]
+    assert np.ptp(x) > 2 * np.pi
+    run = track(model, np.zeros(len(force)), force, None)
+    np.testing.assert_allclose(run.x, x, atol=2e-5 * np.ptp(x))
+
+
+@pytest.mark.parametrize("place", [np.pi / 6, np.pi / 2])
+def test_friction_that_varies_holds_as_it_is_at_that_place(place: float) -> None:
+    model = replace(AXIS, viscous=0.0, controller=None).with_effect(
+        "stribeck", {"Fc": 0.03, "Fs": 0.06, "vs": 0.1}
+    )
+    model = model.with_effect("friction_variation", {"depth": 0.5, "phase": 0.0, "n": 3.0})
+    most, there = 0.06 * (1.0 + 0.5 * np.sin(3.0 * place)), np.full(100, place)
+    for way in (1.0, -1.0):
+        assert np.all(track(model, there, np.full(100, 0.98 * way * most), None).v == 0.0)
+        assert way * track(model, there, np.full(100, 1.02 * way * most), None).v[-1] > 0.0
 
 
 def test_lugre_friction_that_vanishes_with_speed_still_holds_at_rest() -> None:

@@ -29,6 +29,7 @@ CASES: dict[str, dict[str, float]] = {
     "stribeck": {"Fc": 0.03, "Fs": 0.05, "vs": 0.3},
     "presliding": {"Fc": 0.03, "xs": 5e-3},
     "lugre": {"Fc": 0.03, "xs": 5e-3, "Fs": 0.05, "vs": 0.3},
+    "friction_variation": {"depth": 0.3, "phase": 0.4, "n": 3.0},
     "load_friction": {"mu": 0.2},
     "offset": {"off": 0.02},
     "gravity": {"amp": 0.03, "phase": 0.4},
@@ -42,6 +43,8 @@ CASES: dict[str, dict[str, float]] = {
     "elastic": {"f_res": 18.0, "load_fraction": 0.4, "zeta": 0.05},
     "payload": {"J_extra": 6e-4},
 }
+#: What an effect acts on that does nothing alone.
+BESIDE = {"friction_variation": ("coulomb", "stribeck", "presliding", "lugre")}
 
 
 def driven(model: AxisModel, force: np.ndarray = FORCE) -> tuple[np.ndarray, np.ndarray]:
@@ -56,10 +59,11 @@ def driven(model: AxisModel, force: np.ndarray = FORCE) -> tuple[np.ndarray, np.
     return np.array(x), run.x
 
 
-@pytest.mark.parametrize("name", sorted(CASES))
-def test_the_twin_moves_as_the_simulation(name: str) -> None:
-    twin, simulated = driven(AXIS.with_effect(name, CASES[name]))
-    bare, _ = driven(AXIS)
+@pytest.mark.parametrize(("name", "beside"), [(n, b) for n in sorted(CASES) for b in BESIDE.get(n, ("",))])
+def test_the_twin_moves_as_the_simulation(name: str, beside: str) -> None:
+    axis = AXIS.with_effect(beside, CASES[beside]) if beside else AXIS
+    twin, simulated = driven(axis.with_effect(name, CASES[name]))
+    bare, _ = driven(axis)
     size = float(np.max(np.abs(simulated - bare)))
     assert size > 1e-3  # the effect does something
     assert np.max(np.abs(twin - simulated)) < 0.01 * size

@@ -188,6 +188,22 @@ LUGRE = Effect(
     replaces=("coulomb", "stribeck", "presliding", "coulomb_position"),
     joins=("stribeck", "presliding"),
 )
+FRICTION_VARIATION = Effect(
+    name="friction_variation",
+    title="dry friction that varies over the turn",
+    channel=Channel.MECHANICS,
+    slot=Slot.VARIATION,
+    equation="dry friction with a low-speed drop or presliding, its level times 1 + depth sin(n theta + phase)",
+    parameters=(
+        Parameter("depth", "1", Ref.ONE, 0.0, 0.95, 0.1, "relative variation of the level", least=0.02),
+        Parameter("phase", "rad", Ref.ANGLE, -np.pi, np.pi, 0.0, "phase at position zero", phase=True),
+        Parameter("n", "1/pitch", Ref.ONE, 1.0, 60.0, 1.0, "periods in a pitch", fixed=True),
+    ),
+    signature="periodic force residual whose sign follows the direction of motion, as large as the dry friction is at that speed",
+    lookalikes=("torque_ripple", "cogging", "coulomb_position"),
+    separate="one full turn both ways, at constant speed and with acceleration",
+    beside=("stribeck", "presliding", "lugre"),
+)
 LOAD_FRICTION = Effect(
     name="load_friction",
     title="load-dependent friction",
@@ -210,5 +226,6 @@ EFFECTS = (
     STRIBECK,
     PRESLIDING,
     LUGRE,
+    FRICTION_VARIATION,
     LOAD_FRICTION,
 )

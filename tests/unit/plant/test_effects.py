@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sioms.plant.effects import CATALOGUE, EffectsError, Place, build_effects, parse_effects
-from sioms.plant.forces import FORCES, RESISTANCES
+from sioms.plant.forces import DRAGS, DRY, FORCES
 from sioms.plant.motor import MotorBank
 from sioms.plant.parameters import Motor
 
@@ -71,7 +71,7 @@ def test_not_toml():
 def test_every_catalogued_force_exists():
     for name, kind in CATALOGUE.items():
         assert (name in FORCES) == (kind.place in (Place.MOTOR, Place.LOAD))
-        assert (name in RESISTANCES) == (kind.place is Place.RESISTANCE)
+        assert ((name in DRY) != (name in DRAGS)) == (kind.place is Place.RESISTANCE)
 
 
 def _numbers(name):
