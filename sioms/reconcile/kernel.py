@@ -79,9 +79,18 @@ def summed(functions: Any, p: Array, x: float, v: float, u: float, t: float) -> 
 
 
 @inlined
-def friction(levels: Any, p: Array, x: float, v: float, u: float, t: float) -> float:
+def varied(level: float, wave: tuple[float, float, float], x: float) -> float:
+    """Return a level of dry friction as it is at x; ``wave``: depth, wave number and phase of what varies."""
+    depth, number, phase = wave
+    return level if depth == 0.0 else level * (1.0 + depth * np.sin(number * x + phase))
+
+
+@inlined
+def friction(
+    levels: Any, p: Array, wave: tuple[float, float, float], x: float, v: float, u: float, t: float
+) -> float:
     """Sum the FRICTION levels in the direction of v, never negative."""
-    return max(summed(levels, p, x, v, u, t), 0.0)
+    return varied(max(summed(levels, p, x, v, u, t), 0.0), wave, x)
 
 
 @kernel
@@ -179,7 +188,7 @@ def march(
     # Local copies: a function that is called by its address might have changed an array.
     viscous, limit, delay, lag, loss = plant[VISCOUS], plant[LIMIT], plant[DELAY], plant[LAG], plant[LOSS]
     hyst_f, hyst_s, mod, gain_y = plant[HYST_F], plant[HYST_S], plant[MOD_A], plant[GAIN_Y]
-    vary, waves = plant[VARY_A], plant[VARY_N] * plant[TURN_X]
+    wave = (plant[VARY_A], plant[VARY_N] * plant[TURN_X], plant[VARY_PHASE])
     decay = np.exp(-h / lag) if lag > 0.0 else 0.0
     per_mass = 1.0 / jm
     x, v, temp = start[0], start[1], start[2]
@@ -189,7 +198,7 @@ def march(
     hyst = 0.0
     e_old, u_old, y_old, y_older, v_f = start[3], start[4], 0.0, 0.0, gain_y * v
     off = 0
-    level, share, acting = 0.0, 1.0, summed(forces, pf, x, v, u_old, temp)
+    level, acting = 0.0, summed(forces, pf, x, v, u_old, temp)
     u_all = np.zeros(n)
     for i in range(n):
         y = gain_y * x
@@ -258,13 +267,11 @@ def march(
             xp = x + 0.5 * h * v
             for k in range(len(pg)):
                 drive *= call(gains, k, pg, xp, v, ua, temp)
-            if vary != 0.0:
-                share = 1.0 + vary * np.sin(waves * xp + plant[VARY_PHASE])
             sign = 1.0 if v > 0.0 else -1.0
             if v == 0.0:
                 level = 0.0
             elif dry and level * v <= 0.0:
-                level = sign * share * friction(levels, pl, x, v, ua, temp)
+                level = sign * friction(levels, pl, wave, x, v, ua, temp)
             base = drive + external[i] + acting - hyst
             link = coupling(plant, x - xl, v - vl) if two else 0.0
             a0 = (base - viscous * v - level - link) * per_mass
@@ -276,7 +283,8 @@ def march(
                 if hyst_s > 0.0:
                     goal += (hyst_s - hyst_f) * np.exp(-((vp / plant[HYST_V]) ** 2))
                     path *= hyst_s / max(goal, LEAST_LEVEL * hyst_s)
-                if vary != 0.0:  # the level varies, the stiffness before it does not
+                if wave[0] != 0.0:
+                    share = varied(1.0, wave, xp)  # of the level; the stiffness before it does not vary
                     goal *= share
                     path /= max(share, LEAST_LEVEL)
                 way = np.exp(-path)
@@ -305,12 +313,12 @@ def march(
             if dry:
                 if v != 0.0:
                     vm = vp if vp != 0.0 else sign * TINY_SPEED
-                    level = sign * share * friction(levels, pl, xp, vm, ua, temp)
+                    level = sign * friction(levels, pl, wave, xp, vm, ua, temp)
                 xs = x
                 x, v, rest = slide(x, v, (force - level) * per_mass, h)
                 if rest > 0.0:
-                    break_p = share * friction(levels, pl, xs, TINY_SPEED, ua, temp)
-                    break_m = share * friction(levels, pl, xs, -TINY_SPEED, ua, temp)
+                    break_p = friction(levels, pl, wave, xs, TINY_SPEED, ua, temp)
+                    break_m = friction(levels, pl, wave, xs, -TINY_SPEED, ua, temp)
                     v = leave(force, break_p, break_m) * per_mass * rest
                     x += 0.5 * v * rest
             else:

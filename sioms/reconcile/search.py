@@ -244,6 +244,8 @@ class Searcher:
             joins = known()[name].joins
             if joins and not any(n in fit.model.effects for n in joins):
                 continue
+            if name in fit.model.effects:  # what it enriches became it, by what varies beside it
+                continue
             old = next(n for n in known()[name].replaces if n in fit.model.effects)
             level = next(iter(fit.model.effects[old].values()))
             levels = {p.symbol: level for p in known()[name].parameters if p.symbol in ("Fc", "Fs", "f")}
