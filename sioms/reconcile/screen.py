@@ -211,7 +211,7 @@ def screen(
         if effect.slot in STATE_SLOTS:
             out.append(_screen_state(problem, fit, effect, motions, q, rest, dead, travel, levels or {}))
         else:
-            out.extend(_screen_trials(problem, fit, effect, q, rest))
+            out.extend(_screen_trials(problem, fit, effect, q, rest, levels or {}))
     return sorted((s for s in out if s is not None), key=lambda s: -s.gain)
 
 
@@ -403,13 +403,15 @@ def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator
         yield {**start, **g}
 
 
-def _screen_trials(problem: Problem, fit: Fit, effect: Effect, q: Array, rest: Array) -> list[Start]:
+def _screen_trials(
+    problem: Problem, fit: Fit, effect: Effect, q: Array, rest: Array, levels: Mapping[str, float]
+) -> list[Start]:
     """Try an effect on a grid in the simulation; the change it makes may be stretched, and turned round where its size has a sign."""
     model = room_for(fit.model, effect.name)
-    trials = list(trial_values(effect, model, problem))
+    trials = [{**t, **levels} for t in trial_values(effect, model, problem)]
     if effect.joins:
         trials = _beside(trials, fit.model, effect)
-    best = _scored(problem, fit, model, effect, trials, q, rest)
+    best = _scored(problem, fit, model, effect, trials, q, rest, stretched=not levels)
     if effect.slot is Slot.BACKLASH:
         others = [{**s.values, **contact} for s in best[:FEW] for contact in CONTACTS[1:]]
         best = sorted(best + _scored(problem, fit, model, effect, others, q, rest), key=lambda s: -s.gain)
@@ -424,8 +426,13 @@ def _scored(
     trials: list[dict[str, float]],
     q: Array,
     rest: Array,
+    stretched: bool = True,
 ) -> list[Start]:
-    """Simulate trials beside a model and say what each could explain, the best first."""
+    """Simulate trials beside a model and say what each could explain, the best first.
+
+    Args:
+        stretched: their sizes are only typical, and are stretched to what is seen; else they are those of what they replace.
+    """
     best: list[Start] = []
     least = -9.0 if effect.slot is Slot.SCALE or effect.primary.lower < 0.0 else 0.0
     for values, tried in zip(
@@ -440,7 +447,9 @@ def _scored(
             continue
         stretch = float(np.clip(-(d @ rest) / size, least, 9.0))
         gain = 1.0 - float(np.sum((rest + stretch * d) ** 2)) / float(rest @ rest)
-        best.append(Start(effect.name, gain, _stretched(effect, model, values, stretch)))
+        best.append(
+            Start(effect.name, gain, _stretched(effect, model, values, stretch) if stretched else values)
+        )
     return sorted(best, key=lambda s: -s.gain)
 
 

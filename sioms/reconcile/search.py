@@ -47,6 +47,8 @@ LOOSE = 2.0  # an effect does not make the error of the simulated closed loop th
 PERIODIC_SURE = 3.0  # for effects whose order is searched over tens of values
 PASSES = 4  # at most so many times more for a new gap, while it gains
 BEST = 2  # of the candidates beside a gap are judged with its numbers searched anew
+#: What the levels of laws of dry friction are called.
+LEVELS = ("Fc", "Fs", "f")
 WORTH = 2.0  # and not where another candidate leaves less by this factor
 #: Fits are kept in memory up to this size: a second search, with terms beside the library, retraces the first.
 KEPT_BYTES = 128_000_000
@@ -247,8 +249,11 @@ class Searcher:
             if name in fit.model.effects:  # what it enriches became it, by what varies beside it
                 continue
             old = next(n for n in known()[name].replaces if n in fit.model.effects)
-            level = next(iter(fit.model.effects[old].values()))
-            levels = {p.symbol: level for p in known()[name].parameters if p.symbol in ("Fc", "Fs", "f")}
+            given = fit.model.effects[old]
+            level = next((given[s] for s in LEVELS if s in given), None)
+            levels = {
+                p.symbol: level for p in known()[name].parameters if level is not None and p.symbol in LEVELS
+            }
             out += self.screen(fit, [name], levels)
         return out
 
