@@ -205,7 +205,8 @@ def _outcome(named: bool, unexplained: bool, ambiguous: bool) -> Outcome:
 
 
 def _set(r: Rival, model: AxisModel) -> tuple[str, ...]:
-    return tuple(r.rival if n == r.effect else n for n in model.effects)
+    kept = (n for n in model.effects if n == r.effect or n in r.fit.model.effects)
+    return tuple(r.rival if n == r.effect else n for n in kept)
 
 
 def _plan(ready: Prepared, o: Options, model: AxisModel, open_rivals: Sequence[Rival]) -> Experiment | None:

@@ -36,6 +36,11 @@ def replaced(model: AxisModel, name: str) -> bool:
     return any(n in model.effects for n in known()[name].replaces)
 
 
+def vacant(model: AxisModel, name: str, other: str) -> bool:
+    """Say whether the place of an effect may be given to another: neither that nor what it excludes is in the model beside."""
+    return other not in model.effects and not replaced(model.without_effect(name), other)
+
+
 def size(name: str) -> int:
     """Number of parameters of an effect."""
     return len(known()[name].parameters)

@@ -30,6 +30,7 @@ from sioms.reconcile.plausible import (
     small,
     swapped,
     unspecific,
+    vacant,
 )
 from sioms.reconcile.rules import GAIN, SPECIFIC, SURE, negligible
 from sioms.reconcile.screen import Start, screen
@@ -316,7 +317,7 @@ class Searcher:
         """Put a plainer effect, or none, in the place of each that can no longer be beside a new one: it stood for both."""
         out = []
         for name in [n for n in new.model.effects if n in fit.model.effects and not self._stays(new, fit, n)]:
-            others = [o for o in plainer(name, self.names) if o not in new.model.effects]
+            others = [o for o in plainer(name, self.names) if vacant(new.model, name, o)]
             out += [self.fit(swapped(new.model, name, o), 6) for o in others]
             out.append(self.fit(named(new.model.without_effect(name)), 6))
         return out
@@ -439,7 +440,7 @@ class Searcher:
         """Put a simpler look-alike in the place of a richer effect where it does as well."""
         for name in [n for n in fit.model.effects if n not in self.frozen]:
             for other in plainer(name, self.names):
-                if other in fit.model.effects or name not in fit.model.effects:
+                if name not in fit.model.effects or not vacant(fit.model, name, other):
                     continue
                 new = self.fit(swapped(fit.model, name, other), 6)
                 loss = self.loss(new)

@@ -10,7 +10,7 @@ import pytest
 from sioms.reconcile.dry import dry_friction
 from sioms.reconcile.effects import known
 from sioms.reconcile.model import AxisModel, Controller
-from sioms.reconcile.plausible import swapped
+from sioms.reconcile.plausible import swapped, vacant
 from sioms.reconcile.simulate import simulate
 from sioms.reconcile.variation import FACTOR, WHOLE, accompanied, exchanged, named, room_for
 
@@ -68,3 +68,13 @@ def test_the_dry_friction_of_a_motion_is_built_up_and_varies() -> None:
     slid = dry_friction(bristles, x, v, zero, zero, one)[1000:]
     law = 0.03 + 0.02 * np.exp(-0.25)
     np.testing.assert_allclose(slid, -law * share[1000:], atol=0.02 * law)
+
+
+def test_a_place_is_not_given_to_a_law_that_another_in_the_model_excludes() -> None:
+    model = AXIS.with_effect("lugre", LUGRE).with_effect(
+        "backlash", {"gap": 0.01, "load_fraction": 0.5, "f_contact": 100.0, "zeta": 0.3}
+    )
+    assert not vacant(model, "backlash", "stribeck")
+    assert not vacant(model, "backlash", "lugre")
+    assert vacant(model, "backlash", "elastic")
+    assert vacant(model, "lugre", "stribeck")
