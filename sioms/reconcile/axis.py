@@ -31,6 +31,7 @@ from sioms.reconcile.rules import SPECIFIC, SURE
 from sioms.reconcile.search import Found, Searcher, Step
 from sioms.reconcile.timed import Timed
 from sioms.reconcile.tones import as_timed, hum
+from sioms.reconcile.variation import named as varied
 from sioms.reconcile.verdict import Verdict
 
 #: A change in time leaves at most this share of what else would be left above the noise; of several that leave about the same, or no more than
@@ -84,8 +85,8 @@ def _upright(s: Searched) -> Searched:
     """Let effects leave that have come to lean on the end of what they can be: they stood for something else."""
     found, searcher = s.found, s.searcher
     for name in [n for n in found.fit.model.effects if n not in searcher.frozen]:
-        if leans(found.fit.model, name):
-            fit = searcher.fit(found.fit.model.without_effect(name), 6)
+        if name in found.fit.model.effects and leans(found.fit.model, name):
+            fit = searcher.fit(varied(found.fit.model.without_effect(name)), 6)
             step = Step("leave", name, fit.ratio, 1.0 - fit.cost / found.fit.cost, fit.model)
             found = Found(fit, searcher.loss(fit), (*found.ladder, step))
     return (
