@@ -9,26 +9,29 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.simulate import simulate
-from sioms.reconcile_selftest.draw import CONFOUNDED, NAMED, NAMELESS, SAMPLE_S, Axis, commands, draw_axis
+from sioms.reconcile_selftest.axis import Axis
+from sioms.reconcile_selftest.commands import commands
+from sioms.reconcile_selftest.draw import CONFOUNDED, NAMED, NAMELESS, draw_axis
 from sioms.reconcile_selftest.score import Scored, score
 from sioms.reconcile_selftest.world import Recording, World
 from sioms.tools.reconcile_blind import in_turn, judge_all, solve
 from sioms.tools.reconcile_input import read_model
 
 RECORD_S = 5.0
+SETTLED_S = 0.2
 COLUMNS = """[columns]
 time = { name = "time", unit = "s" }
 position = { name = "counts", unit = "count" }
 command = { name = "command" }
 force = { name = "force" }
-force_measured = { name = "force_measured" }
-index = { name = "index" }
 """
+CURRENT, MARKS = 'force_measured = { name = "force_measured" }\n', 'index = { name = "index" }\n'
 
 
 def generate(count: int, seed: int) -> list[Axis]:
@@ -38,68 +41,67 @@ def generate(count: int, seed: int) -> list[Axis]:
     return [draw_axis(f"axis{i:03d}", kind, rng, only) for i, kind, only in in_turn(count, rng, effects)]
 
 
-def record_all(
-    axes: list[Axis], seed: int, seconds: float = RECORD_S, heldout: bool = False
-) -> list[list[Recording]]:
-    """Record all axes.
+def record(axis: Axis, seconds: float = RECORD_S, heldout: bool = False) -> list[Recording]:
+    """Record an axis.
 
     Args:
-        heldout: go on with a fifth record of another command, and the same once more under other noise.
+        heldout: go on with a fifth record of another command, and the same once more without noise.
 
     Returns:
-        Per axis its four recordings, or six.
+        Its four recordings, or six.
     """
-    rng = np.random.default_rng([seed, 1])
-    world = World(axes, rng, np.zeros(len(axes)))
-    orders = [commands(a, seconds, rng) for a in axes]
-    runs = [world.record([o[r] for o in orders]) for r in range(4)]
+    world, orders = World(axis), commands(axis, seconds)
+    runs = [world.record(order) for order in orders[:4]]
     if heldout:
-        fresh, heat = [commands(a, seconds, rng)[1] for a in axes], world.heat.copy()
-        runs.append(world.record(fresh))
+        heat = world.heat
+        runs.append(world.record(orders[4]))
         world.heat = heat
-        runs.append(world.record(fresh))
-    return [[run[j] for run in runs] for j in range(len(axes))]
+        runs.append(world.record(orders[4], noise=0.0))
+    return runs
 
 
 def closed(folder: Path, records: list[Recording]) -> float | None:
     """Measure the share of the gap in force that the model of an answer closes on the held-out command.
 
     Returns:
-        (nominal - model)/(nominal - truth), the truth being what noise alone changes between two runs; None
-        where the gap is no larger than that.
+        (nominal - model)/(nominal - truth), the truth being the generator itself without noise; None where the gap is hardly larger
+        than what that leaves.
     """
-    measured, again = records[4].force[200:], records[5].force[200:]
-    truth = float(np.std(measured - again) / np.sqrt(2.0))
-    nominal, model = (_error(read_model(folder / f), records) for f in ("nominal.toml", "report/model.toml"))
+    models = [read_model(folder / f) for f in ("nominal.toml", "report/model.toml")]
+    settled = round(SETTLED_S / models[0].sample_time_s)
+    truth = float(np.sqrt(np.mean((records[4].force - records[5].force)[settled:] ** 2)))
+    nominal, model = (_error(m, records, settled) for m in models)
     return (nominal - model) / (nominal - truth) if nominal > 1.2 * truth else None
 
 
-def _error(model: AxisModel, records: list[Recording]) -> float:
+def _error(model: AxisModel, records: list[Recording], settled: int) -> float:
     heat = 0.0
     for r in records[:4]:
         heat = simulate(model, r.command, heat).end_temperature
     run = simulate(model, records[4].command, heat)
-    return float(np.sqrt(np.mean(np.nan_to_num(run.force - records[4].force, nan=1e9)[200:] ** 2)))
+    return float(np.sqrt(np.mean(np.nan_to_num(run.force - records[4].force, nan=1e9)[settled:] ** 2)))
 
 
 def write_public(axis: Axis, recordings: list[Recording], folder: Path) -> None:
     """Write what the solver may see: records, column description and nominal model."""
     folder.mkdir(parents=True)
     for i, r in enumerate(recordings):
-        np.savez(
-            folder / f"run{i}.npz",
-            time=np.arange(len(r.counts)) * SAMPLE_S,
-            counts=r.counts,
-            command=r.command,
-            force=r.force,
-            force_measured=r.force_measured,
-            index=r.index,
-        )
-    (folder / "columns.toml").write_text(COLUMNS)
+        seen: dict[str, Any] = {
+            "time": np.arange(len(r.counts)) * axis.sample_s,
+            "counts": r.counts,
+            "command": r.command,
+            "force": r.force,
+        }
+        if axis.current:
+            seen["force_measured"] = r.force_measured
+        if axis.marks:
+            seen["index"] = r.index
+        np.savez(folder / f"run{i}.npz", **seen)
+    (folder / "columns.toml").write_text(COLUMNS + axis.current * CURRENT + axis.marks * MARKS)
     lines: list[str] = []
     for name, values in axis.public().items():
         lines.append(f"[{name}]")
-        lines += [f"{k} = {json.dumps(v)}" for k, v in dict(values).items()]  # type: ignore[call-overload]
+        lines += [f"{k} = {json.dumps(v)}" for k, v in values.items()]
     (folder / "nominal.toml").write_text("\n".join(lines) + "\n")
 
 
@@ -114,12 +116,11 @@ def selftest(count: int, seed: int, out: Path | None = None, jobs: int = 0, repl
     Returns:
         0 when at least nine tenths of the axes were judged right, else 1.
     """
+    print(f"drawing {count} axes", file=sys.stderr, flush=True)
     axes = generate(count, seed)
-    print(f"generating {count} axes", file=sys.stderr, flush=True)
-    recordings = dict(zip((a.name for a in axes), record_all(axes, seed, heldout=True), strict=True))
 
     def judge(axis: Axis, folder: Path) -> Scored:
-        records = recordings[axis.name]
+        records = record(axis, heldout=True)
         write_public(axis, records[:4], folder)
         return _judge(axis, records, folder, replicates)
 

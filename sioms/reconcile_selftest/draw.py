@@ -1,279 +1,326 @@
-"""Draw axes, hidden effects and commands at random. All numbers SI; a draw is reproducible by its seed."""
+"""Draw axes, hidden effects and controllers at random. All numbers SI; a draw is reproducible by its seed.
+
+What is drawn is run before it is taken: the loop must hold, and a drive that saturates do so in some of the samples, not in most.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-SAMPLE_S = 1e-3
+from sioms.reconcile_selftest.axis import Axis, Numbers, Servo
+from sioms.reconcile_selftest.commands import REACH, commands
+from sioms.reconcile_selftest.world import World
 
-#: What may be confounded with what under which poor excitation.
+#: What may be confounded with what under which poor excitation, or for want of which channel.
 CONFOUNDED = {
     "cruise": ("coulomb", "viscous"),
     "oneway": ("coulomb", "offset"),
     "small": ("gravity", "offset"),
+    "no_marks": ("payload", "encoder_scale"),
+    "no_current": ("delay", "lag"),
 }
 NAMED = (
     "viscous",
+    "viscous_direction",
+    "quadratic_drag",
     "coulomb",
+    "coulomb_position",
     "stribeck",
+    "presliding",
+    "lugre",
+    "load_friction",
     "backlash",
-    "cogging",
-    "torque_ripple",
-    "gravity",
-    "offset",
-    "delay",
-    "saturation",
     "elastic",
+    "payload",
+    "cogging",
+    "gravity",
+    "spring",
+    "offset",
+    "torque_ripple",
+    "delay",
+    "lag",
+    "saturation",
+    "thermal_gain",
     "encoder_scale",
     "encoder_quantisation",
-    "thermal_gain",
-    "payload",
+    "eccentricity",
 )
-NAMELESS = ("cubic_spring", "falling_drag", "hysteresis", "swinging_inertia", "knocks")
-MIXABLE = ("viscous", "coulomb", "stribeck", "cogging", "gravity", "offset", "delay", "payload", "elastic")
-
-
-@dataclass(frozen=True, slots=True)
-class Axis:
-    """One axis and what it hides.
-
-    Attributes:
-        kind: null, single, multi, confounded or unknown.
-        named, nameless: hidden effects with their parameters.
-        rival: the look-alike of a confounded effect.
-    """
-
-    name: str
-    kind: str
-    rotary: bool
-    inertia: float
-    viscous: float
-    rated: float
-    speed: float
-    resolution: float
-    pitch: float
-    gains: tuple[float, float, float, float, float]  # k, kz, kp, kb, limit
-    excitation: str
-    named: dict[str, dict[str, float]] = field(default_factory=dict)
-    nameless: dict[str, dict[str, float]] = field(default_factory=dict)
-    rival: str = ""
-
-    def public(self) -> dict[str, object]:
-        """Return what the solver may know."""
-        k, kz, kp, kb, limit = self.gains
-        return {
-            "axis": {
-                "name": self.name,
-                "kind": "rotary" if self.rotary else "linear",
-                "sample_time_s": SAMPLE_S,
-                "inertia": self.inertia,
-                "viscous": self.viscous,
-                "resolution": self.resolution,
-                "pitch": self.pitch,
-                "rated_force": self.rated,
-                "max_speed": self.speed,
-            },
-            "controller": {
-                "k": k,
-                "kz": kz,
-                "kp": kp,
-                "kb": kb,
-                "offset": 0.0,
-                "limit": limit,
-                "velocity_filter_hz": 0.0,
-            },
-        }
+NAMELESS = (
+    "cubic_spring",
+    "falling_drag",
+    "hysteresis",
+    "swinging_inertia",
+    "knocks",
+    "load_square",
+    "stop",
+    "detent",
+)
+#: Of each of these at most one is in a mixture: one drive, one transmission, one law of dry friction, one force along the range.
+EXCLUSIVE = (
+    ("coulomb", "coulomb_position", "stribeck", "presliding", "lugre"),
+    ("delay", "lag", "saturation"),
+    ("elastic", "backlash"),
+    ("gravity", "spring"),
+    ("encoder_quantisation", "backlash"),
+)
+#: Known effects that may be beside one that is outside the library.
+BESIDE = {
+    "cubic_spring": ("coulomb", "payload"),
+    "falling_drag": ("coulomb", "payload"),
+    "stop": ("coulomb", "viscous"),
+    "detent": ("viscous", "payload"),
+    "load_square": ("viscous", "offset"),
+}
+#: Only a measured current, or index marks, tell these from their look-alikes.
+BY_CURRENT, BY_MARKS = {"delay", "lag", "saturation"}, {"payload", "encoder_scale"}
+#: Effects of angle, and a frequent sample time for each rare one.
+TURNING = ("gravity", "swinging_inertia")
+SAMPLES_S = (0.005, 0.002, 0.001, 0.001, 0.001, 0.0005, 0.00025)
+#: One count of the encoder may change the force by this share of the rated one; in how many of the samples a drive saturates, and a controller at most.
+CHATTER, SATURATED, AT_LIMIT = 0.1, (0.03, 0.35), 0.02
+#: A thermal loss is of such a share in the end; a small range is within this angle [rad].
+WARM, SMALL = (0.06, 0.4), 0.4
+TRIES, DRY_RUN_S = 200, 5.0
 
 
 def draw_axis(name: str, kind: str, rng: np.random.Generator, only: str = "") -> Axis:
-    """Draw one axis of a kind; ``only`` asks for a certain effect (single) or excitation (confounded)."""
-    excitation = "full"
-    if kind == "confounded":
-        excitation = only or str(rng.choice(list(CONFOUNDED)))
-    needs_turn = excitation == "small" or only in ("gravity", "swinging_inertia")
-    rotary = bool(needs_turn or rng.random() < 0.6)
-    base = _plant(name, kind, rotary, excitation, rng)
-    named: dict[str, dict[str, float]] = {}
-    nameless: dict[str, dict[str, float]] = {}
+    """Draw one axis of a kind; ``only`` asks for a certain effect (single, unknown) or excitation (confounded).
+
+    Raises:
+        ValueError: no draw gave a loop that holds.
+    """
+    for _ in range(TRIES):
+        axis = _drawn(name, kind, rng, only)
+        if _sound(axis):
+            return axis
+    raise ValueError(f"draw axis {name}: none of {TRIES} draws of {kind} {only} gave a loop that holds")
+
+
+def _sound(axis: Axis) -> bool:
+    """Say whether the loop holds, the drive saturates as it should, the motor warms up enough, and a small range is small."""
+    world = World(axis)
+    runs = [world.record(c) for c in commands(axis, DRY_RUN_S)]
+    force, place = np.abs([r.force for r in runs]), np.abs([r.counts for r in runs]) * axis.resolution
+    if float(np.max(np.mean(force >= 0.999 * axis.servo.limit, axis=1))) > AT_LIMIT:
+        return False
+    if "saturation" in axis.named:
+        share = float(np.mean(force[:4] > axis.named["saturation"]["limit"]))
+        if not SATURATED[0] < share < SATURATED[1]:
+            return False
+    if (
+        "thermal_gain" in axis.named
+        and not WARM[0] < axis.named["thermal_gain"]["loss"] * world.heat < WARM[1]
+    ):
+        return False
+    return axis.excitation != "small" or float(np.max(place[:4])) < SMALL
+
+
+def _drawn(name: str, kind: str, rng: np.random.Generator, only: str) -> Axis:
+    excitation = (only or str(rng.choice(list(CONFOUNDED)))) if kind == "confounded" else "full"
+    turning = excitation == "small" or only in TURNING
+    axis = _plant(name, kind, bool(turning or rng.random() < 0.6), excitation, rng)
+    named: list[str] = []
+    nameless: list[str] = []
     rival = ""
     if kind == "single":
-        pick = only or str(rng.choice(NAMED))
-        if pick == "gravity" and not rotary:
-            pick = "offset"
-        named[pick] = _effect(pick, base, rng)
+        named = [only or _pick(NAMED, axis, rng)]
     elif kind == "multi":
-        for pick in _mixture(rotary, int(rng.integers(2, 4)), rng):
-            named[pick] = _effect(pick, base, rng)
+        named = _mixture(axis, int(rng.integers(2, 4)), rng)
     elif kind == "confounded":
-        pair = list(CONFOUNDED[excitation])
-        rng.shuffle(pair)
-        named[pair[0]], rival = _effect(pair[0], base, rng), pair[1]
-        if pair[0] == "gravity":  # near the horizontal, where a little travel does not show its slope
-            drawn = named["gravity"]["phase"]
-            named["gravity"]["phase"] = float(
-                np.copysign(0.5 * np.pi + 0.2 * (abs(drawn) - 0.5 * np.pi), drawn)
-            )
-        if (
-            excitation == "oneway" and pair[0] == "offset"
-        ):  # a force along with the motion is no friction, whatever is recorded
-            named["offset"]["off"] = -abs(named["offset"]["off"])
+        hidden, rival = (str(p) for p in rng.permutation(CONFOUNDED[excitation]))
+        named = [hidden]
     elif kind == "unknown":
-        pick = only or str(
-            rng.choice(NAMELESS if rotary else [n for n in NAMELESS if n != "swinging_inertia"])
-        )
-        nameless[pick] = _effect(pick, base, rng)
-        if rng.random() < 0.4 and pick in ("cubic_spring", "falling_drag"):
-            named["coulomb"] = _effect("coulomb", base, rng)
-    return Axis(**{**base, "named": named, "nameless": nameless, "rival": rival})  # type: ignore[arg-type]
+        nameless = [only or _pick(NAMELESS, axis, rng)]
+        beside = BESIDE.get(nameless[0], ())
+        named = [str(rng.choice(beside))] if beside and rng.random() < 0.5 else []
+    current = excitation != "no_current" and bool(BY_CURRENT & set(named) or rng.random() < 0.65)
+    marks = excitation != "no_marks" and bool(BY_MARKS & set(named) or rng.random() < 0.75)
+    numbers = {n: _effect(n, axis, rng) for n in (*named, *nameless)}
+    return replace(
+        axis,
+        current=current,
+        marks=marks,
+        named={n: _alike(n, excitation, axis, numbers[n], rng) for n in named},
+        nameless={n: numbers[n] for n in nameless},
+        rival=rival,
+    )
 
 
-def _plant(
-    name: str, kind: str, rotary: bool, excitation: str, rng: np.random.Generator
-) -> dict[str, object]:
-    if rotary:
-        inertia, acceleration = 10 ** rng.uniform(-3.2, -2.0), rng.uniform(250, 500)
-        speed, pitch = rng.uniform(12, 30), 2.0 * np.pi
-        resolution = pitch / float(rng.choice([8192, 16384, 65536]))
-    else:
-        inertia, acceleration = rng.uniform(2, 25), rng.uniform(4, 9)
-        speed, pitch = rng.uniform(0.15, 0.4), float(rng.choice([0.005, 0.01, 0.02]))
-        resolution = float(rng.choice([5e-8, 1e-7, 5e-7]))
-    rated = inertia * acceleration
-    viscous = float(rng.uniform(0.004, 0.03)) * rated / speed
-    # lead-lag position loop: phase lead around the crossover w
-    w = 2.0 * np.pi * rng.uniform(7.0, 14.0)
-    zero, pole = w / 3.0, 3.5 * w
-    kz, kp = -np.exp(-zero * SAMPLE_S), -np.exp(-pole * SAMPLE_S)
-    # |C(jw)| |1 / (J w^2)| = 1
-    z = np.exp(1j * w * SAMPLE_S)
-    k = inertia * w**2 * abs((1.0 + kp / z) / (1.0 + kz / z))
-    return {
-        "name": name,
-        "kind": kind,
-        "rotary": rotary,
-        "inertia": float(inertia),
-        "viscous": viscous,
-        "rated": float(rated),
-        "speed": float(speed),
-        "resolution": resolution,
-        "pitch": pitch,
-        "gains": (float(k), float(kz), float(kp), 0.0, 2.5 * float(rated)),
-        "excitation": excitation,
-    }
+def _alike(name: str, excitation: str, axis: Axis, numbers: Numbers, rng: np.random.Generator) -> Numbers:
+    """Make an effect one with its look-alike where the excitation is poor, or a channel is missing."""
+    match excitation, name:
+        case "small", "gravity":  # near the horizontal, where a little travel does not show its slope
+            drawn = numbers["phase"]
+            phase = np.copysign(0.5 * np.pi + 0.2 * (abs(drawn) - 0.5 * np.pi), drawn)
+            return {**numbers, "phase": float(phase)}
+        case "oneway", "offset":  # a force along with the motion is no friction, whatever is recorded
+            return {"off": -abs(numbers["off"])}
+        case "no_marks", "encoder_scale":  # as much as a payload
+            return {"gain": 1.0 / (1.0 + float(rng.uniform(0.07, 0.17)))}
+        case "no_marks", "payload":  # no more than an encoder may be off
+            return {"J_extra": axis.inertia * float(rng.uniform(0.07, 0.17))}
+        case "no_current", _:  # short against what moves
+            return {symbol: 0.5 * v for symbol, v in numbers.items()}
+        case _:
+            return numbers
 
 
-def _mixture(rotary: bool, count: int, rng: np.random.Generator) -> list[str]:
-    pool = [n for n in MIXABLE if rotary or n != "gravity"]
-    picks = [str(p) for p in rng.choice(pool, count, replace=False)]
-    return picks if not {"coulomb", "stribeck"} <= set(picks) else _mixture(rotary, count, rng)
+def _pick(names: tuple[str, ...], axis: Axis, rng: np.random.Generator) -> str:
+    return str(rng.choice([n for n in names if axis.rotary or n not in TURNING]))
 
 
-def _effect(name: str, base: dict[str, object], rng: np.random.Generator) -> dict[str, float]:
-    """Draw the size of an effect, clear of the noise and within what machines show."""
-    f, v, j, x = (float(base[k]) for k in ("rated", "speed", "inertia", "pitch"))  # type: ignore[arg-type]
+def _mixture(axis: Axis, count: int, rng: np.random.Generator) -> list[str]:
+    picks = {_pick(NAMED, axis, rng) for _ in range(count)}
+    mixed = len(picks) == count and all(len(picks.intersection(group)) < 2 for group in EXCLUSIVE)
+    return sorted(picks) if mixed else _mixture(axis, count, rng)
+
+
+def _plant(name: str, kind: str, rotary: bool, excitation: str, rng: np.random.Generator) -> Axis:
     u = rng.uniform
-    phase = float(u(-np.pi, np.pi))
-    fc = f * float(u(0.06, 0.2))
-    table: dict[str, dict[str, float]] = {
-        "viscous": {"b_extra": f / v * float(u(0.08, 0.4))},
-        "coulomb": {"Fc": fc},
-        "stribeck": {"Fc": fc, "Fs": fc * float(u(1.6, 2.4)), "vs": v * float(u(0.015, 0.05))},
-        "backlash": {
-            "gap": x * float(u(0.004, 0.01)) if x > 1 else 1e-4 * float(u(1.0, 4.0)),
-            "load_fraction": float(u(0.4, 0.6)),
-        },
-        "cogging": {"amp": f * float(u(0.06, 0.14)), "n": float(rng.integers(4, 25)), "phase": phase},
-        "torque_ripple": {"depth": float(u(0.08, 0.2)), "n": float(rng.integers(4, 13)), "phase": phase},
-        "gravity": {"amp": f * float(u(0.08, 0.3)), "phase": phase},
-        "offset": {"off": f * float(u(0.04, 0.12)) * float(rng.choice([-1, 1]))},
-        "delay": {"delay": float(u(1.5e-3, 5e-3))},
-        "saturation": {"limit": f * float(u(0.4, 0.52))},  # the commands ask for 0.55 and more
-        "elastic": {
-            "f_res": float(u(14, 28)),
-            "load_fraction": float(u(0.35, 0.6)),
-            "zeta": float(u(0.03, 0.08)),
-        },
-        "encoder_scale": {"gain": 1.0 + float(u(0.012, 0.03)) * float(rng.choice([-1, 1]))},
-        "encoder_quantisation": {"factor": float(rng.choice([16, 32, 64]))},
-        "thermal_gain": {"loss": float(u(0.7, 1.2)), "tau": float(u(5, 12))},
-        "payload": {"J_extra": j * float(u(0.12, 0.5))},
-        "cubic_spring": {"k": 0.25 * f / ((2.0 * x) ** 3 if x > 1 else 0.1**3) * float(u(0.7, 1.5))},
-        "falling_drag": {"c": 2.0 * f * float(u(0.08, 0.16)) / (v * 0.18), "v0": 0.18 * v},
-        "hysteresis": {
-            "level": f * float(u(0.08, 0.16)),
-            "length": x * float(u(0.03, 0.07)) if x > 1 else 4e-3 * float(u(0.7, 1.5)),
-        },
-        "swinging_inertia": {"depth": float(u(0.2, 0.35)), "n": float(rng.integers(1, 4)), "phase": phase},
-        "knocks": {"height": f * float(u(0.4, 0.8)), "count": 6.0},
-    }
-    return table[name]
+    if rotary:
+        inertia, acceleration, speed, pitch = 10 ** u(-3.2, -2.0), u(250, 500), u(12, 30), 2.0 * np.pi
+        resolution = pitch / float(rng.choice([2048, 4096, 8192, 16384, 65536]))
+    else:
+        inertia, acceleration, speed = u(2, 25), u(4, 9), u(0.15, 0.4)
+        pitch = float(rng.choice([0.005, 0.01, 0.02]))
+        resolution = float(rng.choice([5e-8, 1e-7, 5e-7, 1e-6, 4e-6]))
+    rated, dt = float(inertia * acceleration), float(rng.choice(SAMPLES_S))
+    return Axis(
+        name=name,
+        kind=kind,
+        rotary=rotary,
+        sample_s=dt,
+        inertia=float(inertia),
+        viscous=float(u(0.004, 0.03)) * rated / float(speed),
+        rated=rated,
+        speed=float(speed),
+        resolution=resolution,
+        pitch=pitch,
+        servo=_servo(float(inertia), rated, resolution, dt, rng),
+        excitation=excitation,
+        current=True,
+        marks=True,
+        seed=int(rng.integers(2**31)),
+    )
 
 
-def commands(axis: Axis, seconds: float, rng: np.random.Generator) -> list[Array]:
-    """Draw the position commands of the four records, each starting where the axis is at rest: at zero."""
-    t: Array = np.arange(int(seconds / SAMPLE_S), dtype=np.float64) * SAMPLE_S
-    a = 0.45 * axis.rated / axis.inertia
-    reach = 3.0 * np.pi if axis.rotary else 0.12
-    if axis.excitation == "cruise":
-        v = 0.35 * axis.speed
-        return [_profile(t, np.where(np.sin(2 * np.pi * t / 4.0) >= 0, v, -v), a) for _ in range(4)]
-    if axis.excitation == "oneway":
-        return [
-            np.cumsum(
-                0.4
-                * axis.speed
-                * (
-                    1.0
-                    + 0.5
-                    * np.sin(
-                        2 * np.pi * np.cumsum(rng.uniform(0.5, 2.0, len(t))) * SAMPLE_S + rng.uniform(0, 6)
-                    )
-                )
-                * np.minimum(t / 0.15, 1.0)
+def _servo(inertia: float, rated: float, resolution: float, dt: float, rng: np.random.Generator) -> Servo:
+    """Draw a controller, as fast as one count of the encoder lets it be.
+
+    Lead-lag, PD (without the lag), or a cascade: position gain with velocity feedback, filtered or over two samples.
+    """
+    form = str(rng.choice(["lead", "lead", "pd", "cascade", "mean"]))
+    w = 2.0 * np.pi * float(rng.uniform(7.0, 14.0)) * (0.6 if dt > 2e-3 else 1.0)
+    damping, filtered = float(rng.uniform(0.7, 1.0)), float(rng.uniform(8.0, 15.0))
+    while True:
+        limit = 2.5 * rated
+        if form in ("lead", "pd"):
+            # phase lead around the crossover w, where |C(jw)| |1 / (J w^2)| = 1
+            kz = -float(np.exp(-w / 3.0 * dt))
+            kp = -float(np.exp(-3.5 * w * dt)) if form == "lead" else 0.0
+            z = np.exp(1j * w * dt)
+            k = inertia * w**2 * float(abs((1.0 + kp / z) / (1.0 + kz / z)))
+            servo, count = Servo(k, kz, kp, 0.0, limit), k
+        else:
+            hz = filtered * w / (2.0 * np.pi) if form == "cascade" else 0.0
+            own = 0.7 * w  # the speed loop's crossover is near w
+            servo = Servo(
+                inertia * own**2, 0.0, 0.0, -2.0 * damping * inertia * own, limit, hz, form == "mean"
             )
-            * SAMPLE_S
-            for _ in range(4)
-        ]
-    if axis.excitation == "small":
-        return [_waves(t, 0.2, 0.3 * axis.speed, rng) for _ in range(4)]
-    slow = 0.05 * axis.speed
-    legs = rng.uniform(0.3, 0.9, 24)
-    signs = np.where(np.arange(24) % 2 == 0, 1.0, -1.0)
-    steps = np.repeat(signs * rng.choice([0.0, 1.0, 1.0], 24), (legs * 1000).astype(int))[: len(t)]
-    ladder = np.repeat(np.array([0.2, -0.35, 0.6, -0.8, 0.95, -0.15, 0.45, -0.6]), len(t) // 8 + 1)[: len(t)]
-    return [
-        _fold(_profile(t, steps * 0.8 * axis.speed, a), reach),
-        _waves(t, 0.6 * reach, 0.9 * axis.speed, rng),
-        _profile(
-            t, slow * np.sign(np.sin(2 * np.pi * t / 2.2 + 0.1)) * np.where(t < 0.6 * t[-1], 1.0, 0.4), a
-        ),
-        _fold(_profile(t, ladder * axis.speed, a), reach),
-    ]
+            share = 1.0 - float(np.exp(-2.0 * np.pi * hz * dt)) if hz > 0.0 else 0.5
+            count = servo.k - servo.kb * share / dt
+        if count * resolution < CHATTER * rated:
+            return servo
+        w *= 0.9
 
 
-def _profile(t: Array, speed: Array, acceleration: float) -> Array:
-    """Follow a speed with limited acceleration."""
-    v, out = 0.0, np.empty_like(t)
-    step = acceleration * SAMPLE_S
-    for i, goal in enumerate(speed):
-        v += min(max(goal - v, -step), step)
-        out[i] = v
-    return np.asarray(np.cumsum(out) * SAMPLE_S)
+def _effect(name: str, axis: Axis, rng: np.random.Generator) -> Numbers:
+    """Draw the size of an effect, clear of the noise and within what machines show."""
+    f, v, j, x, q = axis.rated, axis.speed, axis.inertia, axis.pitch, axis.resolution
+    reach, slow = REACH[axis.rotary], max(axis.sample_s / 1e-3, 1.0)
 
+    def u(low: float, high: float) -> float:
+        return float(rng.uniform(low, high))
 
-def _fold(x: Array, reach: float) -> Array:
-    """Shrink a path that leaves the range."""
-    top = float(np.max(np.abs(x)))
-    return x if top <= 2.0 * reach else x * 2.0 * reach / top
+    def order(low: int, high: int) -> float:
+        """Of an angle, or of a short pitch that goes by many times a second."""
+        return float(rng.integers(low, high)) if axis.rotary else float(rng.integers(1, 7))
 
-
-def _waves(t: Array, reach: float, speed: float, rng: np.random.Generator) -> Array:
-    f = rng.uniform(0.4, 6.0, 7)
-    x = np.sum(np.sin(2 * np.pi * f[:, None] * t + rng.uniform(0, 6.28, 7)[:, None]) / f[:, None], axis=0)
-    x = (x - x[0]) * np.minimum(t / 0.3, 1.0) ** 2
-    top = np.max(np.abs(np.gradient(x, SAMPLE_S)))
-    return np.asarray(x * min(speed / top, reach / np.max(np.abs(x))))
+    phase, sign, fc = u(-np.pi, np.pi), float(rng.choice([-1, 1])), f * u(0.06, 0.2)
+    fs, vs = fc * u(1.6, 2.4), v * u(0.015, 0.05)
+    yields = max(x * u(5e-4, 3e-3), 4.0 * q)
+    lost = slow**0.5 * 1e-3
+    match name:
+        case "viscous":
+            return {"b_extra": f / v * u(0.08, 0.4)}
+        case "viscous_direction":
+            return {"b_dir": sign * f / v * u(0.05, 0.15)}
+        case "quadratic_drag":
+            return {"c": f / v**2 * u(0.1, 0.4)}
+        case "coulomb":
+            return {"Fc": fc}
+        case "coulomb_position":
+            return {"Fc": fc, "Fm": fc * u(0.3, 0.6), "n": order(2, 13), "phase": phase}
+        case "stribeck":
+            return {"Fc": fc, "Fs": fs, "vs": vs}
+        case "presliding":
+            return {"Fc": fc, "xs": yields}
+        case "lugre":
+            return {"Fc": fc, "Fs": fs, "vs": vs, "xs": yields}
+        case "load_friction":
+            return {"mu": u(0.08, 0.25)}
+        case "backlash":
+            gap = x * u(0.004, 0.01) if axis.rotary else 1e-4 * u(1.0, 4.0)
+            return {"gap": max(gap, 10.0 * q), "load_fraction": u(0.4, 0.6)}
+        case "elastic":
+            return {"f_res": u(14, 28), "load_fraction": u(0.35, 0.6), "zeta": u(0.03, 0.08)}
+        case "payload":
+            return {"J_extra": j * u(0.12, 0.5)}
+        case "cogging":
+            return {"amp": f * u(0.06, 0.14), "n": order(4, 25), "phase": phase}
+        case "gravity":
+            return {"amp": f * u(0.08, 0.3), "phase": phase}
+        case "spring":
+            return {"k": f / reach * u(0.1, 0.3)}
+        case "offset":
+            return {"off": f * u(0.04, 0.12) * sign}
+        case "torque_ripple":
+            return {"depth": u(0.08, 0.2), "n": order(4, 13), "phase": phase}
+        case "delay":
+            return {"delay": lost * u(1.5, 4.0)}
+        case "lag":
+            return {"tau": lost * u(1.5, 4.0)}
+        case "saturation":
+            return {"limit": f * u(0.25, 0.55)}
+        case "thermal_gain":
+            return {"loss": u(0.7, 1.5), "tau": u(5, 12)}
+        case "encoder_scale":
+            return {"gain": 1.0 + u(0.012, 0.03) * sign}
+        case "encoder_quantisation":
+            return {"factor": float(rng.choice([4, 8, 16, 32]))}
+        case "eccentricity":
+            amp = x * (u(0.004, 0.01) if axis.rotary else u(0.001, 0.003))
+            return {"amp": max(amp, 6.0 * q), "phase": phase}
+        case "cubic_spring":
+            return {"k": 0.25 * f / ((2.0 * x) ** 3 if axis.rotary else 0.1**3) * u(0.7, 1.5)}
+        case "falling_drag":
+            return {"c": 2.0 * f * u(0.08, 0.16) / (v * 0.18), "v0": 0.18 * v}
+        case "hysteresis":
+            return {
+                "level": f * u(0.08, 0.16),
+                "length": x * u(0.03, 0.07) if axis.rotary else 4e-3 * u(0.7, 1.5),
+            }
+        case "swinging_inertia":
+            return {"depth": u(0.2, 0.35), "n": float(rng.integers(1, 4)), "phase": phase}
+        case "knocks":
+            return {"height": f * u(0.4, 0.8), "count": 6.0}
+        case "load_square":
+            return {"mu": u(0.25, 0.4)}
+        case "stop":
+            return {"k": f / reach * u(0.6, 1.5), "x0": reach * u(0.1, 0.3)}
+        case "detent":
+            return {"amp": f * u(0.1, 0.2), "x0": reach * u(-0.2, 0.2), "width": reach * u(0.06, 0.12)}
+        case _:
+            raise ValueError(f"draw effect {name}: unknown; known are {', '.join((*NAMED, *NAMELESS))}")

@@ -6,23 +6,32 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from sioms.reconcile_selftest.draw import Axis
+from sioms.reconcile_selftest.axis import Axis
 
 #: The parameter that says how large an effect is.
 PRIMARY = {
     "viscous": "b_extra",
+    "viscous_direction": "b_dir",
+    "quadratic_drag": "c",
     "coulomb": "Fc",
+    "coulomb_position": "Fm",
     "stribeck": "Fc",
+    "presliding": "Fc",
+    "lugre": "Fc",
+    "load_friction": "mu",
     "backlash": "gap",
     "cogging": "amp",
     "torque_ripple": "depth",
     "gravity": "amp",
+    "spring": "k",
     "offset": "off",
     "delay": "delay",
+    "lag": "tau",
     "saturation": "limit",
     "elastic": "f_res",
     "encoder_scale": "gain",
     "encoder_quantisation": "factor",
+    "eccentricity": "amp",
     "thermal_gain": "loss",
     "payload": "J_extra",
 }

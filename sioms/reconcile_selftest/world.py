@@ -1,19 +1,29 @@
-"""Integrate the drawn axes: all of them side by side, at a fixed small step, until the records are full.
+"""Integrate a drawn axis in continuous time, at a fixed small step, until its records are full.
 
-Semi-implicit Euler steps of 25 us; dry friction as a spring-loaded bristle that breaks (elasto-plastic);
-backlash contact as a spring with damping in proportion to the depth; everything written against time.
+Drift, kick, drift steps of 10 us; dry friction as a spring-loaded bristle that breaks (elasto-plastic), presliding as LuGre's
+bristle with its damping; backlash contact as a spring with damping in proportion to the depth; everything written against time.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
-from sioms.reconcile_selftest.draw import SAMPLE_S, Array, Axis
+from sioms.reconcile_selftest.axis import Array, Axis
 
-STEP_S = 25e-6
+STEP_S = 1e-5
+#: Samples of command before the first, for what comes late.
+BEFORE_S = 0.05
+#: Displacement over which plain dry friction yields, in pitches.
+YIELD = 5e-6
+#: Time constant [s] and size (of the rated force) of the force noise, and of the noise of the current.
+COLOUR_S, DISTURBANCE, CURRENT = 0.02, 0.003, 0.004
+CONTACT_HZ, CONTACT_ZETA = 110.0, 0.08
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,146 +37,270 @@ class Recording:
     index: NDArray[np.bool_]
 
 
-def _row(axes: list[Axis], effect: str, symbol: str, default: float = 0.0) -> Array:
-    return np.array([{**a.named, **a.nameless}.get(effect, {}).get(symbol, default) for a in axes])
+class Plant(NamedTuple):
+    """The numbers of an axis, those of the hidden effects as EFFECT_SYMBOL; the defaults do nothing."""
+
+    sample_s: float
+    inertia: float
+    viscous: float
+    rated: float
+    pitch: float
+    resolution: float
+    k: float
+    kz: float
+    kp: float
+    kb: float
+    top: float
+    filter_share: float
+    mean: float
+    encoder_scale_gain: float = 1.0
+    encoder_quantisation_factor: float = 1.0
+    eccentricity_amp: float = 0.0
+    eccentricity_phase: float = 0.0
+    delay_delay: float = 0.0
+    lag_tau: float = 0.0
+    saturation_limit: float = np.inf
+    thermal_gain_loss: float = 0.0
+    thermal_gain_tau: float = 1.0
+    torque_ripple_depth: float = 0.0
+    torque_ripple_n: float = 0.0
+    torque_ripple_phase: float = 0.0
+    payload_J_extra: float = 0.0
+    viscous_b_extra: float = 0.0
+    viscous_direction_b_dir: float = 0.0
+    quadratic_drag_c: float = 0.0
+    coulomb_Fc: float = 0.0
+    coulomb_position_Fc: float = 0.0
+    coulomb_position_Fm: float = 0.0
+    coulomb_position_n: float = 0.0
+    coulomb_position_phase: float = 0.0
+    stribeck_Fc: float = 0.0
+    stribeck_Fs: float = 0.0
+    stribeck_vs: float = 1.0
+    load_friction_mu: float = 0.0
+    presliding_Fc: float = 0.0
+    presliding_xs: float = 1.0
+    lugre_Fc: float = 0.0
+    lugre_Fs: float = 0.0
+    lugre_vs: float = 1.0
+    lugre_xs: float = 1.0
+    offset_off: float = 0.0
+    spring_k: float = 0.0
+    gravity_amp: float = 0.0
+    gravity_phase: float = 0.0
+    cogging_amp: float = 0.0
+    cogging_n: float = 0.0
+    cogging_phase: float = 0.0
+    elastic_f_res: float = 0.0
+    elastic_load_fraction: float = 0.0
+    elastic_zeta: float = 0.0
+    backlash_gap: float = 0.0
+    backlash_load_fraction: float = 0.0
+    cubic_spring_k: float = 0.0
+    falling_drag_c: float = 0.0
+    falling_drag_v0: float = 1.0
+    hysteresis_level: float = 0.0
+    hysteresis_length: float = 1.0
+    swinging_inertia_depth: float = 0.0
+    swinging_inertia_n: float = 0.0
+    swinging_inertia_phase: float = 0.0
+    stop_k: float = 0.0
+    stop_x0: float = 0.0
+    detent_amp: float = 0.0
+    detent_x0: float = 0.0
+    detent_width: float = 1.0
+    load_square_mu: float = 0.0
+    knocks_height: float = 0.0
+    knocks_count: float = 0.0
 
 
-def _has(axes: list[Axis], effect: str) -> Array:
-    return np.array([1.0 if effect in a.named or effect in a.nameless else 0.0 for a in axes])
-
-
-def _held(queue: Array, start: Array) -> Array:
-    """Mean over one step of commands that are held for a sample each; ``start`` in samples, shape (m,)."""
-    end = start + STEP_S / SAMPLE_S
-    first, last = np.floor(start + 1e-9).astype(int), np.floor(end - 1e-9).astype(int)
-    each = np.arange(queue.shape[1])
-    share = np.where(last > first, (end - last) / (end - start), 0.0)
-    return np.asarray((1.0 - share) * queue[first, each] + share * queue[last, each])
+def _plant(axis: Axis) -> Plant:
+    servo, dt = axis.servo, axis.sample_s
+    return Plant(
+        sample_s=dt,
+        inertia=axis.inertia,
+        viscous=axis.viscous,
+        rated=axis.rated,
+        pitch=axis.pitch,
+        resolution=axis.resolution,
+        k=servo.k,
+        kz=servo.kz,
+        kp=servo.kp,
+        kb=servo.kb,
+        top=servo.limit,
+        filter_share=1.0 - float(np.exp(-2.0 * np.pi * servo.filter_hz * dt)) if servo.filter_hz > 0 else 1.0,
+        mean=float(servo.mean),
+        **{f"{effect}_{s}": float(v) for effect, numbers in axis.hidden.items() for s, v in numbers.items()},
+    )
 
 
 @dataclass(slots=True)
 class World:
-    """All axes side by side. Use from one thread."""
+    """One axis on its bench; the heat of its motor carries over from record to record. Use from one thread.
 
-    axes: list[Axis]
-    rng: np.random.Generator
-    heat: Array
+    Attributes:
+        rng: of its noise.
+    """
 
-    def record(self, commands: list[Array]) -> list[Recording]:
-        """Run one record from rest at zero; the heat carries over from the last one."""
-        axes, rng = self.axes, self.rng
-        m, n = len(axes), len(commands[0])
-        inertia = np.array([a.inertia for a in axes]) + _row(axes, "payload", "J_extra")
-        viscous = np.array([a.viscous for a in axes]) + _row(axes, "viscous", "b_extra")
-        rated = np.array([a.rated for a in axes])
-        turn = 2.0 * np.pi / np.array([a.pitch for a in axes])
-        quantum = np.array([a.resolution for a in axes])
-        coarse = _row(axes, "encoder_quantisation", "factor", 1.0)
-        scale = _row(axes, "encoder_scale", "gain", 1.0)
-        k, kz, kp, _, top = (np.array([a.gains[i] for a in axes]) for i in range(5))
-        fc = np.maximum(_row(axes, "coulomb", "Fc"), _row(axes, "stribeck", "Fc"))
-        extra = _row(axes, "stribeck", "Fs") - _row(axes, "stribeck", "Fc")
-        vs = _row(axes, "stribeck", "vs", 1.0)
-        bristle = np.maximum(fc, 1e-9) / (0.5 * quantum)
-        off = _row(axes, "offset", "off")
-        g_amp, g_ph = _row(axes, "gravity", "amp"), _row(axes, "gravity", "phase")
-        c_amp, c_n, c_ph = (_row(axes, "cogging", s) for s in ("amp", "n", "phase"))
-        r_d, r_n, r_ph = (_row(axes, "torque_ripple", s) for s in ("depth", "n", "phase"))
-        late = _row(axes, "delay", "delay")
-        limit = np.where(_has(axes, "saturation") > 0, _row(axes, "saturation", "limit"), np.inf)
-        loss, tau = _row(axes, "thermal_gain", "loss"), _row(axes, "thermal_gain", "tau", 1.0)
-        cubic = _row(axes, "cubic_spring", "k")
-        d_c, d_v = _row(axes, "falling_drag", "c"), _row(axes, "falling_drag", "v0", 1.0)
-        h_f, h_x = _row(axes, "hysteresis", "level"), _row(axes, "hysteresis", "length", 1.0)
-        s_d, s_n, s_ph = (_row(axes, "swinging_inertia", s) for s in ("depth", "n", "phase"))
-        knock = self._knocks(n)
-        two = np.maximum(_has(axes, "elastic"), _has(axes, "backlash"))
-        share = _row(axes, "elastic", "load_fraction") + _row(axes, "backlash", "load_fraction")
-        loose = _row(axes, "backlash", "gap") * 0.5
-        hz = np.where(loose > 0, 110.0, _row(axes, "elastic", "f_res"))
-        zeta = np.where(loose > 0, 0.08, _row(axes, "elastic", "zeta"))
-        reduced = inertia * share * (1.0 - share)
-        stiff = reduced * (2 * np.pi * hz) ** 2
-        damp = 2.0 * zeta * np.sqrt(stiff * reduced)
-        load = np.where(two > 0, inertia * share, 1.0)
-        motor = inertia * (1.0 - share)
+    axis: Axis
+    rng: np.random.Generator = field(init=False)
+    heat: float = 0.0
 
-        sub = round(SAMPLE_S / STEP_S)
-        x, v, xl, vl = (np.zeros(m) for _ in range(4))
-        z, hyst = np.zeros(m), np.zeros(m)
-        disturbance = np.zeros(m)
-        e_old, u_old = np.zeros(m), np.zeros(m)
-        queue = np.zeros((n + 12, m))
-        counts = np.zeros((n, m), dtype=np.int64)
-        force, measured, marks = np.zeros((n, m)), np.zeros((n, m)), np.zeros((n, m), dtype=bool)
-        command = np.stack(commands, axis=1)
-        for i in range(n):
-            seen = scale * x + 0.3 * quantum * rng.standard_normal(m)
-            counts[i] = (np.floor(seen / (quantum * coarse)) * coarse).astype(np.int64)
-            e = command[i] - counts[i] * quantum
-            u = np.clip(k * (e + kz * e_old) - kp * u_old, -top, top)
-            e_old, u_old = e, u
-            force[i] = u
-            queue[i + 10] = u
-            disturbance += SAMPLE_S / 0.02 * -disturbance + 0.003 * rated * np.sqrt(
-                2 * SAMPLE_S / 0.02
-            ) * rng.standard_normal(m)
-            before = np.floor(x * turn / (2 * np.pi))
-            passed = np.zeros(m, dtype=bool)
-            mean = np.zeros(m)
-            for s in range(sub):
-                mean += np.clip(_held(queue, i + 10 + (s * STEP_S - late) / SAMPLE_S), -limit, limit)
-                # Velocities live half a step after positions (leapfrog), so the force that moves them half a step before.
-                acting = np.clip(_held(queue, i + 10 + ((s - 0.5) * STEP_S - late) / SAMPLE_S), -limit, limit)
-                self.heat += STEP_S / tau * ((acting / rated) ** 2 - self.heat) * (loss > 0)
-                theta = turn * x
-                f = (
-                    acting * (1.0 - loss * self.heat) * (1.0 + r_d * np.sin(r_n * theta + r_ph))
-                    + disturbance
-                    + knock[i]
-                )
-                f += (
-                    off
-                    + g_amp * np.sin(theta + g_ph)
-                    + c_amp * np.sin(c_n * theta + c_ph)
-                    - viscous * v
-                    - cubic * x**3
-                )
-                f -= d_c * v / (1.0 + (v / d_v) ** 2)
-                hyst += np.abs(v) * STEP_S / h_x * (h_f * np.sign(v) - hyst)
-                f -= hyst
-                level = fc + extra * np.exp(-((v / vs) ** 2))
-                z = np.clip(z + v * STEP_S, -level / bristle, level / bristle)
-                f -= (
-                    bristle * z
-                    + (np.abs(z) < 0.999 * level / bristle) * (fc > 0) * 1.2 * np.sqrt(bristle * motor) * v
-                )
-                wind = x - xl
-                depth = np.where(loose > 0, np.sign(wind) * np.maximum(np.abs(wind) - loose, 0.0), wind)
-                link = np.where((loose > 0) & (depth == 0.0), 0.0, stiff * depth + damp * (v - vl)) * two
-                link = np.where((loose > 0) & (link * depth < 0), 0.0, link)
-                mass = motor * (1.0 + s_d * np.sin(s_n * theta + s_ph))
-                f -= 0.5 * motor * s_d * s_n * turn * np.cos(s_n * theta + s_ph) * v * v
-                v = v + STEP_S * (f - link) / mass
-                x = x + STEP_S * v
-                vl = vl + STEP_S * link / load
-                xl = xl + STEP_S * vl
-                now = np.floor(x * turn / (2 * np.pi))
-                passed |= now != before
-                before = now
-            measured[i] = mean / sub + 0.004 * rated * rng.standard_normal(m)
-            marks[i] = passed
-        return [
-            Recording(counts[:, j], command[:, j], force[:, j], measured[:, j], marks[:, j]) for j in range(m)
-        ]
+    def __post_init__(self) -> None:
+        self.rng = self.axis.rng(2)
+
+    def record(self, command: Array, noise: float = 1.0) -> Recording:
+        """Run one record from rest at zero, with so many times the usual noise."""
+        plant, rng, n = _plant(self.axis), self.rng, len(command)
+        late = round(BEFORE_S / plant.sample_s)
+        queue, counts = np.zeros(n + late), np.zeros(n, dtype=np.int64)
+        measured, marks = noise * CURRENT * plant.rated * rng.standard_normal(n), np.zeros(n, dtype=np.bool_)
+        self.heat = _march(
+            plant,
+            round(plant.sample_s / STEP_S),
+            command,
+            noise * 0.3 * plant.resolution * rng.standard_normal(n),
+            noise * self._pushed(n) + self._knocks(n),
+            self.heat,
+            late,
+            queue,
+            counts,
+            measured,
+            marks,
+        )
+        return Recording(counts, command, queue[late:], measured, marks)
+
+    def _pushed(self, n: int) -> Array:
+        """Draw the noise of force: one pole of ``COLOUR_S``."""
+        keep = float(np.exp(-self.axis.sample_s / COLOUR_S))
+        kick = DISTURBANCE * self.axis.rated * np.sqrt(1.0 - keep**2)
+        return np.asarray(lfilter([kick], [1.0, -keep], self.rng.standard_normal(n)))
 
     def _knocks(self, n: int) -> Array:
-        """Draw short force pulses at random times for axes that are knocked."""
-        out = np.zeros((n, len(self.axes)))
-        for j, a in enumerate(self.axes):
-            spec = a.nameless.get("knocks")
-            if spec is None:
-                continue
-            for at in self.rng.integers(200, n - 100, int(spec["count"])):
-                out[at : at + 25, j] += spec["height"] * self.rng.choice([-1.0, 1.0])
+        """Draw force pulses of 25 ms at random times."""
+        out = np.zeros(n)
+        spec = self.axis.nameless.get("knocks", {"count": 0.0, "height": 0.0})
+        for at in self.rng.integers(n // 25, n - n // 50, int(spec["count"])):
+            out[at : at + round(0.025 / self.axis.sample_s)] += spec["height"] * self.rng.choice([-1.0, 1.0])
         return out
+
+
+@njit(cache=True, nogil=True)
+def _held(queue: Array, at: float, step: float) -> float:
+    """Mean over a step from ``at``, both in samples, of a command that is held for a sample each."""
+    first, last = int(np.floor(at + 1e-9)), int(np.floor(at + step - 1e-9))
+    if last <= first:
+        return float(queue[first])
+    return float((queue[first] * (last - at) + queue[last] * (at + step - last)) / step)
+
+
+@njit(cache=True, nogil=True)
+def _march(
+    p: Plant,
+    sub: int,
+    command: Array,
+    jitter: Array,
+    push: Array,
+    heat: float,
+    late: int,
+    queue: Array,
+    counts: NDArray[np.int64],
+    measured: Array,
+    marks: NDArray[np.bool_],
+) -> float:
+    """Fill the commands of the controller (after ``late`` samples), counts, mean currents (added to their noise) and marks.
+
+    Returns:
+        The heat at the end.
+    """
+    h, turn = p.sample_s / sub, 2.0 * np.pi / p.pitch
+    total = p.inertia + p.payload_J_extra
+    share = p.elastic_load_fraction + p.backlash_load_fraction
+    motor, load, two, loose = total * (1.0 - share), total * share, share > 0.0, 0.5 * p.backlash_gap
+    reduced = total * share * (1.0 - share)
+    stiff = reduced * (2 * np.pi * (CONTACT_HZ if loose > 0.0 else p.elastic_f_res)) ** 2
+    damp = 2.0 * (CONTACT_ZETA if loose > 0.0 else p.elastic_zeta) * np.sqrt(stiff * reduced)
+    give = YIELD * p.pitch
+    quantum = p.resolution * p.encoder_quantisation_factor
+    follow = 1.0 - np.exp(-h / p.lag_tau) if p.lag_tau > 0.0 else 1.0
+    # LuGre's bristle: stiffness and damping
+    held = p.lugre_Fs if p.lugre_Fs > 0.0 else p.presliding_Fc
+    slid, fall = p.lugre_Fc + p.presliding_Fc, p.lugre_vs
+    s0 = held / (p.lugre_xs if p.lugre_Fs > 0.0 else p.presliding_xs)
+    s1 = 0.1 * np.sqrt(s0 * motor)
+    x = v = xl = vl = z = bristle = hyst = lagged = 0.0
+    e_old = u_old = y_old = y_older = speed = 0.0
+    for i in range(len(command)):
+        seen = p.encoder_scale_gain * x + p.eccentricity_amp * np.sin(turn * x + p.eccentricity_phase)
+        counts[i] = int(np.floor((seen + jitter[i]) / quantum) * np.round(p.encoder_quantisation_factor))
+        y = counts[i] * p.resolution
+        if i == 0:
+            y_old = y_older = y
+        if p.mean > 0.0:
+            speed = 0.5 * (y - y_older) / p.sample_s
+        else:
+            speed += p.filter_share * ((y - y_old) / p.sample_s - speed)
+        y_older, y_old = y_old, y
+        e = command[i] - y
+        u = min(max(p.k * (e + p.kz * e_old) - p.kp * u_old + p.kb * speed, -p.top), p.top)
+        e_old, u_old = e, u
+        queue[late + i] = u
+        before, passed, mean = np.floor(x / p.pitch), False, 0.0
+        for s in range(sub):
+            goal = _held(queue, late + i + s / sub - p.delay_delay / p.sample_s, 1.0 / sub)
+            drive = lagged + 0.5 * follow * (goal - lagged) if p.lag_tau > 0.0 else goal
+            lagged += follow * (goal - lagged)
+            drive = min(max(drive, -p.saturation_limit), p.saturation_limit)
+            mean += drive
+            if p.thermal_gain_loss > 0.0:
+                heat += h / p.thermal_gain_tau * ((drive / p.rated) ** 2 - heat)
+            x += 0.5 * h * v
+            xl += 0.5 * h * vl
+            theta = turn * x
+            f = drive * (1.0 - p.thermal_gain_loss * heat)
+            f *= 1.0 + p.torque_ripple_depth * np.sin(p.torque_ripple_n * theta + p.torque_ripple_phase)
+            f += push[i] + p.offset_off - p.spring_k * x - p.cubic_spring_k * x**3
+            f += p.gravity_amp * np.sin(x + p.gravity_phase)
+            f += p.cogging_amp * np.sin(p.cogging_n * theta + p.cogging_phase)
+            f -= (p.viscous + p.viscous_b_extra) * v
+            f -= (p.viscous_direction_b_dir + p.quadratic_drag_c * v) * abs(v)
+            f -= p.falling_drag_c * v / (1.0 + (v / p.falling_drag_v0) ** 2)
+            f -= p.stop_k * max(x - p.stop_x0, 0.0)
+            well = (x - p.detent_x0) / p.detent_width
+            f -= p.detent_amp * well * np.exp(0.5 - 0.5 * well * well)
+            hyst += abs(v) * h / p.hysteresis_length * (p.hysteresis_level * np.sign(v) - hyst)
+            f -= hyst
+            level = p.coulomb_Fc + p.coulomb_position_Fc
+            level += p.coulomb_position_Fm * np.sin(p.coulomb_position_n * theta + p.coulomb_position_phase)
+            level += p.stribeck_Fc + (p.stribeck_Fs - p.stribeck_Fc) * np.exp(-((v / p.stribeck_vs) ** 2))
+            level += p.load_friction_mu * abs(drive) + p.load_square_mu * drive * drive / p.rated
+            if level > 0.0:
+                z = min(max(z + v * h, -give), give)
+                f -= level * z / give
+                if abs(z) < give:
+                    f -= 1.2 * np.sqrt(level / give * motor) * v
+            if s0 > 0.0:
+                dropped = slid + (held - slid) * np.exp(-((v / fall) ** 2)) if p.lugre_Fs > 0.0 else slid
+                ahead = dropped / s0 * np.sign(v)
+                moved = (ahead - bristle) * (1.0 - np.exp(-s0 * abs(v) / dropped * h))
+                f -= s0 * (bristle + 0.5 * moved) + s1 * moved / h
+                bristle += moved
+            if two:
+                wind = x - xl
+                depth = np.sign(wind) * max(abs(wind) - loose, 0.0)
+                link = stiff * depth + damp * (v - vl) if loose == 0.0 or depth != 0.0 else 0.0
+                if loose > 0.0 and link * depth < 0.0:
+                    link = 0.0
+                f -= link
+                vl += h * link / load
+            swing = p.swinging_inertia_n * theta + p.swinging_inertia_phase
+            f -= 0.5 * motor * p.swinging_inertia_depth * p.swinging_inertia_n * turn * np.cos(swing) * v * v
+            v += h * f / (motor * (1.0 + p.swinging_inertia_depth * np.sin(swing)))
+            x += 0.5 * h * v
+            xl += 0.5 * h * vl
+            now = np.floor(x / p.pitch)
+            passed |= now != before
+            before = now
+        measured[i] += mean / sub
+        marks[i] = passed
+    return heat

@@ -1,0 +1,117 @@
+"""The generator of the blind test, by facts that do not use its formulas."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sioms.reconcile.effects import library
+from sioms.reconcile_selftest.axis import Axis, Servo
+from sioms.reconcile_selftest.draw import NAMED, SATURATED, draw_axis
+from sioms.reconcile_selftest.score import PRIMARY
+from sioms.reconcile_selftest.world import Recording, World
+from sioms.tools.reconcile_selftest import record
+
+#: An axis of 2 kg without friction, on a soft spring of a controller.
+BARE = Axis(
+    name="bare",
+    kind="null",
+    rotary=False,
+    sample_s=1e-3,
+    inertia=2.0,
+    viscous=0.0,
+    rated=20.0,
+    speed=0.3,
+    resolution=1e-9,
+    pitch=0.01,
+    servo=Servo(800.0, 0.0, 0.0, 0.0, 1e3),
+    excitation="full",
+    current=True,
+    marks=True,
+    seed=1,
+)
+
+
+def run(command: np.ndarray, axis: Axis = BARE, **hidden: dict[str, float]) -> Recording:
+    return World(replace(axis, named=hidden)).record(command, noise=0.0)
+
+
+def test_the_whole_library_is_hidden_and_scored() -> None:
+    assert set(NAMED) == set(library()) == set(PRIMARY)
+    for name, symbol in PRIMARY.items():
+        assert symbol in {p.symbol for p in library()[name].parameters}
+
+
+def test_a_free_axis_keeps_its_energy_and_its_period() -> None:
+    seen = run(np.where(np.arange(3000) < 2, 0.0, 0.01))
+    # a spring of 800 N/m that a sampled loop holds half a sample late gains a little
+    x = seen.counts * 1e-9 - 0.01
+    crossings = np.flatnonzero((x[1:] > 0) != (x[:-1] > 0))
+    assert np.mean(np.diff(crossings)) == pytest.approx(1e3 * np.pi * np.sqrt(2.0 / 800.0), rel=0.01)
+    assert np.max(np.abs(x[-400:])) == pytest.approx(0.01, rel=0.7)
+
+
+@pytest.mark.parametrize(
+    "hidden",
+    [
+        {"viscous": {"b_extra": 8.0}},
+        {"quadratic_drag": {"c": 60.0}},
+        {"coulomb": {"Fc": 1.0}},
+        {"coulomb_position": {"Fc": 1.0, "Fm": 0.5, "n": 2.0, "phase": 0.0}},
+        {"stribeck": {"Fc": 1.0, "Fs": 2.0, "vs": 0.01}},
+        {"presliding": {"Fc": 1.0, "xs": 2e-5}},
+        {"lugre": {"Fc": 1.0, "Fs": 2.0, "vs": 0.01, "xs": 2e-5}},
+        {"load_friction": {"mu": 0.2}},
+    ],
+    ids=lambda hidden: next(iter(hidden)),
+)
+def test_friction_takes_energy(hidden: dict[str, dict[str, float]]) -> None:
+    command = np.where(np.arange(1200) < 2, 0.0, 0.01)
+    free, rubbed = (
+        float(np.max(np.abs(run(command, **h).counts[-400:] * 1e-9 - 0.01))) for h in ({}, hidden)
+    )
+    assert rubbed < 0.8 * free
+
+
+def test_presliding_is_a_spring_until_it_slides() -> None:
+    """A force far below the level moves the axis by force over stiffness, and back."""
+    weak = replace(BARE, servo=Servo(800.0, 0.0, 0.0, -20.0, 1e3))
+    command = np.where((np.arange(2000) > 10) & (np.arange(2000) < 1200), 1.25e-4, 0.0)
+    seen = run(command, weak, presliding={"Fc": 1.0, "xs": 1e-4}, viscous={"b_extra": 100.0})
+    place, force = seen.counts[1150] * 1e-9, seen.force[1150]
+    assert 0.05 < force < 0.15
+    # Dahl: F = Fc (1 - exp(-x/xs)); it overshot a little
+    assert place == pytest.approx(-1e-4 * np.log(1.0 - force), rel=0.06)
+    assert abs(seen.counts[-1] * 1e-9) < 0.2 * place
+
+
+def test_the_current_lags_by_its_time_constant() -> None:
+    stiff = replace(BARE, inertia=1e6)
+    seen = run(np.where(np.arange(100) < 20, 0.0, 0.01), stiff, lag={"tau": 5e-3})
+    assert np.interp(
+        1.0 - np.exp(-1.0), seen.force_measured[20:40] / seen.force[40], np.arange(20)
+    ) + 0.5 == (pytest.approx(5.0, rel=0.02))
+
+
+def test_an_eccentric_encoder_is_right_at_every_mark() -> None:
+    ramp = 0.05 * np.arange(2000) * 1e-3
+    loop = replace(BARE, servo=Servo(5e3, -0.98, -0.6, 0.0, 1e3), viscous=5.0)
+    seen = run(ramp, loop, eccentricity={"amp": 2e-4, "phase": 0.0})
+    at = np.flatnonzero(seen.index)[1:]
+    assert len(at) > 5
+    np.testing.assert_allclose(np.diff(seen.counts[at] * 1e-9), 0.01, atol=2e-4)
+
+
+@pytest.mark.parametrize(("kind", "only"), [("confounded", "small"), ("unknown", "load_square")])
+def test_a_draw_that_is_asked_for_is_drawn(kind: str, only: str) -> None:
+    axis = draw_axis("a", kind, np.random.default_rng(2), only)
+    assert axis.excitation == (only if kind == "confounded" else "full")
+    assert set(axis.nameless) == ({only} if kind == "unknown" else set())
+
+
+def test_a_drive_saturates_in_some_of_the_samples() -> None:
+    axis = draw_axis("a", "single", np.random.default_rng(3), "saturation")
+    beyond = [np.abs(r.force) > axis.named["saturation"]["limit"] for r in record(axis)]
+    assert SATURATED[0] < np.mean(beyond) < SATURATED[1]
