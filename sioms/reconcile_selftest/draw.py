@@ -78,8 +78,10 @@ BY_CURRENT, BY_MARKS = {"delay", "lag", "saturation"}, {"payload", "encoder_scal
 #: Effects of angle, and a frequent sample time for each rare one.
 TURNING = ("gravity", "swinging_inertia")
 SAMPLES_S = (0.005, 0.002, 0.001, 0.001, 0.001, 0.0005, 0.00025)
-#: One count of the encoder may change the force by this share of the rated one; in how many of the samples a drive saturates, and a controller at most.
-CHATTER, SATURATED, AT_LIMIT = 0.1, (0.03, 0.35), 0.02
+#: One count of the encoder may change the force by this share of the rated one, a coarser one than stated by this.
+CHATTER, COARSE = 0.1, 0.5
+#: In how many of the samples a drive saturates, and a controller at most.
+SATURATED, AT_LIMIT = (0.03, 0.35), 0.02
 #: A thermal loss is of such a share in the end; a small range is within this angle [rad].
 WARM, SMALL = (0.06, 0.4), 0.4
 TRIES, DRY_RUN_S = 200, 5.0
@@ -222,18 +224,24 @@ def _servo(inertia: float, rated: float, resolution: float, dt: float, rng: np.r
             kp = -float(np.exp(-3.5 * w * dt)) if form == "lead" else 0.0
             z = np.exp(1j * w * dt)
             k = inertia * w**2 * float(abs((1.0 + kp / z) / (1.0 + kz / z)))
-            servo, count = Servo(k, kz, kp, 0.0, limit), k
+            servo = Servo(k, kz, kp, 0.0, limit)
         else:
             hz = filtered * w / (2.0 * np.pi) if form == "cascade" else 0.0
             own = 0.7 * w  # the speed loop's crossover is near w
             servo = Servo(
                 inertia * own**2, 0.0, 0.0, -2.0 * damping * inertia * own, limit, hz, form == "mean"
             )
-            share = 1.0 - float(np.exp(-2.0 * np.pi * hz * dt)) if hz > 0.0 else 0.5
-            count = servo.k - servo.kb * share / dt
-        if count * resolution < CHATTER * rated:
+        if _by_count(servo, dt) * resolution < CHATTER * rated:
             return servo
         w *= 0.9
+
+
+def _by_count(servo: Servo, dt: float) -> float:
+    """Return by how much the force jumps with the position at once."""
+    share = 0.5 if servo.mean else 1.0
+    if servo.filter_hz > 0.0:
+        share = 1.0 - float(np.exp(-2.0 * np.pi * servo.filter_hz * dt))
+    return servo.k - servo.kb * share / dt
 
 
 def _effect(name: str, axis: Axis, rng: np.random.Generator) -> Numbers:
@@ -273,7 +281,7 @@ def _effect(name: str, axis: Axis, rng: np.random.Generator) -> Numbers:
             return {"mu": u(0.08, 0.25)}
         case "backlash":
             gap = x * u(0.004, 0.01) if axis.rotary else 1e-4 * u(1.0, 4.0)
-            return {"gap": max(gap, 10.0 * q), "load_fraction": u(0.4, 0.6)}
+            return {"gap": max(gap, 20.0 * q), "load_fraction": u(0.4, 0.6)}
         case "elastic":
             return {"f_res": u(14, 28), "load_fraction": u(0.35, 0.6), "zeta": u(0.03, 0.08)}
         case "payload":
@@ -299,7 +307,8 @@ def _effect(name: str, axis: Axis, rng: np.random.Generator) -> Numbers:
         case "encoder_scale":
             return {"gain": 1.0 + u(0.012, 0.03) * sign}
         case "encoder_quantisation":
-            return {"factor": float(rng.choice([4, 8, 16, 32]))}
+            coarse = [n for n in (4, 8, 16, 32) if n * _by_count(axis.servo, axis.sample_s) * q < COARSE * f]
+            return {"factor": float(rng.choice(coarse))}
         case "eccentricity":
             amp = x * (u(0.004, 0.01) if axis.rotary else u(0.001, 0.003))
             return {"amp": max(amp, 6.0 * q), "phase": phase}

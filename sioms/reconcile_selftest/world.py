@@ -232,7 +232,9 @@ def _march(
     e_old = u_old = y_old = y_older = speed = 0.0
     for i in range(len(command)):
         seen = p.encoder_scale_gain * x + p.eccentricity_amp * np.sin(turn * x + p.eccentricity_phase)
-        counts[i] = int(np.floor((seen + jitter[i]) / quantum) * np.round(p.encoder_quantisation_factor))
+        counts[i] = int(
+            np.floor((seen + jitter[i]) / quantum + 0.5) * np.round(p.encoder_quantisation_factor)
+        )
         y = counts[i] * p.resolution
         if i == 0:
             y_old = y_older = y
