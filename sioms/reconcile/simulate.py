@@ -28,6 +28,8 @@ STEPS = {None: 2, Slot.ELASTIC: 4, Slot.BACKLASH: 6}
 #: A record begins in motion that at first makes more way than this share of the largest speed would. Its start is fitted
 #: over so many periods of an elastic transmission, and samples.
 MOVING, PERIODS, FEWEST = 0.01, 4.0, 40
+#: Numbers of a start, and how many memories of an observer tell the speed in it.
+START, MEMORIES = 7, 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,33 +282,54 @@ def _slope_weights(n: int) -> Array:
     return np.asarray(np.linalg.pinv(np.vander(np.arange(n), 3))[1])
 
 
-def _wound_up(
+def _set_going(
     p: Packed,
     y: Array,
     force: Array,
     external: Array | None,
     gain: tuple[float, ...],
     start: Array,
-    slow: float,
+    steps: Array,
+    n: int,
 ) -> Array:
-    """Start in motion with the speed, the wind-up of the transmission and its rate that leave least of the first periods."""
-    r, j = p.plant[k.LOAD], p.plant[k.INERTIA]
-    turn = float(np.sqrt(p.plant[k.STIFF] / (j * r * (1.0 - r))))
-    n = min(len(y), max(FEWEST, int(PERIODS * 2.0 * np.pi / (turn * p.plant[k.DT]))))
+    """Start in motion with those numbers, of as many as there are small steps (k, len(start)), that leave least of the first n samples."""
 
     def innovation(at: Array) -> Array:
         outer = None if external is None else external[:n]
         return _march(p, False, y[:n], y[:n], force[:n], outer, np.zeros(k.CTL_SIZE), gain, at).innovation
 
     first = innovation(start)
-    steps = np.zeros((3, len(start)))
-    steps[0, 1], steps[1, 5], steps[2, 6] = slow, slow / turn, slow
     moved = np.stack([innovation(start + step) - first for step in steps], axis=1)
     if not np.all(np.isfinite(moved)):
         return start
     better: Array = start - steps.T @ np.linalg.lstsq(moved, first, rcond=1e-6)[0]
     after = innovation(better)
     return better if float(after @ after) < float(first @ first) else start
+
+
+def _unknown_at_first(
+    p: Packed, y: Array, noise: Noise, pair: Pair | None, model: AxisModel
+) -> tuple[Array, int] | None:
+    """Return small steps of what a record in motion does not tell of its start, and the samples that do; None where it tells all.
+
+    Of two masses it is the speed, the wind-up and its rate, told by the first periods; of one the speed, where counts are too coarse to
+    show it in 20 ms, told by as many samples as the observer remembers.
+    """
+    if not _moves(y, model):
+        return None
+    slow, dt = MOVING * model.max_speed, model.sample_time_s
+    if pair is not None and p.plant[k.GAP] == 0.0:
+        r, j = p.plant[k.LOAD], p.plant[k.INERTIA]
+        turn = float(np.sqrt(p.plant[k.STIFF] / (j * r * (1.0 - r))))
+        steps = np.zeros((3, START))
+        steps[0, 1], steps[1, 5], steps[2, 6] = slow, slow / turn, slow
+        return steps, min(len(y), max(FEWEST, int(PERIODS * 2.0 * np.pi / (turn * dt))))
+    told = float(np.linalg.norm(_slope_weights(_at_first(y, dt)))) / dt * noise.sensor
+    if pair is not None or told < slow:
+        return None
+    steps = np.zeros((1, START))
+    steps[0, 1] = slow
+    return steps, min(len(y), max(FEWEST, int(MEMORIES / noise.gain[0])))
 
 
 def track(
@@ -343,6 +366,6 @@ def track(
     )
     pair = linked(p)
     gain = IDLE if noise is None else corrections(noise, pair, model.sample_time_s)
-    if pair is not None and p.plant[k.GAP] == 0.0 and _moves(y, model):
-        start = _wound_up(p, y, force, external, gain, start, MOVING * model.max_speed)
+    if noise is not None and (unknown := _unknown_at_first(p, y, noise, pair, model)) is not None:
+        start = _set_going(p, y, force, external, gain, start, *unknown)
     return _march(p, False, y, y, force, external, np.zeros(k.CTL_SIZE), gain, start, lost)

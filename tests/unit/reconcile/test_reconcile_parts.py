@@ -198,6 +198,16 @@ def test_a_record_that_begins_in_motion_begins_with_the_transmission_wound_up() 
     assert np.sqrt(np.mean(p.residual(hidden) ** 2)) < 1.3
 
 
+def test_a_coarse_encoder_does_not_set_a_record_in_motion() -> None:
+    """One count of 0.1 rad within the first 20 ms is no speed of 10 rad/s, which the slow observer of such an encoder would keep."""
+    coarse = replace(AXIS, resolution=0.1)
+    whole = session(coarse).records[0]
+    at = int(np.flatnonzero(np.diff(whole.position[200:]))[3]) + 200
+    later = Session((whole.cut(at - 12, 3000),))
+    p = Problem(later, observer(coarse, sensor_noise(later, 0.1), 2e-3))
+    assert np.sqrt(np.mean(p.residual(coarse) ** 2)) < 1.5
+
+
 def test_a_closed_loop_over_a_record_cut_in_motion_goes_on_as_the_whole() -> None:
     """From rest the controller would throw the axis after its command: errors some fifty times as large."""
     whole = session().records[0]
