@@ -23,6 +23,8 @@ LATTICE_SHARE = 0.998
 SIGNIFICANT = 5.0
 #: ... and explain at least this share of what the drive residual holds.
 DRIVE_GAIN = 0.05
+#: Step of a slope over a time, in samples.
+STEP = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,28 +169,64 @@ def drive(session: Session, model: AxisModel) -> list[Finding]:
     dt = model.sample_time_s
     noise = _white(records)
     limit, at_limit = _plateau(records, noise)
-
-    def misfit(delay: float, lag: float) -> float:
-        total = 0.0
-        for r in records:
-            measured = r.force_measured if r.force_measured is not None else r.force
-            e = measured - drive_output(r.force, max(delay, 0.0), max(lag, 0.0), limit, dt)
-            total += float(np.sum(e[20:] ** 2))
-        return total
-
     n = sum(len(r) - 20 for r in records)
+    late = _latest(records, np.inf, dt)
     found = []
     if at_limit:
+        limited = _latest(records, limit, dt)
+        if limited.left < (1.0 - DRIVE_GAIN) * late.left:  # a drive that only is slow cuts peaks off, too
+            late = limited
+            found.append(
+                Finding(
+                    "saturation",
+                    {"limit": limit},
+                    {"limit": noise * np.sqrt(0.5 * np.pi / at_limit)},
+                    f"measured force stays at {limit:.4g} {model.force_unit} in {at_limit} samples "
+                    "while the command goes on",
+                )
+            )
+    if late.value > max(SIGNIFICANT * late.error, 1e-3 * dt) and late.left < (1.0 - DRIVE_GAIN) * late.none:
+        other = "lag" if late.name == "delay" else "delay"
         found.append(
             Finding(
-                "saturation",
-                {"limit": limit},
-                {"limit": noise * np.sqrt(0.5 * np.pi / at_limit)},
-                f"measured force stays at {limit:.4g} {model.force_unit} in {at_limit} samples "
-                "while the command goes on",
+                late.name,
+                {"delay" if late.name == "delay" else "tau": late.value},
+                {"delay" if late.name == "delay" else "tau": late.error},
+                f"measured force is late by {1e3 * late.value:.3f} ms; misfit {np.sqrt(late.left / n):.3g}, "
+                f"with {other} {np.sqrt(late.other / n):.3g}, with neither {np.sqrt(late.none / n):.3g} "
+                f"{model.force_unit}",
             )
         )
-    none = misfit(0.0, 0.0)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Late:
+    """How late a drive is: by delay or lag, by how much [s] with its standard error; squares left by it, by the other, by neither."""
+
+    name: str
+    value: float
+    error: float
+    left: float
+    other: float
+    none: float
+
+
+def _latest(records: list[Record], limit: float, dt: float) -> _Late:
+    """Fit a delay, and a lag, of a drive with a limit; return what leaves less."""
+
+    def off(delay: float, lag: float) -> Array:
+        parts = [
+            (r.force_measured if r.force_measured is not None else r.force)
+            - drive_output(r.force, max(delay, 0.0), max(lag, 0.0), limit, dt)
+            for r in records
+        ]
+        return np.concatenate([e[20:] for e in parts])
+
+    def misfit(delay: float, lag: float) -> float:
+        e = off(delay, lag)
+        return float(e @ e)
+
     delay = _delay(misfit, dt)
     lag = dt * float(
         minimize_scalar(
@@ -198,25 +236,17 @@ def drive(session: Session, model: AxisModel) -> list[Finding]:
             options={"maxiter": 25},
         ).x
     )
-    scores = {"delay": misfit(delay, 0.0), "lag": misfit(0.0, max(lag, 0.0))}
-    name = min(scores, key=lambda s: scores[s])
+    left = {"delay": misfit(delay, 0.0), "lag": misfit(0.0, lag)}
+    name, other = sorted(left, key=lambda s: left[s])
     value = delay if name == "delay" else lag
-    slope = np.sqrt(n * np.mean(np.concatenate([np.gradient(r.force, dt) for r in records]) ** 2))
-    error = float(np.sqrt(scores[name] / n) / slope)
-    if value > max(SIGNIFICANT * error, 1e-3 * dt) and scores[name] < (1.0 - DRIVE_GAIN) * none:
-        symbol = "delay" if name == "delay" else "tau"
-        other = "lag" if name == "delay" else "delay"
-        found.append(
-            Finding(
-                name,
-                {symbol: float(value)},
-                {symbol: error},
-                f"measured force is late by {1e3 * value:.3f} ms; misfit {np.sqrt(scores[name] / n):.3g}, "
-                f"with {other} {np.sqrt(scores[other] / n):.3g}, with neither {np.sqrt(none / n):.3g} "
-                f"{model.force_unit}",
-            )
-        )
-    return found
+    step = STEP * dt
+    ahead, behind = (
+        (t, 0.0) if name == "delay" else (0.0, t) for t in (value + step, max(value - step, 0.0))
+    )
+    slope = (off(*ahead) - off(*behind)) / (step + min(step, value))
+    size = max(float(slope @ slope), 1e-300)
+    error = float(np.sqrt(left[name] / len(slope) / size))
+    return _Late(name, value, error, left[name], left[other], misfit(0.0, 0.0))
 
 
 def _delay(misfit: Callable[[float, float], float], dt: float) -> float:

@@ -99,6 +99,21 @@ def test_a_good_drive_shows_nothing() -> None:
     assert drive(session(), AXIS) == []
 
 
+@pytest.mark.parametrize("lag_s", [2e-3, 5e-3])
+def test_a_slow_drive_of_a_restless_command_is_not_limited_and_known_as_well_as_is_said(lag_s: float) -> None:
+    """A coarse encoder's chatter is steep, but a lag takes most of it away, and its peaks."""
+    z = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        force = 0.4 * np.sin(2.0 * np.pi * 1.5 * T[:2000]) + 0.2 * rng.standard_normal(2000)
+        measured = drive_output(force, 0.0, lag_s, np.inf, 1e-3) + 2e-3 * rng.standard_normal(2000)
+        place = 1e-3 * np.arange(2000)
+        (found,) = drive(Session((Record("restless", place, force, place, measured),)), AXIS)
+        assert found.effect == "lag"
+        z.append((found.values["tau"] - lag_s) / found.errors["tau"])
+    assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.6
+
+
 def test_the_drive_model_is_that_of_the_simulation() -> None:
     model = AXIS.with_effect("delay", {"delay": 2.7e-3}).with_effect("lag", {"tau": 2e-3})
     run = simulate(model, COMMAND)
