@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from sioms.reconcile.descent import descend
 from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import known
-from sioms.reconcile.fit import Fit, Problem, refit
+from sioms.reconcile.fit import LEFT, Fit, Free, Problem, free_parameters, get, put, refit, shifted
 from sioms.reconcile.model import AxisModel
 
 #: Relative steps in which the numbers of a gap are searched: when it is new, and when it was found beside other effects.
@@ -20,6 +21,12 @@ UNPOLISHED = tuple(
 )
 POLISHED = (("gap", 0.08), ("gap", 0.025), ("gap", 0.008))
 BOUNCE = 3.0  # in units of the median residual
+#: Steps over which slopes are taken beside a gap, before and after its numbers are searched, in sizes of the numbers; that of intervals.
+STRIDES, INTERVALS = ((0.05, 0.02), (0.01, 0.003)), 0.03
+#: Fits from numbers that are off by so many of their sizes, to see what other minima are as deep.
+OTHERS, OFF = 3, 0.04
+#: Accepted steps of a descent at most, and the gain below which it ends.
+STEPS, TOLERANCE = 4, 1e-3
 
 
 def rattles(model: AxisModel) -> bool:
@@ -81,3 +88,68 @@ def _inside(model: AxisModel, name: str) -> bool:
         p.lower * model.scale(p) <= model.effects[name][p.symbol] <= p.upper * model.scale(p)
         for p in known()[name].parameters
     )
+
+
+def deepest(
+    problem: Problem, model: AxisModel, frozen: Sequence[str], rng: np.random.Generator
+) -> tuple[Fit, ...]:
+    """Fit all numbers beside a gap, from the given ones and from others near them; the fit that leaves least comes first.
+
+    Every bounce that comes to fall otherwise is a step in the cost: a slope over 0.2 % is that of the nearest step, not of the cost, and descent
+    by it ends where it began. Over some per cent steps average out. How far apart the minima are that it leads to from here and there is
+    how little the data tell.
+    """
+    free = free_parameters(model, frozen)
+    starts = [model, *(shifted(model, free, OFF * rng.standard_normal(len(free))) for _ in range(OTHERS))]
+    judged, fits = bent(problem, model), []
+    for end in [model, *(_strode(problem, start, frozen) for start in starts)]:
+        r = judged.residual(end)
+        fits.append(Fit(end, free, r, np.empty((len(r), 0))))
+    best = min(fits, key=lambda fit: fit.cost)
+    others = [fit for fit in fits[1:] if fit is not best]
+    best = refit(judged, best.model, frozen, STEPS)
+    slopes = _secants(judged, best.model, free, get(best.model, free), INTERVALS)
+    return replace(best, jacobian=slopes), *others
+
+
+def _strode(problem: Problem, model: AxisModel, frozen: Sequence[str]) -> AxisModel:
+    """Descend by wide slopes, search the numbers of the gap, descend by narrower ones."""
+    before, after = STRIDES
+    for stride in before:
+        model = _descended(problem, model, frozen, stride)
+    model = polish(problem, bent(problem, model), model, frozen, UNPOLISHED[4:]).model
+    for stride in after:
+        model = _descended(problem, model, frozen, stride)
+    return model
+
+
+def _descended(problem: Problem, model: AxisModel, frozen: Sequence[str], stride: float) -> AxisModel:
+    problem, free = bent(problem, model), free_parameters(model, frozen)
+    at, _, _ = descend(
+        lambda x: problem.residual(put(model, free, x)),
+        lambda x, _: _secants(problem, model, free, x, stride),
+        get(model, free),
+        np.array([f.scale for f in free]),
+        np.array([f.lower for f in free]),
+        np.array([f.upper for f in free]),
+        STEPS,
+        TOLERANCE,
+        left=LEFT,
+    )
+    return put(model, free, at)
+
+
+def _secants(problem: Problem, model: AxisModel, free: Sequence[Free], at: Array, stride: float) -> Array:
+    """Differences of the residual over a stride to both sides, within the bounds, per size of each number."""
+
+    def column(i: int) -> Array:
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = at.copy()
+            moved[i] = np.clip(at[i] + sign * stride * free[i].scale, free[i].lower, free[i].upper)
+            ends.append(moved)
+        ahead, behind = (problem.residual(put(model, free, x)) for x in ends)
+        width: float = ends[0][i] - ends[1][i]
+        return np.asarray((ahead - behind) * (free[i].scale / width))
+
+    return np.stack(list(problem.mapper(column, range(len(free)))), axis=1)

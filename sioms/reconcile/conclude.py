@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import binom
 
 from sioms.reconcile.ambiguity import Rival
-from sioms.reconcile.bounces import bent, rattles
+from sioms.reconcile.bounces import deepest, rattles
 from sioms.reconcile.effect import Array
 from sioms.reconcile.evidence import describe, spans_of
 from sioms.reconcile.excitation import Gate
@@ -80,8 +80,8 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     states = session_states(ready.final, found.fit.model)
     gaps = _gaps(ready, nominal, found.fit.model, states)
     whole = replace(ready.problem, end=1.0, weights=None)
-    fit = _last(bent(whole, found.fit.model) if rattles(found.fit.model) else whole, s)
-    spans = spans_of(whole, fit, o.replicates, rng)
+    fit, *others_as_deep = _last(whole, s, rng)
+    spans = spans_of(whole, fit, others_as_deep)
     named, terms = describe(ready.findings, fit, found, s.searcher, others, spans, rng)
     terms += [force.term for force in ready.timed]
     open_rivals = [r for r in others if r.open]
@@ -141,11 +141,14 @@ def _gaps(ready: Prepared, nominal: AxisModel, model: AxisModel, states: Sequenc
     return tuple(replace(g, before=p.before) for g, p in zip(gaps, before, strict=True))
 
 
-def _last(problem: Problem, s: Searched) -> Fit:
-    """Fit once more to all samples."""
+def _last(problem: Problem, s: Searched, rng: np.random.Generator) -> tuple[Fit, ...]:
+    """Fit once more to all samples; beside a gap the fits from elsewhere come after it."""
     model = s.found.fit.model
+    if rattles(model):
+        return deepest(problem, model, s.searcher.frozen, rng)
     fit = refit(problem, model, s.searcher.frozen, LAST)
-    return replace(fit, model=model) if fit.cost > float(np.sum(problem.residual(model) ** 2)) else fit
+    worse = fit.cost > float(np.sum(problem.residual(model) ** 2))
+    return (replace(fit, model=model) if worse else fit,)
 
 
 def _pictures(

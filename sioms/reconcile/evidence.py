@@ -3,68 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
+from scipy.stats import t as student
 
 from sioms.reconcile.ambiguity import Rival
 from sioms.reconcile.blocks import better, block_ids, formal, intervals
 from sioms.reconcile.channels import Finding
-from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import known
-from sioms.reconcile.fit import BASE, Fit, Problem, get, jacobian, refit
+from sioms.reconcile.fit import Fit, Problem, get, refit
 from sioms.reconcile.rules import GAIN, told_apart
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.verdict import Estimate, NamedEffect, apart
 
-#: Multiples of a parameter of the bounces in a gap that are tried for its interval.
-ROUGH_GRID = tuple(float(x) for x in np.linspace(0.9, 1.1, 17))
-
 
 def spans_of(
-    problem: Problem, fit: Fit, replicates: int, rng: np.random.Generator
+    problem: Problem, fit: Fit, others: Sequence[Fit] = ()
 ) -> dict[tuple[str, str], tuple[float, float]]:
-    """Return the 95 % interval of every free number by (effect, symbol): by leaving out each block of time, within its bounds.
+    """Return the 95 % interval of every free number by (effect, symbol), within its bounds.
 
-    Bounces that count little in a fit say how uncertain it is: the residual is taken as it is.
+    It is that of leaving out each block of time, and, where the cost is rough, of how far from this minimum others are.
+
+    Args:
+        others: minima that descent from elsewhere led to.
     """
-    if problem.bend < np.inf:
-        problem = replace(problem, bend=np.inf)
-        r = problem.residual(fit.model)
-        fit = replace(
-            fit, residual=r, jacobian=jacobian(problem, fit.model, fit.free, get(fit.model, fit.free), r)
-        )
     half = np.maximum(intervals(fit, block_ids(problem, fit.model.sample_time_s)), formal(fit))
-    spread = half * np.array([f.scale for f in fit.free])
+    half = half * np.array([f.scale for f in fit.free])
+    if others:
+        at = get(fit.model, fit.free)
+        off = np.array([get(o.model, fit.free) for o in others]) - at
+        turned = np.array([f.phase for f in fit.free])
+        off[:, turned] = np.angle(np.exp(1j * off[:, turned]))
+        half = np.hypot(half, student.ppf(0.975, len(others)) * np.sqrt(np.mean(off**2, axis=0)))
     out = {}
-    for f, s in zip(fit.free, spread, strict=True):
-        value = getattr(fit.model, f.symbol) if f.effect == BASE else fit.model.effects[f.effect][f.symbol]
-        if f.effect != BASE and known()[f.effect].slot is Slot.BACKLASH:
-            s = max(float(s), value * _rough_spread(problem, fit, f.effect, f.symbol, replicates, rng))
+    for f, value, s in zip(fit.free, get(fit.model, fit.free), half, strict=True):
+        low, high = float(value - s), float(value + s)
         out[f.effect, f.symbol] = (
-            max(value - float(s), min(f.lower, value)),
-            min(value + float(s), max(f.upper, value)),
+            max(low, min(f.lower, float(value))),
+            min(high, max(f.upper, float(value))),
         )
     return out
-
-
-def _rough_spread(
-    problem: Problem, fit: Fit, name: str, symbol: str, replicates: int, rng: np.random.Generator
-) -> float:
-    """95 % half-width, relative, of a parameter whose cost is rough: where the best of a grid falls, over bootstrap replicates."""
-    here = fit.model.effects[name]
-    ids = block_ids(problem, fit.model.sample_time_s)
-    count = int(ids.max()) + 1
-
-    def energy(factor: float) -> Array:
-        e = problem.residual(fit.model.with_effect(name, {**here, symbol: here[symbol] * factor}))
-        return np.asarray(np.bincount(ids, weights=e**2, minlength=count), dtype=np.float64)
-
-    costs = np.stack(list(problem.mapper(energy, ROUGH_GRID)))
-    draws = rng.multinomial(count, np.full(count, 1.0 / count), size=replicates)
-    best = np.asarray(ROUGH_GRID)[np.argmin(draws @ costs.T, axis=1)]
-    step = ROUGH_GRID[1] - ROUGH_GRID[0]
-    return float(1.96 * np.sqrt(np.mean((best - 1.0) ** 2) + step**2 / 12.0))
 
 
 def describe(

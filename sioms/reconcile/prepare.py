@@ -38,8 +38,7 @@ class Options:
     """Settings of one analysis.
 
     Attributes:
-        seed: of permutations and bootstrap.
-        replicates: bootstrap replicates.
+        seed: of permutations, bootstrap and starts.
         pictures: keep curves and localisation for the report.
         resample: seed with which the blocks of time are drawn anew, to see whether the verdict stands; None: as they are.
         mapper: as of ``Problem``.
@@ -47,7 +46,6 @@ class Options:
     """
 
     seed: int = 1
-    replicates: int = 200
     pictures: bool = True
     resample: int | None = None
     mapper: Mapper = map

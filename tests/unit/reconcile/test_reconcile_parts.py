@@ -12,9 +12,10 @@ import pytest
 
 from sioms.reconcile.ambiguity import settle
 from sioms.reconcile.blocks import better, block_ids, bootstrap, formal, heldout, intervals
-from sioms.reconcile.bounces import bent
+from sioms.reconcile.bounces import bent, deepest
 from sioms.reconcile.channels import drive, drive_output, index_fit, lattice
 from sioms.reconcile.descent import descend
+from sioms.reconcile.evidence import spans_of
 from sioms.reconcile.excitation import common, gate
 from sioms.reconcile.experiment import Envelope, catalogue, demands, one_speed, repeated, separate
 from sioms.reconcile.fit import LEFT, Problem, free_parameters, get, jacobian, refit
@@ -232,6 +233,26 @@ def test_a_closed_loop_over_a_record_cut_in_motion_goes_on_as_the_whole() -> Non
     assert np.abs(off).max() < 0.02 * np.abs(whole.position - COMMAND).max()
     early = session(AXIS, 3.5 * (1.0 - np.cos(2 * np.pi * T))).records[0]
     assert np.abs(replay(AXIS, early).position - early.position).max() < 5.0 * AXIS.resolution
+
+
+def test_beside_a_gap_wide_slopes_find_what_narrow_ones_miss() -> None:
+    """Every bounce that falls otherwise is a step in the cost; intervals are as wide as its minima lie apart."""
+    gap = {"gap": 0.05, "load_fraction": 0.5, "f_contact": 110.0, "zeta": 0.08}
+    truth = AXIS.with_effect("backlash", gap).with_effect("offset", {"off": 0.06})
+    truth = truth.with_effect("viscous", {"b_extra": 4e-3})
+    legs = np.cumsum(4e-3 * np.repeat(([1, -1, 2, -2, -1, 1, 1, -1] * 3)[:20], 200))
+    p = problem(session(truth, legs))
+    start = AXIS.with_effect("backlash", {**gap, "gap": 0.053, "load_fraction": 0.48})
+    start = start.with_effect("offset", {"off": 0.064}).with_effect("viscous", {"b_extra": 3.7e-3})
+    judged, narrow = bent(p, start), refit(bent(p, start), start)
+    fit, *others = deepest(p, start, (), np.random.default_rng(1))
+    left = [float(np.sum(judged.residual(f.model) ** 2)) for f in (narrow, fit)]
+    assert left[1] < 0.8 * left[0]
+    spans = spans_of(p, fit, others)
+    for name, symbol in (("offset", "off"), ("viscous", "b_extra"), ("backlash", "gap")):
+        true, (low, high) = truth.effects[name][symbol], spans[name, symbol]
+        assert low < true < high
+        assert high - low < 0.1 * true
 
 
 def test_a_stop_is_found_where_it_is() -> None:

@@ -17,7 +17,7 @@ from sioms.reconcile.sampling import Sampling, read_as
 from sioms.tools.reconcile_input import read_data, read_model
 
 AXES = Path(__file__).parents[2] / "physics" / "reconcile_axes"
-QUICK = Options(pictures=False, replicates=20)
+QUICK = Options(pictures=False)
 
 
 def logged(name: str, every: int) -> tuple[Session, AxisModel]:
