@@ -30,6 +30,7 @@ NAMED = (
     "stribeck",
     "presliding",
     "lugre",
+    "friction_variation",
     "load_friction",
     "backlash",
     "elastic",
@@ -65,6 +66,8 @@ EXCLUSIVE = (
     ("gravity", "spring"),
     ("encoder_quantisation", "backlash"),
 )
+#: Laws of dry friction, of which one is beside a variation of it.
+VARYING = ("stribeck", "presliding", "lugre")
 #: Known effects that may be beside one that is outside the library.
 BESIDE = {
     "cubic_spring": ("coulomb", "payload"),
@@ -128,6 +131,8 @@ def _drawn(name: str, kind: str, rng: np.random.Generator, only: str) -> Axis:
     rival = ""
     if kind == "single":
         named = [only or _pick(NAMED, axis, rng)]
+        if named == ["friction_variation"]:
+            named.append(str(rng.choice(VARYING)))
     elif kind == "multi":
         named = _mixture(axis, int(rng.integers(2, 4)), rng)
     elif kind == "confounded":
@@ -176,6 +181,7 @@ def _pick(names: tuple[str, ...], axis: Axis, rng: np.random.Generator) -> str:
 def _mixture(axis: Axis, count: int, rng: np.random.Generator) -> list[str]:
     picks = {_pick(NAMED, axis, rng) for _ in range(count)}
     mixed = len(picks) == count and all(len(picks.intersection(group)) < 2 for group in EXCLUSIVE)
+    mixed = mixed and ("friction_variation" not in picks or bool(picks.intersection(VARYING)))
     return sorted(picks) if mixed else _mixture(axis, count, rng)
 
 
@@ -277,6 +283,8 @@ def _effect(name: str, axis: Axis, rng: np.random.Generator) -> Numbers:
             return {"Fc": fc, "xs": yields}
         case "lugre":
             return {"Fc": fc, "Fs": fs, "vs": vs, "xs": yields}
+        case "friction_variation":
+            return {"depth": u(0.12, 0.4), "n": order(1, 13), "phase": phase}
         case "load_friction":
             return {"mu": u(0.08, 0.25)}
         case "backlash":

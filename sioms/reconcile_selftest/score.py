@@ -18,6 +18,7 @@ PRIMARY = {
     "stribeck": "Fc",
     "presliding": "Fc",
     "lugre": "Fc",
+    "friction_variation": "depth",
     "load_friction": "mu",
     "backlash": "gap",
     "cogging": "amp",

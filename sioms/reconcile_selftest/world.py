@@ -84,6 +84,9 @@ class Plant(NamedTuple):
     lugre_Fs: float = 0.0
     lugre_vs: float = 1.0
     lugre_xs: float = 1.0
+    friction_variation_depth: float = 0.0
+    friction_variation_n: float = 0.0
+    friction_variation_phase: float = 0.0
     offset_off: float = 0.0
     spring_k: float = 0.0
     gravity_amp: float = 0.0
@@ -276,6 +279,10 @@ def _march(
             level += p.coulomb_position_Fm * np.sin(p.coulomb_position_n * theta + p.coulomb_position_phase)
             level += p.stribeck_Fc + (p.stribeck_Fs - p.stribeck_Fc) * np.exp(-((v / p.stribeck_vs) ** 2))
             level += p.load_friction_mu * abs(drive) + p.load_square_mu * drive * drive / p.rated
+            varied = 1.0 + p.friction_variation_depth * np.sin(
+                p.friction_variation_n * theta + p.friction_variation_phase
+            )
+            level *= varied
             if level > 0.0:
                 z = min(max(z + v * h, -give), give)
                 f -= level * z / give
@@ -283,6 +290,7 @@ def _march(
                     f -= 1.2 * np.sqrt(level / give * motor) * v
             if s0 > 0.0:
                 dropped = slid + (held - slid) * np.exp(-((v / fall) ** 2)) if p.lugre_Fs > 0.0 else slid
+                dropped *= varied
                 ahead = dropped / s0 * np.sign(v)
                 moved = (ahead - bristle) * (1.0 - np.exp(-s0 * abs(v) / dropped * h))
                 f -= s0 * (bristle + 0.5 * moved) + s1 * moved / h
