@@ -14,7 +14,8 @@ ELASTIC = Effect(
     parameters=(
         Parameter("f_res", "Hz", Ref.FREQUENCY, 2.0, 300.0, 20.0, "resonance of the free pair"),
         Parameter("load_fraction", "1", Ref.ONE, 0.03, 0.97, 0.5, "share of the inertia behind the spring"),
-        Parameter("zeta", "1", Ref.ONE, 0.0, 1.0, 0.05, "damping ratio"),
+        # what does not ring is no elastic transmission: a bristle's damping, or a lead in time, passes for one of 0.3 to 1
+        Parameter("zeta", "1", Ref.ONE, 0.0, 0.3, 0.05, "damping ratio"),
     ),
     signature="force residual concentrated around one frequency, whatever the position",
     lookalikes=("delay", "lag", "backlash", "payload"),
