@@ -29,7 +29,7 @@ from sioms.reconcile.records import Session
 from sioms.reconcile.refuse import bursts, smoother_share
 from sioms.reconcile.rules import SPECIFIC, SURE
 from sioms.reconcile.search import Found, Searcher, Step
-from sioms.reconcile.timed import Timed
+from sioms.reconcile.timed import Timed, known_beside
 from sioms.reconcile.tones import as_timed, hum
 from sioms.reconcile.variation import named as varied
 from sioms.reconcile.verdict import Verdict
@@ -165,6 +165,11 @@ def _changed(s: Searched) -> Timed | None:
     enough = max(ABOUT * least, len(s.found.fit.residual))
     good = [(fit, course) for fit, course in near if course.left <= enough]
     fit, course = min(good, key=lambda g: len(g[0].free) + g[1].count)
+    beside = refit(known_beside(problem, course.forces), fit.model, frozen)
+    if beside.cost - quiet > HALVED * max(
+        else_left - quiet, 0.0
+    ):  # the windows promised it, the axis does not keep it
+        return None
     return course.timed(1.0 - course.left / fit.cost)
 
 
