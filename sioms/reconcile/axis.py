@@ -78,7 +78,9 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
     if found is not s.found:
         s = replace(s, found=found, share=smoother_share(s.ready.problem, found.fit))
         burst = bursts(s.ready.problem, found.fit)
-    return conclude(s, o, others, burst)
+    verdict = conclude(s, o, others, burst)
+    # a log whose rows the controller has not made one by one is of an axis that has it nevertheless
+    return replace(verdict, model=replace(verdict.model, controller=nominal.controller))
 
 
 def _upright(s: Searched) -> Searched:

@@ -58,8 +58,11 @@ def test_a_controller_that_makes_the_rows_tells_that_they_are_those_of_the_loop(
 
 def test_a_log_of_200_hz_of_an_axis_that_hides_nothing_is_silent() -> None:
     session, model = logged("s05", 5)
-    found = analyse(session, model, QUICK)
+    controller = read_model(AXES / "s05" / "nominal.json").controller
+    found = analyse(session, replace(model, controller=controller), QUICK)
     assert found.outcome.value == "none"
+    assert found.model.controller == controller
+    assert [g.channel for g in found.gaps] == ["force, short windows"]
     assert any("slower than the loop" in note and "1 ms" in note for note in found.notes)
 
 
