@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -99,3 +100,11 @@ def test_a_period_that_is_told_needs_no_search_and_leaves_delays_to_be_named() -
     assert "delay" in ready.names
     assert "delay" not in prepare(session, model, QUICK).names
     assert not prepare(replace(session, loop_time_s=model.sample_time_s), model, QUICK).points
+
+
+@pytest.mark.timeout(60)
+def test_a_pool_of_two_threads_serves_the_fits_of_all_readings() -> None:
+    session, model = logged("s05", 5)
+    with ThreadPoolExecutor(2) as pool:
+        ready = prepare(session, model, replace(QUICK, mapper=pool.map))
+    assert ready.points
