@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 PIECE_NS = 250_000
 """Shortest time between two deliveries of a message that is not cut up: what a small adapter does."""
 MOST_GARBAGE = 12
+STRAY = (b"\x00", b"\xff")
+"""Bytes that a cable plugged in or a transceiver switched on adds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +31,8 @@ class Faults:
         double: replies that come twice.
         lose: replies that are lost: the device has done what it was told.
         deaf: requests that are lost.
+        stray: requests with one byte more in front.
+        short: requests that lack one of their bytes.
         count: how many messages are hit before the wire is good again; -1 for no end.
     """
 
@@ -41,6 +45,8 @@ class Faults:
     double: float = 0.0
     lose: float = 0.0
     deaf: float = 0.0
+    stray: float = 0.0
+    short: float = 0.0
     count: int = -1
 
 
@@ -74,9 +80,17 @@ class Bender:
         """Bend by these from now on."""
         self.faults, self._left = faults, faults.count
 
-    def hears(self) -> bool:
-        """Tell whether a request reaches the device."""
-        return not self._hit(self.faults.deaf)
+    def requested(self, request: bytes) -> tuple[bytes, str]:
+        """Return what reaches the device of a request, and what was done to it."""
+        if self._hit(self.faults.deaf):
+            return b"", "lost"
+        if self._hit(self.faults.stray):
+            stray = self.chance.choice(STRAY)
+            return stray + request, f"{stray.hex()} before it"
+        if request and self._hit(self.faults.short):
+            where = self.chance.randrange(len(request))
+            return request[:where] + request[where + 1 :], f"byte {where} lost"
+        return request, ""
 
     def bend(self, message: bytes) -> tuple[list[Piece], str]:
         """Return the pieces that are delivered for a message of the device, and what was done to it."""

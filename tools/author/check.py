@@ -8,11 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..counterparts.rigs import Rig
-from . import death_trials, golden, line_trials, motion_trials
+from . import death_trials, device_trials, golden, line_trials, motion_trials
 from .station import Station, Unanswered
 from .trial import Result, Trial, Verdict, attempt
 
-TRIALS: tuple[Trial, ...] = (*line_trials.TRIALS, *motion_trials.TRIALS, *death_trials.TRIALS)
+TRIALS: tuple[Trial, ...] = (
+    *line_trials.TRIALS,
+    *motion_trials.TRIALS,
+    *device_trials.TRIALS,
+    *death_trials.TRIALS,
+)
 
 
 @dataclass(frozen=True, slots=True)

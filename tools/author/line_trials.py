@@ -68,7 +68,7 @@ def disturbed(
             raise Failed(
                 "no reading made of a bent message, or of the reply to another request", seen, calm.traffic
             )
-        _check_back(station)
+        check_back(station)
     return calm
 
 
@@ -88,7 +88,8 @@ def _check_alive(station: Station, before: dict[str, Any]) -> None:
         raise Failed("the driver process to live on", f"it died: {why}")
 
 
-def _check_back(station: Station) -> float:
+def check_back(station: Station) -> float:
+    """Wait for a good link after a disturbance; return how long that took [s]."""
     try:
         return station.wait_fresh(BACK_S)
     except TimeoutError as error:
@@ -167,7 +168,7 @@ def _cut_off(station: Station, cut: Any, mend: Any, what: str) -> str:
             _refused(station)
         finally:
             mend()
-        back_s = _check_back(station)
+        back_s = check_back(station)
         _check_alive(station, before)
         calm.watch(0.15)
         if calm.wrong:
@@ -310,7 +311,7 @@ def outputs_missing(station: Station, full: bool) -> str:
         except OSError:
             pass  # refused, or stopped by the fault: what counts is where the axis is
         station.fault()
-        _check_back(station)
+        check_back(station)
         wait_for(lambda: not node.read().in_motion[0], 5.0)
         time.sleep(0.1)
         moved = node.read().position[0] - place

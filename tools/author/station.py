@@ -157,6 +157,7 @@ class Station:
         self.daemon: Daemon | None = None
         self.cell: Workcell
         self.port = ""
+        self._verbs: frozenset[str] | None = None
         try:
             if rig.counterpart:
                 self._connect(paced, wired)
@@ -325,6 +326,16 @@ class Station:
     def has(self, mode: ControlMode) -> bool:
         """Whether the first axis has a control mode."""
         return bool(self.rig.axes and self.cell.info(self.rig.axes[0].node).channels[0].modes & mode)
+
+    @property
+    def verbs(self) -> frozenset[str]:
+        """What the simulated device can be told; nothing for one that does not list it."""
+        if self._verbs is None:
+            self._verbs = frozenset()
+            if self.counterpart is not None:
+                with contextlib.suppress(Unanswered):
+                    self._verbs = frozenset(self.counterpart.tell("verbs") or ())
+        return self._verbs
 
     def speed(self) -> float | None:
         """Return how fast the device really moves, as its counterpart says; None when that does not say."""

@@ -124,10 +124,10 @@ class Wire:
         if not data:
             return
         now_ns = time.monotonic_ns()
-        hears = self.bender.hears()
-        self.log.append((now_ns, ">", data, "" if hears else "lost"))
-        if hears:
-            self._asked_ns = self.to_device.send([Piece(data)], now_ns)
+        reaches, note = self.bender.requested(data)
+        self.log.append((now_ns, ">", data, note))
+        if reaches:
+            self._asked_ns = self.to_device.send([Piece(reaches)], now_ns)
 
     def _from_device(self, fd: int) -> None:
         data = self.device.read(fd)

@@ -1,7 +1,7 @@
 """The life of a counterpart: one ready line, then commands on standard input until it ends.
 
 Each command is a line of words and is answered by one line: ``ok``, ``ok`` with a JSON value, or ``error`` with a
-sentence. When standard input is a pipe or a socket its end ends the process, so that a counterpart does not
+sentence; ``verbs`` lists them. When standard input is a pipe or a socket its end ends the process, so that a counterpart does not
 outlive its test; a terminal or /dev/null does not.
 """
 
@@ -28,6 +28,8 @@ def obey(line: str, handlers: Mapping[str, Handler]) -> str:
     words = line.split()
     if not words:
         return "ok"
+    if words[0] == "verbs":
+        return f"ok {json.dumps(sorted(handlers))}"
     handler = handlers.get(words[0])
     if handler is None:
         return f"error unknown command {words[0]}; one of {', '.join(sorted(handlers))} is right"
