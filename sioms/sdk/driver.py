@@ -213,6 +213,9 @@ class LineUnit(ABC):
 
         For axes call ``bank.poll(...)`` with what was read: the kit then carries out the actions that
         the bank wants, stops first. Runs at the described rate, and at once after a command.
+
+        Raises:
+            StateLost: what ``open`` has set is gone: the unit is opened again at once.
         """
 
     def act(self, action: DriveAction) -> Steps:

@@ -12,6 +12,7 @@ retries and no threads, and its tests need no line: they resume the generator th
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Any
@@ -41,6 +42,20 @@ class DeviceError(Exception):
     def __init__(self, errno_: int, text: str) -> None:
         super().__init__(text)
         self.errno = errno_
+
+
+class StateLost(DeviceError):
+    """A poll found that what the opening had set is gone: the device restarted, or somebody else has set it.
+
+    The kit counts the unit as lost at once, without waiting for ``misses``, and opens it again at once: nothing moves and
+    no output is believed until the opening has set and proved everything anew.
+
+    Args:
+        text: what was read, and what it should be.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(errno.EIO, text)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from sioms.protocol.flags import PageState
 from .blocks import AnyBlock, AxisBlock
 from .connected import FIRST_PAUSE_NS, LONGEST_PAUSE_NS, Connected
 from .driver import LineDriver, LineUnit
-from .exchange import DeviceError, LinkError, Steps, while_wanted
+from .exchange import DeviceError, LinkError, StateLost, Steps, while_wanted
 from .handles import LATER, Handle
 from .line import Done, Priority
 
@@ -99,14 +99,16 @@ class LineEngine(Connected):
         kind = PageState.FAULT if isinstance(error, DeviceError) else PageState.LINK_LOST
         self._runtime.set_link(state.unit.blocks, kind, self._told(state.unit, error))
         state.due_ns = now_ns + state.pause_ns
-        state.pause_ns = min(2 * state.pause_ns, LONGEST_PAUSE_NS)
+        state.pause_ns = min(max(2 * state.pause_ns, FIRST_PAUSE_NS), LONGEST_PAUSE_NS)
 
     def _polled(self, state: _UnitState, _: Any, error: Exception | None) -> None:
         state.busy = False
         now_ns = self._runtime.now_ns()
         if error is not None:
             state.misses += 1
-            if state.misses >= state.unit.misses:
+            if isinstance(error, StateLost):
+                state.pause_ns = 0
+            if state.misses >= state.unit.misses or isinstance(error, StateLost):
                 self._lose_unit(state, self._told(state.unit, error), now_ns)
             return
         state.misses = 0
