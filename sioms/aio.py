@@ -27,7 +27,7 @@ from sioms.protocol.messages import ClientVerb, HandleVerb
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.socketpath import socket_path
 
-from .client.channel import Answer, Call, Channel
+from .client.channel import GRACE_S, Answer, Call, Channel
 from .client.channel import connect as connect_socket
 from .client.command import command
 from .client.node_core import Event, NodeCore
@@ -54,12 +54,26 @@ class _Requests:
         future: asyncio.Future[Answer] = self._loop.create_future()
         self._futures[number] = future
         try:
-            return await future
+            async with asyncio.timeout(None if call.limit_s is None else call.limit_s + GRACE_S):
+                return await future
+        except TimeoutError:
+            if not future.cancelled():
+                raise  # the other side's own answer
+            self._cancel(number, call)
+            raise self._channel.late(call) from None
         except asyncio.CancelledError:
-            if self._futures.pop(number, None) is not None:
-                self._abandoned[number] = call
-                self._channel.send(Call("cancel", self._cancel_verb, number))
+            self._cancel(number, call)
             raise
+
+    def _cancel(self, number: int, call: Call) -> None:
+        if self._futures.pop(number, None) is not None:
+            self._abandoned[number] = call
+            self._channel.send(Call("cancel", self._cancel_verb, number))
+
+    @property
+    def closed(self) -> bool:
+        """Whether it has been closed."""
+        return self._channel.closed
 
     def close(self) -> None:
         """Stop reading; requests in flight end with EBADF."""
@@ -129,15 +143,15 @@ class AsyncNode(NodeCore):
         return tick
 
     async def command(
-        self, axis: int = 0, *, timeout: float | None = 0.0, replace: bool = False, **words: Any
+        self, axis: int | str = 0, *, timeout: float | None = 0.0, replace: bool = False, **words: Any
     ) -> int:
-        """Append one command; see ``sioms.command`` for the words."""
-        return await self.write(command(axis, **words), timeout, replace=replace)
+        """Append one command to an axis, given by index or name; see ``sioms.command`` for the words."""
+        return await self.write(command(self.channel(axis), **words), timeout, replace=replace)
 
     async def move(
         self,
         position: float,
-        axis: int = 0,
+        axis: int | str = 0,
         *,
         timeout: float | None = 0.0,
         replace: bool = False,
@@ -146,12 +160,12 @@ class AsyncNode(NodeCore):
         """Append a position command; see ``AxisNode.move``."""
         return await self.command(axis, position=position, timeout=timeout, replace=replace, **words)
 
-    async def jog(self, velocity: float, axis: int = 0, *, acceleration: float | None = None) -> int:
+    async def jog(self, velocity: float, axis: int | str = 0, *, acceleration: float | None = None) -> int:
         """Go over to a velocity at once, until told otherwise; see ``AxisNode.jog``."""
         words = {} if acceleration is None else {"acceleration": acceleration}
         return await self.command(axis, velocity=velocity, replace=True, **words)
 
-    async def tweak(self, step: float, axis: int = 0, **words: Any) -> int:
+    async def tweak(self, step: float, axis: int | str = 0, **words: Any) -> int:
         """Append a step from where the preceding command ends; see ``AxisNode.tweak``."""
         return await self.command(axis, position=step, relative=True, **words)
 
@@ -201,14 +215,20 @@ class AsyncNode(NodeCore):
         state, number = self._start_of(last)
         if self._subscribed == 0:
             await self.subscribed(-1)
-        async with asyncio.timeout(timeout):
-            while True:
-                head = self._page.head  # what comes while we look is for the next look
-                event = self._find_event(mask, state, number)
-                if event is not None:
-                    return event
-                number = max(number, head)
-                await self._wake()
+        try:
+            async with asyncio.timeout(timeout):
+                while True:
+                    head = self._page.head  # what comes while we look is for the next look
+                    event = self._find_event(mask, state, number)
+                    if event is not None:
+                        return event
+                    number = max(number, head)
+                    await self._wake()
+        except TimeoutError as error:
+            if error.errno:
+                raise
+            text = f"wait for an event on {self.name}: nothing within its time-out"
+            raise TimeoutError(errno.ETIMEDOUT, text) from None
 
     async def _wake(self) -> None:
         """Wait for the wake pipe, and look at the page at least every 50 ms: a hung driver wakes nobody."""
@@ -232,9 +252,13 @@ class AsyncNode(NodeCore):
 class AsyncWorkcell:
     """A session with the daemon in an event loop; made by ``connect``."""
 
-    def __init__(self, requests: _Requests, page: StopRequest | None) -> None:
+    def __init__(self, requests: _Requests, page: StopRequest | None, name: str = "") -> None:
         self._requests = requests
         self._page = page
+        self.name = name
+
+    def __repr__(self) -> str:
+        return f"<AsyncWorkcell {self.name}{', closed' if self._requests.closed else ''}>"
 
     async def __aenter__(self) -> Self:
         return self
@@ -312,4 +336,4 @@ async def connect(path: str | None = None, name: str = "") -> AsyncWorkcell:
     if answer.fds:
         page = StopRequest(memoryview(mmap(answer.fds[0], REQUEST_SIZE)))
         os.close(answer.fds[0])
-    return AsyncWorkcell(requests, page)
+    return AsyncWorkcell(requests, page, answer.value[1])

@@ -25,9 +25,12 @@ def add_parser(subparsers: Any) -> None:
     one.add_argument(
         "--names", action="store_true", help="only names, one a line; nothing when no daemon is there"
     )
+    one.add_argument("--json", action="store_true", help="as JSON")
     one = subparsers.add_parser("info", help="tell what a node is")
     one.add_argument("node", metavar="NODE")
-    subparsers.add_parser("status", help="tell how devices, sessions and the emergency stop stand")
+    one.add_argument("--json", action="store_true", help="as JSON")
+    one = subparsers.add_parser("status", help="tell how devices, sessions and the emergency stop stand")
+    one.add_argument("--json", action="store_true", help="as JSON")
     subparsers.add_parser("reload", help="have the daemon take up its configuration anew")
     one = subparsers.add_parser(
         "stop", help="emergency stop; latches until `sioms reset`; no safety-rated function"
@@ -47,13 +50,21 @@ def run(args: argparse.Namespace) -> int:
     """Run one of the commands; return the exit status."""
     match args.command:
         case "list":
-            return _list(args.verbose, args.names)
+            return _list(args.verbose, args.names, args.json)
         case "info":
             with Workcell(name="sioms") as cell:
-                print("\n".join(describe(cell.info(args.node))))
+                info = cell.info(args.node)
+            if args.json:
+                print_json(info_fields(info))
+            else:
+                print("\n".join(describe(info)))
         case "status":
             with Workcell(name="sioms") as cell:
-                print("\n".join(status_lines(cell.status(), monotonic_ns())))
+                status = cell.status()
+            if args.json:
+                print_json({**status, "now_ns": monotonic_ns()})
+            else:
+                print("\n".join(status_lines(status, monotonic_ns())))
         case "reload":
             with Workcell(name="sioms") as cell:
                 cell.reload()
@@ -87,7 +98,47 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     ]
 
 
-def _list(verbose: bool, names_only: bool) -> int:
+def print_json(value: object) -> None:
+    """Print a value as JSON; what is no number becomes null."""
+    import json
+    import math
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {str(key): plain(inner) for key, inner in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(inner) for inner in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    print(json.dumps(plain(value), indent=1))
+
+
+def info_fields(info: NodeInfo) -> dict[str, Any]:
+    """Return what a node is, under the names of its attributes."""
+    channels = [
+        {
+            "name": c.name, "unit": c.unit, "minimum": c.minimum, "maximum": c.maximum, "width": c.width,
+            "modes": [m.name.lower() for m in ControlMode if m & c.modes and m.name], "limits": c.limits,
+            "description": c.description,
+        }
+        for c in info.channels
+    ]  # fmt: skip
+    return {
+        "name": info.name, "class": info.node_class.name.lower(), "read_only": info.read_only, "bit": info.bit,
+        "device": info.device, "driver": info.driver, "tick_hz": info.tick_hz,
+        "buffer_capacity": info.buffer_capacity, "channels": channels,
+    }  # fmt: skip
+
+
+def entry_fields(entry: NodeEntry) -> dict[str, Any]:
+    """Return a line of the node list under the names of its attributes."""
+    return {
+        "name": entry.name, "class": entry.node_class.name.lower(), "channels": entry.channels,
+        "read_only": entry.read_only, "device": entry.device, "state": entry.state, "held_by": entry.holder,
+    }  # fmt: skip
+
+
+def _list(verbose: bool, names_only: bool, as_json: bool) -> int:
     if names_only:  # what completion asks: it must never get in the way of somebody typing
         try:
             with Workcell(name="sioms") as cell:
@@ -98,6 +149,9 @@ def _list(verbose: bool, names_only: bool) -> int:
     with Workcell(name="sioms") as cell:
         entries = cell.nodes()
     shown = entries if verbose else [entry for entry in entries if not is_part(entry, entries)]
+    if as_json:
+        print_json([entry_fields(entry) for entry in shown])
+        return 0
     rows = [
         (e.name, e.node_class.name.lower(), str(e.channels), "read" if e.read_only else "read, write", e.device,
          e.state, e.holder)

@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from .cell import table
+from .cell import print_json, table
 
 ABOUT = (
     "check puts drivers to work under a daemon of its own, against the simulated device that their rig names, over a wire that "
@@ -22,7 +22,8 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     actions = subparsers.add_parser("driver", help="list and check drivers, record and replay their lines")
     actions = actions.add_subparsers(dest="action", metavar="ACTION", required=True)
-    actions.add_parser("list", help="tell which drivers are installed")
+    one = actions.add_parser("list", help="tell which drivers are installed")
+    one.add_argument("--json", action="store_true", help="as JSON")
     one = actions.add_parser("check", help="put drivers through noise, loss, unplugging, stops and deaths")
     one.add_argument(
         "drivers", metavar="DRIVER", nargs="*", help="registered name, register map, or a Python file"
@@ -66,8 +67,11 @@ def run(args: argparse.Namespace) -> int:
     """Run one of the actions; return the exit status."""
     match args.action:
         case "list":
-            for line in table(("driver", "module", "what it is"), [_driver(e) for e in drivers()]):
-                print(line)
+            head, rows = ("driver", "module", "what it is"), [_driver(e) for e in drivers()]
+            if args.json:
+                print_json([dict(zip(("driver", "module", "description"), row, strict=True)) for row in rows])
+            else:
+                print("\n".join(table(head, rows)))
             return 0
         case "check":
             from .author.command import run_check
@@ -92,12 +96,22 @@ def drivers() -> list[EntryPoint]:
     return sorted(entry_points(group="sioms.drivers"), key=lambda entry: entry.name)
 
 
+def page_of(name: str) -> str:
+    """Return the docstring of an installed driver's module, which is read and not imported; '' when there is none."""
+    found = [entry for entry in drivers() if entry.name == name]
+    return _docstring(found[0]) if found else ""
+
+
+def _docstring(entry: EntryPoint) -> str:
+    spec = find_spec(entry.module)
+    source = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
+    return ast.get_docstring(ast.parse(source)) or ""
+
+
 def _driver(entry: EntryPoint) -> tuple[str, str, str]:
-    """Describe a driver by the first line of its module, which is read and not imported."""
+    """Describe a driver by the first line of its module."""
     try:
-        spec = find_spec(entry.module)
-        source = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
-        text = ast.get_docstring(ast.parse(source)) or ""
+        text = _docstring(entry)
     except (ImportError, OSError, SyntaxError) as error:
         text = f"cannot be read: {error}"
     return entry.name, entry.module, text.partition("\n")[0]

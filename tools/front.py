@@ -27,6 +27,7 @@ class Command:
 
 COMMANDS: dict[str, Command] = {
     "demo": Command("demo", "show the simulated workcell at work"),
+    "init": Command("init", "write a starter configuration, with what is plugged in"),
     "list": Command("cell", "list the nodes of the workcell"),
     "info": Command("cell", "tell what a node is: channels, units, limits"),
     "status": Command("cell", "tell how devices, sessions and the emergency stop stand"),
@@ -35,6 +36,7 @@ COMMANDS: dict[str, Command] = {
     "reset": Command("cell", "clear a latched stop or fault"),
     "reload": Command("cell", "have the daemon take up its configuration anew"),
     "check": Command("cell", "check a configuration"),
+    "service": Command("service", "install the daemon as a service of this machine"),
     "driver": Command("driver", "list, check, trace and replay drivers"),
     "bench": Command("bench", "measure latencies and throughput on this machine"),
     "tactile": Command("tactile", "design, calibrate and measure elastic fingers"),

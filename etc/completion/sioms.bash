@@ -22,7 +22,7 @@ _sioms_driver() {
         return
     fi
     case ${COMP_WORDS[2]} in
-    list) options='--help' ;;
+    list) options='--help --json' ;;
     check) options='--help --all --full --only --counterpart --config --report --json --jobs' ;;
     trace) options='--help --output --seconds --socket' ;;
     replay) options='--help --ignore' ;;
@@ -33,7 +33,7 @@ _sioms_driver() {
 _sioms() {
     local word=${COMP_WORDS[COMP_CWORD]}
     if ((COMP_CWORD == 1)); then
-        mapfile -t COMPREPLY < <(compgen -W 'demo list info status monitor stop reset reload check driver bench tactile reconcile --help --version' -- "$word")
+        mapfile -t COMPREPLY < <(compgen -W 'demo init list info status monitor stop reset reload check service driver bench tactile reconcile --help --version' -- "$word")
         return
     fi
     case ${COMP_WORDS[1]} in

@@ -55,6 +55,7 @@ complete -c smarkers -l help -d 'print this help'
 complete -c smarkers -l version -d 'print the version'
 complete -c sioms -n __fish_use_subcommand -f
 complete -c sioms -n __fish_use_subcommand -a demo -d 'show the simulated workcell at work'
+complete -c sioms -n __fish_use_subcommand -a init -d 'write a starter configuration, with what is plugged in'
 complete -c sioms -n __fish_use_subcommand -a list -d 'list the nodes of the workcell'
 complete -c sioms -n __fish_use_subcommand -a info -d 'tell what a node is; channels, units, limits'
 complete -c sioms -n __fish_use_subcommand -a status -d 'tell how devices, sessions and the emergency stop stand'
@@ -63,6 +64,7 @@ complete -c sioms -n __fish_use_subcommand -a stop -d 'emergency stop of a node 
 complete -c sioms -n __fish_use_subcommand -a reset -d 'clear a latched stop or fault'
 complete -c sioms -n __fish_use_subcommand -a reload -d 'have the daemon take up its configuration anew'
 complete -c sioms -n __fish_use_subcommand -a check -d 'check a configuration'
+complete -c sioms -n __fish_use_subcommand -a service -d 'install the daemon as a service of this machine'
 complete -c sioms -n __fish_use_subcommand -a driver -d 'list, check, trace and replay drivers'
 complete -c sioms -n __fish_use_subcommand -a bench -d 'measure latencies and throughput on this machine'
 complete -c sioms -n __fish_use_subcommand -a tactile -d 'design, calibrate and measure elastic fingers'
@@ -70,6 +72,7 @@ complete -c sioms -n __fish_use_subcommand -a reconcile -d 'find where simulatio
 complete -c sioms -n '__fish_seen_subcommand_from info monitor reset stop' -f -a '(sioms list --names 2>/dev/null)'
 complete -c sioms -n 'test (count (commandline -opc)) -eq 2; and __fish_seen_subcommand_from driver' -f -a 'list check trace replay'
 complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from list' -l help
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from list' -l json
 complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l help
 complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l all
 complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l full

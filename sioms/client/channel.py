@@ -234,7 +234,7 @@ class Channel:
                     if late and not self._reading:  # the reading may just have been passed to us
                         self._pass_on()
                 if late:
-                    raise self._late(call)
+                    raise self.late(call)
                 continue
             try:
                 found = self._read(number, deadline)
@@ -243,7 +243,7 @@ class Channel:
                     self._reading = False
                     self._pass_on()
             if found is None:
-                raise self._late(call)
+                raise self.late(call)
             return self.result(found)
 
     def _pass_on(self) -> None:
@@ -371,5 +371,6 @@ class Channel:
                 continue
         return None
 
-    def _late(self, call: Call) -> OSError:
+    def late(self, call: Call) -> OSError:
+        """Return the error of a request that nobody has answered in time."""
         return OSError(errno.ETIMEDOUT, f"{call.what}: {self.name} does not answer; is its process hung?")

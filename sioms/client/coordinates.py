@@ -41,6 +41,15 @@ class UserAxis:
             raise ValueError(f"make user coordinates: direction {direction!r}; want 1 or -1")
         self.node, self.axis, self.offset, self.direction = node, axis, offset, direction
 
+    def __repr__(self) -> str:
+        channel = self.node.info.channels[self.axis]
+        view = "" if (self.offset, self.direction) == (0.0, 1) else f", {self.direction:+d} * position {self.offset:+g}"
+        try:
+            place = f"at {self.position:.6g} {channel.unit}"
+        except OSError as error:
+            place = error.strerror or str(error)
+        return f"<UserAxis {self.node.name}[{channel.name!r}]{view}: {place}>"
+
     def to_node(self, user: float) -> float:
         """Return the node's position of a user position."""
         return (user - self.offset) * self.direction

@@ -176,27 +176,38 @@ class AxisNode(Node):
     def move(
         self,
         position: float,
-        axis: int = 0,
+        axis: int | str = 0,
         *,
         timeout: float | None = 0.0,
         replace: bool = False,
         **words: Any,
     ) -> int:
-        """Append a position command; see ``command`` for the further words."""
-        return self.write(command(axis, position=position, **words), timeout, replace=replace)
+        """Append a command to go to a position.
+
+        Args:
+            position: target in the axis' unit, m or rad.
+            axis: index of the axis in the node, or its name, e.g. ``"xaxis"``.
+            timeout: how long to wait for room in the command buffer [s]; 0: not; None: for ever.
+            replace: instead of what the axis does and of all that waits.
+            **words: further words of ``sioms.command``, e.g. ``time`` [s] or ``relative``.
+
+        Returns:
+            The driver's tick when it was taken; ``wait_until_idle`` waits for the end of the motion.
+        """
+        return self.write(command(self.channel(axis), position=position, **words), timeout, replace=replace)
 
     def command(
-        self, axis: int = 0, *, timeout: float | None = 0.0, replace: bool = False, **words: Any
+        self, axis: int | str = 0, *, timeout: float | None = 0.0, replace: bool = False, **words: Any
     ) -> int:
-        """Append one command; see ``sioms.command`` for the words."""
-        return self.write(command(axis, **words), timeout, replace=replace)
+        """Append one command to an axis, given by index or name; see ``sioms.command`` for the words."""
+        return self.write(command(self.channel(axis), **words), timeout, replace=replace)
 
-    def jog(self, velocity: float, axis: int = 0, *, acceleration: float | None = None) -> int:
+    def jog(self, velocity: float, axis: int | str = 0, *, acceleration: float | None = None) -> int:
         """Go over to a velocity at once, instead of what the axis does, until told otherwise; ``stop`` ends it.
 
         Args:
             velocity: signed [unit/s].
-            axis: index of the axis in the node.
+            axis: index of the axis in the node, or its name.
             acceleration: at most so much, for this jog alone [unit/s^2]; None: that of the axis.
 
         Jogs end with this client, however that ends; open with a lease if it may hang.
@@ -204,15 +215,19 @@ class AxisNode(Node):
         words = {} if acceleration is None else {"acceleration": acceleration}
         return self.command(axis, velocity=velocity, replace=True, **words)
 
-    def tweak(self, step: float, axis: int = 0, **words: Any) -> int:
-        """Append a step from where the preceding command ends, so that quick tweaks add up; see ``command``."""
-        return self.write(command(axis, position=step, relative=True, **words))
+    def tweak(self, step: float, axis: int | str = 0, **words: Any) -> int:
+        """Append a step [unit] from where the preceding command ends, so that quick tweaks add up; see ``command``."""
+        return self.write(command(self.channel(axis), position=step, relative=True, **words))
 
-    def user(self, axis: int = 0, *, offset: float = 0.0, direction: int = 1) -> UserAxis:
+    def user(self, axis: int | str = 0, *, offset: float = 0.0, direction: int = 1) -> UserAxis:
         """Return one axis in coordinates of one's own: user = direction * position + offset."""
         from .coordinates import UserAxis
 
-        return UserAxis(self, axis, offset, direction)
+        return UserAxis(self, self.channel(axis), offset, direction)
+
+    def __getitem__(self, axis: int | str) -> UserAxis:
+        """Return one axis by index or name, ``arm["xaxis"]``, in the node's own coordinates."""
+        return self.user(axis)
 
     def particulars(self) -> dict[str, list[float]]:
         """Return what readings do not tell, one value an axis: raw and offset [unit], retries and misses.

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 _WAKES = 4096
 """Bytes taken out of the wake pipe in one go, one a publication."""
+_SHOWN = 8
+"""Channels that the representation of a node names."""
 _JUDGED_S = 0.1
 """What a driver may take to judge a packet of records, in pieces between its ticks [s]."""
 
@@ -73,7 +75,8 @@ class NodeCore:
         self._map: mmap | None = mmap(fds[0], size, prot=PROT_READ)
         os.close(fds[0])
         self._page = PageReader(self._map)
-        self._layout = Layout(info.node_class, self._page.channels, channels, bit)
+        names = [channel.name for channel in info.channels]
+        self._layout = Layout(info.node_class, self._page.channels, channels, bit, names)
         self._snapshot = SNAPSHOT[info.node_class]
         self._latest = self._page.latest
         self._subscribed = 0
@@ -134,8 +137,32 @@ class NodeCore:
         fullest: int = max(self.read().buffered)
         return self.info.buffer_capacity - fullest
 
+    def channel(self, which: int | str) -> int:
+        """Return the index of a channel.
+
+        Args:
+            which: its index, or its name, e.g. ``"xaxis"``.
+
+        Raises:
+            OSError: EINVAL, the node has no such channel; the sentence lists those that it has.
+        """
+        names = [channel.name for channel in self.info.channels]
+        if isinstance(which, str):
+            if which in names:
+                return names.index(which)
+        elif -len(names) <= which < len(names):
+            return which % len(names)
+        raise OSError(
+            errno.EINVAL, f"choose channel {which!r} of {self.name}: it has {', '.join(names)} (0 to {len(names) - 1})"
+        )
+
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.name}{' closed' if self.closed else ''}>"
+        what = f"<{type(self).__name__} {self.name}"
+        if self.closed:
+            return f"{what}, closed>"
+        channels = ", ".join(f"{c.name} [{c.unit}]" if c.unit else c.name for c in self.info.channels[:_SHOWN])
+        more = len(self.info.channels) - _SHOWN
+        return f"{what}: {channels}{f' and {more} more' if more > 0 else ''}>"
 
     # --- requests as values ----------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ from sioms.protocol.records import READ_FIELDS
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from typing import Any
 
     import numpy as np
@@ -29,11 +29,20 @@ class Layout:
         block_channels: number of channels of the whole block.
         channels: which of them the node shows, in order.
         bit: for a node of one bit the bit of its port, else -1.
+        names: of the channels that the node shows.
     """
 
-    __slots__ = ("bit", "block_channels", "channels", "count", "fields", "node_class", "rows")
+    __slots__ = ("bit", "block_channels", "channels", "count", "fields", "names", "node_class", "rows")
 
-    def __init__(self, node_class: NodeClass, block_channels: int, channels: list[int], bit: int) -> None:
+    def __init__(
+        self,
+        node_class: NodeClass,
+        block_channels: int,
+        channels: list[int],
+        bit: int,
+        names: Sequence[str] = (),
+    ) -> None:
+        self.names = names
         self.node_class = node_class
         self.block_channels = block_channels
         self.channels = channels
@@ -59,8 +68,8 @@ class Layout:
 class Snapshot:
     """All channels of a node at one tick.
 
-    ``len`` is the number of channels, ``snapshot[i]`` one channel's reading with named fields, and
-    each field is also an attribute: a tuple over all channels.
+    ``len`` is the number of channels, ``snapshot[i]`` or ``snapshot["xaxis"]`` one channel's reading with named
+    fields, and each field is also an attribute: a tuple over all channels.
     """
 
     __slots__ = ("_layout", "_raw")
@@ -87,8 +96,12 @@ class Snapshot:
     def __len__(self) -> int:
         return self._layout.count
 
-    def __getitem__(self, channel: int) -> Any:
+    def __getitem__(self, channel: int | str) -> Any:
         count = self._layout.count
+        if isinstance(channel, str):
+            if channel not in self._layout.names:
+                raise KeyError(f"no channel {channel}; the node has: {', '.join(self._layout.names)}")
+            channel = self._layout.names.index(channel)
         if not -count <= channel < count:
             raise IndexError(f"channel {channel} of a node of {count}; want {-count} to {count - 1}")
         # Loaded when first used: named tuples are a tenth of the start time of a shell tool.

@@ -20,7 +20,9 @@ from .node import NODE, SYNCH_LEAD_S, AxisNode, Node
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from typing import Any, Self
+    from typing import Any, Self, TypeVar, overload
+
+    N = TypeVar("N", bound=Node)
 
 _ACCESS = {"r": Access.READ, "w": Access.WRITE, "rw": Access.READ | Access.WRITE}
 
@@ -41,7 +43,8 @@ class NodeEntry:
         self.node_class = NodeClass(cls)
 
     def __repr__(self) -> str:
-        return f"<{self.node_class.name.lower()} node {self.name}>"
+        held = f", held by {self.holder}" if self.holder else ""
+        return f"<{self.node_class.name.lower()} node {self.name}: device {self.device} {self.state}{held}>"
 
 
 class Marker:
@@ -114,7 +117,8 @@ class Workcell:
     """
 
     def __init__(self, path: str | None = None, name: str | None = None) -> None:
-        self._channel = Channel(connect(path or socket_path()), "the daemon")
+        self._path = path or socket_path()
+        self._channel = Channel(connect(self._path), "the daemon")
         title = os.path.basename(sys.argv[0]) if name is None and sys.argv and sys.argv[0] else name or ""
         answer = self._channel.call(Call("hello", ClientVerb.HELLO, PROTOCOL_VERSION, title))
         _, self.name, self.rights = answer.value
@@ -130,6 +134,12 @@ class Workcell:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def __repr__(self) -> str:
+        if self._channel.closed:
+            return f"<Workcell {self.name}, closed>"
+        nodes = ", ".join(sorted(node.name for node in self._nodes.values()))
+        return f"<Workcell {self.name} at {self._path}: {nodes or 'no node'} open>"
+
     def close(self) -> None:
         """End the session: its nodes are closed and its markers freed."""
         nodes, self._nodes = self._nodes, {}
@@ -143,7 +153,27 @@ class Workcell:
 
     # --- nodes -----------------------------------------------------------------------------------
 
-    def open(self, name: str, mode: str = "r", timeout: float | None = 0.0, *, lease: float = 0.0) -> Any:
+    if TYPE_CHECKING:
+
+        @overload
+        def open(
+            self, name: str, mode: str = "r", timeout: float | None = 0.0, *, lease: float = 0.0, kind: type[N]
+        ) -> N: ...
+
+        @overload
+        def open(
+            self, name: str, mode: str = "r", timeout: float | None = 0.0, *, lease: float = 0.0
+        ) -> Any: ...
+
+    def open(
+        self,
+        name: str,
+        mode: str = "r",
+        timeout: float | None = 0.0,
+        *,
+        lease: float = 0.0,
+        kind: type[Node] | None = None,
+    ) -> Any:
         """Open a node.
 
         Args:
@@ -155,18 +185,23 @@ class Workcell:
             lease: longest silence of this client [s] before its axes are halted, for programs that may
                 hang; 0: none. Any request of the node renews it, ``keepalive`` does, and a call that
                 waits on the node keeps renewing it.
+            kind: AxisNode, AnalogNode or BinaryNode: what the node must be, for type checkers and against mistakes;
+                None takes any.
 
         Returns:
             An AxisNode, AnalogNode or BinaryNode.
 
         Raises:
             OSError: ENOENT no such node; EBUSY held, by whom; EACCES no right; EIO device lost;
-                ETIMEDOUT not free in time.
+                ETIMEDOUT not free in time; EINVAL not of that kind.
         """
         answer = self._channel.call(open_call(name, mode, timeout, lease))
         core = node_parts(answer.value, answer.fds)
         node = NODE[core[0].node_class](core, self, lease)
         self._nodes[node.handle] = node
+        if kind is not None and not isinstance(node, kind):
+            node.close()
+            raise OSError(errno.EINVAL, f"open {name}: it is an {type(node).__name__}; want an {kind.__name__}")
         return node
 
     def close_handle(self, handle: int) -> None:

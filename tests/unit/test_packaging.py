@@ -88,6 +88,8 @@ def built(tmp_path_factory):
     copy.mkdir()
     for name in ("sioms", *OUTER):
         shutil.copytree(TREE / name, copy / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("etc", "examples", "docs/man"):
+        shutil.copytree(TREE / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "LICENSE"):
         shutil.copy(TREE / name, copy)
     (copy / "README.md").write_text("# SIOMS\n")
@@ -119,6 +121,44 @@ def test_wheel_holds_every_module_and_tool(built):
     assert all(mode & 0o111 == 0o111 for mode in modes.values())
     tops = {name.split("/")[0].partition("-")[0] for name in names}
     assert tops == {"sioms"}  # no global name such as daemon is taken
+
+
+def files_beside_modules():
+    """Return what the wheel must hold besides modules, by its path under the environment's ``share``."""
+    found = {f"man/man{page.suffix[1:]}/{page.name}" for page in (TREE / "docs" / "man").iterdir()}
+    for top in ("etc", "examples", "docs/man"):
+        for path in (TREE / top).rglob("*"):
+            if path.is_file() and "__pycache__" not in path.parts:
+                found.add(f"sioms/{path.relative_to(TREE)}")
+    return found
+
+
+def test_wheel_and_sdist_hold_manual_pages_service_files_and_examples(built):
+    for path in built:
+        with zipfile.ZipFile(path) as wheel:
+            shared = {
+                name.partition(".data/data/share/")[2]
+                for name in wheel.namelist()
+                if ".data/data/share/" in name
+            }
+        assert files_beside_modules() == shared
+
+
+def test_an_installed_wheel_finds_the_files_of_its_service(built, tmp_path):
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path / "venv"], check=True)
+    (libraries,) = (tmp_path / "venv" / "lib").glob("python3.*/site-packages")
+    with zipfile.ZipFile(built[0]) as wheel:
+        wheel.extractall(libraries)
+    shutil.move(libraries / "sioms-0.1.0.data" / "data" / "share", tmp_path / "venv" / "share")
+    (libraries / "others.pth").write_text("\n".join(p for p in sys.path if p.endswith("site-packages")))
+    root = tmp_path / "root"
+    code = f"from sioms.tools.front import main; raise SystemExit(main(['service', 'install', '--root', {str(root)!r}]))"
+    done = subprocess.run(
+        [tmp_path / "venv" / "bin" / "python3", "-P", "-c", code], cwd="/", capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    unit = (root / "etc/systemd/system/sioms.service").read_text()
+    assert f"ExecStart={tmp_path}/venv/bin/siomsd --config /etc/sioms/workcell.toml\n" in unit
 
 
 def test_sdist_gives_the_same_wheel(built):

@@ -1,0 +1,86 @@
+"""Axes and channels by name, nodes of a stated class, representations that tell, and time-outs of the asyncio face."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import signal
+
+import pytest
+from daemon_rig import Daemon, raises
+
+import sioms
+import sioms.aio
+
+
+def test_axes_are_chosen_by_name(cell: sioms.Workcell) -> None:
+    with cell.open("mod0", "rw", kind=sioms.AxisNode) as arm:
+        second = arm.info.channels[1].name
+        arm.move(0.03, axis=second, time=0.2)
+        arm.wait_until_idle(timeout=5.0)
+        assert arm.read()[second].position == pytest.approx(0.03, abs=1e-3)
+        assert arm[second].position == arm[1].position
+        assert arm.read()[0].position == pytest.approx(0.0, abs=1e-3)
+        arm[second].move(0.0)
+        arm.wait_until_idle(timeout=5.0)
+        assert f"mod0['{second}']" in repr(arm[second]) and " m>" in repr(arm[second])
+
+
+def test_an_unknown_axis_is_refused_with_those_that_there_are(cell: sioms.Workcell) -> None:
+    with cell.open("mod0", "rw") as arm:
+        names = [channel.name for channel in arm.info.channels]
+        with raises(errno.EINVAL, "'nosuch'", *names):
+            arm.move(0.1, axis="nosuch")
+        with raises(errno.EINVAL, "9", *names):
+            arm[9]
+        with pytest.raises(KeyError, match=names[0]):
+            arm.read()["nosuch"]
+        assert not arm.read().in_motion[0]
+
+
+def test_a_node_of_another_class_is_refused_and_free_again(cell: sioms.Workcell) -> None:
+    with raises(errno.EINVAL, "mod0", "AxisNode", "BinaryNode"):
+        cell.open("mod0", "rw", kind=sioms.BinaryNode)
+    cell.open("mod0", "rw", timeout=1.0).close()
+
+
+def test_representations_tell_what_it_is(cell: sioms.Workcell, daemon: Daemon) -> None:
+    arm = cell.open("mod0", "rw")
+    assert cell.name in repr(cell) and "mod0 open" in repr(cell)
+    assert "AxisNode mod0: " in repr(arm) and "[m]" in repr(arm)
+    (entry,) = [e for e in cell.nodes() if e.name == "mod0"]
+    assert "device mod0 up, held by" in repr(entry)
+    arm.close()
+    assert "closed" in repr(arm)
+
+
+def test_asyncio_takes_names_too(daemon: Daemon) -> None:
+    async def session() -> None:
+        async with await sioms.aio.connect(daemon.socket) as cell:
+            assert cell.name in repr(cell)
+            async with await cell.open("mod0", "rw", timeout=2.0) as arm:
+                second = arm.info.channels[1].name
+                await arm.move(0.02, axis=second, time=0.2)
+                await arm.wait_until_idle(timeout=5.0)
+                assert arm.read()[second].position == pytest.approx(0.02, abs=1e-3)
+                with raises(errno.EINVAL, "nosuch"):
+                    await arm.move(0.0, axis="nosuch")
+                await arm.move(0.0, axis=second)
+                await arm.wait_until_idle(timeout=5.0)
+
+    asyncio.run(session())
+
+
+def test_asyncio_does_not_wait_for_a_daemon_that_hangs(start_daemon: object, daemon: Daemon) -> None:
+    async def session() -> None:
+        async with await sioms.aio.connect(daemon.socket) as cell:
+            os.kill(daemon.pid, signal.SIGSTOP)
+            try:
+                with raises(errno.ETIMEDOUT, "get status", "hung"):
+                    await asyncio.wait_for(cell.status(), 8.0)
+            finally:
+                os.kill(daemon.pid, signal.SIGCONT)
+            assert (await cell.status())["pid"] == daemon.pid
+
+    asyncio.run(session())
