@@ -72,7 +72,7 @@ def test_asyncio_takes_names_too(daemon: Daemon) -> None:
     asyncio.run(session())
 
 
-def test_asyncio_does_not_wait_for_a_daemon_that_hangs(start_daemon: object, daemon: Daemon) -> None:
+def test_asyncio_does_not_wait_for_a_daemon_that_hangs(daemon: Daemon) -> None:
     async def session() -> None:
         async with await sioms.aio.connect(daemon.socket) as cell:
             os.kill(daemon.pid, signal.SIGSTOP)
