@@ -66,7 +66,7 @@ FORCE_MODES = (
 
 AxisTable: Any = table_type(
     AxisSettings,
-    without=("kind", "modes"),
+    without=("kind", "modes", "watch"),
     extra={
         "description": (str, ""),
         "bandwidth_hz": (float, 30.0),

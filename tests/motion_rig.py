@@ -152,9 +152,13 @@ POLL_NS = 10_000_000
 
 
 class Drive:
-    """A drive of its own loop: moves with constant velocity to its target; takes one poll to begin."""
+    """A drive of its own loop: moves with constant velocity to its target; takes one poll to begin.
+
+    ``shove`` is a velocity that a defective board adds to what it was told.
+    """
 
     def __init__(self):
+        self.shove = self._shoved = 0.0
         self.position, self.velocity, self.target, self.wish = 0.0, 0.0, None, None
         self.fault, self.log = "", []
 
@@ -167,32 +171,43 @@ class Drive:
             else:
                 self.target, self.wish = None, c.velocity
         elif action.is_stop:
-            self.target, self.wish, self.velocity = None, 0.0, 0.0
+            self.target, self.wish, self.velocity, self._shoved = None, 0.0, 0.0, 0.0
         elif action.kind is ActionKind.RESET:
             self.fault = ""
 
     def step(self, dt):
+        self._go(dt)
+        self.position += self.shove * dt
+        self.velocity += self.shove - self._shoved
+        self._shoved = self.shove
+
+    def _go(self, dt):
         if self.wish is None:
             return
         if self.target is None:
             self.velocity = self.wish
             self.position += self.velocity * dt
+            self._shoved = 0.0
             return
         left = self.target - self.position
         go = np.clip(left, -abs(self.wish) * dt, abs(self.wish) * dt)
         self.position += go
         self.velocity = go / dt if abs(left) > 0 else 0.0
+        self._shoved = 0.0
 
 
 class Cell:
     """Drives of their own loops behind a DriveBank, polled by an invented clock."""
 
-    def __init__(self, n=2, **settings):
+    def __init__(self, n=2, start=0.0, **settings):
         self.markers = Markers()
         self.bank = DriveBank(
             [axis(modes=DRIVE_MODES, k=None, **settings) for _ in range(n)], markers=self.markers
         )
         self.drives = [Drive() for _ in range(n)]
+        for drive in self.drives:
+            drive.position = start
+        self.holds = np.ones(n, dtype=bool)
         self.now_ns, self.axes, self.events, self.starts = 10**9, list(range(n)), [], []
         self.poll()
 
@@ -205,7 +220,7 @@ class Cell:
             moving = np.abs(velocity) > 0
             self.bank.poll(
                 self.now_ns, np.array([d.position for d in self.drives]), velocity, moving, ~moving,
-                [d.fault for d in self.drives],
+                [d.fault for d in self.drives], holds=self.holds,
             )  # fmt: skip
             self.send()
             self.events += self.bank.take_events()

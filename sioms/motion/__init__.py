@@ -19,6 +19,7 @@ from .settings import (
     Backlash,
     Homing,
     Restore,
+    Watch,
 )
 from .types import CommandError, Event, EventKind, Keeper, MarkerPort
 
@@ -44,4 +45,5 @@ __all__ = [
     "Keeper",
     "MarkerPort",
     "Restore",
+    "Watch",
 ]

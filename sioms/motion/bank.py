@@ -23,7 +23,7 @@ from .homing import HomingRuns
 from .inbox import Inbox
 from .law import ControlLaw
 from .plain import MOST
-from .queue import AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
+from .queue import LOST, AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
 from .sequencer import FORCE, HOLD, STOP, Sequencer
 from .settings import SWITCH_MINUS, SWITCH_PLUS, AxisSettings
 from .types import CommandError, Event, EventKind, Keeper, MarkerPort
@@ -238,6 +238,11 @@ class AxisBank:
         self._abandon(chosen, stamp, errno.EIO, text)
         self._set_limp(chosen[~self.stepper[chosen]])
 
+    def lose_place(self, axes: AxesLike, text: str, now_ns: int | None = None) -> None:
+        """Put axes in fault whose device does not know where they are; see DriveBank.lose_place()."""
+        self._queue.lose_places(np.asarray(axes, dtype=np.int64), text)
+        self.fault(axes, text, now_ns)
+
     def fault_text(self, axis: int) -> str:
         """Return why an axis is in fault, empty when it is not."""
         return self._queue.fault_text(axis)
@@ -294,6 +299,7 @@ class AxisBank:
         chosen, wanted = np.asarray(axes, dtype=np.int64), np.asarray(positions, dtype=np.float64)
         self._inbox.work_in()
         self._queue.check_calibration(chosen, wanted, self._sequencer.is_idle(chosen))
+        self._queue.find_places(chosen)
         for axis, position in zip(chosen.tolist(), wanted.tolist(), strict=True):
             self.shift(axis, position - float(self._position[axis]))
 
@@ -528,7 +534,7 @@ class AxisBank:
     def _keep(self, keeper: Keeper, now_ns: int) -> None:
         """Note where the axes are; before the actuators hear of a motion."""
         latched = self._queue.latched
-        at_rest = (self._sequencer.kind == HOLD) & ~self._limp & ((latched & HOMING) == 0)
+        at_rest = (self._sequencer.kind == HOLD) & ~self._limp & ((latched & (HOMING | LOST)) == 0)
         keeper.note(at_rest, (latched & HOMED) != 0, self._raw, self._position, now_ns)
 
     # -- answers ------------------------------------------------------------------------------

@@ -24,12 +24,19 @@ from .actions import ActionKind, DriveAction
 from .arrival import Approach, Arrivals
 from .commands import Command, is_point_move
 from .profile import InfeasibleError
-from .queue import AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
+from .queue import LOST, AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
 from .settings import AxisSettings
 from .types import CommandError, Event, EventKind, Keeper, MarkerPort
+from .watch import MotionWatch, Order
 
 NEVER_NS = 2**62
 Axes = NDArray[np.int64]
+LATCHED = int(AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP)
+FIRST_REPEAT_NS = 50_000_000
+LONGEST_REPEAT_NS = 1_000_000_000
+"""How often a stop is sent again that failed, or that the drive does not obey."""
+DISOBEYED = 4
+"""So many stops that a drive has confirmed and does not obey are a fault."""
 
 
 class DriveBank:
@@ -68,6 +75,7 @@ class DriveBank:
         self._queue = CommandQueue(settings, markers, capacity, passing=False)
         self._limits = self._queue.limits
         self._velocity_limit, self._acceleration_limit = self._queue.in_force
+        self._watch = MotionWatch(settings, self._limits.velocity, self._acceleration_limit)
         self._running: list[Command | None] = [None] * n
         self._active = np.zeros(n, dtype=bool)
         self._stopping = np.zeros(n, dtype=bool)
@@ -90,6 +98,11 @@ class DriveBank:
         self._homing = np.zeros(n, dtype=bool)
         self._resetting = np.zeros(n, dtype=bool)
         self._stops: dict[int, ActionKind] = {}
+        self._again_ns = np.full(n, NEVER_NS, dtype=np.int64)
+        """When a stop goes out again unless the drive stands."""
+        self._repeats = np.zeros(n, dtype=np.int64)
+        self._refused_stop = np.zeros(n, dtype=bool)
+        self._rests_ns = np.full(n, NEVER_NS, dtype=np.int64)
         self._actions: list[DriveAction] = []
         self._seen = False
         self._last_ns = 0
@@ -186,6 +199,20 @@ class DriveBank:
         self._taken[chosen] = False  # a faulty drive may let go of its axis
         self._queue.latch_fault(chosen, text, stamp)
 
+    def lose_place(self, axes: AxesLike, text: str, now_ns: int | None = None) -> None:
+        """Put axes in fault whose device does not know where they are: it restarted, or says so itself.
+
+        Positions are refused (EPERM) until they are homed or calibrated; reset() clears the fault alone.
+        """
+        chosen = np.asarray(axes, dtype=np.int64)
+        fresh = chosen[(self._queue.latched[chosen] & LOST) == 0]
+        if not fresh.size:
+            return
+        self._queue.lose_places(fresh, text)
+        self.fault(fresh, text, now_ns)
+        for axis in fresh.tolist():
+            self._watch.forget(axis)
+
     def fault_text(self, axis: int) -> str:
         """Return why an axis is in fault, empty when it is not."""
         return self._queue.fault_text(axis)
@@ -194,6 +221,7 @@ class DriveBank:
         """Give the present place of each axis a new coordinate, without motion; see AxisBank.calibrate()."""
         chosen, wanted = np.asarray(axes, dtype=np.int64), np.asarray(positions, dtype=np.float64)
         self._queue.check_calibration(chosen, wanted, self._idle(chosen))
+        self._queue.find_places(chosen)
         self._offset[chosen] += wanted - self._position[chosen]
         self._position[chosen] = wanted
         self._target[chosen] = wanted
@@ -224,6 +252,7 @@ class DriveBank:
         for axis in chosen.tolist():
             self._actions.append(self._action(ActionKind.HOME, axis))
             self._engage(axis, now_ns)
+            self._watch.order(axis, Order.FREE)
         self._homing[chosen] = True
         self._taken[chosen] = False
 
@@ -257,8 +286,9 @@ class DriveBank:
         done: NDArray[np.bool_],
         fault: Sequence[str] | None = None,
         force: NDArray[np.float64] | None = None,
+        holds: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Take the drives' reports, end what has ended and begin what follows.
+        """Take the drives' reports, look whether they move as they were told, end what has ended and begin what follows.
 
         Args:
             now_ns: instant of the report [ns].
@@ -269,6 +299,7 @@ class DriveBank:
                 confirmed, and then seen moving or settle_s old.
             fault: fault text of each axis, empty when it has none; None when none has.
             force: measured forces or torques (n,), None when the drive tells none.
+            holds: drive is switched on and holds its axis where nothing is commanded (n,); None: all do.
         """
         self._last_ns = now_ns
         if self.keeper is not None and not self._seen:
@@ -277,6 +308,8 @@ class DriveBank:
         self._seen = True
         self._moving = moving.copy()
         self._take(now_ns, position, velocity, fault, force)
+        self._look(now_ns, position, velocity, holds)
+        self._repeat_stops(now_ns, moving)
         self._end_reached(now_ns, moving, done)
         self.advance(now_ns)
         self._keep()
@@ -286,7 +319,8 @@ class DriveBank:
         if self.keeper is not None and self._seen:
             homed = (self._queue.latched & int(AxisStatus.HOMED)) != 0
             raw = self._position - self._offset
-            self.keeper.note(~self._active & ~self._moving, homed, raw, self._position, self._last_ns)
+            lost = (self._queue.latched & LOST) != 0
+            self.keeper.note(~self._active & ~self._moving & ~lost, homed, raw, self._position, self._last_ns)
 
     def advance(self, now_ns: int) -> None:
         """Do what time and markers allow without a new report: end timed commands, begin what waits."""
@@ -321,14 +355,74 @@ class DriveBank:
             return
         self._acknowledged[action.axis] = True
         self._started_ns[action.axis] = now_ns
+        if action.is_stop:
+            self._refused_stop[action.axis] = False
+            braking_ns = 2e9 * abs(self._velocity[action.axis]) / self._acceleration_limit[action.axis]
+            self._send_again(action.axis, now_ns + int(min(braking_ns, 1e11)) + LONGEST_REPEAT_NS // 4)
 
     def action_failed(self, action: DriveAction, text: str, now_ns: int) -> None:
-        """Note that an action could not be sent or was refused: the axis is stopped and in fault."""
-        self._resetting[action.axis] = False
-        self.fault([action.axis], f"{action.kind.value} failed: {text}", now_ns)
-        if action.kind is ActionKind.QUICK_STOP:
-            self._stops.pop(action.axis, None)
-            self._acknowledged[action.axis] = True
+        """Note that an action could not be sent or was refused: the axis is stopped and in fault.
+
+        A stop that failed goes out again and again until the drive has confirmed one, or stands.
+        """
+        axis = action.axis
+        self._resetting[axis] = False
+        self.fault([axis], f"{action.kind.value} failed: {text}", now_ns)
+        if action.is_stop:
+            self._stops.pop(axis, None)
+            self._refused_stop[axis] = True
+            self._send_again(axis, now_ns)
+
+    def _send_again(self, axis: int, from_ns: int) -> None:
+        """Send the stop of an axis again some time after an instant, more and more seldom."""
+        pause_ns = FIRST_REPEAT_NS << min(int(self._repeats[axis]), 5)
+        self._again_ns[axis] = from_ns + min(pause_ns, LONGEST_REPEAT_NS)
+        self._repeats[axis] += 1
+
+    def _repeat_stops(self, now_ns: int, moving: NDArray[np.bool_]) -> None:
+        """Send stops again that failed or are not obeyed; an axis that rests needs none."""
+        rests = self._refused_stop & ~moving
+        self._rests_ns = np.where(rests, np.minimum(self._rests_ns, now_ns), NEVER_NS)
+        self._acknowledged |= rests & (now_ns - self._rests_ns >= LONGEST_REPEAT_NS)
+        for axis in np.flatnonzero(self._stopping & (self._again_ns <= now_ns)).tolist():
+            if axis in self._stops:
+                continue
+            if not moving[axis] and not self._refused_stop[axis]:
+                self._again_ns[axis] = NEVER_NS
+                continue
+            if self._repeats[axis] > DISOBEYED and not self._refused_stop[axis]:
+                unit = self.settings[axis].unit
+                text = f"axis {self.settings[axis].name} does not stop: told so {self._repeats[axis]} times, it moves at {self._velocity[axis]:.3g} {unit}/s"
+                self._fault_fresh(np.array([axis]), text, now_ns)
+            latched = bool(self._queue.latched[axis] & LATCHED)
+            self._again_ns[axis] = NEVER_NS
+            self._stops[axis] = ActionKind.QUICK_STOP if latched else ActionKind.STOP
+            self._acknowledged[axis] = False
+
+    def _look(
+        self,
+        now_ns: int,
+        raw: NDArray[np.float64],
+        velocity: NDArray[np.float64],
+        holds: NDArray[np.bool_] | None,
+    ) -> None:
+        """Put axes in fault that move as nobody has told them."""
+        for axis in range(self.n):
+            found = self._watch.look(
+                axis,
+                now_ns,
+                float(raw[axis]),
+                float(velocity[axis]),
+                confirmed=bool(self._acknowledged[axis]),
+                holds=holds is None or bool(holds[axis]),
+                latched=bool(self._queue.latched[axis] & LATCHED),
+            )
+            if found is None:
+                continue
+            if found.lost:
+                self.lose_place([axis], found.text, now_ns)
+            else:
+                self._fault_fresh(np.array([axis]), found.text, now_ns)
 
     def _action(self, kind: ActionKind, axis: int, command: Command | None = None) -> DriveAction:
         return DriveAction(
@@ -437,6 +531,7 @@ class DriveBank:
         velocity, acceleration = min(action.velocity_max, most[0]), min(action.acceleration_max, most[1])
         self._actions.append(replace(action, velocity_max=velocity, acceleration_max=acceleration))
         self._engage(axis, now_ns)
+        self._watch.order(axis, Order.POINT, command.position)
 
     def _homed(self, axis: int, now_ns: int) -> None:
         self._homing[axis] = False
@@ -458,7 +553,9 @@ class DriveBank:
             if command.control_mode & modes.SIGNAL_MARKER:
                 self._queue.signal(command.signal_marker_number, command.signal_generation, now_ns)
         was_stop = bool(self._stopping[axis])
-        self._active[axis] = self._stopping[axis] = False
+        self._active[axis] = self._stopping[axis] = self._refused_stop[axis] = False
+        self._again_ns[axis], self._repeats[axis] = NEVER_NS, 0
+        self._watch.order(axis, Order.HOLD)
         self._queue.load_heads(one)
         if not self._queue.has_head[axis]:
             if was_stop or command is None or _ends_by_itself(command):
@@ -519,6 +616,7 @@ class DriveBank:
         if approach is None:
             self._taken[axis] = False
             self._engage(axis, now_ns)
+            self._watch.order(axis, *_order_of(command))
             self._actions.append(self._action(ActionKind.START, axis, command))
         elif not self._active[axis] and approach.is_idle_for(self._target[axis], self._position[axis]):
             self._end(axis, now_ns)
@@ -535,6 +633,7 @@ class DriveBank:
             if fastest or self._stops.get(axis) is not ActionKind.QUICK_STOP:
                 self._stops[axis] = ActionKind.QUICK_STOP if fastest else ActionKind.STOP
             self._engage(axis, self._last_ns)
+            self._watch.order(axis, Order.STOP)
         self._stopping[axes] = True
 
     def _publish(self) -> None:
@@ -560,6 +659,14 @@ class DriveBank:
         """Tell which axes stand with nothing to do."""
         idle: NDArray[np.bool_] = ~self._active[axes] & ~self._queue.has_head[axes]
         return idle
+
+
+def _order_of(command: Command) -> tuple[Order, float]:
+    """Return what a command is to the watch, and its goal."""
+    mode = command.control_mode
+    if mode & modes.POSITION:
+        return Order.POINT, command.position
+    return (Order.RUN, command.velocity) if mode & modes.VELOCITY else (Order.FORCE, 0.0)
 
 
 def _ends_by_itself(command: Command) -> bool:

@@ -152,5 +152,6 @@ class HomingRuns:
         self._queue.latched[axis] &= ~int(AxisStatus.HOMING)
         self._queue.latched[axis] |= int(AxisStatus.HOMED)
         one = np.array([axis])
+        self._queue.find_places(one)
         self._queue.emit(EventKind.HOMED, one, now_ns)
         self._queue.emit(EventKind.IDLE, one, now_ns)

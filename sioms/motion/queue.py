@@ -27,6 +27,7 @@ from .types import CommandError, Event, EventKind, MarkerPort, RecordError
 AxesLike = Sequence[int] | NDArray[np.int64]
 LimitValue = float | None | Sequence[float | None]
 BARRED, HOMED = int(AxisStatus.EMERGENCY_STOP | AxisStatus.FAULT | AxisStatus.HOMING), int(AxisStatus.HOMED)
+LOST = int(AxisStatus.POSITION_LOST)
 LIMIT_NAMES = ("position_min", "position_max", "velocity_max", "acceleration_max", "jerk_max", "force_max")
 
 PIECE = 512
@@ -72,7 +73,7 @@ class CommandQueue:
     """The waiting commands of n axes. The *head* of an axis is the command that runs next.
 
     Arrays (n,): ``gated_synch`` and ``gated_marker`` say what the head waits for, ``latched`` holds
-    the persistent AxisStatus bits (HOMED, FAULT, EMERGENCY_STOP, FOLLOWING_ERROR, STALLED, HOMING).
+    the persistent AxisStatus bits (HOMED, FAULT, EMERGENCY_STOP, FOLLOWING_ERROR, STALLED, HOMING, POSITION_LOST).
     """
 
     def __init__(
@@ -101,6 +102,7 @@ class CommandQueue:
         self._plain = PlainCheck(self._validator.offered, self.limits)
         self._waiting: dict[tuple[int, int], set[int]] = {}
         self._fault_text: dict[int, str] = {}
+        self._lost_text: dict[int, str] = {}
         self._events: list[tuple[EventKind, Any, int, int, str]] = []
 
     # -- writing ------------------------------------------------------------------------------
@@ -123,6 +125,7 @@ class CommandQueue:
         touched = np.flatnonzero(counts)
         counts = counts[touched]
         self._check_state(touched, counts, replace)
+        self._check_places(records, placed)
         begin, limits_set = self._known(touched, at_rest, replace), self._limits_set
         tail = Tail(np.full((self.n, 3), np.nan), np.zeros(self.n), np.zeros(self.n))
         tail.set_rows(touched, begin)
@@ -202,7 +205,7 @@ class CommandQueue:
     def is_barred(self, axis: int) -> bool:
         """Tell whether an axis takes no commands now; see _check_latches()."""
         latched: int = self.latched.item(axis)
-        return latched & BARRED != 0 or (self.home_required.item(axis) and not latched & HOMED)
+        return latched & (BARRED | LOST) != 0 or (self.home_required.item(axis) and not latched & HOMED)
 
     def append_plain(self, commands: Sequence[Command], axes: NDArray[np.int64]) -> None:
         """Take plain commands of these axes, each of which has a head then."""
@@ -237,6 +240,17 @@ class CommandQueue:
         if bits & AxisStatus.HOMING:
             raise CommandError(errno.EBUSY, what + "homing; wait until it is idle")
         raise CommandError(errno.EPERM, what + "home required; HOME first")
+
+    def _check_places(self, records: NDArray[Any], placed: NDArray[np.int64]) -> None:
+        """Raise when a position is commanded to an axis that does not know where it is."""
+        blind = (self.latched[placed] & LOST != 0) & (records["control_mode"] & modes.POSITION != 0)
+        if blind.any():
+            axis = int(placed[blind.argmax()])
+            raise CommandError(
+                errno.EPERM,
+                f"write axis {axis} ({self.settings[axis].name}): {self._lost_text.get(axis, 'position lost')}; "
+                "HOME it, or CALIBRATE_DEVICE with where it is",
+            )
 
     def append(self, judged: Judged) -> NDArray[np.int64]:
         """Take what still holds; return the axes touched, each of which now has a head."""
@@ -450,8 +464,22 @@ class CommandQueue:
         """Return why an axis is in fault, empty when it is not."""
         return self._fault_text.get(axis, "")
 
+    def lose_places(self, axes: NDArray[np.int64], text: str) -> None:
+        """Latch that these axes do not know where they are, with the reason; only find_places() clears it."""
+        self.latched[axes] = self.latched[axes] & ~HOMED | LOST
+        reason = dict.fromkeys(axes.tolist(), text)
+        self._lost_text.update(reason)
+        self._fault_text.update(reason)  # outweighs an earlier one, such as the lost link that led to it
+        self._limits_set += 1  # what was judged before is judged again
+
+    def find_places(self, axes: NDArray[np.int64]) -> None:
+        """These axes know where they are: they were homed, or given a coordinate."""
+        self.latched[axes] &= ~LOST
+
     def set_homed(self, axes: NDArray[np.int64], homed: bool, now_ns: int) -> None:
         """Set or clear the HOMED bit of these axes; tell those that gained it."""
+        if homed:
+            self.find_places(axes)
         bit = int(AxisStatus.HOMED)
         changed = axes[((self.latched[axes] & bit) != 0) != homed]
         self.latched[changed] ^= bit

@@ -152,6 +152,32 @@ class Restore:
 
 
 @dataclass(frozen=True, slots=True)
+class Watch:
+    """What motion of an axis is a fault (see watch.py).
+
+    Args:
+        uncommanded: motion that nobody commanded is one; false for an axis that is guided by hand or moved by others.
+        tolerance: how far an axis that is to hold may be pushed [unit], None: what velocity_max covers in 10 ms.
+        speed_margin: part of velocity_max by which it may be exceeded.
+    """
+
+    uncommanded: bool = True
+    tolerance: float | None = None
+    speed_margin: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Refuse what means nothing.
+
+        Raises:
+            ValueError: naming the field, its value and what would be right.
+        """
+        if self.tolerance is not None and not self.tolerance > 0:
+            raise ValueError(f"watch: tolerance {self.tolerance:g}; want a positive number")
+        if not 0.05 <= self.speed_margin <= 10:
+            raise ValueError(f"watch: speed_margin {self.speed_margin:g}; want 0.05 to 10")
+
+
+@dataclass(frozen=True, slots=True)
 class AxisSettings:
     """One axis as configured. Lengths in ``unit`` (m or rad), forces in N or N*m.
 
@@ -178,6 +204,7 @@ class AxisSettings:
         deadband: a point move of an axis at rest that is shorter than this is not carried out [unit].
         start_velocity: speed that is taken up and given up at once [unit/s]; steppers only.
         restore: when the position is taken over from the process before, None: never.
+        watch: what motion of a drive that closes its own loop is a fault.
         modes: control-mode flags that a drive offers (drives that close their own loop).
     """
 
@@ -204,6 +231,7 @@ class AxisSettings:
     deadband: float = 0.0
     start_velocity: float = 0.0
     restore: Restore | None = None
+    watch: Watch = Watch()
     modes: ControlMode = EVERY_MODE
 
     def __post_init__(self) -> None:

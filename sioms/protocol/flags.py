@@ -69,11 +69,13 @@ class AxisStatus(IntFlag):
     STALLED = 0x8000
     MISSED_TARGET = 0x10000
     """The last point move ended farther from its target than the tolerance, after all its retries."""
+    POSITION_LOST = 0x20000
+    """The device may have lost its place: no positions are taken until HOME or CALIBRATE_DEVICE; RESET keeps it."""
 
     @property
     def severity(self) -> int:
-        """How bad it is: 0 good, 1 minor (a limit, a miss, saturation), 2 major (fault, stall, emergency stop)."""
-        return 2 if int(self) & 0x80E0 else 1 if int(self) & 0x1640C else 0
+        """How bad it is: 0 good, 1 minor (a limit, a miss, saturation), 2 major (fault, stall, emergency stop, lost place)."""
+        return 2 if int(self) & 0x280E0 else 1 if int(self) & 0x1640C else 0
 
 
 class AnalogStatus(IntFlag):

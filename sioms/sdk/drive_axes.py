@@ -211,14 +211,37 @@ class AxesUnit(LineUnit):
         done: NDArray[np.bool_],
         fault: Sequence[str],
         force: NDArray[np.float64] | None = None,
+        holds: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Tell the bank what was read, and keep velocities inside the soft limits."""
+        """Tell the bank what was read, and keep velocities inside the soft limits.
+
+        Motion that was not commanded is a fault (sioms.motion.watch).
+
+        Args:
+            position: raw positions (n,) [unit].
+            velocity: measured velocities (n,) [unit/s].
+            moving: it moves, or will by an order that it has taken (n,).
+            done: it has reached its target (n,).
+            fault: why the drive is in fault, '' when it is not, for each axis.
+            force: measured forces or torques (n,), None when the drive tells none.
+            holds: it is switched on and holds its axis when nothing is commanded (n,); False of one that has let go, so
+                that it may be turned by hand. None: all hold.
+        """
         now_ns = self.clock()
         self.block.stamp_ns = now_ns
         self._raw = position.copy()
-        self.bank.poll(now_ns, position, velocity, moving, done, fault, force)
+        self.bank.poll(now_ns, position, velocity, moving, done, fault, force, holds)
         self._guard(now_ns)
         self._look_for_short_moves(now_ns, moving, done)
+
+    def lose_place(self, axis: int, text: str) -> None:
+        """Say that the drive does not know where this axis is, for a reason that only the family can see.
+
+        A counter of uptime or boots that went back, a bit "reference lost", an encoder error. The axis is in fault, and takes
+        no positions until it is homed or calibrated: RESET alone does not do. May be called from ``open`` and ``poll``, again
+        and again while it lasts.
+        """
+        self.bank.lose_place([axis], f"{self.name}: {text}", self.clock())
 
     def act(self, action: DriveAction) -> Steps:
         """Carry out what the bank wants; a stop makes void the starts that still wait for the line."""

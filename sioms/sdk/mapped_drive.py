@@ -69,6 +69,7 @@ class DriveUnit(LineUnit):
         self._seldom_ns = 0
         self._alarm = 0
         self._homes = False
+        self._homed: bool | None = None
         self._epoch = 0
         self._jog = ""
         self._jog_speed = 0.0
@@ -100,7 +101,7 @@ class DriveUnit(LineUnit):
         moving, done = self._motion(values)
         self._position = float(values[self._axis.position])
         if "homed" in self._axis.status and not self._homes:
-            self.bank.set_homed([0], self._bit(values, "homed"))
+            self._note_reference(self._bit(values, "homed"), now_ns)
         self.bank.poll(
             now_ns,
             np.array([self._position]),
@@ -198,6 +199,7 @@ class DriveUnit(LineUnit):
         yield from self._mapped.command(self._jog)
 
     def _home(self) -> Steps:
+        self._homed = None
         if "home" not in self._rmap.commands:
             raise DeviceError(errno.EOPNOTSUPP, "the drive cannot home by itself; use CALIBRATE_DEVICE")
         self._homes = True
@@ -222,6 +224,14 @@ class DriveUnit(LineUnit):
         if now_ns >= self._seldom_ns and self._plans["seldom"]:
             self._seldom_ns = now_ns + SELDOM_NS
             values |= yield from self._mapped.read(self._plans["seldom"])
+
+    def _note_reference(self, homed: bool, now_ns: int) -> None:
+        """Tell the bank when the drive finds its reference, or loses it."""
+        if self._homed and not homed:
+            self.bank.lose_place([0], f"position lost: {self.name} no longer knows its reference", now_ns)
+        if self._homed is not homed:
+            self.bank.set_homed([0], homed)
+        self._homed = homed
 
     def _bit(self, values: Values, name: str) -> bool:
         bit = self._axis.status.get(name)

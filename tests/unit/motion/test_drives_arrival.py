@@ -46,10 +46,8 @@ class Watched(Cell):
 
 
 def test_from_the_wrong_side_it_takes_two_moves_and_ends_once():
-    cell = Watched(backlash=SLOW)
+    cell = Watched(backlash=SLOW, start=1.0)
     token = cell.markers.reserve(3)
-    cell.drives[0].position = 1.0
-    cell.poll()
     cell.write(mode=MODE.POSITION | MODE.SPECIFIED_SIGNAL_MARKER, position=0.5, signal_marker_number=token)
     cell.run()
     assert cell.starts_to == [(0.4, 2.0), (0.5, 0.5)]
@@ -79,9 +77,7 @@ def test_calibrated_coordinates_count():
 @pytest.mark.parametrize("verb", ["stop", "emergency_stop"])
 @pytest.mark.parametrize("polls", [3, 10, 31, 40])
 def test_a_stop_in_either_move_is_final(verb, polls):
-    cell = Watched(backlash=SLOW)
-    cell.drives[0].position = 1.0
-    cell.poll()
+    cell = Watched(backlash=SLOW, start=1.0)
     cell.write(mode=[MODE.POSITION, MODE.POSITION], position=[0.5, 0.0])
     cell.poll(polls)
     assert not cell.bank.is_idle([0])

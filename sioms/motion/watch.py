@@ -1,0 +1,297 @@
+"""The motion watch: what an axis does, compared with what it was told and with what it can do.
+
+Drives that close their own loop plan by themselves, so a value left in the drive, another master, a lost reference or
+a defective board moves an axis while everything reads well. Looked at is the raw position, which calibration does not
+change. Found are
+
+* *too fast*: the distance covered beyond ``1 + speed_margin`` times velocity_max adds up to JITTER_S at that speed, in
+  two looks running, and the drive reports such a speed. A sum does not mind when looks come unevenly, and neither the
+  noise of a differentiated encoder nor a short overshoot adds up.
+* *uncommanded*: an axis that is to hold is farther than ``tolerance`` from where it came to rest.
+* *away*: a move to a place gets farther from it (a velocity runs the other way) than braking from the speed at its start
+  needs.
+* *lost*: the position is where the axis cannot have come since the last look. Its place is then no longer known.
+
+What is seen once is not believed, for one damaged reading must stop nothing; two looks make a finding: 20 to 40 ms at
+50 to 100 Hz. Why so: docs/decisions/0094-one-motion-watch.md.
+
+Pure; concurrency: that of its bank.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .settings import AxisSettings
+
+JITTER_S = 0.01
+"""Time at velocity_max that a speed may be exceeded by in all, and that an axis may be pushed by where no tolerance is given [s]."""
+LATE_S = 0.05
+"""How much later than the reading its time stamp may be: a reply that was asked for twice [s]."""
+GAP_NS = 200_000_000
+"""Looks farther apart are a lost link: whether the axis was held meanwhile is not known."""
+SETTLE_NS = 500_000_000
+"""An axis settles after a command, and a drive may set its counter to zero some time after its homing."""
+SETTLING = 0.25
+"""Part of the way by which the place to be held follows an axis that settles, at each look."""
+OVERSHOOT = 0.05
+"""Part of a move by which a drive may pass its target and come back."""
+STILL = 0.25
+"""A step that is followed by one smaller than this part of it was a jump of the reading, not a motion."""
+
+
+class Order(Enum):
+    """What the drive was told."""
+
+    HOLD = auto()
+    STOP = auto()
+    POINT = auto()
+    """Go to ``goal``."""
+    RUN = auto()
+    """Run at the velocity ``goal``."""
+    FORCE = auto()
+    FREE = auto()
+    """Homing by itself: it goes where it likes and sets its counter."""
+
+
+class Finding(NamedTuple):
+    """What an axis does that it must not.
+
+    Args:
+        axis: bank axis.
+        text: what, with numbers and units.
+        lost: its place is no longer known.
+    """
+
+    axis: int
+    text: str
+    lost: bool
+
+
+@dataclass(slots=True)
+class _State:
+    order: Order = Order.HOLD
+    goal: float = 0.0
+    has_begun: bool = False
+    best: float = 0.0
+    """POINT: least distance so far; RUN: farthest place in its direction."""
+    allowed: float = 0.0
+    """How far it may go back from there."""
+    reference: float = 0.0
+    """HOLD: where it came to rest, since ``since_ns``."""
+    since_ns: int = 0
+    place: float = 0.0
+    velocity: float = 0.0
+    held: bool = True
+    """The drive held its axis at the last look."""
+    stamp_ns: int = 0
+    """The last look that was believed."""
+    doubted: float = 0.0
+    doubted_ns: int = 0
+    doubts: int = 0
+    excess: float = 0.0
+    fast: int = 0
+    aways: int = 0
+    free_until_ns: int = 0
+
+
+class MotionWatch:
+    """Watches the axes of a bank.
+
+    Args:
+        settings: of the axes.
+        velocity: velocity limits in force (n,), the bank's own array [unit/s].
+        acceleration: likewise [unit/s^2].
+    """
+
+    def __init__(
+        self,
+        settings: Sequence[AxisSettings],
+        velocity: NDArray[np.float64],
+        acceleration: NDArray[np.float64],
+    ) -> None:
+        self._settings = tuple(settings)
+        self._velocity, self._acceleration = velocity, acceleration
+        self._states = [_State() for _ in settings]
+
+    # --- what the axes are told -------------------------------------------------------------------
+
+    def order(self, axis: int, order: Order, goal: float = 0.0) -> None:
+        """Note what an axis is about to be told.
+
+        Args:
+            axis: bank axis.
+            order: what.
+            goal: raw target of POINT [unit], velocity of RUN [unit/s].
+        """
+        state = self._states[axis]
+        if order is Order.HOLD and state.order is not Order.HOLD:
+            state.reference, state.since_ns = state.place, state.stamp_ns
+        state.order, state.goal, state.has_begun, state.aways = order, goal, False, 0
+
+    def forget(self, axis: int) -> None:
+        """Believe the next reading, whatever it says: the place was lost, and that has been told."""
+        self._states[axis].stamp_ns = 0
+
+    # --- what they do -----------------------------------------------------------------------------
+
+    def look(
+        self,
+        axis: int,
+        now_ns: int,
+        place: float,
+        velocity: float,
+        *,
+        confirmed: bool = True,
+        holds: bool = True,
+        latched: bool = False,
+    ) -> Finding | None:
+        """Judge a reading.
+
+        Args:
+            axis: bank axis.
+            now_ns: time of the reading [ns].
+            place: raw position [unit].
+            velocity: as the drive reports it [unit/s].
+            confirmed: the drive has confirmed what it was told last.
+            holds: the drive is switched on and holds its axis when nothing is commanded.
+            latched: a fault or an emergency stop is latched; the drive may have let go, and is told to stop anyway.
+        """
+        state = self._states[axis]
+        if state.order is Order.FREE:
+            state.free_until_ns = now_ns + SETTLE_NS
+        if not state.stamp_ns or now_ns < state.free_until_ns:
+            state.held = holds
+            self._rest_at(state, now_ns, place, velocity)
+            return None
+        gap_ns = now_ns - state.stamp_ns
+        watched = holds and state.held and (not latched or gap_ns > GAP_NS)
+        watched = watched and self._settings[axis].watch.uncommanded
+        low, high = self._reach(axis, state, gap_ns, confirmed, watched)
+        if not low <= place <= high:
+            return self._doubt(axis, state, now_ns, place, velocity, watched)
+        state.doubts = 0
+        fast = self._is_too_fast(axis, state, now_ns, place, velocity)
+        away = self._is_away(axis, state, place, velocity, confirmed)
+        self._believe(state, now_ns, place, velocity)
+        state.held = holds
+        if not watched:
+            state.reference = place
+        elif state.order is Order.HOLD and 0 < now_ns - state.since_ns <= SETTLE_NS:
+            state.reference += SETTLING * (place - state.reference)
+        if fast:
+            return Finding(axis, self._fast_text(axis, velocity), lost=False)
+        return Finding(axis, self._away_text(axis, state, velocity), lost=False) if away else None
+
+    def _believe(self, state: _State, now_ns: int, place: float, velocity: float) -> None:
+        state.place, state.velocity, state.stamp_ns, state.doubts = place, velocity, now_ns, 0
+
+    def _rest_at(self, state: _State, now_ns: int, place: float, velocity: float) -> None:
+        self._believe(state, now_ns, place, velocity)
+        state.reference, state.since_ns = place, now_ns
+
+    def _tolerance(self, axis: int) -> float:
+        given = self._settings[axis].watch.tolerance
+        return JITTER_S * self._settings[axis].velocity_max if given is None else given
+
+    def _fastest(self, axis: int) -> float:
+        return (1 + self._settings[axis].watch.speed_margin) * float(self._velocity[axis])
+
+    def _braking(self, axis: int, velocity: float) -> float:
+        """Return how far an axis may run on: twice what it brakes in, and the way of the order over the line."""
+        return velocity * velocity / float(self._acceleration[axis]) + 2 * LATE_S * abs(velocity)
+
+    def _reach(
+        self, axis: int, state: _State, gap_ns: int, confirmed: bool, watched: bool
+    ) -> tuple[float, float]:
+        """Return where the axis can have come since the last look."""
+        slack, place = self._tolerance(axis), state.place
+        if state.order is Order.HOLD and watched:
+            return state.reference - slack, state.reference + slack
+        way = self._fastest(axis) * (gap_ns / 1e9 + LATE_S)
+        if gap_ns <= GAP_NS or not confirmed or state.order in (Order.HOLD, Order.FORCE):
+            return place - way - slack, place + way + slack
+        stand = place + math.copysign(self._braking(axis, state.velocity), state.velocity)
+        if state.order is Order.POINT:
+            return min(place, stand, state.goal) - slack, max(place, stand, state.goal) + slack
+        ahead = state.goal if state.order is Order.RUN else state.velocity
+        return min(place - way * (ahead < 0), stand) - slack, max(place + way * (ahead > 0), stand) + slack
+
+    def _doubt(
+        self, axis: int, state: _State, now_ns: int, place: float, velocity: float, watched: bool
+    ) -> Finding | None:
+        """Look a second time at what cannot be, and say what it is."""
+        state.doubts += 1
+        if state.doubts == 1:
+            state.doubted, state.doubted_ns = place, now_ns
+            return None
+        first, second = abs(state.doubted - state.place), abs(place - state.doubted)
+        between_s = (now_ns - state.doubted_ns) / 1e9
+        gap = state.doubted_ns - state.stamp_ns > GAP_NS
+        before, name, unit = state.place, self._settings[axis].name, self._settings[axis].unit
+        held = state.order is Order.HOLD and watched
+        if held:
+            jumped = gap or (first > self._tolerance(axis) and second <= STILL * first)
+        else:
+            jumped = gap or second <= self._fastest(axis) * (between_s + LATE_S)
+        tolerance, reference = self._tolerance(axis), state.reference
+        self._rest_at(state, now_ns, place, velocity)
+        if jumped:
+            within_s = (now_ns - state.doubted_ns) / 1e9 if not gap else 0.0
+            text = f"position lost: axis {name} read {before:.6g} {unit} and reads {place:.6g} {unit}"
+            how = "after a gap in its readings" if gap else f"within {within_s:.3g} s"
+            return Finding(axis, f"{text} {how}, where it cannot have gone by itself", lost=True)
+        if held:
+            text = (
+                f"axis {name} moves though nothing was commanded: from {reference:.6g} to {place:.6g} {unit}"
+            )
+            return Finding(
+                axis, f"{text} at {velocity:.3g} {unit}/s; at most {tolerance:.3g} {unit} is right", False
+            )
+        return Finding(axis, self._fast_text(axis, velocity), lost=False)
+
+    def _is_too_fast(self, axis: int, state: _State, now_ns: int, place: float, velocity: float) -> bool:
+        fastest = self._fastest(axis)
+        beyond = abs(place - state.place) - fastest * (now_ns - state.stamp_ns) / 1e9
+        state.excess = max(0.0, state.excess + beyond)
+        state.fast = state.fast + 1 if beyond > 0 else 0
+        return state.fast > 1 and state.excess > JITTER_S * fastest and abs(velocity) > fastest
+
+    def _is_away(self, axis: int, state: _State, place: float, velocity: float, confirmed: bool) -> bool:
+        if state.order is Order.POINT:
+            left, ahead = abs(state.goal - place), state.goal - place
+        elif state.order is Order.RUN and state.goal:
+            left, ahead = -math.copysign(1.0, state.goal) * place, state.goal
+        else:
+            return False
+        if not state.has_begun or not confirmed:
+            state.has_begun, state.best = confirmed, left
+            state.allowed = self._tolerance(axis)
+            braking = self._braking(axis, velocity)
+            if velocity * ahead < 0:
+                state.allowed += braking
+            elif state.order is Order.POINT:  # it may be too near to brake before it
+                state.allowed += OVERSHOOT * left + max(0.0, braking - left)
+            return False
+        state.best = min(state.best, left)
+        state.aways = state.aways + 1 if left > state.best + state.allowed else 0
+        return state.aways > 1
+
+    def _fast_text(self, axis: int, velocity: float) -> str:
+        unit = self._settings[axis].unit
+        return (
+            f"it moves at {velocity:.4g} {unit}/s; velocity_max is {float(self._velocity[axis]):.4g} {unit}/s"
+        )
+
+    def _away_text(self, axis: int, state: _State, velocity: float) -> str:
+        name, unit = self._settings[axis].name, self._settings[axis].unit
+        if state.order is Order.POINT:
+            return f"axis {name} moves away from its target {state.goal:.6g} {unit}: at {state.place:.6g} {unit}, {velocity:.3g} {unit}/s"
+        return f"axis {name} runs at {velocity:.3g} {unit}/s; {state.goal:.3g} {unit}/s were commanded"
