@@ -1,0 +1,82 @@
+"""``./dev``: an environment in a folder with blanks, one that was moved with its tree, and steps that are slow."""
+
+import importlib.machinery
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TREE = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def dev(tmp_path, monkeypatch):
+    """Return the module ``dev`` with an environment of its own in a folder with blanks."""
+    loader = importlib.machinery.SourceFileLoader("dev_under_test", str(TREE / "dev"))
+    module = importlib.util.module_from_spec(importlib.util.spec_from_loader(loader.name, loader))
+    loader.exec_module(module)
+    monkeypatch.setattr(module, "VENV", tmp_path / "my lab's tree" / ".venv")
+    module.VENV.mkdir(parents=True)
+    return module
+
+
+def installed(dev):
+    """Write what an installer and ``./dev`` write: a script with a plain interpreter line, and a launcher."""
+    dev.make_environment()
+    dev.mend_moved()
+    dev.write_if_new(dev.VENV / "bin" / "ours", dev.launcher("platform:python_version"))
+    script = dev.VENV / "bin" / "theirs"
+    script.write_text(f"{dev.shebang()}import sys\nprint(sys.prefix)\n")
+    script.chmod(0o755)
+
+
+def said(dev, name):
+    return subprocess.run(
+        [dev.VENV / "bin" / name], capture_output=True, text=True, check=True
+    ).stdout.strip()
+
+
+def test_launchers_run_in_a_folder_with_blanks(dev):
+    installed(dev)
+    assert said(dev, "theirs") == str(dev.VENV)
+    done = subprocess.run([dev.VENV / "bin" / "ours"], capture_output=True, text=True)
+    assert sys.version.split()[0] in done.stderr  # sys.exit of a text
+
+
+@pytest.mark.parametrize("places", [("my lab's tree", "plain"), ("plain", "my lab's tree")])
+def test_a_moved_environment_is_mended(dev, tmp_path, monkeypatch, places):
+    first, second = (tmp_path / place / ".venv" for place in places)
+    first.mkdir(parents=True, exist_ok=True)
+    monkeypatch.setattr(dev, "VENV", first)
+    installed(dev)
+    assert said(dev, "theirs") == str(first)
+    second.parent.mkdir(exist_ok=True)
+    if second.exists():
+        second.rmdir()
+    first.rename(second)
+    monkeypatch.setattr(dev, "VENV", second)
+    dev.make_environment()
+    dev.mend_moved()
+    assert said(dev, "theirs") == str(second)
+    activated = subprocess.run(
+        ["sh", "-c", '. "$0" && printf %s "$VIRTUAL_ENV"', str(second / "bin" / "activate")],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert activated.stdout == str(second)
+    before = (second / "bin" / "theirs").read_bytes()
+    dev.mend_moved()
+    assert (second / "bin" / "theirs").read_bytes() == before
+
+
+def test_a_step_ends_when_it_is_silent_and_not_when_it_is_slow(dev, monkeypatch, capfd):
+    monkeypatch.setattr(dev, "QUIET_S", 2.0)
+    monkeypatch.setattr(dev.os, "getloadavg", lambda: (0.0, 0.0, 0.0))
+    slow = "import time\nfor _ in range(4): print('.', flush=True); time.sleep(1)"
+    assert dev.run_step("slow", [sys.executable, "-c", slow]) == 0
+    hangs = "import time; time.sleep(60)"
+    assert dev.run_step("hangs", [sys.executable, "-c", hangs]) == -1
+    assert "hangs: killed; it has printed nothing" in capfd.readouterr().err
+    monkeypatch.setattr(dev.os, "getloadavg", lambda: (100.0 * dev.os.cpu_count(), 0.0, 0.0))
+    assert dev.run_step("starved", [sys.executable, "-c", "import time; time.sleep(4)"]) == 0
