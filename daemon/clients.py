@@ -6,6 +6,7 @@ bounds allow, is ended with a line in the log, and nothing else.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import socket
@@ -25,7 +26,7 @@ from .config import WorkcellTable
 from .marker_owners import MarkerError
 from .marker_verbs import MarkerVerbs
 from .node_verbs import NodeVerbs
-from .rights import Rights
+from .rights import Peer, Rights
 from .sessions import LATER, Refused, Session, Wait, peer_of, pidfd_of
 from .users import Users
 from .workcell_verbs import WorkcellVerbs
@@ -68,7 +69,7 @@ class Clients:
     # --- connections -----------------------------------------------------------------------------
 
     def welcome(self) -> None:
-        """Begin to accept clients; those that came while the configuration was loading have waited."""
+        """Begin to accept clients; while the first configuration is loading they hear that, and nothing else."""
         self._server.loop.watch(self._listener.fileno(), self._accept)
 
     def _accept(self) -> None:
@@ -84,8 +85,7 @@ class Clients:
         sock.setblocking(False)
         peer = peer_of(sock, self.users)
         if len(self.sessions) >= self.bounds.max_sessions:
-            self._server.log("warning", "session refused", peer=peer, why="too many sessions")
-            sock.close()
+            self._refuse(sock, peer)
             return
         session = Session(sock, peer, pidfd_of(sock, peer.pid))
         self.sessions.add(session)
@@ -93,6 +93,15 @@ class Clients:
         if session.pidfd >= 0:
             # A child that it forked may hold the socket open after its death.
             self._server.loop.watch(session.pidfd, lambda: self._end_session(session, ""))
+
+    def _refuse(self, sock: socket.socket, peer: Peer) -> None:
+        """Tell one client too many why it is not taken."""
+        most = self.bounds.max_sessions
+        self._server.log("warning", "session refused", peer=peer, why=f"max_sessions = {most} are open")
+        text = f"connect: {most} sessions are open, as many as max_sessions of [workcell] allows; close one, or allow more"
+        with contextlib.suppress(OSError):
+            sock.send(refusal(0, errno.EUSERS, text))
+        sock.close()
 
     def _receive(self, session: Session) -> None:
         for _ in range(16):  # a chatty client gets its turn, not the loop
@@ -127,6 +136,10 @@ class Clients:
         except ValueError:
             raise _Malformed(f"verb {message[0]} is none") from None
         number, arguments = message[1], message[2:]
+        if starting := self._server.starting:
+            text = f"connect: the daemon is starting: {starting}; `sioms wait` waits until it is ready"
+            self.send(session, refusal(number, errno.EAGAIN, text))
+            return
         if number == 0 or number in session.waits:
             raise _Malformed(f"message number {number} is zero or in use")
         try:

@@ -22,10 +22,13 @@ from .config import Device
 from .loop import Loop, Timer
 from .names import DeviceInfo
 from .nursery import Nursery
+from .patience import Patience
 from .restarts import Restarts
 
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | 0x0010 | fcntl.F_SEAL_SEAL  # 0x10: F_SEAL_FUTURE_WRITE
 _SHUTDOWN_S = 3.0
+LOOK_NS = 1_000_000_000
+"""How often a driver that is starting is looked at."""
 
 
 class State(Enum):
@@ -95,6 +98,8 @@ class DriverProcess:
         self._sock: socket.socket | None = None
         self._pidfd = -1
         self._timer: Timer | None = None
+        self._patience: Patience | None = None
+        self._look_ns = 0
 
     @property
     def name(self) -> str:
@@ -137,6 +142,8 @@ class DriverProcess:
             self._end(f"its process could not be started: {text}")
         else:
             self.pid, self._pidfd = pid, fds[0]
+            self._patience = Patience(pid)
+            self._patience.renew(time.monotonic())
             self._loop.watch(self._pidfd, self._exited)
 
     def send(self, verb: DriverVerb, *arguments: object, fds: Sequence[int] = ()) -> None:
@@ -164,18 +171,22 @@ class DriverProcess:
     def check(self, now_ns: int) -> None:
         """Look at the lease: mark a hung driver stale, end one that stays hung."""
         if self.state is not State.UP:
-            if self.state is State.STARTING and now_ns - self.started_ns > 30_000_000_000:
-                self.kill("it was not ready within 30 s")
+            if self.state is State.STARTING and now_ns >= self._look_ns:
+                self._look_ns = now_ns + LOOK_NS
+                if self._patience is not None and (why := self._patience.stuck(now_ns / 1e9)):
+                    self.kill(f"it was not ready: {why}")
             return
         reader = self._readers[0]
-        age_ns = now_ns - reader.alive_ns
+        age_ns = max(0, now_ns - reader.alive_ns)  # it may have ticked since the daemon looked at the clock
         if age_ns > self.info.lease_s * 1e9 and not self.hung:
             self.hung = True
+            self._patience = Patience(self.pid, self.device.common.hang_s)
+            self._patience.renew(now_ns / 1e9)
             self._owner.device_hung(self, f"its driver has not ticked for {age_ns / 1e9:.3f} s")
         elif age_ns < self.info.lease_s * 1e9:
             self.hung = False
-        if age_ns > (self.info.lease_s + self.device.common.hang_s) * 1e9:
-            self.kill(f"its driver hung for {age_ns / 1e9:.2f} s and was killed")
+        if self.hung and self._patience is not None and (why := self._patience.stuck(now_ns / 1e9)):
+            self.kill(f"its driver hung for {age_ns / 1e9:.2f} s and was killed: {why}")
 
     def kill(self, reason: str) -> None:
         """End the process at once (SIGKILL) and let the restart policy go on."""

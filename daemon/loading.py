@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import os
 import pwd
+import time
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,8 +22,16 @@ from .loop import Loop
 from .names import DeviceInfo, NameTable
 from .nursery import Nursery
 from .nursery_process import NurseryProcess
+from .patience import Patience
 
-TIMEOUT_S = 30.0
+LOOK_S = 1.0
+"""How often the nursery that describes is looked at [s]."""
+TELL_S = 5.0
+"""How often it is told that describing takes long [s]."""
+
+
+class NotDescribed(str):
+    """An error that says nothing about the configuration: a driver that should have described its device did not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +59,18 @@ class Loader:
         done: called with the plan (None when there are errors) and the errors.
         nursery_died: passed on to the nursery.
         process: for the nursery, already started; None: start one.
+        slow: told every few seconds how far it has come, from TELL_S on.
     """
 
     def __init__(
         self, loop: Loop, path: str, done: Callable[[Plan | None, list[str]], None],
         nursery_died: Callable[[Nursery], None], process: NurseryProcess | None = None,
+        slow: Callable[[str], None] = lambda text: None,
     ) -> None:  # fmt: skip
+        self._slow = slow
+        self._began_s = time.monotonic()
+        self._waiting: set[str] = set()
+        self._count = 0
         self._loop = loop
         self._path = path
         self._done = done
@@ -79,8 +94,12 @@ class Loader:
             return
         self._config = config
         self._waiting = set(config.devices)
+        self._count = len(self._waiting)
         self._nursery = Nursery(self._loop, self._died, self._process)
-        self._timer = self._loop.after(TIMEOUT_S, self._late)
+        self._patience = Patience(self._nursery.pid)
+        self._patience.renew(time.monotonic())
+        self._told_s = self._began_s
+        self._timer = self._loop.after(LOOK_S, self._look)
         for name, device in config.devices.items():
             self._nursery.describe(
                 name, device.common.driver, device.settings, config.folder,
@@ -91,6 +110,7 @@ class Loader:
         if name not in self._waiting:
             return
         self._waiting.discard(name)
+        self._patience.renew(time.monotonic())
         if errno_:
             self._errors.append(f"[device.{name}]: {text}")
         else:
@@ -110,11 +130,28 @@ class Loader:
             driver = self._config.devices[name].common.driver
             self._infos[name] = DeviceInfo.unpack(name, driver, packed)
 
-    def _late(self) -> None:
-        self._errors += [
-            f"[device.{n}]: its driver was not described within {TIMEOUT_S:g} s" for n in self._waiting
-        ]
-        self._finish()
+    @property
+    def progress(self) -> str:
+        """How far it has come, in words."""
+        done, passed_s = self._count - len(self._waiting), time.monotonic() - self._began_s
+        return f"{done} of {self._count} devices described after {passed_s:.1f} s"
+
+    def _look(self) -> None:
+        now_s = time.monotonic()
+        if why := self._patience.stuck(now_s):
+            self._errors += [
+                NotDescribed(
+                    f"describe [device.{name}]: its driver does not come to an end: {why}; "
+                    "this says nothing about the configuration"
+                )
+                for name in [n for n in self._config.devices if n in self._waiting][:1]
+            ]
+            self._finish()
+            return
+        if now_s - self._told_s > TELL_S:
+            self._told_s = now_s
+            self._slow(self.progress)
+        self._timer = self._loop.after(LOOK_S, self._look)
 
     def _finish(self) -> None:
         self._timer.cancel()

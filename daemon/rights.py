@@ -53,6 +53,20 @@ class Grant:
         return self.everybody or peer.uid in self.uids or not self.gids.isdisjoint(peer.gids)
 
 
+@dataclass(frozen=True, slots=True)
+class Entitled:
+    """Who has a right, besides the daemon's owner and root.
+
+    Attributes:
+        everybody: all who can connect.
+        uids, gids: users and groups, when it is not everybody.
+    """
+
+    everybody: bool
+    uids: frozenset[int]
+    gids: frozenset[int]
+
+
 class Rights:
     """The grants of a workcell.
 
@@ -107,3 +121,12 @@ class Rights:
             if grant.concerns(peer):
                 rights |= grant.rights if "*" in grant.nodes else grant.rights & Right.STOP
         return rights
+
+    def who_may_stop(self) -> Entitled:
+        """Return who may stop the workcell; see ``on_workcell``."""
+        grants = [grant for grant in self._grants if grant.rights & Right.STOP]
+        return Entitled(
+            not self._grants or any(grant.everybody for grant in grants),
+            frozenset(uid for grant in grants for uid in grant.uids),
+            frozenset(gid for grant in grants for gid in grant.gids),
+        )

@@ -49,7 +49,7 @@ class Server:
     ) -> None:  # fmt: skip
         self.loop = loop
         self.log = log
-        self.shared = Shared()
+        self.shared = Shared(str(listener.getsockname()))
         self.names = NameTable({}, {})
         self.devices: dict[str, DriverProcess] = {}
         self.config: Config | None = None
@@ -65,7 +65,8 @@ class Server:
         self._manager = ServiceManager()
         self._told_ready = False
         self._ending = False
-        self._request_seen = self.shared.request.word
+        self._request_seen = self.shared.request.mark
+        self.clients.welcome()
         self._alive()
         if self._manager.watchdog_ns:
             self._feed_watchdog()
@@ -93,8 +94,21 @@ class Server:
             done(errors)
 
         process, self._first_process = self._first_process, None
-        self._loader = Loader(self.loop, self._path, loaded, self._nursery_died, process)
+        self._loader = Loader(self.loop, self._path, loaded, self._nursery_died, process, self._slow)
         self._loader.start()
+
+    def _slow(self, progress: str) -> None:
+        """Say that loading takes long, so that neither a person nor the service manager takes it for a hang."""
+        self.log("info", "describing takes long", progress=progress)
+        if not self._told_ready:
+            self._manager.tell("EXTEND_TIMEOUT_USEC=30000000")
+
+    @property
+    def starting(self) -> str:
+        """How far the first configuration has come, '' when it is taken up."""
+        if self.config is not None:
+            return ""
+        return self._loader.progress if self._loader is not None else "it ends"
 
     def shutdown(self) -> None:
         """End all drivers, then the loop."""
@@ -122,7 +136,7 @@ class Server:
 
     def reset_workcell(self, who: str) -> None:
         """Clear the latch and give devices in fault another try; nothing moves by itself."""
-        self._request_seen = self.shared.request.word
+        self._request_seen = self.shared.request.mark
         self.shared.latch.reset(self._request_seen)
         self.log("info", "reset", by=who)
         for device in self.devices.values():
@@ -198,6 +212,8 @@ class Server:
         for name in rights.unknown:
             self.log("warning", "grant to nobody", who=name, why="not known on this machine, or no answer")
         self.clients.take_up_rights(rights)
+        if why := self.shared.files.entitle(rights.who_may_stop()):
+            self.log("warning", "stop without the daemon", why=why)
         if first and plan.config.workcell.start_stopped:
             self.shared.latch.stop(time.monotonic_ns(), "started stopped, as configured")
         for name, device in list(self.devices.items()):
@@ -212,8 +228,6 @@ class Server:
             for name in device.info.inputs:
                 if names.nodes.get(name) != self.names.nodes[name]:
                     self._send_input(device, name)  # the name shows something else now
-        if first:
-            self.clients.welcome()
         if old is not None:
             old.close()
         self._maybe_ready()
@@ -292,10 +306,11 @@ class Server:
     def _alive(self) -> None:
         now = time.monotonic_ns()
         self.shared.latch.daemon_alive(now)
-        if self.shared.request.word != self._request_seen:
+        if (mark := self.shared.request.mark) != self._request_seen:
             # A client that could not reach us has asked the drivers directly; they have acted already.
-            self._request_seen = self.shared.request.word
+            self._request_seen = mark
             self.stop_workcell(self.shared.request.source)
+            self.shared.request.take(mark)
         for device in list(self.devices.values()):
             device.check(now)
         self.loop.after(ALIVE_S, self._alive)

@@ -9,11 +9,12 @@ import signal
 import socket
 import stat
 import sys
+from collections.abc import Sequence
 
 from sioms.protocol.socketpath import socket_path
 
 from .config import Config, parse
-from .loading import Loader, Plan
+from .loading import Loader, NotDescribed, Plan
 from .log import Log
 from .loop import Loop
 from .nursery import Nursery
@@ -41,12 +42,17 @@ def serve(config_path: str, given_path: str | None, level: str, process: Nursery
         print(f"siomsd: listen: {error.strerror or error}", file=sys.stderr)
         return 1
     _become_prompt(log)
-    server = Server(loop, listener, config_path, log, process)
+    try:
+        server = Server(loop, listener, config_path, log, process)
+    except OSError as error:
+        os.unlink(path)
+        print(f"siomsd: make {error.filename}: {error.strerror}", file=sys.stderr)
+        return 1
     _take_signals(loop, server)
 
     def loaded(errors: list[str]) -> None:
         if errors:
-            server.exit_status = 2
+            server.exit_status = _status(errors)
             server.shutdown()
 
     server.load(loaded)
@@ -55,6 +61,7 @@ def serve(config_path: str, given_path: str | None, level: str, process: Nursery
     finally:
         if os.path.exists(path):
             os.unlink(path)
+        server.shared.files.remove()
     return server.exit_status
 
 
@@ -86,12 +93,22 @@ def check(path: str, process: NurseryProcess) -> int:
     def died(nursery: Nursery) -> None:
         """Nothing to do: the loader's requests have been answered with the death."""
 
-    Loader(loop, path, loaded, died, process).start()
+    def slow(progress: str) -> None:
+        print(f"{path}: slow, not wrong: {progress}", file=sys.stderr)
+
+    Loader(loop, path, loaded, died, process, slow).start()
     if loop.running and not result:
         loop.run()
     for error in result:
         print(f"{path}: {error}", file=sys.stderr)
-    return 2 if result else 0
+    return _status(result)
+
+
+def _status(errors: Sequence[str]) -> int:
+    """Return the exit status: 2, which a service manager does not try again, for a configuration that is wrong."""
+    if all(isinstance(error, NotDescribed) for error in errors):
+        return 1 if errors else 0
+    return 2
 
 
 def _listen(config_path: str, given: str | None) -> tuple[socket.socket, str]:

@@ -1,4 +1,4 @@
-"""The pages every driver process maps: emergency-stop latch, stop requests, marker table."""
+"""What every driver process shares: the emergency-stop latch, the stop-request file, the marker table."""
 
 from __future__ import annotations
 
@@ -6,39 +6,37 @@ import fcntl
 import mmap
 import os
 
-from sioms.protocol.latch import LATCH_SIZE, REQUEST_SIZE, Latch, StopRequest
+from sioms.protocol.latch import LATCH_SIZE, Latch
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
+from sioms.protocol.stopfile import StopRequest
+
+from .stop_files import StopFiles
 
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
-"""Clients hold the stop-request page too: a page that shrinks kills everybody who has mapped it (SIGBUS)."""
 
 
 class Shared:
-    """The three memory files and the daemon's views of them.
+    """Memory files, the stop files, and the daemon's views of them.
+
+    Args:
+        path: of the daemon's socket, beside which the stop files lie.
 
     Attributes:
-        fds: descriptors of latch, request page and marker table, in the order a driver gets them.
+        fds: descriptors of latch, stop-request file, file of the requests taken and marker table, as a driver gets them.
     """
 
-    def __init__(self) -> None:
-        sizes = (
-            ("sioms-latch", LATCH_SIZE),
-            ("sioms-stop-request", REQUEST_SIZE),
-            ("sioms-markers", TABLE_SIZE),
-        )
-        self.fds = []
-        views = []
-        for name, size in sizes:
-            fd = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-            os.ftruncate(fd, size)
-            fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _SEALS)
-            self.fds.append(fd)
-            views.append(memoryview(mmap.mmap(fd, size)))
-        self.latch = Latch(views[0])
-        self.request = StopRequest(views[1])
-        self.markers = MarkerTable(views[2])
+    def __init__(self, path: str) -> None:
+        self.files = StopFiles(path)
+        latch_fd, latch = _memory("sioms-latch", LATCH_SIZE)
+        markers_fd, markers = _memory("sioms-markers", TABLE_SIZE)
+        self.fds = [latch_fd, self.files.fd, self.files.taken_fd, markers_fd]
+        self.latch = Latch(latch)
+        self.request = StopRequest(self.files.fd, self.files.taken_fd)
+        self.markers = MarkerTable(markers)
 
-    @property
-    def request_fd(self) -> int:
-        """Descriptor of the stop-request page, the only one that clients get."""
-        return self.fds[1]
+
+def _memory(name: str, size: int) -> tuple[int, memoryview]:
+    fd = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    os.ftruncate(fd, size)
+    fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _SEALS)
+    return fd, memoryview(mmap.mmap(fd, size))

@@ -43,7 +43,7 @@ class WorkcellVerbs:
         session.name = str(name)[:80]
         rights = self._clients.rights.on_workcell(session.peer)
         value = [PROTOCOL_VERSION, self._clients.bounds.name, int(rights)]
-        fds = [self._server.shared.request_fd] if rights & Right.STOP else []
+        fds = self._server.shared.files.client_fds if rights & Right.STOP else []
         self._clients.send(session, reply(number, value), fds)
         return LATER
 

@@ -17,21 +17,20 @@ import asyncio
 import errno
 import os
 from collections.abc import AsyncIterator
-from mmap import mmap
-from time import monotonic_ns
+from time import monotonic, monotonic_ns
 from typing import TYPE_CHECKING, Any, Self
 
 from sioms.protocol.flags import PROTOCOL_VERSION, Request
-from sioms.protocol.latch import REQUEST_SIZE, StopRequest
 from sioms.protocol.messages import ClientVerb, HandleVerb
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.socketpath import socket_path
+from sioms.protocol.stopfile import StopRequest
 
 from .client.channel import GRACE_S, Answer, Call, Channel
 from .client.channel import connect as connect_socket
 from .client.command import command
 from .client.node_core import Event, NodeCore
-from .client.workcell import node_parts, open_call
+from .client.workcell import STARTING_S, node_parts, open_call
 
 if TYPE_CHECKING:
     from .client.node_core import Records
@@ -265,6 +264,9 @@ class AsyncWorkcell:
 
     async def __aexit__(self, *_: object) -> None:
         self._requests.close()
+        if self._page is not None:
+            self._page.close()
+            self._page = None
 
     async def open(
         self, name: str, mode: str = "r", timeout: float | None = 0.0, *, lease: float = 0.0
@@ -302,8 +304,13 @@ class AsyncWorkcell:
         try:
             await asyncio.sleep(0)  # sent first, because the daemon knows who and why
         finally:
-            if not node and self._page is not None:
-                self._page.request(monotonic_ns(), os.getpid())
+            page, word = None if node else self._page, 0
+            if page is not None:
+                word = page.request(monotonic_ns(), os.getpid(), why)
+        await asyncio.wait({stopping}, timeout=None if page is None else GRACE_S)
+        if page is not None and page.taken(word) and not (stopping.done() and not stopping.exception()):
+            stopping.cancel()  # the drivers have latched it without the daemon
+            return
         await stopping
 
     async def reset(self, node: str = "") -> None:
@@ -331,9 +338,18 @@ async def connect(path: str | None = None, name: str = "") -> AsyncWorkcell:
     """
     channel = Channel(connect_socket(path or socket_path()), "the daemon")
     requests = _Requests(channel, ClientVerb.CANCEL)
-    answer = await requests.call(Call("hello", ClientVerb.HELLO, PROTOCOL_VERSION, name))
-    page = None
-    if answer.fds:
-        page = StopRequest(memoryview(mmap(answer.fds[0], REQUEST_SIZE)))
-        os.close(answer.fds[0])
-    return AsyncWorkcell(requests, page, answer.value[1])
+    answer = await _hello(requests, name)
+    return AsyncWorkcell(requests, StopRequest(*answer.fds) if answer.fds else None, answer.value[1])
+
+
+async def _hello(requests: _Requests, name: str) -> Answer:
+    """Say hello; to a daemon that is starting again and again, for a while."""
+    deadline = monotonic() + STARTING_S
+    while True:
+        try:
+            return await requests.call(Call("hello", ClientVerb.HELLO, PROTOCOL_VERSION, name))
+        except OSError as error:
+            if error.errno != errno.EAGAIN or monotonic() > deadline:
+                requests.close()
+                raise
+        await asyncio.sleep(0.02)

@@ -1,17 +1,21 @@
-"""Commands of ``sioms`` that ask the daemon, or about it: list, info, status, stop, reset, reload, check."""
+"""Commands of ``sioms`` that ask the daemon, or about it: list, info, status, wait, stop, reset, reload, check."""
 
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import sys
 from collections.abc import Iterable, Sequence
-from time import monotonic_ns
+from time import monotonic, monotonic_ns, sleep
 from typing import Any
 
+from sioms.client.stopping import emergency_stop
 from sioms.client.workcell import NodeEntry, Workcell
 from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
+
+from .arguments import positive
 
 READONLY = ".readonly"
 
@@ -37,6 +41,17 @@ def add_parser(subparsers: Any) -> None:
     )
     one.add_argument(
         "node", metavar="NODE", nargs="?", default="", help="one node; the whole workcell without"
+    )
+    one = subparsers.add_parser(
+        "wait", help="wait until the daemon is ready: all devices have started, or are in fault"
+    )
+    one.add_argument(
+        "-t",
+        "--timeout",
+        type=positive,
+        default=60.0,
+        metavar="SECONDS",
+        help="at most so long (default: 60)",
     )
     one = subparsers.add_parser("reset", help="clear a latched stop or fault; nothing resumes by itself")
     one.add_argument(
@@ -68,9 +83,10 @@ def run(args: argparse.Namespace) -> int:
         case "reload":
             with Workcell(name="sioms") as cell:
                 cell.reload()
+        case "wait":
+            _wait(args.timeout)
         case "stop":
-            with Workcell(name="sioms") as cell:
-                cell.emergency_stop(args.node, "sioms stop")
+            _stop(args.node)
         case "reset":
             with Workcell(name="sioms") as cell:
                 cell.reset(args.node)
@@ -81,6 +97,39 @@ def run(args: argparse.Namespace) -> int:
                 [sys.executable, "-m", "sioms.daemon.main", "--check", "--config", args.config],
             )
     return 0
+
+
+def _wait(timeout_s: float) -> None:
+    """Wait until the daemon is there and no device is starting."""
+    deadline = monotonic() + timeout_s
+    while True:
+        try:
+            with Workcell(name="sioms") as cell:
+                late = [d["name"] for d in cell.status()["devices"] if d["state"] in ("down", "starting")]
+            why = f"starting: {', '.join(late)}"
+            if not late:
+                return
+        except OSError as error:
+            if error.errno not in (
+                errno.ENOENT,
+                errno.ECONNREFUSED,
+                errno.EAGAIN,
+                errno.EIO,
+                errno.ETIMEDOUT,
+            ):
+                raise
+            why = error.strerror or str(error)
+        if monotonic() > deadline:
+            raise TimeoutError(errno.ETIMEDOUT, f"the daemon is not ready after {timeout_s:g} s: {why}")
+        sleep(0.05)
+
+
+def _stop(node: str) -> None:
+    if node:
+        with Workcell(name="sioms") as cell:
+            cell.emergency_stop(node, "sioms stop")
+    elif unheard := emergency_stop("sioms stop", name="sioms"):
+        print(f"sioms stop: stopped and latched by the drivers; {unheard}", file=sys.stderr)
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

@@ -31,6 +31,7 @@ COMMANDS: dict[str, Command] = {
     "list": Command("cell", "list the nodes of the workcell"),
     "info": Command("cell", "tell what a node is: channels, units, limits"),
     "status": Command("cell", "tell how devices, sessions and the emergency stop stand"),
+    "wait": Command("cell", "wait until the daemon is ready"),
     "monitor": Command("monitor", "watch all nodes live, with the emergency stop on a key"),
     "stop": Command("cell", "emergency stop of a node or of the whole workcell"),
     "reset": Command("cell", "clear a latched stop or fault"),

@@ -21,6 +21,7 @@ from contextlib import contextmanager
 from time import monotonic_ns
 from typing import Any
 
+from sioms.client.stopping import emergency_stop
 from sioms.client.workcell import NodeEntry, Workcell
 
 from .cell import READONLY, is_part
@@ -188,7 +189,7 @@ class Monitor:
         # A stop first, whatever else is in the same burst of keys.
         if " " in typed or "e" in typed:
             self._confirming = False
-            self._message = self._do("emergency stop", lambda cell: cell.emergency_stop(why="sioms monitor"))
+            self._message = self._stop()
         elif typed in _SCROLL:
             self._scroll += _SCROLL[typed]
         elif self._confirming:
@@ -204,10 +205,21 @@ class Monitor:
         elif typed[0] in "q\x04":
             self._ended = True
 
+    def _stop(self) -> str:
+        cell = self._watch.cell
+        try:
+            if cell is None:
+                emergency_stop("sioms monitor", name="sioms monitor")
+            else:
+                cell.emergency_stop(why="sioms monitor")
+        except OSError as error:
+            return error.strerror or str(error)
+        return "emergency stop: done"
+
     def _do(self, what: str, act: Any) -> str:
         cell = self._watch.cell
         if cell is None:
-            return f"{what}: no daemon to tell; its drivers have stopped"
+            return f"{what}: no daemon to tell"
         try:
             act(cell)
         except OSError as error:

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import errno
 
+from sioms.client.stopping import emergency_stop
 from sioms.client.workcell import Workcell
 from sioms.protocol.flags import NodeClass
 
 from .options import Line, Target, UsageError, fold
-from .pipe import READONLY, open_node, read_input, run
+from .pipe import READONLY, complain, open_node, read_input, run
 from .tokens import Tokens
 
 TYPE_CHECKING = False
@@ -35,6 +36,10 @@ def _work(words: Sequence[str]) -> None:
     if numbers.bad:
         raise UsageError(numbers.bad.partition(": ")[2])
     _check(line)
+    if not line.targets:
+        if unheard := emergency_stop("sdev -e", name="sdev"):
+            complain("sdev", f"stopped and latched by the drivers; {unheard}", 0)
+        return
     cell = Workcell(name="sdev")
     _stop(cell, line)
     Setter(cell, numbers, bool(line.numbers)).carry_out(
@@ -56,8 +61,6 @@ def _check(line: Line) -> None:
 
 def _stop(cell: Workcell, line: Line) -> None:
     """Carry out the emergency stops, which overtake everything else on the command line."""
-    if not line.targets:
-        cell.emergency_stop(why="sdev -e")
     for target in line.targets:
         if "e" in target.flags:
             node = open_node(cell, target.name, "r", companion=True)

@@ -59,6 +59,7 @@ complete -c sioms -n __fish_use_subcommand -a init -d 'write a starter configura
 complete -c sioms -n __fish_use_subcommand -a list -d 'list the nodes of the workcell'
 complete -c sioms -n __fish_use_subcommand -a info -d 'tell what a node is; channels, units, limits'
 complete -c sioms -n __fish_use_subcommand -a status -d 'tell how devices, sessions and the emergency stop stand'
+complete -c sioms -n __fish_use_subcommand -a wait -d 'wait until the daemon is ready'
 complete -c sioms -n __fish_use_subcommand -a monitor -d 'watch all nodes live, with the emergency stop on a key'
 complete -c sioms -n __fish_use_subcommand -a stop -d 'emergency stop of a node or of the whole workcell'
 complete -c sioms -n __fish_use_subcommand -a reset -d 'clear a latched stop or fault'

@@ -43,7 +43,11 @@ class UserAxis:
 
     def __repr__(self) -> str:
         channel = self.node.info.channels[self.axis]
-        view = "" if (self.offset, self.direction) == (0.0, 1) else f", {self.direction:+d} * position {self.offset:+g}"
+        view = (
+            ""
+            if (self.offset, self.direction) == (0.0, 1)
+            else f", {self.direction:+d} * position {self.offset:+g}"
+        )
         try:
             place = f"at {self.position:.6g} {channel.unit}"
         except OSError as error:

@@ -153,14 +153,17 @@ class NodeCore:
         elif -len(names) <= which < len(names):
             return which % len(names)
         raise OSError(
-            errno.EINVAL, f"choose channel {which!r} of {self.name}: it has {', '.join(names)} (0 to {len(names) - 1})"
+            errno.EINVAL,
+            f"choose channel {which!r} of {self.name}: it has {', '.join(names)} (0 to {len(names) - 1})",
         )
 
     def __repr__(self) -> str:
         what = f"<{type(self).__name__} {self.name}"
         if self.closed:
             return f"{what}, closed>"
-        channels = ", ".join(f"{c.name} [{c.unit}]" if c.unit else c.name for c in self.info.channels[:_SHOWN])
+        channels = ", ".join(
+            f"{c.name} [{c.unit}]" if c.unit else c.name for c in self.info.channels[:_SHOWN]
+        )
         more = len(self.info.channels) - _SHOWN
         return f"{what}: {channels}{f' and {more} more' if more > 0 else ''}>"
 

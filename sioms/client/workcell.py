@@ -6,16 +6,15 @@ import errno
 import os
 import sys
 from _socket import socket
-from mmap import mmap
-from time import monotonic_ns
+from time import monotonic, monotonic_ns, sleep
 
 from sioms.protocol.flags import PROTOCOL_VERSION, Access, NodeClass
-from sioms.protocol.latch import REQUEST_SIZE, StopRequest
 from sioms.protocol.messages import ClientVerb
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.socketpath import socket_path
+from sioms.protocol.stopfile import StopRequest
 
-from .channel import Call, Channel, connect
+from .channel import Answer, Call, Channel, connect
 from .node import NODE, SYNCH_LEAD_S, AxisNode, Node
 
 TYPE_CHECKING = False
@@ -24,6 +23,8 @@ if TYPE_CHECKING:
 
     N = TypeVar("N", bound=Node)
 
+STARTING_S = 5.0
+"""How long a client waits for a daemon that says that it is starting [s]."""
 _ACCESS = {"r": Access.READ, "w": Access.WRITE, "rw": Access.READ | Access.WRITE}
 
 
@@ -120,13 +121,24 @@ class Workcell:
         self._path = path or socket_path()
         self._channel = Channel(connect(self._path), "the daemon")
         title = os.path.basename(sys.argv[0]) if name is None and sys.argv and sys.argv[0] else name or ""
-        answer = self._channel.call(Call("hello", ClientVerb.HELLO, PROTOCOL_VERSION, title))
+        answer = self._hello(Call("hello", ClientVerb.HELLO, PROTOCOL_VERSION, title))
         _, self.name, self.rights = answer.value
         self._request: StopRequest | None = None
         self._nodes: dict[int, Node] = {}
         if answer.fds:
-            self._request = StopRequest(memoryview(mmap(answer.fds[0], REQUEST_SIZE)))
-            os.close(answer.fds[0])
+            self._request = StopRequest(*answer.fds)
+
+    def _hello(self, call: Call) -> Answer:
+        """Say hello; to a daemon that is starting again and again, for a while."""
+        deadline = monotonic() + STARTING_S
+        while True:
+            try:
+                return self._channel.call(call)
+            except OSError as error:
+                if error.errno != errno.EAGAIN or monotonic() > deadline:
+                    self._channel.close()
+                    raise
+            sleep(0.02)
 
     def __enter__(self) -> Self:
         return self
@@ -146,6 +158,9 @@ class Workcell:
         for node in nodes.values():
             node.release()
         self._channel.close()
+        if self._request is not None:
+            self._request.close()
+            self._request = None
 
     def fileno(self) -> int:
         """Return the descriptor of the session's socket; it becomes readable when the daemon goes."""
@@ -157,7 +172,13 @@ class Workcell:
 
         @overload
         def open(
-            self, name: str, mode: str = "r", timeout: float | None = 0.0, *, lease: float = 0.0, kind: type[N]
+            self,
+            name: str,
+            mode: str = "r",
+            timeout: float | None = 0.0,
+            *,
+            lease: float = 0.0,
+            kind: type[N],
         ) -> N: ...
 
         @overload
@@ -201,7 +222,9 @@ class Workcell:
         self._nodes[node.handle] = node
         if kind is not None and not isinstance(node, kind):
             node.close()
-            raise OSError(errno.EINVAL, f"open {name}: it is an {type(node).__name__}; want an {kind.__name__}")
+            raise OSError(
+                errno.EINVAL, f"open {name}: it is an {type(node).__name__}; want an {kind.__name__}"
+            )
         return node
 
     def close_handle(self, handle: int) -> None:
@@ -297,12 +320,17 @@ class Workcell:
             why: for the log and for who asks why nothing moves.
         """
         call = Call("emergency stop", ClientVerb.EMERGENCY_STOP, node, why)
+        request, word = None if node else self._request, 0
         try:
             number = self._channel.send(call)  # first, because the daemon knows who and why
         finally:
-            if not node and self._request is not None:
-                self._request.request(monotonic_ns(), os.getpid())
-        self._channel.wait(number, call)
+            if request is not None:
+                word = request.request(monotonic_ns(), os.getpid(), why)
+        try:
+            self._channel.wait(number, call)
+        except OSError:
+            if request is None or not request.taken(word):
+                raise  # else the drivers have latched it without the daemon
 
     def reset(self, node: str = "") -> None:
         """Clear the latched stop of the workcell or of a node. Nothing resumes by itself."""

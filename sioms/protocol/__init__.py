@@ -7,7 +7,8 @@ no dataclasses, no typing at run time.
 * ``flags``     classes, control modes, status bits, requests, rights
 * ``records``   the structs that ``write`` takes and the fields that ``read`` fills
 * ``page``      the shared-memory page of one block of channels
-* ``latch``     the emergency-stop latch and the stop-request page
+* ``latch``     the emergency-stop latch
+* ``stopfile``  the stop-request file, for stops that the daemon does not hear
 * ``markers``   the marker table
 * ``messages``  the msgpack messages on the Unix sockets
 * ``nodeinfo``  what a node is: channels, units, limits, the record sizes

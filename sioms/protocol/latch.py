@@ -1,19 +1,14 @@
-"""The emergency-stop latch and the stop-request page.
+"""The emergency-stop latch: a page of shared memory that every driver looks at in every tick.
 
-Two pages of shared memory, both checked by every driver in every tick, so that a stop works while
-the daemon is busy or gone:
-
-* the latch page is written by the daemon and the drivers: ``stopped_ns`` is 0, or the time when the
-  workcell was stopped; the daemon also stamps ``daemon_alive_ns`` in it, from its real loop.
-* the request page is writable by every client with the right to stop. Any change of its word is a
-  request; a client can thus cause a stop but never clear one.
+It is written by the daemon and the drivers alone: ``stopped_ns`` is 0, or the time when the workcell was stopped; the
+daemon also stamps ``daemon_alive_ns`` in it, from its real loop. Clients ask for a stop through the daemon or through
+the stop-request file (``stopfile``); they can thus cause a stop but never clear one.
 
 This is a software stop (category 1 or 2 of IEC 60204-1 at best), not a safety-rated function.
 """
 
 LATCH_SIZE = 4096
-REQUEST_SIZE = 4096
-_STOPPED, _RESETS, _ALIVE, _ANSWERED = 0, 1, 2, 3
+_STOPPED, _RESETS, _ALIVE, _ANSWERED, _ANSWERED_AT = 0, 1, 2, 3, 4
 _TEXT, _NAMED, _TEXT_SIZE = 64, 320, 256
 
 
@@ -63,17 +58,17 @@ class Latch:
         self._set_text(_NAMED, source)
 
     @property
-    def answered_request(self) -> int:
-        """Word of the stop-request page that the last reset answered: no new request to who sees it only now."""
-        return self._words[_ANSWERED]
+    def answered_request(self) -> tuple[int, int]:
+        """Mark of the stop-request file that the last reset answered: no new request to who sees it only now."""
+        return self._words[_ANSWERED], self._words[_ANSWERED_AT]
 
-    def reset(self, request: int = 0) -> None:
+    def reset(self, request: tuple[int, int] = (0, 0)) -> None:
         """Clear the latch (the daemon's, on behalf of somebody entitled).
 
         Args:
-            request: word of the stop-request page that is thereby answered.
+            request: mark of the stop-request file that is thereby answered.
         """
-        self._words[_ANSWERED] = request
+        self._words[_ANSWERED], self._words[_ANSWERED_AT] = request  # before the latch opens
         self._words[_RESETS] += 1
         self._words[_STOPPED] = 0
         self._set_text(_NAMED, "")
@@ -92,33 +87,3 @@ class Latch:
         """Drop the views, so that the mapping can be closed."""
         self._words.release()
         self._bytes.release()
-
-
-class StopRequest:
-    """View of the stop-request page.
-
-    Args:
-        buffer: the request page, REQUEST_SIZE bytes; writable in clients that may stop.
-    """
-
-    def __init__(self, buffer: memoryview) -> None:
-        self._words = buffer[:16].cast("Q")
-
-    @property
-    def source(self) -> str:
-        """Who requested last, as far as it said."""
-        return f"pid {self._words[1]}, through the stop-request page"
-
-    @property
-    def word(self) -> int:
-        """The present word; a change is a request."""
-        return self._words[0]
-
-    def request(self, now_ns: int, pid: int) -> None:
-        """Request a stop of the workcell."""
-        self._words[1] = pid
-        self._words[0] = now_ns if now_ns != self._words[0] else now_ns + 1
-
-    def release(self) -> None:
-        """Drop the view, so that the mapping can be closed."""
-        self._words.release()

@@ -251,6 +251,7 @@ class PageReader:
         self._words.release()
 
     def _refuse(self, now_ns: int) -> None:
+        """Raise NotReadable with the reason, unless the page has become good meanwhile."""
         words = self._words
         driver, daemon = unpack_from("<II", self._buffer, 64)
         text = (
@@ -262,10 +263,12 @@ class PageReader:
             raise NotReadable(PageState(daemon), text)
         if driver != PageState.GOOD:
             raise NotReadable(PageState(driver), text)
-        age = (now_ns - words[_ALIVE]) / 1e9
-        raise NotReadable(
-            PageState.STALE, f"its driver has not ticked for {age:.3f} s (lease {words[_LEASE] / 1e9:.3f} s)"
-        )
+        age_ns, lease_ns = now_ns - words[_ALIVE], words[_LEASE]
+        if age_ns > lease_ns:  # else it has come back since the caller looked
+            raise NotReadable(
+                PageState.STALE,
+                f"its driver has not ticked for {age_ns / 1e9:.3f} s (lease {lease_ns / 1e9:.3f} s)",
+            )
 
 
 def slot_header(raw: bytes) -> tuple[int, int, int]:

@@ -22,7 +22,7 @@ import numpy as np
 
 from sioms.motion import CommandError, EventKind
 from sioms.protocol.flags import PageState
-from sioms.protocol.latch import LATCH_SIZE, REQUEST_SIZE, Latch, StopRequest
+from sioms.protocol.latch import LATCH_SIZE, Latch
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
 from sioms.protocol.messages import (
     MAX_PACKET,
@@ -30,6 +30,7 @@ from sioms.protocol.messages import (
     decode,
     encode,
 )
+from sioms.protocol.stopfile import StopRequest
 
 from .attachments import Attachments
 from .blocks import AnyBlock, AxisBlock, set_alarms
@@ -72,7 +73,7 @@ def run(
         settings: its validated settings.
         generation: number of this process among the device's.
         options: stop_sources, alarms, daemon_lease_s, realtime_priority, user, phase of the tick [period], state_folder.
-        fds: control socket, latch page, stop-request page, marker table.
+        fds: control socket, latch page, stop-request file, file of the requests taken, marker table.
     """
     name_process(f"sioms:{device}")
     runtime = Runtime(driver, device, settings, generation, options, fds)
@@ -99,8 +100,8 @@ class Runtime:
         self._control = socket.socket(fileno=fds[0])
         self._control.setblocking(False)
         self.latch = Latch(memoryview(mmap.mmap(fds[1], LATCH_SIZE)))
-        request = StopRequest(memoryview(mmap.mmap(fds[2], REQUEST_SIZE)))
-        table = MarkerTable(memoryview(mmap.mmap(fds[3], TABLE_SIZE)))
+        request = StopRequest(fds[2], fds[3])
+        table = MarkerTable(memoryview(mmap.mmap(fds[4], TABLE_SIZE)))
         self.markers = Markers(table, lambda number: self.tell(DriverVerb.MARKER_SIGNALLED, number))
         description = driver.describe(device, settings)
         self.inputs: dict[str, Input] = {name: Input(name) for name in description.inputs}

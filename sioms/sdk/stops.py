@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sioms.protocol.latch import Latch, StopRequest
+from sioms.protocol.latch import Latch
 from sioms.protocol.messages import DriverVerb
+from sioms.protocol.stopfile import StopRequest
 
 from .blocks import AnyBlock, AxisBlock, BinaryBlock
 
@@ -27,7 +28,7 @@ class Stops:
     Args:
         runtime: the driver process.
         latch: the workcell's emergency-stop latch.
-        request: page on which any client asks for an emergency stop.
+        request: file in which any client asks for an emergency stop.
         sources: inputs of this device that stop the workcell, each (block, channel, bit, active level).
 
     Attributes:
@@ -44,7 +45,7 @@ class Stops:
         self._latch = latch
         self._request = request
         self._sources = [tuple(source) for source in sources]
-        self._seen = (0, latch.resets, request.word)
+        self._seen = (0, latch.resets, request.mark)
 
     @property
     def source(self) -> str:
@@ -62,20 +63,22 @@ class Stops:
     def heed(self) -> None:
         """Look whether the emergency stop, or its reset, has come since the last look; cheap."""
         latch = self._latch
-        if (latch.stopped_ns, latch.resets, self._request.word) != self._seen:
+        if (latch.stopped_ns, latch.resets, self._request.mark) != self._seen:
             self.look()
 
     def look(self) -> None:
-        """Do what the latch and the request page say."""
+        """Do what the latch and the request file say."""
         latch, (seen_stop, seen_resets, seen_request) = self._latch, self._seen
-        word = self._request.word
-        fresh = word not in (seen_request, latch.answered_request)
+        mark = self._request.mark
+        fresh = mark not in (seen_request, latch.answered_request)
         if fresh and latch.stop(time.monotonic_ns(), self._request.source):
             self._runtime.tell(DriverVerb.STOPPED, latch.source)
         stopped_ns, resets = latch.stopped_ns, latch.resets
-        self._seen = (stopped_ns, resets, word)
+        self._seen = (stopped_ns, resets, mark)
         if (stopped_ns and stopped_ns != seen_stop) or resets != seen_resets:
             self._stop_all()
+        if fresh:
+            self._request.take(mark)
         if not stopped_ns and self.stopped:
             self.stopped = False
             self.latched_outputs.clear()

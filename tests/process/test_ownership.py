@@ -208,9 +208,9 @@ def test_bounds_of_a_session(start_daemon: Callable[..., Daemon]) -> None:
             markers[1].wait(1.0)
         markers[0].signal()
         others = [daemon.cell() for _ in range(3)]
-        with raises(errno.EIO):
+        with raises(errno.EUSERS, "4 sessions are open, as many as max_sessions"):
             daemon.cell()
-        daemon.said('event="session refused".*too many sessions')
+        daemon.said('event="session refused".*max_sessions = 4 are open')
         others.pop().close()
         wait_for(lambda: len(cell.status()["sessions"]) == 3, "a session less")
         daemon.cell().close()
@@ -260,6 +260,8 @@ attempt('reload', lambda: cell.reload())
 attempt('zero mod0', lambda: cell.open('mod0.readonly').ioctl(sioms.Request.ZERO_DEVICE))
 attempt('ioctl stop mod0', lambda: cell.open('mod0.readonly').ioctl(sioms.Request.STOP))
 print(json.dumps(['page', 0, cell._request is not None]))
+attempt('stop file', lambda: os.close(os.open(sys.argv[1] + '.stop', os.O_WRONLY)))
+attempt('taken file', lambda: os.close(os.open(sys.argv[1] + '.stopped', os.O_WRONLY)))
 """
 GRANTS = """
 [[grant]]
@@ -293,6 +295,26 @@ def test_foreign_user_is_kept_out_by_the_mode_of_the_socket(
     assert number == errno.EACCES and "group of the socket" in str(text)
 
 
+STOPPER = """
+[[grant]]
+rights = ["read", "stop"]
+users = ["nobody"]
+[[grant]]
+rights = ["read", "write", "stop"]
+groups = ["root"]
+"""
+
+
+@pytest.mark.root
+def test_foreign_user_with_a_grant_to_stop_needs_no_daemon(
+    start_daemon: Callable[..., Daemon], start: Callable[..., object]
+) -> None:
+    daemon = start_daemon(WORKCELL.replace('name = "test"', 'name = "test"\nsocket_mode = "0666"') + STOPPER)
+    os.chmod(daemon.folder.parent, 0o755)
+    said = _foreign(daemon, start)
+    assert said["stop file"][0] == 0 and said["taken file"][0] == errno.EACCES
+
+
 @pytest.mark.root
 def test_foreign_user_may_what_is_granted(
     start_daemon: Callable[..., Daemon], start: Callable[..., object]
@@ -305,7 +327,8 @@ def test_foreign_user_may_what_is_granted(
     assert not [name for name in names if name.startswith("force0")]
     allowed = {name for name, (number, _) in said.items() if number == 0}
     assert allowed == {"list", "nodes", "read mod0", "write io0", "page"}
-    assert said["page"][1] is False, "who may not stop gets no stop-request page"
+    assert said["page"][1] is False, "who may not stop gets no stop-request file"
+    assert said["stop file"][0] == errno.EACCES, "and cannot open it either"
     assert said["write mod0"][0] == errno.EACCES and "nobody has no right to write it" in str(
         said["write mod0"][1]
     )

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sioms.protocol.flags import NodeClass
-from sioms.protocol.latch import LATCH_SIZE, REQUEST_SIZE, Latch, StopRequest
+from sioms.protocol.latch import LATCH_SIZE, Latch
 from sioms.protocol.markers import MARKERS, TABLE_SIZE, MarkerTable, split_token, token_of
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.protocol.records import READ_SIZE, WRITE_STRUCT, numpy_dtype
 from sioms.protocol.socketpath import socket_path
+from sioms.protocol.stopfile import StopRequest
 
 
 def test_the_latch_holds_its_first_stop_until_reset() -> None:
@@ -49,14 +52,41 @@ def test_a_stop_and_reset_between_two_looks_shows() -> None:
     assert (latch.stopped_ns, latch.resets) != before
 
 
-def test_every_request_changes_the_word() -> None:
-    request = StopRequest(memoryview(bytearray(REQUEST_SIZE)))
-    words = [request.word]
-    for now in (5, 5, 5, 6, 0):
-        request.request(now, 42)
-        assert request.word != words[-1]
-        words.append(request.word)
-    assert "pid 42" in request.source
+@pytest.fixture
+def request_file(tmp_path: Path) -> Iterator[StopRequest]:
+    """Return the two stop files, open as a driver has them."""
+    fds = [os.open(tmp_path / name, os.O_RDWR | os.O_CREAT) for name in ("stop", "stopped")]
+    request = StopRequest(*fds)
+    yield request
+    request.close()
+
+
+def test_every_request_changes_the_mark(request_file: StopRequest) -> None:
+    marks = [request_file.mark]
+    for now in (5, 6, 0, 7):
+        request_file.request(now, 42, "a reason\x1b[31m")
+        assert request_file.mark not in marks
+        marks.append(request_file.mark)
+    assert request_file.source == "pid 42: a reason?[31m, through the stop-request page"
+
+
+def test_writing_the_old_word_takes_no_request_back(request_file: StopRequest, tmp_path: Path) -> None:
+    request_file.request(5, 42)
+    before = request_file.mark
+    time.sleep(0.02)  # the clock of the file system ticks
+    content = (tmp_path / "stop").read_bytes()
+    request_file.request(6, 43)
+    (tmp_path / "stop").write_bytes(content)
+    assert request_file.mark[0] == before[0] and request_file.mark != before
+    os.truncate(tmp_path / "stop", 0)
+    assert request_file.mark != before and "pid 0" in request_file.source
+
+
+def test_a_request_is_taken(request_file: StopRequest) -> None:
+    word = request_file.request(1000, 42)
+    assert not request_file.taken(word)
+    request_file.take(request_file.mark)
+    assert request_file.taken(word) and request_file.taken(word - 1) and not request_file.taken(word + 1)
 
 
 @pytest.fixture
@@ -132,12 +162,11 @@ def test_socket_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert socket_path() == str(tmp_path / "s")
 
 
-def test_a_reset_tells_which_request_it_has_answered() -> None:
+def test_a_reset_tells_which_request_it_has_answered(request_file: StopRequest) -> None:
     latch = Latch(memoryview(bytearray(LATCH_SIZE)))
-    request = StopRequest(memoryview(bytearray(REQUEST_SIZE)))
-    request.request(1000, 4711)
+    request_file.request(1000, 4711)
     latch.stop(1000, "a client")
-    latch.reset(request.word)
-    assert latch.stopped_ns == 0 and latch.answered_request == request.word
-    request.request(2000, 4711)
-    assert latch.answered_request != request.word
+    latch.reset(request_file.mark)
+    assert latch.stopped_ns == 0 and latch.answered_request == request_file.mark
+    request_file.request(2000, 4711)
+    assert latch.answered_request != request_file.mark

@@ -1,0 +1,60 @@
+"""The emergency stop of the workcell, whether or not the daemon answers."""
+
+from __future__ import annotations
+
+import errno
+import os
+from time import monotonic, monotonic_ns, sleep
+
+from sioms.protocol.socketpath import socket_path
+from sioms.protocol.stopfile import StopRequest, open_stop_request
+
+from .workcell import Workcell
+
+TAKEN_S = 1.0
+"""How long drivers may take to obey [s]; the slowest ticks are far shorter."""
+
+
+def emergency_stop(why: str = "", path: str | None = None, name: str | None = None) -> str:
+    """Stop the whole workcell and latch the stop until it is reset; needs no session and no daemon that answers.
+
+    Args:
+        why: for the log and for who asks why nothing moves.
+        path: the daemon's socket; None for $SIOMS_SOCKET or the usual places.
+        name: what this client calls itself.
+
+    Returns:
+        '' when the daemon has acknowledged it; else why it has not, the drivers having latched the stop without it.
+
+    Raises:
+        OSError: neither daemon nor drivers have taken the stop.
+    """
+    path = path or socket_path()
+    request = open_stop_request(path)
+    try:
+        if request is None:
+            with Workcell(path, name) as cell:
+                cell.emergency_stop(why=why)
+            return ""
+        word = request.request(monotonic_ns(), os.getpid(), why)  # first: it is heard within a tick
+        try:
+            with Workcell(path, name) as cell:
+                cell.emergency_stop(why=why)  # the daemon knows who it was
+        except OSError as error:
+            if error.errno == errno.EPERM or not taken(request, word):
+                raise
+            return error.strerror or str(error)
+        return ""
+    finally:
+        if request is not None:
+            request.close()
+
+
+def taken(request: StopRequest, word: int) -> bool:
+    """Wait until a request has been obeyed; False when nobody has within TAKEN_S."""
+    deadline = monotonic() + TAKEN_S
+    while not request.taken(word):
+        if monotonic() > deadline:
+            return False
+        sleep(0.002)
+    return True

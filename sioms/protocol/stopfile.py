@@ -1,0 +1,93 @@
+"""The stop-request file: how a stop reaches the drivers when the daemon does not answer.
+
+Two files beside the daemon's socket:
+
+* ``SOCKET.stop`` may be written by everybody who may stop, and by nobody else (its owner, group, mode and access list
+  say who). Every write to it is a request to stop the workcell; nothing that is written there clears anything.
+* ``SOCKET.stopped`` is written by drivers and daemon: which request they have taken.
+
+Drivers look at the first in every tick. Its word and the time of its last change count together: who writes the old
+word again cannot take a request back. The file is read and not mapped, because a mapped file that shrinks ends
+everybody who has mapped it.
+"""
+
+from __future__ import annotations
+
+import os
+from struct import Struct
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import TypeAlias
+
+    Mark: TypeAlias = tuple[int, int]
+
+REQUEST, TAKEN = ".stop", ".stopped"
+_REQUEST = Struct("<QQ240s")
+_WORD = Struct("<Q")
+
+
+class StopRequest:
+    """A descriptor of the stop-request file.
+
+    Args:
+        fd: of ``SOCKET.stop``; who requests may write it, who obeys may read it.
+        taken_fd: of ``SOCKET.stopped``.
+
+    Concurrency: each call is one system call or two; any number of processes.
+    """
+
+    def __init__(self, fd: int, taken_fd: int) -> None:
+        self._fd = fd
+        self._taken_fd = taken_fd
+
+    @property
+    def mark(self) -> Mark:
+        """The present word and the time of the last change [ns, wall clock]; a change of either is a request."""
+        return int.from_bytes(os.pread(self._fd, 8, 0), "little"), os.fstat(self._fd).st_mtime_ns
+
+    @property
+    def source(self) -> str:
+        """Who requested last and why, as far as it said."""
+        data = os.pread(self._fd, _REQUEST.size, 0).ljust(_REQUEST.size, b"\0")
+        _, pid, why = _REQUEST.unpack(data)
+        text = "".join(
+            [c if c.isprintable() else "?" for c in why.split(b"\0")[0].decode("utf-8", "replace")]
+        )
+        return f"pid {pid}{': ' + text if text else ''}, through the stop-request page"
+
+    def request(self, now_ns: int, pid: int, why: str = "") -> int:
+        """Request a stop of the workcell; return the word that stands for it."""
+        os.pwrite(self._fd, _REQUEST.pack(now_ns, pid, why.encode()[:239]), 0)
+        return now_ns
+
+    def take(self, mark: Mark) -> None:
+        """Say that a request has been obeyed."""
+        os.pwrite(self._taken_fd, _WORD.pack(mark[0]), 0)
+
+    def taken(self, word: int) -> bool:
+        """Tell whether a request, or a later one, has been obeyed."""
+        return int.from_bytes(os.pread(self._taken_fd, 8, 0), "little") >= word
+
+    def close(self) -> None:
+        """Close both descriptors."""
+        fds, self._fd, self._taken_fd = (self._fd, self._taken_fd), -1, -1
+        for fd in fds:
+            if fd >= 0:
+                os.close(fd)
+
+    def __del__(self) -> None:
+        self.close()
+
+
+def open_stop_request(path: str) -> StopRequest | None:
+    """Open the files beside a daemon's socket for requesting; None where there are none or one has no right to."""
+    try:
+        fd = os.open(path + REQUEST, os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except OSError:
+        return None
+    try:
+        return StopRequest(fd, os.open(path + TAKEN, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW))
+    except OSError:
+        os.close(fd)
+        return None
