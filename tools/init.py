@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
         told = _told(ports)
     path.write_text(text, encoding="utf-8")
     print(f"{path} written{told}")
-    status = _check(path)
+    status = check(path)
     if status == 0:
         print(f"next:\n  siomsd --config {path} &\n  sioms monitor")
     return status
@@ -126,7 +126,7 @@ def _told(ports: list[Port]) -> str:
     return f": simulated devices, {sure} found and recognised, {len(ports) - sure} found as comments to choose from"
 
 
-def _check(path: Path) -> int:
+def check(path: Path) -> int:
     """Let the daemon check the file, another program by design: tools know no daemon."""
     if find_spec("sioms.daemon") is None:
         return 0

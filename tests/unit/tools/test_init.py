@@ -21,11 +21,23 @@ def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(init, "found", list)
 
 
-@pytest.mark.parametrize("driver", DRIVERS)
-def test_the_example_of_every_driver_is_a_good_configuration(driver: str) -> None:
+def test_the_examples_of_all_drivers_are_a_good_configuration() -> None:
+    text = Path(init.__file__).with_name("starter_simulated.toml").read_text()
+    for i, driver in enumerate(DRIVERS):
+        assert f'driver = "{driver}"' in init.example(driver)
+        text += (
+            "\n" + stanza(init.example(driver), None, f"d{i}").replace('"mod0.plant.', '"arm0.plant.') + "\n"
+        )
+    Path("all.toml").write_text(text)
+    assert init.check(Path("all.toml")) == 0
+
+
+@pytest.mark.parametrize("driver", ["tmcl", "sim-force"])
+def test_a_device_of_a_driver_comes_with_what_it_needs(driver: str) -> None:
     assert main(["init", "mine.toml", "--driver", driver]) == 0  # the status is that of the daemon's check
     devices = tomllib.loads(Path("mine.toml").read_text())["device"]
     assert devices["device0"]["driver"] == driver
+    assert ("arm0" in devices) == driver.startswith("sim-")
 
 
 def test_without_a_word_the_devices_are_simulated(tmp_path: Path) -> None:
