@@ -18,18 +18,23 @@ import threading
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
-from time import monotonic_ns
+from dataclasses import replace
+from time import localtime, monotonic_ns, strftime
 from typing import Any
 
 from sioms.client.stopping import emergency_stop
 from sioms.client.workcell import NodeEntry, Workcell
 
+from . import monitor_jog
 from .cell import READONLY, is_part
-from .monitor_view import NodeView, Style, Text, View, page, screen
+from .monitor_events import History
+from .monitor_view import Jog, NodeView, Style, Text, View, page, screen
 
 FRAME_S = 0.1
 ASK_S = 0.5
 MESSAGE_NS = 5_000_000_000
+MANY = 1 << 20
+"""Lines to scroll that are more than there are: to the end."""
 _INK = {
     Style.PLAIN: "", Style.HEAD: "\x1b[1m", Style.DIM: "\x1b[2m", Style.GOOD: "\x1b[32m", Style.WARN: "\x1b[33m",
     Style.ALARM: "\x1b[1;37;41m",
@@ -80,6 +85,7 @@ class Watch:
         self._nodes: dict[str, Any] = {}
         self._why: dict[str, str] = {}
         self._seen: dict[str, tuple[int, int, float | None]] = {}
+        self._last: dict[str, tuple[Any, Any, int]] = {}
 
     def go_on(self) -> None:
         """Ask until told to end."""
@@ -124,11 +130,14 @@ class Watch:
         for name in self._nodes.keys() - {entry.name for entry in self._entries}:
             self._nodes.pop(name).close()
 
-    def view(self, message: str) -> View:
+    def view(self, message: str, jog: Jog | None = None) -> View:
         """Read all pages and return what is to be shown."""
         now_ns = monotonic_ns()
         nodes = [self._look(entry, now_ns) for entry in list(self._entries)]
-        return View(self._status if self.cell else {}, nodes, self.lost, message, now_ns)
+        clock = strftime("%H:%M:%S", localtime())
+        return View(
+            self._status if self.cell else {}, nodes, self.lost, message, now_ns, clock=clock, jog=jog
+        )
 
     def _look(self, entry: NodeEntry, now_ns: int) -> NodeView:
         node = self._nodes.get(entry.name)
@@ -142,9 +151,14 @@ class Watch:
                 # A driver that was restarted has a new page: open it anew, the next time round.
                 self._why[entry.name] = why
                 self._nodes.pop(entry.name, None)
-        rate = self._rate(entry.name, snapshot.number, now_ns) if snapshot is not None else None
-        info = node.info if node is not None else None
-        return NodeView(entry.name, entry.device, info, snapshot, why, entry.holder, rate)
+        if snapshot is not None and node is not None:
+            self._last[entry.name] = (node.info, snapshot, now_ns)
+            rate = self._rate(entry.name, snapshot.number, now_ns)
+            return NodeView(entry.name, entry.device, node.info, snapshot, why, entry.holder, rate)
+        # What it was last stays in sight, marked as old.
+        info, old, seen_ns = self._last.get(entry.name, (None, None, now_ns))
+        age_s = (now_ns - seen_ns) / 1e9 if old is not None else None
+        return NodeView(entry.name, entry.device, info, old, why, entry.holder, None, age_s)
 
     def _rate(self, name: str, number: int, now_ns: int) -> float | None:
         """Return publications a second, over about a second."""
@@ -168,12 +182,23 @@ class Monitor:
         self._scroll = 0
         self._confirming = False
         self._ended = False
+        self._shows_history = False
+        self._history = History()
+        self._jogger = monitor_jog.Jogger()
 
     def go_on(self) -> None:
         """Show frames and obey keys until q."""
+        try:
+            self._go_on()
+        finally:
+            self._jogger.let_go()
+
+    def _go_on(self) -> None:
         while not self._ended:
             size = shutil.get_terminal_size()
-            view = self._watch.view(self._message)
+            view = self._watch.view(self._message, self._jogger.shown)
+            self._history.look(view)
+            view = replace(view, events=tuple(self._history.lines), history=self._shows_history)
             lines, self._scroll = screen(view, size.columns, size.lines, self._scroll)
             _paint(lines)
             if select.select([0], [], [], FRAME_S)[0]:
@@ -182,6 +207,8 @@ class Monitor:
                     return
                 self._obey(typed)
                 self._message_ns = monotonic_ns()
+            if said := self._jogger.beat(monotonic_ns()):
+                self._tell(said)
             elif monotonic_ns() - self._message_ns > MESSAGE_NS and not self._confirming:
                 self._message = ""
 
@@ -190,6 +217,11 @@ class Monitor:
         if " " in typed or "e" in typed:
             self._confirming = False
             self._message = self._stop()
+            self._jogger.let_go()
+            self._tell(self._message)
+        elif (keys := _jog_keys(typed)) and not self._confirming:
+            for key in keys:
+                self._message = self._jogger.press(key, monotonic_ns())
         elif typed in _SCROLL:
             self._scroll += _SCROLL[typed]
         elif self._confirming:
@@ -202,8 +234,21 @@ class Monitor:
             self._message = (
                 "reset the emergency stop? Motion may be commanded again. y: yes, any other key: no"
             )
+        elif typed[0] == "h":
+            self._shows_history, self._scroll = not self._shows_history, 0 if self._shows_history else MANY
+        elif typed[0] == "\t":
+            self._message = self._jogger.choose(self._watch.view("").nodes)
+        elif typed[0] == "c":
+            self._message = self._jogger.take(self._watch.cell)
         elif typed[0] in "q\x04":
             self._ended = True
+        else:
+            self._message = self._jogger.halt()
+
+    def _tell(self, text: str) -> None:
+        """Show something, and keep it among the events."""
+        self._message, self._message_ns = text, monotonic_ns()
+        self._history.add(strftime("%H:%M:%S", localtime()), text)
 
     def _stop(self) -> str:
         cell = self._watch.cell
@@ -225,6 +270,23 @@ class Monitor:
         except OSError as error:
             return error.strerror or str(error)
         return f"{what}: done"
+
+
+def _jog_keys(typed: str) -> list[str]:
+    """Return the keys of a burst if all of them are for jogging, else nothing.
+
+    Example:
+        >>> _jog_keys("\\x1b[C\\x1b[C"), _jog_keys("+q")
+        (['\x1b[C', '\x1b[C'], [])
+    """
+    keys = []
+    while typed:
+        key = next((key for key in monitor_jog.KEYS if typed.startswith(key)), "")
+        if not key:
+            return []
+        keys.append(key)
+        typed = typed[len(key) :]
+    return keys
 
 
 def _paint(lines: list[Text]) -> None:

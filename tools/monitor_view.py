@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from textwrap import wrap
 from typing import Any
 
 from sioms.protocol.flags import AnalogStatus, AxisStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
 
-KEYS = "space, e: EMERGENCY STOP   R: reset   q: quit   up, down: scroll"
+KEYS = "space, e: EMERGENCY STOP  R: reset  tab, c: jog  h: history  arrows  q: quit"
+JOG_KEYS = "space, e: EMERGENCY STOP  left, right: jog  < >: step  + -: speed  c: let go"
 _COMPACT = 110
 """Width below which an axis is shown with fewer columns, so that its flags stay on the screen."""
+_BODY_LEAST = 3
+"""Lines of the nodes that a long list of faults leaves."""
 
 
 class Style(Enum):
@@ -45,6 +49,7 @@ class NodeView:
         why: why there is none, a sentence.
         holder: who owns it, '' when it is free.
         rate_hz: publications a second, None before there are two looks.
+        age_s: how long ago the snapshot was the newest [s], of a node that cannot be read any more; None: it is current.
     """
 
     name: str
@@ -54,6 +59,25 @@ class NodeView:
     why: str
     holder: str
     rate_hz: float | None
+    age_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Jog:
+    """The axis that is chosen for jogging.
+
+    Attributes:
+        node, axis: which: name of the node, index of the axis in it.
+        speed: of a jog [unit/s].
+        step: of a step [unit].
+        held: whether the monitor owns the axis, so that the keys move it.
+    """
+
+    node: str
+    axis: int
+    speed: float
+    step: float
+    held: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +90,10 @@ class View:
         lost: why there is no daemon, '' when there is one.
         message: answer to the last key.
         now_ns: [ns, CLOCK_MONOTONIC].
+        clock: time of day, shown so that a picture that stands still can be told.
+        events: what has happened, as lines, oldest first.
+        history: whether the events are shown instead of the nodes.
+        jog: the axis that is chosen, if one is.
     """
 
     status: dict[str, Any]
@@ -73,6 +101,10 @@ class View:
     lost: str
     message: str
     now_ns: int
+    clock: str = ""
+    events: Sequence[str] = ()
+    history: bool = False
+    jog: Jog | None = None
 
 
 def screen(view: View, width: int, height: int, scroll: int) -> tuple[list[Text], int]:
@@ -86,50 +118,125 @@ def screen(view: View, width: int, height: int, scroll: int) -> tuple[list[Text]
     Returns:
         Exactly ``height`` lines of at most ``width`` characters, and the scroll that was possible.
     """
-    top, middle, bottom = head(view), body(view, width), [Text(KEYS, Style.DIM)]
+    keys = JOG_KEYS if view.jog is not None and view.jog.held else KEYS
+    middle = [Text(line) for line in view.events] if view.history else body(view, width)
+    bottom = [Text(keys, Style.DIM)]
+    if view.jog is not None:
+        bottom.insert(0, _jog(view, view.jog))
     if view.message:
         bottom.insert(0, Text(view.message, Style.WARN))
+    elif view.events and not view.history:
+        bottom.insert(0, Text(f"last: {view.events[-1]}", Style.DIM))
+    top = head(view, width, max(1, height - len(bottom) - _BODY_LEAST))
     room = max(0, height - len(top) - len(bottom))
     scroll = max(0, min(scroll, len(middle) - room))
     shown = middle[scroll : scroll + room]
     shown += [Text("")] * (room - len(shown))
     if room and len(middle) > room:
-        more = f"   (lines {scroll + 1} to {min(scroll + room, len(middle))} of {len(middle)})"
-        bottom[-1] = Text(KEYS + more, Style.DIM)
-    # A small screen keeps the top, where the stop stands, and the keys.
+        top[-1] = Text(
+            f"lines {scroll + 1} to {min(scroll + room, len(middle))} of {len(middle)}".rjust(width),
+            Style.DIM,
+        )
+    # A small screen keeps the top, where the stop and the faults stand, and the keys.
     lines = [*top, *shown, *bottom]
     if len(lines) > height:
         lines = [*top[: max(0, height - 1)], bottom[-1]][:height]
     return [Text(line.text[:width], line.style) for line in lines], scroll
 
 
+def _jog(view: View, jog: Jog) -> Text:
+    """Return the line of the chosen axis."""
+    node = next((node for node in view.nodes if node.name == jog.node and node.info is not None), None)
+    if node is None or node.info is None:
+        return Text(f"{jog.node} cannot be jogged: it is not there", Style.WARN)
+    channel = node.info.channels[jog.axis]
+    size = f"{jog.speed:g} {channel.unit}/s, steps of {jog.step:g} {channel.unit}"
+    if jog.held:
+        return Text(f"JOG {jog.node} {channel.name}: {size}", Style.GOOD)
+    return Text(f"chosen: {jog.node} {channel.name} ({size}); c takes it, tab: the next axis", Style.DIM)
+
+
 def page(view: View, width: int) -> list[str]:
     """Return everything as lines for a printer or a pipe."""
-    return [line.text.rstrip() for line in [*head(view), *body(view, width)]]
+    return [line.text.rstrip() for line in [*head(view, width), *body(view, width)]]
 
 
-def head(view: View) -> list[Text]:
-    """Return the workcell's line, and what is wrong with it as a whole."""
-    if view.lost:
-        return [Text(f"NO DAEMON: {view.lost}", Style.ALARM), Text("")]
+def head(view: View, width: int = 120, height: int = 1000) -> list[Text]:
+    """Return the workcell's line and all that is wrong, wherever the body has been scrolled to.
+
+    Args:
+        view: what is to be shown.
+        width: of the screen [characters].
+        height: most lines; what does not fit is counted in the last.
+    """
+    clock = f"   {view.clock}" if view.clock else ""
     status = view.status
-    if not status:
-        return [Text("connecting", Style.WARN), Text("")]
-    devices = status["devices"]
-    up = sum(d["state"] == "up" for d in devices)
-    lines = [
-        Text(f"workcell {status['workcell']}   daemon {status['pid']}   devices {up} of {len(devices)} up   "
-             f"sessions {len(status['sessions'])}", Style.HEAD)
-    ]  # fmt: skip
-    if status["stopped_ns"]:
-        since = (view.now_ns - status["stopped_ns"]) / 1e9
-        lines.append(Text(f" EMERGENCY STOP for {since:.1f} s: {status['stop_source']} ", Style.ALARM))
-    for device in devices:
-        if device["state"] != "up" or device["link"] != "good":
-            why = device["reason"] or device["link_reason"]
-            text = f"device {device['name']}: {device['state']}, link {device['link']}, {device['deaths']} deaths: {why}"
-            lines.append(Text(text.removesuffix(": "), Style.WARN))
+    lines: list[Text] = []
+    if view.lost:
+        lines += [Text(text, Style.ALARM) for text in wrap(f"NO DAEMON{clock}: {view.lost}", max(width, 20))]
+    elif not status:
+        lines.append(Text(f"connecting{clock}", Style.WARN))
+    else:
+        devices = status["devices"]
+        up = sum(d["state"] == "up" for d in devices)
+        sessions = len(status["sessions"])
+        text = f"workcell {status['workcell']}{clock}   {up} of {len(devices)} devices up   "
+        text += f"{sessions} session{'s' * (sessions != 1)}   daemon {status['pid']}"
+        lines.append(Text(text, Style.HEAD))
+        if status["stopped_ns"]:
+            since = (view.now_ns - status["stopped_ns"]) / 1e9
+            lines.append(Text(f" EMERGENCY STOP for {since:.1f} s: {status['stop_source']} ", Style.ALARM))
+        for device in devices:
+            if device["state"] != "up" or device["link"] != "good":
+                why = device["reason"] or device["link_reason"]
+                text = f"device {device['name']}: {device['state']}, link {device['link']}, {device['deaths']} deaths: {why}"
+                lines.append(Text(text.removesuffix(": "), Style.WARN))
+    lines += [
+        Text(text, Style.ALARM) for text in _wrapped([f"{who}: {what}" for who, what in faults(view)], width)
+    ]
+    if len(lines) > height:
+        hidden = len(lines) - height + 1
+        lines = [
+            *lines[: height - 1],
+            Text(f"and {hidden} lines more of what is wrong; a taller window shows them", Style.ALARM),
+        ]
     return [*lines, Text("")]
+
+
+def faults(view: View) -> list[tuple[str, str]]:
+    """Return what is wrong with single channels: (node and channel, flags in words)."""
+    found = []
+    for node in view.nodes:
+        if node.info is None or node.snapshot is None or node.age_s is not None:
+            continue
+        wrong: list[AxisStatus | AnalogStatus] = []
+        if node.info.node_class is NodeClass.AXIS:
+            wrong = [AxisStatus(int(status)) & _SERIOUS for status in node.snapshot.status]
+        elif node.info.node_class is NodeClass.ANALOG:
+            wrong = [AnalogStatus(int(flags)) for flags in node.snapshot.flags]
+        found += [
+            (name_of(node, channel), ", ".join(words(flags)))
+            for channel, flags in zip(node.info.channels, wrong, strict=False)
+            if flags
+        ]
+    return found
+
+
+def name_of(node: NodeView, channel: ChannelInfo) -> str:
+    """Return the name under which a channel is told."""
+    single = node.info is not None and len(node.info.channels) == 1
+    return node.name if single else f"{node.name}.{channel.name}"
+
+
+def _wrapped(parts: Sequence[str], width: int) -> list[str]:
+    """Return parts in lines of at most a width, as many in each as fit."""
+    lines: list[str] = []
+    for part in parts:
+        if lines and len(lines[-1]) + 3 + len(part) <= width:
+            lines[-1] += " | " + part
+        else:
+            lines.append(part)
+    return lines
 
 
 def body(view: View, width: int) -> list[Text]:
@@ -138,15 +245,19 @@ def body(view: View, width: int) -> list[Text]:
     for node in view.nodes:
         if view.lost and node.snapshot is None:
             continue  # the head says why
+        first = len(lines)
         rate = "" if node.rate_hz is None else f"  {node.rate_hz:.0f}/s"
         holder = f"  held by {node.holder}" if node.holder else ""
         kind = node.info.node_class.name.lower() if node.info else ""
-        lines.append(Text(f"{node.name}  {kind}{rate}{holder}", Style.HEAD))
+        old = "" if node.age_s is None else f"  LAST SEEN {node.age_s:.1f} s AGO: {node.why}"
+        lines.append(Text(f"{node.name}  {kind}{rate}{holder}{old}", Style.WARN if old else Style.HEAD))
         if node.info is None or node.snapshot is None:
             lines.append(Text(f"  {node.why or 'nothing read yet'}", Style.WARN))
         elif node.info.node_class is NodeClass.AXIS:
+            chosen = view.jog.axis if view.jog is not None and view.jog.node == node.name else -1
             lines += [
-                _axis(c, reading, width) for c, reading in zip(node.info.channels, node.snapshot, strict=True)
+                _axis(c, reading, width, i == chosen)
+                for i, (c, reading) in enumerate(zip(node.info.channels, node.snapshot, strict=True))
             ]
         elif node.info.node_class is NodeClass.ANALOG:
             lines += _grid(
@@ -156,22 +267,28 @@ def body(view: View, width: int) -> list[Text]:
             lines += [
                 _binary(c, reading) for c, reading in zip(node.info.channels, node.snapshot, strict=True)
             ]
+        if node.age_s is not None:
+            lines[first + 1 :] = [Text(line.text, Style.DIM) for line in lines[first + 1 :]]
     return lines
 
 
 _SERIOUS = AxisStatus.FAULT | AxisStatus.FOLLOWING_ERROR | AxisStatus.EMERGENCY_STOP | AxisStatus.STALLED
 
 
-def _axis(channel: ChannelInfo, reading: Any, width: int) -> Text:
+def _axis(channel: ChannelInfo, reading: Any, width: int, chosen: bool) -> Text:
     status = AxisStatus(reading.status)
     style = Style.WARN if status & _SERIOUS else Style.GOOD if reading.in_motion else Style.PLAIN
     flags = ", ".join(words(status)) or "idle"
     unit, push = channel.unit or "", "N m" if channel.unit == "rad" else "N"
+    mark = "> " if chosen else "  "
     if width < _COMPACT:
-        text = f"  {channel.name:<7}{reading.position:>10.5f} {reading.velocity:>8.4f} {reading.force:>8.2f} {push:<3} {flags}"
+        text = (
+            f"{mark}{channel.name:<7}{reading.position:>10.5f} {unit:<3} {reading.velocity:>8.4f} {unit + '/s':<5} "
+            f"{reading.force:>8.2f} {push:<3} {flags}"
+        )
         return Text(text, style)
     text = (
-        f"  {channel.name:<10} {reading.position:>11.6f} {unit:<3} {reading.velocity:>10.5f} {unit + '/s':<5} "
+        f"{mark}{channel.name:<10} {reading.position:>11.6f} {unit:<3} {reading.velocity:>10.5f} {unit + '/s':<5} "
         f"{reading.force:>9.3f} {push:<3} error {reading.following_error:>9.2e}  buffer {reading.buffered:>5}  "
         f"{flags}"
     )

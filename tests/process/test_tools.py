@@ -490,42 +490,94 @@ def test_monitor_prints_one_picture_into_a_pipe(shell: Shell) -> None:
     assert re.search(r"yaxis .* m .* idle", text)
 
 
-def test_monitor_in_a_terminal_stops_and_resets_by_key(daemon: Daemon, cell: sioms.Workcell) -> None:
-    pid, terminal = pty.fork()
-    if pid == 0:
-        os.execve(
-            BIN / "sioms",
-            ["sioms", "monitor"],
-            {**environment(daemon.socket), "TERM": "xterm", "LINES": "40"},
-        )
-    seen = bytearray()
+class MonitorTerminal:
+    """``sioms monitor`` in a terminal."""
 
-    def shows(text: bytes) -> None:
+    def __init__(self, socket: str) -> None:
+        self.pid, self.terminal = pty.fork()
+        if self.pid == 0:
+            os.execve(
+                BIN / "sioms", ["sioms", "monitor"], {**environment(socket), "TERM": "xterm", "LINES": "40"}
+            )
+        self.seen = bytearray()
+
+    def shows(self, text: bytes) -> None:
         deadline = time.monotonic() + 15
-        while text not in seen:
-            assert time.monotonic() < deadline, f"{text!r} not shown in {bytes(seen[-3000:])!r}"
-            if select.select([terminal], [], [], 0.1)[0]:
-                seen.extend(os.read(terminal, 65536))
+        while text not in self.seen:
+            assert time.monotonic() < deadline, f"{text!r} not shown in {bytes(self.seen[-3000:])!r}"
+            self.look()
 
+    def look(self) -> None:
+        if select.select([self.terminal], [], [], 0.1)[0]:
+            self.seen.extend(os.read(self.terminal, 65536))
+
+    def press(self, keys: bytes) -> None:
+        os.write(self.terminal, keys)
+
+    def end(self) -> int:
+        os.write(self.terminal, b"q")
+        self.seen.clear()
+        self.shows(b"\x1b[?1049l")
+        return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+
+
+@pytest.fixture
+def monitor(daemon: Daemon) -> Iterator[MonitorTerminal]:
+    one = MonitorTerminal(daemon.socket)
     try:
-        shows(b"mod0")
-        shows(b"taxis")
-        os.write(terminal, b" ")
-        wait_for(lambda: cell.status()["stopped_ns"], "the stop")
-        shows(b"EMERGENCY STOP for")
-        os.write(terminal, b"R")
-        shows(b"Motion may be commanded again")
-        os.write(terminal, b"n")
-        shows(b"reset left alone")
-        assert cell.status()["stopped_ns"]
-        os.write(terminal, b"R")
-        seen.clear()
-        shows(b"Motion may be commanded again")
-        os.write(terminal, b"y")
-        wait_for(lambda: not cell.status()["stopped_ns"], "the reset")
-        os.write(terminal, b"q")
-        seen.clear()
-        shows(b"\x1b[?1049l")
-        assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+        yield one
     finally:
-        os.close(terminal)
+        os.close(one.terminal)
+
+
+def test_monitor_in_a_terminal_stops_and_resets_by_key(
+    monitor: MonitorTerminal, cell: sioms.Workcell
+) -> None:
+    monitor.shows(b"mod0")
+    monitor.shows(b"taxis")
+    monitor.press(b" ")
+    wait_for(lambda: cell.status()["stopped_ns"], "the stop")
+    monitor.shows(b"EMERGENCY STOP for")
+    monitor.press(b"R")
+    monitor.shows(b"Motion may be commanded again")
+    monitor.press(b"n")
+    monitor.shows(b"reset left alone")
+    assert cell.status()["stopped_ns"]
+    monitor.press(b"R")
+    monitor.seen.clear()
+    monitor.shows(b"Motion may be commanded again")
+    monitor.press(b"y")
+    wait_for(lambda: not cell.status()["stopped_ns"], "the reset")
+    assert monitor.end() == 0
+
+
+def test_monitor_jogs_while_a_key_repeats_and_no_longer(
+    monitor: MonitorTerminal, cell: sioms.Workcell
+) -> None:
+    monitor.shows(b"mod0")
+    monitor.press(b"\t")
+    monitor.shows(b"chosen: mod0 xaxis")
+    with cell.open("mod0.xaxis.readonly") as axis:
+        start = axis.read().position[0]
+        monitor.press(b"\x1b[C")
+        monitor.shows(b"take the axis first")
+        assert not axis.read().in_motion[0]
+        monitor.press(b"c")
+        monitor.shows(b"JOG mod0 xaxis")
+        for _ in range(6):
+            monitor.press(b"\x1b[C")
+            monitor.look()
+            time.sleep(0.05)
+        wait_for(lambda: axis.read().position[0] > start + 0.01, "a jog")
+        wait_for(lambda: not axis.read().in_motion[0], "the end of a jog whose key is up", 3.0)
+        place = axis.read().position[0]
+        monitor.press(b"<")
+        wait_for(lambda: axis.read().position[0] < place - 0.001, "a step back")
+        wait_for(lambda: not axis.read().in_motion[0], "its end")
+        monitor.press(b"\x1b[C")
+        wait_for(lambda: axis.read().in_motion[0], "a jog")
+        os.kill(monitor.pid, signal.SIGSTOP)  # Ctrl-Z, or a hung terminal
+        wait_for(lambda: not axis.read().in_motion[0], "the lease of a monitor that is stopped", 1.0)
+        os.kill(monitor.pid, signal.SIGCONT)
+        monitor.shows(b"taken away")
+    assert monitor.end() == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -10,7 +11,8 @@ from hypothesis import strategies as st
 from tool_rig import AXES, node_info, snapshot
 
 from sioms.protocol.flags import AnalogStatus, AxisStatus, NodeClass
-from sioms.tools.monitor_view import KEYS, NodeView, Style, View, body, head, page, screen
+from sioms.tools.monitor_events import History
+from sioms.tools.monitor_view import JOG_KEYS, KEYS, NodeView, Style, View, body, head, page, screen
 
 SECOND = 1_000_000_000
 
@@ -111,3 +113,69 @@ def test_scrolling_ends_at_the_last_line():
     lines, done = screen(VIEW, 140, 8, 10_000)
     assert "out" in lines[-2].text
     assert screen(VIEW, 140, 8, done) == (lines, done)
+
+
+def many_faults(count: int) -> View:
+    reading = snapshot(
+        NodeClass.AXIS, 4, status=[AxisStatus.FAULT | AxisStatus.STALLED, 0, 0, AxisStatus.FOLLOWING_ERROR]
+    )
+    nodes = [node(NodeClass.AXIS, list(AXES), reading, name=f"mod{i}") for i in range(count)]
+    return View(status(), nodes, "", "", 5 * SECOND, clock="12:34:56")
+
+
+@pytest.mark.parametrize("scroll", [0, 20, 1000])
+def test_a_fault_is_at_the_top_wherever_the_body_is(scroll):
+    lines, _ = screen(many_faults(6), 80, 24, scroll)
+    text = " ".join(line.text for line in lines if line.style is Style.ALARM)
+    for i in range(6):
+        assert f"mod{i}.{AXES[0]}: " in text and f"mod{i}.{AXES[3]}: " in text
+
+
+@given(st.integers(20, 120), st.integers(6, 40), st.integers(1, 40))
+def test_faults_that_do_not_fit_are_counted(width, height, count):
+    lines, _ = screen(many_faults(count), width, height, 0)
+    text = " ".join(line.text for line in lines)
+    shown = sum(f"mod{i}.{AXES[axis]}: " in text for i in range(count) for axis in (0, 3))
+    assert shown == 2 * count or "lines more of what is wrong"[:width] in text or width < 45
+
+
+def test_the_head_has_a_clock():
+    assert "12:34:56" in head(many_faults(1))[0].text
+    assert "12:34:56" in head(View({}, [], "gone", "", 0, clock="12:34:56"))[0].text
+
+
+def test_units_stand_on_a_screen_of_80_columns():
+    lines, _ = screen(VIEW, 80, 40, 0)
+    (line,) = [line.text for line in lines if line.text.endswith("moving")]
+    assert " m " in line and " m/s " in line and " N " in line
+
+
+def test_last_values_stay_after_the_daemons_death():
+    old = node(NodeClass.AXIS, list(AXES), AXIS.snapshot, why="the daemon has gone", age_s=3.25)
+    text = [line.text for line in body(View({}, [old], "it has gone", "", 0), 100)]
+    assert "LAST SEEN 3.2 s AGO: the daemon has gone" in text[0]
+    assert "0.10000 m" in text[1]
+    assert {line.style for line in body(View({}, [old], "gone", "", 0), 100)[1:]} == {Style.DIM}
+
+
+def test_the_keys_fit_on_80_columns():
+    assert max(len(KEYS), len(JOG_KEYS)) <= 80
+
+
+def test_history_tells_what_came_and_what_went_but_not_of_what_cannot_be_seen():
+    history = History()
+    good = node(NodeClass.AXIS, list(AXES), snapshot(NodeClass.AXIS, 4))
+    bad = many_faults(1).nodes[0]
+    bad = replace(bad, name="mod0")
+    gone = replace(good, snapshot=None, info=None)
+    for i, (found, lost) in enumerate([(good, ""), (bad, ""), (bad, ""), (gone, "it has gone"), (good, "")]):
+        history.look(View({} if lost else status(), [found], lost, "", 0, clock=str(i)))
+    assert set(history.lines) == {
+        f"1 mod0.{AXES[0]}: fault, stalled",
+        f"1 mod0.{AXES[3]}: following error",
+        "3 no daemon: it has gone",
+        "4 daemon: good again",
+        f"4 mod0.{AXES[0]}: good again",
+        f"4 mod0.{AXES[3]}: good again",
+    }
+    assert len(history.lines) == 6
