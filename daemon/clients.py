@@ -10,6 +10,7 @@ import contextlib
 import errno
 import os
 import socket
+import time
 import traceback
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +36,13 @@ if TYPE_CHECKING:
     from .server import Server
 
 LONGEST_WAIT_S = 7 * 24 * 3600.0
+_SHOWN = frozenset(
+    {
+        ClientVerb.EMERGENCY_STOP, ClientVerb.RESET, ClientVerb.SIGNAL_MARKER, ClientVerb.FREE_MARKER,
+        ClientVerb.WAIT_MARKER, ClientVerb.CLOSE,
+    }
+)  # fmt: skip
+"""What readings of nodes show: who has the answer shall read nothing older."""
 
 
 class _Malformed(Exception):
@@ -144,15 +152,14 @@ class Clients:
             raise _Malformed(f"message number {number} is zero or in use")
         try:
             value = self._verb(session, verb, number, arguments)
-        except Refused as error:
-            self.send(session, refusal(number, error.errno, str(error)))
-        except MarkerError as error:
-            self.send(session, refusal(number, error.errno, str(error)))
+        except (Refused, MarkerError) as error:
+            # Also then: who closes a handle that its driver has ended already shall see the axes halted.
+            self.send(session, refusal(number, error.errno, str(error), _as_of_ns(verb)))
         except (ValueError, TypeError, LookupError, OverflowError) as error:
             raise _Malformed(f"{verb.name} with arguments {arguments!r:.80}: {error}") from None
         else:
             if value is not LATER:
-                self.send(session, reply(number, value))
+                self.send(session, reply(number, value, _as_of_ns(verb)))
 
     def _verb(self, session: Session, verb: ClientVerb, number: int, arguments: list[Any]) -> Any:
         match verb:
@@ -258,3 +265,8 @@ class Clients:
             return False
         self.answer(wait, refusal(wait.number, errno.ECANCELED, f"{wait.what}: cancelled"))
         return True
+
+
+def _as_of_ns(verb: ClientVerb) -> int:
+    """Return the instant at which a request had its effect on what readings show: now, or never."""
+    return time.monotonic_ns() if verb in _SHOWN else 0

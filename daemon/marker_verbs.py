@@ -91,7 +91,8 @@ class MarkerVerbs:
         """Answer the waits of markers that have been signalled, by clients or by drivers."""
         for reservation, wait in list(self._waits):
             if self._owners.is_signalled(reservation):
-                self._clients.answer(wait, reply(wait.number, self._table.stamp_ns(reservation.number)))
+                stamp_ns = self._table.stamp_ns(reservation.number)
+                self._clients.answer(wait, reply(wait.number, stamp_ns, time.monotonic_ns()))
 
     def end_session(self, session: Session) -> None:
         """Free what a session owns."""

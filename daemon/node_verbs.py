@@ -238,7 +238,7 @@ class NodeVerbs:
         self._claims.release(handle.claims)
         wait = handle.session.waits.get(handle.closing)
         if wait is not None:
-            self._clients.answer(wait, reply(handle.closing))
+            self._clients.answer(wait, reply(handle.closing, None, time.monotonic_ns()))
         if self._opens:
             self.retry_opens()
 

@@ -118,6 +118,7 @@ class WorkcellVerbs:
             if device is None:
                 raise OSError(errno.EIO, "not configured any more")
             device.send(verb, node.block, node.channels, text)
+            self._server.shared.latch.ordered()
         except OSError as error:
             raise Refused(errno.EIO, f"{verb.name.lower()} {node.name}: {error.strerror}") from None
 

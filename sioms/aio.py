@@ -6,7 +6,8 @@
             await mod0.wait_until_idle()
 
 Requests are the same values that the blocking face sends (``sioms.client.node_core``); only the waiting
-differs. Reading needs no waiting: ``read`` is an ordinary call.
+differs. Reading needs no waiting: ``read`` is an ordinary call. Only right after an acknowledgement it may
+take until the driver publishes again; ``await node.fresh()`` lets the loop go on meanwhile.
 
 Concurrency: one event loop, any number of its tasks. Cancelling a task cancels its request.
 """
@@ -30,6 +31,7 @@ from .client.channel import GRACE_S, Answer, Call, Channel
 from .client.channel import connect as connect_socket
 from .client.command import command
 from .client.node_core import Event, NodeCore
+from .client.shown import acknowledged_by_daemon
 from .client.workcell import STARTING_S, node_parts, open_call
 
 if TYPE_CHECKING:
@@ -188,6 +190,12 @@ class AsyncNode(NodeCore):
         """Write all channels of a binary or analog output."""
         return await self.write(self._outputs(values))
 
+    async def fresh(self) -> Any:
+        """Return what ``read`` returns, but let the loop go on until the newest snapshot shows what was acknowledged."""
+        while not self.is_shown():
+            await asyncio.sleep(self.look_s)
+        return self.read()
+
     async def wait_until_idle(self, timeout: float | None = None) -> None:
         """Wait until all axes of the node stand still and their buffers are empty."""
         await self.ioctl(Request.WAIT_UNTIL_IDLE, None, timeout)
@@ -203,7 +211,7 @@ class AsyncNode(NodeCore):
         await self.subscribed(every)
         number = 0
         while True:
-            snapshot = self.read()
+            snapshot = await self.fresh()
             if snapshot.number > number:
                 number = snapshot.number
                 yield snapshot
@@ -211,6 +219,8 @@ class AsyncNode(NodeCore):
 
     async def wait_event(self, mask: int = -1, last: Any = None, timeout: float | None = None) -> Event:
         """Wait until a masked bit differs from the last state seen; see ``BinaryNode.wait_event``."""
+        if last is None:
+            await self.fresh()
         state, number = self._start_of(last)
         if self._subscribed == 0:
             await self.subscribed(-1)
@@ -310,6 +320,7 @@ class AsyncWorkcell:
         await asyncio.wait({stopping}, timeout=None if page is None else GRACE_S)
         if page is not None and page.taken(word) and not (stopping.done() and not stopping.exception()):
             stopping.cancel()  # the drivers have latched it without the daemon
+            acknowledged_by_daemon(monotonic_ns())
             return
         await stopping
 

@@ -34,8 +34,11 @@ from sioms.protocol.messages import (
     value_of,
 )
 
+from .shown import acknowledged_by_daemon
+
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from typing import Any
 
 _CMSG_CLOEXEC = 0x40000000
@@ -122,14 +125,22 @@ class Channel:
         name: whose it is, for messages: the daemon, or a node.
         passed: whether answers may bring descriptors along; those of drivers never do, and looking for
             them takes time.
+        acknowledged: told of the instant of the effect of what has been answered [ns], before the answer is.
 
     Attributes:
         keepalive_s: while a thread waits for an answer, it tells the other side this often [s] that it
             lives; 0 = never. The waiting thread itself does, so that a program that hangs is silent.
     """
 
-    def __init__(self, sock: socket, name: str, passed: bool = True) -> None:
+    def __init__(
+        self,
+        sock: socket,
+        name: str,
+        passed: bool = True,
+        acknowledged: Callable[[int], None] = acknowledged_by_daemon,
+    ) -> None:
         self.name = name
+        self.acknowledged = acknowledged
         self._sock = sock
         self._passed = passed
         self._number = 0
@@ -338,6 +349,8 @@ class Channel:
     def result(self, found: tuple[list, list[int]]) -> Answer:  # type: ignore[type-arg]
         """Turn a packet into an answer, or raise its refusal."""
         message, fds = found
+        if len(message) > 5 and message[5]:
+            self.acknowledged(message[5])
         if message[2]:
             for fd in fds:
                 os.close(fd)

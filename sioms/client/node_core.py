@@ -8,14 +8,15 @@ from __future__ import annotations
 import errno
 import os
 from mmap import PROT_READ, mmap
-from time import monotonic_ns
+from time import monotonic_ns, sleep
 
 from sioms.protocol.flags import NodeClass, PageState, Request, WriteFlag
 from sioms.protocol.messages import MAX_INLINE, MAX_WRITE, HandleVerb
 from sioms.protocol.nodeinfo import NodeInfo
-from sioms.protocol.page import NotReadable, PageReader
+from sioms.protocol.page import NotReadable, PageReader, as_of_ns
 from sioms.protocol.records import ANALOG_WRITE, BINARY_WRITE
 
+from . import shown
 from .channel import KEEPALIVE, Call, Channel
 from .snapshot import SNAPSHOT, BinarySnapshot, Layout
 
@@ -61,6 +62,7 @@ class NodeCore:
     Attributes:
         info: what the node is (GET_IO_STRUCT_INFO).
         name: node name.
+        owed_ns: what took effect before this instant must be in what is read next; 0: nothing is owed.
     """
 
     def __init__(
@@ -80,6 +82,10 @@ class NodeCore:
         self._snapshot = SNAPSHOT[info.node_class]
         self._latest = self._page.latest
         self._subscribed = 0
+        self.owed_ns = 0
+        device = self._page.device
+        shown.join(self, device)
+        channel.acknowledged = lambda instant_ns: shown.acknowledged(device, instant_ns)
 
     @property
     def closed(self) -> bool:
@@ -89,17 +95,59 @@ class NodeCore:
     def read(self) -> Any:
         """Return the newest snapshot of all channels: a copy of memory, no system call.
 
+        Everything that was acknowledged before, to this process and about this device, shows in it. Right after
+        an acknowledgement that may take until the driver has published again: a tick, or the next poll.
+
         Raises:
             OSError: EIO, the device is starting, lost, hung or in fault, with the reason; never old
                 data as new. EBADF, the node is closed.
         """
         try:
             raw = self._latest(monotonic_ns())
+            if self.owed_ns:
+                raw = self._wait_shown(raw)
         except (NotReadable, ValueError) as error:
             raise self._unreadable(error) from None
         if self._subscribed:
             self._drain()
         return self._snapshot(raw, self._layout)
+
+    def is_shown(self) -> bool:
+        """Whether ``read`` need not wait: the newest snapshot shows all that has been acknowledged.
+
+        Raises:
+            OSError: as ``read``.
+        """
+        if self.owed_ns:
+            try:
+                self._is_paid(self._latest(monotonic_ns()))
+            except (NotReadable, ValueError) as error:
+                raise self._unreadable(error) from None
+        return not self.owed_ns
+
+    def _is_paid(self, raw: bytes) -> bool:
+        instant_ns = as_of_ns(raw)
+        if instant_ns < self.owed_ns:
+            return False
+        shown.paid(self, instant_ns)
+        return True
+
+    def _wait_shown(self, raw: bytes) -> bytes:
+        """Wait for the publication that shows what has been acknowledged; its end is that of a good page, too."""
+        heard_ns = monotonic_ns()
+        while not self._is_paid(raw):
+            sleep(self.look_s)
+            now_ns = monotonic_ns()
+            if self._channel.keepalive_s and now_ns - heard_ns > self._channel.keepalive_s * 1e9:
+                heard_ns = now_ns
+                self.keepalive()
+            raw = self._latest(now_ns)
+        return raw
+
+    @property
+    def look_s(self) -> float:
+        """How often to look for a publication that must come [s]: ten times a tick, within reason."""
+        return min(max(0.1 / self.info.tick_hz, 50e-6), 1e-3)
 
     def history(self, after: int, *, gone: bool = False) -> list[Any]:
         """Return the snapshots after a given number that the page still holds, oldest first.
@@ -244,6 +292,7 @@ class NodeCore:
         """Let go of memory and descriptors; the driver ends the handle at the end of file."""
         if self._map is None:
             return
+        shown.leave(self, self._page.device)
         self._channel.close()
         self._page.release()
         self._map.close()

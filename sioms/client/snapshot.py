@@ -160,7 +160,7 @@ class AxisSnapshot(Snapshot):
     following_error = _field(9, "Commanded minus measured position.")
     in_motion = _field(10, "1 while a command is being carried out.")
     status = _field(11, "AxisStatus flags.")
-    buffered = _field(12, "Commands in the buffer, the running one included.")
+    buffered = _field(12, "Commands that wait in the buffer; the running one has left it.")
 
 
 class AnalogSnapshot(Snapshot):

@@ -16,6 +16,7 @@ from sioms.protocol.stopfile import StopRequest
 
 from .channel import Answer, Call, Channel, connect
 from .node import NODE, SYNCH_LEAD_S, AxisNode, Node
+from .shown import acknowledged_by_daemon
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -331,6 +332,7 @@ class Workcell:
         except OSError:
             if request is None or not request.taken(word):
                 raise  # else the drivers have latched it without the daemon
+            acknowledged_by_daemon(monotonic_ns())
 
     def reset(self, node: str = "") -> None:
         """Clear the latched stop of the workcell or of a node. Nothing resumes by itself."""

@@ -6,7 +6,7 @@ if TYPE_CHECKING:
 else:
     from .enumeration import IntEnum, IntFlag
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 
 
 class NodeClass(IntEnum):

@@ -8,7 +8,7 @@ This is a software stop (category 1 or 2 of IEC 60204-1 at best), not a safety-r
 """
 
 LATCH_SIZE = 4096
-_STOPPED, _RESETS, _ALIVE, _ANSWERED, _ANSWERED_AT = 0, 1, 2, 3, 4
+_STOPPED, _RESETS, _ALIVE, _ANSWERED, _ANSWERED_AT, _ORDERS = 0, 1, 2, 3, 4, 5
 _TEXT, _NAMED, _TEXT_SIZE = 64, 320, 256
 
 
@@ -39,6 +39,15 @@ class Latch:
     def daemon_alive_ns(self) -> int:
         """Last stamp of the daemon's loop [ns, CLOCK_MONOTONIC]."""
         return self._words[_ALIVE]
+
+    @property
+    def orders(self) -> int:
+        """How many orders the daemon has sent to drivers on their control sockets; one more: look there."""
+        return self._words[_ORDERS]
+
+    def ordered(self) -> None:
+        """Note that an order has been sent (the daemon's), so that the driver's next tick obeys it first."""
+        self._words[_ORDERS] += 1
 
     @property
     def source(self) -> str:

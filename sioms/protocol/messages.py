@@ -1,9 +1,14 @@
 """Messages on the SOCK_SEQPACKET sockets: one msgpack array a packet.
 
 Request  [verb, id, arguments...]        id > 0, unique among the sender's unanswered requests
-Reply    [0, id, errno, value or text]   errno 0: value; else text, one sentence without full stop
-Reply    [0, id, 0, bytes, true]         a long value: its msgpack, compressed by zlib
+Reply    [0, id, errno, value or text, zipped, as_of_ns]
+                                         errno 0: value, when zipped its msgpack compressed by zlib;
+                                         else text, one sentence without full stop
 Notice   [verb, 0, arguments...]         draws no reply
+
+``as_of_ns`` is the instant at which what was asked for had taken effect [ns, CLOCK_MONOTONIC]: a reader
+that has the reply takes no snapshot of an earlier ``as_of_ns`` (see page.py). 0: nothing to wait for; the last
+two may then be left out.
 
 Packets are bounded by MAX_PACKET; a larger write sends the beginning of its records ahead, in notices
 that carry its number. No client passes a descriptor to anybody: closing what a stranger opened may block.
@@ -149,17 +154,18 @@ def decode(packet: bytes) -> list[object]:
     return message
 
 
-def reply(number: int, value: object = None) -> bytes:
+def reply(number: int, value: object = None, as_of_ns: int = 0) -> bytes:
     """Pack a successful reply; a long one is compressed, one that is still too long becomes a refusal."""
-    packet = encode(0, number, 0, value)
+    packet = encode(0, number, 0, value, False, as_of_ns) if as_of_ns else encode(0, number, 0, value)
     if len(packet) <= MAX_PACKET:
         return packet
     from zlib import compress  # thousands of nodes or channels, much alike
 
-    packet = encode(0, number, 0, compress(_pack(value)), True)
+    packet = encode(0, number, 0, compress(_pack(value)), True, as_of_ns)
     if len(packet) <= MAX_PACKET:
         return packet
-    return refusal(number, EMSGSIZE, f"the answer takes {len(packet)} bytes; at most {MAX_PACKET} fit")
+    text = f"the answer takes {len(packet)} bytes; at most {MAX_PACKET} fit"
+    return refusal(number, EMSGSIZE, text, as_of_ns)
 
 
 def value_of(message: list[Any]) -> Any:
@@ -168,7 +174,7 @@ def value_of(message: list[Any]) -> Any:
     Raises:
         MalformedMessage: it says that it is compressed, and is not.
     """
-    if len(message) < 5:
+    if len(message) < 5 or not message[4]:
         return message[3]
     from zlib import decompress
 
@@ -178,6 +184,7 @@ def value_of(message: list[Any]) -> Any:
         raise MalformedMessage(f"decompress answer: {type(error).__name__}: {error}") from None
 
 
-def refusal(number: int, errno_: int, text: str) -> bytes:
+def refusal(number: int, errno_: int, text: str, as_of_ns: int = 0) -> bytes:
     """Pack a refusal with its errno and its sentence."""
-    return encode(0, number, errno_, text[:MAX_TEXT])
+    text = text[:MAX_TEXT]
+    return encode(0, number, errno_, text, False, as_of_ns) if as_of_ns else encode(0, number, errno_, text)

@@ -11,10 +11,14 @@ Layout (little endian; offsets in bytes)::
     24   slots (a power of two)    64  driver state u32, daemon state u32 (PageState)
     32   bytes of a slot           72  head: number of the newest snapshot, 0 = none yet
                                    80  alive_ns: stamped every tick by the driver
+    88   device: random number of the driver process, the same in all its pages
     96   reason: UTF-8 text, NUL padded, why the state is not good (160 bytes)
     256  slots
 
-    slot: number u64, stamp_ns u64, tick u64, reserved u64, then one array of 8-byte values a field
+    slot: number u64, stamp_ns u64, tick u64, as_of_ns u64, then one array of 8-byte values a field
+
+A snapshot shows everything that took effect before its ``as_of_ns``. An acknowledgement carries the
+instant of its effect, so the first snapshot with an ``as_of_ns`` not before that is the one that shows it.
 
 A snapshot is written with its number zeroed, and published by its number and then by the head, so
 a writer killed half-way leaves the preceding snapshot the newest. The ring lets a reader that was
@@ -31,17 +35,21 @@ from .flags import NodeClass, PageState
 from .records import READ_FIELDS
 
 MAGIC = b"SIOMSpg1"
-VERSION = 1
+VERSION = 2
 HEADER_SIZE = 256
 SLOT_HEADER = 32
 REASON_OFFSET = 96
 REASON_SIZE = 160
 _GOOD = PageState.GOOD | PageState.GOOD << 32
-_HEAD, _ALIVE, _LEASE, _STATES = 72 // 8, 80 // 8, 48 // 8, 64 // 8
+_HEAD, _ALIVE, _LEASE, _STATES, _DEVICE = 72 // 8, 80 // 8, 48 // 8, 64 // 8, 88 // 8
 _HEADER = Struct("<8sIIIIQQQQQII")
 _SLOT = Struct("<QQQQ")
+_AS_OF = Struct("<Q")
 
-if os.uname().machine in ("x86_64", "i686", "AMD64"):
+_ORDERED = os.uname().machine in ("x86_64", "i686", "AMD64")
+"""Whether stores become visible, and loads are made, in the order of the program."""
+
+if _ORDERED:
 
     def _fence() -> None:
         """Keep store order: nothing to do, this processor does."""
@@ -100,6 +108,7 @@ class PageWriter:
         slots: length of the ring, a power of two of at least 4.
         lease_ns: how old ``alive_ns`` may get before readers call the driver hung.
         generation: distinguishes successive driver processes of one device.
+        device: number of the driver process, unlike that of any other.
     """
 
     def __init__(
@@ -110,6 +119,7 @@ class PageWriter:
         slots: int,
         lease_ns: int,
         generation: int,
+        device: int = 0,
     ) -> None:
         if slots < 4 or slots & (slots - 1):
             raise PageError(f"lay out page: {slots} slots; must be a power of two of at least 4")
@@ -121,6 +131,7 @@ class PageWriter:
         )  # fmt: skip
         self._bytes = buffer.cast("B")
         self._words = self._bytes.cast("Q")
+        self._words[_DEVICE] = device
         self._mask = slots - 1
         self._size = size
         self._number = 0
@@ -134,13 +145,14 @@ class PageWriter:
         """Stamp the driver as alive [ns, CLOCK_MONOTONIC]."""
         self._words[_ALIVE] = now_ns
 
-    def publish(self, payload: memoryview, stamp_ns: int, tick: int) -> None:
+    def publish(self, payload: memoryview, stamp_ns: int, tick: int, as_of_ns: int) -> None:
         """Publish one snapshot of all channels.
 
         Args:
             payload: the field arrays one after the other, ``memoryview`` of bytes.
             stamp_ns: time the values hold for [ns, CLOCK_MONOTONIC].
             tick: number of the driver's tick.
+            as_of_ns: what took effect before this instant is shown [ns, CLOCK_MONOTONIC].
         """
         number = self._number + 1
         offset = HEADER_SIZE + (number & self._mask) * self._size
@@ -150,6 +162,7 @@ class PageWriter:
         _fence()
         words[word + 1] = stamp_ns
         words[word + 2] = tick
+        words[word + 3] = as_of_ns
         self._bytes[offset + SLOT_HEADER : offset + self._size] = payload
         _fence()
         words[word] = number
@@ -185,7 +198,17 @@ class PageReader:
         PageError: no page of this version.
     """
 
-    __slots__ = ("_buffer", "_mask", "_size", "_words", "channels", "generation", "node_class", "slots")
+    __slots__ = (
+        "_buffer",
+        "_mask",
+        "_size",
+        "_words",
+        "channels",
+        "device",
+        "generation",
+        "node_class",
+        "slots",
+    )
 
     def __init__(self, buffer) -> None:  # type: ignore[no-untyped-def]  # mmap or bytes-like whose slices copy
         magic, version, cls, channels, _, slots, size, _, _, generation, _, _ = _HEADER.unpack_from(buffer, 0)
@@ -199,6 +222,7 @@ class PageReader:
         self.node_class = NodeClass(cls)
         self.slots: int = slots
         self.generation: int = generation
+        self.device: int = self._words[_DEVICE]
 
     @property
     def head(self) -> int:
@@ -232,9 +256,11 @@ class PageReader:
             number = words[_HEAD]
             offset = HEADER_SIZE + (number & self._mask) * self._size
             raw: bytes = self._buffer[offset : offset + self._size]
-            # The writer may have lapped us between reading the head and copying.
-            if words[offset >> 3] == number and raw[:8] == number.to_bytes(8, "little") and number:
-                return raw
+            # The writer may have lapped us since we read the head; it clears the number before it writes.
+            if words[offset >> 3] == number and number:
+                if _ORDERED or raw[:8] == number.to_bytes(8, "little"):
+                    return raw
+                continue
             if number == 0:
                 raise NotReadable(PageState.STARTING, "nothing published yet")
 
@@ -275,3 +301,9 @@ def slot_header(raw: bytes) -> tuple[int, int, int]:
     """Return (number, stamp_ns, tick) of a copied snapshot."""
     number, stamp_ns, tick, _ = _SLOT.unpack_from(raw, 0)
     return number, stamp_ns, tick
+
+
+def as_of_ns(raw: bytes) -> int:
+    """Return the instant up to which a copied snapshot shows everything [ns, CLOCK_MONOTONIC]."""
+    instant: int = _AS_OF.unpack_from(raw, 24)[0]
+    return instant

@@ -26,7 +26,7 @@ from sioms.protocol.messages import (
 
 from .blocks import AxisBlock
 from .handles import LATER, Handle
-from .requests import ioctl
+from .requests import LOOKS, ioctl
 from .writing import write
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class Attachments:
         handle = Handle(
             number, node, who, sock, fds[1], fds[2] if len(fds) > 2 else -1, self._runtime.blocks[block],
             np.array(channels, dtype=np.intp), bit, Access(access), exclusive, Right(rights), lease_ns,
-            time.monotonic_ns(),
+            time.monotonic_ns(), self._runtime.effects,
         )  # fmt: skip
         self.handles[number] = handle
         if lease_ns:
@@ -137,11 +137,14 @@ class Attachments:
             match verb:
                 case HandleVerb.WRITE:
                     flags, timeout_s, data = arguments
+                    self._runtime.effects.note()
                     if handle.ahead[1]:
                         data = _whole(handle, number, data)
                     value = write(self._runtime, handle, number, int(flags), _seconds(timeout_s), data)
                 case HandleVerb.IOCTL:
                     request, argument, timeout_s = arguments
+                    if request not in LOOKS:
+                        self._runtime.effects.note()
                     value = ioctl(self._runtime, handle, number, int(request), argument, _seconds(timeout_s))
                 case HandleVerb.SUBSCRIBE:
                     self._subscribe(handle, int(arguments[0]))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.flags import PageState
 
+from .blocks import AnyBlock
 from .connection import Connection, open_connection
 from .driver import LineDriver, StreamDriver
 from .exchange import DeviceError, Steps
@@ -88,6 +89,9 @@ class Connected:
         """Begin: the line is up."""
         raise NotImplementedError
 
+    def acted(self, block: AnyBlock) -> None:
+        """What a client asked for has been done on the line."""
+
     def line_lost(self, reason: str, now_ns: int) -> None:
         """Close the line and try again later."""
         line, self.line = self.line, None
@@ -117,6 +121,8 @@ class Connected:
 
         def done(value: Any, error: Exception | None) -> None:
             if error is None:
+                self._runtime.effects.note()
+                self.acted(handle.block)
                 handle.answer(number, value)
             else:
                 errno_ = error.errno if isinstance(error, DeviceError) else errno.EIO

@@ -18,6 +18,13 @@ class Engine(Protocol):
 
     tick_hz: float
 
+    @property
+    def publishes(self) -> bool:
+        """Whether every tick publishes all blocks."""
+
+    def as_of_ns(self, block: AnyBlock, stamp_ns: int) -> int:
+        """Return the instant before which everything shows in a publication that is made now [ns]."""
+
     def tick(self, now_ns: int) -> None:
         """Do the work of one tick and publish."""
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import errno
 import os
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ from sioms.protocol.flags import Access, Right
 from sioms.protocol.messages import encode, refusal, reply
 
 from .blocks import AnyBlock
+from .effects import Effects
 
 if TYPE_CHECKING:
     from .writing import AxesWrite
@@ -45,6 +46,7 @@ class Handle:
         block: what it shows; ``channels`` of it, and one bit of them if ``bit`` >= 0.
         access: what it may do by its mode; ``exclusive`` says that it owns its channels.
         rights: what its user may do.
+        effects: the instant that its answers carry.
         lease_ns: longest silence allowed to the client, 0 = any.
         every: the client is woken by every n-th publication; 0 = not; -1 = when a binary edge came.
         writing: writes of axis records that are not in the buffers yet, the oldest first.
@@ -68,6 +70,7 @@ class Handle:
     rights: Right
     lease_ns: int
     heard_ns: int
+    effects: Effects
     every: int = 0
     countdown: int = 0
     writes_under_way: int = 0
@@ -83,11 +86,11 @@ class Handle:
 
     def answer(self, number: int, value: object = None) -> None:
         """Reply to a request; a client that does not read is found dead later, by its socket or its lease."""
-        self._send(reply(number, value))
+        self._send(reply(number, value, self.effects.last_ns))
 
     def refuse(self, number: int, errno_: int, text: str) -> None:
         """Refuse a request."""
-        self._send(refusal(number, errno_, text))
+        self._send(refusal(number, errno_, text, self.effects.last_ns))
 
     def tell_end(self, errno_: int, text: str) -> None:
         """Tell the client why its handle ends, before the socket closes."""
@@ -128,6 +131,7 @@ class Wait:
         ready: asked every tick; answers with (value,) when done, None while not; raises OSError to refuse.
         channels: axes it depends on: dropped buffers end it.
         cancelled: undoes what the wait has begun.
+        looks: it changes nothing, it only waits for what readings show.
     """
 
     handle: Handle
@@ -137,12 +141,18 @@ class Wait:
     ready: Callable[[], tuple[Any] | None]
     channels: frozenset[int] = frozenset()
     cancelled: Callable[[], None] | None = None
+    looks: bool = False
 
 
 class Waits:
-    """All waits of a driver process."""
+    """All waits of a driver process.
 
-    def __init__(self) -> None:
+    Args:
+        effects: where the effects of what has waited are noted.
+    """
+
+    def __init__(self, effects: Effects) -> None:
+        self._effects = effects
         self._waits: list[Wait] = []
 
     def add(self, wait: Wait) -> None:
@@ -156,8 +166,13 @@ class Waits:
         wait.handle.waits[wait.number] = wait
         self._waits.append(wait)
 
-    def check(self, now_ns: int) -> None:
-        """Answer what is ready or late; cheap when nothing waits."""
+    def check(self, now_ns: int, shown: Sequence[AnyBlock]) -> None:
+        """Answer what is ready or late; cheap when nothing waits.
+
+        Args:
+            now_ns: the time [ns].
+            shown: blocks that have just been published, as they are now.
+        """
         if not self._waits:
             return
         for wait in list(self._waits):
@@ -170,6 +185,8 @@ class Waits:
                 continue
             if done is not None:
                 self._remove(wait)
+                if not (wait.looks and any(wait.handle.block is block for block in shown)):
+                    self._effects.note()
                 wait.handle.answer(wait.number, done[0])
             elif wait.deadline_ns is not None and now_ns >= wait.deadline_ns:
                 self.end(wait, errno.ETIMEDOUT, f"{wait.what}: not within its time-out")

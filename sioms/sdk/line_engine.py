@@ -36,6 +36,7 @@ class _UnitState:
         self.due_ns = 0
         self.pause_ns = FIRST_PAUSE_NS
         self.fresh = False
+        self.as_of_ns = 0
 
 
 class LineEngine(Connected):
@@ -81,12 +82,17 @@ class LineEngine(Connected):
         state.busy = True
         if state.is_up:
             state.due_ns = max(state.due_ns + self._period_ns, now_ns)
-            steps, done = state.unit.poll(), self._polled
+            steps, done = self._poll(state), self._polled
         else:
             steps, done = state.unit.open(), self._opened
         self.guarded(
             lambda: line.submit(steps, Priority.POLL, lambda v, e: done(state, v, e), now_ns), now_ns
         )
+
+    def _poll(self, state: _UnitState) -> Steps:
+        """Poll a unit, and note when that began: what it was told until then shows in the readings."""
+        state.as_of_ns = self._runtime.as_of_ns()
+        yield from state.unit.poll()
 
     def _opened(self, state: _UnitState, _: Any, error: Exception | None) -> None:
         state.busy = False
@@ -111,7 +117,7 @@ class LineEngine(Connected):
             if state.misses >= state.unit.misses or isinstance(error, StateLost):
                 self._lose_unit(state, self._told(state.unit, error), now_ns)
             return
-        state.misses = 0
+        state.misses, as_of_ns = 0, state.as_of_ns
         if state.fresh:
             state.fresh = False
             self._runtime.set_link(state.unit.blocks, PageState.GOOD, "")
@@ -125,8 +131,8 @@ class LineEngine(Connected):
         if state.due_ns <= now_ns and self.line is not None and not state.busy and self._runtime.running:
             self._start(state, now_ns)
         for block in state.unit.blocks:
-            self._runtime.publish(block, block.stamp_ns or now_ns)
-        self._runtime.after_publication(now_ns)
+            self._runtime.pages.publish(block, block.stamp_ns or now_ns, self._runtime.tick, as_of_ns)
+        self._runtime.after_publication(now_ns, state.unit.blocks)
 
     def _told(self, unit: LineUnit, error: Exception) -> str:
         """Return what failed of which unit, and what to look at unless the driver has said so."""
@@ -179,6 +185,10 @@ class LineEngine(Connected):
             self._take_actions(state, block, now_ns)
         state.due_ns = min(state.due_ns, now_ns)  # look at once what it did
 
+    def as_of_ns(self, block: AnyBlock, stamp_ns: int) -> int:
+        """Return when the present poll of the block's unit began."""
+        return self._by_block[id(block)].as_of_ns
+
     def write_outputs(
         self,
         handle: Handle | None,
@@ -219,6 +229,8 @@ class LineEngine(Connected):
                 if error is not None:
                     self._runtime.log("error", f"{state.unit.name}: safe outputs could not be set: {error}")
             elif error is None:
+                self._runtime.effects.note()
+                self.acted(block)
                 handle.answer(number, self._runtime.tick)
             else:
                 errno_ = error.errno if isinstance(error, DeviceError) else errno.EIO
@@ -227,6 +239,11 @@ class LineEngine(Connected):
         priority = Priority.STOP if handle is None else Priority.OUTPUT
         self.guarded(lambda: line.submit(steps, priority, done, now_ns), now_ns)
         return LATER
+
+    def acted(self, block: AnyBlock) -> None:
+        """Look at once what it did: who reads waits for the poll."""
+        state = self._by_block[id(block)]
+        state.due_ns = min(state.due_ns, self._runtime.now_ns())
 
     def commands_written(self, block: AnyBlock) -> None:
         """Send at once what the bank has to send."""

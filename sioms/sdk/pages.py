@@ -38,6 +38,7 @@ class Pages:
         self._subscribers: dict[int, list[Handle]] = {id(block): [] for block in blocks}
         self._edges: dict[int, int] = {}
         self._links: dict[int, tuple[PageState, str]] = {}
+        device_number = int.from_bytes(os.urandom(8), "little") or 1
         for block in blocks:
             spec = block.spec
             size = -(-page_size(spec.node_class, block.n, spec.history) // PAGE) * PAGE
@@ -45,7 +46,9 @@ class Pages:
             os.ftruncate(fd, size)
             self.fds.append(fd)
             memory = memoryview(mmap.mmap(fd, size))
-            writer = PageWriter(memory, spec.node_class, block.n, spec.history, lease_ns, generation)
+            writer = PageWriter(
+                memory, spec.node_class, block.n, spec.history, lease_ns, generation, device_number
+            )
             writer.alive(time.monotonic_ns())
             self._writers[id(block)] = writer
 
@@ -54,10 +57,10 @@ class Pages:
         for writer in self._writers.values():
             writer.alive(now_ns)
 
-    def publish(self, block: AnyBlock, stamp_ns: int, tick: int) -> None:
+    def publish(self, block: AnyBlock, stamp_ns: int, tick: int, as_of_ns: int) -> None:
         """Publish a block and wake who subscribed to it."""
         key = id(block)
-        self._writers[key].publish(block.payload(), stamp_ns, tick)
+        self._writers[key].publish(block.payload(), stamp_ns, tick, as_of_ns)
         subscribers = self._subscribers[key]
         if subscribers:
             self._wake(block, subscribers)

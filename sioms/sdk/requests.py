@@ -32,6 +32,12 @@ def _refuse(errno_: int, text: str) -> OSError:
     return OSError(errno_, text)
 
 
+LOOKS = frozenset(
+    {
+        Request.WAIT_UNTIL_IDLE, Request.GET_LIMITS, Request.GET_GAINS, Request.GET_STATISTICS, Request.GET_PARTICULARS,
+    }
+)  # fmt: skip
+"""Requests that change nothing that readings show; of all others a reading after the answer shows the effect."""
 _NEEDS_OWNER = {
     Request.CALIBRATE_DEVICE, Request.HOME, Request.SET_LIMITS, Request.FLUSH, Request.ZERO_DEVICE, Request.SET_GAINS,
 }  # fmt: skip
@@ -129,12 +135,14 @@ def _axis_request(
     match request:
         case Request.WAIT_UNTIL_IDLE:
             if bank.is_idle(axes):
+                if not runtime.engine.publishes:  # it may have learned so since the last publication
+                    runtime.effects.note()
                 return None
             channels = frozenset(int(a) for a in axes)
             runtime.waits.add(
                 Wait(
                     handle, number, what, runtime.deadline(timeout_s),
-                    lambda: (None,) if bank.is_idle(axes) else None, channels,
+                    lambda: (None,) if bank.is_idle(axes) else None, channels, looks=True,
                 )
             )  # fmt: skip
             return LATER

@@ -35,6 +35,7 @@ from sioms.protocol.stopfile import StopRequest
 from .attachments import Attachments
 from .blocks import AnyBlock, AxisBlock, set_alarms
 from .driver import Driver, LineDriver, StreamDriver, TickDriver
+from .effects import Effects
 from .engine import Engine
 from .handles import Waits
 from .inputs import Input
@@ -93,7 +94,9 @@ class Runtime:
         self.device = device
         self.tick = 0
         self.running = True
-        self.waits = Waits()
+        self.effects = Effects()
+        self.waits = Waits(self.effects)
+        self.looked_ns = 0
         self.outputs: dict[tuple[int, int], float] = {}
         self.statistics = TickStatistics()
         self.line_due: Callable[[], None] = lambda: None
@@ -141,13 +144,17 @@ class Runtime:
 
     def publish(self, block: AnyBlock, stamp_ns: int) -> None:
         """Publish a block and wake who subscribed to it."""
-        self.pages.publish(block, stamp_ns, self.tick)
+        self.pages.publish(block, stamp_ns, self.tick, self.engine.as_of_ns(block, stamp_ns))
 
     # --- services to engine and requests ---------------------------------------------------------
 
     def now_ns(self) -> int:
         """Return the time [ns, CLOCK_MONOTONIC]."""
         return time.monotonic_ns()
+
+    def as_of_ns(self) -> int:
+        """Return an instant before which all that was asked for has been heeded: now, unless there is something new."""
+        return time.monotonic_ns() if self.stops.is_up_to_date else self.looked_ns
 
     def deadline(self, timeout_s: float | None) -> int | None:
         """Return when a time-out that begins now ends [ns]."""
@@ -192,15 +199,16 @@ class Runtime:
         for block in blocks:
             if isinstance(block, AxisBlock):
                 block.bank.fault(np.arange(block.n), reason, now_ns)
+        self.effects.note()
         self.set_link(blocks, PageState.LINK_LOST, reason)
         self.take_events()
         ours = {id(block) for block in blocks}
         self.waits.end_where(lambda w: id(w.handle.block) in ours, errno.EIO, reason)
 
-    def after_publication(self, now_ns: int) -> None:
-        """Look at what a publication may have brought about."""
+    def after_publication(self, now_ns: int, shown: Sequence[AnyBlock]) -> None:
+        """Look at what a publication of some blocks may have brought about."""
         self.take_events()
-        self.waits.check(now_ns)
+        self.waits.check(now_ns, shown)
         self.stops.look_at_inputs()
 
     def end_axis_waits(self, block: AnyBlock, axes: Any, errno_: int, text: str) -> None:
@@ -244,6 +252,7 @@ class Runtime:
         self._timer.set(self._scheduled_ns + 2 * self.period_ns - self._lead_ns, self.period_ns)
         status = 0
         try:
+            self.looked_ns = time.monotonic_ns()
             self.stops.look()
             self._tick_and_publish(self._scheduled_ns)  # who opens a node at once finds readings
             self._scheduled_ns += self.period_ns
@@ -274,7 +283,7 @@ class Runtime:
             slack_ns = engine.warm_up(scheduled_ns)
         began_ns = time.monotonic_ns()
         self.tick += 1
-        self.stops.heed()
+        self._look_around(began_ns)
         if began_ns - self.latch.daemon_alive_ns > self._daemon_lease_ns:
             self._miss_daemon()
         elif self._daemon_late:
@@ -282,7 +291,7 @@ class Runtime:
         self.clients.check_leases(began_ns)
         ticked_ns = self._tick_and_publish(scheduled_ns)
         self._spare_until_ns = ticked_ns + self.period_ns // 4
-        self.after_publication(ticked_ns)
+        self.after_publication(ticked_ns, self.blocks if engine.publishes else ())
         ended_ns = time.monotonic_ns()
         self.statistics.record(scheduled_ns, began_ns, self.driver.inputs_ns, ticked_ns, ended_ns)
         if self._ending_ns:
@@ -292,6 +301,18 @@ class Runtime:
                 engine.slack(ended_ns, scheduled_ns + self.period_ns)
                 slack_ns = time.monotonic_ns() - ended_ns
             self.statistics.record_slack(slack_ns)
+
+    def _look_around(self, began_ns: int) -> None:
+        """Heed what the daemon and the latch ask for; what was asked for before ``began_ns`` is done with this tick."""
+        if self.stops.heed_orders():
+            self._hear_orders()
+        self.looked_ns = began_ns
+        self.stops.heed()
+
+    def _hear_orders(self) -> None:
+        """Obey all that the daemon has sent."""
+        while self.running and self._take_order():
+            pass
 
     def _tick_and_publish(self, scheduled_ns: int) -> int:
         """Return when the tick itself was done."""
@@ -391,6 +412,7 @@ class Runtime:
                 continue
             for event in block.bank.take_events():
                 if event.kind in (EventKind.DROPPED, EventKind.FAULT):
+                    self.effects.note()
                     self.end_axis_waits(block, event.axes, event.errno or errno.EIO, event.text)
                     if event.kind is EventKind.FAULT:
                         names = ", ".join(block.spec.channels[a].name for a in event.axes[:4])
@@ -418,18 +440,24 @@ class Runtime:
 
     def _control_readable(self) -> None:
         for _ in range(PACKETS_A_TURN):
-            try:
-                packet, fds, _, _ = socket.recv_fds(self._control, MAX_PACKET, 8)
-            except BlockingIOError:
+            if not self._take_order():
                 return
-            except OSError:
-                packet, fds = b"", []
-            if not packet:
-                self.unwatch(self._control.fileno())
-                self.end("the daemon has gone")
-                return
-            message: list[Any] = decode(packet)
-            self._obey(DriverVerb(message[0]), message[2:], fds)
+
+    def _take_order(self) -> bool:
+        """Obey one message of the daemon; return whether there was one."""
+        try:
+            packet, fds, _, _ = socket.recv_fds(self._control, MAX_PACKET, 8)
+        except BlockingIOError:
+            return False
+        except OSError:
+            packet, fds = b"", []
+        if not packet:
+            self.unwatch(self._control.fileno())
+            self.end("the daemon has gone")
+            return False
+        message: list[Any] = decode(packet)
+        self._obey(DriverVerb(message[0]), message[2:], fds)
+        return True
 
     def _obey(self, verb: DriverVerb, arguments: list[Any], fds: list[int]) -> None:
         match verb:

@@ -46,6 +46,7 @@ class Stops:
         self._request = request
         self._sources = [tuple(source) for source in sources]
         self._seen = (0, latch.resets, request.mark)
+        self._orders = latch.orders
 
     @property
     def source(self) -> str:
@@ -59,6 +60,22 @@ class Stops:
         if self._latch.stop(time.monotonic_ns(), source):
             self._runtime.tell(DriverVerb.STOPPED, source)
         self.look()
+
+    @property
+    def is_up_to_date(self) -> bool:
+        """Whether all that latch, request page and daemon ask for has been seen."""
+        latch = self._latch
+        return (
+            latch.stopped_ns, latch.resets, self._request.mark
+        ) == self._seen and latch.orders == self._orders  # fmt: skip
+
+    def heed_orders(self) -> bool:
+        """Return whether the daemon has sent orders since the last look; cheap."""
+        orders = self._latch.orders
+        if orders == self._orders:
+            return False
+        self._orders = orders
+        return True
 
     def heed(self) -> None:
         """Look whether the emergency stop, or its reset, has come since the last look; cheap."""
@@ -76,10 +93,12 @@ class Stops:
         stopped_ns, resets = latch.stopped_ns, latch.resets
         self._seen = (stopped_ns, resets, mark)
         if (stopped_ns and stopped_ns != seen_stop) or resets != seen_resets:
+            self._runtime.effects.note()
             self._stop_all()
         if fresh:
             self._request.take(mark)
         if not stopped_ns and self.stopped:
+            self._runtime.effects.note()
             self.stopped = False
             self.latched_outputs.clear()
             for block in self._runtime.blocks:
@@ -123,6 +142,7 @@ class Stops:
     def stop_node(self, block: AnyBlock, channels: Any, source: str) -> None:
         """Emergency stop of some channels: latched until reset."""
         runtime = self._runtime
+        runtime.effects.note()
         if isinstance(block, AxisBlock):
             block.bank.emergency_stop(channels, time.monotonic_ns())
             runtime.engine.stop([block])
@@ -139,6 +159,7 @@ class Stops:
         """
         if self.stopped:
             raise OSError(errno.EPERM, f"{what}: the whole workcell is stopped ({self.source}); reset that")
+        self._runtime.effects.note()
         if isinstance(block, AxisBlock):
             self._reset_axes(block, channels)
         else:

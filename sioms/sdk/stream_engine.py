@@ -99,7 +99,11 @@ class StreamEngine(Connected):
                 self._runtime.set_link(self._driver.blocks, PageState.GOOD, "")
                 self._pause_ns = FIRST_PAUSE_NS
             self._good_ns, self._heard = now_ns, True
-            self._runtime.after_publication(now_ns)
+            self._runtime.after_publication(now_ns, self._driver.blocks)
+
+    def as_of_ns(self, block: AnyBlock, stamp_ns: int) -> int:
+        """Return when the sample was taken: what the device was told after that, it cannot show."""
+        return min(stamp_ns, self._runtime.now_ns())
 
     def write_outputs(
         self,

@@ -70,6 +70,10 @@ class TickEngine:
         """Whether there are readings to publish."""
         return self._is_open
 
+    def as_of_ns(self, block: AnyBlock, stamp_ns: int) -> int:
+        """Return when this tick began: nothing is served in the middle of one."""
+        return self._runtime.looked_ns
+
     def write_outputs(
         self,
         handle: Handle | None,

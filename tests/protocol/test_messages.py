@@ -54,6 +54,8 @@ GOLDEN = [
     (reply(9), "940009" + "00c0"),
     (reply(9, [1, 2]), "94000900920102"),
     (refusal(9, 16, "held"), "94000910a468656c64"),
+    (reply(9, None, 1 << 40), "96000900c0c2cf0000010000000000"),
+    (refusal(9, 16, "held", 1 << 40), "96000910a468656c64c2cf0000010000000000"),
 ]  # fmt: skip
 
 
@@ -106,12 +108,14 @@ def test_a_long_reply_is_compressed_and_one_too_long_is_a_refusal() -> None:
     message = decode(packet)
     assert message[:3] == [0, 7, 0] and message[4] is True and value_of(message) == value
     assert value_of(decode(reply(7, [1]))) == [1]
+    assert value_of(decode(reply(7, [1], 99))) == [1] and decode(reply(7, [1], 99))[5] == 99
+    assert decode(reply(7, value, 99))[5] == decode(refusal(7, 5, "no", 99))[5] == 99
     noise = random.Random(1).randbytes(2 * MAX_PACKET)
     refused = decode(reply(7, noise))
     assert refused[2] == errno.EMSGSIZE and str(MAX_PACKET) in refused[3]
     for odd in (b"", b"nonsense", None, packet):
         with pytest.raises(MalformedMessage):
-            value_of([0, 7, 0, odd, True])
+            value_of([0, 7, 0, odd, True, 0])
 
 
 NUMBERS = {

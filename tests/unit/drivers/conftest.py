@@ -89,7 +89,7 @@ class Bench:
     def _publish(self, block, stamp_ns):
         writer = next(writer for candidate, writer in self._pages if candidate is block)
         writer.alive(self.now_ns)
-        writer.publish(block.payload(), stamp_ns, 0)
+        writer.publish(block.payload(), stamp_ns, 0, 0)
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ CHANNELS = 3
 class Page:
     def __init__(self, node_class: NodeClass = NodeClass.ANALOG, slots: int = 4) -> None:
         self.buffer = bytearray(page_size(node_class, CHANNELS, slots))
-        self.writer = PageWriter(memoryview(self.buffer), node_class, CHANNELS, slots, LEASE_NS, 7)
+        self.writer = PageWriter(memoryview(self.buffer), node_class, CHANNELS, slots, LEASE_NS, 7, 99)
         self.payload = bytearray(slot_size(node_class, CHANNELS) - SLOT_HEADER)
 
     def reader(self) -> PageReader:
@@ -47,20 +47,20 @@ class Page:
     def publish(self, value: int) -> None:
         for i in range(0, len(self.payload), 8):
             pack_into("<q", self.payload, i, value)
-        self.writer.publish(memoryview(self.payload), 1000 + value, 2000 + value)
+        self.writer.publish(memoryview(self.payload), 1000 + value, 2000 + value, 3000 + value)
         self.writer.alive(1000 + value)
 
 
 def test_header_is_as_documented() -> None:
     page = Page(NodeClass.AXIS, 8)
     assert bytes(page.buffer[:8]) == b"SIOMSpg1"
-    assert unpack_from("<IIII", page.buffer, 8) == (1, NodeClass.AXIS, CHANNELS, 13)
+    assert unpack_from("<IIII", page.buffer, 8) == (2, NodeClass.AXIS, CHANNELS, 13)
     assert unpack_from("<QQQQQ", page.buffer, 24) == (8, 32 + 8 * 13 * CHANNELS, HEADER_SIZE, LEASE_NS, 7)
     assert unpack_from("<II", page.buffer, 64) == (PageState.STARTING, PageState.GOOD)
     page.publish(5)
-    assert unpack_from("<QQ", page.buffer, 72) == (1, 1005)
+    assert unpack_from("<QQQ", page.buffer, 72) == (1, 1005, 99) and page.reader().device == 99
     slot = HEADER_SIZE + 1 * slot_size(NodeClass.AXIS, CHANNELS)
-    assert unpack_from("<QQQQ", page.buffer, slot) == (1, 1005, 2005, 0)
+    assert unpack_from("<QQQQ", page.buffer, slot) == (1, 1005, 2005, 3005)
 
 
 @pytest.mark.parametrize("slots", [0, 1, 2, 3, 5, 6, 100])
@@ -69,11 +69,11 @@ def test_a_ring_is_a_power_of_two_from_four_on(slots: int) -> None:
         PageWriter(memoryview(bytearray(1 << 16)), NodeClass.ANALOG, 1, slots, 1, 1)
 
 
-@pytest.mark.parametrize("head", [b"SIOMSpg2\1\0\0\0", b"SIOMSpg1\2\0\0\0", bytes(12)])
+@pytest.mark.parametrize("head", [b"SIOMSpg2\2\0\0\0", b"SIOMSpg1\1\0\0\0", bytes(12)])
 def test_what_is_no_page_is_refused(head: bytes) -> None:
     page = Page()
     page.buffer[:12] = head
-    with pytest.raises(PageError, match="want b'SIOMSpg1', 1"):
+    with pytest.raises(PageError, match="want b'SIOMSpg1', 2"):
         page.reader()
 
 
@@ -224,7 +224,7 @@ def test_a_reader_in_another_process_sees_only_whole_snapshots() -> None:
         number = 0
         while not done.is_set():
             number += 1
-            writer.publish(memoryview(number.to_bytes(8, "little") * (13 * 50)), 0, 0)
+            writer.publish(memoryview(number.to_bytes(8, "little") * (13 * 50)), 0, 0, 0)
 
     thread = threading.Thread(target=write, daemon=True)
     thread.start()

@@ -1,0 +1,71 @@
+"""What the open nodes of this process owe to acknowledgements: no reading older than what was acknowledged.
+
+An acknowledgement carries the instant of its effect, a snapshot the instant up to which it shows everything
+(``sioms.protocol.page``). All nodes of a device learn of an acknowledgement that any of them has got, all nodes
+of the process of what the daemon has acknowledged: a stop, a reset, a signal. A node that owes nothing pays
+one comparison for that in ``read``.
+
+Concurrency: any thread.
+"""
+
+from __future__ import annotations
+
+from _thread import allocate_lock
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from .node_core import NodeCore
+
+MOST_DEVICES = 256
+"""Driver processes remembered without an open node; those of before a restart are of no use any more."""
+
+_lock = allocate_lock()
+_nodes: dict[int, list[NodeCore]] = {}
+_last_ns: dict[int, int] = {}
+_everywhere_ns = 0
+
+
+def join(node: NodeCore, device: int) -> None:
+    """Let an open node of a driver process owe what has been acknowledged so far."""
+    with _lock:
+        _nodes.setdefault(device, []).append(node)
+        node.owed_ns = max(_last_ns.get(device, 0), _everywhere_ns)
+
+
+def leave(node: NodeCore, device: int) -> None:
+    """Forget a node that is closed."""
+    with _lock:
+        nodes = _nodes.get(device, [])
+        if node in nodes:
+            nodes.remove(node)
+        if not nodes:
+            _nodes.pop(device, None)
+            for old in [d for d in _last_ns if d not in _nodes][: max(0, len(_last_ns) - MOST_DEVICES)]:
+                del _last_ns[old]
+
+
+def acknowledged(device: int, as_of_ns: int) -> None:
+    """Let the nodes of a driver process show nothing that ends before an instant."""
+    with _lock:
+        if as_of_ns > _last_ns.get(device, 0):
+            _last_ns[device] = as_of_ns
+            for node in _nodes.get(device, ()):
+                if as_of_ns > node.owed_ns:
+                    node.owed_ns = as_of_ns
+
+
+def acknowledged_by_daemon(as_of_ns: int) -> None:
+    """Let all nodes show nothing that ends before an instant."""
+    global _everywhere_ns
+    with _lock:
+        _everywhere_ns = max(_everywhere_ns, as_of_ns)
+        for nodes in _nodes.values():
+            for node in nodes:
+                node.owed_ns = max(node.owed_ns, as_of_ns)
+
+
+def paid(node: NodeCore, as_of_ns: int) -> None:
+    """Note that a node has a snapshot that shows everything before an instant."""
+    with _lock:
+        if node.owed_ns <= as_of_ns:
+            node.owed_ns = 0
