@@ -276,8 +276,8 @@ def _jog_keys(typed: str) -> list[str]:
     """Return the keys of a burst if all of them are for jogging, else nothing.
 
     Example:
-        >>> _jog_keys("\\x1b[C\\x1b[C"), _jog_keys("+q")
-        (['\x1b[C', '\x1b[C'], [])
+        >>> _jog_keys("+>>"), _jog_keys("+q")
+        (['+', '>', '>'], [])
     """
     keys = []
     while typed:
