@@ -1,7 +1,8 @@
 """Trinamic modules and evaluation boards on TMCL, up to six motors a module.
 
 The module makes its own ramps. Its serial heartbeat (global parameter 68) is the dead-man: without a request for that long
-the motors stop.
+the motors stop. A module that restarts has neither heartbeat nor ramps nor place; every poll proves that it has not. One that is out of
+step, so that not even a stop reaches it, is brought back by single bytes (sioms.sdk.codec.tmcl.Framing).
 
     [device.mod0]
     driver = "tmcl"
@@ -20,7 +21,7 @@ from __future__ import annotations
 
 import errno
 import math
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -31,10 +32,10 @@ from sioms.motion import DriveAction
 from sioms.protocol.flags import ControlMode
 from sioms.sdk import drive_axes
 from sioms.sdk.blocks import BlockSpec, Description
-from sioms.sdk.codec.tmcl import SERIAL_HEARTBEAT, SIZE, Axis, Module, Op
+from sioms.sdk.codec.tmcl import SERIAL_HEARTBEAT, SIZE, TICKS, Axis, Framing, Module, Op, separator
 from sioms.sdk.drive_axes import BANK_MODES, POSITION_MODES, AxesUnit, DriveSettings, drive_table
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
-from sioms.sdk.exchange import DeviceError, Steps
+from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Pause, Send, StateLost, Steps
 from sioms.sdk.golden import Golden
 
 MODES = BANK_MODES | POSITION_MODES | ControlMode.VELOCITY
@@ -47,6 +48,12 @@ EXTENDED_FAULTS = {1: "motor stalled", 2: "deviation from the encoder too large"
 """Bits of axis parameter 207."""
 FAULT_BITS = {Axis.DRIVER_ERRORS: DRIVER_FAULTS, Axis.EXTENDED_ERRORS: EXTENDED_FAULTS}
 SELDOM_NS = 500_000_000
+PAD_S = 0.01
+"""How long after a single byte, beside the time of the characters, the module has to say that it was the ninth."""
+DRIFT, JITTER_MS, TICKS_MS = 0.1, 200, 1000
+"""How far the module's clock may be from this one: part of the time since a reading, and more [ms]; after how long that is renewed [ms]."""
+ROUNDING = {Axis.MAX_SPEED: 2, Axis.MAX_ACCELERATION: 256}
+"""By how much, beside 2 %, a ramp may read otherwise than it was set: modules hold it in steps of their own."""
 
 AxisTable: Any = drive_table(
     {
@@ -172,20 +179,25 @@ class TmclUnit(AxesUnit):
         line = settings.line
         on_line_s = SIZE * line.bits_per_character / line.baud if line.serial else 0.0
         self._module = Module(settings.address, settings.host_address, settings.turnaround_s + on_line_s)
+        self.framing = Framing(settings.address)
+        self._pad_s = PAD_S + on_line_s * (SIZE + 1) / SIZE
         self._motors = [axis.motor for axis in settings.axis]
         self._scales = [Scale.of(axis, settings) for axis in settings.axis]
-        self._ramps: dict[tuple[int, int], int] = {}
+        self._ramps: dict[tuple[int, Axis], int] = {}
+        self._has_ticks = True
+        self._ticks: tuple[int, int, int] | None = None
+        self._turn = 0
+        self._lost = ""
         self._homes = [False] * len(self._motors)
         self._faults = [""] * len(self._motors)
         self._without: set[int] = set()
         self._seldom_ns = 0
 
     def open(self) -> Steps:
-        """Identify the module, stop its motors, and set its heartbeat."""
-        self._ramps.clear()
-        self._homes = [False] * len(self._motors)
+        """Identify the module, stop what moves it, arm its heartbeat and set its limits; all are read back."""
         settings, module = self._settings, self._module
-        version = yield module.exchange(Op.VERSION, 1)
+        self._homes = [False] * len(self._motors)
+        version = yield from self._ask(module.exchange(Op.VERSION, 1), search=True)
         number, firmware = version >> 16 & 0xFFFF, version & 0xFFFF
         if settings.module and number != settings.module:
             text = (
@@ -194,29 +206,62 @@ class TmclUnit(AxesUnit):
             raise DeviceError(
                 errno.ENODEV, f"{text}configuration says {settings.module}; check address and wiring"
             )
-        yield from self._end_searches()
+        yield from self._end_programs()
         yield from self.stop()
-        wanted = round(settings.heartbeat_s * 1000)
+        self._lost = self._lost or (yield from self._what_is_lost())
+        yield from self._arm()
+        yield from self._limit()
+        if self._lost:
+            self._lose_place(self._lost)
+            self._lost = ""
+
+    def _arm(self) -> Steps:
+        """Set the heartbeat, and read it back."""
+        wanted = round(self._settings.heartbeat_s * 1000)
         try:
-            present = yield module.exchange(Op.GGP, SERIAL_HEARTBEAT)
+            present = yield from self._ask(self._module.exchange(Op.GGP, SERIAL_HEARTBEAT))
             if present != wanted:  # never written without need: some modules keep it in their EEPROM
-                yield module.exchange(Op.SGP, SERIAL_HEARTBEAT, 0, wanted)
+                yield from self._ask(
+                    self._module.exchange(Op.SGP, SERIAL_HEARTBEAT, 0, wanted), repeatable=True
+                )
+                present = yield from self._ask(self._module.exchange(Op.GGP, SERIAL_HEARTBEAT))
         except DeviceError as error:
             if wanted:
                 text = f"{error}; the module has no heartbeat, heartbeat_s = 0 accepts that its motors go on"
                 raise DeviceError(error.errno, f"{text} when the host dies") from None
+            return
+        if present != wanted:
+            text = f"arm {self.name}: the serial heartbeat (global parameter 68) reads {present} ms, {wanted} was set"
+            raise DeviceError(errno.EIO, f"{text}; heartbeat_s = {present / 1000:g} is what the module takes")
+
+    def _limit(self) -> Steps:
+        """Set the ramps of all motors to the limits of the axes, so that nobody's own are in force, and read them back."""
+        for axis, scale in enumerate(self._scales):
+            settings = self._settings.axis[axis]
+            for parameter, value in (
+                (Axis.MAX_ACCELERATION, scale.acceleration(settings.acceleration_max)),
+                (Axis.MAX_SPEED, scale.speed(settings.velocity_max)),
+            ):
+                yield from self._ramp(axis, parameter, value)
+                present = yield from self._ask(self._module.get(parameter, self._motors[axis]))
+                if not _is_near(parameter, present, value):
+                    text = f"limit motor {self._motors[axis]} of {self.name}: parameter {int(parameter)} reads {present}"
+                    raise DeviceError(errno.ERANGE, f"{text}, {value} was set; the module cannot do it")
 
     def poll(self) -> Steps:
         """Read positions, speeds and ends of all motors, and now and then their errors."""
+        yield from self._prove()
         n = len(self._motors)
         position, velocity = np.zeros(n), np.zeros(n)
         moving, done = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         for axis, (motor, scale) in enumerate(zip(self._motors, self._scales, strict=True)):
             # before the position, which the end of a search changes
-            searches = self._homes[axis] and (yield self._module.exchange(Op.RFS, 2, motor)) != 0
-            steps = yield self._module.get(Axis.ACTUAL_POSITION, motor)
-            speed = yield self._module.get(Axis.ACTUAL_SPEED, motor)
-            reached = yield self._module.get(Axis.POSITION_REACHED, motor)
+            searches = (
+                self._homes[axis] and (yield from self._ask(self._module.exchange(Op.RFS, 2, motor))) != 0
+            )
+            steps = yield from self._ask(self._module.get(Axis.ACTUAL_POSITION, motor))
+            speed = yield from self._ask(self._module.get(Axis.ACTUAL_SPEED, motor))
+            reached = yield from self._ask(self._module.get(Axis.POSITION_REACHED, motor))
             position[axis] = steps / scale.per_unit
             velocity[axis] = speed / (scale.per_speed * scale.per_unit)
             moving[axis], done[axis] = speed != 0, bool(reached)
@@ -229,30 +274,31 @@ class TmclUnit(AxesUnit):
         self.report(position, velocity, moving, done, self._faults)
 
     def start_position(self, axis: int, position: float, speed: float, action: DriveAction) -> Steps:
-        """Set the ramp where it differs, and move."""
+        """Set the ramp, and move."""
         motor, scale = self._motors[axis], self._scales[axis]
         yield from self._ramp(axis, Axis.MAX_ACCELERATION, scale.acceleration(action.acceleration_max))
         yield from self._ramp(axis, Axis.MAX_SPEED, scale.speed(speed))
-        yield self._module.exchange(Op.MVP, 0, motor, scale.position(position))
+        yield from self._ask(self._module.exchange(Op.MVP, 0, motor, scale.position(position)))
 
     def start_velocity(self, axis: int, velocity: float, action: DriveAction) -> Steps:
         """Turn right or left."""
         scale = self._scales[axis]
         yield from self._ramp(axis, Axis.MAX_ACCELERATION, scale.acceleration(action.acceleration_max))
         op = Op.ROR if velocity * scale.per_unit >= 0 else Op.ROL
-        yield self._module.exchange(op, 0, self._motors[axis], scale.speed(velocity))
+        yield from self._ask(self._module.exchange(op, 0, self._motors[axis], scale.speed(velocity)))
 
     def halt(self, axis: int, *, fastest: bool) -> Steps:
         """Stop a motor: MST brakes with the ramp's acceleration, and there is nothing faster; a search ends first."""
         motor = self._motors[axis]
         if self._homes[axis]:
             self._homes[axis] = False
-            yield self._module.exchange(Op.RFS, 1, motor)
-        yield self._module.exchange(Op.MST, 0, motor)
+            with suppress(DeviceError):  # the stop must go out all the same
+                yield from self._ask(self._module.exchange(Op.RFS, 1, motor), search=True, repeatable=True)
+        yield from self._ask(self._module.exchange(Op.MST, 0, motor), search=True)
 
     def home(self, axis: int) -> Steps:
         """Begin the module's reference search."""
-        yield self._module.exchange(Op.RFS, 0, self._motors[axis])
+        yield from self._ask(self._module.exchange(Op.RFS, 0, self._motors[axis]))
         self._homes[axis] = True
 
     def reset(self, axis: int) -> Steps:
@@ -262,19 +308,143 @@ class TmclUnit(AxesUnit):
         if self._faults[axis]:
             raise DeviceError(errno.EIO, self._faults[axis])
 
-    def _end_searches(self) -> Steps:
-        """End reference searches that a process before this one began: MST stops the motor, the search may start it again."""
+    # --- the line ----------------------------------------------------------------------------------
+
+    def _ask(
+        self, exchange: Exchange, *, search: bool = False, repeatable: bool = False
+    ) -> Generator[Any, Any, Any]:
+        """Carry out an exchange; where it fails, bring the module into step, and repeat what may be.
+
+        Args:
+            exchange: to be carried out.
+            search: the module may be of a kind that does not answer a wrong checksum, which takes long to find out.
+            repeatable: though the codec does not know that it is.
+        """
+        repeatable = repeatable or exchange.repeatable
+        if self.framing.unanswered:
+            yield from self._into_step(search=search)
+        try:
+            return (yield self.framing.watched(exchange))
+        except LinkError as error:
+            if error.heard and repeatable and not self.framing.refused:  # a damaged reply: it is in step
+                with suppress(LinkError):
+                    return (yield self.framing.watched(exchange))
+            yield from self._into_step(search=search)
+            if not repeatable:
+                raise
+        return (yield self.framing.watched(exchange))
+
+    def _into_step(self, *, search: bool) -> Steps:
+        """Send single bytes until the module answers that nine of them were no telegram.
+
+        A stop may come in between and do the same; then there is nothing left to do.
+        """
+        for _ in range(SIZE):
+            if not self.framing.unanswered:
+                return
+            yield Send(self.framing.next_pad(), "a single byte, to get into step")
+            yield Pause(self._pad_s)
+        if search:
+            yield from self._search()
+
+    def _search(self) -> Steps:
+        """Find the step of a module that passes over a wrong checksum: shift by a byte and ask, nine times."""
+        ask = self._module.exchange(Op.VERSION, 1)
+        between = bytes((separator(ask.data),))
+        for _ in range(SIZE):
+            if not self.framing.unanswered:
+                return
+            yield Send(between, "a single byte, to get into step")
+            with suppress(LinkError):
+                yield self.framing.watched(ask)
+
+    # --- what must hold ----------------------------------------------------------------------------
+
+    def _prove(self) -> Steps:
+        """Prove that the module has not restarted, and one by one that the heartbeat and all ramps are as they were set.
+
+        Raises:
+            StateLost: they are not; the kit opens the module again.
+        """
+        self._lost = yield from self._time_jumped()
+        heartbeat = [None] if self._settings.heartbeat_s else []
+        turns = heartbeat + list(self._ramps)
+        self._turn = (self._turn + 1) % len(turns)
+        key, lost = turns[self._turn], self._lost
+        if heartbeat and not lost and (key is None or not self._has_ticks):
+            lost = yield from self._heartbeat_lost()
+        if key is not None and not lost:
+            lost = yield from self._ramp_lost(*key)
+        if lost:
+            self._lost = self._lost or ("" if self._has_ticks else lost)
+            raise StateLost(f"{self.name}: {lost}: it restarted, or somebody else has set it")
+
+    def _what_is_lost(self) -> Generator[Any, Any, str]:
+        """Return how a module that was opened before shows that it restarted since, so that its place is not to be trusted."""
+        if not self._ramps:
+            return ""
+        lost: str = yield from self._time_jumped()
+        if self._has_ticks:
+            return lost
+        if self._settings.heartbeat_s:
+            lost = yield from self._heartbeat_lost()
+        for axis, parameter in list(self._ramps):
+            lost = lost or (yield from self._ramp_lost(axis, parameter))
+        return lost
+
+    def _time_jumped(self) -> Generator[Any, Any, str]:
+        """Return what is wrong with the module's clock, '' when it went on as this one did, or when it has none."""
+        if not self._has_ticks:
+            return ""
+        asked_ns = self.clock()
+        try:
+            ticks = yield from self._ask(self._module.exchange(Op.GGP, TICKS))
+        except DeviceError:
+            self._has_ticks = False
+            return ""
+        answered_ns = self.clock()
+        before = self._ticks or (ticks, asked_ns, answered_ns)
+        passed = (ticks - before[0]) % 2**32
+        least, most = max(0, asked_ns - before[2]) / 1e6, (answered_ns - before[1]) / 1e6
+        if most > TICKS_MS or self._ticks is None:
+            self._ticks = ticks, asked_ns, answered_ns
+        if least * (1 - DRIFT) - JITTER_MS <= passed <= most * (1 + DRIFT) + JITTER_MS:
+            return ""
+        self._ticks = None
+        return f"the module's clock (parameter 132) went from {before[0]} to {ticks} ms in {most:.0f} ms"
+
+    def _heartbeat_lost(self) -> Generator[Any, Any, str]:
+        wanted = round(self._settings.heartbeat_s * 1000)
+        present = yield from self._ask(self._module.exchange(Op.GGP, SERIAL_HEARTBEAT))
+        return (
+            "" if present == wanted else f"the heartbeat (global parameter 68) is {present} ms, not {wanted}"
+        )
+
+    def _ramp_lost(self, axis: int, parameter: Axis) -> Generator[Any, Any, str]:
+        wanted, motor = self._ramps[axis, parameter], self._motors[axis]
+        present = yield from self._ask(self._module.get(parameter, motor))
+        if _is_near(parameter, present, wanted):
+            return ""
+        return f"parameter {int(parameter)} of motor {motor} is {present}, not {wanted}"
+
+    def _lose_place(self, text: str) -> None:
+        """Nobody knows where the axes are: the module counts from 0 where it started."""
+        every = list(range(len(self._motors)))
+        self.bank.set_homed(every, homed=False)
+        self.bank.fault(every, f"{self.name}: position lost: {text}: it restarted", self.clock())
+
+    def _end_programs(self) -> Steps:
+        """End what may start a motor again: a program in the module, and reference searches of a process before this one."""
+        with suppress(DeviceError):  # an evaluation board runs none
+            yield from self._ask(self._module.exchange(Op.END_PROGRAM), repeatable=True)
         for motor in self._motors:
             with suppress(DeviceError):  # there are modules without reference search
-                yield self._module.exchange(Op.RFS, 1, motor)
+                yield from self._ask(self._module.exchange(Op.RFS, 1, motor), repeatable=True)
 
     def _ramp(self, axis: int, parameter: Axis, value: int) -> Steps:
-        """Set a parameter of the ramp unless the module has it."""
-        key = (axis, int(parameter))
-        if self._ramps.get(key) != value:
-            self._ramps.pop(key, None)
-            yield self._module.set(parameter, self._motors[axis], value)
-            self._ramps[key] = value
+        """Set a parameter of the ramp; each time, for a module that restarted since has forgotten it."""
+        yield from self._ask(self._module.set(parameter, self._motors[axis], value), repeatable=True)
+        self._ramps[axis, parameter] = value
 
     def _read_faults(self) -> Steps:
         """Read the error flags of all motors; a module without them has none."""
@@ -284,7 +454,7 @@ class TmclUnit(AxesUnit):
                 if parameter in self._without:
                     continue
                 try:
-                    flags = yield self._module.get(parameter, motor)
+                    flags = yield from self._ask(self._module.get(parameter, motor))
                 except DeviceError:
                     self._without.add(parameter)
                     continue
@@ -338,7 +508,9 @@ class Tmcl(LineDriver):
         super().__init__(name, settings, kit)
         self.line = settings.line
         self.recovery_s = settings.recovery_s
-        self._units = (TmclUnit(name, settings, self.describe(name, settings).blocks[0], kit),)
+        unit = TmclUnit(name, settings, self.describe(name, settings).blocks[0], kit)
+        self.overheard = unit.framing.overheard
+        self._units = (unit,)
 
     @property
     def units(self) -> Sequence[LineUnit]:
@@ -351,6 +523,10 @@ def _axes(settings: TmclSettings) -> list[Any]:
         drive_axes.axis_settings(axis, MODES, homing=axis.homing, required=axis.home_required)
         for axis in settings.axis
     ]
+
+
+def _is_near(parameter: Axis, present: int, wanted: int) -> bool:
+    return abs(present - wanted) <= ROUNDING[parameter] + 0.02 * wanted
 
 
 def _check_heartbeat(settings: TmclSettings) -> None:

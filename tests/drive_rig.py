@@ -43,7 +43,9 @@ class Joined:
     def begin(self) -> None:
         """Make a new driver: the one before was killed, the device goes on."""
         settings = msgspec.convert(self._table, self._driver.Settings)
-        self.unit: Any = self._driver("mod0", settings, self).units[0]  # type: ignore[arg-type]
+        driver = self._driver("mod0", settings, self)  # type: ignore[arg-type]
+        self._overheard = driver.overheard
+        self.unit: Any = driver.units[0]
         self.unit.clock = lambda: round(self.now_s * 1e9)
 
     def log(self, level: str, text: str) -> None:
@@ -75,7 +77,10 @@ class Joined:
                     self.wait(max(0.001, len(data) * CHARACTER_S), look)
                     reply = b"".join(self.device.take(data))
                     self.wait(len(reply) * CHARACTER_S, look)
-                    if not isinstance(step, Send):
+                    if isinstance(step, Send):
+                        if self._overheard is not None and reply:
+                            self._overheard(reply, round(self.now_s * 1e9))
+                    else:
                         try:
                             value = self._decoded(step, reply)
                         except (LinkError, DeviceError) as error:

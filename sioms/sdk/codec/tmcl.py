@@ -1,16 +1,19 @@
 """Trinamic TMCL in its binary form, without I/O: nine bytes each way, closed by the sum of the first eight.
 
-There is nothing to resynchronise on, so after a bad or missing reply the line has to fall silent before the next request
-(``LineDriver.recovery_s``). Source: TMCL firmware manuals (TMCM-1140, TMCM-1276), chapter "TMCL and the TMCL-IDE".
+There is nothing to resynchronise on: the vendor's receiver waits for nine bytes for ever (TMC-EvalSystem ``tmc/TMCL.c``, ``rx``), so one
+byte too many or too few and it cuts every telegram that follows at the wrong place. :class:`Framing` gets it back into step. After a bad or
+missing reply the line has to fall silent before the next request (``LineDriver.recovery_s``), because a reply does not say which
+parameter it is of. Source of the telegrams: TMCL firmware manuals (TMCM-1140, TMCM-1276), chapter "TMCL and the TMCL-IDE".
 """
 
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from struct import pack, unpack
+from typing import Any
 
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError
 
@@ -31,6 +34,7 @@ class Op(IntEnum):
     SGP = 9
     GGP = 10
     RFS = 13
+    END_PROGRAM = 128
     VERSION = FIRMWARE_VERSION
 
 
@@ -54,6 +58,10 @@ class Axis(IntEnum):
 
 SERIAL_HEARTBEAT = 68
 """Global parameter of bank 0 [ms], 0 = off."""
+TICKS = 132
+"""Global parameter of bank 0: milliseconds since the module started."""
+LONGEST = 3 * SIZE
+"""Bytes in which a reply must be found: a local echo, the reply, and what a disturbed line adds."""
 EXECUTED = (100, 101)
 STATUS = {
     1: (errno.EIO, "wrong checksum"),
@@ -104,11 +112,11 @@ class Module:
 
     def exchange(self, op: Op, kind: int = 0, motor: int = 0, value: int = 0) -> Exchange:
         """Return a request and the check of its reply."""
-        of_motor = "" if op in (Op.VERSION, Op.GGP, Op.SGP) else f"motor {motor} of "
-        what = f"{op.name} {kind} of {of_motor}module {self.address}"
+        what = f"{op.name} {kind} of {_of(op, motor, self.address)}"
         repeatable = op in _READS or (op is Op.RFS and kind == 2)
         data = request(self.address, op, kind, motor, value)
-        return Exchange(data, _size, self._decoder(op, value, what), self.turnaround_s, repeatable, what)
+        find, decode = self._finder(data, what), self._decoder(op, value, what)
+        return Exchange(data, find, decode, self.turnaround_s, repeatable, what)
 
     def get(self, parameter: int, motor: int) -> Exchange:
         """Read an axis parameter."""
@@ -118,18 +126,47 @@ class Module:
         """Write an axis parameter, in the module's memory alone."""
         return self.exchange(Op.SAP, parameter, motor, value)
 
+    def _finder(self, sent: bytes, what: str) -> Callable[[bytes], int | None]:
+        """Return what tells where the reply ends, behind a local echo of the request or stray bytes.
+
+        Raises:
+            LinkError: what came is damaged, or of another module.
+        """
+
+        def want(reply: bytes) -> int | None:
+            for end in range(SIZE, len(reply) + 1):
+                telegram = reply[end - SIZE : end]
+                of_us = telegram[0] == self.host and (telegram[1] == self.address or telegram[2] == 1)
+                if of_us and telegram != sent and is_telegram(telegram):
+                    return end
+            first = reply[:SIZE]
+            if len(first) < SIZE or (first == sent and len(reply) < LONGEST):
+                return None
+            if first[:2] == bytes((self.host, self.address)):
+                raise LinkError(f"{what}: the checksum of the reply is wrong ({first.hex(' ')})")
+            if first != sent and is_telegram(first):
+                raise LinkError(
+                    f"{what}: the reply goes from {first[1]} to {first[0]}; {self.address} to {self.host} is right"
+                )
+            if len(reply) >= LONGEST:
+                raise LinkError(f"{what}: no reply in {len(reply)} bytes ({reply[:LONGEST].hex(' ')})")
+            return None
+
+        return want
+
     def _decoder(self, op: Op, sent: int, what: str) -> Callable[[bytes], int]:
-        def decode(reply: bytes) -> int:
-            if len(reply) != SIZE or checksum(reply[:-1]) != reply[-1]:
+        def decode(found: bytes) -> int:
+            reply = found[-SIZE:]
+            if not is_telegram(reply):
                 raise LinkError(f"{what}: the checksum of the reply is wrong ({reply.hex(' ')})")
             host, module, status, command, value = unpack(">BBBBi", reply[:-1])
+            if status == 1 and host == self.host:  # module and command are those of the last good telegram
+                raise LinkError(f"{what}: the module received a wrong checksum")
             if (host, module) != (self.host, self.address):
                 text = (
                     f"{what}: the reply goes from {module} to {host}; {self.address} to {self.host} is right"
                 )
                 raise LinkError(text)
-            if status == 1:  # the command byte of such a reply is stale: the status comes first
-                raise LinkError(f"{what}: the module received a wrong checksum")
             if command != op:
                 raise LinkError(f"{what}: the reply answers command {command}; {int(op)} is right")
             if status not in EXECUTED:
@@ -140,5 +177,102 @@ class Module:
         return decode
 
 
-def _size(reply: bytes) -> int:
-    return SIZE
+def is_telegram(data: bytes) -> bool:
+    """Tell whether these are nine bytes that a receiver takes for a telegram."""
+    return len(data) == SIZE and checksum(data[:-1]) == data[-1]
+
+
+# --- into step ------------------------------------------------------------------------------------
+#
+# A receiver out of step holds 0 to 8 bytes. Single bytes complete them, and the module answers: nine bytes with a wrong checksum draw
+# status 1 at once, and with that reply it is in step. What it holds may be a motion command short of a byte, so the single bytes
+# must complete no valid telegram. Zeros may: of "rotate right 1019" (01 01 00 00 00 00 03 fb 00) with one 00 lost, one more 00 makes
+# 260864. What is held is a piece of what was sent last; of each piece of 9 - k bytes the k-th byte may not be the checksum: ten
+# values at most that the k-th byte must avoid, of 256.
+
+
+def remnants(telegram: bytes) -> set[bytes]:
+    """Return what a receiver may hold of a telegram that lost one run of bytes, or part of which went to the telegram before."""
+    return {telegram[:i] + telegram[j:] for i in range(SIZE) for j in range(i + 1, SIZE + 1)}
+
+
+def padding(module: int, suspects: Iterable[bytes]) -> bytes:
+    """Return nine single bytes none of which completes a valid telegram of what is left of the suspects.
+
+    None of them is the module's address, or 0, so nothing that begins with them is for this module either.
+
+    Example:
+        >>> padding(1, [request(1, Op.ROR, 0, 0, 1019)]).hex(" ")
+        'fe ff fe ff ff ff ff ff ff'
+    """
+    held = [piece for suspect in suspects for piece in remnants(suspect)]
+    found = b""
+    for count in range(1, SIZE + 1):
+        avoid = {checksum(piece + found) for piece in held if len(piece) == SIZE - count} | {0, module}
+        found += bytes((next(value for value in range(255, 0, -1) if value not in avoid),))
+    return found
+
+
+def separator(telegram: bytes) -> int:
+    """Return a byte that, sent between repetitions of a telegram, makes no valid telegram wherever a receiver cuts them."""
+
+    def is_safe(value: int) -> bool:
+        row = telegram + bytes((value,)) + telegram
+        return not any(is_telegram(row[start : start + SIZE]) for start in range(1, SIZE + 1))
+
+    return next(value for value in range(255, 0, -1) if is_safe(value) and value != telegram[0])
+
+
+class Framing:
+    """Whether a module is in step, and the single bytes that bring it back.
+
+    Concurrency: one thread; several jobs of one line may share it, for a stop may come between any two exchanges of another.
+
+    Attributes:
+        unanswered: the telegram that drew no right answer, b"" when the module is in step.
+        refused: the answer was that the module received a wrong checksum.
+    """
+
+    def __init__(self, address: int) -> None:
+        self.unanswered = b""
+        self.refused = False
+        self._address = address
+        self._pads = self._heard = b""
+        self._asks = False
+
+    def watched(self, exchange: Exchange) -> Exchange:
+        """Return an exchange that tells here how it went, and that the line does not repeat by itself."""
+
+        def decode(reply: bytes) -> Any:
+            try:
+                value = exchange.decode(reply)
+            except LinkError:
+                self.refused = True
+                raise
+            except DeviceError:
+                self.unanswered = b""
+                raise
+            self.unanswered = b""
+            return value
+
+        self.unanswered, self.refused, self._pads, self._asks = exchange.data, False, b"", False
+        return replace(exchange, decode=decode, repeatable=False)
+
+    def next_pad(self) -> bytes:
+        """Return the next single byte to be sent."""
+        if not self._pads:
+            self._pads, self._heard = padding(self._address, [self.unanswered]), b""
+        pad, self._pads, self._asks = self._pads[:1], self._pads[1:], True
+        return pad
+
+    def overheard(self, data: bytes, now_ns: int) -> None:
+        """Take what came while no reply was awaited: status 1 says that the module is in step."""
+        self._heard = (self._heard + data)[-LONGEST:]
+        telegrams = (self._heard[end - SIZE : end] for end in range(SIZE, len(self._heard) + 1))
+        if self._asks and any(is_telegram(each) and each[2] == 1 for each in telegrams):
+            self.unanswered, self._heard, self._asks = b"", b"", False
+
+
+def _of(op: Op, motor: int, address: int) -> str:
+    motors = "" if op in (Op.VERSION, Op.GGP, Op.SGP, Op.END_PROGRAM) else f"motor {motor} of "
+    return f"{motors}module {address}"
