@@ -30,10 +30,11 @@ from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
 from sioms.sdk.codec import sample_stream as stream
-from sioms.sdk.codec.clock_fit import ClockFit
 from sioms.sdk.codec.cobs import FrameReceiver, frame
+from sioms.sdk.codec.sequence import SequenceWatch
+from sioms.sdk.device_clock import DeviceClock
 from sioms.sdk.driver import Kit, StreamDriver
-from sioms.sdk.exchange import DeviceError, Send, Steps
+from sioms.sdk.exchange import DeviceError, LinkError, Send, Steps
 from sioms.sdk.golden import Golden, Incomplete
 from sioms.sdk.settings import LineSettings
 
@@ -42,6 +43,10 @@ _FIXED_BYTES = 10 + 2 + 2
 """Header, CRC, code byte and closing zero of a sample frame."""
 LINE_SHARE = 0.95
 """Part of the line's capacity that a stream may fill."""
+RATE_BLOCKS, RATE_S = 20, 0.25
+"""The rate is looked at over so many blocks and so long a time."""
+RATE_TOLERANCE = 0.05
+LATE_US = 1_000_000
 
 
 class FramedAdcSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -138,9 +143,13 @@ class FramedAdc(StreamDriver):
         self._scale = np.broadcast_to(np.array(settings.scale, dtype=np.float64), settings.channels)
         self._offset = np.broadcast_to(np.array(settings.offset, dtype=np.float64), settings.channels)
         self._receiver = FrameReceiver()
-        self._fit = ClockFit(1000, stream.CLOCK_MODULUS_US)
-        self._sequence: int | None = None
-        self._lost = self._foreign = 0
+        self._clock = DeviceClock(name, kit, 1e6, stream.CLOCK_MODULUS_US)
+        self._sequence = SequenceWatch(stream.SEQUENCE_MODULUS, settings.rate_hz)
+        self._t_us: int | None = None
+        self._blocks_since = 0
+        self._since_us: int | None = None
+        self._granted_hz = 0.0
+        self._foreign = 0
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
@@ -165,7 +174,8 @@ class FramedAdc(StreamDriver):
             )
         if settings.rate_hz > about.max_rate_hz:
             raise self._not_this(f"sends at most {about.max_rate_hz} Hz; rate_hz = {settings.rate_hz}")
-        self._sequence = None
+        self._sequence.expect_anew()
+        self._t_us, self._since_us, self._granted_hz, self.trouble = None, None, 0.0, ""
         yield stream.start(settings.stream, settings.rate_hz)
 
     def feed(self, data: bytes, now_ns: int) -> int:
@@ -180,39 +190,46 @@ class FramedAdc(StreamDriver):
             if block.stream != self.settings.stream or len(block.values) != self._block.n:
                 self._foreign += 1
                 continue
-            self._take(block, now_ns)
-            good += 1
+            good += self._take(block, now_ns)
         return good
 
     def heartbeat(self) -> Steps:
         """Say hello; the answer is not waited for, so that it never stands in the way of samples."""
         yield Send(frame(bytes((stream.Message.HELLO,))), "hello")
 
-    def counters(self) -> Mapping[str, int]:
+    def counters(self) -> Mapping[str, int | str]:
         """Return what the receiver saw."""
         seen = self._receiver.counters
         return {
             "frames": seen.frames,
             "bad_crc": seen.bad_crc,
             "malformed": seen.malformed + seen.oversized,
-            "lost_blocks": self._lost,
+            "lost_blocks": self._sequence.lost,
+            "old_blocks": self._sequence.late + self._sequence.doubled,
             "foreign_frames": self._foreign,
-            "clock_restarts": self._fit.restarts,
+            **self._clock.counters(),
         }
 
     def close(self) -> Steps:
         """Stop the stream."""
         yield Send(frame(bytes((stream.Message.STOP, self.settings.stream))), "stop")
 
-    def _take(self, block: stream.SampleBlock, now_ns: int) -> None:
-        flags = 0
-        if self._sequence is not None:
-            lost = (block.sequence - self._sequence - 1) % stream.SEQUENCE_MODULUS
-            # a device that began anew counts from 0: that is no loss
-            if lost and lost < stream.SEQUENCE_MODULUS // 2:
-                self._lost += lost
-                flags = int(AnalogStatus.OVERRUN)
-        self._sequence = block.sequence
+    def _take(self, block: stream.SampleBlock, now_ns: int) -> bool:
+        """Publish a block; return whether it was a new one."""
+        self._check_clock(block.t_us)
+        lost = self._sequence.accept(block.sequence, now_ns)
+        if lost is None:
+            self.trouble = (
+                f"blocks come, but their number stands still at {block.sequence}: the device is frozen"
+            )
+            return False
+        last_us, self._t_us = self._t_us, block.t_us
+        if block.t_us == last_us:
+            self.trouble = f"blocks come, but the device's clock stands still at {last_us} us"
+            return False
+        self._check_rate(lost + 1, block.t_us)
+        self.trouble = ""
+        flags = int(AnalogStatus.OVERRUN) if lost else 0
         if block.flags & stream.SampleFlag.SATURATED:
             flags |= int(AnalogStatus.SATURATED)
         if block.flags & stream.SampleFlag.OVERRUN:
@@ -223,12 +240,45 @@ class FramedAdc(StreamDriver):
         np.subtract(block.values, self._offset, out=data)
         np.multiply(data, self._scale, out=data)
         self._block.flags[:] = flags | np.where(np.isfinite(data), 0, int(AnalogStatus.INVALID))
-        self._block.stamp_ns = self._fit.to_host(block.t_us, now_ns)
+        self._block.stamp_ns = self._clock.to_host(block.t_us, now_ns)
         self.kit.publish(self._block, self._block.stamp_ns)
         if self._finger is not None:
             self._finger.take(data, self._block.flags, self._block.stamp_ns, now_ns)
             for derived in self._finger.blocks:
                 self.kit.publish(derived, derived.stamp_ns)
+        return True
+
+    def _check_clock(self, t_us: int) -> None:
+        """Raise LinkError when the device's clock was set back, by more than a block can be late."""
+        behind_us = 0 if self._t_us is None else (self._t_us - t_us) % stream.CLOCK_MODULUS_US
+        if LATE_US < behind_us < stream.CLOCK_MODULUS_US // 2:
+            raise LinkError(
+                f"{self.name}: the device's clock went from {self._t_us} back to {t_us} us: it has restarted"
+            )
+
+    def _check_rate(self, blocks: int, t_us: int) -> None:
+        """Compare the rate with the one that was granted when the stream began; raises LinkError when it is another."""
+        if self._since_us is None:
+            self._blocks_since, self._since_us = 0, t_us
+            return
+        self._blocks_since += blocks
+        passed_s = (t_us - self._since_us) % stream.CLOCK_MODULUS_US * 1e-6
+        if self._blocks_since < RATE_BLOCKS or passed_s < RATE_S:
+            return
+        hz = self._blocks_since / passed_s
+        self._blocks_since, self._since_us = 0, t_us
+        wanted_hz = self._granted_hz or self.settings.rate_hz
+        if abs(hz / wanted_hz - 1) <= RATE_TOLERANCE:
+            self._granted_hz = wanted_hz
+        elif self._granted_hz:
+            text = f"{self.name}: {hz:.1f} blocks a second after {wanted_hz:g}: another host has started the stream anew"
+            raise LinkError(text)
+        else:
+            self._granted_hz = hz
+            self.kit.log(
+                "warning",
+                f"{self.name}: the device sends {hz:.1f} blocks a second, not rate_hz = {wanted_hz:g}",
+            )
 
     def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
         """Answer the requests of a finger's nodes."""

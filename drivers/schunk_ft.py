@@ -15,10 +15,10 @@ from typing import Any
 from sioms.protocol.flags import AnalogStatus, Request
 from sioms.sdk.blocks import AnyBlock, BlockSpec, Description
 from sioms.sdk.codec import schunk_ifb as ifb
-from sioms.sdk.codec.clock_fit import ClockFit
 from sioms.sdk.codec.schunk_ifb import Command, Status
-from sioms.sdk.codec.sequence import SequenceWatch
+from sioms.sdk.codec.sequence import SequenceRestart, SequenceWatch
 from sioms.sdk.datagram import split_address
+from sioms.sdk.device_clock import DeviceClock
 from sioms.sdk.driver import Kit, Refusal, StreamDriver
 from sioms.sdk.exchange import Aside, DeviceError, Exchange, LinkError, Steps
 from sioms.sdk.force_torque import ForceBlock, ForceSettings, check_whole, force_spec
@@ -28,6 +28,10 @@ from sioms.sdk.settings import LineSettings
 SILENCE_S = 3 / ifb.RATE_HZ + 0.1
 _BAD = Status.INVALID | Status.HARDWARE
 _OVERLOAD = Status.MECHANICAL_RANGE | Status.USER_RANGE
+SAME_RUN_NS = 10_000_000_000
+"""After a longer absence nothing tells whether the sensor kept its power."""
+SAME_RUN_RECORDS = 100
+"""So far may its counter be from where time has brought it, and 2 % of that time."""
 
 
 class SchunkFtSettings(ForceSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -82,14 +86,14 @@ class SchunkFt(StreamDriver):
 
         return (
             Golden(
-                "read the product's name", ifb.Commands().get(ifb.PRODUCT), "ff ff 01 00 04 00 f0 01 00 00",
+                "read the product's name", ifb.get(ifb.PRODUCT), "ff ff 00 00 04 00 f0 01 00 00",
                 "ff ff 01 00 08 00 f0 00 01 00 00 4b 4d 53", b"KMS",
             ),
             Golden(
-                "tare", ifb.Commands(last=2).act(Command.TARE), "ff ff 03 00 01 00 12", "ff ff 03 00 02 00 12 00",
+                "tare", ifb.act(Command.TARE), "ff ff 00 00 01 00 12", "ff ff 03 00 02 00 12 00",
             ),
             Golden(
-                "start", ifb.Commands(last=6).act(Command.START), "ff ff 07 00 01 00 40", "ff ff 07 00 02 00 40 00",
+                "start", ifb.act(Command.START), "ff ff 00 00 01 00 40", "ff ff 07 00 02 00 40 00",
             ),
             Golden("record", reply=sent, value=(4416, 64, 1, values), read=read),
         )  # fmt: skip
@@ -101,12 +105,11 @@ class SchunkFt(StreamDriver):
         self.line = LineSettings(udp=f"{host}:0", local=settings.data)
         self.advice = f"look whether a firewall keeps UDP from {host} to {settings.data} away"
         self._block = ForceBlock(self.describe(name, settings).blocks[0], name, kit)
-        self._commands = ifb.Commands()
-        self._sequence = SequenceWatch(ifb.SEQUENCE_MODULUS)
-        self._clock = ClockFit(int(1e9 / ifb.RATE_HZ), ifb.SEQUENCE_MODULUS)
+        self._sequence = SequenceWatch(ifb.SEQUENCE_MODULUS, ifb.RATE_HZ)
+        self._clock = DeviceClock(name, kit, ifb.RATE_HZ, ifb.SEQUENCE_MODULUS)
         self._status: int | None = None
-        self._packet: int | None = None
         self._records = self._malformed = 0
+        self._newest: tuple[int, int] | None = None
         self._known = ""
 
     @property
@@ -116,18 +119,18 @@ class SchunkFt(StreamDriver):
 
     def open(self) -> Steps:
         """Stop a stream that may still run, identify the sensor, set it up, and start the stream."""
-        commands, settings = self._commands, self.settings
+        settings = self.settings
         try:
-            yield from self._tolerated(commands.act(Command.STOP))
+            yield from self._tolerated(ifb.act(Command.STOP))
             yield from self._identify()
             if settings.tool is not None:
-                yield Aside(commands.act(Command.TOOL, settings.tool))
+                yield Aside(ifb.act(Command.TOOL, settings.tool))
             if settings.noise_filter is not None:
-                yield Aside(commands.act(Command.NOISE_FILTER, settings.noise_filter))
-            self._sequence.expect_anew()
+                yield Aside(ifb.act(Command.NOISE_FILTER, settings.noise_filter))
+            self._sequence.expect_anew(goes_on=True)
             self._clock.expect_anew()
-            self._packet = None
-            yield Aside(commands.act(Command.START))
+            self.trouble = ""
+            yield Aside(ifb.act(Command.START))
         except LinkError as error:
             raise LinkError(f"open {self.name}: {error}") from None
         except DeviceError as error:
@@ -136,13 +139,24 @@ class SchunkFt(StreamDriver):
     def feed(self, data: bytes, now_ns: int) -> int:
         """Publish the record of a datagram, if it is fresh."""
         record = ifb.parse(data)
-        if record is None or self._packet not in (None, record.packet):
+        if record is None:
             self._malformed += 1
             return 0
-        self._packet = record.packet
-        lost = self._sequence.accept(record.counter)
+        is_first = self._sequence.last is None
+        try:
+            lost = self._sequence.accept(record.counter, now_ns)
+        except SequenceRestart:
+            self._doubt_zero("the sensor restarted")
+            raise
         if lost is None:
+            if is_first and self._sequence.last is not None:
+                self._compare(record.counter, now_ns)
+            else:
+                self.trouble = (
+                    f"records come, but their number stands still at {record.counter}: the sensor is frozen"
+                )
             return 0
+        self._newest, self.trouble = (record.counter, now_ns), ""
         flags = int(AnalogStatus.OVERRUN) if lost else 0
         if record.status != self._status or record.status != Status.READY:
             flags |= self._judge(record.status, now_ns)
@@ -165,13 +179,13 @@ class SchunkFt(StreamDriver):
         seen, block = self._sequence, self._block
         return {
             "records": self._records, "malformed": self._malformed, "lost": seen.lost, "late": seen.late,
-            "doubled": seen.doubled, "sequence_restarts": seen.restarts, "clock_restarts": self._clock.restarts,
-            "saturated": block.saturated, "invalid": block.invalid, "status": block.status,
+            "doubled": seen.doubled, "sequence_restarts": seen.restarts, "saturated": block.saturated,
+            "invalid": block.invalid, "status": block.status, **self._clock.counters(),
         }  # fmt: skip
 
     def close(self) -> Steps:
         """Stop the stream."""
-        yield from self._tolerated(self._commands.act(Command.STOP))
+        yield from self._tolerated(ifb.act(Command.STOP))
 
     # --- inside ----------------------------------------------------------------------------------
 
@@ -183,23 +197,44 @@ class SchunkFt(StreamDriver):
             return
 
     def _tare(self, command: Command) -> Steps:
-        yield Aside(self._commands.act(command))
-        self._block.offset[:] = 0.0
+        yield Aside(ifb.act(command))
+        if command is Command.TARE:
+            self._block.take_zero()
+        else:
+            self._block.forget_zero()
+
+    def _compare(self, counter: int, now_ns: int) -> None:
+        """Tell from the first number after an opening whether the sensor has been at it all the time."""
+        if self._newest is None:
+            return
+        last, last_ns = self._newest
+        away_ns = now_ns - last_ns
+        expected = last + round(away_ns * 1e-9 * ifb.RATE_HZ)
+        half = ifb.SEQUENCE_MODULUS // 2
+        off = (counter - expected + half) % ifb.SEQUENCE_MODULUS - half
+        if away_ns > SAME_RUN_NS or abs(off) > SAME_RUN_RECORDS + 0.02 * away_ns * 1e-9 * ifb.RATE_HZ:
+            self._doubt_zero(
+                f"the sensor was away for {away_ns * 1e-9:.1f} s and has counted anew, as after a restart"
+            )
+
+    def _doubt_zero(self, why: str) -> None:
+        if self._block.is_zeroed:
+            self._block.lose_zero(f"its tare may be gone: {why}")
 
     def _identify(self) -> Steps:
-        product: str = (yield Aside(self._commands.get(ifb.PRODUCT))).rstrip(b"\0").decode("ascii", "replace")
-        unit: bytes = yield Aside(self._commands.get(ifb.UNIT))
-        firmware: str = (
-            (yield Aside(self._commands.get(ifb.FIRMWARE))).rstrip(b"\0").decode("ascii", "replace")
-        )
+        product: str = (yield Aside(ifb.get(ifb.PRODUCT))).rstrip(b"\0").decode("ascii", "replace")
+        unit: bytes = yield Aside(ifb.get(ifb.UNIT))
+        firmware: str = (yield Aside(ifb.get(ifb.FIRMWARE))).rstrip(b"\0").decode("ascii", "replace")
         if self.settings.product and product != self.settings.product:
             raise _not_this(f"calls itself {product!r}; the configuration says {self.settings.product!r}")
-        if unit.strip(b"\0"):
+        known = f"{product}, firmware {firmware}"
+        if unit == product.encode("ascii", "replace"):
+            known += "; it answers every parameter with its name, as the vendor's simulator does, so units are taken for N and N*m"
+        elif unit.strip(b"\0"):
             number = int.from_bytes(unit, "little")
             raise _not_this(
                 f"has unit selection {number}; N and N*m, 0, are right: set them on the sensor's page"
             )
-        known = f"{product}, firmware {firmware}"
         if known != self._known:
             self._known = known
             self.kit.log("info", f"identified {self.name} at {self.settings.line}: {known}")

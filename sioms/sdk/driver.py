@@ -278,6 +278,7 @@ class StreamDriver(Driver):
         heartbeat_s: period of ``heartbeat`` [s], 0 = never.
         silence_s: without a good frame for this long the link is lost [s].
         advice: what to look at when a stream was started and nothing comes.
+        trouble: what is wrong with what comes, where frames come and none is good; told when the link is lost by it.
         gap_s, recovery_s: as of LineDriver.
     """
 
@@ -286,6 +287,7 @@ class StreamDriver(Driver):
     heartbeat_s: float = 0.0
     silence_s: float = 0.5
     advice: str = ""
+    trouble: str = ""
     gap_s: float = 0.0
     recovery_s: float = 0.1
 
@@ -302,7 +304,12 @@ class StreamDriver(Driver):
             now_ns: time of their arrival [ns, CLOCK_MONOTONIC].
 
         Returns:
-            The number of good frames in them; the kit supervises the stream by it.
+            The number of good frames in them; the kit supervises the stream by it. A frame is good when it is new: one that
+            was seen before, or whose number or clock stands still, is none.
+
+        Raises:
+            LinkError: what comes is no longer the stream that was opened: the device restarted, or somebody else set it
+                otherwise. Readers are told at once, and the stream is opened again.
         """
 
     def heartbeat(self) -> Steps:

@@ -70,9 +70,13 @@ def check_whole(block: BlockSpec, channels: Sequence[int]) -> None:
 class ForceBlock(AnalogBlock):
     """Forces and torques of one sensor; values at or beyond full scale are flagged as saturated.
 
+    **A zero that vanished is told.** Once the sensor has taken a zero of its own (``zeroed``), readings count from there. When that
+    zero is gone or may be (``lose_zero``), they are INVALID until somebody says what counts: a new zero of the
+    sensor, one of the driver's (ZERO_DEVICE), or the sensor's own taken back (``forget_zero``).
+
     Attributes:
         saturated, invalid: readings so far that were flagged as such.
-        status: the sensor's status in words.
+        is_zeroed: the sensor counts from a zero that was taken on request.
     """
 
     def __init__(self, spec: BlockSpec, device: str, kit: Kit) -> None:
@@ -82,8 +86,35 @@ class ForceBlock(AnalogBlock):
         self._scale = np.ones(self.n)
         self._size = np.empty(self.n)
         self.saturated = self.invalid = 0
-        self.status = "ok"
+        self.is_zeroed = False
+        self._lost_zero = ""
+        self._offset_then = self.offset.copy()
+        self._status = "ok"
         self._told, self._told_ns = "ok", -SAY_AGAIN_NS
+
+    @property
+    def status(self) -> str:
+        """The sensor's status in words, and that of its zero."""
+        return self._status if not self._lost_zero else f"{self._status}; {self._lost_zero}"
+
+    def take_zero(self) -> None:
+        """Note that the sensor has taken a zero of its own; the driver's is cleared."""
+        self.is_zeroed, self._lost_zero = True, ""
+        self.offset[:] = 0.0
+
+    def forget_zero(self) -> None:
+        """Note that the sensor counts from its factory's zero; the driver's is cleared."""
+        self.is_zeroed, self._lost_zero = False, ""
+        self.offset[:] = 0.0
+
+    def lose_zero(self, why: str) -> None:
+        """Flag readings as INVALID until there is a zero again; nothing when that is the case."""
+        if self._lost_zero:
+            return
+        self.is_zeroed = False
+        self._lost_zero = f"zero lost: {why}; zero it again"
+        self._offset_then = self.offset.copy()
+        self._kit.log("error", f"{self._device}: {self._lost_zero}: its readings are INVALID until then")
 
     def set_scale(self, force_n: float, torque_nm: float) -> None:
         """Tell what one of the sensor's numbers is [N], [N m]."""
@@ -104,6 +135,8 @@ class ForceBlock(AnalogBlock):
         """
         data = self.data
         np.multiply(values, self._scale, out=data)
+        if self._lost_zero:
+            flags |= self._judge_zero()
         np.abs(data, out=self._size)
         self.flags[:] = flags
         # one comparison for the ordinary case: not-a-number is not smaller either
@@ -118,7 +151,14 @@ class ForceBlock(AnalogBlock):
 
     def say(self, status: str, now_ns: int) -> None:
         """Note the sensor's status, and log a change of it."""
-        self.status = status
+        self._status = status
         if status != self._told and now_ns - self._told_ns >= SAY_AGAIN_NS:
             self._told, self._told_ns = status, now_ns
             self._kit.log("info" if status == "ok" else "warning", f"{self._device}: status: {status}")
+
+    def _judge_zero(self) -> int:
+        if np.array_equal(self.offset, self._offset_then):
+            return int(AnalogStatus.INVALID)
+        self._lost_zero = ""  # ZERO_DEVICE has set another one since
+        self._kit.log("info", f"{self._device}: zeroed again")
+        return 0

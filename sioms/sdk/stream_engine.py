@@ -11,7 +11,7 @@ from sioms.protocol.flags import PageState
 from .blocks import AnyBlock
 from .connected import FIRST_PAUSE_NS, LONGEST_PAUSE_NS, Connected
 from .driver import StreamDriver
-from .exchange import DeviceError
+from .exchange import DeviceError, LinkError
 from .handles import Handle
 from .line import Priority
 
@@ -56,7 +56,11 @@ class StreamEngine(Connected):
                     lambda: line.submit(self._driver.open(), Priority.POLL, self._opened, now_ns), now_ns
                 )
         elif now_ns - self._good_ns > self._driver.silence_s * 1e9:
-            self._stalled(now_ns)
+            trouble = self._driver.trouble
+            self._stalled(
+                f"no good frame for {(now_ns - self._good_ns) / 1e9:.3f} s{trouble and ': ' + trouble}",
+                now_ns,
+            )
         elif self._driver.heartbeat_s and now_ns >= self._heartbeat_ns and line.is_free:
             self._heartbeat_ns = now_ns + int(self._driver.heartbeat_s * 1e9)
             self.guarded(
@@ -64,10 +68,9 @@ class StreamEngine(Connected):
                 now_ns,
             )
 
-    def _stalled(self, now_ns: int) -> None:
+    def _stalled(self, reason: str, now_ns: int) -> None:
         """Begin anew: at once when the stream ran, else after a pause that grows."""
         self._is_up = False
-        reason = f"no good frame for {(now_ns - self._good_ns) / 1e9:.3f} s"
         if not self._heard:
             reason += f" after the start of the stream{self._driver.advice and '; ' + self._driver.advice}"
             self._due_ns = now_ns + self._pause_ns
@@ -94,7 +97,12 @@ class StreamEngine(Connected):
     def _feed(self, data: bytes, now_ns: int) -> None:
         if not self._is_up:
             return
-        if self._driver.feed(data, now_ns):
+        try:
+            good = self._driver.feed(data, now_ns)
+        except LinkError as error:  # what comes is another stream than the one that was opened
+            self._stalled(str(error), now_ns)
+            return
+        if good:
             if self._good_ns == 0 or not self._runtime.is_good(self._driver.blocks):
                 self._runtime.set_link(self._driver.blocks, PageState.GOOD, "")
                 self._pause_ns = FIRST_PAUSE_NS

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+
+import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sioms.sdk.codec import ati_rdt as rdt
 from sioms.sdk.codec import ft300, http_get
 from sioms.sdk.codec import schunk_ifb as ifb
-from sioms.sdk.codec.sequence import RESTART_AFTER, SequenceWatch
+from sioms.sdk.codec.sequence import RESTART_AFTER, SequenceRestart, SequenceWatch
 from sioms.sdk.exchange import DeviceError, LinkError
 
 COUNTS = st.tuples(*[st.integers(-32768, 32767)] * 6)
@@ -68,9 +71,8 @@ def test_datagrams_of_any_bytes(data: bytes) -> None:
 
 @given(st.binary(max_size=400), CUTS)
 def test_replies_of_any_bytes_raise_only_what_the_kit_takes(noise: bytes, sizes: list[int]) -> None:
-    commands = ifb.Commands()
     exchanges = [
-        rdt.start(rdt.Command.REALTIME, 0.1), commands.get(ifb.PRODUCT), commands.act(ifb.Command.STOP),
+        rdt.start(rdt.Command.REALTIME, 0.1), ifb.get(ifb.PRODUCT), ifb.act(ifb.Command.STOP),
         http_get.get("h", "/netftapi2.xml", rdt.parse_page, 1.0),
     ]  # fmt: skip
     starts = (b"", b"\xff\xff\x01\x00\x09\x00\xf0\x00", b"HTTP/1.0 200 OK\r\nContent-Length: 30\r\n\r\n")
@@ -100,19 +102,20 @@ def test_every_status_has_words(bits: int, word: int) -> None:
 
 # --- numbered records -----------------------------------------------------------------------------
 
+RATE_HZ, MS = 1000.0, 1_000_000
+
 
 @given(
     st.integers(0, 0xFFFF), st.lists(st.sampled_from(["good", "good", "good", "lost", "doubled", "late"]), max_size=120)
 )  # fmt: skip
 def test_a_bad_network_is_counted_exactly(first: int, fates: list[str]) -> None:
     """Each number is sent once; some are lost, doubled, or overtaken by the next that arrives: the counts tell which."""
-    watch = SequenceWatch(1 << 16)
-    watch.accept(first)
+    watch = SequenceWatch(1 << 16, RATE_HZ)
+    assert watch.accept(first, 0) is None, "nothing shows that the first one is not old"
     held: list[int] = []
-    fresh = 0
     arrived = ["start"]
     for step, fate in enumerate([*fates, "good"], start=1):
-        number = (first + step) & 0xFFFF
+        number, now_ns = (first + step) & 0xFFFF, step * MS
         if fate == "lost":
             continue
         if fate == "late":
@@ -120,14 +123,13 @@ def test_a_bad_network_is_counted_exactly(first: int, fates: list[str]) -> None:
                 held.append(number)
                 continue
             fate = "good"
-        lost_before = watch.accept(number)
+        lost_before = watch.accept(number, now_ns)
         assert lost_before is not None and lost_before >= 0
-        fresh += 1
         arrived.append(fate)
         if fate == "doubled":
-            assert watch.accept(number) is None
+            assert watch.accept(number, now_ns) is None
         for each in held:
-            assert watch.accept(each) is None
+            assert watch.accept(each, now_ns) is None
             arrived.append("late")
         held.clear()
     assert watch.lost == fates.count("lost")
@@ -136,24 +138,86 @@ def test_a_bad_network_is_counted_exactly(first: int, fates: list[str]) -> None:
     assert watch.restarts == 0
 
 
-@given(st.lists(st.integers(0, 0xFFFF), max_size=200))
-def test_any_numbers_keep_the_counts_sane(numbers: list[int]) -> None:
-    watch = SequenceWatch(1 << 16)
-    for number in numbers:
-        lost = watch.accept(number)
-        assert lost is None or 0 <= lost < 1 << 15
+@given(st.lists(st.tuples(st.integers(0, 0xFFFF), st.integers(0, 3000)), max_size=200))
+def test_any_numbers_keep_the_counts_sane(arrivals: list[tuple[int, int]]) -> None:
+    """Nothing is fresh beyond what the sender can have counted in the time, whatever comes."""
+    watch = SequenceWatch(1 << 16, RATE_HZ)
+    now_ns = fresh = 0
+    for number, wait_ms in arrivals:
+        now_ns += wait_ms * MS
+        with contextlib.suppress(SequenceRestart):
+            lost = watch.accept(number, now_ns)
+            assert lost is None or 0 <= lost < 1 << 15
+            fresh += 0 if lost is None else 1 + lost
     assert watch.lost >= 0 and watch.late >= 0 and watch.doubled >= 0
+    assert fresh <= 1.05 * now_ns / MS + RATE_HZ * (1 + watch.restarts)
+
+
+@given(st.integers(0, 0xFFFFFFFF), st.integers(1, 40))
+def test_a_frozen_stream_is_never_fresh(last: int, window: int) -> None:
+    """One record sent for ever, or a window of them over and over: a frozen stream is not taken for a restart."""
+    watch = SequenceWatch(1 << 32, RATE_HZ)
+    numbers = [(last + i) & 0xFFFFFFFF for i in range(window)]
+    for i, number in enumerate(numbers):
+        watch.accept(number, i * MS)
+    for i in range(1000):
+        assert watch.accept(numbers[i % window], (window + i) * MS) is None
+    assert watch.restarts == 0 and watch.lost == 0
+    after = (last + window) & 0xFFFFFFFF
+    with contextlib.suppress(SequenceRestart):
+        assert watch.accept(after, (window + 1000) * MS) == 0
+
+
+@given(st.integers(0, 0xFFFF), st.integers(0, 0xFFFF), st.integers(0, 200))
+def test_a_restart_is_told_and_never_fresh(last: int, first: int, pause_ms: int) -> None:
+    """A 16-bit counter that begins elsewhere within the time in which a link is lost: told, unless it passes for a gap."""
+    watch = SequenceWatch(1 << 16, RATE_HZ)
+    for i in range(10):
+        watch.accept((last - 9 + i) & 0xFFFF, i * MS)
+    step = (first - last) & 0xFFFF
+    if 0 < step <= RATE_HZ * 1.1 + pause_ms:
+        return  # 1.8 % of all places look like lost records
+    if -step & 0xFFFF < RESTART_AFTER:
+        return  # and a few like doubled ones
+    try:
+        for i in range(300):
+            assert watch.accept((first + i) & 0xFFFF, (10 + pause_ms + i) * MS) is None
+    except SequenceRestart as error:
+        assert "it has restarted" in str(error) and watch.restarts == 1
+    else:
+        raise AssertionError("300 records of another count, and not a word")
 
 
 def test_a_sender_that_counts_anew() -> None:
-    watch = SequenceWatch(1 << 32)
+    watch = SequenceWatch(1 << 32, RATE_HZ)
     for number in range(5000, 5010):
-        watch.accept(number)
-    answers = [watch.accept(number) for number in range(1, 20)]
-    assert answers == [None] * (RESTART_AFTER - 1) + [0] * (19 - RESTART_AFTER + 1)
+        watch.accept(number, number * MS)
+    for number in range(1, RESTART_AFTER):
+        assert watch.accept(number, (5010 + number) * MS) is None
+    with pytest.raises(SequenceRestart, match="began anew at 1 after 5009"):
+        watch.accept(RESTART_AFTER, 5020 * MS)
     assert (watch.restarts, watch.lost) == (1, 0)
-    watch.expect_anew()
-    assert watch.accept(70) == 0 and watch.lost == 0
-    assert SequenceWatch(1 << 32).accept(7) == 0
-    wrapping = SequenceWatch(1 << 32)
-    assert [wrapping.accept(n) for n in (0xFFFFFFFE, 0xFFFFFFFF, 0, 2)] == [0, 0, 0, 1]
+    assert watch.accept(70, 5021 * MS) is None and watch.accept(71, 5022 * MS) == 0
+    wrapping = SequenceWatch(1 << 32, RATE_HZ)
+    assert [wrapping.accept(n, i * MS) for i, n in enumerate((0xFFFFFFFE, 0xFFFFFFFF, 0, 2))] == [
+        None,
+        0,
+        0,
+        1,
+    ]
+
+
+def test_a_host_that_was_held_up_loses_records_and_no_more() -> None:
+    """The socket kept 300 records, the others of two seconds are lost: no restart."""
+    watch = SequenceWatch(1 << 16, RATE_HZ)
+    for number in range(100):
+        watch.accept(number, number * MS)
+    fresh = [watch.accept(number, 2100 * MS) for number in range(100, 400)]
+    assert fresh == [0] * 300
+    assert watch.accept(2100, 2101 * MS) is None, (
+        "more than the second that is kept: taken up after a restart"
+    )
+    watch = SequenceWatch(1 << 16, RATE_HZ)
+    for number in range(100):
+        watch.accept(number, number * MS)
+    assert [watch.accept(number, 900 * MS) for number in (100, 101, 900)] == [0, 0, 798]

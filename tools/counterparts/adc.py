@@ -3,8 +3,9 @@
 A tactile array of ``--channels`` elements in rows of ``--columns``, pitch 1, first element at (0, 0), behind an ADC:
 forces spread over the elements, noise, clipping with its flag, an own clock with an error, a dead-man of 5 s. Commands on
 standard input: ``touch NEWTON X Y [RADIUS]``, ``press FROM TO SECONDS X Y [RADIUS]``, ``release``, ``lose COUNT`` (blocks the
-device fails to send), ``restart`` (as after a power cycle), ``unplug [SECONDS]``, ``plug``, ``state``, and the faults
-of a line.
+device fails to send), ``restart`` (as after a power cycle), ``power_cycle [SECONDS]``, ``freeze [COUNT]`` (the last block again), ``hold on|off``
+(numbers go on, clock and samples stand still), ``refuse COUNT`` (busy), ``foreign rate|stop|zero VALUE``, ``unplug [SECONDS]``, ``plug``, ``state``, and the
+faults of a line.
 """
 
 from __future__ import annotations
@@ -24,12 +25,13 @@ from types import MappingProxyType
 from .control import serve
 from .faults import Faults
 from .ports import PtyPort
+from .supply import Refusals, Standstill, Supply
 
 DEAD_MAN_S = 5.0
 SATURATED, OVERRUN = 1, 2
 FORMATS = {"i16": (0x01, "h", 32767), "i32": (0x02, "i", 2**31 - 1), "f32": (0x03, "f", 0)}
 """Name to first byte, code of struct and largest number, 0 for none."""
-OK, UNKNOWN, VALUE = 0, 1, 2
+OK, UNKNOWN, VALUE, BUSY = 0, 1, 2, 3
 
 
 def _crc_step(byte: int) -> int:
@@ -109,11 +111,18 @@ class FrontEnd:
         self.received = b""
         self.clock_start_us = int(options.clock_start_us)
         self.lose = 0
+        self.held_s = 0.0
+        self.supply = Supply(clock, self.boot)
+        self.standstill, self.refusals = Standstill(), Refusals()
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew, as after a power cycle: no stream, clock and number at their start."""
-        self.born_s = self.heard_s = self.clock()
+        """Begin anew at once."""
+        self.boot(self.clock())
+
+    def boot(self, at_s: float) -> None:
+        """Begin anew, as after its power came back: no stream, clock and number at their start."""
+        self.born_s = self.heard_s = at_s
         self.rate_hz = 0
         self.sequence = 0
         self.flags = 0
@@ -122,6 +131,8 @@ class FrontEnd:
 
     def take(self, data: bytes) -> list[bytes]:
         """Return the replies to what the host sent."""
+        if not self.supply.is_on:
+            return []
         self.heard_s = self.clock()
         *pieces, self.received = (self.received + data).split(b"\0")
         self.received = self.received[-300:]
@@ -134,6 +145,8 @@ class FrontEnd:
         if kind == 0x10:
             name = str(options.name).encode()
             return struct.pack("<BBBBI", 0x11, 1, options.channels, form, options.max_rate) + name
+        if kind in (0x12, 0x13, 0x14) and self.refusals.take():
+            return bytes((0x1F, kind, BUSY))
         if kind == 0x12 and len(payload) == 6:
             return bytes((0x1F, kind, self._start(*struct.unpack("<BI", payload[1:]))))
         if kind in (0x13, 0x14) and len(payload) == 2:
@@ -156,11 +169,13 @@ class FrontEnd:
     def due(self) -> list[bytes]:
         """Return the frames of the blocks sampled until now, and stop when the host has been silent too long."""
         now_s = self.clock()
+        if not self.supply.is_on:
+            return []
         if self.rate_hz and now_s - self.heard_s > DEAD_MAN_S:
             self.rate_hz = 0
         frames = []
         while self.rate_hz and self.next_s <= now_s:
-            frames.append(frame(self._block(self.next_s)))
+            frames.append(self.standstill.bend(frame(self._block(self.held_s or self.next_s))))
             self.next_s += 1 / self.rate_hz
             if self.lose:
                 self.lose -= 1
@@ -209,7 +224,29 @@ class FrontEnd:
             "sequence": self.sequence,
             "force_n": self.touch.force_n(self.clock()),
             "since_heard_s": self.clock() - self.heard_s,
+            "on": self.supply.is_on,
         }
+
+    def handlers(self) -> dict[str, Callable[..., object]]:
+        """Return the commands on standard input that need no port."""
+
+        def hold(word: str) -> None:
+            self.held_s = self.clock() if word == "on" else 0.0
+
+        def foreign(kind: str, value: str = "0") -> None:
+            if kind == "rate":
+                self._start(1, int(value))
+            elif kind == "stop":
+                self.rate_hz = 0
+            elif kind == "zero":
+                self.zeros = self._forces(self.clock())
+            else:
+                raise ValueError(f"{kind}; one of rate, stop, zero is right")
+
+        return {
+            "restart": self.restart, "state": self.state, "power_cycle": self.supply.cycle, "freeze": self.standstill.set,
+            "refuse": self.refusals.set, "hold": hold, "foreign": foreign,
+        }  # fmt: skip
 
 
 async def _stream(device: FrontEnd, send: Callable[[bytes], None]) -> None:
@@ -281,10 +318,9 @@ async def run(device: FrontEnd, more: Mapping[str, Callable[..., object]] = Mapp
         "press": press,
         "release": lambda: press("0", "0", "0", "0", "0"),
         "lose": lose,
-        "restart": device.restart,
+        **device.handlers(),
         "unplug": unplug,
         "plug": port.plug,
-        "state": device.state,
         **more,
     }
     await serve(str(options.link or port.name), handlers, close)

@@ -1,8 +1,14 @@
 """A SCHUNK FTS sensor with its Ethernet box: ``python -m sioms.tools.counterparts.schunk_ifb --port 0 --data-port 0``.
 
-Commands on TCP, a record of 35 bytes a thousand times a second on UDP to the host that the commands came from. The stream goes on when
-the commands' connection ends. Commands on standard input: ``load FX FY FZ TX TY TZ [SECONDS]``, ``status BITS`` (or-ed to its own), ``stall``,
-``resume``, ``reboot``, ``hang_up``, ``product NAME``, ``unit NUMBER``, ``garbage SIZE``, ``state``, and the faults of the records' way: ``mute COUNT``
+Commands on TCP, a record of 35 bytes a thousand times a second on UDP to the host that the commands came from, each with a counter of 16
+bits and one of 8. As in the vendor's own simulator replies are numbered on each connection from 1 on whatever the command's
+number, what one segment brings is one command, and a piece of less than 7 bytes ends the connection. The stream goes on when the
+commands' connection ends. With ``--vendor`` it is that simulator in the rest too: it streams from its start and always, answers every
+parameter with its name, takes all and does nothing of it.
+
+Commands on standard input: ``load FX FY FZ TX TY TZ [SECONDS]``, ``status BITS`` (or-ed to its own), ``stall``, ``resume``, ``hang_up``,
+``product NAME``, ``unit NUMBER``, ``garbage SIZE``, ``state``, ``power_cycle [SECONDS]`` (connections die without a word), ``refuse COUNT`` (busy),
+``freeze [COUNT]``, ``foreign zero|tool|filter|stop|unit VALUE``, ``shift COUNT`` (the counter jumps), and the faults of the records' way: ``mute COUNT``
 (drop), ``double``, ``late SECONDS COUNT``, ``cut``; ``deaf COUNT`` loses commands.
 """
 
@@ -17,11 +23,21 @@ from collections.abc import Callable
 from .control import serve
 from .faults import Faults
 from .load import Load
+from .supply import Refusals, Standstill, Supply
 from .udp import Address, UdpPort, missed, stream
 
 DATA_PORT = 54843
 READY, MECHANICAL_RANGE = 0x01, 0x10
-OK, UNKNOWN, LENGTH, VALUE, LOCKED, NO_INDEX, NO_SUBINDEX = 0x00, 0x01, 0x02, 0x03, 0x10, 0x13, 0x14
+OK, UNKNOWN, LENGTH, VALUE, BUSY, LOCKED, NO_INDEX, NO_SUBINDEX = (
+    0x00,
+    0x01,
+    0x02,
+    0x03,
+    0x04,
+    0x10,
+    0x13,
+    0x14,
+)
 LENGTHS = {0x12: 1, 0x13: 1, 0x30: 2, 0x31: 2, 0x40: 1, 0x41: 1, 0xF0: 4}
 MOST = {0x30: 3, 0x31: 4}
 
@@ -37,46 +53,53 @@ class Sensor:
         }  # fmt: skip
         self.extra_status = 0
         self.stalled = False
-        self.reboot()
+        self.supply = Supply(clock, self.boot, options.boot_s)
+        self.standstill, self.refusals = Standstill(), Refusals()
+        self.boot(clock())
 
-    def reboot(self) -> None:
-        """Begin anew, as after a power cycle."""
-        self.streaming = False
-        self.next_s = 0.0
-        self.counter = 0
+    def boot(self, at_s: float) -> None:
+        """Begin anew, as after its power came back."""
+        self.streaming = self.options.vendor
+        self.next_s = at_s if self.streaming else 0.0
+        self.counter = self.packet = 0
         self.selected = {0x30: 0, 0x31: 0}
-        self.received = b""
+        self.is_tared = False
         self.load.zero(None)
 
-    def take(self, data: bytes) -> list[bytes]:
-        """Return the replies to what came on TCP, cut anywhere."""
-        self.received += data
-        replies = []
-        while len(self.received) >= 6:
-            sync, counter, length = struct.unpack("<2sHH", self.received[:6])
-            if sync != b"\xff\xff":
-                self.received = b""
-                break
-            if len(self.received) < 6 + length:
-                break
-            payload, self.received = self.received[6 : 6 + length], self.received[6 + length :]
-            answer = self._answer(payload)
-            replies.append(struct.pack("<2sHH", b"\xff\xff", counter, len(answer)) + answer)
-        return replies
+    def take(self, data: bytes, number: int) -> bytes | None:
+        """Return the reply to what one segment brought, None when the connection is given up.
+
+        Args:
+            data: the segment; the vendor's receiver takes one for one command, and looks at no sync and no length.
+            number: of the reply on its connection.
+        """
+        if len(data) < 7:
+            return None
+        answer = self._answer(data[6:])
+        return struct.pack("<2sHH", b"\xff\xff", number % 0x10000, len(answer)) + answer
 
     def _answer(self, payload: bytes) -> bytes:
-        command = payload[0] if payload else 0
+        command = payload[0]
+        if self.options.vendor:
+            if command in (0xF0, 0xF1):
+                return (
+                    bytes((command, OK))
+                    + payload[1:4]
+                    + (self.options.product.encode() if command == 0xF0 else b"")
+                )
+            return bytes((command, OK if command in LENGTHS or command in (0x10, 0x11, 0x20) else UNKNOWN))
         if command == 0xF1:
             return bytes((command, LOCKED))
         if command not in LENGTHS:
             return bytes((command, UNKNOWN))
         if len(payload) != LENGTHS[command]:
             return bytes((command, LENGTH))
+        if command != 0xF0 and self.refusals.take():
+            return bytes((command, BUSY))
         match command:
-            case 0x12:
-                self.load.zero(self.clock())
-            case 0x13:
-                self.load.zero(None)
+            case 0x12 | 0x13:
+                self.is_tared = command == 0x12
+                self.load.zero(self.clock() if self.is_tared else None)
             case 0x30 | 0x31:
                 if payload[1] > MOST[command]:
                     return bytes((command, VALUE))
@@ -99,17 +122,21 @@ class Sensor:
     def due(self, send: Callable[[bytes], None]) -> None:
         """Send the records sampled until now."""
         now_s, rate_hz = self.clock(), self.options.rate * (1 + self.options.clock_ppm * 1e-6)
+        if not self.supply.is_on:
+            return
         if self.streaming:
             count = missed(self.next_s, now_s, rate_hz)
             self.next_s += count / rate_hz
             self.counter = (self.counter + count) % 0x10000
+            self.packet = (self.packet + count) % 0x100
         while self.streaming and self.next_s <= now_s:
             values, clipped = self.load.measured(self.next_s)
             status = READY | self.extra_status | (MECHANICAL_RANGE if clipped else 0)
-            self.counter = (self.counter + 1) % 0x10000
+            self.counter, self.packet = (self.counter + 1) % 0x10000, (self.packet + 1) % 0x100
             self.next_s += 1 / rate_hz
             if not self.stalled:
-                send(struct.pack("<2sHHBI6f", b"\xff\xff", self.counter, 29, 0x40, status, *values))
+                record = struct.pack("<2sHHBI6f", b"\xff\xff", self.counter, 29, self.packet, status, *values)
+                send(self.standstill.bend(record))
 
     def handlers(self) -> dict[str, Callable[..., object]]:
         """Return the commands on standard input."""
@@ -123,17 +150,34 @@ class Sensor:
         def unit(number: str) -> None:
             self.parameters[0x0050, 0] = bytes((int(number),))
 
+        def foreign(kind: str, value: str = "0") -> None:
+            if kind == "zero":
+                self.load.zero(self.clock())
+            elif kind in ("tool", "filter"):
+                self.selected[0x30 if kind == "tool" else 0x31] = int(value)
+            elif kind == "stop":
+                self.streaming, self.next_s = False, 0.0
+            elif kind == "unit":
+                unit(value)
+            else:
+                raise ValueError(f"{kind}; one of zero, tool, filter, stop, unit is right")
+
+        def shift(count: str) -> None:
+            self.counter = (self.counter + int(count)) % 0x10000
+
         def set_stall(value: bool) -> Callable[[], None]:
             return lambda: setattr(self, "stalled", value)
 
         def state() -> dict[str, object]:
             return {
                 "streaming": self.streaming, "counter": self.counter, "tool": self.selected[0x30],
-                "noise_filter": self.selected[0x31], "load": self.load.true(self.clock()),
+                "noise_filter": self.selected[0x31], "load": self.load.true(self.clock()), "tared": self.is_tared,
+                "on": self.supply.is_on,
             }  # fmt: skip
 
         return {
-            **self.load.handlers(self.clock), "status": status, "product": product, "unit": unit, "reboot": self.reboot,
+            **self.load.handlers(self.clock), "status": status, "product": product, "unit": unit, "foreign": foreign, "shift": shift,
+            "power_cycle": self.supply.cycle, "freeze": self.standstill.set, "refuse": self.refusals.set,
             "stall": set_stall(True), "resume": set_stall(False), "state": state,
         }  # fmt: skip
 
@@ -170,11 +214,20 @@ class CommandPort:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.host = writer.get_extra_info("peername")[0]
         self._writers.add(writer)
+        cycles, number = self._sensor.supply.cycles, 0
         try:
-            while data := await reader.read(4096):
+            while data := await reader.read(1024):
+                if cycles != self._sensor.supply.cycles:
+                    if self._sensor.supply.is_on:
+                        writer.transport.abort()  # a box that has restarted knows nothing of this connection
+                        break
+                    continue
                 if self._faults.hears():
-                    for reply in self._sensor.take(data):
-                        writer.write(reply)
+                    number += 1
+                    reply = self._sensor.take(data, number)
+                    if reply is None:
+                        break
+                    writer.write(reply)
         except ConnectionError:
             pass
         finally:
@@ -190,6 +243,8 @@ def options_parser() -> argparse.ArgumentParser:
     parser.add_argument("--product", default="KMS")
     parser.add_argument("--rate", type=float, default=1000.0)
     parser.add_argument("--clock-ppm", type=float, default=40.0)
+    parser.add_argument("--boot-s", type=float, default=0.0, help="from power to readiness")
+    parser.add_argument("--vendor", action="store_true", help="as the vendor's own simulator")
     parser.add_argument("--range-n", type=float, default=400.0)
     parser.add_argument("--range-nm", type=float, default=15.0)
     return parser

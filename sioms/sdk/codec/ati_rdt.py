@@ -3,7 +3,8 @@
 A request of 8 bytes starts and stops the stream, sets the zero ("bias") and clears latches. A datagram holds one record of 36
 bytes, or several in buffered mode; all numbers are big-endian. ``rdt_seq`` counts records from 1 on for each request,
 ``ft_seq`` the sensor's internal samples. Forces are counts, whose number per unit stands in the sensor's page. Sources: ATI Net
-F/T manual, section "UDP interface using RDT" and status code; ATI Ethernet Axia manual, status code.
+F/T manual, section "UDP interface using RDT" and status code; ATI Ethernet Axia manual (9620-05-C-Ethernet Axia-02), status code,
+table 11.2 (page), section 12 (RDT).
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ MAX_RECORDS = 40
 """Records of a buffered datagram that fit an Ethernet frame."""
 SEQUENCE_MODULUS = 1 << 32
 SAMPLE_HZ = 7000.0
-"""Internal samples a second, unless the sensor was set otherwise."""
+"""Internal samples a second of a Net F/T, where its page does not tell."""
+SLOWEST_SAMPLE_HZ = 100.0
+"""A smaller number where the page tells the internal rate is the number of a setting, not a rate."""
 _RECORD = Struct(">III6i")
 
 
@@ -196,6 +199,8 @@ class SensorPage:
         counts_per_torque: counts in a unit of torque.
         force_unit, torque_unit: names of these units.
         rate_hz: rate of its records [Hz].
+        sample_hz: internal samples a second, which ``ft_seq`` counts; 0 where the page does not tell.
+        bias: the vector that its zero subtracts; empty where the page does not tell.
     """
 
     product: str
@@ -205,6 +210,8 @@ class SensorPage:
     force_unit: str
     torque_unit: str
     rate_hz: float
+    sample_hz: float = 0.0
+    bias: tuple[float, ...] = ()
 
 
 def parse_page(text: str) -> SensorPage:
@@ -215,8 +222,32 @@ def parse_page(text: str) -> SensorPage:
     """
     return SensorPage(
         _element(text, "prodname"), _element(text, "setserial"), _number(text, "cfgcpf"), _number(text, "cfgcpt"),
-        _element(text, "scfgfu"), _element(text, "scfgtu"), _number(text, "comrdtrate"),
+        _element(text, "scfgfu"), _element(text, "scfgtu"), _number(text, "comrdtrate"), _sample_hz(text), _bias(text),
     )  # fmt: skip
+
+
+def _sample_hz(text: str) -> float:
+    """Return the internal rate: ``runrate`` of a Net F/T, ``setrate`` of an Axia (488 to 7812)."""
+    for name in ("runrate", "setrate"):
+        word = _optional(text, name)
+        if word and re.fullmatch(r"\d+(\.\d*)?", word) and float(word) >= SLOWEST_SAMPLE_HZ:
+            return float(word)
+    return 0.0
+
+
+def _bias(text: str) -> tuple[float, ...]:
+    """Return ``setbias``: six numbers apart by semicolon, comma or blank."""
+    try:
+        return tuple(
+            float(word) for word in re.split(r"[;,\s]+", _optional(text, "setbias").strip(" ;,")) if word
+        )
+    except ValueError:
+        return ()
+
+
+def _optional(text: str, name: str) -> str:
+    found = re.search(rf"<{name}>([^<]{{0,200}})</{name}>", text)
+    return "" if found is None else found[1].strip()
 
 
 def _element(text: str, name: str) -> str:

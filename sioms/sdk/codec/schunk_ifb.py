@@ -1,8 +1,10 @@
 """SCHUNK FTS sensors behind the Ethernet interface box (IFB-EN), without I/O: commands on TCP, records on UDP.
 
-Both frames begin ``FF FF``, a counter (u16) and the length of what follows (u16); all numbers are little-endian. A reply repeats the
-counter of its command, then command, error code and data. A record of 35 bytes comes a thousand times a second. Source: the
-vendor's public driver and simulator.
+Both frames begin ``FF FF``, a counter (u16) and the length of what follows (u16); all numbers are little-endian. A reply has command,
+error code and data. **Its counter is no echo**: the box numbers its replies on each connection from 1 on, and the vendor's library
+sends 0 in every command; so a reply belongs to a command by its order and by the command byte. A record of 35 bytes comes a thousand
+times a second; its ``packet`` is a second counter of 8 bits that runs with every record. Source: the vendor's public driver and
+simulator (SCHUNK-SE-Co-KG/schunk_force_torque_sensor b0e4359: ``schunk_fts_dummy/src/tcp.rs``, ``udp.rs``, ``schunk_fts_library/utility.py``).
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ RECORD_BYTES = 35
 _SYNC = b"\xff\xff"
 _HEAD_BYTES = 6
 _MAX_PAYLOAD = 1024
-_MAX_OLD_BYTES = 8192
-"""More than this in front of the awaited reply means that the stream is another protocol."""
+TIMEOUT_S = 1.0
+"""Longest time to an answer."""
 _RECORD = Struct("<2sHHBI6f")
 _RECORD_PAYLOAD = RECORD_BYTES - _HEAD_BYTES
 
@@ -79,7 +81,7 @@ class Record:
 
     Args:
         counter: number of the record, modulo 65536.
-        packet: its kind.
+        packet: a counter of its own, modulo 256.
         status: see :class:`Status`.
         values: fx, fy, fz, tx, ty, tz.
     """
@@ -119,72 +121,53 @@ def status_text(status: int) -> str:
     return "; ".join(words) or "ok"
 
 
-class Commands:
-    """Numbers the commands and frames them; a reply with another number is an old one.
+def act(command: Command, *arguments: int, timeout_s: float = TIMEOUT_S) -> Exchange:
+    """Return the exchange of a command without data in its reply.
 
-    Args:
-        last: number of the command before the first.
-        timeout_s: longest time to an answer [s].
+    Example:
+        >>> act(Command.START).data.hex(" ")
+        'ff ff 00 00 01 00 40'
     """
-
-    def __init__(self, last: int = 0, timeout_s: float = 1.0) -> None:
-        self._last = last
-        self._timeout_s = timeout_s
-
-    def act(self, command: Command, *arguments: int) -> Exchange:
-        """Return the exchange of a command without data in its reply."""
-        what = command.name.lower().replace("_", " ") + "".join(f" {each}" for each in arguments)
-        return self._exchange(bytes((command, *arguments)), lambda data: None, what, False)
-
-    def get(self, parameter: tuple[int, int]) -> Exchange:
-        """Return the exchange that reads a parameter; its value is bytes."""
-        index = pack("<HB", *parameter)
-        what = f"read parameter {parameter[0]:#06x}/{parameter[1]}"
-
-        def decode(data: bytes) -> bytes:
-            if data[:3] != index:
-                raise LinkError(f"{what}: the reply is to {data[:3].hex(' ')}")
-            return data[3:]
-
-        return self._exchange(bytes((Command.GET_PARAMETER,)) + index, decode, what, True)
-
-    def _exchange(
-        self, payload: bytes, decode: Callable[[bytes], Any], what: str, repeatable: bool
-    ) -> Exchange:
-        self._last = number = self._last % 0xFFFF + 1
-        frame = pack("<2sHH", _SYNC, number, len(payload)) + payload
-
-        def want(reply: bytes) -> int | None:
-            return _find(reply, number, what)[1]
-
-        def unpack(reply: bytes) -> Any:
-            start, end = _find(reply, number, what)
-            if end is None or len(reply) < end:
-                raise LinkError(f"{what}: the reply is cut after {len(reply)} bytes")
-            body = reply[start + _HEAD_BYTES : end]
-            if len(body) < 2 or body[0] != payload[0]:
-                raise LinkError(f"{what}: the reply {body.hex(' ')} is none to command {payload[0]:02x}")
-            if body[1]:
-                number_, text = _ERRORS.get(body[1], (errno.EIO, "unknown error"))
-                raise DeviceError(number_, f"{what}: the sensor answers error {body[1]:02x}, {text}")
-            return decode(body[2:])
-
-        return Exchange(frame, want, unpack, self._timeout_s, repeatable, what)
+    what = command.name.lower().replace("_", " ") + "".join(f" {each}" for each in arguments)
+    return _exchange(bytes((command, *arguments)), lambda data: None, what, False, timeout_s)
 
 
-def _find(data: bytes, number: int, what: str) -> tuple[int, int | None]:
-    """Return start and end of the frame with a number, past frames with others; the end is None while it is not known."""
-    start = 0
-    while len(data) - start >= _HEAD_BYTES:
-        sync, counter, length = unpack_from("<2sHH", data, start)
+def get(parameter: tuple[int, int], timeout_s: float = TIMEOUT_S) -> Exchange:
+    """Return the exchange that reads a parameter; its value is bytes."""
+    index = pack("<HB", *parameter)
+    what = f"read parameter {parameter[0]:#06x}/{parameter[1]}"
+
+    def decode(data: bytes) -> bytes:
+        if data[:3] != index:
+            raise LinkError(f"{what}: the reply is to {data[:3].hex(' ')}")
+        return data[3:]
+
+    return _exchange(bytes((Command.GET_PARAMETER,)) + index, decode, what, True, timeout_s)
+
+
+def _exchange(
+    payload: bytes, decode: Callable[[bytes], Any], what: str, repeatable: bool, timeout_s: float
+) -> Exchange:
+    frame = pack("<2sHH", _SYNC, 0, len(payload)) + payload
+
+    def want(reply: bytes) -> int | None:
+        if len(reply) < _HEAD_BYTES:
+            return None
+        sync, _, length = unpack_from("<2sHH", reply)
         if sync != _SYNC or length > _MAX_PAYLOAD:
-            raise LinkError(
-                f"{what}: {data[start : start + _HEAD_BYTES].hex(' ')} begins no reply of this sensor"
-            )
-        end = start + _HEAD_BYTES + length
-        if counter == number:
-            return start, end
-        if end > _MAX_OLD_BYTES:
-            raise LinkError(f"{what}: {end} bytes of replies to other commands")
-        start = end
-    return start, None
+            raise LinkError(f"{what}: {reply[:_HEAD_BYTES].hex(' ')} begins no reply of this sensor")
+        return _HEAD_BYTES + int(length)
+
+    def unpack(reply: bytes) -> Any:
+        end = want(reply)
+        if end is None or len(reply) < end:
+            raise LinkError(f"{what}: the reply is cut after {len(reply)} bytes")
+        body = reply[_HEAD_BYTES:end]
+        if len(body) < 2 or body[0] != payload[0]:
+            raise LinkError(f"{what}: the reply {body.hex(' ')} is none to command {payload[0]:02x}")
+        if body[1]:
+            number, text = _ERRORS.get(body[1], (errno.EIO, "unknown error"))
+            raise DeviceError(number, f"{what}: the sensor answers error {body[1]:02x}, {text}")
+        return decode(body[2:])
+
+    return Exchange(frame, want, unpack, timeout_s, repeatable, what)

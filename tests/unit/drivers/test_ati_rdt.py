@@ -23,8 +23,17 @@ HOST = ("127.0.0.1", 4711)
 UDP = {"udp": "192.168.1.1:49152"}
 
 
+@pytest.fixture(autouse=True)
+def invented_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The driver's openings take place in the rig's time."""
+    monkeypatch.setattr(ati_driver.time, "monotonic_ns", lambda: int(AtiRig.latest.now_s * 1e9))
+
+
 class AtiRig(Rig):
+    latest: AtiRig
+
     def __init__(self, *options: str, **table: Any) -> None:
+        AtiRig.latest = self
         super().__init__(AtiRdt, {"line": UDP, "full_scale": (400, 400, 400, 20, 20, 20), **table})
         self.device = ati_rdt.Sensor(ati_rdt.options_parser().parse_args(options), self.now)
         self.device.load.noise_n = self.device.load.noise_nm = 0.0
@@ -32,6 +41,8 @@ class AtiRig(Rig):
         self.aside, self.on_line = self._page, self._request
 
     def _page(self, data: bytes) -> bytes:
+        if not self.device.supply.is_on:
+            return b""
         assert data.startswith(b"GET /netftapi2.xml ")
         self.pages += 1
         return b"HTTP/1.0 200 OK\r\n\r\n" + self.device.xml().encode()
@@ -149,18 +160,14 @@ def test_buffered_and_bias() -> None:
         rig.driver.ioctl(block.spec, Request.HOME, range(6), None)
 
 
-def test_a_stall_restarts_the_stream_and_a_longer_loss_identifies_anew(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_stall_restarts_the_stream_and_a_longer_loss_identifies_anew() -> None:
     rig = AtiRig()
-    monkeypatch.setattr(ati_driver.time, "monotonic_ns", lambda: int(rig.now_s * 1e9))
     rig.do(rig.driver.open())
     rig.go(0.1)
     rig.now_s += 0.3
     rig.do(rig.driver.open())
-    assert rig.pages == 1
+    assert rig.pages == 1 and "another client took it, for RDT serves one" in rig.said[-1]
     rig.go(0.1)
-    rig.device.reboot()
     rig.now_s += 3.0
     rig.do(rig.driver.open())
     assert rig.pages == 2
@@ -175,17 +182,164 @@ def test_a_stall_restarts_the_stream_and_a_longer_loss_identifies_anew(
         rig.do(rig.driver.open())
 
 
-def test_a_clock_of_another_rate_is_told_and_not_believed() -> None:
-    rig = AtiRig("--internal-hz", "4000")
+@pytest.mark.parametrize("internal_hz", ["976", "7000", "7812"])
+def test_the_internal_rate_is_read_from_the_page(internal_hz: str) -> None:
+    """At 976 Hz taken for 7000, stamps were 2.5 s wrong for 5 s."""
+    model = "net" if internal_hz == "7000" else "axia"
+    rig = AtiRig("--internal-hz", internal_hz, "--model", model, "--rate", "900", rate_hz=900)
     rig.do(rig.driver.open())
-    rig.go(7.0)
-    (said,) = [text for text in rig.said if "sample_hz" in text]
-    found = re.search(
-        r"the sensor counts (\d+) samples/s, not sample_hz = 7000; .*; set sample_hz = (\d+)", said
-    )
-    assert found is not None and found[1] == found[2] and int(found[1]) == pytest.approx(4000, rel=5e-3)
-    assert abs(rig.now_s - rig.published[-1][0] * 1e-9) < 2e-3
+    rig.go(3.0)
+    assert -1e-6 <= rig.now_s + rig.delay_s - rig.published[-1][0] * 1e-9 < 3e-3
+    assert steps_of(rig.published)[200:].max() < 4e6 and not [
+        text for text in rig.said if "sample_hz" in text
+    ]
+
+
+@pytest.mark.parametrize("internal_hz", [488, 976, 4000, 7812])
+def test_a_clock_of_another_rate_is_told_and_measured(internal_hz: int) -> None:
+    """A page that tells no internal rate: no stamp is more than 50 ms off, and after a second all are right."""
+    rig = AtiRig("--internal-hz", str(internal_hz), "--no-rate", "--rate", "400", rate_hz=400)
+    rig.do(rig.driver.open())
+    before = len(rig.published)
+    ages = []
+    for _ in range(6000):
+        rig.go(0.001)
+        if len(rig.published) > before:
+            before = len(rig.published)
+            ages.append((rig.now_s, rig.now_s + rig.delay_s - rig.published[-1][0] * 1e-9))
+    assert max(age for _, age in ages) < 0.052 and min(age for _, age in ages) > -1e-6
+    assert max(age for at_s, age in ages if at_s > ages[0][0] + 1.5) < 6e-3
+    said = [text for text in rig.said if "sample_hz" in text]
+    found = re.search(r"the device counts (\d+) a second, not 7000; .*; set sample_hz = (\d+)", said[0])
+    assert found is not None and int(found[1]) == pytest.approx(internal_hz, rel=0.03) and len(said) <= 2
+    assert rig.driver.counters()["stamp_uncertainty_us"] < 5000
     assert (steps_of(rig.published) >= 0).all()
+
+
+@pytest.mark.parametrize("buffered", [False, True])
+def test_a_frozen_stream_is_none(buffered: bool) -> None:
+    """The last datagram again and again; a sample that stands still under numbers that go on; in both cases also after an opening."""
+    for cause in ("freeze", "hold"):
+        rig = AtiRig(buffered=buffered)
+        rig.do(rig.driver.open())
+        rig.go(0.5)
+        rig.device.handlers()[cause](*(["on"] if cause == "hold" else []))
+        rig.go(0.02)
+        before = len(rig.published)
+        for _ in range(3):
+            rig.go(2.0)
+            assert len(rig.published) == before, cause
+            assert "stands still at" in rig.driver.trouble
+            rig.do(rig.driver.open())
+        rig.device.handlers()[cause]("off" if cause == "hold" else "0")
+        rig.do(rig.driver.open())
+        rig.go(0.1)
+        assert len(rig.published) > before + 50 and rig.driver.trouble == ""
+
+
+def test_records_faster_than_samples_are_not_published_twice() -> None:
+    """An Axia of 488 samples a second asked for 1000 records: a sample is published once, and the stream is alive."""
+    rig = AtiRig("--model", "axia", "--internal-hz", "488")
+    rig.do(rig.driver.open())
+    rig.go(2.0)
+    assert len(rig.published) == pytest.approx(976, abs=20) and rig.driver.counters()["repeated"] > 900
+    assert rig.driver.trouble == ""
+
+
+def zeroed(*options: str, **table: Any) -> AtiRig:
+    rig = AtiRig(*options, **table)
+    rig.do(rig.driver.open())
+    rig.go(0.5)
+    rig.device.load.put(rig.now_s, LOAD)
+    (block,) = rig.driver.blocks
+    rig.do(rig.driver.ioctl(block.spec, Request.CALIBRATE_DEVICE, range(6), None))
+    rig.go(0.1)
+    assert rig.data == pytest.approx([0] * 6, abs=1e-5) and rig.flags == 0 and block.is_zeroed
+    return rig
+
+
+@pytest.mark.parametrize("off_s", [0.05, 0.3, 5.0])
+@pytest.mark.parametrize("page", [True, False])
+def test_a_bias_that_went_with_the_power_is_told(off_s: float, page: bool) -> None:
+    none: dict[str, Any] = {"page": "none", "model": "net", "counts_per_force": 1e6, "counts_per_torque": 1e6}
+    rig = zeroed(**({} if page else none))
+    rig.device.supply.cycle(str(off_s))
+    rig.go(off_s + 0.15)
+    rig.do(rig.driver.open())
+    rig.go(0.1)
+    assert rig.data == pytest.approx(LOAD) and rig.flags == INVALID
+    assert "zero lost" in rig.driver.counters()["status"]
+    assert rig.pages == 3 * page, "at the opening, behind the bias, and as the sensor has restarted"
+    (block,) = rig.driver.blocks
+    rig.do(rig.driver.ioctl(block.spec, Request.CALIBRATE_DEVICE, range(6), None))
+    rig.go(0.1)
+    assert rig.data == pytest.approx([0] * 6, abs=1e-5) and rig.flags == 0
+
+
+def test_a_bias_is_kept_over_a_stall_and_repeated_until_the_page_shows_it() -> None:
+    rig = zeroed()
+    for _ in range(300):
+        rig.now_s += 0.001
+        rig.device.due(lambda record, to: None)
+    rig.do(rig.driver.open())
+    rig.go(0.1)
+    assert rig.flags == 0 and rig.driver.counters()["status"] == "ok"
+    rig.device.load.put(rig.now_s, (0,) * 6)
+    heard, deaf = rig.on_line, [2]
+
+    def half_deaf(data: bytes) -> bytes:
+        deaf[0] -= 1
+        return b"" if deaf[0] >= 0 else heard(data)
+
+    rig.on_line = half_deaf
+    (block,) = rig.driver.blocks
+    rig.do(rig.driver.ioctl(block.spec, Request.CALIBRATE_DEVICE, range(6), None))
+    rig.go(0.1)
+    assert rig.data == pytest.approx([0] * 6, abs=1e-5), "the third request was heard"
+
+
+def test_another_master_is_noticed_by_the_page() -> None:
+    """Its zero: readings INVALID. Its units: not one reading of them once it is known, the new ones after an opening."""
+    rig = zeroed()
+    rig.do(rig.driver.heartbeat())
+    assert rig.flags == 0
+    rig.device.load.put(rig.now_s, (0,) * 6)
+    rig.device.handlers()["foreign"]("zero")
+    rig.do(rig.driver.heartbeat())
+    rig.go(0.01)
+    assert rig.flags == INVALID and "another client, or its page" in rig.driver.counters()["status"]
+    (block,) = rig.driver.blocks
+    rig.do(rig.driver.ioctl(block.spec, Request.CALIBRATE_DEVICE, range(6), None))
+    rig.device.load.put(rig.now_s, LOAD)
+    rig.device.handlers()["foreign"]("units", "lbf")
+    rig.do(rig.driver.heartbeat())
+    with pytest.raises(LinkError, match="its page tells other settings than at its opening"):
+        rig.go(0.01)
+    rig.do(rig.driver.open())
+    rig.go(0.1)
+    assert rig.data == pytest.approx(LOAD, rel=1e-4) and rig.flags == 0
+    rig.aside = lambda data: b""
+    for _ in range(30):  # a web server that is gone is asked less and less often, and nothing comes of it
+        rig.do(rig.driver.heartbeat())
+    rig.go(0.1)
+    assert rig.flags == 0
+
+
+def test_a_client_that_takes_the_stream_is_told_of() -> None:
+    rig = AtiRig()
+    rig.do(rig.driver.open())
+    rig.go(0.1)
+    before = len(rig.published)
+    rig.device.handlers()["foreign"]("client")
+    sent: list[Any] = []
+    for _ in range(200):
+        rig.now_s += 0.001
+        rig.device.due(lambda record, to: sent.append(to))
+    assert set(sent) == {("127.0.0.1", 9)}
+    rig.do(rig.driver.open())
+    rig.go(0.1)
+    assert len(rig.published) > before + 90
+    assert "another client took it, for RDT serves one; look for other programs" in rig.said[-1]
 
 
 @pytest.mark.parametrize(
