@@ -118,6 +118,7 @@ class Ft300(StreamDriver):
         self._sensor = Sensor(name, settings, kit)
         self._block = _force_block(name, settings, kit)
         self._receiver = ft300.RecordReceiver()
+        self._still = ft300.Standstill()
         self._stamp_ns = 0
 
     @property
@@ -133,19 +134,23 @@ class Ft300(StreamDriver):
 
     def feed(self, data: bytes, now_ns: int) -> int:
         """Publish every good record; those that came together were measured one period apart."""
-        found = self._receiver.feed(data)
+        found, good = self._receiver.feed(data), 0
         for behind, (counts, after_loss) in zip(range(len(found) - 1, -1, -1), found, strict=True):
+            if not self._still.is_fresh(counts):
+                self.trouble = self._still.text
+                continue
+            good, self.trouble = good + 1, ""
             stamp_ns = max(now_ns - RECORD_NS - behind * PERIOD_NS, self._stamp_ns + 1)
             self._stamp_ns = stamp_ns
             self._block.show(counts, stamp_ns, int(AnalogStatus.OVERRUN) if after_loss else 0)
-        return len(found)
+        return good
 
     def counters(self) -> Mapping[str, int | str]:
         """Return what the receiver saw."""
         seen = self._receiver.counters
         return {
             "records": seen.records, "bad_crc": seen.bad_crc, "skipped_bytes": seen.skipped_bytes, "lost": seen.lost,
-            "saturated": self._block.saturated,
+            "saturated": self._block.saturated, "equal": self._still.equal,
         }  # fmt: skip
 
     def close(self) -> Steps:
@@ -186,6 +191,7 @@ class RegisterUnit(LineUnit):
         self.name = name
         self._sensor = Sensor(name, settings, kit)
         self.force = _force_block(name, settings, kit)
+        self._still = ft300.Standstill()
         specs = _specs(settings)
         self._acceleration = AnalogBlock(specs[1]) if settings.acceleration else None
 
@@ -203,6 +209,8 @@ class RegisterUnit(LineUnit):
         last = ft300.FORCES_AT + 6 if self._acceleration is None else ft300.ACCELERATION_AT + 3
         words = yield self._sensor.unit.read_holding(ft300.FORCES_AT, last - ft300.FORCES_AT)
         counts = [word - 0x10000 if word & 0x8000 else word for word in words]
+        if not self._still.is_fresh(tuple(counts[:6])):
+            raise LinkError(f"poll {self.name}: {self._still.text}")
         now_ns = time.monotonic_ns()
         self.force.fill(counts[:6], now_ns)
         if self._acceleration is not None:

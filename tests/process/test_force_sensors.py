@@ -105,7 +105,7 @@ def test_ft300_streams_through_damage_loss_and_deaths(start: Callable[..., Any],
         with raises(errno.ENOTTY, "CALIBRATE_DEVICE"):
             node.ioctl(Request.CALIBRATE_DEVICE)
         # a sensor that began anew streams no more: it is told to again
-        wire.tell("reboot")
+        wire.tell("power_cycle 0.3")
         wait_for(lambda: wire.tell("state")["streaming"], "streaming again")
         wire.wait_up("f0")
         lost_and_back(wire, "unplug", "is gone|no such port", "plug")
@@ -227,11 +227,15 @@ def test_ati_through_a_bad_network_stalls_and_deaths(start: Callable[..., Any], 
         shows(node, (0.0,) * 6, "zeroed by the sensor")
         wire.tell("load")
         shows(node, tuple(-value for value in LOAD), "counted from the sensor's zero")
-        # the sensor loses its stream for a moment, for longer, and its own zero with its power
-        wire.tell("reboot")
+        # the sensor loses its own zero with its power: told, until there is another
+        wire.tell("power_cycle 0.3")
         wait_for(lambda: wire.tell("state")["streaming"], "streaming again")
         wire.wait_up("f0")
         shows(node, (0.0,) * 6, "restarted")
+        assert flags(node) & AnalogStatus.INVALID and "zero lost" in stream(node)["status"]
+        wire.daemon.wait_line("f0: zero lost: .*; zero it again: its readings are INVALID until then")
+        node.ioctl(Request.CALIBRATE_DEVICE, timeout=5.0)
+        wait_for(lambda: not flags(node), "good behind a new zero")
     lost_and_back(wire, "stall", "start the realtime stream: no reply|no good frame", "resume")
     pid = wire.pid("f0")
     os.kill(pid, signal.SIGKILL)
@@ -394,6 +398,85 @@ def test_schunk_through_a_bad_network_stalls_and_deaths(
     wire.daemon.signal(signal.SIGTERM)
     assert wire.daemon.wait_exit(15) == 0
     assert not wire.tell("state")["streaming"]
+
+
+STOP = 'on_loss = "stop"\n'
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "table", "words"),
+    [
+        ("schunk_ifb", ("--port", "0", "--data-port", "0"), SCHUNK, "their number stands still at .*: the sensor is frozen"),
+        ("ati_rdt", ("--port", "0"), ATI, "their number stands still at .*: the sensor is frozen"),
+        ("ft300", ("--baud", "19200"), "[device.f0]\n" + FT300, "the last [0-9]+ records were all the same"),
+    ],
+)  # fmt: skip
+def test_a_frozen_stream_is_a_lost_link_and_stops_the_workcell(
+    start: Callable[..., Any], short_folder: Path, name: str, options: tuple[str, ...], table: str, words: str
+) -> None:
+    """Every 8th identical record was taken for a restart: no EIO in 5 s, and ``on_loss`` could not act."""
+    wire = Sensor(start, short_folder, name, *options)
+    cell = wire.serve(table + STOP)
+    wire.wait_up("f0")
+    with cell.open("f0") as node:
+        number = node.read().number
+        node.wait_new(number + 20, 5.0)
+        began = time.monotonic()
+        wire.tell("freeze")
+        wait_for(lambda: not wire.reads("f0"), "EIO", 2.0)
+        took_s = time.monotonic() - began
+        wait_for(lambda: cell.status()["stop_source"], "the workcell stopped by the loss", 2.0)
+        wait_for(lambda: re.search(words, wire.reason("f0")), f"{words} in {wire.reason('f0')}")
+        seen = []
+        while time.monotonic() < began + 4.0:
+            seen.append(wire.reads("f0"))
+            time.sleep(0.02)
+        assert not any(seen), f"readable {sum(seen)} times of {len(seen)} while it stood still"
+        wire.tell("freeze 0")
+        wire.wait_up("f0")
+        print(f"{name}: lost {took_s:.3f} s after its stream stood still")
+
+
+def test_schunk_connection_lost_and_box_restarted(start: Callable[..., Any], short_folder: Path) -> None:
+    """Replies are numbered from 1 on each connection; a supply that is off for 0.3 s leaves the host's connection dead, without a word."""
+    wire = Sensor(start, short_folder, "schunk_ifb", "--port", "0", "--data-port", "0")
+    cell = wire.serve(SCHUNK + "noise_filter = 3\n")
+    wire.wait_up("f0")
+    with cell.open("f0") as node:
+        for _ in range(3):
+            wire.tell("hang_up")
+            node.ioctl(Request.CALIBRATE_DEVICE, timeout=5.0)
+        assert flags(node) == 0
+        wire.tell("power_cycle 0.3")
+        wait_for(lambda: not wire.reads("f0"), "lost")
+        wire.wait_up("f0")
+        state = wire.tell("state")
+        assert state["noise_filter"] == 3 and not state["tared"]
+        assert (
+            flags(node) == AnalogStatus.INVALID
+            and "zero lost: its tare may be gone" in stream(node)["status"]
+        )
+        wire.tell("refuse 1")
+        with raises(errno.EBUSY, "tare: the sensor answers error 04, busy"):
+            node.ioctl(Request.CALIBRATE_DEVICE, timeout=5.0)
+        assert flags(node) == AnalogStatus.INVALID
+        node.zero(20)
+        wait_for(lambda: flags(node) == 0, "good behind a zero of the driver's")
+
+
+def test_schunk_as_the_vendors_simulator(start: Callable[..., Any], short_folder: Path) -> None:
+    """Streams before it is asked, answers every parameter alike: taken, every record read, none of 5 s lost."""
+    wire = Sensor(start, short_folder, "schunk_ifb", "--port", "0", "--data-port", "0", "--vendor")
+    cell = wire.serve(SCHUNK)
+    wire.wait_up("f0")
+    with cell.open("f0") as node:
+        before, began = stream(node), time.monotonic()
+        time.sleep(2.0)
+        after, took_s = stream(node), time.monotonic() - began
+        assert after["records"] - before["records"] + after["lost"] - before["lost"] == pytest.approx(
+            1000 * took_s, rel=0.1
+        )
+        assert after["malformed"] == 0
 
 
 def test_schunk_wrong_host_identity_and_a_taken_port(start: Callable[..., Any], short_folder: Path) -> None:

@@ -28,6 +28,8 @@ STOP_S = 0.5
 """How long the manual has 0xFF sent to end the stream [s]."""
 QUIET_S = 0.1
 """Time that the sensor then needs until it takes requests [s]."""
+FROZEN_AFTER = 12
+"""So many equal records in a row are no measurement: see :class:`Standstill`."""
 HEAD = b"\x20\x4e"
 RECORD_BYTES = 16
 _RECORD = Struct("<2x6hH")
@@ -103,6 +105,40 @@ class RecordReceiver:
         self.counters.lost += lost
         self._skipped, self._synchronised = 0, True
         return lost > 0
+
+
+class Standstill:
+    """Tells a sensor that measures from one that repeats itself. The records carry neither number nor time.
+
+    What can be known: the data sheet gives a noise of 0.1 N and 0.005 N m or more, some counts in each of the six channels, so two records
+    are equal once in 10**6 at the most, and twelve in a row never. A converter at its end may stand still in one channel, not in all
+    six. **A sensor that repeats the last hundred records cannot be told from a load that repeats itself.**
+
+    Attributes:
+        equal: records like the last one, in a row.
+
+    Example:
+        >>> still = Standstill()
+        >>> [still.is_fresh((1, 2, 3, 4, 5, 6)) for _ in range(14)].count(True)
+        12
+        >>> still.is_fresh((1, 2, 3, 4, 5, 7))
+        True
+    """
+
+    def __init__(self) -> None:
+        self.equal = 0
+        self._last: tuple[int, ...] | None = None
+
+    def is_fresh(self, counts: tuple[int, ...]) -> bool:
+        """Take a record; return whether it may be a new measurement. A new opening changes nothing of what was seen."""
+        self.equal = self.equal + 1 if counts == self._last else 0
+        self._last = counts
+        return self.equal < FROZEN_AFTER
+
+    @property
+    def text(self) -> str:
+        """What to say of it."""
+        return f"the last {self.equal + 1} records were all the same, which no measurement is: the sensor is frozen"
 
 
 def build_record(counts: Sequence[int]) -> bytes:
