@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import errno
 import math
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
@@ -33,7 +34,7 @@ from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
 from sioms.sdk.codec.ascii_line import MAX_LINE_BYTES, LineReceiver
-from sioms.sdk.codec.clock_fit import ClockFit
+from sioms.sdk.device_clock import DeviceClock
 from sioms.sdk.driver import Kit, StreamDriver
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Send, Steps
 from sioms.sdk.golden import Golden, Incomplete
@@ -46,6 +47,11 @@ TRIES = 5
 """Lines after which a device that sent no good one is another device."""
 LINE_SHARE = 0.95
 """Part of the line's capacity that a stream may fill."""
+SET_BACK_US = 100_000
+"""A time column that goes back by more than this is a board that has restarted."""
+NEVER_NS = 1 << 62
+GREETED_NS = 10_000_000_000
+"""A device that was read so short a time ago need not greet again: a board greets when it starts."""
 
 
 class AsciiStreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -62,6 +68,8 @@ class AsciiStreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
         greeting: words that one of the lines after opening must contain, comments included.
         start, stop: sent on opening and on closing, with the ends of line written in them ("RUN\\r\\n").
         open_s: longest time until the first good line [s]; boards that restart when opened take two.
+        frozen_after: equal lines in a row after which the device counts as frozen, and its link as lost; 0 = never. For
+            devices without a time column whose noise is larger than their last digit: nothing else tells.
         low, high: numbers at which the converter is at its end: at or beyond them a sample is SATURATED.
         minimum, maximum: range of the values [unit].
         history: snapshots kept for readers.
@@ -80,6 +88,7 @@ class AsciiStreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     start: str = ""
     stop: str = ""
     open_s: float = 3.0
+    frozen_after: int = 0
     low: float | None = None
     high: float | None = None
     minimum: float | None = None
@@ -138,7 +147,14 @@ class AsciiStream(StreamDriver):
         self._low = -math.inf if settings.low is None else settings.low
         self._high = math.inf if settings.high is None else settings.high
         self._receiver = LineReceiver(_columns(settings), settings.checksum)
-        self._fit = ClockFit(1000, CLOCKS[settings.time][1]) if settings.time else None
+        modulus_us = CLOCKS[settings.time][1] if settings.time else 0
+        self._clock = DeviceClock(name, kit, 1e6, modulus_us) if settings.time else None
+        self._modulus_us = modulus_us
+        self._time_us: int | None = None
+        self._gone_on_ns = 0
+        self._last: tuple[float, ...] | None = None
+        self._equal = 0
+        self._good_ns, self._since_ns = -GREETED_NS, NEVER_NS
         line = settings.line
         self._character_ns = 1e9 * line.bits_per_character / line.baud if line.serial else 0.0
         self._stamp_ns = 0
@@ -153,34 +169,45 @@ class AsciiStream(StreamDriver):
         """Wait for the greeting and a good line; tell what is wrong with the lines when none comes."""
         self._receiver.restart()
         settings = self.settings
-        inspection = Inspection(_columns(settings), settings.checksum, settings.greeting)
+        is_known = time.monotonic_ns() - self._good_ns < GREETED_NS
+        greeting = "" if is_known else settings.greeting
+        inspection = Inspection(_columns(settings), settings.checksum, greeting)
         start = settings.start.encode("ascii")
         what = f"wait for lines of {_columns(settings)} numbers from {self.name} on {self.line}"
         yield Exchange(start, inspection.want, lambda reply: None, settings.open_s, False, what)
         self._dropped = self._receiver.counters.dropped
+        self._time_us, self._since_ns, self.trouble = None, NEVER_NS, ""
 
     def feed(self, data: bytes, now_ns: int) -> int:
         """Publish a snapshot for every good line."""
         good, end = 0, 0
+        greeting = self.settings.greeting.encode()
         for piece in data.splitlines(keepends=True):
             end += len(piece)
+            if greeting and greeting in piece and now_ns - self._since_ns > self.settings.open_s * 1e9:
+                raise LinkError(f"{self.name}: it has greeted again: it has restarted")
             for row in self._receiver.feed(piece):
                 # the bytes behind a line's end came after it
-                self._take(row, now_ns - round((len(data) - end) * self._character_ns))
-                good += 1
+                arrived_ns = now_ns - round((len(data) - end) * self._character_ns)
+                if self._is_fresh(row, arrived_ns):
+                    self._take(row, arrived_ns)
+                    good += 1
+        if good:
+            self._since_ns = min(self._since_ns, now_ns)
+            self._good_ns, self.trouble = now_ns, ""
         return good
 
-    def counters(self) -> Mapping[str, int]:
+    def counters(self) -> Mapping[str, int | str]:
         """Return what the receiver saw."""
         seen = self._receiver.counters
-        restarts = self._fit.restarts if self._fit else 0
         return {
             "lines": seen.lines,
             "bad_columns": seen.bad_columns,
             "bad_number": seen.bad_number,
             "bad_checksum": seen.bad_checksum,
             "oversized": seen.oversized,
-            "clock_restarts": restarts,
+            "equal": self._equal,
+            **(self._clock.counters() if self._clock is not None else {}),
         }
 
     def close(self) -> Steps:
@@ -194,10 +221,42 @@ class AsciiStream(StreamDriver):
             return super().ioctl(block, request, channels, argument)
         return self._finger.ioctl(block, request, argument)
 
+    def _is_fresh(self, row: tuple[float, ...], now_ns: int) -> bool:
+        """Tell whether a line is a new sample; raises LinkError when its time says that the board has restarted."""
+        if self._clock is not None and not self._has_gone_on(row[0], now_ns):
+            return False
+        self._equal = self._equal + 1 if row == self._last else 0
+        self._last = row
+        limit = self.settings.frozen_after
+        if limit and self._equal >= limit:
+            self.trouble = f"the last {self._equal + 1} lines were all the same: the device is frozen"
+            return False
+        return True
+
+    def _has_gone_on(self, number: float, now_ns: int) -> bool:
+        """Tell whether the time column goes on; it may stand still while lines come faster than it counts."""
+        time_us, last_us = self._device_us(number), self._time_us
+        if last_us is not None:
+            behind_us = (last_us - time_us) % self._modulus_us
+            if SET_BACK_US < behind_us < self._modulus_us // 2:
+                raise LinkError(
+                    f"{self.name}: its time went from {last_us} back to {time_us} us: it has restarted"
+                )
+            if behind_us < self._modulus_us // 2:
+                if now_ns - self._gone_on_ns > self.silence_s / 2 * 1e9:
+                    self.trouble = f"lines come, but their time stands still at {number:g} {self.settings.time}: the device is frozen"
+                    return False
+                return behind_us == 0
+        self._time_us, self._gone_on_ns = time_us, now_ns
+        return True
+
+    def _device_us(self, number: float) -> int:
+        return round(number * CLOCKS[self.settings.time][0]) % self._modulus_us
+
     def _take(self, row: tuple[float, ...], now_ns: int) -> None:
         arrived_ns = now_ns
-        if self._fit is not None:
-            now_ns = self._fit.to_host(round(row[0] * CLOCKS[self.settings.time][0]), now_ns)
+        if self._clock is not None:
+            now_ns = self._clock.to_host(self._device_us(row[0]), now_ns)
             row = row[1:]
         numbers = np.array(row)
         flags = np.where((numbers <= self._low) | (numbers >= self._high), int(AnalogStatus.SATURATED), 0)
@@ -293,6 +352,8 @@ def _check(settings: AsciiStreamSettings) -> None:
         raise ValueError(f"rate_hz = {settings.rate_hz:g}; want 0.1 to 20000")
     if not 0 < settings.open_s <= 60:
         raise ValueError(f"open_s = {settings.open_s:g}; want more than 0 and up to 60")
+    if settings.frozen_after < 0 or settings.frozen_after == 1:
+        raise ValueError(f"frozen_after = {settings.frozen_after}; want 0 for never, or 2 and more")
     if settings.low is not None and settings.high is not None and settings.low >= settings.high:
         raise ValueError(f"low = {settings.low:g} and high = {settings.high:g}; want low below high")
     for key in ("start", "stop", "greeting"):

@@ -3,7 +3,8 @@
 A load-cell amplifier of ``--columns`` channels as hobby boards are programmed: a banner before the first sample, a line of counts for each
 sample, its own clock in the first column (``--time``), a 12-bit converter that clips. Each channel follows its load with a lag of
 first order. Commands on standard input, beside those of the line: ``load CHANNEL NEWTON``, ``say TEXT`` (a line of one's own: a
-comment, a cut line ...), ``lose COUNT`` (lines that are not sent), ``restart`` (as after a power cycle), ``state``.
+comment, a cut line ...), ``lose COUNT`` (lines that are not sent), ``restart``, ``power_cycle [SECONDS]``, ``freeze [COUNT]`` (the last line again),
+``hold on|off`` (lines go on, clock and readings stand still), ``foreign start|stop 0`` (another host's word), ``state``.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import time
 from collections.abc import Callable
 
 from . import wire
+from .supply import Standstill, Supply
 
 CLOCKS = {"none": 0.0, "us": 1e6, "ms": 1e3, "s": 1.0}
 """Counts of the board's clock in a second; seconds are printed with six digits."""
@@ -34,20 +36,28 @@ class Board:
         self.lose = 0
         self._said: list[bytes] = []
         self._heard = b""
+        self.held_s = 0.0
+        self._body = ""
+        self.supply, self.standstill = Supply(clock, self.boot), Standstill()
         self.restart()
 
     def restart(self) -> None:
+        """Begin anew at once."""
+        self.boot(self.clock())
+
+    def boot(self, at_s: float) -> None:
         """Begin anew: clock and banner, or silent until the word comes that it waits for."""
-        self.born_s = self.next_s = self.clock()
+        self.born_s = self.next_s = at_s
         self.felt = list(self.loads)
         self.lines = 0
         self.runs = False
+        self._said.clear()
         if not self.options.wait_for:
-            self._run()
+            self._run(at_s)
 
-    def _run(self) -> None:
+    def _run(self, at_s: float) -> None:
         """Greet and begin to send."""
-        self.runs, self.next_s = True, self.clock()
+        self.runs, self.next_s = True, at_s
         if self.options.banner:
             self.say(f"# {self.options.banner}")
 
@@ -61,17 +71,21 @@ class Board:
 
     def take(self, data: bytes) -> list[bytes]:
         """Obey the word that starts it, and the letter that ends it."""
+        if not self.supply.is_on:
+            return []
         self._heard = (self._heard + data)[-200:]
         *lines, self._heard = self._heard.split(b"\n")
         for line in lines:
             if line.strip() == self.options.wait_for.encode() and line.strip():
-                self._run()
+                self._run(self.clock())
             elif line.strip() == b"x":
                 self.runs = False
         return []
 
     def due(self) -> list[bytes]:
         """Return the lines of the samples taken until now."""
+        if not self.supply.is_on:
+            return []
         while self.runs and self.next_s <= self.clock():
             self._sample(self.next_s)
             self.next_s += 1 / self.options.rate
@@ -79,6 +93,9 @@ class Board:
         return said
 
     def _sample(self, at_s: float) -> None:
+        if self.held_s:
+            self._print(self._body)
+            return
         step = 1 - math.exp(-1 / self.options.rate / self.options.lag_s)
         self.felt = [felt + (load - felt) * step for felt, load in zip(self.felt, self.loads, strict=True)]
         counts = [
@@ -98,7 +115,11 @@ class Board:
             for character in body.encode():
                 check ^= character
             body += f"*{check:02X}"
-        self.say(body)
+        self._body = body
+        self._print(body)
+
+    def _print(self, body: str) -> None:
+        self.say(self.standstill.bend(body.encode()).decode())
 
     def _time(self, at_s: float) -> str:
         """Return the board's clock, a counter of 32 bits."""
@@ -117,11 +138,23 @@ class Board:
         def lose(count: str) -> None:
             self.lose = int(count)
 
+        def hold(word: str) -> None:
+            self.held_s = self.clock() if word == "on" else 0.0
+
+        def foreign(kind: str, value: str = "0") -> None:
+            if kind not in ("start", "stop"):
+                raise ValueError(f"{kind}; one of start, stop is right")
+            if kind == "start":
+                self._run(self.clock())
+            else:
+                self.runs = False
+
         def state() -> dict[str, object]:
-            return {"lines": self.lines, "felt": self.felt, "runs": self.runs}
+            return {"lines": self.lines, "felt": self.felt, "runs": self.runs, "on": self.supply.is_on}
 
         return {
-            "load": load, "lose": lose, "state": state, "restart": self.restart,
+            "load": load, "lose": lose, "state": state, "restart": self.restart, "hold": hold,
+            "power_cycle": self.supply.cycle, "freeze": self.standstill.set, "foreign": foreign,
             "say": lambda *words: self.say(" ".join(words)),
         }  # fmt: skip
 
