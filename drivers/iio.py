@@ -34,6 +34,9 @@ from sioms.sdk.golden import Golden, Incomplete
 from sioms.sdk.iio_device import TIMESTAMP, IioDevice, find_device
 from sioms.sdk.settings import LineSettings
 
+SCALING_S = 1.0
+"""Period in which scale and offset are looked at: any program may set them."""
+
 
 class IioSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Keys of the device.
@@ -73,6 +76,7 @@ class Iio(StreamDriver):
     """
 
     Settings = IioSettings
+    heartbeat_s = SCALING_S
 
     @classmethod
     def variant(cls, settings: IioSettings) -> type[Driver]:
@@ -104,7 +108,9 @@ class Iio(StreamDriver):
         self._block = AnalogBlock(_describe(settings).blocks[0])
         self.silence_s = max(0.5, (20 + 3 * settings.watermark) / settings.rate_hz)
         self._stamp_ns = 0
-        self._scans = self._lost = 0
+        self._newest_ns = 0
+        self._changed = ""
+        self._scans = self._lost = self._old = 0
 
     @property
     def line(self) -> LineSettings:  # type: ignore[override]  # found anew each time: numbers change with plugging
@@ -135,7 +141,7 @@ class Iio(StreamDriver):
         self._layout, self._receiver = layout, ScanReceiver(layout.size)
         self._scaling = [_Scaling(device, channel) for channel in settings.channels]
         self._types = {element.name: element.type for element in layout.elements}
-        self._last_ns = 0
+        self._last_ns, self.trouble, self._changed = 0, "", ""
         self._began_ns = time.monotonic_ns() if TIMESTAMP in self._types else 0
         try:
             device.write(f"{device.buffer}/enable", 1)
@@ -146,6 +152,8 @@ class Iio(StreamDriver):
 
     def feed(self, data: bytes, now_ns: int) -> int:
         """Publish a snapshot for every scan."""
+        if self._changed:
+            raise LinkError(self._changed)
         raw = self._layout.decode(self._receiver.feed(data))
         scans = len(raw[self.settings.channels[0]])
         if not scans:
@@ -159,17 +167,27 @@ class Iio(StreamDriver):
         for row, flag, stamp_ns in zip(values, flags, stamps, strict=True):
             if stamp_ns < self._began_ns:
                 continue  # left over from before: the driver was killed with the buffer on
+            if not self._is_new(stamp_ns):
+                continue
             self._block.data[:] = row
             self._block.flags[:] = flag | self._overrun(stamp_ns)
             self._stamp_ns = self._block.stamp_ns = max(stamp_ns, self._stamp_ns + 1)
             self.kit.publish(self._block, self._block.stamp_ns)
             taken += 1
         self._scans += taken
+        if taken:
+            self.trouble = ""
         return taken
 
+    def heartbeat(self) -> Steps:
+        """Look whether somebody has changed scale or offset; what has come since is then of another unit."""
+        device = self._device()
+        self._changed = next(filter(None, (scaling.change(device) for scaling in self._scaling)), "")
+        yield from ()
+
     def counters(self) -> Mapping[str, int | str]:
-        """Return how many scans came, and how many are missing between them."""
-        return {"scans": self._scans, "lost_scans": self._lost}
+        """Return how many scans came, how many are missing between them, and how many were old ones."""
+        return {"scans": self._scans, "lost_scans": self._lost, "old_scans": self._old}
 
     def close(self) -> Steps:
         """Switch the buffer off."""
@@ -193,6 +211,15 @@ class Iio(StreamDriver):
             return [now_ns - round((scans - 1 - i) * 1e9 / self.settings.rate_hz) for i in range(scans)]
         ahead_ns = time.time_ns() - time.monotonic_ns() if self._is_realtime else 0
         return [min(int(stamp) - ahead_ns, now_ns) for stamp in raw[TIMESTAMP]]
+
+    def _is_new(self, stamp_ns: int) -> bool:
+        """Tell whether a scan was taken after all before it; without a channel of time it cannot be told."""
+        if TIMESTAMP not in self._types or stamp_ns > self._newest_ns:
+            self._newest_ns = stamp_ns
+            return True
+        self._old += 1
+        self.trouble = "scans come, but the time at which they were taken stands still"
+        return False
 
     def _overrun(self, stamp_ns: int) -> int:
         """Return OVERRUN when the time since the last scan holds more than one of them."""
@@ -233,9 +260,14 @@ class IioRaw(TickDriver):
         self._scaling = [_Scaling(self._device, channel) for channel in self.settings.channels]
         for scaling in self._scaling:
             self._device.read(scaling.attribute)
+        self._look_ns = time.monotonic_ns() + int(SCALING_S * 1e9)
 
     def tick(self, now_ns: int) -> None:
         """Read every channel; one that fails is INVALID, a device that is gone is a loss."""
+        if now_ns >= self._look_ns:
+            self._look_ns = now_ns + int(SCALING_S * 1e9)
+            for changed in filter(None, [scaling.change(self._device) for scaling in self._scaling]):
+                raise LinkError(changed)
         for index, scaling in enumerate(self._scaling):
             try:
                 self._block.data[index] = scaling.value(self._device.number(scaling.attribute))
@@ -260,11 +292,25 @@ class _Scaling:
     """
 
     def __init__(self, device: IioDevice, channel: str) -> None:
+        self._channel = channel
         _, self._factor = unit_of(channel)
         self.attribute = f"in_{channel}_raw"
         self._offset, self._scale = device.scaling(channel)
         if not device.has(self.attribute) and device.has(f"in_{channel}_input"):
             self.attribute, self._offset, self._scale = f"in_{channel}_input", 0.0, 1.0
+
+    def change(self, device: IioDevice) -> str:
+        """Return a sentence when scale or offset are no longer those that were read, '' otherwise."""
+        if self.attribute.endswith("_input"):
+            return ""
+        offset, scale = device.scaling(self._channel)
+        if (offset, scale) == (self._offset, self._scale):
+            return ""
+        before, after = (
+            f"offset {self._offset:g}, scale {self._scale:g}",
+            f"offset {offset:g}, scale {scale:g}",
+        )
+        return f"{device.folder.name}: {self._channel} has {after} after {before}: another program has set it"
 
     def value(self, number: float) -> float:
         return (number + self._offset) * self._scale * self._factor

@@ -4,7 +4,8 @@ As far as files can it behaves like the kernel's dummy device (``iio_simple_dumm
 with a rate, a buffer that is set up by attributes and read as whole scans from a FIFO, stamps of the chosen clock. What files
 cannot do: refuse a value when it is written, refuse a second reader, or answer EBUSY to raw readings while the buffer runs.
 Commands on standard input: ``volt CHANNEL VALUE``, ``lose COUNT`` (scans that the buffer has no room for), ``bytes COUNT`` (cut the
-stream in pieces of that size), ``unplug``, ``plug``, ``state``.
+stream in pieces of that size), ``unplug``, ``plug``, ``power_cycle [SECONDS]`` (of a converter on USB: gone, then anew), ``freeze [COUNT]`` (the last scan
+again, its time too), ``foreign rate|scale|enable VALUE`` (another program writes the attribute), ``state``.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from .control import serve
+from .supply import Standstill
 
 PERIOD_S = 0.002
 SCALES = {"voltage0": 1.3333, "voltage1-voltage2": 0.0025, "voltage3-voltage4": 0.0025, "accel_x": 0.01}
@@ -52,6 +54,7 @@ class Dummy:
         self.raw = {"voltage0": 73, "voltage1-voltage2": 33, "voltage3-voltage4": -34, "accel_x": 34}
         self.lose = self.sent = self.lost = 0
         self.piece = 65536
+        self.standstill = Standstill()
         self.next_s = 0.0
         self._pipe = -1
         self._gone: list[int] = []
@@ -132,7 +135,7 @@ class Dummy:
         now_s = time.monotonic()
         self.next_s = self.next_s or now_s
         while self.next_s <= now_s:
-            scan = self._scan(self.next_s)
+            scan = self.standstill.bend(self._scan(self.next_s))
             self.next_s += period_s
             if self.lose:
                 self.lose, self.lost = self.lose - 1, self.lost + 1
@@ -164,6 +167,15 @@ class Dummy:
                 raw = self.raw[channel] & (1 << int(TYPES[channel][4:].split("/")[0])) - 1
                 scan += struct.pack("<H", raw)
         return scan + bytes(-len(scan) % (8 if "timestamp" in on else 2))
+
+    def foreign(self, kind: str, value: str) -> None:
+        """Let another program write an attribute."""
+        places = {
+            "rate": self.trigger / "sampling_frequency", "scale": self.root / "in_voltage_scale", "enable": self.root / "buffer/enable",
+        }  # fmt: skip
+        if kind not in places:
+            raise ValueError(f"{kind}; one of {', '.join(places)} is right")
+        places[kind].write_text(f"{value}\n")
 
     def state(self) -> dict[str, object]:
         """Return what a bystander sees."""
@@ -199,9 +211,14 @@ async def run() -> None:
     def cut(count: str) -> None:
         device.piece = int(count)
 
+    def power_cycle(off_s: str = "0.2") -> None:
+        device.unplug()
+        asyncio.get_running_loop().call_later(float(off_s), device.plug)
+
     handlers: dict[str, Callable[..., object]] = {
         "volt": device.volt, "lose": lose, "bytes": cut, "state": device.state,
-        "unplug": device.unplug, "plug": device.plug,
+        "unplug": device.unplug, "plug": device.plug, "power_cycle": power_cycle, "freeze": device.standstill.set,
+        "foreign": device.foreign,
     }  # fmt: skip
     await serve(str(options.link), handlers, close)
 

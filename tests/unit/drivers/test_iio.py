@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,70 @@ def test_scans_without_a_clock_of_ours_are_mapped(tmp_path: Path) -> None:
             list(driver.close())
     finally:
         dummy.unplug()
+
+
+@pytest.fixture
+def dummy(tmp_path: Path) -> Iterator[Dummy]:
+    dummy = Dummy(tmp_path, 0, "dummy")
+    dummy.plug()
+    yield dummy
+    dummy.unplug()
+
+
+def driver_of(dummy: Dummy, kit: Kit, mode: str) -> Any:
+    table = {"device": "dummy", "channels": ["voltage0"], "mode": mode, "rate_hz": 100.0,
+             "sysfs": str(dummy.root.parent), "dev": str(dummy.fifo.parent)}  # fmt: skip
+    if mode == "buffer":
+        table["trigger"] = "instance1"
+    settings = msgspec.convert(table, Iio.Settings)
+    return Iio.variant(settings)("a", settings, kit)  # type: ignore[arg-type]
+
+
+def test_a_scan_that_comes_again_is_none(dummy: Dummy) -> None:
+    """Equal values are a quiet input; an equal time is a buffer that stands still."""
+    kit = Kit()
+    driver = driver_of(dummy, kit, "buffer")
+    assert list(driver.open()) == []
+    dummy.standstill.set("0")
+    began_s = time.monotonic()
+    for i in range(1, 6):
+        assert driver.feed(dummy._scan(began_s + i / 100), round((began_s + 1) * 1e9)) == 1
+    for opening in range(2):
+        for _ in range(20):
+            assert driver.feed(dummy._scan(began_s + 0.05), round((began_s + 1) * 1e9)) == 0
+        assert "the time at which they were taken stands still" in driver.trouble or opening
+        assert list(driver.open()) == []
+    assert len(kit.published) == 5 and driver.counters()["old_scans"] == 40
+    list(driver.close())
+
+
+@pytest.mark.parametrize("mode", ["raw", "buffer"])
+def test_a_scale_that_another_program_sets_is_told_before_it_is_read_wrong(dummy: Dummy, mode: str) -> None:
+    kit = Kit()
+    driver = driver_of(dummy, kit, mode)
+    words = "voltage0 has offset 7, scale 2.5 after offset 7, scale 1.3333: another program has set it"
+    if mode == "buffer":
+        assert list(driver.open()) == []
+        assert list(driver.heartbeat()) == []
+        now_s = time.monotonic()
+        assert driver.feed(dummy._scan(now_s), round(now_s * 1e9) + 10**6) == 1
+        dummy.foreign("scale", "2.5")
+        assert list(driver.heartbeat()) == []
+        with pytest.raises(LinkError, match=words):
+            driver.feed(dummy._scan(now_s + 0.01), round(now_s * 1e9) + 10**8)
+        assert list(driver.open()) == []
+        assert driver.feed(dummy._scan(time.monotonic()), round(time.monotonic() * 1e9) + 10**8) == 1
+        assert kit.published[-1][1] == pytest.approx([80 * 2.5e-3])
+        return
+    driver.open()
+    now_ns = time.monotonic_ns()
+    driver.tick(now_ns)
+    dummy.foreign("scale", "2.5")
+    with pytest.raises(LinkError, match=words):
+        driver.tick(now_ns + 2 * 10**9)
+    driver.open()
+    driver.tick(now_ns + 3 * 10**9)
+    assert list(driver.blocks[0].data) == pytest.approx([80 * 2.5e-3])
 
 
 @pytest.mark.parametrize(
