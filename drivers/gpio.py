@@ -176,8 +176,9 @@ class Gpio(TickDriver):
         edges = self._fetch()
         if not edges:
             return
-        block = self._blocks[-1]
-        for index, (value, stamp_ns) in enumerate(self._port.take(edges)):
+        block, values = self._blocks[-1], self._port.take(edges)
+        block.count_lost(0, self._port.lost - self._told)
+        for index, (value, stamp_ns) in enumerate(values):
             if index:
                 self.kit.publish(block, now_ns)
             block.set(0, value, stamp_ns)

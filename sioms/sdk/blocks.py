@@ -161,6 +161,10 @@ class BinaryBlock(Block):
         self._edges[port] += 1
         return True
 
+    def count_lost(self, port: int, edges: int) -> None:
+        """Count edges that happened and that nobody can tell any more: who compares ``edges`` sees that he missed them."""
+        self._edges[port] += edges
+
 
 @dataclass(slots=True)
 class AxisBlock:

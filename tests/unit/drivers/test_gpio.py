@@ -100,6 +100,10 @@ def test_a_full_event_buffer_is_counted_said_and_made_good() -> None:
     assert rig.driver.counters() == {"edges": 4, "lost_edges": 6}
     assert rig.said == ["io0: 6 edges lost; want a higher tick_hz, a longer debounce_s, or a calmer line"]
     assert rig.published[-1][0] == 0b11, "the level of the line whose only edge was lost is read"
+    counts = [count for _, _, count in rig.published]
+    assert counts[0] == 7 and counts[-1] == 10, (
+        "the first reading behind the loss counts the six that nobody saw"
+    )
     rig.tick()
     assert len(rig.said) == 1
 
