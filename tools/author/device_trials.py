@@ -522,6 +522,10 @@ def other_master(station: Station, full: bool) -> str:
         return _foreign_outputs(station)
     axis = _first_axis(station)
     fast = _usual_speed(station, axis)
+    with station.cell.open(
+        f"{axis.node}.readonly"
+    ) as seen:  # else the motion is taken for the end of the last stop
+        wait_for(lambda: not seen.read().in_motion[0], 2.0)
     try:
         device.tell(f"foreign velocity {0.5 * fast:.9g}")
     except Unanswered as error:
