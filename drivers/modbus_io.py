@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import errno
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,13 +29,17 @@ from sioms.sdk.codec import modbus_pdu
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
 from sioms.sdk.exchange import DeviceError, Steps
 from sioms.sdk.golden import Golden
+from sioms.sdk.line import ATTEMPTS
 from sioms.sdk.mapped import MappedUnit, golden_of, unit_on
+from sioms.sdk.mapped_guard import Guard
 from sioms.sdk.registers import UNITS, to_words, width
 from sioms.sdk.regmap import Port, RegisterMap, Signal, named_map
 from sioms.sdk.settings import LineSettings
 from sioms.wording import did_you_mean
 
 MAPS = Path(__file__).parent / "maps"
+LOST_S = 0.5
+"""A block that is silent for so long is lost [s]: inputs that stop the workcell must not be blind for longer."""
 
 
 class ModbusIoSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -112,7 +116,7 @@ class ModbusIo(LineDriver):
             characters = 3.5 * settings.line.bits_per_character
             self.gap_s = max(rmap.gap_s, 0.00175 if baud > 19200 else characters / baud)
         self.recovery_s = rmap.turnaround_s if settings.line.serial is not None else 0.0
-        self._units = [IoUnit(name, rmap, settings, _plan(rmap, settings))]
+        self._units = [IoUnit(name, rmap, settings, _plan(rmap, settings), kit.log)]
 
     @property
     def units(self) -> Sequence[LineUnit]:
@@ -202,16 +206,28 @@ class IoUnit(LineUnit):
         rmap: its register map.
         settings: its configuration.
         plans: its ports.
+        log: takes a level and a sentence.
+
+    Attributes:
+        clock: the time [ns, CLOCK_MONOTONIC].
     """
 
     def __init__(
-        self, name: str, rmap: RegisterMap, settings: ModbusIoSettings, plans: Sequence[PortPlan]
+        self,
+        name: str,
+        rmap: RegisterMap,
+        settings: ModbusIoSettings,
+        plans: Sequence[PortPlan],
+        log: Callable[[str, str], None],
     ) -> None:
         self.name = name
+        self.clock = time.monotonic_ns
+        self.misses = max(1, int(LOST_S / (ATTEMPTS * rmap.turnaround_s)))
         self._settings, self._plans = settings, plans
         unit = unit_on(settings.line, settings.address, rmap.turnaround_s)
         counts = {plan.port.signal: plan.count for plan in plans}
         self._mapped = MappedUnit(rmap, unit, None, name, counts)
+        self._guard = Guard(self._mapped, settings.watchdog_s, log)
         self._reads = self._mapped.plan(plan.port.signal for plan in plans)
         self._blocks = [
             BinaryBlock(plan.spec) if plan.spec.node_class is NodeClass.BINARY else AnalogBlock(plan.spec)
@@ -224,18 +240,16 @@ class IoUnit(LineUnit):
         return self._blocks
 
     def open(self) -> Steps:
-        """Clear a watchdog that has tripped, identify the block, and set its watchdog."""
-        commands = self._mapped.rmap.commands
-        if "watchdog_restart" in commands and self._settings.watchdog_s:
-            yield from self._mapped.command("watchdog_restart")
+        """Clear a watchdog that has acted, identify the block, set its watchdog and see that it runs."""
+        yield from self._guard.clear()
         yield from self._mapped.identify({"model": self._settings.model})
-        if self._settings.watchdog_s:
-            yield from self._mapped.command("watchdog", timeout=self._settings.watchdog_s)
+        yield from self._guard.open()
 
     def poll(self) -> Steps:
-        """Read all ports; the stamp is the time of the last reply."""
+        """Read all ports and see that the watchdog still runs; the stamp is the time of the last reply of the ports."""
         values = yield from self._mapped.read(self._reads)
-        now_ns = time.monotonic_ns()
+        now_ns = self.clock()
+        yield from self._guard.poll(now_ns)
         for plan, block in zip(self._plans, self._blocks, strict=True):
             value = values[plan.port.signal]
             block.stamp_ns = now_ns
@@ -252,10 +266,10 @@ class IoUnit(LineUnit):
         if plan.spec.node_class is NodeClass.BINARY:
             bits = int(values[-1])
             pdu = modbus_pdu.write_coils(plan.signal.address, plan.count, bits)
-            yield self._mapped.unit.exchange(pdu)
+            yield from self._mapped.write(pdu)
             return
         for channel, value in zip(channels, values, strict=True):
-            yield self._mapped.unit.exchange(self._analog(plan, channel, value))
+            yield from self._mapped.write(self._analog(plan, channel, value))
 
     def _analog(self, plan: PortPlan, channel: int, value: float) -> modbus_pdu.Pdu:
         signal = plan.signal

@@ -29,6 +29,11 @@ Values = dict[str, Any]
 
 SIZES = ("speed", "acceleration", "deceleration")
 
+BUSY_TRIES = 4
+"""Times a write is sent that the device answers with "busy": it has not been carried out then, so it may be sent again."""
+BUSY_S = 0.01
+"""Pause before it is sent again [s]."""
+
 _READ = {
     "coil": pdus.READ_COILS,
     "discrete": pdus.READ_DISCRETE,
@@ -112,25 +117,42 @@ class MappedUnit:
             DeviceError: EINVAL, and nothing is sent, when a quantity does not fit its register.
         """
         command = self.rmap.commands[name]
+        changed = {item.differs_from for write in command.writes for item in write.items} - {None}
+        present = (yield from self.read(self.plan(map(str, changed)))) if changed else {}
         try:
-            encoded = [(self.encode(write, quantities), write.pause_s) for write in command.writes]
+            encoded = [(self.encode(write, quantities, present), write.pause_s) for write in command.writes]
         except ValueError as error:
             raise DeviceError(errno.EINVAL, f"{name} of {self.name}: {error}") from None
         for pdu, pause_s in encoded:
-            yield self.unit.exchange(replace(pdu, repeatable=command.repeat))
+            yield from self.write(replace(pdu, repeatable=command.repeat))
             if pause_s:
                 yield Pause(pause_s)
+
+    def write(self, pdu: Pdu) -> Steps:
+        """Send a write. What the device is too busy for (exception 6) is sent again; what it still works at (5) is taken."""
+        for tries in range(BUSY_TRIES):
+            try:
+                yield self.unit.exchange(pdu)
+                return
+            except DeviceError as error:
+                if error.errno == errno.EINPROGRESS:
+                    return
+                if error.errno != errno.EBUSY or tries == BUSY_TRIES - 1:
+                    raise
+            yield Pause(BUSY_S)
 
     def check(self, command: Command, quantities: Mapping[str, float]) -> None:
         """Raise Misfit when a quantity does not fit its register."""
         for write in command.writes:
             self.encode(write, quantities)
 
-    def encode(self, write: Write, quantities: Mapping[str, float]) -> Pdu:
+    def encode(
+        self, write: Write, quantities: Mapping[str, float], present: Mapping[str, Any] | None = None
+    ) -> Pdu:
         """Return the request of one write; raises ValueError when a quantity does not fit."""
         if write.table == "coil":
             return pdus.write_coil(write.address, bool(write.items[0].value))
-        words = [word for item in write.items for word in self._item(item, quantities)]
+        words = [word for item in write.items for word in self._item(item, quantities, present or {})]
         if write.function == "single":
             return pdus.write_register(write.address, words[0])
         return pdus.write_registers(write.address, words)
@@ -145,6 +167,11 @@ class MappedUnit:
         item = items[0]
         raw = rounded(self._raw(item, si), item.round) + more
         return abs(self.gearing.to_si(raw, UNITS[item.unit], item.scale))
+
+    def step(self, name: str) -> float:
+        """Return how much one count of a signal's register is [SI]."""
+        signal = self.rmap.signals[name]
+        return abs(self.gearing.to_si(1.0, UNITS[signal.unit], signal.scale))
 
     def identify(self, settings: Mapping[str, Any]) -> Steps:
         """Read what tells the device from others and compare.
@@ -170,6 +197,8 @@ class MappedUnit:
             return ""
         texts = {int(key, 0): text for key, text in alarms.codes.items()}
         lasting = "; only a power cycle clears it" if code in alarms.lasting else ""
+        if lasting and code in alarms.place_lost:
+            lasting = "; homing or a preset with the vendor's tool, or a power cycle clears it"
         return f"alarm {code:#x}, {texts.get(code, 'not in the map')}{lasting}"
 
     def _signal(self, name: str) -> Signal:
@@ -204,9 +233,14 @@ class MappedUnit:
         raw = self.gearing.from_si(si, UNITS[item.unit], item.scale)
         return abs(raw) if item.source in SIZES else raw
 
-    def _item(self, item: Item, quantities: Mapping[str, float]) -> tuple[int, ...]:
+    def _item(
+        self, item: Item, quantities: Mapping[str, float], present: Mapping[str, Any]
+    ) -> tuple[int, ...]:
         if item.value is not None:
             return to_words(item.value, item.type, self.rmap.word_order)
+        if item.values:
+            other = next(value for value in item.values if value != present.get(str(item.differs_from)))
+            return to_words(other, item.type, self.rmap.word_order)
         source = str(item.source)
         si = quantities[source]
         raw = self._raw(item, si)

@@ -19,10 +19,16 @@ from sioms.protocol.flags import ControlMode
 
 from .blocks import AnyBlock, AxisBlock, BlockSpec
 from .driver import Kit, LineUnit
-from .exchange import DeviceError, Steps, while_wanted
+from .exchange import DeviceError, Pause, Steps, while_wanted
 from .mapped import MappedUnit, Values
+from .mapped_guard import Guard
 
 SELDOM_NS = 1_000_000_000
+REST_S = 5.0
+"""Longest time that a drive may take to come to rest when it is opened [s]."""
+LOOKS_AT_REST = 10
+"""Looks at a braking drive before it is told to stop again."""
+LOOK_S = 0.02
 LATENCY_S = 0.03
 """Longest time that a start may wait for the line before the drive gets it."""
 
@@ -66,6 +72,7 @@ class DriveUnit(LineUnit):
             group: self._mapped.plan(self._rmap.poll.get(group, ())) for group in ("always", "seldom", "open")
         }
         self._alarm_plan = self._mapped.plan([self._rmap.alarms.signal] if self._rmap.alarms else [])
+        self._guard = Guard(mapped, log=kit.log)
         self._seldom_ns = 0
         self._alarm = 0
         self._homes = False
@@ -82,10 +89,19 @@ class DriveUnit(LineUnit):
         return (self._block,)
 
     def open(self) -> Steps:
-        """Identify the drive, stop it, read what is read once, and switch it on."""
+        """Identify the drive, bring it to rest, see whether it was off meanwhile, and switch it on.
+
+        Whatever another master or an earlier host left running ends here, before anything is switched on.
+        """
         self._jog, self._jog_speed, self._last, self._seldom_ns = "", 0.0, None, 0
+        self._homes, self._alarm = False, 0
+        yield from self._guard.clear()
         yield from self._mapped.identify({"pulses_per_turn": self._mapped.gearing.pulses_per_turn})
-        yield from self._mapped.command("fastest")
+        yield from self._bring_to_rest()
+        yield from self._end_silence_alarm()
+        was_off = yield from self._guard.open()
+        if was_off and not self._rmap.restart.keeps_place:
+            self._lose_place("it was switched off, and counts from another zero")
         if self._enable:
             yield from self._mapped.command("enable")
 
@@ -96,12 +112,12 @@ class DriveUnit(LineUnit):
         values = yield from self._mapped.read(self._plans["always"])
         now_ns = self._clock()
         self._block.stamp_ns = now_ns
+        yield from self._guard.poll(now_ns)
         yield from self._read_seldom(values, now_ns)
         fault = self._fault(values)
         moving, done = self._motion(values)
         self._position = float(values[self._axis.position])
-        if "homed" in self._axis.status and not self._homes:
-            self._note_reference(self._bit(values, "homed"), now_ns)
+        self._look_at_place(values, now_ns)
         self.bank.poll(
             now_ns,
             np.array([self._position]),
@@ -109,6 +125,7 @@ class DriveUnit(LineUnit):
             np.array([moving]),
             np.array([done]),
             [fault],
+            holds=np.array([self._holds(values)]),
         )
 
     def act(self, action: DriveAction) -> Steps:
@@ -131,6 +148,47 @@ class DriveUnit(LineUnit):
         return self._mapped.command("fastest")
 
     # --- inside ----------------------------------------------------------------------------------
+
+    def _bring_to_rest(self) -> Steps:
+        """Stop the drive until it reads at rest.
+
+        Raises:
+            DeviceError: EBUSY, it moves on: somebody else commands it.
+        """
+        end_ns = self._clock() + int(REST_S * 1e9)
+        while True:
+            yield from self._mapped.command("fastest")
+            for _ in range(LOOKS_AT_REST):
+                values = yield from self._mapped.read(self._plans["always"])
+                if not self._motion(values)[0]:
+                    return
+                yield Pause(LOOK_S)
+            if self._clock() > end_ns:
+                text = f"{self.name}: still moves {REST_S:g} s after it was told to stop"
+                raise DeviceError(errno.EBUSY, f"{text}; look for another master on its line")
+
+    def _end_silence_alarm(self) -> Steps:
+        """Reset the alarm by which the drive tells that the host before this one, or the cable, fell silent."""
+        if self._rmap.alarms is not None and self._rmap.dead_man.alarm:
+            values = yield from self._mapped.read(self._alarm_plan)
+            if int(values[self._rmap.alarms.signal]) == self._rmap.dead_man.alarm:
+                yield from self._mapped.command("reset")
+
+    def _lose_place(self, text: str) -> None:
+        """Say that the drive does not know where it is; no positions are taken until it is homed or calibrated."""
+        self.bank.lose_place([0], f"{self.name}: position lost: {text}", self._clock())
+
+    def _look_at_place(self, values: Values, now_ns: int) -> None:
+        """Tell the bank when the drive has found or lost its reference."""
+        alarms = self._rmap.alarms
+        if alarms is not None and self._alarm in alarms.place_lost:
+            self._lose_place(self._mapped.alarm_text(self._alarm))
+        if "homed" in self._axis.status and not self._homes:
+            self._note_reference(self._bit(values, "homed"), now_ns)
+
+    def _holds(self, values: Values) -> bool:
+        """Return whether the drive is switched on, so that its axis cannot be turned by hand."""
+        return "enabled" not in self._axis.status or self._bit(values, "enabled")
 
     def _unless_overtaken(self, action: DriveAction, epoch: int) -> Steps:
         """Carry out an action, and no further once a stop has overtaken it: a command may take several messages."""

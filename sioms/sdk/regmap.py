@@ -87,11 +87,13 @@ class Bit(Schema, frozen=True):
 
 
 class Item(Schema, frozen=True):
-    """One value of a write: a constant, or a quantity of the command converted to the unit.
+    """One value of a write: a constant, a quantity of the command converted to the unit, or one that changes the register.
 
     Args:
         type: of the registers.
         value: the constant.
+        values: constants of which the first is written that ``differs_from`` does not read just before the command.
+        differs_from: signal of the register that only acts when it is modified.
         source: name of the quantity: position, velocity, acceleration, deceleration, speed (|velocity|) ...
         unit, scale: as for a signal.
         minimum, maximum: raw numbers that the device accepts.
@@ -100,6 +102,8 @@ class Item(Schema, frozen=True):
 
     type: TypeName = "u16"
     value: int | None = None
+    values: tuple[int, ...] = ()
+    differs_from: str | None = None
     source: str | None = None
     unit: str = ""
     scale: float = 1.0
@@ -135,6 +139,23 @@ class Command(Schema, frozen=True):
     note: str = ""
 
 
+class Proof(Schema, frozen=True):
+    """What a signal reads while something holds: a number, a range, or a quantity of the command that set it.
+
+    Args:
+        signal: that is read.
+        equals: number that it must read, in SI.
+        minimum, maximum: or the range.
+        source: or the quantity: ``timeout``.
+    """
+
+    signal: str
+    equals: float | None = None
+    minimum: float | None = None
+    maximum: float | None = None
+    source: str | None = None
+
+
 class DeadMan(Schema, frozen=True):
     """What the device itself does when its host falls silent.
 
@@ -144,12 +165,38 @@ class DeadMan(Schema, frozen=True):
         timeout_s: of the device [s].
         covers: control modes that end by it.
         refresh: commands that must be sent again (by = "refresh").
+        proof: what is read while it is set and runs: after ``commands.watchdog``, where the map has that, and in the
+            polls. A device that reads otherwise is not opened, or opened again.
+        tripped: what is read when it has acted and holds the outputs until ``commands.watchdog_restart``.
+        alarm: by which a drive tells that it has acted; reset at opening, for every end of a host raises it.
     """
 
     by: Literal["refresh", "link", "none"] = "none"
     timeout_s: float = 0.0
     covers: tuple[str, ...] = ()
     refresh: tuple[str, ...] = ()
+    proof: tuple[Proof, ...] = ()
+    tripped: Proof | None = None
+    alarm: int = 0
+    note: str = ""
+
+
+class Restart(Schema, frozen=True):
+    """What tells that a device was off meanwhile, even if it answers again before its link counts as lost.
+
+    Args:
+        counter: signal that only grows while the device is on: its uptime.
+        token: signal of a register that a power cycle sets back and that nothing else uses; ``commands.token`` writes it at
+            opening, the polls look whether it still reads so.
+        minimum, maximum: of the token; its value after switching on is not among them.
+        keeps_place: the drive knows its position after a power cycle: an absolute encoder.
+    """
+
+    counter: str = ""
+    token: str = ""
+    minimum: int = 1
+    maximum: int = 999
+    keeps_place: bool = False
     note: str = ""
 
 
@@ -160,6 +207,8 @@ class Alarms(Schema, frozen=True):
     codes: dict[str, str] = {}
     lasting: tuple[int, ...] = ()
     """Codes that only a power cycle clears."""
+    place_lost: tuple[int, ...] = ()
+    """Codes after which the position means nothing until the axis is homed or calibrated."""
     bitmask: bool = False
     """The signal is a set of flags, not a number."""
 
@@ -244,6 +293,7 @@ class RegisterMap(Schema, frozen=True, kw_only=True):
     models: dict[str, dict[str, int]] = {}
     """Model name to the number of channels of each port."""
     dead_man: DeadMan = DeadMan()
+    restart: Restart = Restart()
     alarms: Alarms | None = None
     golden: tuple[GoldenFrame, ...] = ()
 

@@ -16,7 +16,7 @@ from .codec.modbus_pdu import MAX_READ_BITS, MAX_READ_REGISTERS, MAX_WRITE_REGIS
 from .registers import RANGES, UNITS, Per, to_words, width
 
 if TYPE_CHECKING:
-    from .regmap import Command, Item, RegisterMap, Signal, Write
+    from .regmap import Command, Item, Proof, RegisterMap, Signal, Write
 
 MODES = ("POSITION", "VELOCITY", "FORCE")
 POLL_GROUPS = ("always", "seldom", "open")
@@ -28,12 +28,12 @@ STATUS_NAMES = (
 COMMANDS = {
     "position": False, "relative": False, "velocity": False, "force": False, "jog_speed": True, "jog_plus": False,
     "jog_minus": False, "stop": True, "fastest": True, "home": False, "reset": True, "zero": False, "enable": True,
-    "disable": True, "watchdog": True, "watchdog_restart": True,
+    "disable": True, "watchdog": True, "watchdog_restart": True, "token": True,
 }  # fmt: skip
 # quantity of a command -> SI unit
 SOURCES = {
     "position": "{u}", "velocity": "{u}/s", "speed": "{u}/s", "acceleration": "{u}/s^2", "deceleration": "{u}/s^2",
-    "force": "N", "timeout": "s",
+    "force": "N", "timeout": "s", "token": "",
 }  # fmt: skip
 
 
@@ -79,7 +79,9 @@ def _struct_problems(value: Mapping[str, Any], expected: type[msgspec.Struct], p
 
 def meaning_problems(m: RegisterMap) -> list[str]:
     """Return one sentence for each contradiction in a map that follows the schema."""
-    parts = (_signals, _overlaps, _references, _commands, _axis, _dead_man, _ports, _alarms, _golden)
+    parts = (
+        _signals, _overlaps, _references, _commands, _axis, _dead_man, _proofs, _restart, _ports, _alarms, _golden,
+    )  # fmt: skip
     return [problem for part in parts for problem in part(m)]
 
 
@@ -173,20 +175,33 @@ def _item(m: RegisterMap, place: str, item: Item) -> Iterator[str]:
     if item.type == "text":
         yield f"{place}: a text cannot be written"
         return
-    if (item.value is None) == (item.source is None):
-        count = "neither value nor source" if item.value is None else "both value and source"
+    ways = [name for name in ("value", "source", "values") if getattr(item, name) not in (None, ())]
+    if len(ways) != 1:
+        count = {0: "neither value nor source", 2: f"both {' and '.join(ways)}"}.get(len(ways), "all of them")
         yield f"{place}: has {count}; exactly one is right"
         return
-    if item.value is not None:
+    yield from _alternates(m, place, item)
+    for value in item.values if item.value is None else (item.value,):
         try:
-            to_words(item.value, item.type, m.word_order)
+            to_words(value, item.type, m.word_order)
         except ValueError as error:
             yield f"{place}: {error}"
+    if item.source is None:
         return
     if item.scale == 0:
         yield f"{place}: scale is 0; another number is right"
     yield from _unit(f"{place}.unit", item.unit)
     yield from _item_source(place, item)
+
+
+def _alternates(m: RegisterMap, place: str, item: Item) -> Iterator[str]:
+    """Check an item that only acts when the register changes."""
+    if item.differs_from is not None:
+        yield from _signal(m, f"{place}.differs_from", item.differs_from)
+        if len(set(item.values)) < 2:
+            yield f"{place}: values are {list(item.values)}; two that differ are right, one of which changes the register"
+    elif item.values:
+        yield f"{place}: values without differs_from, the signal of the register they change"
 
 
 def _item_source(place: str, item: Item) -> Iterator[str]:
@@ -251,9 +266,48 @@ def _dead_man(m: RegisterMap) -> Iterator[str]:
         yield f"dead_man.timeout_s: is {dead.timeout_s} s; more than 0 is right"
     if dead.by == "refresh" and not dead.refresh:
         yield "dead_man.refresh: names no command that must be sent again"
+    if dead.alarm and (m.alarms is None or "reset" not in m.commands):
+        yield "dead_man.alarm: needs alarms and commands.reset, by which it is told and cleared"
     for name in dead.refresh:
         if name not in m.commands:
             yield f"dead_man.refresh: unknown command {name}{did_you_mean(name, m.commands)}"
+
+
+def _proofs(m: RegisterMap) -> Iterator[str]:
+    dead = m.dead_man
+    named = [(f"dead_man.proof[{i}]", proof) for i, proof in enumerate(dead.proof)]
+    if dead.tripped is not None:
+        named.append(("dead_man.tripped", dead.tripped))
+        if "watchdog_restart" not in m.commands:
+            yield "dead_man.tripped: needs commands.watchdog_restart, which ends it"
+    for place, proof in named:
+        yield from _signal(m, place, proof.signal)
+        yield from _proof(m, place, proof)
+    if "watchdog" in m.commands and not dead.proof:
+        yield (
+            "dead_man.proof: missing; what commands.watchdog sets must be read back, or nobody knows whether it runs"
+        )
+
+
+def _proof(m: RegisterMap, place: str, proof: Proof) -> Iterator[str]:
+    if proof.minimum is None and proof.maximum is None and proof.equals is None and proof.source is None:
+        yield f"{place}: tests nothing; equals, minimum, maximum or source is right"
+    if proof.source is not None and proof.source != "timeout":
+        yield f"{place}: unknown quantity {proof.source}; timeout is right"
+    signal = m.signals.get(proof.signal)
+    if signal is not None and (signal.count > 1 or signal.type == "text"):
+        yield f"{place}: {proof.signal} is no single number"
+
+
+def _restart(m: RegisterMap) -> Iterator[str]:
+    restart = m.restart
+    for key, name in (("counter", restart.counter), ("token", restart.token)):
+        if name:
+            yield from _signal(m, f"restart.{key}", name)
+    if bool(restart.token) != ("token" in m.commands):
+        yield "restart.token: needs commands.token, which writes it; both or neither is right"
+    if restart.token and restart.maximum - restart.minimum < 1:
+        yield f"restart: the token is {restart.minimum} to {restart.maximum}; a wider range is right"
 
 
 def _ports(m: RegisterMap) -> Iterator[str]:

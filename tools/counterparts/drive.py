@@ -25,6 +25,8 @@ class Mover:
         position, velocity: actual.
         low, high: hard ends, where the motion stops dead.
         slip: feedback minus commanded position [pulses], grows when steps are lost.
+        origin: where the drive's zero is, on the machine [pulses].
+        shoved: velocity at which the motor turns by itself, a defect.
     """
 
     position: float = 0.0
@@ -36,6 +38,26 @@ class Mover:
     acceleration: float = 1.0
     deceleration: float = 1.0
     slip: float = 0.0
+    origin: float = 0.0
+    shoved: float = 0.0
+
+    @property
+    def turns(self) -> float:
+        """How fast the motor turns, by whatever cause."""
+        return self.shoved or self.velocity
+
+    def count_from(self, position: float) -> None:
+        """Call the present place a position: the ends of the machine stay where they are."""
+        shift = position - self.position - self.slip
+        self.origin -= shift
+        self.low += shift
+        self.high += shift
+        self.position, self.slip = position, 0.0
+
+    @property
+    def home(self) -> float:
+        """Position of the machine's zero, where the homing sensor is."""
+        return -self.slip - self.origin
 
     @property
     def busy(self) -> bool:
@@ -51,8 +73,9 @@ class Mover:
         """Return what a bystander sees of it."""
         return {
             "position": self.position,
+            "place": self.position + self.slip + self.origin,
             "feedback": self.feedback,
-            "velocity": self.velocity,
+            "velocity": self.turns,
             "moving": int(self.busy),
         }
 
@@ -78,6 +101,9 @@ class Mover:
 
     def step(self, dt: float) -> bool:
         """Integrate one step; returns whether a hard end was hit in it."""
+        if self.shoved:
+            self.position = min(max(self.position + self.shoved * dt, self.low), self.high)
+            return False
         wanted = self.top_speed
         if self.target is not None:
             distance = self.target - self.position
@@ -142,9 +168,19 @@ class SimulatedDrive(Protocol):
     def raise_alarm(self, code: int) -> None:
         """Go into fault."""
 
+    def foreign(self, kind: str, value: float) -> None:
+        """Obey another master: ``velocity``, ``position``, ... ; ValueError for a kind that the drive does not have."""
+
+    def shove(self, velocity: float) -> None:
+        """Turn by itself at a velocity; 0 ends it."""
+
 
 def drive_handlers(drives: Mapping[int, SimulatedDrive]) -> dict[str, Callable[..., object]]:
-    """Return the commands ``state [UNIT]``, ``alarm CODE [UNIT]``, ``slip PULSES [UNIT]``, ``ends LOW HIGH [UNIT]``."""
+    """Return the commands of drives, those of the first unless one is named.
+
+    ``state [UNIT]``, ``alarm CODE [UNIT]``, ``slip PULSES [UNIT]``, ``ends LOW HIGH [UNIT]``, ``foreign KIND VALUE [UNIT]``,
+    ``shove VELOCITY [UNIT]``.
+    """
     first = str(next(iter(drives)))
 
     def state(unit: str = first) -> dict[str, float]:
@@ -160,4 +196,12 @@ def drive_handlers(drives: Mapping[int, SimulatedDrive]) -> dict[str, Callable[.
         mover = drives[int(unit)].mover
         mover.low, mover.high = number(low), number(high)
 
-    return {"state": state, "alarm": alarm, "slip": slip, "ends": ends}
+    def foreign(kind: str, value: str, unit: str = first) -> None:
+        drives[int(unit)].foreign(kind, number(value))
+
+    def shove(velocity: str, unit: str = first) -> None:
+        drives[int(unit)].shove(number(velocity))
+
+    return {
+        "state": state, "alarm": alarm, "slip": slip, "ends": ends, "foreign": foreign, "shove": shove,
+    }  # fmt: skip

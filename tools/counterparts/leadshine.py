@@ -2,8 +2,9 @@
 
 Behaves as the vendor's manuals say: paths 0 to 15 from 0x6200 on, trigger word 0x6002, jog by the control word
 that must come again within 50 ms, status 0x1003, alarms 0x2203, functions 03, 06 and 10 only, exception 8 for a
-damaged request. Commands on standard input, beside those of the line (``mute``, ``noise``, ``unplug`` ...):
-``state [UNIT]``, ``alarm CODE [UNIT]``, ``slip PULSES [UNIT]``, ``ends LOW HIGH [UNIT]``.
+damaged request. Parameters are in RAM until 0x1801 = 0x2211 saves them; the encoder is incremental, so switched off it forgets its
+place, its reference and its alarm; with bit 2 of 0x6000 saved it homes by itself when it is switched on. Commands on standard
+input: those of the line (``mute``, ``noise``, ``unplug``, ``power_cycle`` ...) and of drives (``state``, ``alarm``, ``shove`` ...).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from .faults import Faults
 from .modbus import ILLEGAL_FUNCTION, ILLEGAL_VALUE, RtuLine, serial_parser, simulated, unit_list
 
 JOG_DEAD_MAN_S = 0.05
+PR_CONTROL, HOME_AT_POWER_ON = 0x6000, 0x04
 MAX_WORDS = 97
 """Messages have at most 200 bytes."""
 RANGES = (
@@ -45,11 +47,30 @@ class Drive:
             0x01C1: 3,
         }
         self.words |= {0x01E1: 100, 0x600F: 200, 0x6010: 50}
+        self.saved = dict(self.words)
         self.alarm = 0
         self.done = 0
         self.homing = False
         self.jog_until_s = 0.0
-        self.time = Stepper(self._step, lambda: not self.mover.busy, clock)
+        self.time = Stepper(self._step, lambda: not self.mover.busy and not self.mover.shoved, clock)
+
+    # -- supply ----------------------------------------------------------------------------------
+
+    def power_off(self) -> None:
+        """Let go of the motor; the place is forgotten."""
+        self.time.catch_up()
+        self.mover.halt()
+
+    def power_on(self) -> None:
+        """Boot with what was saved, counting from zero where it stands."""
+        self.time.catch_up()
+        self.mover.halt()
+        self.mover.count_from(0.0)
+        self.words = dict(self.saved)
+        self.alarm = self.done = 0
+        self.homing, self.jog_until_s = False, 0.0
+        if self.words.get(PR_CONTROL, 0) & HOME_AT_POWER_ON:
+            self.trigger(0x20)
 
     # -- motion ----------------------------------------------------------------------------------
 
@@ -63,7 +84,8 @@ class Drive:
         if was_going and mover.target is None and not self.alarm:
             self.done |= COMMAND_DONE | PATH_DONE
             if self.homing:
-                self.homing, mover.position, mover.slip = False, 0.0, 0.0
+                self.homing = False
+                mover.count_from(0.0)
                 self.done |= HOMED
 
     def _rpm(self, rpm: float) -> float:
@@ -101,9 +123,9 @@ class Drive:
             case 0x20 if self._may_move():
                 self.done, self.homing = 0, True
                 rate = self._ramp(100)
-                self.mover.go_to(-self.mover.slip, self._rpm(self.words[0x600F]), rate, rate)
+                self.mover.go_to(self.mover.home, self._rpm(self.words[0x600F]), rate, rate)
             case 0x21 if not self.mover.busy:
-                self.mover.position = self.mover.slip = 0.0
+                self.mover.count_from(0.0)
             case word if 0x10 <= word <= 0x1F:
                 return self.run_path(word - 0x10)
             case 0 | 0x20 | 0x21:
@@ -125,6 +147,7 @@ class Drive:
                     self.mover.run(sign * self._rpm(self.words[0x01E1]), self._ramp(100), self._ramp(100))
             case 0x2211:
                 self.words[0x1901] = 0x5555
+                self.saved = dict(self.words)
             case _:
                 return ILLEGAL_VALUE
         return None
@@ -134,6 +157,25 @@ class Drive:
         self.time.catch_up()
         self.alarm, self.homing, self.jog_until_s = code, False, 0.0
         self.mover.stop()
+
+    def foreign(self, kind: str, value: float) -> None:
+        """Run path 0 at a velocity [pulses/s], which is reached already, or start it to a position [pulses]."""
+        self.time.catch_up()
+        match kind:
+            case "velocity":
+                rpm = round(value / self.words[0x0001] * 60)
+                self.write(16, 0x6200, [2, 0, 0, rpm & 0xFFFF, 100, 100, 0, 0x10])
+                self.mover.velocity = self.mover.top_speed
+            case "position":
+                pulses = round(value)
+                self.write(16, 0x6200, [1, pulses >> 16 & 0xFFFF, pulses & 0xFFFF, 100, 100, 100, 0, 0x10])
+            case _:
+                raise ValueError(f"kind {kind}: velocity or position is right")
+
+    def shove(self, velocity: float) -> None:
+        """Turn by itself [pulses/s]."""
+        self.time.catch_up()
+        self.mover.shoved = velocity
 
     # -- registers -------------------------------------------------------------------------------
 
@@ -146,7 +188,7 @@ class Drive:
         self.time.catch_up()
         mover = self.mover
         live = {0x1003: self.status(), 0x2203: self.alarm, 0x6002: 0, 0x1801: 0}
-        rpm = round(mover.velocity / self.words[0x0001] * 60)
+        rpm = round(mover.turns / self.words[0x0001] * 60)
         pairs = {0x1014: mover.feedback, 0x602C: mover.feedback, 0x1044: rpm, 0x1046: rpm}
         for first, value in pairs.items():
             live[first], live[first + 1] = value >> 16 & 0xFFFF, value & 0xFFFF
@@ -191,7 +233,9 @@ async def run() -> None:
     options = parser.parse_args()
     drives = {unit: Drive(pulses_per_turn=options.pulses_per_turn) for unit in unit_list(options.units)}
     devices = [simulated(unit, drive, RANGES) for unit, drive in drives.items()]
-    line = RtuLine(devices, options.link, Faults(), baud=options.baud, answers_damage=True)
+    line = RtuLine(
+        devices, options.link, Faults(), baud=options.baud, answers_damage=True, powered=drives.values()
+    )
     for drive in drives.values():
         if options.ends:
             drive.mover.low, drive.mover.high = options.ends

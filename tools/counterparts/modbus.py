@@ -1,6 +1,7 @@
 """What the Modbus counterparts share: pymodbus's own servers behind a line that can be disturbed.
 
-A serial counterpart is the drive's UART and a pymodbus RTU server. The UART takes a frame from the
+Between the line and the server stands the gate: what the device's supply, its refusals and its frozen readings make of a
+request, whatever the device. A serial counterpart is the drive's UART and a pymodbus RTU server. The UART takes a frame from the
 line when its CRC is right or the line falls silent, drops damaged ones, and hands good ones to the server
 over a second pty; the server's replies go back through the faults. A TCP counterpart is a relay before pymodbus's TCP server.
 """
@@ -21,7 +22,7 @@ from pymodbus.framer.rtu import FramerRTU
 from pymodbus.server import ModbusSerialServer, ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from .faults import Faults
+from .faults import FOREVER, Faults
 from .ports import PtyPort
 
 # a port that is unplugged under it is no news here
@@ -29,6 +30,8 @@ logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 ILLEGAL_FUNCTION = ExcCodes.ILLEGAL_FUNCTION
 ILLEGAL_VALUE = ExcCodes.ILLEGAL_VALUE
+BUSY = 6
+WRITES = (5, 6, 15, 16, 22, 23)
 
 
 class Registers(Protocol):
@@ -76,6 +79,82 @@ def with_crc(body: bytes) -> bytes:
     return body + FramerRTU.compute_CRC(body).to_bytes(2, "big")
 
 
+class Powered(Protocol):
+    """A device whose supply can be switched."""
+
+    def power_off(self) -> None:
+        """Lose what a device without supply loses at once: torque, outputs."""
+
+    def power_on(self) -> None:
+        """Boot: what is not non-volatile is as delivered."""
+
+
+class Gate:
+    """What a request meets before the server: a supply that is off, a refusal, a frozen answer.
+
+    Args:
+        devices: that are switched together.
+
+    Attributes:
+        is_on: whether there is supply.
+        refusals: writes that are still answered "busy" (exception 6) and not carried out.
+        frozen: reads that are still answered as they were the last time.
+        changed: called when the supply was switched.
+    """
+
+    def __init__(self, devices: Iterable[Powered]) -> None:
+        self.is_on = True
+        self.refusals = self.frozen = 0
+        self.changed: Callable[[], None] = lambda: None
+        self._devices = list(devices)
+        self._answers: dict[bytes, bytes] = {}
+        self._boot: asyncio.TimerHandle | None = None
+
+    def answer(self, unit: int, pdu: bytes) -> bytes | None:
+        """Return what the device answers without looking at its registers, None when it looks."""
+        if pdu[0] in WRITES and self.refusals > 0:
+            self.refusals -= 1
+            return bytes((pdu[0] | 0x80, BUSY))
+        if pdu[0] not in WRITES and self.frozen > 0 and bytes((unit,)) + pdu in self._answers:
+            self.frozen -= 1
+            return self._answers[bytes((unit,)) + pdu]
+        return None
+
+    def note(self, unit: int, pdu: bytes, reply: bytes) -> None:
+        """Note the answer to a read, for when the readings stand still."""
+        if pdu[0] not in WRITES:
+            self._answers[bytes((unit,)) + pdu] = reply
+
+    def power_cycle(self, seconds: str = "0.2") -> None:
+        """Switch the supply off for a time."""
+        if self.is_on:
+            self.is_on = False
+            for device in self._devices:
+                device.power_off()
+            self.changed()
+        if self._boot is not None:
+            self._boot.cancel()
+        self._boot = asyncio.get_running_loop().call_later(float(seconds), self._on)
+
+    def _on(self) -> None:
+        self._answers.clear()
+        for device in self._devices:
+            device.power_on()
+        self.is_on = True
+        self.changed()
+
+    def handlers(self) -> dict[str, Callable[..., object]]:
+        """Return the commands ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze [COUNT]``."""
+
+        def refuse(count: str) -> None:
+            self.refusals = int(count)
+
+        def freeze(count: str = "") -> None:
+            self.frozen = int(count) if count else FOREVER
+
+        return {"power_cycle": self.power_cycle, "refuse": refuse, "freeze": freeze}
+
+
 class RtuLine:
     """The line with its drives: pty, UART, faults and pymodbus's server.
 
@@ -85,6 +164,7 @@ class RtuLine:
         faults: of the line.
         baud, bits: when baud is not 0 a reply comes no earlier than the line would carry it.
         answers_damage: units answer a damaged request with exception 8 instead of silence.
+        powered: the drives, for their supply.
     """
 
     def __init__(
@@ -96,7 +176,10 @@ class RtuLine:
         baud: int = 0,
         bits: int = 10,
         answers_damage: bool = False,
+        powered: Iterable[Powered] = (),
     ) -> None:
+        self.gate = Gate(powered)
+        self.gate.changed = self._silence
         self.port = PtyPort(link, self._from_line)
         self._inner = PtyPort(None, self._from_server)
         self._devices, self._faults = devices, faults
@@ -105,6 +188,8 @@ class RtuLine:
         self._answers_damage = answers_damage
         self._frame = b""
         self._reply = b""
+        self._asked = b""
+        self._boots = 0
         self._arrived_s = 0.0
         self._gap: asyncio.TimerHandle | None = None
         self.requests = 0
@@ -136,13 +221,21 @@ class RtuLine:
 
         return {
             **self._faults.handlers(),
+            **self.gate.handlers(),
             "unplug": unplug,
             "plug": self.port.plug,
             "garbage": garbage,
             "requests": lambda: self.requests,
         }
 
+    def _silence(self) -> None:
+        """Forget what is on its way: the supply was switched."""
+        self._frame = self._reply = self._asked = b""
+        self._boots += 1
+
     def _from_line(self, data: bytes) -> None:
+        if not self.gate.is_on:
+            return
         loop = asyncio.get_running_loop()
         self._frame = (self._frame + data)[-256:]  # no frame is longer
         if self._gap is not None:
@@ -157,7 +250,12 @@ class RtuLine:
         self._arrived_s = asyncio.get_running_loop().time() + len(frame) * self._character_s
         if frame[0] in self._units and self._faults.hears():
             self.requests += 1
-            self._inner.write(frame)
+            self._asked = frame
+            ready = self.gate.answer(frame[0], frame[1:-2])
+            if ready is None:
+                self._inner.write(frame)
+            else:
+                self._send(with_crc(frame[:1] + ready))
 
     def _damaged(self) -> None:
         frame, self._frame = self._frame, b""
@@ -168,20 +266,35 @@ class RtuLine:
         self._reply += data
         if crc_is_right(self._reply):
             reply, self._reply = self._reply, b""
-            self._send(reply)
+            if self._asked:
+                self.gate.note(reply[0], self._asked[1:-2], reply[1:-2])
+                self._send(reply)
 
     def _send(self, reply: bytes) -> None:
         loop = asyncio.get_running_loop()
         delay_s, data = self._faults.outgoing(reply)
         ready_s = self._arrived_s + (3.5 + len(reply)) * self._character_s + delay_s
-        loop.call_at(max(ready_s, loop.time()), self.port.write, data)
+        loop.call_at(max(ready_s, loop.time()), self._write, data, self._boots)
+
+    def _write(self, data: bytes, boots: int) -> None:
+        if self.gate.is_on and boots == self._boots:
+            self.port.write(data)
 
 
 class TcpLine:
-    """A relay with faults before pymodbus's TCP server; both listen on the loopback interface."""
+    """A relay with faults before pymodbus's TCP server; both listen on the loopback interface.
 
-    def __init__(self, devices: list[SimDevice], port: int, faults: Faults) -> None:
+    A device without supply says nothing, not even that a connection is gone; after booting it resets the connections that
+    it does not know any more when something comes on them.
+    """
+
+    def __init__(
+        self, devices: list[SimDevice], port: int, faults: Faults, powered: Iterable[Powered] = ()
+    ) -> None:
         self.port = port
+        self.gate = Gate(powered)
+        self.gate.changed = self._silence
+        self._boots = 0
         self._devices, self._faults = devices, faults
         self._public: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
@@ -230,7 +343,15 @@ class TcpLine:
 
             return run
 
-        return {**self._faults.handlers(), "unplug": start(self.unplug), "plug": start(self.plug)}
+        return {
+            **self._faults.handlers(),
+            **self.gate.handlers(),
+            "unplug": start(self.unplug),
+            "plug": start(self.plug),
+        }
+
+    def _silence(self) -> None:
+        self._boots += 1
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
@@ -239,12 +360,25 @@ class TcpLine:
             task.add_done_callback(self._serving.discard)
         inner_reader, inner_writer = await asyncio.open_connection("127.0.0.1", self._inner)
         self._writers |= {writer, inner_writer}
-        outward = asyncio.create_task(self._outward(inner_reader, writer))
+        asked: dict[bytes, bytes] = {}
+        boots = self._boots
+        outward = asyncio.create_task(self._outward(inner_reader, writer, asked, boots))
         try:
-            while data := await reader.read(4096):
+            while frame := await _frame(reader):
+                if not self.gate.is_on:
+                    continue
+                if boots != self._boots:
+                    writer.transport.abort()
+                    return
                 if self._faults.hears():
-                    inner_writer.write(data)
-        except ConnectionError:
+                    ready = self.gate.answer(frame[6], frame[7:])
+                    if ready is None:
+                        asked[frame[:2]] = frame[7:]
+                        inner_writer.write(frame)
+                    else:
+                        head = frame[:4] + (len(ready) + 1).to_bytes(2, "big") + frame[6:7]
+                        self._send(writer, head + ready, boots)
+        except (ConnectionError, asyncio.IncompleteReadError):
             pass
         finally:
             outward.cancel()
@@ -252,12 +386,34 @@ class TcpLine:
             inner_writer.close()
             writer.close()
 
-    async def _outward(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _outward(
+        self,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        asked: dict[bytes, bytes],
+        boots: int,
+    ) -> None:
         with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
-            while head := await reader.readexactly(6):
-                frame = head + await reader.readexactly(int.from_bytes(head[4:6], "big"))
-                delay_s, data = self._faults.outgoing(frame)
-                asyncio.get_running_loop().call_later(delay_s, writer.write, data)
+            while frame := await _frame(reader):
+                self.gate.note(frame[6], asked.pop(frame[:2], b"\x10"), frame[7:])
+                self._send(writer, frame, boots)
+
+    def _send(self, writer: asyncio.StreamWriter, frame: bytes, boots: int) -> None:
+        def write(data: bytes) -> None:
+            if self.gate.is_on and boots == self._boots:
+                writer.write(data)
+
+        delay_s, data = self._faults.outgoing(frame)
+        asyncio.get_running_loop().call_later(delay_s, write, data)
+
+
+async def _frame(reader: asyncio.StreamReader) -> bytes:
+    """Return the next message, b'' at the end of the stream."""
+    head = await reader.read(1)
+    if not head:
+        return b""
+    head += await reader.readexactly(5)
+    return head + await reader.readexactly(int.from_bytes(head[4:6], "big"))
 
 
 def serial_parser(description: str, units: str = "1") -> argparse.ArgumentParser:

@@ -308,7 +308,7 @@ MAP_RIGS: tuple[Rig, ...] = (
     Rig(
         "modbus-io",
         '[device.wago_750]\ndriver = "modbus-io"\nmap = "wago_750"\nchannels = { di = 8, do = 8, ai = 2, ao = 2 }\n'
-        'safe = { do = 0, ao = 0 }\nmain = "di"\n' + QUICK + 'line = { tcp = "{port}" }\n',
+        'safe = { do = 0, ao = 0 }\nmain = "di"\nwatchdog_s = 0.5\n' + QUICK + 'line = { tcp = "{port}" }\n',
         ("wago", "--inputs", "8", "--outputs", "8", "--analogs", "2"), tcp=True,
         inputs=("wago_750",), outputs=(Output("wago_750.do", 8, 0), Output("wago_750.ao", 0, 0, 5.0)), analogs=("wago_750.ai",), name="wago_750",
     ),

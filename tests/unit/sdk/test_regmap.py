@@ -80,6 +80,46 @@ ITEM = "commands/position/writes/0/items/2"
         ("commands/home/writes/0/items/0/source", "speed", "has both value and source; exactly one is right"),
         ("commands/home/writes/0/items/0", {}, "has neither value nor source"),
         (
+            "commands/home/writes/0/items/0",
+            {"values": [1, 2], "differs_from": "stat"},
+            "items[0].differs_from: unknown signal stat; did you mean status",
+        ),
+        (
+            "commands/home/writes/0/items/0",
+            {"values": [1, 1], "differs_from": "status"},
+            "values are [1, 1]; two that differ are right",
+        ),
+        ("commands/home/writes/0/items/0", {"values": [1, 2]}, "values without differs_from"),
+        ("commands/home/writes/0/items/0/values", [1, 2], "has both value and values; exactly one is right"),
+        (
+            "commands/watchdog",
+            {"writes": [{"address": 1, "items": [{"source": "timeout", "unit": "s"}]}]},
+            "dead_man.proof: missing; what commands.watchdog sets must be read back",
+        ),
+        ("dead_man/proof", [{"signal": "status"}], "dead_man.proof[0]: tests nothing; equals"),
+        (
+            "dead_man/proof",
+            [{"signal": "statu", "equals": 1}],
+            "proof[0]: unknown signal statu; did you mean status",
+        ),
+        (
+            "dead_man/proof",
+            [{"signal": "status", "source": "speed"}],
+            "dead_man.proof[0]: unknown quantity speed; timeout is right",
+        ),
+        (
+            "dead_man/tripped",
+            {"signal": "status", "equals": 1},
+            "dead_man.tripped: needs commands.watchdog_restart, which ends it",
+        ),
+        ("restart/counter", "uptim", "restart.counter: unknown signal uptim"),
+        (
+            "restart/token",
+            "",
+            "restart.token: needs commands.token, which writes it; both or neither is right",
+        ),
+        ("restart/maximum", 1, "restart: the token is 1 to 1; a wider range is right"),
+        (
             "commands/home/writes/0/items",
             [{"type": "u32", "value": 1}],
             "function single writes one register, not 2",
