@@ -43,6 +43,8 @@ SETTLING = 0.25
 """Part of the way by which the place to be held follows an axis that settles, at each look."""
 OVERSHOOT = 0.05
 """Part of a move by which a drive may pass its target and come back."""
+MOST_BEFORE = 15
+"""Orders without a look between them that are remembered."""
 STILL = 0.25
 """A step that is followed by one smaller than this part of it was a jump of the reading, not a motion."""
 
@@ -79,6 +81,8 @@ class Finding(NamedTuple):
 class _State:
     order: Order = Order.HOLD
     goal: float = 0.0
+    before: tuple[tuple[Order, float], ...] = ()
+    """What it was told before that since the last look: it may have heard all or nothing of it."""
     has_begun: bool = False
     best: float = 0.0
     """POINT: least distance so far; RUN: farthest place in its direction."""
@@ -134,6 +138,10 @@ class MotionWatch:
         state = self._states[axis]
         if order is Order.HOLD and state.order is not Order.HOLD:
             state.reference, state.since_ns = state.place, state.stamp_ns
+        if order is Order.HOLD:
+            state.before = ()
+        elif state.order is not Order.HOLD:
+            state.before = (*state.before[-MOST_BEFORE:], (state.order, state.goal))
         state.order, state.goal, state.has_begun, state.aways = order, goal, False, 0
 
     def forget(self, axis: int) -> None:
@@ -182,6 +190,8 @@ class MotionWatch:
         away = self._is_away(axis, state, place, velocity, confirmed)
         self._believe(state, now_ns, place, velocity)
         state.held = holds
+        if confirmed:
+            state.before = ()
         if not watched:
             state.reference = place
         elif state.order is Order.HOLD and 0 < now_ns - state.since_ns <= SETTLE_NS:
@@ -218,11 +228,16 @@ class MotionWatch:
         way = self._fastest(axis) * (gap_ns / 1e9 + LATE_S)
         if gap_ns <= GAP_NS or not confirmed or state.order in (Order.HOLD, Order.FORCE):
             return place - way - slack, place + way + slack
-        stand = place + math.copysign(self._braking(axis, state.velocity), state.velocity)
-        if state.order is Order.POINT:
-            return min(place, stand, state.goal) - slack, max(place, stand, state.goal) + slack
-        ahead = state.goal if state.order is Order.RUN else state.velocity
-        return min(place - way * (ahead < 0), stand) - slack, max(place + way * (ahead > 0), stand) + slack
+        reached = [place, place + math.copysign(self._braking(axis, state.velocity), state.velocity)]
+        for order, goal in (*state.before, (state.order, state.goal)):
+            if order is Order.POINT:
+                reached.append(goal)
+            elif order is Order.FORCE:
+                reached += [place - way, place + way]
+            else:
+                ahead = goal if order is Order.RUN else state.velocity
+                reached.append(place + way * ((ahead > 0) - (ahead < 0)))
+        return min(reached) - slack, max(reached) + slack
 
     def _doubt(
         self, axis: int, state: _State, now_ns: int, place: float, velocity: float, watched: bool

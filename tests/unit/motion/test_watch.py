@@ -4,7 +4,7 @@ import errno
 
 import numpy as np
 import pytest
-from motion_rig import MODE, POLL_NS, Cell, axis
+from motion_rig import MODE, POLL_NS, Cell, axis, records
 
 from sioms.motion import ActionKind, CommandError, EventKind, Watch
 from sioms.motion.watch import MotionWatch, Order
@@ -219,6 +219,21 @@ def test_a_silence_in_which_the_axis_did_what_it_was_told_loses_nothing(order):
         cell.drives[0].step(POLL_NS * 1e-9)
     cell.poll(20)
     assert not cell.status() & S.FAULT, cell.text
+
+
+def test_an_order_that_the_drive_may_have_heard_before_a_silence_loses_nothing():
+    cell = Defect()
+    cell.bank.append(records(mode=MODE.POSITION, position=2.5), [0], cell.now_ns)
+    (action,) = cell.bank.take_actions()
+    cell.drives[0].take(action)
+    cell.bank.action_failed(action, "its reply was damaged", cell.now_ns)
+    for _ in range(30):
+        cell.drives[0].step(POLL_NS * 1e-9)
+    cell.now_ns += 10**9
+    cell.send()  # the stop of a link that is there again
+    cell.poll(5)
+    assert not cell.status() & S.POSITION_LOST, cell.text
+    assert cell.drives[0].velocity == 0
 
 
 def test_reset_alone_gives_no_positions_to_an_axis_that_lost_its_place():
