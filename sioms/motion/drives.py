@@ -413,6 +413,7 @@ class DriveBank:
                 now_ns,
                 float(raw[axis]),
                 float(velocity[axis]),
+                moving=bool(self._moving[axis]),
                 confirmed=bool(self._acknowledged[axis]),
                 holds=holds is None or bool(holds[axis]),
                 latched=bool(self._queue.latched[axis] & LATCHED),

@@ -43,10 +43,12 @@ SETTLING = 0.25
 """Part of the way by which the place to be held follows an axis that settles, at each look."""
 OVERSHOOT = 0.05
 """Part of a move by which a drive may pass its target and come back."""
+LONGEST_BRAKE_S = 10.0
+"""However fast an axis is found, it is not given longer to brake [s]."""
 MOST_BEFORE = 15
 """Orders without a look between them that are remembered."""
 STILL = 0.25
-"""A step that is followed by one smaller than this part of it was a jump of the reading, not a motion."""
+"""A step that is followed by one at less than this part of its speed was a jump of the reading, not a motion."""
 
 
 class Order(Enum):
@@ -93,6 +95,8 @@ class _State:
     since_ns: int = 0
     place: float = 0.0
     velocity: float = 0.0
+    rests_ns: int = 0
+    """Until then an axis that was found moving may brake: the driver before this one was killed in motion."""
     held: bool = True
     """The drive held its axis at the last look."""
     stamp_ns: int = 0
@@ -157,6 +161,7 @@ class MotionWatch:
         place: float,
         velocity: float,
         *,
+        moving: bool = False,
         confirmed: bool = True,
         holds: bool = True,
         latched: bool = False,
@@ -168,6 +173,7 @@ class MotionWatch:
             now_ns: time of the reading [ns].
             place: raw position [unit].
             velocity: as the drive reports it [unit/s].
+            moving: the drive says that it moves.
             confirmed: the drive has confirmed what it was told last.
             holds: the drive is switched on and holds its axis when nothing is commanded.
             latched: a fault or an emergency stop is latched; the drive may have let go, and is told to stop anyway.
@@ -178,10 +184,14 @@ class MotionWatch:
         if not state.stamp_ns or now_ns < state.free_until_ns:
             state.held = holds
             self._rest_at(state, now_ns, place, velocity)
+            brakes_s = 2 * abs(velocity) / float(self._acceleration[axis]) if moving else 0.0
+            state.rests_ns = now_ns + int(min(brakes_s, LONGEST_BRAKE_S) * 1e9) + SETTLE_NS * moving
             return None
+        if not moving:
+            state.rests_ns = min(state.rests_ns, now_ns)
         gap_ns = now_ns - state.stamp_ns
         watched = holds and state.held and (not latched or gap_ns > GAP_NS)
-        watched = watched and self._settings[axis].watch.uncommanded
+        watched = watched and self._settings[axis].watch.uncommanded and now_ns >= state.rests_ns
         low, high = self._reach(axis, state, gap_ns, confirmed, watched)
         if not low <= place <= high:
             return self._doubt(axis, state, now_ns, place, velocity, watched)
@@ -253,7 +263,9 @@ class MotionWatch:
         before, name, unit = state.place, self._settings[axis].name, self._settings[axis].unit
         held = state.order is Order.HOLD and watched
         if held:
-            jumped = gap or (first > self._tolerance(axis) and second <= STILL * first)
+            first_s = (state.doubted_ns - state.stamp_ns) / 1e9
+            stands = second * first_s <= STILL * first * between_s  # looks may come unevenly
+            jumped = gap or (first > self._tolerance(axis) and stands)
         else:
             jumped = gap or second <= self._fastest(axis) * (between_s + LATE_S)
         tolerance, reference = self._tolerance(axis), state.reference

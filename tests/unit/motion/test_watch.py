@@ -70,6 +70,20 @@ def test_an_axis_may_be_pushed_a_little_and_one_that_is_let_go_far():
     cell.polls_to_fault()
 
 
+@pytest.mark.parametrize("brakes", [True, False])
+def test_an_axis_that_is_found_moving_may_brake_and_no_more(brakes):
+    """The driver before this one was killed in motion; the new one has sent a stop before its first poll."""
+    watch, now, place, velocity = watch_of_one(), 10**9, 0.0, 1.0
+    found = []
+    for _ in range(300):
+        found.append(watch.look(0, now, place, velocity, moving=velocity > 0))
+        now += POLL_NS
+        place += velocity * POLL_NS * 1e-9
+        velocity = max(0.0, velocity - 5.0 * POLL_NS * 1e-9) if brakes else velocity
+    assert any(found) is not brakes
+    assert brakes or "nothing was commanded" in next(each for each in found if each).text
+
+
 def test_an_axis_that_is_guided_by_hand_is_not_watched_for_that_alone():
     cell = Defect(watch=Watch(uncommanded=False))
     cell.drives[0].shove = 1.0
