@@ -198,18 +198,7 @@ class Attachments:
 
     def _make_safe(self, handle: Handle) -> None:
         """Give the outputs of a handle their safe values; of a bit only that bit."""
-        block = handle.block
-        if handle.bit < 0 or not block.spec.safe or block.spec.safe[int(handle.channels[0])] is None:
-            self._runtime.stops.make_safe(block, handle.channels)
-            return
-        channel = int(handle.channels[0])
-        mask = 1 << handle.bit
-        present = int(self._runtime.outputs.get((id(block), channel), 0))
-        value = (present & ~mask) | (int(block.spec.safe[channel] or 0) & mask)
-        try:
-            self._runtime.engine.write_outputs(None, 0, block, [channel], [value])
-        except OSError as error:
-            self._runtime.log("error", f"safe output of {handle.node} could not be set: {error.strerror}")
+        self._runtime.stops.make_safe(handle.block, handle.channels, handle.bit)
 
 
 def _keep_part(handle: Handle, number: int, records: bytes) -> None:

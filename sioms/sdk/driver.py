@@ -227,7 +227,11 @@ class LineUnit(ABC):
         raise NotImplementedError(f"{type(self).__name__} describes axes but carries out no actions")
 
     def write_outputs(self, block: BlockSpec, channels: Sequence[int], values: Sequence[float]) -> Steps:
-        """Write output channels of a writable binary or analog block."""
+        """Write output channels of a writable binary or analog block.
+
+        ``block.data`` must show what the device has: ``poll`` reads it back, or this sets it when the device has
+        acknowledged. The kit makes ports of single bits from it, and sends safe values until they show there.
+        """
         raise NotImplementedError(f"{type(self).__name__} describes a writable block but takes no outputs")
 
     def stop(self) -> Steps:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 from .blocks import AnyBlock
 from .exchange import Steps
 from .handles import Handle
+from .outputs import Change
 
 if TYPE_CHECKING:
     pass
@@ -29,14 +30,12 @@ class Engine(Protocol):
         """Do the work of one tick and publish."""
 
     def write_outputs(
-        self,
-        handle: Handle | None,
-        number: int,
-        block: AnyBlock,
-        channels: Sequence[int],
-        values: Sequence[float],
+        self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]
     ) -> Any:
-        """Set outputs for a client (handle) or for safety (None)."""
+        """Set outputs for a client."""
+
+    def make_safe(self, block: AnyBlock) -> None:
+        """Send the safe values that are wanted of a block (Runtime.outputs) now; later looks send what was lost."""
 
     def carry_out(self, handle: Handle, number: int, steps: Steps, what: str) -> Any:
         """Run the steps that answer a client's request."""

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 
@@ -56,6 +57,17 @@ class StateLost(DeviceError):
 
     def __init__(self, text: str) -> None:
         super().__init__(errno.EIO, text)
+
+
+class HookError(Exception):
+    """A driver's hook raised what it should not have; the cause is the driver author's exception. Ends the device.
+
+    Args:
+        what: which hook.
+    """
+
+    def __init__(self, what: str) -> None:
+        super().__init__(what)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,3 +138,27 @@ def while_wanted(steps: Steps, is_wanted: Callable[[], bool]) -> Generator[Step,
         except (LinkError, DeviceError) as error:
             failure = error
     return False
+
+
+def noting(steps: Steps, note: Callable[[], None]) -> Steps:
+    """Carry out steps, and note each good reply when it comes: others may have their turn before the steps go on."""
+    value: Any = None
+    failure: Exception | None = None
+    while True:
+        try:
+            step = steps.throw(failure) if failure else steps.send(value)
+        except StopIteration:
+            return
+        value, failure = None, None
+        if isinstance(step, Exchange):
+            step = replace(step, decode=partial(_decode_and_note, step.decode, note))
+        try:
+            value = yield step
+        except (LinkError, DeviceError) as error:
+            failure = error
+
+
+def _decode_and_note(decode: Callable[[bytes], Any], note: Callable[[], None], reply: bytes) -> Any:
+    value = decode(reply)
+    note()
+    return value

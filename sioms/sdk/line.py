@@ -17,7 +17,7 @@ from itertools import count
 from typing import Any
 
 from .connection import Connection
-from .exchange import Aside, DeviceError, Exchange, LinkError, Pause, Send, Step, Steps
+from .exchange import Aside, DeviceError, Exchange, HookError, LinkError, Pause, Send, Step, Steps
 from .side_connection import SideConnection
 
 ATTEMPTS = 2
@@ -254,6 +254,14 @@ class Line:
             self._finish(running.job, end.value, None, now_ns)
         except (LinkError, DeviceError) as error:
             self._finish(running.job, None, error, now_ns)
+        except Exception as error:  # never to be taken for something that the line or a client has done
+            failure = HookError(getattr(running.job.steps, "__qualname__", "a hook"))
+            failure.__cause__ = error
+            self._running = None
+            try:
+                self._next_job(now_ns)  # what waits may be a stop
+            finally:
+                raise failure
         else:
             running.step, running.attempts = step, 0
             self._begin(step, now_ns)

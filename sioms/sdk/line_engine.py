@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import errno
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from sioms.motion import DriveAction, DriveBank
 from sioms.protocol.flags import PageState
 
-from .blocks import AnyBlock, AxisBlock
+from .blocks import AnyBlock, AxisBlock, BinaryBlock
 from .connected import FIRST_PAUSE_NS, LONGEST_PAUSE_NS, Connected
 from .driver import LineDriver, LineUnit
-from .exchange import DeviceError, LinkError, StateLost, Steps, while_wanted
+from .exchange import DeviceError, LinkError, Pause, StateLost, Steps, noting, while_wanted
 from .handles import LATER, Handle
-from .line import Done, Priority
+from .line import Done, Line, Priority
+from .outputs import Change
 
 if TYPE_CHECKING:
     from .runtime import Runtime
 
+RETRY_S = 0.02
+"""Pause before what must get through is sent again, where no poll does it."""
 MAX_WRITES = 16
 """Writes of outputs that one handle may have waiting for the line."""
 
@@ -37,6 +40,16 @@ class _UnitState:
         self.pause_ns = FIRST_PAUSE_NS
         self.fresh = False
         self.as_of_ns = 0
+        self.mark = 0
+
+
+@dataclass(slots=True, eq=False)
+class _Write:
+    """A client's write of outputs that is not done yet; one that a stop or a safe value has overtaken is void."""
+
+    block: AnyBlock
+    changes: Mapping[int, Change]
+    is_void: bool = False
 
 
 class LineEngine(Connected):
@@ -48,7 +61,8 @@ class LineEngine(Connected):
         self._period_ns = int(1e9 / poll_hz)
         self._units = [_UnitState(unit) for unit in driver.units]
         self._by_block = {id(block): state for state in self._units for block in state.unit.blocks}
-        self._voids: Counter[tuple[int, int]] = Counter()
+        self._writes: list[_Write] = []
+        self._saving: set[int] = set()
         self._closed = False
         self.publishes = False
 
@@ -92,6 +106,7 @@ class LineEngine(Connected):
     def _poll(self, state: _UnitState) -> Steps:
         """Poll a unit, and note when that began: what it was told until then shows in the readings."""
         state.as_of_ns = self._runtime.as_of_ns()
+        state.mark = self._runtime.outputs.mark()
         yield from state.unit.poll()
 
     def _opened(self, state: _UnitState, _: Any, error: Exception | None) -> None:
@@ -123,10 +138,12 @@ class LineEngine(Connected):
             self._runtime.set_link(state.unit.blocks, PageState.GOOD, "")
             for block in state.unit.blocks:
                 # who wrote them may have gone meanwhile
-                self._runtime.stops.make_safe(block, self._unowned(block))
+                self._runtime.stops.make_unowned_safe(block)
         for block in state.unit.blocks:
             if isinstance(block, AxisBlock):
                 self._take_actions(state, block, now_ns)
+            elif block.spec.writable:
+                self._runtime.stops.look_at_outputs(block, state.mark)
         # the line is slower than the rate asked for: poll back to back, and publish while the request is on the line
         if state.due_ns <= now_ns and self.line is not None and not state.busy and self._runtime.running:
             self._start(state, now_ns)
@@ -183,6 +200,9 @@ class LineEngine(Connected):
         else:
             bank.action_failed(action, f"{state.unit.name}: {error}", now_ns)
             self._take_actions(state, block, now_ns)
+            if self._closed and action.is_stop and self.line is not None:  # no poll has it sent again
+                steps, done = _later(state.unit.act(action)), partial(self._acted, state, block, bank, action)
+                self.guarded(partial(self.line.submit, steps, Priority.ACT, done, now_ns), now_ns)
         state.due_ns = min(state.due_ns, now_ns)  # look at once what it did
 
     def as_of_ns(self, block: AnyBlock, stamp_ns: int) -> int:
@@ -190,45 +210,25 @@ class LineEngine(Connected):
         return self._by_block[id(block)].as_of_ns
 
     def write_outputs(
-        self,
-        handle: Handle | None,
-        number: int,
-        block: AnyBlock,
-        channels: Sequence[int],
-        values: Sequence[float],
+        self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]
     ) -> Any:
         """Send the values; the client's answer comes when the device has confirmed them."""
         state, line, now_ns = self._by_block[id(block)], self.line, self._runtime.now_ns()
         if line is None or not state.is_up:
             raise OSError(errno.EIO, f"write {block.spec.name}: {state.unit.name} does not answer")
-        if handle is not None and handle.writes_under_way >= MAX_WRITES:
+        if handle.writes_under_way >= MAX_WRITES:
             raise OSError(
                 errno.EAGAIN,
                 f"write {handle.node}: {MAX_WRITES} writes wait for the line already; wait for their answers",
             )
-        outputs, wanted = (
-            self._runtime.outputs,
-            {(id(block), c): v for c, v in zip(channels, values, strict=True)},
-        )
-        steps = state.unit.write_outputs(block.spec, channels, values)
-        if handle is None:
-            self._voids.update(wanted.keys())
-        else:
-            steps = self._unless_void(steps, {key: self._voids[key] for key in wanted})
-        if handle is not None:
-            handle.writes_under_way += 1
-        outputs.update(wanted)  # at once: writes of single bits begin from what is on its way already
+        write = _Write(block, changes)
+        self._writes.append(write)
+        handle.writes_under_way += 1
 
         def done(_: Any, error: Exception | None) -> None:
-            if handle is not None:
-                handle.writes_under_way -= 1
-            if error is not None:
-                for key in [k for k, v in wanted.items() if outputs.get(k) == v]:
-                    del outputs[key]  # what it is now, the device tells
-            if handle is None:
-                if error is not None:
-                    self._runtime.log("error", f"{state.unit.name}: safe outputs could not be set: {error}")
-            elif error is None:
+            self._writes.remove(write)
+            handle.writes_under_way -= 1
+            if error is None:
                 self._runtime.effects.note()
                 self.acted(block)
                 handle.answer(number, self._runtime.tick)
@@ -236,14 +236,79 @@ class LineEngine(Connected):
                 errno_ = error.errno if isinstance(error, DeviceError) else errno.EIO
                 handle.refuse(number, errno_, f"write {handle.node}: {state.unit.name}: {error}")
 
-        priority = Priority.STOP if handle is None else Priority.OUTPUT
-        self.guarded(lambda: line.submit(steps, priority, done, now_ns), now_ns)
+        self.guarded(
+            lambda: line.submit(self._write(state.unit, write), Priority.OUTPUT, done, now_ns), now_ns
+        )
         return LATER
 
     def acted(self, block: AnyBlock) -> None:
         """Look at once what it did: who reads waits for the poll."""
         state = self._by_block[id(block)]
         state.due_ns = min(state.due_ns, self._runtime.now_ns())
+
+    def _write(self, unit: LineUnit, write: _Write) -> Steps:
+        """Carry out a write of outputs, and no further once a stop or a safe value has overtaken it.
+
+        What the port shall be is made up when its turn on the line has come: others may have written to it meanwhile.
+        """
+        outputs = self._runtime.outputs
+        channels, values = outputs.merged(write.block, write.changes)
+        steps = self._written(unit, write.block, channels, values)
+        if not (yield from while_wanted(steps, lambda: not write.is_void)):
+            raise DeviceError(errno.ECANCELED, "overtaken by a stop or a safe value")
+
+    def _written(
+        self, unit: LineUnit, block: AnyBlock, channels: Sequence[int], values: Sequence[float]
+    ) -> Steps:
+        """Write outputs, and note that the device has them as soon as it says so: a stop may go out before this goes on."""
+        note = partial(self._runtime.outputs.acknowledge, block, channels, values)
+        steps = unit.write_outputs(block.spec, channels, values)
+        yield from noting(steps, note) if isinstance(block, BinaryBlock) else steps
+        note()
+
+    def make_safe(self, block: AnyBlock) -> None:
+        """Send the safe values that are wanted, ahead of everything but other stops; one message of each block is on its way."""
+        wanted = self._runtime.outputs.unsent(block)
+        for write in self._writes:
+            write.is_void |= write.block is block and any(
+                change.mask & wanted[channel].mask
+                for channel, change in write.changes.items()
+                if channel in wanted
+            )
+        state, line, now_ns = self._by_block[id(block)], self.line, self._runtime.now_ns()
+        if not wanted or line is None or not state.is_up or id(block) in self._saving:
+            return
+        self._saving.add(id(block))
+        self.guarded(partial(self._send_safe, line, state.unit, block, 0.0, now_ns), now_ns)
+
+    def _send_safe(self, line: Line, unit: LineUnit, block: AnyBlock, pause_s: float, now_ns: int) -> None:
+        priority = Priority.ACT if pause_s else Priority.STOP
+        line.submit(
+            self._safe(unit, block, pause_s), priority, partial(self._saved, line, unit, block), now_ns
+        )
+
+    def _safe(self, unit: LineUnit, block: AnyBlock, pause_s: float) -> Steps:
+        if pause_s:
+            yield Pause(pause_s)
+        outputs = self._runtime.outputs
+        channels, values = outputs.merged(block, outputs.unsent(block))
+        if channels:
+            yield from self._written(unit, block, channels, values)
+
+    def _saved(self, line: Line, unit: LineUnit, block: AnyBlock, _: Any, error: Exception | None) -> None:
+        self._saving.discard(id(block))
+        if error is not None:
+            self._runtime.stops.tell_unsafe(block, str(error))
+        if line is not self.line:
+            return
+        if self._closed and error is not None:  # no poll comes any more: try for as long as the process lasts
+            self._saving.add(id(block))
+            now_ns = self._runtime.now_ns()
+            self.guarded(partial(self._send_safe, line, unit, block, RETRY_S, now_ns), now_ns)
+        elif error is None:
+            self._runtime.effects.note()
+            self.acted(block)
+            self.make_safe(block)  # something more may be wanted by now
 
     def commands_written(self, block: AnyBlock) -> None:
         """Send at once what the bank has to send."""
@@ -252,24 +317,11 @@ class LineEngine(Connected):
             block.bank.advance(now_ns)
             self._take_actions(state, block, now_ns)
 
-    def _unless_void(self, steps: Steps, marks: dict[tuple[int, int], int]) -> Steps:
-        """Carry out a write of outputs, and no further once a stop or a safe value has overtaken it."""
-        done = yield from while_wanted(
-            steps, lambda: all(self._voids[key] == mark for key, mark in marks.items())
-        )
-        if not done:
-            raise DeviceError(errno.ECANCELED, "overtaken by a stop or a safe value")
-
-    def _unowned(self, block: AnyBlock) -> list[int]:
-        """Return the channels whose outputs no client holds; a stopped workcell holds none."""
-        holders = [] if self._runtime.stops.stopped else self._runtime.clients.handles.values()
-        held = {int(c) for h in holders if h.exclusive and h.block is block for c in h.channels}
-        return [c for c in range(block.n) if c not in held]
-
     def stop(self, blocks: Sequence[AnyBlock]) -> None:
         """Send what the banks have been told: their stops overtake everything else on the line."""
         for block in blocks:
-            self._voids.update((id(block), c) for c in range(block.n))
+            for write in self._writes:
+                write.is_void |= write.block is block
             self.commands_written(block)
 
     def is_quiet(self) -> bool:
@@ -284,5 +336,14 @@ class LineEngine(Connected):
             return
         for state in self._units:
             if state.is_up:
+                for block in state.unit.blocks:
+                    if block.spec.writable:
+                        self.make_safe(block)
                 done: Done = lambda _value, _error: None  # noqa: E731
                 self.guarded(partial(line.submit, state.unit.close(), Priority.ACT, done, now_ns), now_ns)
+
+
+def _later(steps: Steps) -> Steps:
+    """Carry out steps after a pause in which the line serves nobody else for long."""
+    yield Pause(RETRY_S)
+    yield from steps

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from .blocks import AnyBlock, BinaryBlock, BlockSpec
+from .blocks import AnyBlock, AxisBlock, BinaryBlock, BlockSpec
 
 WHOLE = -1
 """Mask of an analog value."""
@@ -86,7 +86,7 @@ class Outputs:
         written = self._written.get((id(block), channel))
         if written is not None:
             return written[1]
-        return int(block.data[channel]) if isinstance(block, BinaryBlock) else 0.0
+        return _reading(block, channel)
 
     def acknowledge(self, block: AnyBlock, channels: Sequence[int], values: Sequence[float]) -> None:
         """Note that the device has taken a write."""
@@ -176,4 +176,10 @@ def _differing(block: AnyBlock, channel: int, wanted: _Safe) -> int:
     info = block.spec.channels[channel]
     range_ = (info.maximum or 0.0) - (info.minimum or 0.0)
     near = NEAR * (range_ or max(1.0, abs(wanted.value)))
-    return 0 if abs(float(block.fields[0, channel]) - wanted.value) <= near else WHOLE
+    return 0 if abs(_reading(block, channel) - wanted.value) <= near else WHOLE
+
+
+def _reading(block: AnyBlock, channel: int) -> float:
+    if isinstance(block, AxisBlock):
+        raise TypeError(f"outputs of {block.spec.name!r}: axes have none")
+    return float(block.data[channel])

@@ -16,6 +16,8 @@ import socket
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -37,11 +39,13 @@ from .blocks import AnyBlock, AxisBlock, set_alarms
 from .driver import Driver, LineDriver, StreamDriver, TickDriver
 from .effects import Effects
 from .engine import Engine
+from .exchange import HookError
 from .handles import Waits
 from .inputs import Input
 from .keeping import keep_positions
 from .line_engine import LineEngine
 from .markers import Markers
+from .outputs import Outputs
 from .pages import Pages
 from .rt import TimerFd, become_realtime, name_process
 from .statistics import TickStatistics
@@ -97,7 +101,7 @@ class Runtime:
         self.effects = Effects()
         self.waits = Waits(self.effects)
         self.looked_ns = 0
-        self.outputs: dict[tuple[int, int], float] = {}
+        self.outputs = Outputs()
         self.statistics = TickStatistics()
         self.line_due: Callable[[], None] = lambda: None
         self._control = socket.socket(fileno=fds[0])
@@ -200,6 +204,7 @@ class Runtime:
             if isinstance(block, AxisBlock):
                 block.bank.fault(np.arange(block.n), reason, now_ns)
         self.effects.note()
+        self.outputs.forget(blocks)
         self.set_link(blocks, PageState.LINK_LOST, reason)
         self.take_events()
         ours = {id(block) for block in blocks}
@@ -332,21 +337,29 @@ class Runtime:
 
     def _fail(self, error: Exception) -> None:
         """Stop first, report second: the driver has raised what it should not have."""
+        what = ""
+        if isinstance(error, HookError) and isinstance(error.__cause__, Exception):
+            what, error = f" in {error}", error.__cause__
         trace = "".join(traceback.format_exception(error)[-3:])
-        try:
-            self.engine.recover(f"the driver failed: {error!r}")
-            now_ns = time.monotonic_ns()
-            for block in self.blocks:
-                if isinstance(block, AxisBlock):
-                    block.bank.emergency_stop(np.arange(block.n), now_ns)
-            self.engine.stop(self.blocks)
-            for block in self.blocks:
-                self.stops.make_safe(block, range(block.n))
-            self.engine.close()
-            self._run_line(now_ns + FAIL_GRACE_NS)
-        except Exception as second:  # nothing may keep the failure from being reported
-            trace += f" (and while stopping: {second!r})"
-        self.log("error", f"driver failed: {error!r}: {trace}")
+        now_ns = time.monotonic_ns()
+        for block in self.blocks:
+            if isinstance(block, AxisBlock):
+                block.bank.emergency_stop(np.arange(block.n), now_ns)
+        attempts: list[Callable[[], None]] = [
+            lambda: self.engine.recover(f"the driver failed: {error!r}"),
+            lambda: self.engine.stop(self.blocks),
+            *(partial(self.stops.make_safe, block, range(block.n)) for block in self.blocks),
+            self.engine.close,
+            lambda: self._run_line(now_ns + FAIL_GRACE_NS),
+        ]
+        for attempt in attempts:
+            try:
+                attempt()
+            except (
+                Exception
+            ) as second:  # nothing may keep the others from being stopped, nor this from being told
+                trace += f" (and while stopping: {second!r})"
+        self.log("error", f"driver failed{what}: {error!r}: {trace}")
 
     def _run_line(self, until_ns: int) -> None:
         """Let the line send what is left to send; nothing else runs any more."""
@@ -359,7 +372,8 @@ class Runtime:
             for fd, _ in self._epoll.poll(0.005):
                 callback = self._callbacks.get(fd)
                 if callback is not None and fd not in others:
-                    callback()
+                    with suppress(HookError):  # one failure is being told already
+                        callback()
 
     def end(self, reason: str) -> None:
         """Stop everything, make outputs safe, and let the process end when all is quiet."""

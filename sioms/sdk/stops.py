@@ -12,14 +12,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sioms.protocol.flags import PageState
 from sioms.protocol.latch import Latch
 from sioms.protocol.messages import DriverVerb
 from sioms.protocol.stopfile import StopRequest
 
 from .blocks import AnyBlock, AxisBlock, BinaryBlock
+from .outputs import safe_of
 
 if TYPE_CHECKING:
     from .runtime import Runtime
+
+
+TOLD_NS = 10_000_000_000
+"""How often it is logged that safe outputs could not be set."""
 
 
 class Stops:
@@ -41,6 +47,8 @@ class Stops:
     ) -> None:
         self.stopped = False
         self.latched_outputs: dict[tuple[int, int], str] = {}
+        self._unsafe: dict[int, tuple[int, int]] = {}
+        """Blocks with safe values that could not be set: when that was logged, and failures since."""
         self._runtime = runtime
         self._latch = latch
         self._request = request
@@ -166,19 +174,68 @@ class Stops:
             for channel in channels:
                 self.latched_outputs.pop((id(block), int(channel)), None)
 
-    def make_safe(self, block: AnyBlock, channels: Any) -> None:
-        """Give output channels their safe values; those without one keep the last."""
-        if isinstance(block, AxisBlock) or not block.spec.writable or not block.spec.safe:
+    # --- outputs ---------------------------------------------------------------------------------
+
+    def make_safe(self, block: AnyBlock, channels: Any, bit: int = -1) -> None:
+        """Want the safe values of output channels, or of one bit, until the device has them; those without one keep the last."""
+        if isinstance(block, AxisBlock):
             return
-        safe = [(int(c), value) for c in channels if (value := block.spec.safe[int(c)]) is not None]
-        if not safe:
+        wanted = {int(c): safe for c in channels if (safe := safe_of(block.spec, int(c), bit)) is not None}
+        for channel, safe in wanted.items():
+            self._runtime.outputs.want(block, channel, safe)
+        if wanted:
+            self._runtime.engine.make_safe(block)
+
+    def make_unowned_safe(self, block: AnyBlock) -> None:
+        """Make outputs safe that no client holds, after the device was opened; a stopped workcell holds none."""
+        holders = [] if self.stopped else self._runtime.clients.handles.values()
+        for channel in range(block.n):
+            held = [h for h in holders if h.exclusive and h.block is block and channel in h.axes]
+            if not held:
+                self.make_safe(block, [channel])
+            elif all(h.bit >= 0 for h in held):
+                width = block.spec.channels[channel].width
+                for bit in {*range(width)} - {h.bit for h in held}:
+                    self.make_safe(block, [channel], bit)
+
+    def look_at_outputs(self, block: AnyBlock, mark: int) -> None:
+        """Compare outputs that were read with the safe values that are wanted, and send what the device does not have.
+
+        Args:
+            block: as it was read.
+            mark: of Outputs, from before the reading.
+        """
+        outputs, key = self._runtime.outputs, id(block)
+        outputs.read(block, mark, lambda channel: self.stop_of(block, channel) is not None)
+        if outputs.unsent(block):
+            self._runtime.engine.make_safe(block)
+        elif key in self._unsafe and not outputs.unconfirmed(block):
+            del self._unsafe[key]
+            self._runtime.set_link([block], PageState.GOOD, "")
+            self._runtime.log("info", f"{self._name(block)}: safe outputs are confirmed")
+
+    def tell_unsafe(self, block: AnyBlock, why: str) -> None:
+        """Tell clients and log that safe outputs are wanted and could not be set; they are tried again."""
+        now_ns, runtime = time.monotonic_ns(), self._runtime
+        told_ns, count = self._unsafe.get(id(block), (0, 0))
+        if now_ns - told_ns < TOLD_NS:
+            self._unsafe[id(block)] = (told_ns, count + 1)
             return
-        runtime = self._runtime
-        try:
-            runtime.engine.write_outputs(None, 0, block, [c for c, _ in safe], [v for _, v in safe])
-        except OSError as error:
-            name = f"{runtime.device}.{block.spec.name}"
-            runtime.log("error", f"safe outputs of {name} could not be set: {error.strerror}")
+        self._unsafe[id(block)] = (now_ns, 0)
+        text = f"safe outputs not confirmed: {why}"
+        if runtime.is_good([block]):
+            runtime.set_link([block], PageState.GOOD, text)
+        tries = f" ({count} more tries since)" if count else ""
+        runtime.log(
+            "error", f"{self._name(block)}: {text}; they are sent until the device confirms them{tries}"
+        )
+
+    def stop_of(self, block: AnyBlock, channel: int) -> str | None:
+        """Return who has stopped an output channel, None when it is not stopped."""
+        return self.source if self.stopped else self.latched_outputs.get((id(block), channel))
+
+    def _name(self, block: AnyBlock) -> str:
+        return ".".join(part for part in (self._runtime.device, block.spec.name) if part)
 
     def _reset_axes(self, block: AxisBlock, channels: Any) -> None:
         block.bank.reset(np.array(channels, dtype=np.intp))

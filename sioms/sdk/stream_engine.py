@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.flags import PageState
@@ -14,6 +14,7 @@ from .driver import StreamDriver
 from .exchange import DeviceError, LinkError
 from .handles import Handle
 from .line import Priority
+from .outputs import Change
 
 if TYPE_CHECKING:
     from .runtime import Runtime
@@ -114,15 +115,13 @@ class StreamEngine(Connected):
         return min(stamp_ns, self._runtime.now_ns())
 
     def write_outputs(
-        self,
-        handle: Handle | None,
-        number: int,
-        block: AnyBlock,
-        channels: Sequence[int],
-        values: Sequence[float],
+        self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]
     ) -> Any:
         """Refuse: a stream has no outputs."""
         raise OSError(errno.EBADF, f"write {block.spec.name}: this device only sends")
+
+    def make_safe(self, block: AnyBlock) -> None:
+        """Nothing: a stream has no outputs."""
 
     def commands_written(self, block: AnyBlock) -> None:
         """Nothing: a stream has no axes."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.flags import PageState
@@ -11,8 +12,9 @@ from sioms.protocol.flags import PageState
 from .blocks import AnyBlock
 from .connected import FIRST_PAUSE_NS, LONGEST_PAUSE_NS
 from .driver import Refusal, TickDriver
-from .exchange import LinkError, Steps
+from .exchange import HookError, LinkError, Steps
 from .handles import Handle
+from .outputs import Change
 
 if TYPE_CHECKING:
     from .runtime import Runtime
@@ -38,6 +40,7 @@ class TickEngine:
         self._runtime = runtime
         self._driver = driver
         self._is_open = False
+        self._outputs = [block for block in driver.blocks if block.spec.writable]
         self._retry_ns = 0
         self._pause_ns = FIRST_PAUSE_NS
 
@@ -45,11 +48,16 @@ class TickEngine:
         """Tick the driver and publish all blocks."""
         if not self._is_open and not self._open(now_ns):
             return
+        mark = self._runtime.outputs.mark()
         try:
             self._driver.tick(now_ns)
         except LinkError as error:  # the device is gone; open will find it again
             self._is_open, self._retry_ns = False, now_ns + self._pause_ns
             self._runtime.lose(self._driver.blocks, str(error))
+            return
+        self._pause_ns = FIRST_PAUSE_NS
+        for block in self._outputs:
+            self._runtime.stops.look_at_outputs(block, mark)
 
     def _open(self, now_ns: int) -> bool:
         if now_ns < self._retry_ns:
@@ -61,8 +69,10 @@ class TickEngine:
             self._retry_ns = now_ns + self._pause_ns
             self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
             return False
-        self._is_open, self._pause_ns = True, FIRST_PAUSE_NS
+        self._is_open = True
         self._runtime.set_link(self._driver.blocks, PageState.GOOD, "")
+        for block in self._outputs:
+            self._runtime.stops.make_unowned_safe(block)
         return True
 
     @property
@@ -75,21 +85,33 @@ class TickEngine:
         return self._runtime.looked_ns
 
     def write_outputs(
-        self,
-        handle: Handle | None,
-        number: int,
-        block: AnyBlock,
-        channels: Sequence[int],
-        values: Sequence[float],
+        self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]
     ) -> Any:
         """Hand the values to the driver; they take effect in the next tick."""
+        self._write(block, changes)
+        return self._runtime.tick
+
+    def make_safe(self, block: AnyBlock) -> None:
+        """Hand the safe values that are wanted to the driver; what it refuses is tried again after the next tick."""
+        changes = self._runtime.outputs.unsent(block)
+        if not changes or not self._is_open:
+            return
+        try:
+            self._write(block, changes)
+        except OSError as error:
+            self._runtime.stops.tell_unsafe(block, error.strerror or str(error))
+
+    def _write(self, block: AnyBlock, changes: Mapping[int, Change]) -> None:
+        channels, values = self._runtime.outputs.merged(block, changes)
         try:
             self._driver.write_outputs(block.spec, channels, values)
         except Refusal as error:
             raise OSError(error.errno, str(error)) from None
-        for channel, value in zip(channels, values, strict=True):
-            self._runtime.outputs[(id(block), channel)] = value
-        return self._runtime.tick
+        except LinkError as error:
+            raise OSError(errno.EIO, str(error)) from None
+        except Exception as error:
+            raise HookError(f"{type(self._driver).__name__}.write_outputs") from error
+        self._runtime.outputs.acknowledge(block, channels, values)
 
     def carry_out(self, handle: Handle, number: int, steps: Steps, what: str) -> Any:
         """Refuse: a driver without a line has none to send steps on."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,8 +19,9 @@ from sioms.motion import CommandError, Judged, Judgement
 from sioms.protocol.flags import NodeClass, WriteFlag
 from sioms.protocol.records import WRITE_STRUCT, numpy_dtype
 
-from .blocks import AxisBlock, BinaryBlock
+from .blocks import AnyBlock, AxisBlock, BinaryBlock
 from .handles import LATER, Handle, Wait
+from .outputs import WHOLE, Change, safe_of
 
 if TYPE_CHECKING:
     from .runtime import Runtime
@@ -58,7 +60,7 @@ def write(
     size = record.size
     if not data or len(data) % size:
         raise OSError(errno.EINVAL, f"{what}: {len(data)} bytes; want whole records of {size} bytes")
-    if runtime.stops.stopped:
+    if isinstance(block, AxisBlock) and runtime.stops.stopped:
         raise OSError(errno.EPERM, f"{what}: stopped by emergency stop ({runtime.stops.source}); reset first")
     check_link(runtime, handle, what)
     if isinstance(block, AxisBlock):
@@ -70,12 +72,9 @@ def write(
                 return runtime.tick
         return _write_axes(runtime, handle, number, flags, timeout_s, np.frombuffer(data, _DTYPE[node_class]))
     records = np.frombuffer(data, _DTYPE[node_class])
-    channels, values = _output_values(runtime, handle, records, what)
-    for channel in channels:
-        source = runtime.stops.latched_outputs.get((id(block), channel))
-        if source is not None:
-            raise OSError(errno.EPERM, f"{what}: stopped by emergency stop ({source}); reset the node first")
-    return runtime.engine.write_outputs(handle, number, block, channels, values)
+    changes = _changes(handle, records, what)
+    _take_responsibility(runtime, block, changes, what)
+    return runtime.engine.write_outputs(handle, number, block, changes)
 
 
 def check_link(runtime: Runtime, handle: Handle, what: str) -> None:
@@ -219,12 +218,32 @@ def _write_axes(
 # --- outputs -------------------------------------------------------------------------------------
 
 
-def _output_values(
-    runtime: Runtime, handle: Handle, records: NDArray[Any], what: str
-) -> tuple[list[int], list[float]]:
-    """Check the records of an output and turn them into one value for each channel."""
+def _take_responsibility(runtime: Runtime, block: AnyBlock, changes: Mapping[int, Change], what: str) -> None:
+    """Let a client say what outputs shall be; under a stop that may only be their safe values.
+
+    Raises:
+        OSError: EPERM, an output is stopped and this is not its safe value.
+    """
+    stops, stopped = runtime.stops, []
+    for channel, change in changes.items():
+        source = stops.stop_of(block, channel)
+        if source is None:
+            continue
+        safe = safe_of(block.spec, channel)
+        if safe is None or Change(change.mask, safe.value).over(0) != change.over(0):
+            first = "reset first" if stops.stopped else "reset the node first"
+            but = "" if safe is None else ", or write its safe value"
+            raise OSError(errno.EPERM, f"{what}: stopped by emergency stop ({source}); {first}{but}")
+        stopped.append((channel, Change(change.mask, safe.value)))
+    runtime.outputs.release(block, changes)
+    for channel, safe_part in stopped:
+        runtime.outputs.want(block, channel, safe_part)
+
+
+def _changes(handle: Handle, records: NDArray[Any], what: str) -> dict[int, Change]:
+    """Check the records of an output and turn them into one change of each channel."""
     block = handle.block
-    ports: dict[int, float] = {}
+    changes: dict[int, Change] = {}
     for record in records:
         index = int(record["channel"])
         if not 0 <= index < len(handle.channels):
@@ -242,8 +261,9 @@ def _output_values(
                 raise OSError(
                     errno.EINVAL, f"{what}: channel {info.name}: data {value}; want 0 to {(1 << width) - 1}"
                 )
-            before = ports.get(channel, runtime.outputs.get((id(block), channel), int(block.data[channel])))
-            ports[channel] = (int(before) & ~mask) | (value & mask)
+            mask &= (1 << width) - 1
+            before = changes.get(channel, Change(0, 0))
+            changes[channel] = Change(before.mask | mask, Change(mask, value).over(before.value))
         else:
             number = float(record["data"])
             low = -math.inf if info.minimum is None else info.minimum
@@ -257,5 +277,5 @@ def _output_values(
                     errno.ERANGE,
                     f"{what}: channel {info.name}: data {number:g} {info.unit}; want {low:g} to {high:g} {info.unit}",
                 )
-            ports[channel] = number
-    return list(ports), list(ports.values())
+            changes[channel] = Change(WHOLE, number)
+    return changes

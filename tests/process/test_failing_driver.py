@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
 from daemon_rig import wait_for
 from wire_rig import SLIDE, Wire
 
@@ -55,3 +56,39 @@ def test_a_driver_that_raises_sends_the_stop_first(start: Any, short_folder: Pat
     wait_for(lambda: wire.state("moving") == 0, "the drive at rest", 2.0)
     assert wire.state("feedback") < 0.5 / 0.01 * 10000
     assert any("ZeroDivisionError" in line for line in wire.daemon.lines)
+
+
+WRITER = '''
+from sioms.drivers.sim_io import SimIo
+
+
+class Careless(SimIo):
+    """Raises what a client's own mistake would raise, in a write."""
+
+    def write_outputs(self, block, channels, values):
+        if values[0] == 5:
+            {}["outputs"]
+        super().write_outputs(block, channels, values)
+
+
+DRIVER = Careless
+'''
+
+
+def test_an_exception_in_a_write_is_told_as_the_drivers_with_its_place(
+    start: Any, short_folder: Path
+) -> None:
+    (short_folder / "careless.py").write_text(WRITER)
+    wire = Wire(start, short_folder, "leadshine")
+    wire.serve('[device.io0]\ndriver = "./careless.py"\noutputs = 4\nsafe = 0\n')
+    wire.wait_up("io0")
+    node, pid = wire.client.open("io0", "rw"), wire.pid("io0")
+    node.set(3)
+    with pytest.raises(OSError, match="io0") as caught:
+        node.set(5)
+    assert "malformed" not in str(caught.value)
+    line = wire.daemon.wait_line("driver failed", 10.0).string
+    assert "KeyError('outputs')" in line and "write_outputs" in line and "careless.py" in line
+    assert not any("malformed" in each for each in wire.daemon.lines)
+    wait_for(lambda: wire.pid("io0") not in (0, pid), "a new driver")
+    wire.wait_up("io0")

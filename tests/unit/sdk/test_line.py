@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Pause, Send, Steps
+from sioms.sdk.exchange import DeviceError, Exchange, HookError, LinkError, Pause, Send, Steps
 from sioms.sdk.line import ATTEMPTS, Counters, Line, Priority
 from sioms.sdk.settings import LineSettings
 
@@ -251,3 +251,20 @@ def test_what_nobody_asked_for_goes_to_who_takes_it() -> None:
     assert rig.results == [("a", b"HI")] and taken == [b"sample", b"sample"]
     rig.wire.ours.close()
     rig.wire.device.close()
+
+
+def test_an_exception_of_a_hook_is_the_drivers_and_what_waits_goes_out(rig: Rig) -> None:
+    def broken() -> Steps:
+        yield exchange(b"x")
+        raise KeyError("a key")
+
+    rig.submit("broken", broken())
+    rig.submit("stop", ask(b"s"), Priority.ACT)
+    assert rig.heard() == b"x"
+    with pytest.raises(HookError, match="broken") as caught:
+        rig.answer(b"X")
+    assert isinstance(caught.value.__cause__, KeyError)
+    rig.pass_time(1e3 * GAP_S)
+    assert rig.heard() == b"s"
+    rig.answer(b"S")
+    assert rig.results == [("stop", b"S")]
