@@ -42,6 +42,15 @@ def test_the_documented_reply() -> None:
     assert board.take(b"r vbus_voltage *94\n") == []
     assert board.take(b"r vbus_voltage ; what\n") == [b"24.087744\r\n"]
     assert board.take(b"v 0 1 0*103\nf 7!nonsense\n") == [b"invalid motor 7\r\n", b"unknown command\r\n"]
+    # an empty line is an unknown command, so CR LF draws one; one that is too long takes the next with it
+    assert board.take(b"f 9\r\n") == [b"invalid motor 9\r\n", b"unknown command\r\n"]
+    assert board.take(b"x" * 256 + b"f 9\nf 8\n") == [b"invalid motor 8\r\n"]
+    assert board.take(b"f 1") == [] and board.take(b"1\n") == [b"invalid motor 11\r\n"]  # no time-out
+    # a line without a checksum is obeyed, and read as far as numbers go
+    assert board.take(b"v 0 2.5x*\n") == [] and board.axes[0].p["controller.input_vel"] == 2.5
+    assert board.take(b"w axis0.current_state 8\nw vbus_voltage 1\nw axis0.requested_state x\n") == 3 * [
+        b"not implemented\r\n"
+    ]
     assert board.take(b"r axis0.no\n") == [b"invalid property\r\n"]
 
 
@@ -61,7 +70,10 @@ def test_sets_and_what_is_read_behind_them(step: int) -> None:
         feed(move, reply("invalid motor 0", "1.25", "0 0"), step)
     with pytest.raises(DeviceError, match="invalid property"):
         feed(odrive.read(["axis0.x"], 0.1), reply("invalid property", "0 0"), step)
-    for bad in (b"1.25*1\r\n", b"1.25\r\n", b"\xff*3\r\n"):
+    # what a board says to stray bytes carries no checksum, and is not for us
+    stray = b"unknown command\r\n"
+    assert feed(move, stray + reply("1.25") + stray + reply("0 0"), step) == [[1.25]]
+    for bad in (b"1.25*1\r\n", b"\xff*3\r\n"):
         with pytest.raises(LinkError, match="checksum"):
             feed(move, bad + reply("0 0"), step)
     for text in ("nan", "word"):

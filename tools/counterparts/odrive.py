@@ -1,152 +1,73 @@
 """An ODrive board (firmware 0.5.6) on a pty: ``python -m sioms.tools.counterparts.odrive --link PATH``.
 
-Behaves as the documentation and the firmware's parser say: lines end at LF, CR or ``!``, ``;`` begins a comment, a wrong
-checksum is silence, replies carry a checksum when the request did, set commands are not answered, values are cut to nine
-characters. A rotor with inertia and friction hangs on each axis. Commands on standard input, beside those of the line:
-``state [AXIS]``, ``error BITS [AXIS]``, ``switch TURNS [AXIS]`` (end switch for homing), ``set PATH VALUE``.
+Its parser is that of the firmware's ``communication/ascii_protocol.cpp`` (fw-v0.5.6, a308314e), line for line: lines end at LF, CR
+or ``!`` and an empty one is an unknown command; ``;`` begins a comment; a wrong checksum is silence, but a line without one is
+obeyed; 256 bytes without an end are dropped, and the next line with them; there is no time-out; only the first letter
+tells the command; numbers are read as far as they go; set commands are not answered; values are cut to nine characters.
+What hangs behind it is in ``odrive_axis``. Commands on standard input, beside those of the line:
+
+``state [AXIS]``, ``error BITS [AXIS]``, ``switch TURNS [AXIS]`` (end switch for homing), ``set PATH VALUE`` (and keep it
+without supply), ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze [COUNT]``, ``foreign KIND VALUE [AXIS]`` (velocity,
+torque, position, mode), ``shove V [AXIS]``.
 """
 
 from __future__ import annotations
 
 import asyncio
-import math
 import re
 import time
 from collections.abc import Callable
 
 from . import wire
 from .control import number
-from .drive import Stepper
+from .drive import STEP_S, Stepper
+from .odrive_axis import CLOSED_LOOP, FLAGS, IDLE, READ_ONLY, STORED, UNSIGNED, Axis
+
+__all__ = ["CLOSED_LOOP", "IDLE", "Axis", "Board"]
 
 MAX_LINE = 256
-DRY = 0.05
-"""Dry friction [Nm]: what is pushed less than that sticks."""
-IDLE, CLOSED_LOOP, HOMING = 1, 8, 11
-WATCHDOG, NO_SWITCH = 1 << 11, 1 << 17
-
-
-class Axis:
-    """One axis with its rotor; turns, seconds, Nm."""
-
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self.p: dict[str, float] = {
-            "error": 0, "current_state": IDLE, "requested_state": 0, "motor.error": 0, "encoder.error": 0,
-            "controller.error": 0, "controller.input_pos": 0, "controller.input_vel": 0, "controller.input_torque": 0,
-            "controller.config.control_mode": 3, "controller.config.input_mode": 1, "controller.config.vel_limit": 20,
-            "controller.config.vel_ramp_rate": 1, "controller.trajectory_done": 1, "trap_traj.config.vel_limit": 2,
-            "trap_traj.config.accel_limit": 0.5, "trap_traj.config.decel_limit": 0.5, "config.enable_watchdog": 0,
-            "config.watchdog_timeout": 0, "motor.config.torque_lim": 5.0,
-        }  # fmt: skip
-        self.position = self.velocity = self.setpoint = 0.0
-        self.inertia, self.friction = 0.02, 0.1
-        self.switch: float | None = None
-        self.trajectory: float | None = None
-        self._clock = clock
-        self.fed_s = clock()
-
-    def feed(self) -> None:
-        """Feed the watchdog."""
-        self.fed_s = self._clock()
-
-    def fail(self, bits: int) -> None:
-        """Disarm with an error."""
-        self.p["error"] = int(self.p["error"]) | bits
-        self.p["current_state"] = IDLE
-
-    def request(self, state: int) -> None:
-        """Go into a state."""
-        if state in (CLOSED_LOOP, HOMING) and self.p["error"]:
-            return
-        if state == HOMING and self.switch is None:
-            self.fail(NO_SWITCH)
-            return
-        if state == CLOSED_LOOP and self.p["current_state"] != CLOSED_LOOP:
-            self.p["controller.input_pos"] = self.position
-            self.setpoint = self.velocity
-            self.trajectory = None
-            self.p["controller.input_vel"] = self.p["controller.input_torque"] = 0.0
-        if state in (IDLE, CLOSED_LOOP, HOMING):
-            self.p["current_state"] = state
-
-    def step(self, now_s: float, dt: float) -> None:
-        """Go on by dt."""
-        p = self.p
-        if p["config.enable_watchdog"] and now_s - self.fed_s > p["config.watchdog_timeout"]:
-            self.fail(WATCHDOG)
-        if abs(self.velocity) > 1.2 * p["controller.config.vel_limit"] and p["current_state"] == CLOSED_LOOP:
-            p["controller.error"] = int(p["controller.error"]) | 1
-            self.fail(1 << 9)
-        state = int(p["current_state"])
-        if state == CLOSED_LOOP:
-            torque = self._control(dt)
-        elif state == HOMING:
-            torque = self._servo(-5.0)
-            if self.switch is not None and self.position <= self.switch:
-                self.position, self.switch = 0.0, 0.0
-                p["current_state"], p["controller.input_pos"] = IDLE, 0.0
-        else:
-            torque = 0.0
-        limit = p["motor.config.torque_lim"]
-        torque = max(-limit, min(limit, torque))
-        way = self.velocity or torque  # dry friction is against the motion, at rest against what pushes
-        drag = self.friction * self.velocity + math.copysign(DRY, way)
-        change = (torque - drag) / self.inertia / (2 * math.pi) * dt
-        stops = abs(torque) <= DRY and abs(self.velocity) <= abs(change)
-        self.velocity = 0.0 if stops else self.velocity + change
-        self.position += self.velocity * dt
-
-    def _servo(self, wanted: float) -> float:
-        return (wanted - self.velocity) * 2 * math.pi * self.inertia / 0.004
-
-    def _control(self, dt: float) -> float:
-        p = self.p
-        mode = int(p["controller.config.control_mode"])
-        if mode == 1:
-            return p["controller.input_torque"]
-        if mode == 2:
-            self.setpoint = self._ramped(p["controller.input_vel"], dt)
-        elif self.trajectory is not None:
-            self.setpoint = self._trapezoid(dt)
-        else:
-            self.setpoint = 20.0 * (p["controller.input_pos"] - self.position)
-        return self._servo(self.setpoint)
-
-    def _ramped(self, wanted: float, dt: float) -> float:
-        if int(self.p["controller.config.input_mode"]) != 2:
-            return wanted
-        change = self.p["controller.config.vel_ramp_rate"] * dt
-        return self.setpoint + max(-change, min(change, wanted - self.setpoint))
-
-    def _trapezoid(self, dt: float) -> float:
-        p = self.p
-        rate, top = p["trap_traj.config.decel_limit"], p["trap_traj.config.vel_limit"]
-        way = (self.trajectory or 0.0) - self.position
-        if abs(way) < 2e-3 and abs(self.velocity) < 4 * rate * dt + 0.05:
-            self.trajectory, p["controller.trajectory_done"] = None, 1
-            return 20.0 * way
-        # keep a little behind the braking parabola for the lag of the velocity loop
-        reach = math.sqrt(2 * rate * abs(way)) - 0.004 * rate
-        wanted = math.copysign(min(top, max(reach, 20.0 * min(abs(way), 0.002))), way)
-        change = max(p["trap_traj.config.accel_limit"], rate) * dt * 1.2
-        return self.setpoint + max(-change, min(change, wanted - self.setpoint))
+FOREVER = 1 << 30
+_INTEGER = r"\s*([+-]?\d+)"
+_FLOAT = r"\s*([+-]?(?:\d+\.?\d*(?:e[+-]?\d+)?|\.\d+(?:e[+-]?\d+)?|nan|inf(?:inity)?))"
+HELP = (
+    "Please see documentation for more details", "", "Available commands syntax reference:",
+    "Position: q axis pos vel-lim I-lim", "Position: p axis pos vel-ff I-ff", "Velocity: v axis vel I-ff", "Torque: c axis T",
+    "", "Properties start at odrive root, such as axis0.requested_state", "Read: r property", "Write: w property value", "",
+    "Save config: ss", "Erase config: se", "Reboot: sr",
+)  # fmt: skip
 
 
 class Board:
     """The board; times in seconds of the given clock."""
 
-    def __init__(self, version: str = "0.5.6", clock: Callable[[], float] = time.monotonic) -> None:
-        major, minor, revision = (int(part) for part in version.split("."))
-        self.axes = [Axis(clock), Axis(clock)]
-        self.properties: dict[str, float] = {
-            "vbus_voltage": 24.087744, "fw_version_major": major, "fw_version_minor": minor,
-            "fw_version_revision": revision, "serial_number": 35601883739976,
-        }  # fmt: skip
-        self._line = bytearray()
+    def __init__(
+        self, version: str = "0.5.6", dry: float = 0.05, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.version = [int(part) for part in version.split(".")]
+        self.axes = [Axis(dry), Axis(dry)]
         self.time = Stepper(self._step, lambda: False, clock)
+        self._clock = clock
+        self._booted_s = self._off_until_s = clock()
+        self._refusals = self._frozen = 0
+        self._image: dict[str, str] = {}
+        self._forget_line()
 
     def _step(self, now_s: float, dt: float) -> None:
+        powered = now_s >= self._off_until_s
+        if powered and self._booted_s < self._off_until_s:
+            self.boot(self._off_until_s)
         for axis in self.axes:
-            axis.step(now_s, dt)
+            axis.step(dt, powered)
+
+    def boot(self, now_s: float | None = None) -> None:
+        """Begin anew, as after a reset or when the supply comes."""
+        self._booted_s = self._clock() if now_s is None else now_s
+        self._forget_line()
+        for axis in self.axes:
+            axis.boot()
+
+    def _forget_line(self) -> None:
+        self._line, self._active = bytearray(), True
 
     def connected(self) -> list[bytes]:
         """Say nothing."""
@@ -159,137 +80,266 @@ class Board:
 
     def take(self, data: bytes) -> list[bytes]:
         """Take bytes; obey complete lines."""
-        self.time.catch_up()
-        replies = []
+        if self.time.catch_up() < self._off_until_s:
+            return []
+        replies: list[bytes] = []
         for byte in data:
             if byte in b"\r\n!":
-                if len(self._line) <= MAX_LINE and (reply := self._checked(bytes(self._line))):
-                    replies.append(reply)
-                self._line.clear()
+                line, is_whole = bytes(self._line), self._active
+                self._forget_line()
+                if is_whole:  # else it did not begin at its beginning
+                    replies += self._process(line)
             else:
                 self._line.append(byte)
+                if len(self._line) >= MAX_LINE:
+                    self._line, self._active = bytearray(), False
         return replies
 
-    def _checked(self, raw: bytes) -> bytes:
-        text = raw.split(b";")[0]
-        body, star, digits = text.partition(b"*")
-        if star:
-            total = 0
-            for byte in body:
-                total ^= byte
-            if not digits.strip().isdigit() or int(digits) != total:
-                return b""
-        reply = self._obey(body.decode("ascii", "replace").split())
-        if not reply:
-            return b""
-        total = 0
-        for byte in reply.encode():
-            total ^= byte
-        return reply.encode() + (f"*{total}".encode() if star else b"") + b"\r\n"
+    def _process(self, raw: bytes) -> list[bytes]:
+        raw = raw.partition(b";")[0]
+        body, star, digits = raw.partition(b"*")
+        has_checksum = bool(star and digits)
+        if has_checksum:
+            found = re.match(_INTEGER, digits.decode("latin-1"))
+            if found is None or int(found[1]) % 2**32 != _xor(body):
+                return []
+        text = (body if has_checksum else raw).partition(b"\0")[0].decode("latin-1")
+        replies = [reply.encode("latin-1") for reply in self._obey(text)]
+        return [r + (f"*{_xor(r)}".encode() if has_checksum else b"") + b"\r\n" for r in replies]
 
-    def _obey(self, words: list[str]) -> str:
-        if not words:
-            return ""
-        name, rest = words[0], words[1:]
-        if name in ("p", "q", "v", "c", "t", "f", "u"):
-            return self._motion(name, rest)
-        if name == "r" and len(rest) == 1:
-            found = self._find(rest[0])
-            return "invalid property" if found is None else _shown(found[0][found[1]])
-        if name == "w" and len(rest) == 2:
-            return self._write(*rest)
-        if name == "sc":
-            for axis in self.axes:
-                for key in ("error", "motor.error", "encoder.error", "controller.error"):
-                    axis.p[key] = 0
-            return ""
-        if name in ("i", "h", "ss", "se", "sr"):
-            return "Hardware version: 3.6-24V" if name == "i" else ""
-        return "invalid command format" if name in ("r", "w") else "unknown command"
+    def _obey(self, text: str) -> list[str]:
+        letter = text[:1]
+        if letter in ("p", "q", "v", "c", "t", "w") and self._refusals > 0:
+            self._refusals -= 1
+            return ["not implemented" if letter == "w" else "invalid command format"]
+        match letter:
+            case "f" | "r":
+                return [self._kept(text, self._feedback if letter == "f" else self._read)]
+            case "p" | "q" | "v" | "c" | "t" | "u":
+                return self._motion(letter, text)
+            case "w":
+                return self._write(text)
+            case "s":
+                self._system(text[1:2])
+                return []
+            case "e":
+                return [self._encoder(text)]
+            case "h":
+                return list(HELP)
+            case "i":
+                version = ".".join(map(str, self.version))
+                return [
+                    "Hardware version: 3.6-56V",
+                    f"Firmware version: {version}",
+                    "Serial number: 20AD34913548",
+                ]
+        return ["unknown command"]
 
-    def _motion(self, name: str, rest: list[str]) -> str:
-        try:
-            index, values = int(rest[0]), [float(word) for word in rest[1:]]
-        except (IndexError, ValueError):
+    def _kept(self, text: str, ask: Callable[[str], str]) -> str:
+        """Return what a read says, or said last when readings stand still."""
+        if self._frozen > 0 and text in self._image:
+            self._frozen -= 1
+        else:
+            self._image[text] = ask(text)
+        return self._image[text]
+
+    def _feedback(self, text: str) -> str:
+        found = _scan(text, "f", "u")
+        if not found:
             return "invalid command format"
-        if not values and name not in "fu":
-            return "invalid command format"
-        if not 0 <= index < len(self.axes):
-            return f"invalid motor {index}"
-        axis = self.axes[index]
-        p = axis.p
-        if name == "f":
-            return f"{axis.position:f} {axis.velocity:f}"
+        if found[0] >= len(self.axes):
+            return f"invalid motor {int(found[0])}"
+        p = self.axes[int(found[0])].p
+        return f"{p['encoder.pos_estimate']:f} {p['encoder.vel_estimate']:f}"
+
+    def _motion(self, letter: str, text: str) -> list[str]:
+        shapes = {"p": "ufff", "q": "ufff", "v": "uff", "c": "uf", "t": "uf", "u": "u"}
+        found = _scan(text, letter, shapes[letter])
+        if len(found) < min(2, len(shapes[letter])):
+            return ["invalid command format"]
+        if not 0 <= found[0] < len(self.axes):
+            return [f"invalid motor {int(found[0]) % 2**32}"]
+        axis, values = self.axes[int(found[0])], found[1:]
+        if letter in "pqt":
+            axis.move(values[0], trapezoid=letter == "t")
+        elif letter in "vc":
+            axis.p["controller.config.control_mode"] = 2 if letter == "v" else 1
+        beside = {
+            "p": ("", "controller.input_vel", "controller.input_torque"),
+            "q": ("", "controller.config.vel_limit", "motor.config.torque_lim"),
+            "v": ("controller.input_vel", "controller.input_torque"), "c": ("controller.input_torque",),
+        }  # fmt: skip
+        for path, value in zip(beside.get(letter, ()), values, strict=False):
+            if path:
+                axis.p[path] = value
         axis.feed()
-        if name in "pqt":
-            p["controller.config.control_mode"], p["controller.input_pos"] = 3, values[0]
-            axis.trajectory = values[0] if name == "t" else None
-            if name == "t":
-                p["controller.config.input_mode"], p["controller.trajectory_done"] = 5, 0
-        elif name == "v":
-            p["controller.config.control_mode"], p["controller.input_vel"] = 2, values[0]
-        elif name == "c":
-            p["controller.config.control_mode"], p["controller.input_torque"] = 1, values[0]
-        return ""
+        return []
 
-    def _find(self, path: str) -> tuple[dict[str, float], str] | None:
-        if path in self.properties:
-            return self.properties, path
+    def _encoder(self, text: str) -> str:
+        found = _scan(text[2:], "l", "ui") if text[1:2] == "s" else []
+        if len(found) < 2:
+            return "invalid command format"
+        if not 0 <= found[0] < len(self.axes):
+            return f"invalid motor {int(found[0]) % 2**32}"
+        axis = self.axes[int(found[0])]
+        axis.origin = axis.place - found[1] / 8192
+        axis.feed()
+        return f"encoder set to {int(found[1]) % 2**32}"
+
+    def _system(self, letter: str) -> None:
+        armed = any(axis.p["motor.is_armed"] for axis in self.axes)
+        if letter == "c":
+            for axis in self.axes:
+                axis.clear()
+            return
+        for axis in self.axes:
+            if letter == "s" and not armed:
+                axis.stored.update((path, axis.p[path]) for path in axis.stored)
+            elif letter == "e":
+                axis.stored = dict(STORED)
+        if letter in ("r", "e") or (letter == "s" and not armed):
+            self.boot()
+
+    def _read(self, text: str) -> str:
+        words = text[1:].split()
+        if not words:
+            return "invalid command format"
+        found = self._find(words[0])
+        if found is not None:
+            axis, path = found
+            return _shown(path, axis.p[path])
+        own = {
+            "vbus_voltage": "24.087744", "serial_number": "35601883739976"[:9],
+            "system_stats.uptime": str(int(1000 * (self._clock() - self._booted_s)) % 2**32)[:9],
+            **{f"fw_version_{n}": str(v) for n, v in zip(("major", "minor", "revision"), self.version, strict=True)},
+        }  # fmt: skip
+        return own.get(words[0], "invalid property")
+
+    def _find(self, path: str) -> tuple[Axis, str] | None:
         match = re.fullmatch(r"axis([01])\.(.+)", path)
         if match is None or match[2] not in self.axes[int(match[1])].p:
             return None
-        return self.axes[int(match[1])].p, match[2]
+        return self.axes[int(match[1])], match[2]
 
-    def _write(self, path: str, text: str) -> str:
-        found = self._find(path)
-        if found is None or found[0] is self.properties:
-            return "invalid property"
-        try:
-            value = float(text)
-        except ValueError:
-            return "invalid value"
-        if found[1] == "requested_state":
-            self.axes[int(path[4])].request(int(value))
-        else:
-            found[0][found[1]] = value
-        return ""
+    def _write(self, text: str) -> list[str]:
+        words = text[1:].split()
+        if not words:
+            return ["invalid command format"]
+        found = self._find(words[0])
+        if found is None:
+            return [
+                "not implemented" if self._read(f"r {words[0]}") != "invalid property" else "invalid property"
+            ]
+        axis, path = found
+        kind = _INTEGER if path in UNSIGNED or path in FLAGS else _FLOAT
+        value = re.match(kind, words[1] if len(words) > 1 else "", re.IGNORECASE)
+        if path in READ_ONLY or value is None:
+            return ["not implemented"]
+        axis.write(path, float(bool(int(value[1]))) if path in FLAGS else float(value[1]))
+        return []
+
+    # --- standard input ---------------------------------------------------------------------------
+
+    def state(self, index: str = "") -> dict[str, object]:
+        """Return what a bystander sees; without an index of axis 0, and the speed of the fastest."""
+        self.time.catch_up()
+        axis = self.axes[int(index or 0)]
+        speed = axis.velocity if index else max((a.velocity for a in self.axes), key=abs)
+        return {"position": axis.position, "place": axis.place, "velocity": speed, "state": axis.p["current_state"],
+                "error": axis.p["error"], "torque": axis.p["controller.input_torque"],
+                "armed": any(a.p["config.enable_watchdog"] for a in self.axes)}  # fmt: skip
+
+    def power_cycle(self, seconds: str = "0.2") -> None:
+        """Take the supply away for a time."""
+        self._off_until_s = self.time.catch_up() + float(seconds)
+
+    def foreign(self, kind: str, value: str, index: str = "0") -> None:
+        """Obey another master, who also closes the loop."""
+        self.time.catch_up()
+        path = f"axis{index}.controller.config."
+        lines = {
+            "velocity": (f"w {path}input_mode 1", f"v {index} {value}"),
+            "torque": (f"w {path}input_mode 1", f"c {index} {value}"),
+            "position": (f"w {path}input_mode 1", f"p {index} {value}"), "mode": (f"w {path}control_mode {value}",),
+        }  # fmt: skip
+        if kind not in lines:
+            raise ValueError(f"kind {kind}: one of {', '.join(lines)} is right")
+        axis = self.axes[int(index)]
+        if kind != "mode" and axis.p["current_state"] != CLOSED_LOOP:
+            axis.clear()
+            self._obey(f"w axis{index}.requested_state {CLOSED_LOOP}")
+            axis.step(STEP_S)
+        for line in lines[kind]:
+            self._obey(line)
 
     def handlers(self) -> dict[str, Callable[..., object]]:
         """Return the commands on standard input."""
-
-        def state(index: str = "0") -> dict[str, float]:
-            self.time.catch_up()
-            axis = self.axes[int(index)]
-            return {"position": axis.position, "velocity": axis.velocity, "state": axis.p["current_state"],
-                    "error": axis.p["error"], "torque": axis.p["controller.input_torque"]}  # fmt: skip
 
         def error(bits: str, index: str = "0") -> None:
             self.axes[int(index)].p["motor.error"] = 0x10
             self.axes[int(index)].fail(int(number(bits)))
 
         def switch(turns: str, index: str = "0") -> None:
-            self.axes[int(index)].switch = float(turns)
+            axis = self.axes[int(index)]
+            axis.switch = axis.origin + float(turns)
+            axis.p["min_endstop.config.enabled"] = axis.stored["min_endstop.config.enabled"] = 1
 
         def set_(path: str, value: str) -> None:
             found = self._find(path)
             if found is None:
                 raise ValueError(f"no property {path}")
-            found[0][found[1]] = float(value)
+            axis, name = found
+            axis.write(name, float(value))
+            if name in axis.stored:
+                axis.stored[name] = float(value)
 
-        return {"state": state, "error": error, "switch": switch, "set": set_}
+        def refuse(count: str) -> None:
+            self._refusals = int(count)
+
+        def freeze(count: str = str(FOREVER)) -> None:
+            self._frozen = int(count)
+
+        def shove(speed: str, index: str = "0") -> None:
+            self.axes[int(index)].shoved = float(speed)
+
+        return {"state": self.state, "error": error, "switch": switch, "set": set_, "power_cycle": self.power_cycle,
+                "refuse": refuse, "freeze": freeze, "foreign": self.foreign, "shove": shove}  # fmt: skip
 
 
-def _shown(value: float) -> str:
-    text = str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else f"{value:f}"
-    return text[:9]
+def _xor(data: bytes) -> int:
+    total = 0
+    for byte in data:
+        total ^= byte
+    return total
+
+
+def _scan(text: str, letter: str, kinds: str) -> list[float]:
+    """Return the numbers behind a letter, as far as they can be read, as ``sscanf`` does."""
+    if not text.startswith(letter):
+        return []
+    values, at = [], len(letter)
+    for kind in kinds:
+        match = re.compile(_FLOAT if kind == "f" else _INTEGER, re.IGNORECASE).match(text, at)
+        if match is None:
+            break
+        values.append(float(match[1]))
+        at = match.end()
+    return values
+
+
+def _shown(path: str, value: float) -> str:
+    if path in UNSIGNED or path in FLAGS:
+        return str(int(value))[:9]
+    return f"{value:f}"[:9]
 
 
 async def main() -> None:
     """Serve until told to end."""
     parser = wire.parser("simulated ODrive board")
     parser.add_argument("--version", default="0.5.6")
+    parser.add_argument("--friction", type=float, default=0.05, help="dry friction of the rotors [Nm]")
     options = parser.parse_args()
-    board = Board(options.version)
+    board = Board(options.version, options.friction)
     await wire.run(board, options, board.handlers())
 
 

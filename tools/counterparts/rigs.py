@@ -220,7 +220,7 @@ RIGS: tuple[Rig, ...] = (
         '[device.odrive]\ndriver = "odrive"\nquick_stop = "hold"\nline = { serial = "{port}" }\n'
         '[[device.odrive.axis]]\nname = "x"\nnumber = 0\ntravel_per_turn = 0.01\nvelocity_max = 0.1\n'
         "acceleration_max = 0.3\n" + LIMITS,
-        ("odrive",),
+        ("odrive", "--friction", "1.0"),
         axes=(Axis("odrive", velocity=0.02, tolerance=3e-4),),
     ),
     Rig(

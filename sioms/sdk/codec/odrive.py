@@ -11,7 +11,6 @@ import errno
 import math
 import re
 from collections.abc import Callable, Sequence
-from typing import Any
 
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError
 
@@ -76,7 +75,7 @@ def number(text: str, what: str) -> float:
 
 def exchange(
     sets: Sequence[str], reads: Sequence[str], timeout_s: float, *, repeatable: bool = False,
-    check: Callable[[list[list[float]]], None] | None = None,
+    check: Callable[[list[list[float]]], None] | None = None, urgent: bool = False,
 ) -> Exchange:  # fmt: skip
     """Return set commands and the reads behind them; the value is the numbers of each reply.
 
@@ -89,26 +88,27 @@ def exchange(
         timeout_s: longest time for all of them [s].
         repeatable: the sets may be sent again.
         check: looks at the replies, raises LinkError.
+        urgent: stray bytes on the line must not damage the first line: an empty one goes ahead and ends them.
 
     Raises:
         ValueError: a line that cannot be sent.
     """
     asked = [*reads] if reads[-1].startswith("f ") else [*reads, "f 0"]
     widths = [2 if text.startswith("f ") else 1 for text in asked]
-    data = b"".join(line(text) for text in (*sets, *asked))
+    data = (b"\n" if urgent else b"") + b"".join(line(text) for text in (*sets, *asked))
     what = f"send {', '.join(sets) or ', '.join(reads)}"
 
     def want(reply: bytes) -> int | None:
-        lines = reply.split(b"\n")[:-1]
+        lines = _answers(reply)
         # a refused set speaks before the replies; a refused read speaks instead of its reply
         extra = sum(bool(_REFUSAL.match(each)) for each in lines) if sets else 0
         if len(reply) > MAX_LINE * (len(sets) + len(asked) + 1):
             raise LinkError(f"{what}: {len(reply)} bytes without an end")
         needed = len(asked) + min(extra, len(sets))
-        return sum(len(each) + 1 for each in lines[:needed]) if len(lines) >= needed else None
+        return _end_of(reply, needed) if len(lines) >= needed else None
 
     def decode(reply: bytes) -> list[list[float]]:
-        texts = [unwrap(each, what) for each in reply.split(b"\n")[:-1]]
+        texts = [unwrap(each, what) for each in _answers(reply)]
         for text in texts:
             if _REFUSAL.match(text.encode("ascii", "replace")):
                 raise DeviceError(errno.EINVAL, f"{what}: refused, {text}")
@@ -125,27 +125,59 @@ def exchange(
     return Exchange(data, want, decode, timeout_s, repeatable, what)
 
 
+def _answers(reply: bytes) -> list[bytes]:
+    """Return the complete lines that answer ours; one without a checksum answers stray bytes that have ended as a line."""
+    return [each for each in reply.split(b"\n")[:-1] if b"*" in each]
+
+
+def _end_of(reply: bytes, answers: int) -> int:
+    """Return where so many answers end."""
+    end = 0
+    for _ in range(answers):
+        end = reply.index(b"\n", reply.index(b"*", end)) + 1
+    return end
+
+
 def read(paths: Sequence[str], timeout_s: float) -> Exchange:
     """Return the exchange that reads properties; the value is one number each, as lists of one."""
     return exchange((), [f"r {path}" for path in paths], timeout_s, repeatable=True)
 
 
 def confirmed(
-    sets: Sequence[str], back: Sequence[tuple[str, float]], timeout_s: float, **options: Any
+    sets: Sequence[str],
+    back: Sequence[tuple[str, float]],
+    timeout_s: float,
+    *,
+    also: Sequence[str] = (),
+    repeatable: bool = False,
+    urgent: bool = False,
 ) -> Exchange:
     """Return sets and the check that these properties hold these values afterwards.
 
-    A mismatch is a LinkError: a line was lost on its way.
+    A mismatch is a LinkError: a line was lost on its way. The value is the numbers of each reply, those of ``also`` last.
+
+    Args:
+        sets: lines that draw no reply.
+        back: properties and the values that they must have then.
+        timeout_s: longest time for all of it [s].
+        also: further lines that draw a reply.
+        repeatable, urgent: as of ``exchange``.
     """
 
     def check(values: list[list[float]]) -> None:
-        for (path, wanted), (got, *_) in zip(back, values, strict=True):
-            if abs(got - wanted) > _TOLERANCE * max(1.0, abs(wanted)):
+        for (path, wanted), (got, *_) in zip(back, values, strict=False):
+            if not agrees(got, wanted):
                 raise LinkError(
                     f"send {', '.join(sets)}: {path} reads {got:g} afterwards; {wanted:g} was sent"
                 )
 
-    return exchange(sets, [f"r {path}" for path, _ in back], timeout_s, check=check, **options)
+    reads = [*(f"r {path}" for path, _ in back), *also]
+    return exchange(sets, reads, timeout_s, check=check, repeatable=repeatable, urgent=urgent)
+
+
+def agrees(got: float, wanted: float) -> bool:
+    """Tell whether a property that was read holds a value that was sent."""
+    return abs(got - wanted) <= _TOLERANCE * max(1.0, abs(wanted))
 
 
 def error_text(axis: int, bits: int, details: Sequence[tuple[str, int]]) -> str:
