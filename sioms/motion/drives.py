@@ -260,6 +260,10 @@ class DriveBank:
         """Tell whether these axes stand still and have no commands."""
         return bool(self._idle(np.asarray(axes, dtype=np.int64)).all())
 
+    def is_latched(self, axis: int) -> bool:
+        """Tell whether an emergency stop or a fault of an axis is latched: its drive must not be switched on."""
+        return bool(self._queue.latched[axis] & LATCHED)
+
     def particulars(self, axes: AxesLike) -> dict[str, list[float]]:
         """Return what the readings do not tell of these axes, by name; see AxisBank.particulars()."""
         chosen = np.asarray(axes)

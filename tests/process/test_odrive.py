@@ -137,3 +137,66 @@ def test_boards_that_do_not_fit(start: Callable[..., Any], short_folder: Path) -
         Misfit("encoder failed", change="error 0x100 1", axis="j"),
     )
     check_misfits(start, short_folder, "odrive", CONFIG, misfits)
+
+
+def test_nothing_left_in_the_board_moves_it_and_a_restart_is_told(
+    start: Callable[..., Any], short_folder: Path
+) -> None:
+    wire = Wire(start, short_folder, "odrive", "--baud", "115200", "--friction", "0.5")
+    cell = wire.serve(CONFIG)
+    wire.wait_up("mod0.x")
+
+    def stands(seconds: float, after: str) -> None:
+        place, until = wire.state("place", 0), time.monotonic() + seconds
+        while time.monotonic() < until:
+            assert abs(wire.state("velocity", 0)) < 0.05, after
+        assert wire.state("place", 0) == pytest.approx(place, abs=0.02), after
+
+    with cell.open("mod0.x", "rw") as x:
+        x.command(velocity=0.05)
+        wait_for(lambda: wire.state("velocity", 0) > 4, "motion")
+        wire.tell("unplug")
+        wait_for(lambda: wire.state("state", 0) == 1, "idle by the watchdog", 3.0)
+        wait_for(lambda: abs(wire.state("velocity", 0)) < 0.01, "rest", 5.0)
+        wire.tell("plug")
+        wire.wait_up("mod0.x")
+        stands(0.5, "replugged")
+        assert wire.state("state", 0) == 1, "a fault is latched"
+        x.reset()
+        wait_for(lambda: wire.state("state", 0) == 8, "closed loop")
+        stands(0.5, "reset")
+        # the move begins where the axis is, not where the velocity run began
+        place = wire.state("place", 0)
+        x.move(x.read().position[0] + 0.01)
+        lowest = place
+        until = time.monotonic() + 5.0
+        while (here := wire.state("place", 0)) < place + 0.98 and time.monotonic() < until:
+            lowest = min(lowest, here)
+        assert lowest > place - 0.01 and here == pytest.approx(place + 1, abs=0.03)
+        x.wait_until_idle(8.0)
+        # a restart that no link notices: told, the dead-man is set again, positions are refused
+        wire.tell("power_cycle 0.03")
+        wait_for(lambda: not wire.state("armed"), "the restart", 1.0)
+        wait_for(lambda: wire.state("armed"), "the dead-man", 3.0)
+        wire.wait_up("mod0.x")
+        stands(0.3, "restarted")
+        assert x.read().status[0] & AxisStatus.POSITION_LOST
+        x.reset()
+        with raises(1, "place is lost"):
+            x.move(0.01)
+        x.calibrate(0.05)
+        x.move(0.06)
+        x.wait_until_idle(8.0)
+
+
+def test_a_workcell_that_starts_stopped_closes_no_loop(start: Callable[..., Any], short_folder: Path) -> None:
+    wire = Wire(start, short_folder, "odrive")
+    cell = wire.serve("start_stopped = true\n" + CONFIG)
+    wire.wait_up("mod0.x")
+    until = time.monotonic() + 1.0
+    while time.monotonic() < until:
+        assert wire.state("state", 0) == wire.state("state", 1) == 1
+    cell.reset()
+    with cell.open("mod0.x", "rw") as x:
+        x.move(0.01)
+        x.wait_until_idle(8.0)

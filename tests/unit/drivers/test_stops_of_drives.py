@@ -162,7 +162,7 @@ def test_a_watchdog_that_runs_out_while_the_board_is_opened_leaves_no_idle_axis(
     for left_s in (0.001, 0.006, 0.012, 0.018, 0.024):
         rig.begin()
         rig.do(rig.unit.open())
-        rig.wait(rig.device.axes[0].fed_s + 0.5 - left_s - rig.now_s)
+        rig.wait(rig.device.axes[0].left_s - left_s)
         rig.begin()
         rig.do(rig.unit.open())
         assert rig.device.axes[0].p["current_state"] == odrive.CLOSED_LOOP, left_s
