@@ -31,6 +31,12 @@ LOAD = (10.0, -20.0, 30.0, 1.0, -2.0, 3.0)
 PUT = "load " + " ".join(map(str, LOAD))
 FT300 = 'driver = "ft300"\nline = { serial = "{port}", baud = 19200 }\n'
 ATI = '[device.f0]\ndriver = "ati-rdt"\nline = { udp = "{port}" }\npage = "{port}"\nfull_scale = [400, 400, 400, 20, 20, 20]\n'
+ADC = 'driver = "framed-adc"\nchannels = 4\nrate_hz = 200\nline = { serial = "{port}", baud = 921600 }\n'
+LINES = 'driver = "ascii-stream"\ncolumns = ["a", "b"]\nrate_hz = 200.0\ntime = "ms"\nline = { serial = "{port}" }\n'
+IIO = (
+    'driver = "iio"\ndevice = "iio_dummy_part_no"\nmode = "buffer"\ntrigger = "instance1"\nchannels = ["voltage0"]\nrate_hz = 200.0\n'
+    'sysfs = "{port}/sysfs"\ndev = "{port}/dev"\n'
+)
 SCHUNK = '[device.f0]\ndriver = "schunk-ft"\nline = { tcp = "{port}" }\ndata = "{port}"\n'
 
 
@@ -409,6 +415,9 @@ STOP = 'on_loss = "stop"\n'
         ("schunk_ifb", ("--port", "0", "--data-port", "0"), SCHUNK, "their number stands still at .*: the sensor is frozen"),
         ("ati_rdt", ("--port", "0"), ATI, "their number stands still at .*: the sensor is frozen"),
         ("ft300", ("--baud", "19200"), "[device.f0]\n" + FT300, "the last [0-9]+ records were all the same"),
+        ("adc", ("--channels", "4"), "[device.f0]\n" + ADC, "their number stands still at .*: the device is frozen"),
+        ("ascii_stream", ("--rate", "200", "--time", "ms"), "[device.f0]\n" + LINES, "their time stands still at .* ms: the device is frozen"),
+        ("iio", (), "[device.f0]\n" + IIO, "the time at which they were taken stands still"),
     ],
 )  # fmt: skip
 def test_a_frozen_stream_is_a_lost_link_and_stops_the_workcell(

@@ -3,7 +3,7 @@
 The chip is the kernel's own (gpio-sim, set up in configfs by root), so that what holds of the character device holds here: who
 holds a line, edges and their stamps, bias, debouncing, a chip that vanishes. Where there is no such kernel, one is started by
 ``tests/kernel/run.py``. Commands on standard input: ``pull LINE 0|1`` (what is outside of an input), ``level LINE``, ``unplug``,
-``plug``, ``state``.
+``plug``, ``power_cycle [SECONDS]`` (of a chip on USB: gone, then anew), ``state``.
 """
 
 from __future__ import annotations
@@ -103,6 +103,10 @@ async def run() -> None:
         options.link.unlink(missing_ok=True)
         options.link.symlink_to(chip.path)
 
+    def power_cycle(off_s: str = "0.2") -> None:
+        chip.unplug()
+        asyncio.get_running_loop().call_later(float(off_s), plug)
+
     async def close() -> None:
         chip.remove()
         with contextlib.suppress(OSError):
@@ -113,7 +117,7 @@ async def run() -> None:
         str(options.link),
         {
             "pull": lambda line, level: chip.pull(int(line), int(level)), "level": lambda line: chip.level(int(line)),
-            "unplug": chip.unplug, "plug": plug, "state": lambda: {"levels": list(map(chip.level, range(chip.count)))},
+            "unplug": chip.unplug, "plug": plug, "power_cycle": power_cycle, "state": lambda: {"levels": list(map(chip.level, range(chip.count)))},
         },
         close,
     )  # fmt: skip

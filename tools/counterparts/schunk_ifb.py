@@ -38,8 +38,10 @@ OK, UNKNOWN, LENGTH, VALUE, BUSY, LOCKED, NO_INDEX, NO_SUBINDEX = (
     0x13,
     0x14,
 )
-LENGTHS = {0x12: 1, 0x13: 1, 0x30: 2, 0x31: 2, 0x40: 1, 0x41: 1, 0xF0: 4}
+LENGTHS = {0x12: 1, 0x13: 1, 0x20: 1, 0x30: 2, 0x31: 2, 0x40: 1, 0x41: 1, 0xF0: 4}
 MOST = {0x30: 3, 0x31: 4}
+RESET_S = 5.0
+"""Time that the vendor's tests give a sensor after command 0x20."""
 
 
 class Sensor:
@@ -100,6 +102,8 @@ class Sensor:
             case 0x12 | 0x13:
                 self.is_tared = command == 0x12
                 self.load.zero(self.clock() if self.is_tared else None)
+            case 0x20:
+                self.supply.cycle(str(RESET_S))
             case 0x30 | 0x31:
                 if payload[1] > MOST[command]:
                     return bytes((command, VALUE))

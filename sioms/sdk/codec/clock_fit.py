@@ -179,17 +179,16 @@ class ClockFit:
     def _measure(self) -> None:
         """Replace a rate that the device does not keep, and forget what came before it changed."""
         points = list(self._points)[-RATE_POINTS:]
-        lately = points[-RATE_LATELY:]
+        lately, ratio = points[-RATE_LATELY:], self._ratio(points)
         if len(lately) == RATE_LATELY < len(points):
-            change = abs(self._ratio(lately) / self._ratio(points) - 1)
+            change = abs(self._ratio(lately) / ratio - 1)
             if change > 4 * RATE_TOLERANCE + RATE_JITTER_NS / (lately[-1][1] - lately[0][1]):
                 self._begin_with(lately)
-                points = lately
+                points, ratio = lately, self._ratio(lately)
         span_ns = points[-1][1] - points[0][1]
         if span_ns < RATE_SPAN_NS or len(points) < 4:
             return
         self.is_measured = True
-        ratio = self._ratio(points)
         if abs(ratio - 1) > RATE_TOLERANCE + RATE_JITTER_NS / span_ns:
             self._tick_ns *= ratio
             self._late_since_ns = None
