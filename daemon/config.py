@@ -53,7 +53,7 @@ class DeviceTable(msgspec.Struct, frozen=True):
     driver: str
     description: str = ""
     on_loss: Literal["none", "stop"] = "none"
-    realtime_priority: Annotated[int, Meta(ge=0, le=99)] = 50
+    realtime_priority: Annotated[int, Meta(ge=0, le=99)] | None = None
     hang_s: Seconds = 1.0
     user: str = ""
 

@@ -14,6 +14,8 @@ from typing import Any
 
 TIDY = 1024
 """Pending calls from which on cancelled ones are looked for."""
+RESTLESS_NS, REST_NS, PAUSE_S = 20_000_000, 100_000, 0.005
+"""After so long without a wait of at least REST_NS the loop pauses."""
 Callback = Callable[[], Any]
 
 
@@ -41,6 +43,7 @@ class Loop:
         self._timers: list[tuple[int, int, Timer]] = []
         self._order = itertools.count()
         self._tidy_at = TIDY
+        self._restless_ns = time.monotonic_ns()
         self.running = True
 
     def watch(self, fd: int, callback: Callback) -> None:
@@ -76,10 +79,24 @@ class Loop:
         while self._timers and self._timers[0][2].callback is None:
             heapq.heappop(self._timers)
         timeout = max(0.0, (self._timers[0][0] - time.monotonic_ns()) / 1e9) if self._timers else None
-        for key, _ in self._selector.select(timeout):
+        began_ns = time.monotonic_ns()
+        events = self._selector.select(timeout)
+        rested_ns = time.monotonic_ns()
+        if rested_ns - began_ns > REST_NS:
+            self._restless_ns = rested_ns
+        for key, _ in events:
             # An earlier callback of this round may have closed this descriptor.
             if self._selector.get_map().get(key.fd) is key:
                 key.data()
+            self._serve_timers()  # a crowd at the door must not delay the stamp that drivers look at
+        self._serve_timers()
+        if time.monotonic_ns() - self._restless_ns > RESTLESS_NS:
+            time.sleep(
+                PAUSE_S
+            )  # it may run before all other processes: a flood must not take the machine with it
+            self._restless_ns = time.monotonic_ns()
+
+    def _serve_timers(self) -> None:
         now = time.monotonic_ns()
         while self._timers and self._timers[0][0] <= now:
             callback = heapq.heappop(self._timers)[2].callback

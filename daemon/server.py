@@ -26,6 +26,7 @@ from .names import NameTable
 from .notify import ServiceManager
 from .nursery import Nursery
 from .nursery_process import NurseryProcess
+from .realtime import LOOK_S, Budget, make_ordinary, realtime_use
 from .rights import Rights
 from .shared import Shared
 
@@ -66,8 +67,10 @@ class Server:
         self._told_ready = False
         self._ending = False
         self._request_seen = self.shared.request.mark
+        self._budget = Budget(log)
         self.clients.welcome()
         self._alive()
+        self._look_at_budget()
         if self._manager.watchdog_ns:
             self._feed_watchdog()
 
@@ -314,6 +317,12 @@ class Server:
         for device in list(self.devices.values()):
             device.check(now)
         self.loop.after(ALIVE_S, self._alive)
+
+    def _look_at_budget(self) -> None:
+        use = realtime_use({device.name: device.pid for device in self.devices.values()})
+        if greedy := self._budget.look(time.monotonic(), use):
+            make_ordinary(greedy[1])
+        self.loop.after(LOOK_S, self._look_at_budget)
 
     def _feed_watchdog(self) -> None:
         self._manager.tell("WATCHDOG=1")

@@ -21,8 +21,8 @@ from .nursery import Nursery
 from .nursery_process import NurseryProcess
 from .server import Server
 
-PRIORITY = 10
-"""SCHED_FIFO priority of the daemon; that of a driver is 50 unless configured otherwise."""
+PRIORITY = 50
+"""SCHED_FIFO priority of the daemon: that of a driver, so that it gets its turn whenever a tick is done."""
 
 
 def serve(config_path: str, given_path: str | None, level: str, process: NurseryProcess) -> int:
@@ -66,10 +66,10 @@ def serve(config_path: str, given_path: str | None, level: str, process: Nursery
 
 
 def _become_prompt(log: Log) -> None:
-    """Run before all ordinary processes, where allowed, and behind the drivers; what we start does not inherit it.
+    """Run before all ordinary processes, where allowed, and beside the drivers; what we start does not inherit it.
 
     Not for work but for the end: a killed process closes its sockets only when it gets a processor, and by
-    that the drivers see that we are gone. Also an emergency stop through us then waits for nobody.
+    that the drivers see that we are gone. Also an emergency stop or a SIGTERM through us then waits for nobody.
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))

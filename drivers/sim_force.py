@@ -88,6 +88,7 @@ class SimForce(TickDriver):
     """
 
     Settings = SimForceSettings
+    realtime_priority = 0
 
     @classmethod
     def describe(cls, name: str, settings: SimForceSettings) -> Description:
@@ -103,8 +104,9 @@ class SimForce(TickDriver):
         )
         inputs = tuple(dict.fromkeys(contact.node for contact in settings.contact))
         return Description(
-            (BlockSpec("", NodeClass.ANALOG, channels, history=settings.history),), settings.tick_hz, inputs
-        )
+            (BlockSpec("", NodeClass.ANALOG, channels, history=settings.history),), settings.tick_hz, inputs,
+            lease_s=1.0,
+        )  # fmt: skip
 
     def __init__(self, name: str, settings: SimForceSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)

@@ -115,6 +115,7 @@ class SimIo(TickDriver):
     """
 
     Settings = SimIoSettings
+    realtime_priority = 0
 
     @classmethod
     def describe(cls, name: str, settings: SimIoSettings) -> Description:
@@ -132,7 +133,7 @@ class SimIo(TickDriver):
                     "in" if settings.outputs else "", NodeClass.BINARY, (channel,), history=settings.history
                 )
             )
-        return Description(tuple(ports), settings.tick_hz, tuple(_nodes(settings)))
+        return Description(tuple(ports), settings.tick_hz, tuple(_nodes(settings)), lease_s=1.0)
 
     def __init__(self, name: str, settings: SimIoSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)

@@ -85,6 +85,7 @@ class SimTactile(TickDriver):
     """
 
     Settings = SimTactileSettings
+    realtime_priority = 0
 
     @classmethod
     def describe(cls, name: str, settings: SimTactileSettings) -> Description:
@@ -102,6 +103,7 @@ class SimTactile(TickDriver):
             ),
             settings.tick_hz,
             tuple(dict.fromkeys(node for node in felt if node)),
+            lease_s=1.0,
         )
 
     def __init__(self, name: str, settings: SimTactileSettings, kit: Kit) -> None:

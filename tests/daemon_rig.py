@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import signal
 import sys
@@ -86,6 +87,7 @@ class Daemon:
         env: further variables of its environment.
         ready: whether to wait until it says that it is ready.
         files: to be put beside the configuration, by name.
+        real_time: whether simulated drivers ask for real time, as those of hardware do; tests time what they do.
     """
 
     def __init__(
@@ -96,8 +98,11 @@ class Daemon:
         *,
         ready: bool = True,
         files: Mapping[str, str] | None = None,
+        real_time: bool = True,
     ) -> None:
         self.folder = folder
+        if real_time:
+            text = re.sub(r'(driver = "sim-\w+"\n)(?!realtime_priority)', r"\1realtime_priority = 50\n", text)
         for name, content in (files or {}).items():
             (folder / name).write_text(content)
         self.config = folder / "cell.toml"

@@ -103,10 +103,13 @@ class Driver(ABC):
             [ns, CLOCK_MONOTONIC] splits the tick's time in two in the statistics.
         rig: what ``sioms driver check`` runs a driver with that is not shipped: a mapping with the keys of ``Rig``
             of ``sioms.tools.counterparts.rigs``.
+        realtime_priority: SCHED_FIFO priority of its process unless the configuration says otherwise; 0: an ordinary
+            process. For drivers of hardware; a simulation has no business before other people's work.
     """
 
     Settings: ClassVar[type[msgspec.Struct]]
     rig: ClassVar[Mapping[str, Any]] = {}
+    realtime_priority: ClassVar[int] = 50
     inputs_ns = 0
 
     def __init__(self, name: str, settings: Any, kit: Kit) -> None:

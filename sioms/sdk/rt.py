@@ -10,12 +10,19 @@ import ctypes
 import errno
 import gc
 import os
+import resource
+import signal
 import time
+from collections.abc import Callable
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _TFD_CLOEXEC, _TFD_NONBLOCK, _TFD_TIMER_ABSTIME = 0o2000000, 0o4000, 1
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _PR_SET_NAME, _PR_SET_TIMERSLACK = 15, 29
+
+
+RESTLESS_S = 0.2
+"""Longest that a real-time process may work without waiting for anything [s]; ticks take milliseconds."""
 
 
 class _Timespec(ctypes.Structure):
@@ -64,11 +71,27 @@ def name_process(name: str) -> None:
     _libc.prctl(_PR_SET_NAME, name.encode()[:15], 0, 0, 0)
 
 
-def become_realtime(priority: int) -> list[str]:
+def _limit_restlessness(gave_up: Callable[[float], None]) -> None:
+    """Become an ordinary process when the kernel says that we have not waited for anything for too long."""
+
+    def take(_number: int, _frame: object) -> None:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        gave_up(RESTLESS_S)
+
+    signal.signal(signal.SIGXCPU, take)
+    _, most = resource.getrlimit(resource.RLIMIT_RTTIME)
+    soft = int(RESTLESS_S * 1e6)
+    if most == resource.RLIM_INFINITY or most > soft:  # else whoever started us has set a tighter one
+        resource.setrlimit(resource.RLIMIT_RTTIME, (soft, most))
+
+
+def become_realtime(priority: int, gave_up: Callable[[float], None]) -> list[str]:
     """Ask for real-time scheduling and resident memory, and switch the cyclic collector off.
 
     Args:
         priority: SCHED_FIFO priority 1 to 99; 0 leaves the scheduling as it is.
+        gave_up: called when the process has worked for RESTLESS_S [s] without waiting for anything, and was
+            therefore made an ordinary one.
 
     Returns:
         What was refused, in words, for the log.
@@ -77,6 +100,7 @@ def become_realtime(priority: int) -> list[str]:
     _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     if priority:
         try:
+            _limit_restlessness(gave_up)
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
         except (PermissionError, OSError) as error:
             refused.append(f"SCHED_FIFO priority {priority} ({errno.errorcode.get(error.errno or 0, '?')})")

@@ -82,7 +82,8 @@ def run(
     """
     name_process(f"sioms:{device}")
     runtime = Runtime(driver, device, settings, generation, options, fds)
-    return runtime.run(int(options["realtime_priority"]), str(options["user"]))
+    wanted = options["realtime_priority"]
+    return runtime.run(driver.realtime_priority if wanted is None else int(wanted), str(options["user"]))
 
 
 class Runtime:
@@ -246,7 +247,7 @@ class Runtime:
         """Tick until told to end; return the exit status."""
         if user and os.getuid() == 0:
             _become_user(user)
-        refused = become_realtime(priority)
+        refused = become_realtime(priority, self._gave_up_realtime)
         if refused:
             self.log("debug", "runs without " + ", ".join(refused))
         self.watch(self._control.fileno(), self._control_readable)
@@ -267,6 +268,13 @@ class Runtime:
             status = 1
             self._fail(error)
         return status
+
+    def _gave_up_realtime(self, worked_s: float) -> None:
+        self.log(
+            "warning",
+            f"gave up real-time scheduling: its tick has worked for {worked_s:g} s without a rest, and nothing else "
+            "on that processor could; lower the rate, or give it fewer channels",
+        )
 
     def _loop(self) -> None:
         poll, callbacks = self._epoll.poll, self._callbacks

@@ -7,6 +7,7 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from daemon_rig import WORKCELL, Client, Daemon, at_rest, axes, has_ended, jog, raises, wait_for
@@ -246,3 +247,41 @@ def _last(node: sioms.Node) -> sioms.client.snapshot.Snapshot:
     wait_for(lambda: _errno(node.read) == errno.EIO, f"{node.name} is refused", 5.0)
     raw = wait_for(lambda: node._page.numbered(node._page.head), "the last snapshot")
     return node._snapshot(raw, node._layout)
+
+
+@pytest.mark.root
+def test_only_drivers_that_ask_run_in_a_real_time_class(start_daemon: Callable[..., Daemon]) -> None:
+    asked = axes("mod1", "xaxis").replace('driver = "sim-axes"', 'driver = "sim-axes"\nrealtime_priority = 5')
+    daemon = start_daemon('[workcell]\nname = "test"\n' + axes("mod0", "xaxis") + asked, real_time=False)
+    classes = {d: os.sched_getscheduler(int(daemon.device(d)["pid"])) for d in ("mod0", "mod1")}
+    assert classes == {"mod0": os.SCHED_OTHER, "mod1": os.SCHED_FIFO}
+    own = os.sched_getparam(daemon.pid).sched_priority
+    assert own >= 5, "the daemon must get its turn beside its drivers"
+
+
+@pytest.mark.root
+def test_sigterm_is_obeyed_on_a_full_core(start_daemon: Callable[..., Daemon]) -> None:
+    """Drivers that ask for real time and for more than a core has; the daemon takes it away and ends when told to."""
+    text = '[workcell]\nname = "test"\n'
+    for i in range(6):
+        many = axes(f"mod{i}", "xaxis").replace(
+            'driver = "sim-axes"', 'driver = "sim-axes"\nrealtime_priority = 50\ntick_hz = 8000.0'
+        )
+        text += many
+    daemon = start_daemon(text, ready=False)
+    os.sched_setaffinity(daemon.pid, {0})
+    for child in Path(f"/proc/{daemon.pid}/task/{daemon.pid}/children").read_text().split():
+        os.sched_setaffinity(int(child), {0})  # the nursery: drivers inherit it
+    daemon.running.wait_line("event=ready", 60.0)
+    with daemon.cell() as cell:
+        pids = [d["pid"] for d in cell.status()["devices"]]
+    assert all(os.sched_getaffinity(pid) == {0} for pid in pids)
+    daemon.running.wait_line("real time given up|gave up real-time scheduling", 30.0)
+    time.sleep(1.0)
+    began = time.monotonic()
+    daemon.running.signal(signal.SIGTERM)
+    daemon.running.wait_line("event=shutdown", 5.0)
+    heard_s = time.monotonic() - began
+    assert daemon.running.wait_exit(10.0) == 0
+    print(f"SIGTERM heard after {heard_s:.3f} s, ended after {time.monotonic() - began:.3f} s")
+    assert heard_s < 1.0

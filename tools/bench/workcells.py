@@ -26,19 +26,19 @@ def axes(
         f"velocity_max = {velocity}\nacceleration_max = {acceleration}\nforce_max = 60.0\n{soft}"
         f"motor = {{ mass = 1.0, viscous = 2.0, encoder_step = 1e-6 }}\n{axis_keys}\n"
     )
-    head = f'[device.{name}]\ndriver = "sim-axes"\nlate_max_s = 0.5\ntick_hz = {tick_hz}\nhistory = {history}\ncapacity = {capacity}\n'
+    head = f'[device.{name}]\ndriver = "sim-axes"\nrealtime_priority = 50\nlate_max_s = 0.5\ntick_hz = {tick_hz}\nhistory = {history}\ncapacity = {capacity}\n'
     return head + "".join(f'[[device.{name}.axis]]\nname = "a{i}"\n{one}' for i in range(count))
 
 
 def force(name: str, *, tick_hz: float = 1000.0) -> str:
     """Return a device with a six-component force/torque sensor."""
-    return f'[device.{name}]\ndriver = "sim-force"\ntick_hz = {tick_hz}\n'
+    return f'[device.{name}]\ndriver = "sim-force"\nrealtime_priority = 50\ntick_hz = {tick_hz}\n'
 
 
 def wave(name: str, period_s: float, *, tick_hz: float = 1000.0) -> str:
     """Return a device with one input bit that a light beam breaks periodically."""
     return (
-        f'[device.{name}]\ndriver = "sim-io"\ninputs = 1\ntick_hz = {tick_hz}\n'
+        f'[device.{name}]\ndriver = "sim-io"\nrealtime_priority = 50\ninputs = 1\ntick_hz = {tick_hz}\n'
         f"[[device.{name}.wave]]\nbit = 0\nperiod_s = {period_s}\nhigh_s = {period_s / 2}\n"
     )
 

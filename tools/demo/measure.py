@@ -11,7 +11,7 @@ from typing import Any
 
 import sioms
 
-from .rig import Process
+from .rig import PATIENCE_S, Process
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ def reading(cell: sioms.Workcell, trials: int) -> Row:
 
 def writing(cell: sioms.Workcell, trials: int) -> Row:
     """Write a command and have it acknowledged."""
-    with cell.open("mod0.taxis", "rw", timeout=2.0) as node:
+    with cell.open("mod0.taxis", "rw", timeout=PATIENCE_S) as node:
         record = sioms.command(velocity=0.01)
         return row(
             "write, acknowledged by the driver", _timed(lambda: node.write(record, replace=True), trials)
@@ -70,12 +70,12 @@ def writing(cell: sioms.Workcell, trials: int) -> Row:
 def edge_to_client(cell: sioms.Workcell, trials: int) -> Row:
     """From an edge of a light beam, by its stamp, to the waiting client awake."""
     times = []
-    with cell.open("mod0.xaxis", "rw", timeout=2.0) as axis, cell.open("beam0") as beam:
+    with cell.open("mod0.xaxis", "rw", timeout=PATIENCE_S) as axis, cell.open("beam0") as beam:
         for _ in range(trials):
             axis.move(0.12 if axis.read().position[0] < 0.09 else 0.08)
-            event = beam.wait_event(timeout=5.0)
+            event = beam.wait_event(timeout=PATIENCE_S)
             times.append((time.monotonic_ns() - event.stamp_ns) / 1e3)
-            axis.wait_until_idle(5.0)
+            axis.wait_until_idle(PATIENCE_S)
     return row("light beam edge to client awake", times)
 
 
@@ -97,7 +97,7 @@ def kill_to_halt(cell: sioms.Workcell, trials: int) -> Row:
 def stop_to_halt(cell: sioms.Workcell, trials: int) -> Row:
     """From the call of the emergency stop to the last of eight axes braking."""
     times = []
-    with cell.open("mod0", "rw", 2.0) as first, cell.open("mod1", "rw", 2.0) as second:
+    with cell.open("mod0", "rw", PATIENCE_S) as first, cell.open("mod1", "rw", PATIENCE_S) as second:
         for trial in range(trials):
             velocity = 0.05 if trial % 2 == 0 else -0.05
             for node in (first, second):
@@ -118,21 +118,21 @@ def stop_to_halt(cell: sioms.Workcell, trials: int) -> Row:
 def _first_slower(node: Any, velocity: float, after_ns: int) -> int:
     """Return the stamp of the first snapshot after a time in which an axis is slower than commanded."""
     number = 0
-    deadline = time.monotonic() + 2.0
+    deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
         for snapshot in node.history(number):
             number = snapshot.number
             if snapshot.stamp_ns > after_ns and abs(snapshot.commanded_velocity[0]) < velocity:
                 return int(snapshot.stamp_ns)
         time.sleep(0.0005)
-    raise RuntimeError(f"{node.name} did not slow down within 2 s")
+    raise RuntimeError(f"{node.name} did not slow down in time")
 
 
 def _wait(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + PATIENCE_S
     while not condition():
         if time.monotonic() > deadline:
-            raise RuntimeError("the axis did not do within 5 s what it was told to do")
+            raise RuntimeError("the axis did not do what it was told to do")
         time.sleep(0.001)
 
 

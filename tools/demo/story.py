@@ -13,7 +13,7 @@ from sioms.client.command import command
 
 from . import measure
 from .recorder import Recorder
-from .rig import Process, daemon, tool
+from .rig import PATIENCE_S, Process, daemon, tool
 
 
 def tell(out: str, quick: bool, wire: bool) -> int:
@@ -127,7 +127,7 @@ class _Show:
             "markers and synch",
         )
         cell = self._cell
-        with cell.open("mod0", "rw") as mod0, cell.open("mod1", "rw") as mod1:
+        with cell.open("mod0", "rw", PATIENCE_S) as mod0, cell.open("mod1", "rw", PATIENCE_S) as mod1:
             picked, placed = cell.reserve_markers(2)
             mod0.write([
                 command(0, position=0.18, synch=True),
@@ -144,12 +144,12 @@ class _Show:
             _say(
                 f"buffered: mod0 {list(mod0.read().buffered)}, mod1 {list(mod1.read().buffered)} commands; nothing moves yet"
             )
-            start_ns = cell.synch(mod0, mod1)
+            start_ns = cell.synch(mod0, mod1, lead=2.0)  # a busy machine takes its time
             self._note("synch: both modules start", start_ns)
-            self._note("marker 1: mod0 has picked", picked.wait(5.0))
-            self._note("marker 2: mod1 has made room", placed.wait(5.0))
-            mod0.wait_until_idle(5.0)
-            mod1.wait_until_idle(5.0)
+            self._note("marker 1: mod0 has picked", picked.wait(PATIENCE_S))
+            self._note("marker 2: mod1 has made room", placed.wait(PATIENCE_S))
+            mod0.wait_until_idle(PATIENCE_S)
+            mod1.wait_until_idle(PATIENCE_S)
             self._note("both modules at rest")
 
     def _beam(self) -> None:
@@ -158,19 +158,19 @@ class _Show:
             "a moving axis breaks a beam; the program waits for the edge",
             "light beam",
         )
-        with self._cell.open("mod0.xaxis", "rw") as axis, self._cell.open("beam0") as beam:
+        with self._cell.open("mod0.xaxis", "rw", PATIENCE_S) as axis, self._cell.open("beam0") as beam:
             axis.move(0.0, max_velocity=0.25, max_acceleration=3.0)
-            broken = beam.wait_event(timeout=5.0)
+            broken = beam.wait_event(timeout=PATIENCE_S)
             awake_us = (time.monotonic_ns() - broken.stamp_ns) / 1e3
             self._note("beam 0 broken", broken.stamp_ns)
-            free = beam.wait_event(last=broken, timeout=5.0)
+            free = beam.wait_event(last=broken, timeout=PATIENCE_S)
             axis.move(0.12, replace=True, max_velocity=0.6, max_acceleration=6.0)
             self._note("beam 0 free again: turn back", free.stamp_ns)
             width_mm = (free.stamp_ns - broken.stamp_ns) / 1e9 * 0.25 * 1e3
             _say(
                 f"awake {awake_us:.0f} us after the edge; the edges' stamps make the beam {width_mm:.2f} mm wide (it is 40 mm)"
             )
-            axis.wait_until_idle(5.0)
+            axis.wait_until_idle(PATIENCE_S)
 
     def _finger(self) -> None:
         self._begin(
@@ -179,7 +179,7 @@ class _Show:
             "tactile finger",
         )
         with (
-            self._cell.open("mod1.zaxis", "rw") as axis,
+            self._cell.open("mod1.zaxis", "rw", PATIENCE_S) as axis,
             self._cell.open("lord1") as sensor,
             self._cell.open("tactile0") as finger,
             self._cell.open("tactile0.shape") as shape,
@@ -188,7 +188,7 @@ class _Show:
             finger.zero(20)
             axis.command(velocity=0.02)
             while abs(sensor.read().data[2]) < 0.5:
-                sensor.wait_new(sensor.read().number, 1.0)
+                sensor.wait_new(sensor.read().number, PATIENCE_S)
             self._note("touch: force above 0.5 N")
             axis.command(force=6.0, time=0.8, replace=True)
             time.sleep(0.7)
@@ -204,9 +204,9 @@ class _Show:
                 f"shape: {math.degrees(felt['angle']):.2f} +- {math.degrees(felt['var_angle'] ** 0.5):.2f} deg, "
                 f"{felt['load']:.0f} N/m, radius {1e3 * felt['radius']:.1f} mm (it is 6 mm)"
             )
-            axis.wait_until_idle(2.0)
+            axis.wait_until_idle(PATIENCE_S)
             axis.move(0.0)
-            axis.wait_until_idle(5.0)
+            axis.wait_until_idle(PATIENCE_S)
             self._note("finger free again")
 
     def _pipes(self) -> None:
@@ -234,7 +234,7 @@ class _Show:
             time.sleep(0.15)
             reading = watch.read()[0]
             self._note(f"axis at rest: {abs(reading.velocity):.4f} m/s")
-            self._cell.open("mod0.xaxis", "rw").close()
+            self._cell.open("mod0.xaxis", "rw", PATIENCE_S).close()
             _say("and free for the next client")
 
     def _stop(self) -> None:
@@ -242,7 +242,7 @@ class _Show:
             "Emergency stop", "any client may; latched until somebody entitled resets it", "emergency stop"
         )
         cell = self._cell
-        with cell.open("mod0", "rw") as mod0, cell.open("mod1", "rw") as mod1:
+        with cell.open("mod0", "rw", PATIENCE_S) as mod0, cell.open("mod1", "rw", PATIENCE_S) as mod1:
             for node in (mod0, mod1):
                 node.write([command(axis, velocity=0.15) for axis in range(2)])
             time.sleep(0.5)
@@ -259,8 +259,8 @@ class _Show:
             for node in (mod0, mod1):
                 node.write([command(axis, position=0.0) for axis in range(2)])
             self._note("new commands: back to zero")
-            mod0.wait_until_idle(5.0)
-            mod1.wait_until_idle(5.0)
+            mod0.wait_until_idle(PATIENCE_S)
+            mod1.wait_until_idle(PATIENCE_S)
 
     def _latencies(self, quick: bool) -> None:
         _chapter("How fast", "medians and worst cases of this run on this machine")

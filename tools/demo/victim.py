@@ -8,7 +8,7 @@ import sioms
 
 def main(node: str, velocity: float) -> None:
     """Move and say so; never stop by itself."""
-    with sioms.Workcell(name="victim") as cell, cell.open(node, "rw", timeout=2.0) as axis:
+    with sioms.Workcell(name="victim") as cell, cell.open(node, "rw", timeout=60.0) as axis:
         axis.command(velocity=velocity)
         print("moving", flush=True)
         time.sleep(3600)

@@ -8,7 +8,7 @@ from importlib.resources import files
 
 import sioms
 
-from .rig import Process, daemon
+from .rig import PATIENCE_S, Process, daemon
 
 PORTS = {"/dev/ttyUSB0": "drives", "/dev/ttyACM0": "finger", "192.168.127.254:502": "io"}
 """Port names of the configuration, and the counterpart that takes the place of each."""
@@ -55,12 +55,12 @@ def show(folder: str) -> None:
             with cell.open("io0.do", "rw") as outputs:
                 outputs.set(0b101)
                 print(
-                    f"  io0.do     outputs written and read back: {outputs.wait_new(outputs.read().number, 1.0).data[0]:#010b}"
+                    f"  io0.do     outputs written and read back: {outputs.wait_new(outputs.read().number, PATIENCE_S).data[0]:#010b}"
                 )
 
 
 def _wait_links(cell: sioms.Workcell) -> None:
-    deadline = time.monotonic() + 15.0
+    deadline = time.monotonic() + PATIENCE_S
     while any(device["link"] != "good" for device in cell.status()["devices"]):
         if time.monotonic() > deadline:
             raise RuntimeError(f"a link did not come up: {cell.status()['devices']}")
@@ -71,7 +71,7 @@ def _move(cell: sioms.Workcell) -> None:
     with cell.open("slide0", "rw") as axis:
         began = time.monotonic()
         axis.move(0.02)
-        axis.wait_until_idle(10.0)
+        axis.wait_until_idle(PATIENCE_S)
         print(
             f"  slide0     moved to {axis.read().position[0] * 1e3:.2f} mm in {time.monotonic() - began:.2f} s"
         )

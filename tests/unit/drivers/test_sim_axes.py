@@ -264,3 +264,25 @@ def test_bad_settings_are_told_by_describe(table, words):
 def test_unknown_keys_are_errors_at_every_depth(change):
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert({"axis": [SERVO | change]}, SimAxes.Settings)
+
+
+@pytest.mark.parametrize("bandwidth_hz", [10.0, 30.0, 60.0])
+def test_a_starved_machine_moves_as_a_free_one(bench, bandwidth_hz):
+    """Ticks 10 to 80 ms apart, as on a machine with much else to do: the controller's turns are made up for."""
+    axis = SERVO | {
+        "following_error_max": 0.02,
+        "jerk_max": 120.0,
+        "velocity_max": 0.6,
+        "acceleration_max": 6.0,
+    }
+    mod = bench.make(SimAxes, "mod0", {"axis": [axis, axis | {"name": "y"}]})
+    bench.run(0.01)
+    bench.write(mod, control_mode=ControlMode.POSITION, position=0.3)
+    random, now_ns, worst = np.random.default_rng(1), bench.now_ns, 0.0
+    for _ in range(60):
+        now_ns += int(random.integers(10, 80)) * 1_000_000
+        mod.tick(now_ns)
+        worst = max(worst, abs(mod.bank.fields[9, 0]))
+    assert not status(mod) & AxisStatus.FAULT and mod.bank.is_idle([0])
+    assert mod.bank.fields[0, 0] == pytest.approx(0.3, abs=2e-4)
+    assert worst < 2 * 6.0 / (2 * np.pi * bandwidth_hz) ** 2 + 0.002
