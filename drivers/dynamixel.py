@@ -1,7 +1,9 @@
 """Dynamixel X servos on protocol 2.0, several on one line, each an axis.
 
 The operating mode is a choice of the configuration, for it lies in the servo's EEPROM and changes only with the torque off.
-The bus watchdog is the dead-man: without a request for that long the servo stops.
+The bus watchdog is the dead-man: without a request for that long the servo stops. Every poll reads torque, watchdog, profile and goal and
+compares them with what was written, and the servo's clock with this one: a servo that restarted, or that somebody else
+has commanded, is opened again. A goal goes out in one packet with the profile that limits it.
 
     [device.arm0]
     driver = "dynamixel"
@@ -20,7 +22,7 @@ from __future__ import annotations
 import errno
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -32,7 +34,7 @@ from sioms.sdk.codec import dynamixel
 from sioms.sdk.codec.dynamixel import Bus, Status, signed
 from sioms.sdk.drive_axes import BANK_MODES, POSITION_MODES, AxesUnit, DriveSettings, drive_table
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
-from sioms.sdk.exchange import DeviceError, Pause, Send, Steps
+from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Pause, Send, StateLost, Steps
 from sioms.sdk.golden import Golden
 
 MODES = {
@@ -47,12 +49,23 @@ REBOOT_S = 0.5
 HARDWARE_ERRORS = {1: "input voltage", 4: "overheating", 8: "encoder", 16: "electrical shock", 32: "overload"}
 """Bits of register 70 as the e-Manual numbers them for the X series."""
 WATCHDOG_TICK_S, WATCHDOG_EXPIRED = 0.02, 0xFF
-BRAKE_CHARACTERS, WAKE_S = 35, 0.0005
+NO_WATCHDOG = "firmware before 38 has none; watchdog_s = 0 accepts that the servo goes on when the host dies"
+BRAKE_CHARACTERS, WAKE_S = 43, 0.0005
 """Between the reading of place and speed and the arrival of the goal made of them: reply and request, and the host."""
 DRIVE_MODE, OPERATING_MODE, VELOCITY_LIMIT, TORQUE, RETURN_LEVEL, HARDWARE_ERROR = 10, 11, 44, 64, 68, 70
 WATCHDOG, GOAL_CURRENT, GOAL_VELOCITY, PROFILE_ACCELERATION, PROFILE_VELOCITY = 98, 102, 104, 108, 112
-GOAL_POSITION, MOVING, PRESENT_VELOCITY = 116, 122, 128
+GOAL_POSITION, TICK, MOVING, PRESENT_VELOCITY = 116, 120, 122, 128
+IMAGE, IMAGE_SIZE = TORQUE, PRESENT_VELOCITY + 8 - TORQUE
 TIME_BASED = 0x04
+FARTHEST = 1_048_575
+"""Goal of the extended position mode, 256 turns (e-Manual, Goal Position)."""
+FLUSH = bytes(200)
+"""More than the receiver holds of a packet whose length was damaged. Zeros cannot complete one: they make a CRC of 0 only of a CRC of 0."""
+TICKS, DRIFT, JITTER_MS, TICKS_MS, LONGEST_MS = 32768, 0.1, 200, 1000, 20_000
+"""The servo's clock: where it begins anew [ms], how far it may be from this one (part of the time since a reading, and more [ms]), after
+how long that reading is renewed, and from where on it tells nothing [ms]."""
+OUTAGE_NS = 2_000_000_000
+"""How long after a reading a servo that stood may be told to be in the same turn."""
 
 AxisTable: Any = drive_table(
     {
@@ -93,6 +106,32 @@ class DynamixelSettings(DriveSettings, frozen=True, forbid_unknown_fields=True, 
     turnaround_s: float = 0.05
 
 
+class Image(NamedTuple):
+    """Registers 64 to 135 at one time.
+
+    Args:
+        data: the registers.
+        alert: the servo has a hardware error.
+        asked_ns, answered_ns: between which it answered.
+    """
+
+    data: bytes
+    alert: bool
+    asked_ns: int
+    answered_ns: int
+
+    def get(self, address: int, size: int) -> int:
+        """Return a register, signed when it has more than one byte."""
+        if size == 1:
+            return self.data[address - IMAGE]
+        return signed(self.data, address - IMAGE, size)
+
+    @property
+    def tick(self) -> int:
+        """The servo's clock [ms]."""
+        return self.get(TICK, 2) % TICKS
+
+
 class ServoUnit(AxesUnit):
     """One servo."""
 
@@ -108,74 +147,81 @@ class ServoUnit(AxesUnit):
         self._per_unit = axis.steps_per_turn / axis.travel_per_turn
         self._speed = 60 / abs(axis.travel_per_turn) / axis.speed_unit_rpm
         self._rate = 3600 / abs(axis.travel_per_turn) / axis.acceleration_unit_rpm2
-        self._ramps: dict[int, int] = {}
-        self._torque = False
-        self._fault = ""
+        self._set: dict[int, tuple[int, int]] = {}
+        self._writes = 0
+        self._limits = (0, axis.steps_per_turn - 1)
+        self._clock_read: Image | None = None
+        self._last: Image | None = None
+        self._fault = self._jumped = ""
 
     # --- hooks ----------------------------------------------------------------------------------
 
     def open(self) -> Steps:
-        """Identify the servo, stop it, look at its mode and limits, set its watchdog and switch the torque on."""
+        """Identify the servo, stop it, prove its mode, limits and watchdog, and switch it on unless a stop is latched."""
         bus, servo, axis = self._bus, self._id, self._axis
-        self._ramps.clear()
-        self._fault = ""
-        answer: Status = yield bus.ping(servo)
+        answer: Status = yield from self._sure(bus.ping(servo))
         model = int.from_bytes(answer.data[:2], "little")
         if axis.model and model != axis.model:
             text = f"identify {self.name}: servo {servo} is model {model}, firmware {answer.data[2]}"
             raise DeviceError(errno.ENODEV, f"{text}; the configuration says {axis.model}")
-        level: Status = yield bus.read(servo, RETURN_LEVEL, 1)
-        if level.data[0] != 2:  # at a lower level a write draws no reply
-            yield Send(
-                dynamixel.packet(servo, dynamixel.Op.WRITE, bytes((RETURN_LEVEL, 0, 2))), "ask for replies"
-            )
-            yield Pause(0.01)
-        yield bus.write(servo, WATCHDOG, 0, 1, repeatable=True)
-        yield from self.stop()
+        # at a lower level it answers neither writes nor reads
+        yield Send(
+            dynamixel.packet(servo, dynamixel.Op.WRITE, bytes((RETURN_LEVEL, 0, 2))), "ask for replies"
+        )
+        yield Pause(0.01)
+        before: Image = yield from self._read()
+        lost = self._lost_place(before)
+        if lost:
+            self.lose_place(0, lost)
+        self._set.clear()
+        self._fault = self._jumped = ""
+        self._set[RETURN_LEVEL] = (2, 1)
         yield from self._set_mode()
-        limit: Status = yield bus.read(servo, VELOCITY_LIMIT, 4)
-        highest = signed(limit.data, 0, 4) / self._speed
-        if axis.velocity_max > highest * 1.001:
-            text = (
-                f"velocity_max = {axis.velocity_max:g}, but the servo's limit (register 44) is {highest:.4g}"
-            )
-            raise DeviceError(errno.ERANGE, f"open {self.name}: {text}; want at most that")
-        yield from self._watch()
-        if not self._fault and not answer.alert:
+        yield from self.stop()
+        yield from self._write(WATCHDOG, 0, 1)
+        yield from self._check_limits()
+        yield from self._set_profile()
+        yield from self._arm()
+        if not before.alert and not self.bank.is_latched(0):
             yield from self._switch_on()
 
     def poll(self) -> Steps:
-        """Read watchdog, moving, current, velocity and position in one message."""
-        answer: Status = yield self._bus.read(self._id, WATCHDOG, MOVING + 14 - WATCHDOG)
-        expired, data = answer.data[0] == WATCHDOG_EXPIRED, answer.data[MOVING - WATCHDOG :]
-        yield from self._judge(answer.alert, expired)
-        speed = signed(data, 6, 4) / self._speed * math.copysign(1, self._per_unit)
-        position = (signed(data, 10, 4) - self._axis.zero) / self._per_unit
-        force = signed(data, 4, 2) * self._axis.current_unit * self._axis.force_per_ampere
-        moving = bool(data[0]) or signed(data, 6, 4) != 0
-        arrived = bool(data[1] & 1)
+        """Read all that moves it and how it moves in one message, and prove that it is as it was set."""
+        writes = self._writes
+        image: Image = yield from self._read()
+        if writes != self._writes:
+            return  # a stop came in between: what was read is older than it
+        yield from self._judge(image)
+        speed = image.get(PRESENT_VELOCITY, 4) / self._speed * math.copysign(1, self._per_unit)
+        position = (image.get(PRESENT_VELOCITY + 4, 4) - self._axis.zero) / self._per_unit
+        force = image.get(MOVING + 4, 2) * self._axis.current_unit * self._axis.force_per_ampere
+        moving = bool(image.get(MOVING, 1)) or speed != 0
+        arrived = bool(image.get(MOVING + 1, 1) & 1)
+        self._last = image
         one = np.array
         self.report(
-            one([position]), one([speed]), one([moving]), one([arrived]), [self._fault], one([force])
+            one([position]), one([speed]), one([moving]), one([arrived]), [self._fault], one([force]),
+            one([bool(image.get(TORQUE, 1))]),
         )  # fmt: skip
 
     def start_position(self, axis: int, position: float, speed: float, action: DriveAction) -> Steps:
-        """Set the profile where it differs, and the goal."""
+        """Set profile and goal at once."""
+        goal = self._steps_of(position)
         yield from self._switch_on()
-        yield from self._ramp(PROFILE_ACCELERATION, self._count(action.acceleration_max * self._rate))
-        yield from self._ramp(PROFILE_VELOCITY, self._count(speed * self._speed))
-        yield self._write(GOAL_POSITION, self._steps_of(position), 4)
+        yield from self._aim(
+            self._count(action.acceleration_max * self._rate), self._count(speed * self._speed), goal
+        )
 
     def start_velocity(self, axis: int, velocity: float, action: DriveAction) -> Steps:
-        """Set the profile where it differs, and the velocity."""
+        """Set velocity and profile at once."""
         yield from self._switch_on()
-        yield from self._ramp(PROFILE_ACCELERATION, self._count(action.acceleration_max * self._rate))
-        yield self._write(GOAL_VELOCITY, round(velocity * self._speed * math.copysign(1, self._per_unit)), 4)
+        wanted = round(velocity * self._speed * math.copysign(1, self._per_unit))
+        yield from self._run(wanted, action.acceleration_max)
 
     def start_force(self, axis: int, force: float, action: DriveAction) -> Steps:
         """Set the current."""
         yield from self._switch_on()
-        yield self._write(
+        yield from self._write(
             GOAL_CURRENT, round(force / self._axis.force_per_ampere / self._axis.current_unit), 2
         )
 
@@ -184,26 +230,14 @@ class ServoUnit(AxesUnit):
         if self._fault and not fastest:
             return
         if fastest and self._settings.quick_stop == "torque_off":
-            self._torque = False
-            yield self._write(TORQUE, 0, 1, repeatable=True)
-        elif self._axis.mode == "velocity":
-            yield self._write(GOAL_VELOCITY, 0, 4, repeatable=True)
-        elif self._axis.mode == "current":
-            yield self._write(GOAL_CURRENT, 0, 2, repeatable=True)
-        else:
-            yield from self._brake()
-
-    def _brake(self) -> Steps:
-        """Set the goal where braking ends: one nearer, as the place of now, the servo would overshoot and come back to."""
-        highest = self.bank.settings[0].acceleration_max
-        yield from self._ramp(PROFILE_ACCELERATION, self._count(highest * self._rate))
-        now: Status = yield self._bus.read(self._id, PRESENT_VELOCITY, 8)
-        speed, place = signed(now.data, 0, 4) / self._speed, signed(now.data, 4, 4)
-        way = speed * (self._stop_s + abs(speed) / (2 * highest)) * abs(self._per_unit)
-        goal = place + round(way)
-        if self._axis.mode == "position":  # beyond its one turn the servo would refuse the goal, and go on
-            goal = min(max(goal, 0), self._axis.steps_per_turn - 1)
-        yield self._write(GOAL_POSITION, goal, 4, repeatable=True)
+            yield from self._write(TORQUE, 0, 1, repeatable=True)
+            return
+        try:
+            yield from self._rest()
+        except DeviceError:
+            # the goals of one whose watchdog has expired are read-only until that is cleared; RESET arms it again
+            yield from self._write(WATCHDOG, 0, 1, repeatable=True)
+            yield from self._rest()
 
     def reset(self, axis: int) -> Steps:
         """Restart a servo that has shut down; else renew its watchdog."""
@@ -215,10 +249,203 @@ class ServoUnit(AxesUnit):
         if self._fault:
             raise DeviceError(errno.EIO, self._fault)
 
-    # --- inside ----------------------------------------------------------------------------------
+    # --- stops and starts --------------------------------------------------------------------------
 
-    def _write(self, address: int, value: int, size: int, *, repeatable: bool = False) -> Any:
-        return self._bus.write(self._id, address, value, size, repeatable=repeatable)
+    def _rest(self) -> Steps:
+        """Come to rest and stay there, by the goals of the mode."""
+        if self._axis.mode == "velocity":
+            yield from self._run(0, self.bank.settings[0].acceleration_max)
+        elif self._axis.mode == "current":
+            yield from self._write(GOAL_CURRENT, 0, 2, repeatable=True)
+        else:
+            yield from self._brake()
+
+    def _brake(self) -> Steps:
+        """Set the goal where braking ends: one nearer, as the place of now, the servo would overshoot and come back to."""
+        highest = self.bank.settings[0].acceleration_max
+        now: Status = yield from self._sure(self._bus.read(self._id, PRESENT_VELOCITY, 8))
+        speed, place = signed(now.data, 0, 4) / self._speed, signed(now.data, 4, 4)
+        way = speed * (self._stop_s + abs(speed) / (2 * highest)) * abs(self._per_unit)
+        goal = place + round(way)
+        if self._axis.mode == "position":  # beyond its limits the servo would refuse the goal, and go on
+            goal = min(max(goal, self._limits[0]), self._limits[1])
+        fastest = self._count(self.bank.settings[0].velocity_max * self._speed)
+        yield from self._aim(self._count(highest * self._rate), fastest, goal, repeatable=True)
+
+    def _aim(self, acceleration: int, velocity: int, goal: int, *, repeatable: bool = False) -> Steps:
+        """Write profile and goal at once, so that no goal goes without its limits."""
+        values = [(acceleration, 4), (velocity, 4), (goal, 4)]
+        yield from self._write_all(PROFILE_ACCELERATION, values, repeatable=repeatable)
+
+    def _run(self, velocity: int, acceleration: float) -> Steps:
+        values = [(velocity, 4), (self._count(acceleration * self._rate), 4)]
+        yield from self._write_all(GOAL_VELOCITY, values, repeatable=velocity == 0)
+
+    def _switch_on(self) -> Steps:
+        """Switch the torque on, unless it is; no goal of before may be taken up, in whatever mode it was left."""
+        torque: Status = yield self._bus.read(self._id, TORQUE, 1)
+        if torque.data[0]:  # it was stopped and holds, or brakes yet
+            self._set[TORQUE] = (1, 1)
+            return
+        yield from self._set_mode()
+        yield from self._rest()
+        for goal in (GOAL_POSITION, GOAL_VELOCITY):
+            self._set.pop(goal, None)  # it may be set anew by the servo itself
+        yield from self._write(TORQUE, 1, 1)
+
+    # --- openings ----------------------------------------------------------------------------------
+
+    def _set_mode(self) -> Steps:
+        """Set operating mode and profile by velocity where they differ; they lie in the EEPROM, so with the torque off.
+
+        A change of mode clears the profile and sets the goal current to its limit.
+        """
+        drive, mode = yield from self._modes()
+        wanted = MODES[self._axis.mode][0]
+        if not drive & TIME_BASED and mode == wanted:
+            return
+        yield from self._write(TORQUE, 0, 1, repeatable=True)
+        for goal in (GOAL_CURRENT, PROFILE_ACCELERATION, PROFILE_VELOCITY):
+            self._set.pop(goal, None)
+        if drive & TIME_BASED:
+            yield from self._write(DRIVE_MODE, drive & ~TIME_BASED, 1)
+        if mode != wanted:
+            yield from self._write(OPERATING_MODE, wanted, 1)
+        drive, mode = yield from self._modes()
+        if drive & TIME_BASED or mode != wanted:
+            text = f"set the mode of {self.name}: registers 10 and 11 read {drive} and {mode}"
+            raise DeviceError(errno.EIO, f"{text}; {drive & ~TIME_BASED} and {wanted} were written")
+
+    def _modes(self) -> Any:
+        now: Status = yield self._bus.read(self._id, DRIVE_MODE, 2)
+        return now.data[0], now.data[1]
+
+    def _check_limits(self) -> Steps:
+        """Read the limits of velocity and position."""
+        limit: Status = yield self._bus.read(self._id, VELOCITY_LIMIT, 12)
+        self._limits = signed(limit.data, 8, 4), signed(limit.data, 4, 4)
+        highest = signed(limit.data, 0, 4) / self._speed
+        if self._axis.velocity_max > highest * 1.001:
+            text = f"velocity_max = {self._axis.velocity_max:g}, but the servo's limit (register 44) is {highest:.4g}"
+            raise DeviceError(errno.ERANGE, f"open {self.name}: {text}; want at most that")
+
+    def _set_profile(self) -> Steps:
+        """Set the profile to the limits of the axis: 0, as after a start, is without limit."""
+        settings = self.bank.settings[0]
+        values = [
+            (self._count(settings.acceleration_max * self._rate), 4),
+            (self._count(settings.velocity_max * self._speed), 4),
+        ]
+        yield from self._write_all(PROFILE_ACCELERATION, values, repeatable=True)
+
+    def _arm(self) -> Steps:
+        """Set the watchdog, and read it back."""
+        ticks = round(self._settings.watchdog_s / WATCHDOG_TICK_S)
+        if not ticks:
+            return
+        try:
+            yield from self._write(WATCHDOG, ticks, 1)
+        except DeviceError as error:
+            raise DeviceError(error.errno, f"{error}; {NO_WATCHDOG}") from None
+        present: Status = yield self._bus.read(self._id, WATCHDOG, 1)
+        if present.data[0] != ticks:
+            text = f"arm {self.name}: the bus watchdog (register 98) reads {present.data[0]}, {ticks} was written"
+            raise DeviceError(errno.EIO, f"{text}; {NO_WATCHDOG}")
+
+    # --- what must hold ----------------------------------------------------------------------------
+
+    def _judge(self, image: Image) -> Steps:
+        """Say why the servo cannot move, or that it is not as it was set.
+
+        Raises:
+            StateLost: it restarted, or somebody else has written to it; the kit opens it again.
+        """
+        if image.alert:
+            errors: Status = yield self._bus.read(self._id, HARDWARE_ERROR, 1)
+            names = [text for bit, text in HARDWARE_ERRORS.items() if errors.data[0] & bit]
+            self._fault = f"hardware error {errors.data[0]:#x}, {', '.join(names)}; RESET restarts the servo"
+            self._set.clear()
+            return
+        if WATCHDOG in self._set and image.get(WATCHDOG, 1) == WATCHDOG_EXPIRED:
+            self._fault = "the bus watchdog expired: the servo heard nothing for too long"
+            return
+        self._fault = ""
+        self._jumped = self._time_jumped(image)
+        lost = self._jumped or self._otherwise(image)
+        if lost:
+            raise StateLost(f"{self.name}: {lost}: it restarted, or somebody else has written to it")
+
+    def _otherwise(self, image: Image) -> str:
+        """Return which register is not as it was written, '' when all are."""
+        for address, (value, size) in self._set.items():
+            if image.get(address, size) != value:
+                return f"register {address} reads {image.get(address, size)}, {value} was written"
+        return ""
+
+    def _time_jumped(self, image: Image) -> str:
+        """Return what is wrong with the servo's clock, '' when it went on as this one did."""
+        before = self._clock_read or image
+        passed = (image.tick - before.tick + JITTER_MS) % TICKS - JITTER_MS
+        least = max(0, image.asked_ns - before.answered_ns) / 1e6
+        most = (image.answered_ns - before.asked_ns) / 1e6
+        if most > TICKS_MS or self._clock_read is None:
+            self._clock_read = image
+        if most > LONGEST_MS or least * (1 - DRIFT) - JITTER_MS <= passed <= most * (1 + DRIFT) + JITTER_MS:
+            return ""
+        return f"the servo's clock (register 120) went from {before.tick} to {image.tick} ms in {most:.0f} ms"
+
+    def _lost_place(self, image: Image) -> str:
+        """Return how a servo that was opened before shows that it forgot its turns, '' when it knows them.
+
+        A restart leaves the place within one turn. It is the same place when the servo stood and reads what it read.
+        """
+        last = self._last
+        jumped = self._jumped or self._time_jumped(image)
+        self._clock_read, self._last = image, None
+        if last is None or self._axis.mode == "position":
+            return ""
+        off = WATCHDOG in self._set and not image.get(WATCHDOG, 1) and not image.get(TORQUE, 1)
+        way = abs(image.get(PRESENT_VELOCITY + 4, 4) - last.get(PRESENT_VELOCITY + 4, 4))
+        stood = not last.get(MOVING, 1) and image.asked_ns - last.answered_ns < OUTAGE_NS
+        if not (jumped or off) or (stood and way < self._axis.steps_per_turn / 4):
+            return ""
+        return f"position lost: it restarted ({jumped or 'watchdog and torque are off'}) and counts within one turn"
+
+    # --- the line ----------------------------------------------------------------------------------
+
+    def _read(self) -> Any:
+        """Return the image of the registers."""
+        asked_ns = self.clock()
+        answer: Status = yield self._bus.read(self._id, IMAGE, IMAGE_SIZE)
+        return Image(answer.data, answer.alert, asked_ns, self.clock())
+
+    def _sure(self, exchange: Exchange) -> Any:
+        """Carry out an exchange that may be repeated; a receiver that waits for the end of a damaged packet is given one."""
+        try:
+            return (yield exchange)
+        except LinkError:
+            yield Send(FLUSH, "zeros, to end a damaged packet")
+        return (yield exchange)
+
+    def _write(self, address: int, value: int, size: int, *, repeatable: bool = False) -> Steps:
+        yield from self._write_all(address, [(value, size)], repeatable=repeatable)
+
+    def _write_all(
+        self, address: int, values: Sequence[tuple[int, int]], *, repeatable: bool = False
+    ) -> Steps:
+        """Write registers at once, and note what they must read from now on."""
+        sizes = [size for _, size in values]
+        places = [address + sum(sizes[:i]) for i in range(len(sizes))]
+        self._writes += 1
+        for place in places:
+            self._set.pop(place, None)
+        exchange = self._bus.write_all(self._id, address, values, repeatable=repeatable)
+        if repeatable:
+            yield from self._sure(exchange)
+        else:
+            yield exchange
+        if address >= IMAGE:
+            self._set.update(zip(places, values, strict=True))
 
     def _count(self, value: float) -> int:
         """Return a speed or acceleration of a profile, at least 1: 0 would be "without limit"."""
@@ -229,60 +456,10 @@ class ServoUnit(AxesUnit):
         if self._axis.mode == "position" and not 0 <= steps < self._axis.steps_per_turn:
             text = f"position {position:g} is step {steps} of the servo; 0 to {self._axis.steps_per_turn - 1} in this mode"
             raise DeviceError(errno.ERANGE, text)
-        if abs(steps) >= 2**31:
-            raise DeviceError(errno.ERANGE, f"position {position:g} is beyond 2^31 steps")
+        if abs(steps) > FARTHEST:
+            text = f"position {position:g} is step {steps} of the servo; {-FARTHEST} to {FARTHEST} is right"
+            raise DeviceError(errno.ERANGE, text)
         return steps
-
-    def _set_mode(self) -> Steps:
-        """Set operating mode and profile by velocity where they differ; they lie in the EEPROM, so with the torque off."""
-        now: Status = yield self._bus.read(self._id, DRIVE_MODE, 2)
-        drive, mode = now.data[0] & ~TIME_BASED, MODES[self._axis.mode][0]
-        if (drive, mode) == (now.data[0], now.data[1]):
-            return
-        yield self._write(TORQUE, 0, 1, repeatable=True)
-        self._torque = False
-        if drive != now.data[0]:
-            yield self._write(DRIVE_MODE, drive, 1)
-        if mode != now.data[1]:
-            yield self._write(OPERATING_MODE, mode, 1)
-
-    def _watch(self) -> Steps:
-        ticks = round(self._settings.watchdog_s / WATCHDOG_TICK_S)
-        if ticks:
-            yield self._write(WATCHDOG, ticks, 1)
-
-    def _switch_on(self) -> Steps:
-        """Switch the torque on, unless it is; the goal of before must not be taken up."""
-        if self._torque:
-            return
-        torque: Status = yield self._bus.read(self._id, TORQUE, 1)
-        if torque.data[0]:  # it was stopped and holds, or brakes yet
-            self._torque = True
-            return
-        if self._axis.mode in ("position", "extended_position"):
-            yield from self._brake()  # it may coast yet
-        elif self._axis.mode == "velocity":
-            yield self._write(GOAL_VELOCITY, 0, 4)
-        else:
-            yield self._write(GOAL_CURRENT, 0, 2)
-        yield self._write(TORQUE, 1, 1)
-        self._torque = True
-
-    def _ramp(self, address: int, value: int) -> Steps:
-        if self._ramps.get(address) != value:
-            self._ramps.pop(address, None)
-            yield self._write(address, value, 4, repeatable=True)
-            self._ramps[address] = value
-
-    def _judge(self, alert: bool, expired: bool) -> Steps:
-        """Say why the servo cannot move."""
-        if alert:
-            errors: Status = yield self._bus.read(self._id, HARDWARE_ERROR, 1)
-            names = [text for bit, text in HARDWARE_ERRORS.items() if errors.data[0] & bit]
-            self._fault = f"hardware error {errors.data[0]:#x}, {', '.join(names)}; RESET restarts the servo"
-            return
-        mute = expired and self._torque and self._settings.watchdog_s
-        self._fault = "the bus watchdog expired: the servo heard nothing for too long" if mute else ""
 
 
 class Dynamixel(LineDriver):

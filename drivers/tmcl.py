@@ -212,7 +212,8 @@ class TmclUnit(AxesUnit):
         yield from self._arm()
         yield from self._limit()
         if self._lost:
-            self._lose_place(self._lost)
+            for axis in range(len(self._motors)):  # the module counts from 0 where it started
+                self.lose_place(axis, f"position lost, it restarted: {self._lost}")
             self._lost = ""
 
     def _arm(self) -> Steps:
@@ -426,12 +427,6 @@ class TmclUnit(AxesUnit):
         if _is_near(parameter, present, wanted):
             return ""
         return f"parameter {int(parameter)} of motor {motor} is {present}, not {wanted}"
-
-    def _lose_place(self, text: str) -> None:
-        """Nobody knows where the axes are: the module counts from 0 where it started."""
-        every = list(range(len(self._motors)))
-        self.bank.set_homed(every, homed=False)
-        self.bank.fault(every, f"{self.name}: position lost: {text}: it restarted", self.clock())
 
     def _end_programs(self) -> Steps:
         """End what may start a motor again: a program in the module, and reference searches of a process before this one."""

@@ -6,8 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
+from sioms.protocol.records import NodeClass, numpy_dtype
 from sioms.sdk.driver import LineDriver
 from sioms.sdk.exchange import DeviceError, LinkError, Pause, Send, Steps
 from sioms.sdk.markers import Markers
@@ -50,6 +52,26 @@ class Joined:
 
     def log(self, level: str, text: str) -> None:
         """Take what the driver says."""
+
+    def command(self, **fields: Any) -> None:
+        """Write one command to the bank, as a client does, and send what it wants sent."""
+        record = np.zeros(1, numpy_dtype(NodeClass.AXIS))
+        for name, value in fields.items():
+            record[name] = value
+        self.unit.bank.append(record, [0], self.unit.clock())
+        self._act()
+
+    def poll(self, count: int = 1, pause_s: float = 0.02) -> None:
+        """Poll some times, and send what the bank wants sent, as the kit does."""
+        for _ in range(count):
+            self.wait(pause_s)
+            self.do(self.unit.poll())
+            self._act()
+
+    def _act(self) -> None:
+        for action in self.unit.bank.take_actions():
+            self.do(self.unit.act(action))
+            self.unit.bank.action_done(action, self.unit.clock())
 
     def wait(self, seconds: float, look: Callable[[], object] = lambda: None) -> None:
         """Let time pass, and look at each millisecond."""

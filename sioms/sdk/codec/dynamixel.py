@@ -97,20 +97,33 @@ def signed(data: bytes, at: int, size: int) -> int:
     return int.from_bytes(data[at : at + size], "little", signed=True)
 
 
-def size_of(data: bytes, what: str) -> int | None:
-    """Return the length of the packet that data begins with, None while it is not known.
+def find(data: bytes, what: str) -> tuple[int, int] | None:
+    """Return where the status packet in data begins and ends, behind stray bytes and a local echo; None while it is not whole.
 
     Raises:
-        LinkError: data cannot begin a status packet.
+        LinkError: data holds none.
     """
-    if not HEADER.startswith(data[:4]):
-        raise LinkError(f"{what}: the reply begins with {data[:4].hex(' ')}; ff ff fd 00 is right")
-    if len(data) < 7:
-        return None
-    length = int(unpack_from("<H", data, 5)[0])
-    if not 4 <= length <= MAX_LENGTH:
-        raise LinkError(f"{what}: the reply tells a length of {length}; 4 to {MAX_LENGTH} is right")
-    return length + 7
+    at = 0
+    while (at := data.find(HEADER, at)) >= 0:
+        if len(data) < at + 7:
+            break
+        length = int(unpack_from("<H", data, at + 5)[0])
+        if not 3 <= length <= MAX_LENGTH:
+            raise LinkError(f"{what}: the reply tells a length of {length}; 4 to {MAX_LENGTH} is right")
+        end = at + length + 7
+        if len(data) < end:
+            break
+        if data[at + 7] == STATUS or not is_whole(data[at:end]):
+            return at, end
+        at = end
+    if len(data) > 2 * MAX_LENGTH:
+        raise LinkError(f"{what}: no reply in {len(data)} bytes; one beginning with ff ff fd 00 is right")
+    return None
+
+
+def is_whole(data: bytes) -> bool:
+    """Tell whether the CRC of a packet is right."""
+    return crc16_umts(data[:-2]).to_bytes(2, "little") == data[-2:]
 
 
 def parse(data: bytes, what: str) -> Status:
@@ -120,7 +133,7 @@ def parse(data: bytes, what: str) -> Status:
         LinkError: damaged, or no status.
         DeviceError: the servo refuses.
     """
-    if len(data) < _SHORTEST or crc16_umts(data[:-2]).to_bytes(2, "little") != data[-2:]:
+    if len(data) < _SHORTEST or not is_whole(data):
         raise LinkError(f"{what}: the CRC of the reply is wrong ({data.hex(' ')})")
     content = unstuff(data[7:-2])
     if content[0] != STATUS or len(content) < 2:
@@ -156,8 +169,14 @@ class Bus:
 
     def write(self, servo: int, address: int, value: int, size: int, *, repeatable: bool = False) -> Exchange:
         """Write one register."""
-        parameters = little(address, 2) + little(value, size)
-        what = f"write {value} at {address} of servo {servo}"
+        return self.write_all(servo, address, [(value, size)], repeatable=repeatable)
+
+    def write_all(
+        self, servo: int, address: int, values: Sequence[tuple[int, int]], *, repeatable: bool = False
+    ) -> Exchange:
+        """Write registers that follow one another, each as (value, size), at once."""
+        parameters = little(address, 2) + b"".join(little(value, size) for value, size in values)
+        what = f"write {', '.join(str(value) for value, _ in values)} at {address} of servo {servo}"
         return self._one(servo, Op.WRITE, parameters, 0, what, repeatable=repeatable)
 
     def reboot(self, servo: int) -> Exchange:
@@ -168,10 +187,14 @@ class Bus:
         self, servo: int, op: Op, parameters: bytes, size: int, what: str, *, repeatable: bool
     ) -> Exchange:
         timeout_s = self.turnaround_s + (size + _SHORTEST) * self.character_s
+
+        def want(data: bytes) -> int | None:
+            found = find(data, what)
+            return found[1] if found else None
+
         return Exchange(
-            packet(servo, op, parameters), lambda data: size_of(data, what), _from(servo, size, what), timeout_s,
-            repeatable, what,
-        )  # fmt: skip
+            packet(servo, op, parameters), want, _from(servo, size, what), timeout_s, repeatable, what
+        )
 
 
 def sync_read(servos: Sequence[int], address: int, size: int) -> bytes:
@@ -187,7 +210,8 @@ def sync_write(values: Mapping[int, int], address: int, size: int) -> bytes:
 
 def _from(servo: int, size: int, what: str) -> Callable[[bytes], Any]:
     def decode(data: bytes) -> Status:
-        status = parse(data, what)
+        found = find(data, what) or (0, len(data))
+        status = parse(data[slice(*found)], what)
         if status.id != servo or len(status.data) != size:
             raise LinkError(
                 f"{what}: {len(status.data)} bytes from servo {status.id}; {size} from {servo} are right"
