@@ -27,6 +27,7 @@ OFF_S = 1.5
 NOTICE_S = 3.0
 """Longest time from what happens in the device to its fault, or the loss of its link [s]."""
 WATCH_S = 0.5
+STOOD_S = 0.06
 SILENT_S = 0.25
 """How long requests are lost or refused, beginning with the stop [s]."""
 LONG_SILENCE_S = 2.0
@@ -87,11 +88,19 @@ def _stays(station: Station, fast: float, seconds: float, after: str) -> None:
 
 
 def _rests(station: Station, fast: float, after: str, seconds: float = NOTICE_S) -> None:
-    if not wait_for(lambda: abs(station.speed() or 0.0) <= SLOW * fast, seconds):
-        raise Failed(
-            f"the device at rest within {seconds:g} s after {after}",
-            f"it moves at {station.speed():.6g} (usually {fast:.6g})",
-        )
+    """Wait until the device stands, and has stood for a moment: a motor that swings passes a speed of 0, too."""
+    deadline, since = time.monotonic() + seconds, 0.0
+    while True:
+        speed, now = abs(station.speed() or 0.0), time.monotonic()
+        since = (since or now) if speed <= SLOW * fast else 0.0
+        if since and now - since > STOOD_S:
+            return
+        if now > deadline and not since:
+            raise Failed(
+                f"the device at rest within {seconds:g} s after {after}",
+                f"it moves at {speed:.6g} (usually {fast:.6g})",
+            )
+        time.sleep(0.002)
 
 
 def _in_fault(node: Any) -> bool:
