@@ -1,0 +1,479 @@
+"""Rig: a whole driver process and its clients on one thread and one clock of its own, served in any order.
+
+The driver side is the runtime with its engine, banks, handles and pages, the client side channels and nodes. Only what
+the operating system does is replaced: the clock, the timers, the sleep of a reading that waits, and the line.
+"""
+
+from __future__ import annotations
+
+import _socket
+import os
+import random
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+import sioms.client.node_core
+import sioms.sdk.connected
+from sioms.client import shown
+from sioms.client.channel import Call, Channel
+from sioms.client.node_core import NodeCore
+from sioms.motion import AxisSettings, DriveAction
+from sioms.protocol.flags import Access, ControlMode, NodeClass, Request, Right
+from sioms.protocol.latch import LATCH_SIZE, Latch
+from sioms.protocol.markers import TABLE_SIZE, MarkerTable
+from sioms.protocol.messages import DriverVerb, encode
+from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
+from sioms.sdk.blocks import AnalogBlock, AnyBlock, BinaryBlock, BlockSpec, Description
+from sioms.sdk.drive_axes import AxesUnit
+from sioms.sdk.driver import Driver, Kit, LineDriver, LineUnit, StreamDriver
+from sioms.sdk.exchange import Exchange, Steps
+from sioms.sdk.runtime import Runtime
+from sioms.sdk.settings import LineSettings
+
+Done = Callable[[Any], None]
+
+
+class _Timer:
+    """A timer descriptor without time: the rig says what has expired."""
+
+    def __init__(self) -> None:
+        self.fd = os.eventfd(0)
+        self.expired = 0
+
+    def set(self, first_ns: int, period_ns: int = 0) -> None:
+        """Nothing: the rig knows when it ticks."""
+
+    def expirations(self) -> int:
+        """Return how many periods are over."""
+        expired, self.expired = self.expired, 0
+        return expired
+
+
+class Client:
+    """A node that a client has open: its own channel, and the handle in the driver."""
+
+    def __init__(self, world: World, node: NodeCore, channel: Channel) -> None:
+        self.world = world
+        self.node = node
+        self.channel = channel
+        self.pending: dict[int, Done] = {}
+
+    def send(self, call: Call, done: Done) -> None:
+        """Send a request; ``done`` is called with the answer, or the refusal, when that has come."""
+        self.pending[self.channel.send(call)] = done
+        self.world.serve(self)
+        self.take()
+
+    def take(self) -> None:
+        """Take the answers that have come."""
+        while self.pending and (found := self.channel.take()) is not None:
+            done = self.pending.pop(found[0][1], None)
+            try:
+                value: Any = self.channel.result(found).value
+            except OSError as error:
+                value = error
+            if done is not None:
+                done(value)
+
+    def ioctl(self, request: Request, argument: object = None, done: Done = lambda _: None) -> None:
+        """Send a request."""
+        self.send(self.node._ioctl(request, argument, None), done)
+
+    def write(self, records: bytes, done: Done = lambda _: None, *, replace: bool = False) -> None:
+        """Send a write."""
+        self.send(self.node._write(records, 0.0, replace), done)
+
+
+class World:
+    """A driver process, its clients, and the order of things.
+
+    Args:
+        driver: class of the driver.
+        table: its settings.
+        chance: of the order.
+        device: replies to what the driver sends on its line; None for a driver without.
+    """
+
+    def __init__(
+        self, driver: type[Driver], table: dict[str, Any], chance: random.Random, device: Device | None = None
+    ) -> None:
+        self.chance = chance
+        self.device = device
+        self.clients: list[Client] = []
+        latch, request, taken, markers = (_memory(n) for n in (LATCH_SIZE, 4096, 4096, TABLE_SIZE))
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.control = ours
+        self.control.setblocking(False)
+        settings = msgspec.convert(table, driver.Settings)
+        options = {"stop_sources": [], "alarms": [], "daemon_lease_s": 1e6, "phase": 0.0, "state_folder": ""}
+        fds = [theirs.detach(), latch, request, taken, markers]
+        self.runtime = Runtime(driver, "dev", settings, 1, options, fds)
+        import mmap
+
+        self.latch = Latch(memoryview(mmap.mmap(latch, LATCH_SIZE)))
+        self.markers = MarkerTable(memoryview(mmap.mmap(markers, TABLE_SIZE)))
+        self.latch.daemon_alive(time.monotonic_ns())
+        self._fds = [latch, markers]
+        self.runtime._scheduled_ns = time.monotonic_ns()
+        self.runtime.looked_ns = time.monotonic_ns()
+        self.page_fds = list(self.runtime.pages.fds)
+        self.ticks = 0
+        for _ in range(400):
+            self.turn(calm=True)
+            if self.runtime.is_good(self.runtime.blocks) and all(
+                map(self.runtime.published, self.runtime.blocks)
+            ):
+                return
+        raise AssertionError("the driver does not come up")
+
+    def open(self, block: int, channels: Sequence[int], *, exclusive: bool, bit: int = -1) -> Client:
+        """Open a node as the daemon does."""
+        number = len(self.clients) + 1
+        shown_block = self.runtime.blocks[block]
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        readable, wake = os.pipe2(os.O_NONBLOCK)
+        access = Access.READ | Access.WRITE if exclusive else Access.READ
+        self.runtime.clients.attach(
+            [theirs.detach(), wake], number, block, list(channels), bit, int(access), exclusive, int(Right.ALL), 0,
+            "tester", f"node{number}",
+        )  # fmt: skip
+        spec = shown_block.spec
+        info = NodeInfo(
+            [f"node{number}", int(spec.node_class), not exclusive, [spec.channels[c].pack() for c in channels], bit,
+             1000.0, spec.capacity, "dev", "test", 2]
+        )  # fmt: skip
+        channel = Channel(_socket.socket(fileno=ours.detach()), info.name, False)
+        fd = os.dup(self.page_fds[block])
+        node = NodeCore(info, number, [fd, readable], list(channels), bit, channel)
+        self.clients.append(Client(self, node, channel))
+        return self.clients[-1]
+
+    def serve(self, client: Client) -> None:
+        """Let the driver serve what a client has sent."""
+        handle = self.runtime.clients.handles[client.node.handle]
+        self.runtime.clients._readable(handle)
+
+    def tick(self, skipped: int = 0) -> None:
+        """Let the driver tick; some ticks before that were missed."""
+        runtime = self.runtime
+        CLOCK.now_ns = max(CLOCK.now_ns, runtime._scheduled_ns + runtime.period_ns * (skipped + 1))
+        runtime._timer.expired = skipped + 1  # type: ignore[attr-defined]
+        self.ticks += 1
+        runtime._on_timer()
+        self.latch.daemon_alive(CLOCK.now_ns)
+        while True:
+            try:
+                self.control.recv(1 << 16)
+            except BlockingIOError:
+                return
+
+    def turn(self, *, calm: bool = False) -> None:
+        """Let one thing happen: a tick, perhaps a late one, or something on the line."""
+        chance = self.chance
+        CLOCK.now_ns += chance.randrange(1, 400_000)
+        if self.device is not None and self.runtime.engine.line is not None and chance.random() < 0.7:  # type: ignore[attr-defined]
+            self._line()
+        else:
+            self.tick(0 if calm or chance.random() < 0.8 else chance.randrange(1, 4))
+        for client in self.clients:
+            client.take()
+
+    def _line(self) -> None:
+        engine, device = self.runtime.engine, self.device
+        assert device is not None
+        if device.work():
+            engine._readable()  # type: ignore[attr-defined]
+        line = engine.line  # type: ignore[attr-defined]
+        if line is not None and line.deadline_ns is not None and not device.owes:
+            CLOCK.now_ns = max(CLOCK.now_ns, line.deadline_ns)
+            engine._line_due()  # type: ignore[attr-defined]
+
+    def order(self, verb: DriverVerb, *arguments: object) -> None:
+        """Send an order as the daemon does; it is acknowledged to all nodes."""
+        self.control.send(encode(verb, 0, *arguments))
+        self.latch.ordered()
+        shown.acknowledged_by_daemon(time.monotonic_ns())
+
+    def close(self) -> None:
+        """End everything."""
+        for client in self.clients:
+            client.node.release()
+            self.runtime.clients.drop(self.runtime.clients.handles[client.node.handle])
+        for fd in [*self._fds, *self.page_fds]:
+            os.close(fd)
+        if self.device is not None:
+            self.device.close()
+        for timer in (self.runtime._timer, self.runtime._line_timer):
+            os.close(timer.fd)
+        self.runtime._epoll.close()
+        self.runtime._control.close()
+        self.control.close()
+
+
+class _Clock:
+    now_ns = 10_000_000_000
+
+    def __call__(self) -> int:
+        self.now_ns += 1
+        return self.now_ns
+
+
+CLOCK = _Clock()
+
+
+@contextmanager
+def own_time(world: list[World]) -> Iterator[None]:
+    """Put the rig's clock, timers and line in the place of the system's; a reading that waits lets the world turn."""
+
+    def sleep(_: float) -> None:
+        world[0].turn()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(time, "monotonic_ns", CLOCK)
+        patch.setattr(sioms.client.node_core, "monotonic_ns", CLOCK)
+        patch.setattr(sioms.client.node_core, "sleep", sleep)
+        patch.setattr("sioms.sdk.runtime.TimerFd", _Timer)
+        patch.setattr(
+            sioms.sdk.connected, "open_connection", lambda settings, _: world_device(world, settings)
+        )
+        yield
+
+
+def world_device(world: list[World], settings: LineSettings) -> Any:
+    """Return the connection to the device of the world that is being made."""
+    device = DEVICE[-1]
+    device.settings = settings
+    return device
+
+
+DEVICE: list[Device] = []
+
+
+def _memory(size: int) -> int:
+    fd = os.memfd_create("rig")
+    os.ftruncate(fd, size)
+    return fd
+
+
+# --- a device on a line ---------------------------------------------------------------------------
+
+
+class Device:
+    """What is at the other end of the line, and the connection to it: it works off a request when its turn comes.
+
+    It holds an axis that moves slowly, four outputs, a sensor with a tare of its own.
+    """
+
+    def __init__(self, chance: random.Random, *, pushes: bool = False) -> None:
+        self.fd = os.eventfd(0)
+        self.settings = LineSettings(tcp="nowhere:1")
+        self.outputs = 0
+        self.tare = 0
+        self.position, self.velocity = 0.0, 0.0
+        self.faulty = False
+        self._chance = chance
+        self._asked: list[bytes] = []
+        self._heard = b""
+        self._pushes = pushes
+        self._count = 0
+        DEVICE.append(self)
+
+    @property
+    def owes(self) -> bool:
+        """Whether a request has not been answered."""
+        return bool(self._asked or self._heard)
+
+    def is_connected(self) -> bool:
+        return True
+
+    def write(self, data: bytes) -> None:
+        self._asked.append(bytes(data))
+
+    def read(self) -> bytes:
+        data, self._heard = self._heard, b""
+        return data
+
+    def close(self) -> None:
+        fd, self.fd = self.fd, -1
+        if fd >= 0:
+            os.close(fd)
+
+    def work(self) -> bool:
+        """Do one thing; return whether there is something to read."""
+        self.position += self.velocity * 1e-3
+        if self._pushes and self._chance.random() < 0.6:
+            self._count += 1
+            self._heard += b"S%d,%d,%d\n" % (CLOCK.now_ns, self._count, self.tare)  # the sample is on its way
+            return self._chance.random() < 0.5
+        if self._asked:
+            self._heard += self._answer(self._asked.pop(0)) + b"\n"
+        return bool(self._heard)
+
+    def _answer(self, request: bytes) -> bytes:
+        word, _, number = request.strip().partition(b" ")
+        match word:
+            case b"out":
+                self.outputs = int(number)
+            case b"tare":
+                self.tare = int(number)
+            case b"run":
+                self.velocity = float(number)
+            case b"halt":
+                self.velocity = 0.0
+            case b"get":
+                return b"%d,%d,%.6f,%.6f" % (self.outputs, self.tare, self.position, self.velocity)
+        return b"ok"
+
+
+def ask(text: str) -> Exchange:
+    """Return the exchange of one line each way; samples in between are not for it."""
+
+    def want(got: bytes) -> int | None:
+        end = 0
+        for line in got.splitlines(keepends=True):
+            end += len(line)
+            if line.endswith(b"\n") and not line.startswith(b"S"):
+                return end
+        return None
+
+    def decode(reply: bytes) -> str:
+        return reply.splitlines()[-1].decode()
+
+    return Exchange(text.encode() + b"\n", want, decode, 1e3, False, text)
+
+
+def tare(number: Any) -> Steps:
+    """Give the device a tare."""
+    yield ask(f"tare {int(number)}")
+
+
+class LineTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Settings of the drivers below."""
+
+    pieces: int = 2
+
+
+_AXIS = AxisSettings(
+    "x", velocity_max=1.0, acceleration_max=10.0, force_max=1.0,
+    modes=ControlMode.VELOCITY | ControlMode.POSITION | ControlMode.WAIT_FOR_EXTERNAL_SYNCH
+    | ControlMode.SPECIFIED_WAIT_MARKER,
+)  # fmt: skip
+_AXIS_SPEC = BlockSpec("", NodeClass.AXIS, (ChannelInfo("x", "m"),), capacity=64)
+_OUT_SPEC = BlockSpec("out", NodeClass.BINARY, (ChannelInfo("out", width=4),), True)
+_TARE_SPEC = BlockSpec("tare", NodeClass.ANALOG, (ChannelInfo("tare", "N"),))
+
+
+class _AxisUnit(AxesUnit):
+    def open(self) -> Steps:
+        yield ask("halt")
+
+    def poll(self) -> Steps:
+        text: str = yield ask("get")
+        yield ask("nothing")  # a poll of several exchanges: what it read first is from before
+        _, _, position, velocity = (float(n) for n in text.split(","))
+        moving = np.array([velocity != 0.0])
+        self.report(np.array([position]), np.array([velocity]), moving, ~moving, [""])
+
+    def start_position(self, axis: int, position: float, speed: float, action: DriveAction) -> Steps:
+        yield ask(f"run {speed}")
+
+    def start_velocity(self, axis: int, velocity: float, action: DriveAction) -> Steps:
+        yield ask(f"run {velocity}")
+
+    def halt(self, axis: int, *, fastest: bool) -> Steps:
+        yield ask("halt")
+
+
+class _OutUnit(LineUnit):
+    """Outputs and a number in the device, read back by the poll."""
+
+    name = "unit"
+
+    def __init__(self) -> None:
+        self.out, self.tare = BinaryBlock(_OUT_SPEC), AnalogBlock(_TARE_SPEC)
+
+    @property
+    def blocks(self) -> Sequence[AnyBlock]:
+        return (self.out, self.tare)
+
+    def open(self) -> Steps:
+        yield ask("nothing")
+
+    def poll(self) -> Steps:
+        text: str = yield ask("get")
+        yield ask("nothing")
+        outputs, tare, _, _ = text.split(",")
+        self.out.set(0, int(outputs), time.monotonic_ns())
+        self.tare.data[0] = float(tare)
+
+    def write_outputs(self, block: BlockSpec, channels: Sequence[int], values: Sequence[float]) -> Steps:
+        yield ask(f"out {int(values[-1])}")
+
+
+class OnLine(LineDriver):
+    """A drive and an output block on one line."""
+
+    Settings = LineTable
+
+    def __init__(self, name: str, settings: LineTable, kit: Kit) -> None:
+        super().__init__(name, settings, kit)
+        self.line = LineSettings(tcp="nowhere:1")
+        self._units = [_AxisUnit("drive", [_AXIS], _AXIS_SPEC, kit), _OutUnit()]
+
+    @classmethod
+    def describe(cls, name: str, settings: LineTable) -> Description:
+        return Description((_AXIS_SPEC, _OUT_SPEC, _TARE_SPEC), 50.0, lease_s=1e6)
+
+    @property
+    def units(self) -> Sequence[LineUnit]:
+        return self._units
+
+    def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
+        if request is not Request.CALIBRATE_DEVICE:
+            return super().ioctl(block, request, channels, argument)
+
+        return tare(argument)
+
+
+class Pushing(StreamDriver):
+    """A sensor that pushes samples and can be told a tare."""
+
+    Settings = LineTable
+    silence_s = 1e6
+
+    def __init__(self, name: str, settings: LineTable, kit: Kit) -> None:
+        super().__init__(name, settings, kit)
+        self.line = LineSettings(tcp="nowhere:1")
+        self._block = AnalogBlock(_TARE_SPEC)
+        self._rest = b""
+
+    @classmethod
+    def describe(cls, name: str, settings: LineTable) -> Description:
+        return Description((_TARE_SPEC,), 100.0, lease_s=1e6)
+
+    @property
+    def blocks(self) -> Sequence[AnyBlock]:
+        return (self._block,)
+
+    def open(self) -> Steps:
+        yield from ()
+
+    def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
+        if request is not Request.CALIBRATE_DEVICE:
+            return super().ioctl(block, request, channels, argument)
+        return tare(argument)
+
+    def feed(self, data: bytes, now_ns: int) -> int:
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        for line in lines:
+            stamp_ns, _, tare = line[1:].split(b",")
+            self._block.data[0] = float(tare)
+            self.kit.publish(self._block, int(stamp_ns))
+        return len(lines)
