@@ -470,6 +470,8 @@ class AxisBank:
         law.step(desired, self._desired_velocity, self._position, self._velocity, dt, rows)
         if rows is not None:
             self._follow_actual(rows)
+        if law.force_ends.any:
+            self._yield()
         if self._any_limp:
             law.relax(self._limp)
             self._follow_actual(self._limp)
@@ -481,6 +483,15 @@ class AxisBank:
             self._force[s] = 0.0
             desired[s] = law.slewed[s]
         np.subtract(desired, self._position, out=self._following)
+
+    def _yield(self) -> None:
+        """Hold where they are the axes that would have to press harder than they were told to reach their set-point."""
+        law = self._law
+        axes = law.force_ends.look(self._velocity, law.velocity_limit, self._last_ns)
+        if axes.size:
+            law.give_way(axes)
+            self._sequencer.hold(axes, self._position[axes], self._last_ns)
+            self._sequencer.store.evaluate(self._last_ns, self._desired, self._desired_velocity)
 
     def _follow_actual(self, rows: NDArray[np.bool_]) -> None:
         """Where no position is commanded, the commanded position is the actual one."""

@@ -172,6 +172,22 @@ class DriveBank:
         """Empty the buffers and stop at maximum deceleration, in the next poll."""
         self._halt(np.asarray(axes, dtype=np.int64), fastest=False)
 
+    def stop_at_limit(self, axes: AxesLike, side: AxisStatus, text: str, now_ns: int) -> None:
+        """Stop axes that a velocity or a force would take past a soft limit: who waits hears it, the status says it.
+
+        Args:
+            axes: bank axes.
+            side: LIMIT_MINUS or LIMIT_PLUS.
+            text: for who waits.
+            now_ns: the instant.
+        """
+        chosen = np.asarray(axes, dtype=np.int64)
+        forces = [a for a in chosen.tolist() if _is_force(self._running[a])]
+        self._queue.emit(EventKind.DROPPED, chosen, now_ns, errno.ERANGE, text)
+        self._halt(chosen, fastest=False)
+        self._outcome[chosen] |= int(side)
+        self._outcome[forces] |= int(AxisStatus.FORCE_ENDED)
+
     def emergency_stop(self, axes: AxesLike, now_ns: int) -> None:
         """Empty the buffers and stop the fastest way the drive has; latched until reset()."""
         chosen = np.asarray(axes, dtype=np.int64)
@@ -655,6 +671,9 @@ class DriveBank:
         status = self._queue.latched | self._outcome
         status |= np.where(busy, int(AxisStatus.MOVING), 0)
         status |= np.where(self._stopping, int(AxisStatus.STOPPING), 0)
+        if any(_is_force(command) for command in self._running):
+            forces = np.array([_is_force(command) for command in self._running])
+            status |= np.where(forces & self._active, int(AxisStatus.FORCE_MODE), 0)
         status |= np.where(self._queue.gated_marker & ~running, int(AxisStatus.WAITING_MARKER), 0)
         status |= np.where(self._queue.gated_synch & ~running, int(AxisStatus.WAITING_SYNCH), 0)
         self._status_word[:] = status
@@ -678,6 +697,11 @@ def _ends_by_itself(command: Command) -> bool:
     """Tell whether the drive's own 'done' ends this command."""
     mode = command.control_mode
     return bool(mode & modes.POSITION) and not (mode & modes.TIME)
+
+
+def _is_force(command: Command | None) -> bool:
+    """Tell whether this command is one of force."""
+    return command is not None and bool(command.control_mode & modes.ANY_FORCE)
 
 
 def _is_open_ended(command: Command) -> bool:

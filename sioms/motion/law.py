@@ -18,6 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from .force_end import ForceEnds
 from .settings import AxisKind, AxisSettings
 
 Vector = NDArray[np.float64]
@@ -68,6 +69,7 @@ class ControlLaw:
         self._start_velocity = np.array([s.start_velocity for s in settings], dtype=np.float64)
         self._any_start = bool(self._start_velocity.any())
         self.saturated = np.zeros(n, dtype=bool)
+        self.force_ends = ForceEnds(n)
         self.all_servo = not self.stepper.any()
         self.stepper_rows: slice | NDArray[np.int64] = np.flatnonzero(self.stepper)
         """The stepper rows as an index; a slice when all are, which copies nothing."""
@@ -118,7 +120,8 @@ class ControlLaw:
             np.add(desired, self.kb * velocity, out=self._u, where=force_rows)
             np.add(self._u, self.offset, out=self._u, where=force_rows)
             self.error[force_rows] = self._integral[force_rows] = 0.0
-        self._clip()
+            np.copyto(self.force_ends.asked, desired, where=force_rows)
+        self._clip(velocity)
         if not self.all_servo:
             self._slew(desired, desired_velocity, w_last, e_last, dt)
 
@@ -149,10 +152,16 @@ class ControlLaw:
         """Let the outputs of axes (a mask) be zero, and forget what led to them."""
         self.output[axes] = self.error[axes] = self._integral[axes] = 0.0
 
-    def _clip(self) -> None:
+    def give_way(self, axes: NDArray[np.int64]) -> None:
+        """Forget the error of axes whose set-point has yielded: what it was before must not push back."""
+        self.error[axes] = self._integral[axes] = 0.0
+
+    def _clip(self, velocity: Vector) -> None:
         np.negative(self.force_limit, out=self._low)
         np.maximum(self._u, self._low, out=self.output)
         np.minimum(self.output, self.force_limit, out=self.output)
+        if self.force_ends.any:
+            self.force_ends.bound(self.output, velocity, self.velocity_limit)
         np.not_equal(self.output, self._u, out=self.saturated)
 
     def _slew(

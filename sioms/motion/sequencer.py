@@ -191,6 +191,7 @@ class Sequencer:
         p, v, a = self.state(one, now_ns)[0].tolist()
         bounds = self._bounds(axis, command)._replace(minimum=-math.inf, maximum=math.inf)
         self.store.put(int(self.store.row[axis]), self._planner.plan(command, (p, v, a), bounds))
+        self._law.force_ends.end(one)
         self._run_now(one, RATE, now_ns)
 
     def _run_now(self, axes: Axes, kind: int, start_ns: int) -> None:
@@ -304,6 +305,8 @@ class Sequencer:
         store.begin(axes, start_ns, fraction)
         self._ready[axes] = False
         self._queue.has_head[axes] = False
+        if self.any_force or self._law.force_ends.any:
+            self._law.force_ends.end(axes)
         self.kind[axes] = self._row_kind[rows]
         self.guard[axes] = self._row_guard[rows]
         self.outcome[axes] = 0
@@ -361,10 +364,19 @@ class Sequencer:
         self.refresh(axes)
 
     def _set_kind(self, axes: Axes, kind: int) -> None:
+        if self.any_force:
+            self._leave_force(axes)
         rows = self.store.row[axes]
         self.kind[axes] = self._row_kind[rows] = kind
         self.guard[axes] = False
         self._row_signals[rows] = self._row_checked[rows] = False
+
+    def _leave_force(self, axes: Axes) -> None:
+        """Axes that leave force mode for a stop or a hold press no harder than they were told."""
+        law = self._law
+        for axis in axes[self.kind[axes] == FORCE].tolist():
+            velocity, limit = float(self._velocity[axis]), float(law.velocity_limit[axis])
+            law.force_ends.begin(axis, velocity, limit, float(law.offset[axis]))
 
     def _settle_masks(self) -> None:
         self.any_force = bool((self.kind == FORCE).any())

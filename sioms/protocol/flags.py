@@ -72,10 +72,15 @@ class AxisStatus(IntFlag):
     POSITION_LOST = 0x20000
     """The device may have lost its place: no positions are taken until HOME or CALIBRATE_DEVICE; RESET keeps it."""
 
+    FORCE_ENDED = 0x40000
+    """The last force command met a limit of velocity or position before its end: what holds now is the position."""
+
     @property
     def severity(self) -> int:
-        """How bad it is: 0 good, 1 minor (a limit, a miss, saturation), 2 major (fault, stall, emergency stop, lost place)."""
-        return 2 if int(self) & 0x280E0 else 1 if int(self) & 0x1640C else 0
+        """How bad it is: 0 good, 1 minor (a limit, a miss, a force that met none, saturation), 2 major (fault, stall,
+        emergency stop, lost place).
+        """
+        return 2 if int(self) & 0x280E0 else 1 if int(self) & 0x5640C else 0
 
 
 class AnalogStatus(IntFlag):

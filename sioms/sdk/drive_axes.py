@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.motion import ActionKind, AxisSettings, Command, DriveAction, DriveBank, Homing
-from sioms.protocol.flags import ControlMode, NodeClass
+from sioms.protocol.flags import AxisStatus, ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 
 from .blocks import AnyBlock, AxisBlock, BlockSpec
@@ -300,6 +300,7 @@ class AxesUnit(LineUnit):
             yield from self.start_position(axis, command.position, speed, action)
             self._goes[axis], self._stood_ns[axis] = True, 0
         elif mode & ControlMode.FORCE:
+            self._runs[axis] = True
             yield from self.start_force(axis, command.force, action)
         else:
             self._runs[axis] = True
@@ -324,7 +325,7 @@ class AxesUnit(LineUnit):
                 self.bank.fault([axis], text, now_ns)
 
     def _guard(self, now_ns: int) -> None:
-        """Stop an axis that runs at a velocity before it passes a soft limit."""
+        """Stop an axis that runs at a velocity, or by a force, before it passes a soft limit."""
         between_s = min(1.0, (now_ns - self._guarded_ns) / 1e9)
         self._guarded_ns = now_ns
         for axis in _where(self._runs):
@@ -340,11 +341,11 @@ class AxesUnit(LineUnit):
             passed_high = high is not None and velocity > 0 and position + ahead > high
             if passed_low or passed_high:
                 bound = low if passed_low else high
-                self._kit.log(
-                    "warning",
-                    f"{self.name} {settings.name}: stopped at {position:g}, the soft limit is {bound:g}",
-                )
-                self.bank.stop([axis], now_ns)
+                text = f"{self.name} {settings.name}: stopped at {position:g}, the soft limit is {bound:g}"
+                self._kit.log("warning", text)
+                self._runs[axis] = False
+                side = AxisStatus.LIMIT_MINUS if passed_low else AxisStatus.LIMIT_PLUS
+                self.bank.stop_at_limit([axis], side, text, now_ns)
 
 
 def _where(marks: Sequence[bool]) -> list[int]:

@@ -1,6 +1,7 @@
 """The bank's verbs and buffer semantics (specification 3.3 to 3.5), on an invented clock."""
 
 import errno
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -431,3 +432,89 @@ def test_flush_of_a_waiting_axis_is_idle_at_once():
     rig.bank.flush([0])
     assert rig.bank.is_idle([0])
     assert [e.kind for e in rig.bank.take_events()] == [EventKind.IDLE]
+
+
+class Wall:
+    """A mass with friction before a wall that is a spring; ``force`` is that on the wall."""
+
+    def __init__(
+        self, place: float, *, mass: float = 1.0, stiffness: float = 2e4, viscous: float = 2.0
+    ) -> None:
+        self.place, self.mass, self.stiffness, self.viscous = place, mass, stiffness, viscous
+        self.velocity = self.force = 0.0
+
+    def before(self, rig: Rig, sign: float = 1.0) -> Callable[[np.ndarray, float], np.ndarray]:
+        """Return the plant with the wall on the side that the sign says."""
+
+        def step(output: np.ndarray, dt: float) -> np.ndarray:
+            x, steps = sign * float(rig.raw[0]), 10
+            for _ in range(steps):
+                depth = x - self.place
+                self.force = max(0.0, self.stiffness * depth + 40.0 * self.velocity) if depth > 0 else 0.0
+                drive = sign * float(output[0]) - self.force - self.viscous * self.velocity
+                self.velocity += drive / self.mass * dt / steps
+                x += self.velocity * dt / steps
+            return np.array([sign * x])
+
+        return step
+
+
+@pytest.mark.parametrize("force", [4.0, -4.0])
+@pytest.mark.parametrize("way", [0.02, 0.06, 0.1, 0.25, 1.0])
+@pytest.mark.parametrize("end", ["velocity", "time", "stop", "switch", "position"])
+def test_what_follows_a_force_presses_no_harder_than_the_force(force: float, way: float, end: str) -> None:
+    """It met nothing, or not yet: braked from there it may meet a wall, and holds there what was asked at most."""
+    sign = 1.0 if force > 0 else -1.0
+    limits = {"position_max": way + 0.02, "position_min": -way - 0.02} if end == "position" else {}
+    gains = {"k": 4e4, "kz": -0.95, "kb": -4.0}
+    rig = Rig([axis(velocity_max=0.5, acceleration_max=2.0, force_max=50.0, **gains, **limits)])
+    wall = Wall(way)
+    rig.plant = wall.before(rig, sign)
+    timed = MODE.SPECIFIED_TIME if end == "time" else 0
+    rig.write(mode=MODE.FORCE | timed, force=force, time=0.1 if timed else 0.0)
+    rig.tick(110)
+    if end == "stop":
+        rig.bank.stop([0], rig.now_ns)
+    if end == "switch":
+        rig.switches = lambda raw: np.array([SWITCH_PLUS if sign > 0 else SWITCH_MINUS])
+    presses = [0.0]
+    for _ in range(1500):
+        rig.tick()
+        # in force mode damping comes beside the force, and so it does when the axis is thrown back
+        if not rig.field("status") & S.FORCE_MODE and rig.field("velocity") * sign > -0.005:
+            presses.append(rig.field("force") * sign)
+    assert max(presses) <= abs(force) + 1e-6, "the actuator, in the direction of the force"
+    assert wall.force <= abs(force) + 0.05, "the wall, when all has come to rest"
+    ended = (
+        any(e.kind is EventKind.DROPPED and e.errno == errno.ERANGE for e in rig.events) and end != "switch"
+    )
+    assert bool(rig.field("status") & S.FORCE_ENDED) == ended
+    if ended:
+        assert S(rig.field("status")).severity >= 1 and not rig.field("status") & S.FORCE_MODE
+        rig.write(mode=MODE.POSITION, position=0.0)
+        rig.run()
+        assert not rig.field("status") & S.FORCE_ENDED
+        assert abs(rig.field("position")) < 1e-3, "afterwards it has all its force again"
+
+
+def test_the_bound_of_a_force_is_lifted_at_rest() -> None:
+    """What is held then is held with all there is; a zero force that is stopped in motion holds, too."""
+    for force in (3.0, 0.0):
+        rig = Rig([axis(k=2000.0, kb=-40.0, force_max=50.0)])
+        wall = Wall(9.0)
+        push, plant = [0.0], wall.before(rig)
+        rig.plant = lambda output, dt, plant=plant, push=push: plant(output + push[0], dt)
+        rig.write(mode=MODE.FORCE, force=3.0)
+        rig.tick(100)
+        rig.write(mode=MODE.FORCE, force=force)
+        rig.tick(10)
+        rig.bank.stop([0], rig.now_ns)
+        rig.tick(1500)
+        held = rig.field("position")
+        assert rig.bank.is_idle([0])
+        push[0] = -20.0
+        rig.tick(1000)
+        assert abs(rig.field("position") - held) < 0.02, "it gives way by the stiffness of the law alone"
+        push[0] = 20.0
+        rig.tick(1000)
+        assert abs(rig.field("position") - held) < 0.02

@@ -159,3 +159,28 @@ def test_homing_is_the_drives_own():
     assert cell.status() & S.HOMING
     cell.poll(200)
     assert cell.status() & S.HOMED and cell.bank.is_idle([0])
+
+
+def test_a_soft_limit_that_ends_a_run_or_a_force_is_told():
+    for mode, bits in ((MODE.VELOCITY, 0), (MODE.FORCE, S.FORCE_ENDED)):
+        bank = DriveBank(
+            [axis(modes=MODE.VELOCITY | MODE.FORCE | MODE.POSITION)], markers=Markers(), settle_s=0.0
+        )
+        still, moves = np.zeros(1), np.array([0.5])
+        no, yes = np.array([False]), np.array([True])
+        now = 1_000_000_000
+        bank.poll(now, still, still, no, yes)
+        bank.append(records(mode=mode, velocity=0.5, force=1.0), [0], now)
+        for action in bank.take_actions():
+            bank.action_done(action, now)
+        bank.poll(now + 10_000_000, np.array([0.005]), moves, yes, no)
+        status = int(bank.fields.view(np.int64)[11, 0])
+        assert bool(status & S.FORCE_MODE) == (mode is MODE.FORCE)
+        bank.stop_at_limit([0], S.LIMIT_PLUS, "the soft limit is near", now + 11_000_000)
+        assert [a.is_stop for a in bank.take_actions()] == [True]
+        bank.poll(now + 20_000_000, np.array([0.006]), still, no, yes)
+        status = S(int(bank.fields.view(np.int64)[11, 0]))
+        assert status & S.LIMIT_PLUS and status.severity == 1
+        assert status & S.FORCE_ENDED == bits and not status & S.FORCE_MODE
+        told = [e for e in bank.take_events() if e.kind is EventKind.DROPPED]
+        assert [(e.errno, e.text) for e in told] == [(errno.ERANGE, "the soft limit is near")]

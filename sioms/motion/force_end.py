@@ -1,0 +1,95 @@
+"""What follows a force command that ends without another command: the axis brakes and holds, and presses no harder than it was told.
+
+The place to be held follows from a profile of braking. Where something stands within that way, the control law would
+press on it with all it has, although a few newtons were asked for. So the actuator may work against the motion with
+all its force, but in the direction of the motion, or of the force when the axis stood, at most with the force that was
+asked for, beside the offset. Where that is not enough to follow the set-point, the set-point yields: the axis holds
+where it is. An axis that is thrown back yields, too, and is damped. At rest the bound is lifted; what is held then is
+held against what pushes from outside.
+
+Pure; concurrency: that of its bank.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+REST = 0.01
+"""Part of the velocity limit below which an axis may be at rest."""
+REST_NS = 50_000_000
+"""So long it must be so [ns]."""
+
+
+class ForceEnds:
+    """Bounds of the output of axes that have left force mode.
+
+    Args:
+        n: number of axes.
+
+    Attributes:
+        any: whether there is a bound at all.
+        asked: force that was commanded last, NaN before one was (n,).
+    """
+
+    def __init__(self, n: int) -> None:
+        self.any = False
+        self.asked = np.full(n, math.nan)
+        self._direction = np.zeros(n)
+        self._most = np.zeros(n)
+        self._presses = np.zeros(n, dtype=bool)
+        self._moved_ns = np.zeros(n, dtype=np.int64)
+
+    def begin(self, axis: int, velocity: float, limit: float, offset: float) -> None:
+        """Bound the output of an axis that leaves force mode.
+
+        Args:
+            axis: bank axis.
+            velocity: measured [unit/s].
+            limit: of the velocity [unit/s].
+            offset: force that is added to every command.
+        """
+        asked = float(self.asked[axis])
+        if math.isnan(asked):  # it was over before any tick put it out
+            return
+        direction = math.copysign(1.0, velocity if abs(velocity) > REST * limit else asked)
+        self._direction[axis] = direction
+        self._most[axis] = max(0.0, asked * direction) + offset * direction
+        self._moved_ns[axis] = 0
+        self.asked[axis] = math.nan
+        self.any = True
+
+    def end(self, axes: NDArray[np.int64]) -> None:
+        """Lift the bounds of axes: they are at rest, or have been given a command."""
+        self._direction[axes], self.asked[axes] = 0.0, math.nan
+        self.any = bool(self._direction.any())
+
+    def bound(
+        self, output: NDArray[np.float64], velocity: NDArray[np.float64], limit: NDArray[np.float64]
+    ) -> None:
+        """Bound the output of axes that do not move away from what they press on, in place; all (n,)."""
+        direction = self._direction
+        np.greater(output * direction, self._most, out=self._presses)
+        self._presses &= direction != 0.0
+        towards = velocity * direction >= -REST * limit
+        np.copyto(output, self._most * direction, where=self._presses & towards)
+
+    def look(
+        self, velocity: NDArray[np.float64], limit: NDArray[np.float64], now_ns: int
+    ) -> NDArray[np.int64]:
+        """Lift the bounds of axes at rest; return the axes whose set-point has to yield.
+
+        Args:
+            velocity: measured (n,).
+            limit: of the velocity (n,).
+            now_ns: instant of the tick.
+        """
+        bounded = self._direction != 0.0
+        moves = bounded & ((np.abs(velocity) > REST * limit) | (self._moved_ns == 0))
+        self._moved_ns[moves] = now_ns
+        rested = np.flatnonzero(bounded & (now_ns - self._moved_ns > REST_NS))
+        if rested.size:
+            self.end(rested)
+        return np.flatnonzero(self._presses)
