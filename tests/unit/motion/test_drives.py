@@ -4,7 +4,7 @@ import errno
 
 import numpy as np
 import pytest
-from motion_rig import DRIVE_MODES, MODE, POLL_NS, Cell, axis, records
+from motion_rig import DRIVE_MODES, MODE, POLL_NS, Cell, Markers, axis, records
 
 from sioms.motion import ActionKind, CommandError, DriveBank, EventKind
 from sioms.protocol.flags import AxisStatus as S
