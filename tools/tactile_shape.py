@@ -163,7 +163,7 @@ class Tally:
     def add(self, row: tuple[float, ...]) -> None:
         """Count a frame."""
         self.frames += 1
-        if row[_TOUCHED]:
+        if row[_TOUCHED] == 1.0:
             quality = Quality(int(row[_QUALITY]))
             self.touched += 1
             self.good += quality is Quality.GOOD

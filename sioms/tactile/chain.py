@@ -13,6 +13,15 @@ it, and hardly while what the touch left of creep is above the noise. So touches
 little their pauses tell. A touch is what rises above the noise in sum over all elements, what all have in common
 left out; it ends at half that level.  A touch from the first frame on cannot be told from an offset: call `zero`
 untouched.
+
+What is no touch is kept from freezing the baseline (`sioms.tactile.witness`):
+an element that moves alone is suspect and left out, until it has stood still for `RECOVER_S` while nothing touched: then it gets a
+baseline of its own again. So does an element that comes to life late. What moves all elements alike, a step of the supply, is taken
+into the baseline at once.
+
+Readings that repeat may be those of a converter with steps above its noise: they count as they are, with the step as their
+uncertainty, for as long as a touch is held. But where most elements have been seen to be noisy since the last `zero`, an element that repeats its reading
+for `DEAD_FRAMES` is dead; if all do, the converter is stuck, and the finger blind.
 """
 
 from __future__ import annotations
@@ -25,18 +34,38 @@ from numpy.typing import ArrayLike, NDArray
 
 from sioms.tactile.finger import Finger
 from sioms.tactile.linearity import linearise
+from sioms.tactile.model import StrainTable
+from sioms.tactile.witness import FEWEST, TOUCH_SIGMA, Sight, Witness, moves_alone
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 SETTLE_FRAMES = 20  # averaged for the first baseline
-DEAD_FRAMES = 200  # an element whose reading has not changed for so long is dead; noise moves a living one
-_TOUCH_SIGMA = 8.0  # above the mean of the noise's chi square, in its standard deviations
+DEAD_FRAMES = 200  # without a change, where readings are noisy: dead
+RECOVER_S = 2.0  # an element that moved alone must stand still so long, untouched, to be believed again
+HELD_FRAMES = 16  # of a steady touch, that are first averaged; then twice as many, and so on
+MOST_HELD = 1024
+_NOISY, _MOST_NOISY = 0.25, 0.75  # an element that changes in so many frames; share of all elements
+_MEMORY = 64  # frames over which changes are counted
+_STILL = 6.0  # standard deviations within which a suspect element stands still
+_ALIKE = 0.15  # of a step of all elements, by which one may differ from it
+_COMMON_SIGMA = 6.0  # of the elements' median, for a step of all
+_MOST_SCALE = 25.0  # of the noise's variance over that of the finger's file
+_STEADY, _STEADY_SHARE = 6.0, 0.02  # of a held touch: mean square in deviations, and share of the peak
 _CREPT, _CREPT_AFTER_HOLD = (
     0.1,
     0.02,
 )  # of the output of a touch, that may be left at once and after the release hold
 _DRIFT_SHARE = 0.2  # of the noise, by which the baseline may move unseen in one drift time
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Held:
+    """Hold the mean strains over some frames of a steady touch, and their variances, shape (ns,); immutable."""
+
+    strains: Floats
+    variance: Floats
+    frames: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,6 +80,9 @@ class StrainFrame:
         touched: whether there is a touch.
         settled: whether the baseline is known yet; before, strains are nan.
         strength: chi square of the outputs against the noise, per element; about 1 when untouched.
+        blind: the usable elements cannot tell whether there is a touch; `touched` is then what it was.
+        variance: of the strains, shape (ns,), where the converter's steps or noise are above those of the finger's file.
+        held: the mean over a touch that has been steady; the same object until there is a longer one.
     """
 
     strains: Floats
@@ -60,6 +92,9 @@ class StrainFrame:
     touched: bool
     settled: bool
     strength: float
+    blind: bool = False
+    variance: Floats | None = None
+    held: Held | None = None
 
 
 class SignalChain:
@@ -68,9 +103,12 @@ class SignalChain:
     Args:
         finger: the calibrated finger.
         settle_frames: frames averaged for the first baseline and after `zero`.
+        table: the finger's, if it is at hand.
     """
 
-    def __init__(self, finger: Finger, settle_frames: int = SETTLE_FRAMES) -> None:
+    def __init__(
+        self, finger: Finger, settle_frames: int = SETTLE_FRAMES, table: StrainTable | None = None
+    ) -> None:
         if settle_frames < 1:
             raise ValueError(f"make signal chain: {settle_frames} frames to settle; need at least 1")
         e, self._signal = finger.elements, finger.signal
@@ -79,7 +117,10 @@ class SignalChain:
         self._gain, self._quadratic = np.array(e.gain), np.array(e.quadratic)
         self._fading = math.log(_CREPT / _CREPT_AFTER_HOLD) / max(self._signal.release_hold_s, 1e-3)
         self._mixing: Floats | None = None  # the gains as a matrix, if they are more than a diagonal
-        self._noise = np.array(e.noise) ** 2
+        self._own_noise = np.array(e.noise) ** 2
+        self._witness = Witness(finger, finger.strain_table() if table is None else table)
+        self._changes = np.zeros(self._count)
+        self._frames, self._is_noisy, self._step = 0, False, math.inf
         self._settle = settle_frames
         self._last: Floats = np.full(self._count, np.nan)
         self._same: NDArray[np.int64] = np.zeros(self._count, dtype=np.int64)
@@ -96,6 +137,19 @@ class SignalChain:
         # of the baseline, in squares of the noise; and what creep may have left in the readings
         self._variance = np.full(self._count, 1.0 / self._settle)
         self._crept = np.zeros(self._count)
+        self._first, self._square = np.zeros(self._count), np.zeros(self._count)
+        self._scale = 1.0
+        self._is_noisy = False
+        self._suspect: Flags = np.zeros(self._count, dtype=np.bool_)
+        self._still_s, self._stood, self._mark = (np.zeros(self._count) for _ in range(3))
+        self._average = _Average(self._count)
+        self._weigh()
+
+    def _weigh(self) -> None:
+        """Take the noise of the file, or of the first readings, or the converter's steps, whichever is larger."""
+        steps = 0.0 if math.isinf(self._step) else (self._step * self._signal.scale) ** 2 / 6.0
+        self._noise: Floats = np.maximum(self._scale * self._own_noise, steps)
+        self._is_own = self._scale == 1.0 and not np.any(self._own_noise < steps)
 
     @property
     def baseline(self) -> Floats:
@@ -146,54 +200,165 @@ class SignalChain:
             raise ValueError(
                 f"process frame: stamp {stamp_ns} ns is before the last one, {self._stamp_ns} ns"
             )
-        finite = np.isfinite(reading)
-        saturated = finite & ((reading <= self._signal.lowest) | (reading >= self._signal.highest))
-        dead = self._watch(reading)
-        usable = finite & ~saturated & ~dead & self._used
-        output = np.where(usable, reading, 0.0) * self._signal.scale
         elapsed_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
         self._stamp_ns = stamp_ns
+        finite = np.isfinite(reading)
+        saturated = finite & ((reading <= self._signal.lowest) | (reading >= self._signal.highest))
+        dead = self._watch(reading, finite)
+        alive = finite & ~saturated & ~dead & self._used
+        output = np.where(alive, reading, 0.0) * self._signal.scale
         if self._left > 0:
-            self._start(output, usable)
-            return StrainFrame(np.full(self._count, np.nan), usable, saturated, dead, False, False, math.nan)
-        usable &= self._seen > 0.0
+            self._start(output, alive)
+            return StrainFrame(np.full(self._count, np.nan), alive, saturated, dead, False, False, math.nan)
+        usable = alive & ~self._suspect
+        sight = self._witness.sight(usable)
         change = output - self._baseline
-        strength, count = self._strength(change, usable)
-        self._touch(strength, count)
-        self._follow(change, usable, elapsed_s)
+        if sight.blind:
+            strength = math.nan
+            self._variance += (elapsed_s / self._signal.drift_time_s) ** 2
+        else:
+            usable, strength = self._judge(change, usable, sight)
+            self._follow(change, usable, elapsed_s)
+            self._recover(output, alive, elapsed_s)
+        return self._told(change, usable, saturated, dead, strength, sight.blind)
+
+    def _judge(self, change: Floats, usable: Flags, sight: Sight) -> tuple[Flags, float]:
+        """Find whether there is a touch; an element that moves alone is suspect from then on, a step of all is taken up."""
+        square, common = self._squares(change, usable)
+        strength, count = float(square.sum()), int(np.count_nonzero(usable))
+        if strength > count + TOUCH_SIGMA * math.sqrt(2.0 * count):
+            alone = moves_alone(square, sight.followed)
+            if alone is not None:
+                usable = self._accuse(alone, usable)
+                square, common = self._squares(change, usable)
+                strength, count = float(square.sum()), count - 1
+        self._touch(strength / count, count)
+        noise = math.sqrt(float(self._noise[usable].mean()) * 1.6 / count)
+        if not self._touched and abs(common) > _COMMON_SIGMA * noise:
+            step = np.where(
+                usable, common + (change - common) * self._noise / (self._noise + self._crept**2), 0.0
+            )
+            self._baseline += step
+            change -= step
+            self._variance[usable] = 1.0
+        return usable, strength / count
+
+    def _squares(self, change: Floats, usable: Flags) -> tuple[Floats, float]:
+        """Return each element's square in units of its noise, without what all have in common, and that."""
+        # a touch is somewhere; what moves all elements alike is temperature or the supply, which a fast change would else
+        # turn into a touch
+        common = float(np.median(change[usable]))
+        square = (change - common) ** 2 / (self._noise + (_ALIKE * common) ** 2)
+        square[~usable] = 0.0
+        return square, common
+
+    def _accuse(self, element: int, usable: Flags) -> Flags:
+        self._suspect[element] = True
+        self._still_s[element] = self._stood[element] = 0.0
+        usable = usable.copy()
+        usable[element] = False
+        return usable
+
+    def _recover(self, output: Floats, alive: Flags, elapsed_s: float) -> None:
+        """Give suspect elements a baseline again when they have stood still, untouched."""
+        if self._touched or not self._suspect.any():
+            return
+        off = output - self._mark
+        still = self._suspect & alive & (self._stood > 0.0) & (off**2 < _STILL**2 * self._noise)
+        self._stood = np.where(still, self._stood + 1.0, 1.0)
+        self._mark = np.where(still, self._mark + off / self._stood, output)
+        self._still_s = np.where(still, self._still_s + elapsed_s, 0.0)
+        back = still & (self._still_s >= RECOVER_S)
+        if back.any():
+            self._baseline[back] = self._mark[back]
+            self._variance[back] = 1.0 / self._stood[back]
+            self._crept[back] = 0.0
+            self._suspect &= ~back
+
+    def _told(
+        self, change: Floats, usable: Flags, saturated: Flags, dead: Flags, strength: float, blind: bool
+    ) -> StrainFrame:
         linear = linearise(change, self._quadratic)
         if self._mixing is None:
             strains = -self._gain * linear
         else:
             strains = -self._mixing @ np.where(usable, linear, 0.0)
         strains[~usable] = np.nan
-        return StrainFrame(strains, usable, saturated, dead, self._touched, True, strength)
+        variance = None if self._is_own else self._gain**2 * self._noise
+        held = None
+        if self._touched and not blind:
+            before = self._average.held
+            held = self._average.take(
+                strains, usable, self._gain**2 * self._noise, self._variance, not self._is_own
+            )
+            if held is not None and held is not before:
+                self._look_longer(held, usable)
+        else:
+            self._average.clear()
+        return StrainFrame(
+            strains, usable, saturated, dead, self._touched, True, strength, blind, variance, held
+        )
 
-    def _watch(self, reading: Floats) -> Flags:
-        """Count how long each reading has stayed the same."""
-        self._same = np.where(reading == self._last, self._same + 1, 0)
+    def _look_longer(self, held: Held, usable: Flags) -> None:
+        """Find whether one element has moved alone, in the mean over a steady touch: its noise is that much less."""
+        output, sight = -held.strains / self._gain, self._witness.sight(usable)
+        square = (output - np.median(output[usable])) ** 2 / (held.variance / self._gain**2)
+        square[~usable] = 0.0
+        alone = moves_alone(square, sight.followed)
+        if alone is not None:
+            self._accuse(alone, usable)
+
+    def _watch(self, reading: Floats, finite: Flags) -> Flags:
+        """Count changes, learn the converter's step, and return which elements are dead."""
+        with np.errstate(invalid="ignore"):
+            moved = np.abs(reading - self._last)
+        change = moved > 0.0
         self._last = reading.copy()
-        dead: Flags = self._same >= DEAD_FRAMES
-        return dead
+        self._changes += (change - self._changes) / _MEMORY
+        self._same = np.where(change | ~finite, 0, self._same + 1)
+        least = float(np.min(moved, initial=math.inf, where=change))
+        if least < self._step * (1.0 - 1e-6):
+            self._step = least
+            self._weigh()
+        self._frames += 1
+        if self._frames % _MEMORY == 0 and not self._is_noisy:
+            self._is_noisy = self._noisy(finite & self._used)
+        still: Flags = self._same >= DEAD_FRAMES
+        return still & self._is_noisy
 
-    def _start(self, output: Floats, usable: Flags) -> None:
+    def _noisy(self, elements: Flags) -> bool:
+        """Return whether most of these elements change often, so that one which never does is dead."""
+        count = int(np.count_nonzero(elements))
+        return bool(count > 0 and np.count_nonzero(self._changes[elements] > _NOISY) >= _MOST_NOISY * count)
+
+    def _start(self, output: Floats, alive: Flags) -> None:
+        """Take a frame for the first baseline; frames in which few elements read anything do not count."""
+        if np.count_nonzero(alive) < max(FEWEST, 0.5 * np.count_nonzero(self._used)):
+            return
+        self._first = np.where(alive & (self._seen == 0.0), output, self._first)
         self._sum += output
-        self._seen += usable
+        self._square += np.where(alive, (output - self._first) ** 2, 0.0)
+        self._seen += alive
         self._left -= 1
         if self._left == 0:
-            self._baseline = self._sum / np.maximum(self._seen, 1.0)
+            seen = np.maximum(self._seen, 1.0)
+            self._baseline = self._sum / seen
+            self._suspect = self._used & (self._seen < 0.5 * self._settle)
+            self._scale = self._louder(seen)
+            self._weigh()
 
-    def _strength(self, change: Floats, usable: Flags) -> tuple[float, int]:
-        count = int(np.count_nonzero(usable))
-        if count == 0:
-            return 0.0, 0
-        # a touch is somewhere; what moves all elements alike is temperature, which a fast change would else
-        # turn into a touch
-        local = change[usable] - np.median(change[usable])
-        return float(np.sum(local**2 / self._noise[usable])) / count, count
+    def _louder(self, seen: Floats) -> float:
+        """Return the noise's variance over that of the finger's file, 1 if the first readings do not tell it is more."""
+        known, freedom = self._seen > 1.0, float(np.sum(seen - 1.0))
+        if not known.any():
+            return 1.0
+        away = (self._baseline - self._first) ** 2
+        ratio = (self._square - seen * away)[known] / (seen - 1.0)[known] / self._own_noise[known]
+        found = float(np.median(ratio))
+        return min(found, _MOST_SCALE) if found > 1.0 + 6.0 * math.sqrt(2.0 / freedom) + 0.2 else 1.0
 
     def _touch(self, strength: float, count: int) -> None:
-        level = 1.0 + _TOUCH_SIGMA * math.sqrt(2.0 / max(count, 1))
+        level = 1.0 + TOUCH_SIGMA * math.sqrt(2.0 / count)
         if strength > level:
             self._touched = True
         elif strength < 0.5 * (1.0 + level):
@@ -213,3 +378,59 @@ class SignalChain:
         believed[~usable] = 0.0
         self._baseline += believed * change
         self._variance *= 1.0 - believed
+
+
+class _Average:
+    """Averages the strains of a touch while it is steady, and says so after 16 frames, after 32, and so on."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the touch."""
+        self._sum, self._block = np.zeros(self._count), np.zeros(self._count)
+        self._frames = self._in_block = 0
+        self._usable: Flags | None = None
+        self._held: Held | None = None
+
+    @property
+    def held(self) -> Held | None:
+        """Return the mean so far."""
+        return self._held
+
+    def take(
+        self, strains: Floats, usable: Flags, noise: Floats, baseline: Floats, stepped: bool
+    ) -> Held | None:
+        """Add a frame of a touch; return the mean to be looked at.
+
+        Args:
+            strains: shape (ns,).
+            usable: of them.
+            noise: variance of a frame's strains.
+            baseline: variance of the baseline, in units of the noise's.
+            stepped: steps of the converter are in the noise: a mean keeps them.
+        """
+        if self._frames >= MOST_HELD:
+            return self._held
+        if self._usable is None or not np.array_equal(usable, self._usable):
+            self.clear()
+            self._usable = usable
+        self._block += strains
+        self._in_block += 1
+        if self._in_block < HELD_FRAMES:
+            return self._held
+        block, share = self._block / HELD_FRAMES, 1.0 / HELD_FRAMES
+        self._block, self._in_block = np.zeros(self._count), 0
+        if self._frames:
+            off = (block - self._sum / self._frames)[usable]
+            own = noise[usable] * (1.0 if stepped else share + 1.0 / self._frames)
+            if np.mean(off**2 / (own + (_STEADY_SHARE * np.abs(block[usable]).max()) ** 2)) > _STEADY:
+                self._sum, self._frames, self._held = np.zeros(self._count), 0, None
+        self._sum += block * HELD_FRAMES
+        self._frames += HELD_FRAMES
+        if self._frames & (self._frames - 1) == 0:
+            kept = 1.0 if stepped else 1.0 / self._frames
+            variance = noise * (kept + np.minimum(baseline, 1.0))
+            self._held = Held(self._sum / self._frames, variance, self._frames)
+        return self._held

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sioms.tactile.closedform import ellipse_spectrum, equivalent_radius
+from sioms.tactile.closedform import equivalent_radius
 from sioms.tactile.contact import Contact, frictionless
 from sioms.tactile.cylinder import Cylinder, respond
 from sioms.tactile.emap import e_map, highest_needed
 from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import Finger
 from sioms.tactile.indenter import FLAT, Wedge
+from sioms.tactile.model import pressed
 from sioms.tactile.series import spread
 from sioms.tactile.width import WidthTable, rigid_core_table
 
@@ -83,13 +84,13 @@ def predicted_errors(finger: Finger, loads: ArrayLike, radii_m: ArrayLike, place
     middle = angles.size // 2
     spots = np.linspace(angles[middle - 1], angles[middle], places)
     highest = finger.highest()
-    matrix = finger.e_map()[:, : 2 * highest + 1]
+    matrix, spectra = finger.e_map()[:, : 2 * highest + 1], pressed(finger.cylinder, highest)
     load, radius = np.atleast_1d(np.asarray(loads, float)), np.atleast_1d(np.asarray(radii_m, float))
     out = np.empty((3, load.size, radius.size))
     for row, p in enumerate(load):
         for column, rc in enumerate(radius):
             half = widths.half_width(float(p) * equivalent_radius(finger.cylinder, float(rc)))
-            spectrum = ellipse_spectrum(half * np.arange(highest + 1))
+            spectrum = spectra(half)
             frames = [
                 estimator.frame(matrix @ spread(finger.cylinder, -float(p), spectrum, float(t)))
                 for t in spots

@@ -18,7 +18,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from enum import Flag, auto
+from enum import Enum, Flag, auto
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,10 +26,12 @@ from numpy.typing import ArrayLike, NDArray
 from sioms.tactile.finger import Finger
 from sioms.tactile.kernel import MOST_STEPS, NOT_DRAWN, Products, Solve, Status, compiled, drawn_frame, plain
 from sioms.tactile.linearity import linearise
+from sioms.tactile.model import StrainTable
 from sioms.tactile.posterior import DEVIATIONS, Averager
 from sioms.tactile.proximity import Proximity
 
 Floats = NDArray[np.float64]
+Covariance = tuple[tuple[float, float, float], ...]
 Found = tuple[int, float, float, Products, int, float]  # status, t, b, products there, steps, sum of weights
 
 
@@ -56,6 +58,10 @@ class Quality(Flag):
     WITHOUT_LOAD = (
         auto()
     )  # the force sensor's load was not there, too old, or did not press: fitted without it
+    BLIND = auto()  # whether anything touches is not known: the elements that are left cannot say
+    SUSPECT = (
+        auto()
+    )  # one touch explains the strains only without one element, or without a shift of all: fitted so
 
 
 _HUGE = 1e30  # variance of an element that must not count
@@ -67,8 +73,45 @@ _RATHER_ROUND = (
     9.0  # chi square by which a hollow touch beside the last elements must be more likely than a round one
 )
 _HOLLOW = 1.2  # R in units of rb, beyond which noise alone does not make a flat
-_NOTHING = Quality.NO_CONTACT | Quality.TOO_FEW_ELEMENTS | Quality.WRONG_SIGN | Quality.NO_BASELINE
-_DOUBT = Quality.POOR_FIT | Quality.OUT_OF_ARC | Quality.OVERLOAD | Quality.NOT_CONVERGED | Quality.IMPRECISE
+_UNKNOWN = Quality.TOO_FEW_ELEMENTS | Quality.NO_BASELINE | Quality.BLIND
+_NOTHING = Quality.NO_CONTACT | Quality.WRONG_SIGN | _UNKNOWN
+_DOUBT = (
+    Quality.POOR_FIT | Quality.OUT_OF_ARC | Quality.OVERLOAD | Quality.NOT_CONVERGED | Quality.IMPRECISE
+    | Quality.SUSPECT | Quality.WRONG_SIGN
+)  # fmt: skip
+_TRIED = 3  # elements without which a poor fit is tried again
+_SHIFTS = 4  # rounds in which a shift of all elements is found
+_ALIKE = 0.05  # of a shift of all elements, by which one may differ from it
+
+
+class State(Enum):
+    """Say what is known of a touch; the flags of `Quality` say why."""
+
+    BLIND = "blind"  # whether anything touches is not known
+    UNTOUCHED = "untouched"
+    TOUCHED = "touched"
+    DOUBTFUL = "doubtful"  # something is there, but not one touch that presses and is told well
+
+
+def state_of(quality: Quality) -> State:
+    """Return the state that the flags say."""
+    if quality & _UNKNOWN:
+        return State.BLIND
+    if quality & Quality.NO_CONTACT:
+        return State.UNTOUCHED
+    return State.DOUBTFUL if quality & _DOUBT else State.TOUCHED
+
+
+@dataclass(slots=True)
+class _Frame:
+    """One frame while it is fitted: strains, their variances, model errors as shares of the peak, squared, and the load."""
+
+    y: Floats
+    noise: Floats
+    share: Floats
+    load: float
+    load_weight: float
+    count: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +162,11 @@ class ShapeEstimate:
     def usable(self) -> bool:
         """Return whether anything was estimated."""
         return not self.quality & _NOTHING
+
+    @property
+    def state(self) -> State:
+        """Return blind, untouched, touched or doubtful."""
+        return state_of(self.quality)
 
     @property
     def doubtful(self) -> bool:
@@ -180,7 +228,7 @@ class Estimator:
         self._drawn = near if conductor and near.amplitude != 0.0 else None
         pitch = self._pitch = float(np.ptp(angles)) / max(angles.size - 1, 1)
         self._arc = float(angles.min()) - 0.5 * pitch, float(angles.max()) + 0.5 * pitch
-        self._radius = finger.cylinder.outer_m
+        self._radius, self._circles = finger.cylinder.outer_m, finger.contact.circles
         self._largest = most_hollow * self._radius
         table = self._table
         self._widest = float(table.half_widths[-1]) ** 2
@@ -189,6 +237,11 @@ class Estimator:
         self._fixed = (
             table.nodes, table.first, table.step, float(table.half_widths[1]), bank, bank**2 + 1e-300, places,
         )  # fmt: skip
+
+    @property
+    def table(self) -> StrainTable:
+        """Return the finger's strains."""
+        return self._table
 
     @staticmethod
     def _choose(wanted: bool | None) -> Solve:
@@ -214,8 +267,9 @@ class Estimator:
         )
 
     def frame(
-        self, strains: ArrayLike, load: Load | None = None, usable: NDArray[np.bool_] | None = None
-    ) -> ShapeEstimate:
+        self, strains: ArrayLike, load: Load | None = None, usable: NDArray[np.bool_] | None = None,
+        variance: Floats | None = None, floor: float = 0.0,
+    ) -> ShapeEstimate:  # fmt: skip
         """Estimate the touch of one frame.
 
         Args:
@@ -224,6 +278,9 @@ class Estimator:
             load: what a force sensor says, if any.
             usable: which elements to use, shape (ns,); None takes all that are finite and not dead in the
                 finger's file.
+            variance: of the strains, shape (ns,), where it is not that of the finger's file.
+            floor: error of the model [share of the peak] beside the finger's misfit, for means over so many frames that it
+                shows.
 
         Raises:
             ValueError: wrong number of strains, or a load that is not finite and pressing.
@@ -237,10 +294,17 @@ class Estimator:
             raise ValueError(
                 f"estimate shape: load is {load.value} +- {load.deviation} N/m; need a finite pressing load"
             )
-        return self._estimate(y, load, usable)
+        noise, share = self._noise, self._share
+        if variance is not None:
+            noise = np.where(self._used, variance, _HUGE)
+        if floor:
+            share = share + floor**2
+        return self._estimate(y, noise, share, load, usable)
 
-    def _estimate(self, y: Floats, load: Load | None, usable: NDArray[np.bool_] | None) -> ShapeEstimate:
-        noise, quality, count = self._noise, Quality.GOOD, y.size
+    def _estimate(
+        self, y: Floats, noise: Floats, share: Floats, load: Load | None, usable: NDArray[np.bool_] | None
+    ) -> ShapeEstimate:
+        quality, count = Quality.GOOD, y.size
         good = self._used & np.isfinite(y)
         if usable is not None:
             good &= usable
@@ -252,21 +316,28 @@ class Estimator:
         value, weight = 0.0, 0.0
         if load is not None:
             value, weight = load.value, 1.0 / max(load.deviation, 1e-6 * load.value) ** 2
-        least = count + self._contact_sigma * math.sqrt(2.0 * count)
+        frame = _Frame(y, noise, share, value, weight, count)
+        shape = self._fit(frame, quality)
+        if shape.quality & (Quality.POOR_FIT | Quality.WRONG_SIGN):
+            shape = self._mended(frame, shape, quality)
+        return shape
+
+    def _fit(self, frame: _Frame, quality: Quality) -> ShapeEstimate:
+        """Fit one touch."""
+        y, noise, value, weight, count = frame.y, frame.noise, frame.load, frame.load_weight, frame.count
+        least = self._least(count)
         if self._drawn is None:
-            pull, found = NOT_DRAWN, self._search(noise, least, y, value, weight)
+            pull, found = NOT_DRAWN, self._search(frame, least)
         else:
             pull = self._pull(self._drawn, y)
-            found = self._search_drawn(pull, noise, least, y, value, weight)
+            found = self._search_drawn(frame, pull, least)
         if found[0] == Status.NO_CONTACT:
             return nothing(quality | Quality.NO_CONTACT)
         if found[0] == Status.WRONG_SIGN:
             return nothing(quality | Quality.WRONG_SIGN)
         shape = self._describe(*found[1:], value, weight, count, quality)
         if Quality.FLAT_OR_HOLLOW in shape.quality and self._at_end(shape.angle_rad) and not pull.shape[1]:
-            other = self._search(
-                noise, 0.0, y, value, weight, start=self._narrow_start(y, noise, shape.angle_rad)
-            )
+            other = self._search(frame, 0.0, start=self._narrow_start(y, noise, shape.angle_rad))
             if (
                 other[0] == Status.FITTED
                 and _chi(other, value, weight) < _chi(found, value, weight) + _RATHER_ROUND
@@ -274,7 +345,69 @@ class Estimator:
                 convex = self._describe(*other[1:], value, weight, count, quality)
                 shape = shape if Quality.FLAT_OR_HOLLOW in convex.quality else convex
         deviation = self._open(shape)
-        return self._averaged(shape, deviation, y, noise, pull, value, weight) if deviation else shape
+        return self._averaged(shape, deviation, frame, pull) if deviation else shape
+
+    def _least(self, count: int) -> float:
+        """Return the chi square of strains from which on they are a touch."""
+        return count + self._contact_sigma * math.sqrt(2.0 * count)
+
+    def _mended(self, frame: _Frame, shape: ShapeEstimate, quality: Quality) -> ShapeEstimate:
+        """Return the fit without one element, or without what all have in common, if that is what one touch does not explain.
+
+        Else the poor fit as it is.
+        """
+        if frame.count <= 4:
+            return shape
+        z = frame.y**2 / frame.noise
+        loudest = int(np.argmax(z))
+        if float(z.sum() - z[loudest]) < self._least(frame.count - 1):
+            return nothing(quality | Quality.NO_CONTACT | Quality.BAD_ELEMENTS)
+        best = shape
+        for element in {loudest, *self._blamed(frame, shape)}:
+            if frame.noise[element] < _HUGE:
+                noise = frame.noise.copy()
+                noise[element] = _HUGE
+                left = dataclasses.replace(
+                    frame, y=np.where(noise < _HUGE, frame.y, 0.0), noise=noise, count=frame.count - 1
+                )
+                best = _better(best, self._fit(left, quality | Quality.SUSPECT | Quality.BAD_ELEMENTS))
+        return _better(best, self._unshifted(frame, quality | Quality.SUSPECT))
+
+    def _blamed(self, frame: _Frame, shape: ShapeEstimate) -> list[int]:
+        """Return the elements without which most of a poor fit would go; of what looks like a pull the most stretched one."""
+        if not shape.usable:
+            return [int(np.argmax(frame.y))]
+        rest, basis, _ = self._left_over(frame, shape)
+        blame = rest**2 / np.maximum(1.0 - np.sum(basis**2, axis=0), 1e-3)
+        return [int(element) for element in np.argsort(blame)[-_TRIED:]]
+
+    def _unshifted(self, frame: _Frame, quality: Quality) -> ShapeEstimate:
+        """Return the fit without a shift of all outputs alike, which elements far from the touch tell first."""
+        known = frame.noise < _HUGE
+        there = np.where(known, self._gain, 0.0)
+        shift = float(np.median(frame.y[known] / self._gain[known]))
+        for left in reversed(range(_SHIFTS)):
+            noise = np.where(known, frame.noise + (_ALIKE * shift * self._gain) ** 2, _HUGE)
+            unshifted = dataclasses.replace(frame, y=frame.y - shift * there, noise=noise)
+            trial = self._fit(unshifted, quality)
+            if not (left and trial.usable):
+                break
+            rest, basis, weights = self._left_over(unshifted, trial)
+            own = there * np.sqrt(weights)
+            own = own - basis.T @ (basis @ own)
+            shift += float(own @ rest) / max(float(own @ own), 1e-300)
+        return trial
+
+    def _left_over(self, frame: _Frame, shape: ShapeEstimate) -> tuple[Floats, Floats, Floats]:
+        """Return residuals in deviations, an orthonormal basis of what place, load and width can take up, and the weights."""
+        y = frame.y
+        if self._drawn is not None:
+            y = self._left(self._pull(self._drawn, y), y, np.array([shape.angle_rad]))[0]
+        weights = np.where(frame.noise < _HUGE, 1.0 / (frame.noise + frame.share * float(np.max(y**2))), 0.0)
+        f, turned, widened = self._table.at(shape.angle_rad, 0.25 * shape.width_rad**2)
+        basis = np.linalg.qr((np.stack([f, turned, widened]) * np.sqrt(weights)).T)[0].T
+        rest = (y - shape.load_n_per_m * f) * np.sqrt(weights)
+        return rest - basis.T @ (basis @ rest), basis, weights
 
     def _open(self, shape: ShapeEstimate) -> float:
         """Return the deviation of the place [rad] over which to average, 0 where the best fit stands.
@@ -305,14 +438,13 @@ class Estimator:
         return float(places[best, 0]), float(places[best, 1])
 
     def _search(
-        self, noise: Floats, least: float, y: Floats, load: float, load_weight: float, pull: Floats = NOT_DRAWN,
-        start: tuple[float, float] = (0.0, -1.0),
-    ) -> Found:  # fmt: skip
+        self, frame: _Frame, least: float, pull: Floats = NOT_DRAWN, start: tuple[float, float] = (0.0, -1.0)
+    ) -> Found:
         """Fit, and fit again no wider than the most hollow indenter while the fit is wider."""
-        top = self._widest
+        top, load, load_weight = self._widest, frame.load, frame.load_weight
         for _ in range(1 + _HOLD_PASSES):
             found = self._solve(
-                *self._fixed, noise, self._share, least, y, pull, load, load_weight, top, *start
+                *self._fixed, frame.noise, frame.share, least, frame.y, pull, load, load_weight, top, *start
             )
             status, _, b, at, _, _ = found
             if status != Status.FITTED:
@@ -353,24 +485,27 @@ class Estimator:
         strains: Floats = -gain * linearise(output - drawn, quadratic)
         return strains
 
-    def _search_drawn(
-        self, pull: Floats, noise: Floats, least: float, y: Floats, load: float, load_weight: float
-    ) -> Found:
+    def _search_drawn(self, frame: _Frame, pull: Floats, least: float) -> Found:
         """Fit from the places where a touch and its pull together explain most; return the best."""
-        blank = (0.0,) * 10
+        blank, y, noise = (0.0,) * 10, frame.y, frame.noise
+        load, load_weight = frame.load, frame.load_weight
         if float(np.sum(y * y / noise)) < least:
             return Status.NO_CONTACT, 0.0, 0.0, blank, 0, 0.0
         bank, places = self._fixed[4], self._fixed[6]
         clean = np.where(noise < _HUGE, self._left(pull, y, places[:, 0]), 0.0)
-        score = np.maximum(np.sum(bank * clean / noise, axis=1), 0.0) ** 2 / np.sum(bank**2 / noise, axis=1)
-        cost = np.sum(clean**2 / noise, axis=1) - score
+        score = np.sum(bank * clean / noise, axis=1)
+        score *= np.abs(score) / np.sum(bank**2 / noise, axis=1)
+        square = np.sum(clean**2 / noise, axis=1)
         best: Found = (Status.WRONG_SIGN, 0.0, 0.0, blank, 0, 0.0)
+        if np.min(square - np.maximum(score, 0.0)) >= np.min(square + np.minimum(score, 0.0)):
+            return best
+        cost = square - np.maximum(score, 0.0)
         least_cost = math.inf
         for _ in range(_PROXIMITY_STARTS):
             start = int(np.argmin(cost))
             t, b = float(places[start, 0]), float(places[start, 1])
             cost[np.abs(places[:, 0] - t) < _APART] = math.inf
-            found = self._search(noise, 0.0, clean[start], load, load_weight, pull, (t, b))
+            found = self._search(dataclasses.replace(frame, y=clean[start]), 0.0, pull, (t, b))
             at, left = found[3], math.inf
             if found[0] == Status.FITTED:
                 left = at[9] - (at[3] + load_weight * load) ** 2 / (at[0] + load_weight)
@@ -378,17 +513,20 @@ class Estimator:
                 best, least_cost = found, left
         return best
 
-    def _averaged(
-        self, shape: ShapeEstimate, deviation: float, y: Floats, noise: Floats, pull: Floats, load: float, load_weight: float
-    ) -> ShapeEstimate:  # fmt: skip
+    def _averaged(self, shape: ShapeEstimate, deviation: float, frame: _Frame, pull: Floats) -> ShapeEstimate:
         """Return the mean over all touches that the frame allows, in place of a best fit whose place is hardly known."""
-        t, arc = shape.angle_rad, self._averager.arc
+        t, arc, y, noise = shape.angle_rad, self._averager.arc, frame.y, frame.noise
         mean = None
         if arc[0] <= t <= arc[1]:
             there = np.where(noise < _HUGE, self._left(pull, y, np.array([t]))[0], 0.0)
-            weights = 1.0 / (noise + self._share * float(np.max(there**2)))
+            weights = 1.0 / (noise + frame.share * float(np.max(there**2)))
             mean = self._averager.average(
-                lambda places: self._left(pull, y, places), weights, load, load_weight, t, deviation
+                lambda places: self._left(pull, y, places),
+                weights,
+                frame.load,
+                frame.load_weight,
+                t,
+                deviation,
             )
         if mean is None:
             return dataclasses.replace(shape, quality=shape.quality | Quality.IMPRECISE)
@@ -397,8 +535,18 @@ class Estimator:
         return dataclasses.replace(
             shape, angle_rad=mean.angle, load_n_per_m=mean.load, equivalent_radius_m=mean.radius,
             equivalent_curvature_per_m=bend, radius_m=rc, width_rad=2.0 * math.sqrt(mean.square),
-            covariance=mean.covariance, quality=shape.quality & Quality.BAD_ELEMENTS | judged | Quality.IMPRECISE,
+            covariance=self._rounded(mean.covariance, mean.radius, mean.square),
+            quality=shape.quality & (Quality.BAD_ELEMENTS | Quality.SUSPECT) | judged | Quality.IMPRECISE,
         )  # fmt: skip
+
+    def _rounded(self, covariance: Covariance, radius: float, b: float) -> Covariance:
+        """Add to the variance of R what circles taken for parabolas do to it: so much less is R of `sioms.plant.rubber`."""
+        if not self._circles or not radius > 0.0:
+            return covariance
+        bend = max(self._radius / radius - 1.0, 0.0)  # rb/rc
+        off = self._circles * radius * b * (0.36 + 0.7 * bend + 0.28 * bend**2)
+        (aa, ap, ar), (pa, pp, pr), (ra, rp, rr) = covariance
+        return (aa, ap, ar), (pa, pp, pr), (ra, rp, rr + off * off)
 
     def _bent(self, radius: float) -> tuple[float, float]:
         """Return 1/R [1/m] and rc [m]."""
@@ -421,7 +569,7 @@ class Estimator:
         bend, rc = self._bent(radius)
         return ShapeEstimate(
             t, p, radius, bend, rc, 2.0 * math.sqrt(b),
-            math.sqrt(chi / total), misfit, covariance, quality, steps,
+            math.sqrt(chi / total), misfit, self._rounded(covariance, radius, b), quality, steps,
         )  # fmt: skip
 
     def _judge(self, t: float, b: float, load: float, radius: float, misfit: float, steps: int) -> Quality:
@@ -451,6 +599,13 @@ class Estimator:
             yield self.frame(strains, load)
             if progress is not None:
                 progress(done)
+
+
+def _better(one: ShapeEstimate, other: ShapeEstimate) -> ShapeEstimate:
+    """Return the other if it is a touch that fits well, and better than the one."""
+    if not other.usable or Quality.POOR_FIT in other.quality or other.misfit >= one.misfit:
+        return one
+    return other
 
 
 def _chi(found: Found, load: float, load_weight: float) -> float:

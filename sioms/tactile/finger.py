@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sioms.tactile.cylinder import DEFAULT_SHEAR_MODULUS_PA, Cylinder
 from sioms.tactile.emap import MOST_EXTENT, e_map, highest_needed
-from sioms.tactile.model import Spectra, StrainTable, adhering, elliptic, strain_table
+from sioms.tactile.model import Spectra, StrainTable, adhering, bounded, elliptic, strain_table
 from sioms.tactile.strips import Strips
 from sioms.tactile.width import WidthTable, hertz_table, rigid_core_table
 
@@ -29,6 +29,7 @@ Floats = NDArray[np.float64]
 FORMAT = "sioms finger 1"
 MOST_ADHESION = 1.5  # full adhesion has no size of its own below Poisson's ratio 1/2: see `contact.adhere`
 ContactKind = Literal["frictionless", "adhering", "hertz"]
+PressureKind = Literal["exact", "elliptic"]
 
 
 class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -88,13 +89,26 @@ class Signal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ContactModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The contact model: width table (ratio of P R to Hertz's over the half width) and share of adhesion."""
+    """How a round indenter presses.
+
+    Args:
+        model: hertz takes the pressure for elliptic.
+        adhesion: share of full adhesion.
+        half_width_rad: of the width table [rad], rising from 0.
+        ratio: of P R to Hertz's at these.
+        most_load_n_per_m: load beyond which an estimate is flagged as overload.
+        pressure: exact, or the ellipse of the dissertation, by which R of wide contacts comes out small.
+        circles: standard deviation of R in units of what finger and indenters being circles, not the model's parabolas, does to
+            it; 0 where they are parabolas.
+    """
 
     model: ContactKind = "frictionless"
     adhesion: float = 0.0
     half_width_rad: tuple[float, ...] = ()
     ratio: tuple[float, ...] = ()
     most_load_n_per_m: float = 1000.0
+    pressure: PressureKind = "exact"
+    circles: float = 0.0
 
 
 class IdentifiedMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -207,12 +221,15 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def spectra(self) -> Spectra:
         """Return the spectra of the contact model."""
-        if self.contact.model == "adhering" and self.contact.adhesion > 0.0:
-            return adhering(self.cylinder, self.highest(), self.contact.adhesion)
-        return elliptic(self.highest())
+        contact, highest = self.contact, self.highest()
+        is_ellipse = contact.model == "hertz" or contact.pressure == "elliptic"
+        base = elliptic(highest) if is_ellipse else bounded(self.cylinder, highest)
+        if contact.model == "adhering" and contact.adhesion > 0.0:
+            return adhering(self.cylinder, contact.adhesion, base)
+        return base
 
     def strain_table(self) -> StrainTable:
-        """Tabulate the strains under round contacts; takes about a tenth of a second."""
+        """Tabulate the strains under round contacts; takes about a second, and a tenth for the next finger of that body."""
         angles, outer, spectra = np.asarray(self.angles_rad), self.geometry.outer_m, self.spectra()
         full = self.e_map()
         half = full.shape[1] // 2

@@ -298,8 +298,10 @@ def _solver(fit: Fit) -> Solve:
         weights = 1.0 / (noise + share * square.max())
         if start_b < 0.0:
             score = bank @ (weights * y)
-            best = np.argmax(score * np.abs(score) / (bank_square @ weights))
-            if score[best] <= 0.0:
+            explained = score * np.abs(score) / (bank_square @ weights)
+            best = np.argmax(explained)
+            # a pull: turned over, some touch explains more
+            if explained[best] <= -explained.min():
                 return 2, 0.0, 0.0, blank, 0, 0.0
             start_t, start_b = places[best, 0], places[best, 1]
         t, b, at, steps = fit(

@@ -18,14 +18,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sioms.tactile.chain import SETTLE_FRAMES, SignalChain, StrainFrame
+from sioms.tactile.chain import SETTLE_FRAMES, Held, SignalChain, StrainFrame
 from sioms.tactile.estimator import Estimator, Load, Quality, ShapeEstimate, nothing
 from sioms.tactile.finger import Finger
+from sioms.tactile.witness import FEWEST
 
 Floats = NDArray[np.float64]
 
+MEAN_FLOOR = 2.5e-4  # of the peak: what circles and tables leave of a model that fits
+MEAN_MISFIT = 3.0
+BROAD_LOAD = 300.0  # N/m, beyond which the model's own errors grow
+_NOT_ONE = Quality.POOR_FIT | Quality.SUSPECT | Quality.WRONG_SIGN
+
 CHANNELS: tuple[tuple[str, str, str], ...] = (
-    ("touched", "", "1 while something touches"),
+    ("touched", "", "1 while something touches, 0 while nothing does, nan while that is not known"),
     ("angle", "rad", "place of the contact"),
     ("load", "N/m", "load P, 0 while untouched"),
     ("radius", "m", "radius rc of the indenter, infinite for a flat"),
@@ -121,8 +127,10 @@ class ShapeSensor:
         settle_frames: int = SETTLE_FRAMES,
     ) -> None:
         self.finger = finger
-        self._chain = SignalChain(finger, settle_frames)
         self._estimator = Estimator(finger, compiled=compiled, conductor=conductor)
+        self._chain = SignalChain(finger, settle_frames, self._estimator.table)
+        self._held: Held | None = None
+        self._verdict = Quality.GOOD
         self._tare = tare
         self._stamp_ns: int | None = None
 
@@ -166,29 +174,54 @@ class ShapeSensor:
         strain = self._chain.frame(raw, stamp_ns)
         elapsed_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
         self._stamp_ns = stamp_ns
-        if not strain.settled or self._tare is None or reading is None:
+        if not strain.settled or strain.blind or self._tare is None or reading is None:
             return strain, None
         return strain, self._tare.load(reading, strain.touched, elapsed_s)
 
     def shape(self, strain: StrainFrame, load: Load | None = None) -> ShapeEstimate:
-        """Do the rest of `frame`: estimate; remembers nothing, so another sensor of the same finger may do it."""
+        """Do the rest of `frame`: estimate; depends on nothing but its arguments, so another sensor of the same finger may do it."""
         if not strain.settled:
             return nothing(Quality.NO_BASELINE)
+        bad = Quality.GOOD if strain.usable.all() else Quality.BAD_ELEMENTS
+        if strain.blind:
+            few = Quality.TOO_FEW_ELEMENTS if np.count_nonzero(strain.usable) < FEWEST else Quality.GOOD
+            return nothing(Quality.BLIND | bad | few)
         if not strain.touched:
-            return nothing(Quality.NO_CONTACT)
-        shape = self._estimator.frame(strain.strains, load, strain.usable)
+            return nothing(Quality.NO_CONTACT | bad)
+        shape = self._estimator.frame(strain.strains, load, strain.usable, strain.variance)
+        if shape.quality & Quality.NO_CONTACT:
+            # something moves, but too little to be a touch, or not as one does
+            shape = nothing(shape.quality & ~Quality.NO_CONTACT | Quality.POOR_FIT | bad)
+        if strain.held is not self._held:
+            self._verdict = self._judged(strain, shape.load_n_per_m)
+            self._held = strain.held
+        more = self._verdict
         if self._tare is not None and load is None:
-            shape = dataclasses.replace(shape, quality=shape.quality | Quality.WITHOUT_LOAD)
-        return shape
+            more |= Quality.WITHOUT_LOAD
+        return dataclasses.replace(shape, quality=shape.quality | more) if more else shape
+
+    def _judged(self, strain: StrainFrame, load: float) -> Quality:
+        """Return POOR_FIT if the mean over a steady touch shows that it is not one touch; its noise is that much less."""
+        held = strain.held
+        if held is None:
+            return Quality.GOOD
+        if self._verdict and self._held is not None and held.frames > self._held.frames:
+            return self._verdict  # of the same touch; what the baseline may drift meanwhile hides it again
+        floor = MEAN_FLOOR * max(1.0, load / BROAD_LOAD)
+        shape = self._estimator.frame(held.strains, None, strain.usable, held.variance, floor)
+        if shape.quality & _NOT_ONE or (shape.usable and shape.misfit > MEAN_MISFIT):
+            return Quality.POOR_FIT
+        return Quality.GOOD
 
 
 def numbers(sensed: Sensed) -> tuple[float, ...]:
     """Return the estimate as numbers in the order of CHANNELS; nan for what is not known."""
     shape = sensed.shape
     (aa, ap, ar), (_, pp, pr), (_, _, rr) = shape.covariance
-    untouched = sensed.strain.settled and not sensed.strain.touched
+    known = sensed.strain.settled and not sensed.strain.blind
+    touched = float(sensed.strain.touched) if known else math.nan
     return (
-        float(sensed.strain.touched), shape.angle_rad, 0.0 if untouched else shape.load_n_per_m, shape.radius_m,
+        touched, shape.angle_rad, 0.0 if touched == 0.0 else shape.load_n_per_m, shape.radius_m,
         shape.equivalent_radius_m, shape.equivalent_curvature_per_m, shape.width_rad, shape.residual, shape.misfit,
         aa, pp, rr, ap, ar, pr, float(shape.quality.value),
     )  # fmt: skip

@@ -19,7 +19,7 @@ from sioms.tactile import closedform
 from sioms.tactile.contact import frictionless, width_for_load
 from sioms.tactile.cylinder import Cylinder
 from sioms.tactile.indenter import Wedge
-from sioms.tactile.model import stuck
+from sioms.tactile.model import pressed, stuck
 from sioms.tactile.width import WidthTable
 
 Floats = NDArray[np.float64]
@@ -240,11 +240,12 @@ def touch_loads(
     cylinder: Cylinder, widths: WidthTable, touches: Touches, highest: int, edge_half_angle: float = np.pi / 4,
     wider: Floats | float = 1.0,
 ) -> TouchLoads:  # fmt: skip
-    """Return the tractions of the touches: an edge as a wedge with the rigid core, the others as ellipses of the table's
-    width, times `wider` of each touch, with the tangential traction of full adhesion beside them (scale it by the share
-    of adhesion).
+    """Return the tractions of the touches: an edge as a wedge with the rigid core, the others with the table's width, times
+    `wider` of each touch, with the tangential traction of full adhesion beside them (scale it by the share of adhesion).
+    Hertz's table brings elliptic pressures, another the exact ones.
     """
     k, line = np.arange(highest + 1), 1.0 / (np.pi * cylinder.outer_m)
+    shape = None if widths.is_hertz else pressed(cylinder, highest)
     normal, shear = np.empty((len(touches), highest + 1)), np.empty((len(touches), highest + 1))
     sticking, factor = stuck(cylinder, highest), np.broadcast_to(wider, len(touches))
     for number in range(len(touches)):
@@ -257,7 +258,7 @@ def touch_loads(
         else:
             half = widths.half_width(load * closedform.equivalent_radius(cylinder, radius))
             half *= float(factor[number])
-            p = -load * line * closedform.ellipse_spectrum(k * half)
+            p = -load * line * (closedform.ellipse_spectrum(k * half) if shape is None else shape(half))
             p[0] *= 0.5
         normal[number], shear[number] = p, load * line * sticking(half)
     return TouchLoads(normal, shear)

@@ -57,6 +57,11 @@ class WidthTable:
         object.__setattr__(self, "_unit", float(hertz_product(self.cylinder, 1.0)))
 
     @property
+    def is_hertz(self) -> bool:
+        """Return whether this is Hertz's half plane."""
+        return bool(np.all(self.ratio == 1.0))
+
+    @property
     def largest(self) -> float:
         """Return the largest b [rad^2] of the table."""
         return float(self.half_widths[-1] ** 2)

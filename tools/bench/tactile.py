@@ -11,10 +11,11 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.tactile.closedform import ellipse_spectrum, equivalent_radius
+from sioms.tactile.closedform import equivalent_radius
 from sioms.tactile.cylinder import FINGER_B
 from sioms.tactile.estimator import Estimator, Load
 from sioms.tactile.finger import Finger, nominal_finger
+from sioms.tactile.model import pressed
 from sioms.tactile.sensing import ShapeSensor
 from sioms.tactile.series import spread
 
@@ -41,13 +42,13 @@ def frames_of(finger: Finger, count: int, seed: int) -> tuple[Floats, Floats]:
     25 to 400 N/m, from an edge to a flat; shapes (count, ns) and (count, 3).
     """
     random, widths, highest = np.random.default_rng(seed), finger.width_table(), finger.highest()
-    matrix = finger.e_map()[:, : 2 * highest + 1]
+    matrix, spectra = finger.e_map()[:, : 2 * highest + 1], pressed(finger.cylinder, highest)
     truth, frames = np.empty((count, 3)), np.empty((count, len(finger.angles_rad)))
     low, high = min(finger.angles_rad), max(finger.angles_rad)
     for number in range(count):
         angle, load = random.uniform(low, high), random.uniform(25.0, 400.0)
         radius = equivalent_radius(finger.cylinder, float(random.choice(RADII)))
-        spectrum = ellipse_spectrum(widths.half_width(load * radius) * np.arange(highest + 1))
+        spectrum = spectra(widths.half_width(load * radius))
         frames[number] = matrix @ spread(finger.cylinder, -load, spectrum, angle)
         truth[number] = angle, load, radius
     return frames + NOISE * random.normal(size=frames.shape), truth

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from sioms.tactile.chain import DEAD_FRAMES, SETTLE_FRAMES, SignalChain
+from sioms.tactile.chain import DEAD_FRAMES, RECOVER_S, SETTLE_FRAMES, SignalChain
 from sioms.tactile.finger import Finger
 
 PERIOD_NS = 8_333_333
@@ -27,6 +27,11 @@ class Bench:
         self.chain, self.stamp_ns = SignalChain(finger), 0
         self.random = np.random.default_rng(11)
         self.offset = np.linspace(-2.0, 3.0, 16)
+        # an edge right over each element moves its neighbours, too
+        table = finger.strain_table()
+        places = np.round((np.array(finger.angles_rad) - table.first) / table.step).astype(int)
+        felt = table.nodes[0, places, 0]
+        self.pattern = felt / np.diag(felt)[:, None]
 
     def feed(self, frames: int, output: float = 0.0, element: int = 8, drift_per_s: float = 0.0):  # type: ignore[no-untyped-def]
         out = None
@@ -34,7 +39,7 @@ class Bench:
             self.stamp_ns += PERIOD_NS
             self.offset = self.offset + drift_per_s * PERIOD_NS * 1e-9
             raw = self.offset + 0.05 * self.random.normal(size=16)
-            raw[element] += output
+            raw += output * self.pattern[element]
             out = self.chain.frame(raw, self.stamp_ns)
         return out
 
@@ -51,25 +56,27 @@ def test_strain_of_a_touch(finger: Finger) -> None:
     touched = [bench.feed(1, 100 * (linear + 4.0 * linear**2)) for _ in range(100)]
     assert all(frame.touched for frame in touched)
     assert np.mean([frame.strains[8] for frame in touched]) == pytest.approx(-3.0 * linear, rel=0.02)
-    assert np.mean([frame.strains[2] for frame in touched]) == pytest.approx(0.0, abs=1e-3)
+    assert np.mean([frame.strains[2] for frame in touched]) == pytest.approx(
+        -3.0 * linear * bench.pattern[8][2], abs=1e-3
+    )
     assert not bench.feed(5).touched
 
 
 def test_drift_is_followed_untouched_and_kept_out_of_touches(finger: Finger) -> None:
     bench = Bench(finger)
     bench.feed(200)
-    frame = bench.feed(1200, drift_per_s=0.05)
+    frame = bench.feed(1200, drift_per_s=0.02)
     assert not frame.touched
     lag = bench.offset.mean() - bench.chain.baseline.mean()
-    assert lag == pytest.approx(0.05 * finger.signal.drift_time_s, rel=0.3)  # first-order follower
+    assert lag == pytest.approx(0.02 * finger.signal.drift_time_s, rel=0.5)  # first-order follower
     before = bench.chain.baseline
-    bench.feed(600, output=5.0, drift_per_s=0.01)
+    bench.feed(600, output=5.0, drift_per_s=0.005)
     assert bench.chain.baseline == pytest.approx(before)
     bench.feed(
         10
     )  # after the release the others catch up with their drift, the element that was touched hardly
     moved = (bench.chain.baseline - before) / (bench.offset - before)
-    assert np.all(np.delete(moved, 8) > 0.5) and moved[8] < 0.2
+    assert np.mean(np.delete(moved, 8)) > 0.5 and moved[8] < 0.2
     bench.feed(1200)
     assert bench.chain.baseline == pytest.approx(bench.offset, abs=0.02)
 
@@ -94,7 +101,7 @@ def test_touches_in_quick_succession_let_the_baseline_follow_but_take_no_creep(
 def test_zero_takes_a_new_baseline(finger: Finger) -> None:
     bench = Bench(finger)
     bench.feed(100)
-    bench.offset[3] += 4.0
+    bench.offset += 4.0 * bench.pattern[3]
     assert bench.feed(5).touched
     bench.chain.zero()
     assert not bench.feed(SETTLE_FRAMES).settled
@@ -119,14 +126,16 @@ def test_bad_elements_are_marked(finger: Finger) -> None:
     for _ in range(DEAD_FRAMES + 1):
         bench.stamp_ns += PERIOD_NS
         raw = bench.offset + 0.05 * bench.random.normal(size=16)
-        raw[4], raw[5], raw[6] = 1.0, np.nan, 100.0
+        raw[4], raw[9], raw[14] = 1.0, np.nan, 100.0
         frame = bench.chain.frame(raw, bench.stamp_ns)
-    assert frame.dead.tolist() == [n in (4, 6) for n in range(16)]
-    assert frame.saturated.tolist() == [n == 6 for n in range(16)]
-    assert frame.usable.tolist() == [n not in (4, 5, 6) for n in range(16)]
-    assert np.isnan(frame.strains[[4, 5, 6]]).all()
+    assert frame.dead.tolist() == [n in (4, 14) for n in range(16)]
+    assert frame.saturated.tolist() == [n == 14 for n in range(16)]
+    assert frame.usable.tolist() == [n not in (4, 9, 14) for n in range(16)]
+    assert np.isnan(frame.strains[[4, 9, 14]]).all()
     assert not frame.touched
-    assert bench.feed(1).usable.all()  # it moves again
+    # they move again: two at once, the one that seemed to move alone after a while
+    assert bench.feed(1).usable.tolist() == [n != 4 for n in range(16)]
+    assert bench.feed(round((RECOVER_S + 0.1) * 1e9 / PERIOD_NS)).usable.all()
 
 
 def test_gains_are_replaced(finger: Finger) -> None:

@@ -11,11 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sioms.tactile import emap, series
-from sioms.tactile.closedform import ellipse_spectrum, equivalent_radius
+from sioms.tactile.closedform import equivalent_radius
 from sioms.tactile.cylinder import FINGER_B
 from sioms.tactile.estimator import Estimator, Load, Quality
 from sioms.tactile.finger import Finger, nominal_finger
 from sioms.tactile.linearity import linearise
+from sioms.tactile.model import pressed
 
 ANGLES = np.radians(143.0 - 9.22 * np.arange(16))
 MATRIX = emap.e_map(FINGER_B, ANGLES, 10.3e-3, 100)[:, :201]
@@ -28,7 +29,7 @@ def estimator(nominal: Finger) -> Estimator:
 
 def strains(finger: Finger, place: float, load: float, rc: float):  # type: ignore[no-untyped-def]
     half = finger.width_table().half_width(load * equivalent_radius(FINGER_B, rc))
-    return MATRIX @ series.spread(FINGER_B, -load, ellipse_spectrum(half * np.arange(101)), place)
+    return MATRIX @ series.spread(FINGER_B, -load, pressed(FINGER_B, 100)(half), place)
 
 
 @settings(max_examples=60, deadline=None)

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from sioms.tactile import emap, series
-from sioms.tactile.closedform import ellipse_spectrum, equivalent_radius
+from sioms.tactile.closedform import equivalent_radius
 from sioms.tactile.cylinder import FINGER_B
 from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import Finger, from_toml, to_toml
+from sioms.tactile.model import pressed
 from sioms.tactile.strips import Strips, find_strips
 
 STRIPS = Strips(math.radians(10.0), 0.06, 0.7, 0.08, -1.2)
@@ -36,7 +37,7 @@ def test_estimates_are_those_of_the_touch_that_was_changed(nominal: Finger, stri
     ):
         t, radius = math.radians(degrees), equivalent_radius(FINGER_B, rc)
         half = nominal.width_table().half_width(load * radius) * float(STRIPS.width_factor(t))
-        spectrum = ellipse_spectrum(half * np.arange(101))
+        spectrum = pressed(FINGER_B, 100)(half)
         strains = float(STRIPS.strain_factor(t)) * (matrix @ series.spread(FINGER_B, -load, spectrum, t))
         shape = knows.frame(strains)
         assert shape.load_n_per_m == pytest.approx(load, rel=2e-3)
