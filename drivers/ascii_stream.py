@@ -152,6 +152,7 @@ class AsciiStream(StreamDriver):
         self._modulus_us = modulus_us
         self._time_us: int | None = None
         self._gone_on_ns = 0
+        self._is_open_anew = True
         self._last: tuple[float, ...] | None = None
         self._equal = 0
         self._good_ns, self._since_ns = -GREETED_NS, NEVER_NS
@@ -176,7 +177,7 @@ class AsciiStream(StreamDriver):
         what = f"wait for lines of {_columns(settings)} numbers from {self.name} on {self.line}"
         yield Exchange(start, inspection.want, lambda reply: None, settings.open_s, False, what)
         self._dropped = self._receiver.counters.dropped
-        self._time_us, self._since_ns, self.trouble = None, NEVER_NS, ""
+        self._is_open_anew, self._since_ns, self.trouble = True, NEVER_NS, ""
 
     def feed(self, data: bytes, now_ns: int) -> int:
         """Publish a snapshot for every good line."""
@@ -236,19 +237,19 @@ class AsciiStream(StreamDriver):
     def _has_gone_on(self, number: float, now_ns: int) -> bool:
         """Tell whether the time column goes on; it may stand still while lines come faster than it counts."""
         time_us, last_us = self._device_us(number), self._time_us
-        if last_us is not None:
-            behind_us = (last_us - time_us) % self._modulus_us
-            if SET_BACK_US < behind_us < self._modulus_us // 2:
-                raise LinkError(
-                    f"{self.name}: its time went from {last_us} back to {time_us} us: it has restarted"
-                )
-            if behind_us < self._modulus_us // 2:
-                if now_ns - self._gone_on_ns > self.silence_s / 2 * 1e9:
-                    self.trouble = f"lines come, but their time stands still at {number:g} {self.settings.time}: the device is frozen"
-                    return False
-                return behind_us == 0
-        self._time_us, self._gone_on_ns = time_us, now_ns
-        return True
+        behind_us = 0 if last_us is None else (last_us - time_us) % self._modulus_us
+        if last_us is not None and not self._is_open_anew and SET_BACK_US < behind_us < self._modulus_us // 2:
+            raise LinkError(
+                f"{self.name}: its time went from {last_us} back to {time_us} us: it has restarted"
+            )
+        is_old = behind_us == 0 if self._is_open_anew else behind_us < self._modulus_us // 2
+        if last_us is None or not is_old:
+            self._time_us, self._gone_on_ns, self._is_open_anew = time_us, now_ns, False
+            return True
+        if self._is_open_anew or now_ns - self._gone_on_ns > self.silence_s / 2 * 1e9:
+            self.trouble = f"lines come, but their time stands still at {number:g} {self.settings.time}: the device is frozen"
+            return False
+        return behind_us == 0
 
     def _device_us(self, number: float) -> int:
         return round(number * CLOCKS[self.settings.time][0]) % self._modulus_us

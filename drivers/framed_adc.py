@@ -219,6 +219,7 @@ class FramedAdc(StreamDriver):
         self._check_clock(block.t_us)
         lost = self._sequence.accept(block.sequence, now_ns)
         if lost is None:
+            self._t_us = block.t_us if self._t_us is None else self._t_us
             self.trouble = (
                 f"blocks come, but their number stands still at {block.sequence}: the device is frozen"
             )

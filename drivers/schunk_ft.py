@@ -121,7 +121,7 @@ class SchunkFt(StreamDriver):
         """Stop a stream that may still run, identify the sensor, set it up, and start the stream."""
         settings = self.settings
         try:
-            yield from self._tolerated(ifb.act(Command.STOP))
+            yield from self._tolerated(ifb.act(Command.STOP), anew=True)
             yield from self._identify()
             if settings.tool is not None:
                 yield Aside(ifb.act(Command.TOOL, settings.tool))
@@ -189,10 +189,10 @@ class SchunkFt(StreamDriver):
 
     # --- inside ----------------------------------------------------------------------------------
 
-    def _tolerated(self, exchange: Exchange) -> Steps:
+    def _tolerated(self, exchange: Exchange, *, anew: bool = False) -> Steps:
         """Do what the sensor may refuse: a stop when nothing streams."""
         try:
-            yield Aside(exchange)
+            yield Aside(exchange, anew)
         except DeviceError:
             return
 

@@ -113,9 +113,14 @@ class Aside:
     """An exchange on the driver's connection beside its line (``StreamDriver.aside``): a web page, a command port.
 
     The reply may end with the connection: ``decode`` then gets what has come.
+
+    Args:
+        exchange: what is asked.
+        anew: on a new connection: behind a loss the one there was may be dead, without a word from the other side.
     """
 
     exchange: Exchange
+    anew: bool = False
 
 
 Step = Exchange | Send | Pause | Aside

@@ -276,7 +276,7 @@ class Line:
         if isinstance(step, Pause):
             self._rest_until(now_ns + int(step.duration_s * 1e9))
         elif isinstance(step, Aside):
-            self._ask_aside(step.exchange, now_ns)
+            self._ask_aside(step, now_ns)
         elif now_ns < self._quiet_since_ns + self._gap_ns:
             self._rest_until(self._quiet_since_ns + self._gap_ns)
         else:
@@ -313,11 +313,13 @@ class Line:
         self._state = _State.EXPECTING
         self._until_ns = now_ns + on_line_ns + int(step.timeout_s * 1e9)
 
-    def _ask_aside(self, exchange: Exchange, now_ns: int) -> None:
+    def _ask_aside(self, step: Aside, now_ns: int) -> None:
         if self._aside is None:
-            raise RuntimeError(f"{exchange.what}: the driver names no connection aside")
+            raise RuntimeError(f"{step.exchange.what}: the driver names no connection aside")
         self.counters.requests += 1
-        self._aside.begin(exchange, now_ns)
+        if step.anew:
+            self._aside.close()
+        self._aside.begin(step.exchange, now_ns)
         self._state, self._until_ns = _State.ASIDE, now_ns
 
     def _look_aside(self, now_ns: int) -> None:

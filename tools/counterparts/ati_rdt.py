@@ -191,6 +191,7 @@ class WebServer:
             head = await reader.readuntil(b"\r\n\r\n")
             if not self._sensor.supply.is_on:
                 await asyncio.sleep(10.0)
+                return
             found = head.split(b" ")[1:2] == [b"/netftapi2.xml"]
             text = self._sensor.xml() if found else "<html>not found</html>"
             status = "200 OK" if found else "404 Not Found"

@@ -139,6 +139,9 @@ def test_a_time_that_stands_still_is_a_frozen_device(unit: str, cause: str) -> N
     rig.device.handlers()[cause](*(["on"] if cause == "hold" else []))
     rig.go(0.3)
     assert rig.go(3.0) == 0 and "their time stands still at" in rig.driver.trouble
+    for _ in range(3):
+        rig.open()
+        assert rig.go(1.0) == 0, "not for a moment, behind an opening neither"
     rig.device.handlers()[cause](*(["off"] if cause == "hold" else ["0"]))
     assert rig.go(1.0) == pytest.approx(80, abs=2) and rig.driver.trouble == ""
 

@@ -157,9 +157,11 @@ class Beside:
         self.now_ns = 10**9
         self.results: list[Any] = []
 
-    def run(self, exchange: Exchange, meanwhile: Callable[[], None] = lambda: None) -> Any:
+    def run(
+        self, exchange: Exchange, meanwhile: Callable[[], None] = lambda: None, anew: bool = False
+    ) -> Any:
         def steps() -> Steps:
-            return (yield Aside(exchange))
+            return (yield Aside(exchange, anew))
 
         self.line.submit(
             steps(), Priority.POLL, lambda value, error: self.results.append(error or value), self.now_ns
@@ -197,6 +199,9 @@ def test_exchanges_beside_the_line(server: socket.socket, device: socket.socket)
     assert isinstance(rig.run(word(b"b", 100), answer(b"nono")), DeviceError)
     kept = made[0]
     assert rig.run(word(b"c", 100), answer(b"more")) == b"more" and made[0] is kept, "one connection for all"
+    made.clear()
+    assert rig.run(word(b"n", 100), answer(b"anew"), anew=True) == b"anew" and made[0] is not kept
+    assert kept.recv(10) == b"", "the one that may be dead is given up"
     assert rig.run(word(b"d", 100), answer(b"end", end=True)) == b"end", "the reply ends with the connection"
     assert rig.run(word(b"e", 100), answer(b"good")) == b"good", "connected anew"
     made.pop().close()
@@ -206,7 +211,7 @@ def test_exchanges_beside_the_line(server: socket.socket, device: socket.socket)
     made.clear()
     assert rig.run(word(b"h", 100), answer(b"late")) == b"late", "and not the reply to what timed out"
     assert isinstance(rig.run(word(b"i", 100), answer(b"x", end=True)), LinkError)
-    assert rig.counters.refused == 1 and rig.counters.replies == 6
+    assert rig.counters.refused == 1 and rig.counters.replies == 7
     rig.line.close()
 
 
