@@ -148,9 +148,9 @@ def _changed(s: Searched) -> Timed | None:
     """
     model = s.found.fit.model
     odd = s.found.fit.ratio > LEAST_ODD
-    if (
-        not (odd or warm(model)) or s.ready.points
-    ):  # what is not known between the rows would pass for changes
+    if s.ready.points or not (
+        odd or warm(model)
+    ):  # between rows that are points, anything would pass for a change
         return None
     problem, frozen = s.ready.problem, s.searcher.frozen
     models = [m for m in (*(step.model for step in s.found.ladder), model) if not (warm(m) or rattles(m))]
@@ -162,17 +162,15 @@ def _changed(s: Searched) -> Timed | None:
     least = min((course.left for _, course in near), default=np.inf)
     quiet = len(s.found.fit.residual) if odd else 0
     else_left = (1.0 - s.share) * float(np.sum(problem.residual(model) ** 2))
-    if least - quiet > HALVED * max(else_left - quiet, 0.0):
+    most = quiet + HALVED * max(else_left - quiet, 0.0)
+    if least > most:
         return None
     enough = max(ABOUT * least, len(s.found.fit.residual))
     good = [(fit, course) for fit, course in near if course.left <= enough]
     fit, course = min(good, key=lambda g: len(g[0].free) + g[1].count)
-    beside = refit(known_beside(problem, course.forces), fit.model, frozen)
-    if beside.cost - quiet > HALVED * max(
-        else_left - quiet, 0.0
-    ):  # the windows promised it, the axis does not keep it
-        return None
-    return course.timed(1.0 - course.left / fit.cost)
+    # what the windows promise the axis must keep
+    kept = refit(known_beside(problem, course.forces), fit.model, frozen).cost <= most
+    return course.timed(1.0 - course.left / fit.cost) if kept else None
 
 
 def warm(model: AxisModel) -> bool:

@@ -7,10 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sioms.reconcile.descent import descend
 from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import known
-from sioms.reconcile.fit import LEFT, Fit, Free, Problem, free_parameters, get, put, refit, shifted
+from sioms.reconcile.fit import Fit, Free, Problem, descended, free_parameters, get, put, refit, shifted
 from sioms.reconcile.model import AxisModel
 
 #: Relative steps in which the numbers of a gap are searched: when it is new, and when it was found beside other effects.
@@ -116,27 +115,20 @@ def _strode(problem: Problem, model: AxisModel, frozen: Sequence[str]) -> AxisMo
     """Descend by wide slopes, search the numbers of the gap, descend by narrower ones."""
     before, after = STRIDES
     for stride in before:
-        model = _descended(problem, model, frozen, stride)
+        model = _stride(problem, model, frozen, stride)
     model = polish(problem, bent(problem, model), model, frozen, UNPOLISHED[4:]).model
     for stride in after:
-        model = _descended(problem, model, frozen, stride)
+        model = _stride(problem, model, frozen, stride)
     return model
 
 
-def _descended(problem: Problem, model: AxisModel, frozen: Sequence[str], stride: float) -> AxisModel:
+def _stride(problem: Problem, model: AxisModel, frozen: Sequence[str], stride: float) -> AxisModel:
     problem, free = bent(problem, model), free_parameters(model, frozen)
-    at, _, _ = descend(
-        lambda x: problem.residual(put(model, free, x)),
-        lambda x, _: _secants(problem, model, free, x, stride),
-        get(model, free),
-        np.array([f.scale for f in free]),
-        np.array([f.lower for f in free]),
-        np.array([f.upper for f in free]),
-        STEPS,
-        TOLERANCE,
-        left=LEFT,
-    )
-    return put(model, free, at)
+
+    def slopes(x: Array, r: Array) -> Array:
+        return _secants(problem, model, free, x, stride)
+
+    return descended(problem, model, free, STEPS, TOLERANCE, slopes).model
 
 
 def _secants(problem: Problem, model: AxisModel, free: Sequence[Free], at: Array, stride: float) -> Array:

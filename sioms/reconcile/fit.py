@@ -57,7 +57,8 @@ class Problem:
         begin, end: share of each record that counts; the rest is simulated but not looked at.
         weights: factor on each residual, shape (n,), for resampled blocks; None: all alike.
         bend: residuals beyond this count little more than it (Cauchy's loss): bounces in a gap that come a little late or early.
-        mapper: applies a function to many trials, in order, as ``map`` does; one that uses all cores may be given.
+        mapper: applies a function to many trials, in order, as ``map`` does; one that uses all cores may be given. Not to be used
+            within a trial: every fit uses it, and a pool that waits for itself waits for ever.
     """
 
     session: Session
@@ -295,21 +296,33 @@ def refit(
     if not free:
         r = problem.residual(model)
         return Fit(model, free, r, np.empty((len(r), 0)))
-    fit = _descended(problem, model, free, iterations, tolerance)
+
+    fit = descended(problem, model, free, iterations, tolerance)
     smooth = tuple(f for f in free if f.effect == BASE or known()[f.effect].slot is not Slot.BACKLASH)
     if 0 < len(smooth) < len(free):  # whose steps fail wherever a gap is to take part in them
-        model = _descended(problem, fit.model, smooth, 2 * iterations, 0.1 * tolerance).model
+        model = descended(problem, fit.model, smooth, 2 * iterations, 0.1 * tolerance).model
         r = problem.residual(model)
         fit = Fit(model, free, r, jacobian(problem, model, free, get(model, free), r))
     return fit
 
 
-def _descended(
-    problem: Problem, model: AxisModel, free: tuple[Free, ...], iterations: int, tolerance: float
+def descended(
+    problem: Problem,
+    model: AxisModel,
+    free: tuple[Free, ...],
+    iterations: int,
+    tolerance: float,
+    slopes: Callable[[Array, Array], Array] | None = None,
 ) -> Fit:
+    """Descend from a model in some of its numbers, within their bounds.
+
+    Args:
+        free: the numbers that move, at least one.
+        iterations, tolerance, slopes: as of ``descend``; None takes the differences of ``jacobian``.
+    """
     at, r, j = descend(
         lambda x: problem.residual(put(model, free, x)),
-        lambda x, r: jacobian(problem, model, free, x, r),
+        slopes or (lambda x, r: jacobian(problem, model, free, x, r)),
         get(model, free),
         np.array([f.scale for f in free]),
         np.array([f.lower for f in free]),

@@ -28,9 +28,8 @@ USUAL = ("payload", "viscous", "coulomb", "offset", "gravity")
 LATE, BEHIND = (0.0, 0.1, 0.2, 0.3, 0.4), (-8.0, -5.6, -4.0, -2.8, -2.0, -1.4, -1.0)
 #: Reading the rows as points leaves at most this share, and as late ones, which few logs have, this one.
 LESS, MUCH_LESS = 0.85, 0.5
-STEPS = 4
-#: A fit is at its end when so many steps more leave more than this share.
-SETTLED, MOST_FITS = 0.98, 5
+#: Accepted steps of a fit, which is at its end when so many more leave more than this share.
+STEPS, SETTLED, MOST_FITS = 4, 0.98, 5
 #: Beyond so many times its median a fourth difference is that of a step.
 STANDS_OUT = 3.0
 #: For so long an unknown force shows in the innovations.
@@ -68,20 +67,23 @@ class Sampling:
 
 
 def read_as(session: Session, sampling: Sampling) -> Session:
-    """Return the session with the mean force of every sample in the place of the logged one."""
+    """Return the session with the mean force of every sample [{F}] in the place of the logged one, in all its records.
 
-    def mean(r: Record, signal: Array | None, late: float | None) -> Array | None:
+    What the loop makes, and the drive's current with it, comes ``sampling.late``; a force from outside is nobody's loop and is
+    read as it was measured.
+    """
+
+    def mean(signal: Array | None, late: float | None) -> Array | None:
         return None if signal is None else _mean(signal, late)
 
     def read(r: Record) -> Record:
         late = sampling.late
-        outer = None if late is None else 0.0
         return replace(
             r,
             force=_mean(r.force, late),
-            force_measured=mean(r, r.force_measured, late),
-            feedforward=mean(r, r.feedforward, late),
-            external=mean(r, r.external, outer),
+            force_measured=mean(r.force_measured, late),
+            feedforward=mean(r.feedforward, late),
+            external=mean(r.external, None if late is None else 0.0),
         )
 
     return replace(session, records=tuple(map(read, session.records)), final=tuple(map(read, session.final)))
@@ -101,6 +103,10 @@ def trusted(problem: Problem, model: AxisModel) -> Problem:
 
     A step of the force between two rows leaves an error of 0.29 of it in the mean (it may be anywhere between them) and a fourth difference
     of three of it.
+
+    Args:
+        problem: whose noise says how large the innovation is that is expected.
+        model: through which a force shows in the innovation.
     """
     impulse = problem.answer(model, np.eye(max(round(MEMORY_S / model.sample_time_s), 10), 1)[:, 0])
     expected = problem.noise.innovation
@@ -120,17 +126,15 @@ def sampling_of(problem: Problem, model: AxisModel, frozen: Sequence[str] = ()) 
     """Return how else than held from row to row the force is to be read, if that leaves much less; None: it is held.
 
     Args:
+        problem: whose force is the logged one.
         model: what is known; what most axes may lack is fitted along.
+        frozen: effects that keep their values.
     """
-    start = _usual(model)
-    held = _settled(problem, start, frozen)
+    held = _settled(problem, _usual(model), frozen)
 
-    def tried(lates: Sequence[float | None]) -> list[Fit]:
-        def fitted(late: float | None) -> Fit:
-            other = replace(problem, session=read_as(problem.session, Sampling(late)))
-            return refit(other, held.model, frozen, STEPS)
-
-        return [fitted(late) for late in lates]  # every fit has all cores
+    def fitted(late: float | None) -> Fit:
+        other = replace(problem, session=read_as(problem.session, Sampling(late)))
+        return refit(other, held.model, frozen, STEPS)
 
     ids = block_ids(problem, model.sample_time_s)
     best, late, found = held, None, False
@@ -139,7 +143,7 @@ def sampling_of(problem: Problem, model: AxisModel, frozen: Sequence[str] = ()) 
         ((None, *BEHIND), MUCH_LESS),
     )
     for lates, most in readings:  # beginning with what is the more likely
-        fits = tried(lates)
+        fits = [fitted(late) for late in lates]
         i = int(np.argmin([f.cost for f in fits]))
         loss, other = (np.bincount(ids, weights=f.residual**2).astype(np.float64) for f in (fits[i], best))
         gain, sure = better(loss, other)

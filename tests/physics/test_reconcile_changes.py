@@ -6,13 +6,16 @@ The axis is made here, in plain steps of 0.2 ms, by equations that share nothing
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import copysign, pi, sin
 
 import numpy as np
 import pytest
 
-from sioms.reconcile.axis import analyse
+from sioms.reconcile import axis
+from sioms.reconcile.axis import _changed, _explained, analyse
 from sioms.reconcile.changes import change, settled
+from sioms.reconcile.course import Course
 from sioms.reconcile.fit import refit
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.prepare import Options, prepare
@@ -114,3 +117,22 @@ def test_a_sagging_supply_beside_friction_is_said_and_not_named() -> None:
     assert [t.name for t in verdict.symbolic] == ["term_switch"]
     assert "gain of the drive switches in time, on in run: 3." in verdict.symbolic[0].evidence[0]
     assert next(g for g in verdict.gaps if g.channel == "force, closed loop").closed > 0.9
+
+
+def test_a_change_that_the_axis_does_not_keep_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    quick = Options(pictures=False)
+    s = _explained(prepare(drive(picked), AXIS, quick), quick)
+    assert _changed(s) is not None
+
+    def promised(*given: object) -> Course:
+        course = settled(*given)  # type: ignore[arg-type]
+        return replace(course, forces=tuple(0.0 * f for f in course.forces))
+
+    monkeypatch.setattr(axis, "settled", promised)
+    assert _changed(s) is None
+
+
+def test_between_points_of_a_faster_loop_no_change_is_looked_for() -> None:
+    quick = Options(pictures=False)
+    s = _explained(prepare(drive(picked), AXIS, quick), quick)
+    assert _changed(replace(s, ready=replace(s.ready, points=True))) is None

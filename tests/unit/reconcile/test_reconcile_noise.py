@@ -78,7 +78,14 @@ def test_a_motion_without_noise_is_found_without_a_loop() -> None:
 
 @pytest.mark.parametrize(("name", "values", "is_one"), [
     ("elastic", {"f_res": 20.0, "load_fraction": 0.4, "zeta": 0.05}, True),
-    ("elastic", {"f_res": 20.0, "load_fraction": 0.4, "zeta": 1.0}, False),
+    ("elastic", {"f_res": 20.0, "load_fraction": 0.4, "zeta": 0.25}, True),
+    ("elastic", {"f_res": 20.0, "load_fraction": 0.4, "zeta": 0.3}, False),
+    ("lugre", {"Fc": 0.1, "xs": 0.003 * 2 * np.pi, "Fs": 0.15, "vs": 0.2}, True),
+    ("lugre", {"Fc": 0.1, "xs": 0.003 * 2 * np.pi, "Fs": 0.15, "vs": 2e-4 * 20.0}, False),
+    ("lugre", {"Fc": 0.1, "xs": 1e-5 * 2 * np.pi, "Fs": 0.15, "vs": 0.2}, False),
+    ("encoder_scale", {"gain": 0.95}, True),
+    ("encoder_scale", {"gain": 0.985}, False),
+    ("encoder_scale", {"gain": 0.8}, False),
     ("presliding", {"Fc": 0.1, "xs": 0.003 * 2 * np.pi}, True),
     ("presliding", {"Fc": 0.1, "xs": 0.005 * 2 * np.pi}, False),
     ("payload", {"J_extra": 20.0 * 2e-3}, False),

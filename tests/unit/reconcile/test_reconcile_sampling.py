@@ -8,13 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
-from sioms.reconcile.axis import analyse
+from sioms.reconcile.axis import _explained, _upright, analyse
 from sioms.reconcile.checks import runs_the_loop
+from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.fit import Problem
 from sioms.reconcile.model import AxisModel
+from sioms.reconcile.noise import observer
 from sioms.reconcile.prepare import Options, prepare
 from sioms.reconcile.records import Record, Session
-from sioms.reconcile.sampling import Sampling, read_as
+from sioms.reconcile.sampling import Sampling, read_as, trusted
 from sioms.tools.reconcile_input import read_data, read_model
 
 AXES = Path(__file__).parents[2] / "physics" / "reconcile_axes"
@@ -55,6 +59,53 @@ def test_a_controller_that_makes_the_rows_tells_that_they_are_those_of_the_loop(
     assert runs_the_loop(session, model)
     assert not runs_the_loop(session, replace(model, controller=None))
     assert not prepare(session, model, QUICK).held
+
+
+def test_a_step_between_two_rows_makes_what_follows_count_less_and_ringing_does_not() -> None:
+    model = replace(read_model(AXES / "s05" / "nominal.json"), sample_time_s=0.005, controller=None)
+    t = np.arange(2000.0)
+    step = np.where(t < 1000.0, 0.0, 0.2 * model.rated_force) + 1e-3 * np.sin(0.7 * t) * model.rated_force
+    ringing = 0.2 * model.rated_force * np.sin(1.5 * t)
+    session = Session(tuple(Record("r", np.zeros(2000), force) for force in (step, ringing)))
+    noise = observer(model, model.resolution, 1e-3 * model.rated_force)
+    stepped, rung = (r.trust for r in trusted(Problem(session, noise), model).session.records)
+    assert stepped is not None
+    assert rung is not None
+    assert stepped[1000:1010].min() < 0.2
+    assert stepped[:990].min() > 0.99
+    assert stepped[1200:].min() > 0.99
+    assert rung.min() > 0.99
+
+
+def test_a_force_that_was_filtered_before_it_was_logged_is_read_earlier() -> None:
+    session, model = logged("s05", 1)
+    share = 1.0 - np.exp(-2.0 * np.pi * 40.0 * model.sample_time_s)
+    late = tuple(replace(r, force=lfilter([share], [1.0, share - 1.0], r.force)) for r in session.records)
+    ready = prepare(Session(late), model, QUICK)
+    (said,) = (note for note in ready.notes if "tells the force late" in note)
+    assert 2.0 < float(said.split("some ")[1].split(" ms")[0]) < 5.0
+    assert "delay" not in ready.names
+
+
+@pytest.mark.parametrize("period", ["0.0", "0.02", "'fast'"])
+def test_a_period_of_the_loop_that_cannot_be_is_refused(tmp_path: Path, period: str) -> None:
+    model = replace(read_model(AXES / "s05" / "nominal.json"), controller=None)
+    np.savez(tmp_path / "run.npz", x=np.zeros(1000), u=np.zeros(1000))
+    columns = "position = { name = 'x', unit = 'rad' }\nforce = { name = 'u', unit = 'N m' }\n"
+    (tmp_path / "columns.toml").write_text(f"loop_time_s = {period}\n[columns]\n{columns}")
+    with pytest.raises(BadInputError, match="loop_time_s is"):
+        read_data(tmp_path, model)
+
+
+def test_what_has_come_to_lean_on_its_end_leaves() -> None:
+    session, model = logged("s05", 5)
+    s = _explained(prepare(session, model, QUICK), QUICK)
+    limp = s.found.fit.model.with_effect("elastic", {"f_res": 6.0, "load_fraction": 0.1, "zeta": 0.3})
+    leaning = replace(s, found=replace(s.found, fit=replace(s.found.fit, model=limp)))
+    upright = _upright(leaning).found
+    assert "elastic" not in upright.fit.model.effects
+    assert (upright.ladder[-1].action, upright.ladder[-1].effect) == ("leave", "elastic")
+    assert _upright(s) is s
 
 
 def test_a_log_of_200_hz_of_an_axis_that_hides_nothing_is_silent() -> None:
