@@ -27,6 +27,8 @@ from sioms.reconcile.sensors.effect import SensorModel
 from sioms.tactile.finger import Finger, from_toml
 from sioms.tactile.finger import to_toml as finger_to_toml
 from sioms.tactile.touches import Recording
+from sioms.tools.arrays import UnreadableError, read_npz
+from sioms.tools.reconcile_table import NUMBERS
 from sioms.tools.tactile_data import read_nominal
 
 if TYPE_CHECKING:
@@ -120,14 +122,10 @@ def read_experiments(data: Path) -> list[Experiment]:
     out = []
     for path in sorted(data.glob("*.npz")):
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {
-                    k: np.asarray(file[k], dtype=np.float64)
-                    for k in file.files
-                    if file[k].dtype.kind in "fiub"
-                }
-        except (OSError, ValueError) as e:
-            raise BadInputError(f"read {path}: {e}") from e
+            raw = read_npz(path)
+        except UnreadableError as error:
+            raise BadInputError(str(error)) from None
+        arrays = {k: np.asarray(v, dtype=np.float64) for k, v in raw.items() if v.dtype.kind in NUMBERS}
         got = _named(arrays, columns, path.name)
         out.append(Experiment(path.stem, _recording(got, path.name), _touches(got, path.name)))
     if not out:

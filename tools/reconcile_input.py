@@ -261,11 +261,11 @@ def read_model(path: Path) -> AxisModel:
     if not path.exists():
         raise BadInputError(f"read model {path}: no such file")
     if path.suffix != ".json":
-        return parse_model(path.read_text(), str(path))
+        return parse_model(path.read_text(errors="replace"), str(path))
     where = f"read model {path}"
     try:
         given = json.loads(path.read_text())
-    except ValueError as e:
+    except (ValueError, RecursionError) as e:
         raise BadInputError(f"{where}: {e}") from e
     if not isinstance(given, Mapping):
         raise BadInputError(f"{where}: it holds {given!r:.40}; needs an object")

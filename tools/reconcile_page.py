@@ -163,7 +163,7 @@ def gap_of(g: Gap) -> dict[str, Any]:
     """Return the keys that every gap has."""
     return {
         "channel": g.channel, "unit": g.unit, "before": g.before, "after": g.after,
-        "floor": g.floor, "closed": g.closed,
+        "floor": g.floor, "floor_from": g.floor_from, "closed": g.closed,
     }  # fmt: skip
 
 

@@ -109,13 +109,14 @@ def _what(v: Verdict) -> str:
 def _gaps(gaps: Sequence[Gap]) -> str:
     rows = "".join(
         f"<tr><td>{g.channel}<td class=n>{number(g.before)}<td class=n>{number(g.after)}<td class=n>"
-        f"{number(g.floor)}<td>{g.unit}<td class=n>{100 * g.closed:.1f} %<td class=n>{_maybe(g.frozen)}"
+        f"{number(g.floor)}<td>{g.unit}<td>{g.floor_from}<td class=n>{100 * g.closed:.1f} %<td class=n>{_maybe(g.frozen)}"
         f"<td class=n>{_maybe(g.session)}"
         for g in gaps
     )
     return (
-        "<table><tr><th>channel<th>before<th>after<th>noise floor<th>unit<th>closed<th>later half, frozen"
-        f"<th>later half, session re-estimated{rows}</table>"
+        "<table><tr><th>channel<th>before<th>after<th>noise floor<th>unit<th>floor from<th>closed<th>later half, frozen"
+        f"<th>later half, session re-estimated{rows}</table><p>Table and pictures are of the model to which the untouched samples have "
+        "contributed nothing. The numbers of the effects and model.toml come from a last fit to all records after that.</p>"
     )
 
 
@@ -211,7 +212,7 @@ def _gap_picture(figure: Figure, v: Verdict) -> Figure:
     rows = figure.subplots(len(shown), 1, squeeze=False)[:, 0]
     for ax, t in zip(rows, shown, strict=True):
         step = max(len(t.time_s) // 3000, 1)
-        ax.axvspan(0.8 * t.time_s[-1], t.time_s[-1], color="#e8eef3", lw=0)
+        ax.axvspan(t.untouched_s, t.time_s[-1], color="#e8eef3", lw=0)
         ax.plot(
             t.time_s[::step],
             (t.before - t.measured)[::step],

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.reconcile.errors import BadInputError
+from sioms.tools.arrays import UnreadableError, read_mat, read_npz
 
 Array = NDArray[np.float64]
 SUFFIXES = (".csv", ".npz", ".mat", ".txt")
@@ -59,6 +60,8 @@ SPELLINGS = {
     "-": "1",
     "": "1",
 }
+#: Kinds of arrays that are columns.
+NUMBERS = "fiub"
 #: Lines that may stand before the head.
 REMARKS = 60
 _IN_BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]$")
@@ -112,18 +115,16 @@ def load_table(path: Path) -> Table:
     """
     if not path.exists():
         raise BadInputError(f"read {path}: no such file")
-    if path.suffix == ".npz":
-        with np.load(path, allow_pickle=False) as z:
-            return _table({k: np.asarray(z[k], dtype=np.float64) for k in z.files if z[k].ndim == 1})
-    if path.suffix == ".mat":
-        from scipy.io import loadmat
-
-        raw = loadmat(path, squeeze_me=True)
+    if path.suffix in (".npz", ".mat"):
+        try:
+            raw = read_npz(path) if path.suffix == ".npz" else read_mat(path)
+        except UnreadableError as error:
+            raise BadInputError(str(error)) from None
         return _table(
             {
                 k: np.asarray(v, dtype=np.float64)
                 for k, v in raw.items()
-                if not k.startswith("__") and np.ndim(v) == 1
+                if np.ndim(v) == 1 and np.asarray(v).dtype.kind in NUMBERS
             }
         )
     return _text(path)

@@ -13,7 +13,6 @@ import numpy as np
 from sioms.reconcile.ambiguity import settle
 from sioms.reconcile.blocks import better
 from sioms.reconcile.bounces import rattles
-from sioms.reconcile.calibrate import calibrated
 from sioms.reconcile.changes import change, settled
 from sioms.reconcile.channels import with_resolution
 from sioms.reconcile.conclude import LARGE, LEAST_ODD, UNEXPLAINED, Searched, conclude
@@ -24,7 +23,7 @@ from sioms.reconcile.excitation import Gate, gate
 from sioms.reconcile.fit import refit
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.plausible import leans
-from sioms.reconcile.prepare import Options, Prepared, prepare, reread
+from sioms.reconcile.prepare import Options, Prepared, noise_read, prepare, reread, searched
 from sioms.reconcile.records import Session
 from sioms.reconcile.refuse import bursts, smoother_share
 from sioms.reconcile.rules import SPECIFIC, SURE
@@ -61,7 +60,7 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
         BadInputError: the data cannot be used.
     """
     o = options or Options()
-    ready = prepare(session, with_resolution(nominal, session), o)
+    ready = prepare(session, with_resolution(nominal, searched(session)), o)
     s = _explained(ready, o)
     if (other := reread(s.ready, s.found.fit.model, s.searcher.frozen, o)) is not None:
         o.progress("the force is not held from row to row: searching anew")
@@ -221,7 +220,7 @@ def _search(ready: Prepared, o: Options) -> tuple[Prepared, Gate, Searcher, Foun
             start, earlier = ready.model, ()
             continue
         start = found.fit.model
-        anew = calibrated(ready.problem, ready.problem.session, start)
+        anew = noise_read(ready.problem, start)
         if turn == AGAIN or anew.noise.drive > FELL * ready.problem.noise.drive:
             break
         o.progress(

@@ -103,7 +103,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     elif outcome is not Outcome.UNEXPLAINED:
         notes += _of_loops(gaps, ratio)
     open_now = open_rivals if outcome is Outcome.AMBIGUOUS else []
-    places, spectrum, traces = _pictures(ready, whole, nominal, fit.model, o, rng)
+    places, spectrum, traces = _pictures(ready, nominal, found.fit.model, o, rng)
     return Verdict(
         outcome=outcome,
         nominal=nominal,
@@ -135,7 +135,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
 def _gaps(ready: Prepared, nominal: AxisModel, model: AxisModel, states: Sequence[State]) -> tuple[Gap, ...]:
     """Measure the gaps; before, nothing was known of a force in time."""
     gaps = measure(ready.final, nominal, model, states)
-    if not ready.timed or ready.final.session.final:
+    if not ready.timed or ready.apart:
         return gaps
     before = measure(as_recorded(ready.final, ready.timed), nominal, nominal)
     return tuple(replace(g, before=p.before) for g, p in zip(gaps, before, strict=True))
@@ -152,20 +152,20 @@ def _last(problem: Problem, s: Searched, rng: np.random.Generator) -> tuple[Fit,
 
 
 def _pictures(
-    ready: Prepared,
-    whole: Problem,
-    nominal: AxisModel,
-    model: AxisModel,
-    o: Options,
-    rng: np.random.Generator,
+    ready: Prepared, nominal: AxisModel, model: AxisModel, o: Options, rng: np.random.Generator
 ) -> tuple[tuple[Place, ...], tuple[Spectrum, Spectrum] | None, tuple[Trace, ...]]:
-    """Localise the disagreement, and keep curves, if pictures are wanted."""
+    """Localise the disagreement, and keep curves, if pictures are wanted.
+
+    The places are of the samples on which the search was made; the curves show the records on which the gap is measured, by the
+    models that it is measured of: those to which the untouched samples have contributed nothing.
+    """
     if not o.pictures:
         return (), None, ()
     o.progress("locating the disagreement")
-    plain = as_recorded(whole, ready.timed)
+    plain = as_recorded(ready.problem, ready.timed)
     places = tuple(locate(plain, nominal, rng))
-    return places, spectra(plain, nominal), _traces((plain, whole), (nominal, model))
+    before = ready.final if ready.apart else as_recorded(ready.final, ready.timed)
+    return places, spectra(plain, nominal), _traces((before, ready.final), (nominal, model))
 
 
 def _of_much(ratio: float, share: float) -> str:
@@ -239,7 +239,15 @@ def _traces(problems: tuple[Problem, Problem], models: tuple[AxisModel, AxisMode
             heat = run.end_temperature
             own.append(run.force)
         curves.append(own)
+    dt = models[0].sample_time_s
     return tuple(
-        Trace(r.name, np.arange(len(r), dtype=np.float64) * models[0].sample_time_s, r.force, before, after)
+        Trace(
+            r.name,
+            np.arange(len(r), dtype=np.float64) * dt,
+            r.force,
+            before,
+            after,
+            int(problems[0].begin * len(r)) * dt,
+        )
         for r, before, after in zip(problems[0].session.records, *curves, strict=True)
     )

@@ -23,7 +23,7 @@ def parsed(text: bytes, where: str) -> dict[str, Any]:
     """
     try:
         return tomllib.loads(text.decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
+    except (ValueError, RecursionError) as e:  # of tomllib, of the decoder, of an integer of too many digits
         raise BadInputError(f"{where}: {e}") from e
 
 

@@ -62,6 +62,7 @@ class Prepared:
         held: nobody knows but it seems that the force is held from row to row.
         points: the force is known at the rows of the log only.
         timed: forces that keep their own time, by now among the known ones of the problems' records.
+        apart: the final statement is made on whole records of their own.
     """
 
     nominal: AxisModel
@@ -74,10 +75,11 @@ class Prepared:
     held: bool = False
     points: bool = False
     timed: tuple[Timed, ...] = ()
+    apart: bool = False
 
     def beside(self, force: Timed) -> Prepared:
-        """Take a force in time for known."""
-        final = self.final if self.final.session.final else known_beside(self.final, force.forces)
+        """Take a force in time for known; records of their own have had none of it."""
+        final = self.final if self.apart else known_beside(self.final, force.forces)
         return replace(
             self, problem=known_beside(self.problem, force.forces), final=final, timed=(*self.timed, force)
         )
@@ -132,28 +134,29 @@ def _channels(
         points: between the rows of the log the force is not known for certain.
     """
     o.progress("channels: sensor, then drive")
+    seen = searched(session)
     findings: list[Finding] = []
     model = nominal
-    coarse = lattice(session, nominal)
-    scale = index_scale(session, nominal)
+    coarse = lattice(seen, nominal)
+    scale = index_scale(seen, nominal)
     findings += [f for f in (coarse, scale) if f is not None]
-    driven = drive(session, nominal)
+    driven = drive(seen, nominal)
     findings += driven
     for f in findings:
         model = model.with_effect(f.effect, dict(f.values))
     factor = coarse.values["factor"] if coarse is not None else 1.0
-    seen = {symbol: value for f in driven for symbol, value in f.values.items()}
+    late = {symbol: value for f in driven for symbol, value in f.values.items()}
     noise = observer(
         nominal,
-        sensor_noise(session, nominal.resolution * factor),
+        sensor_noise(seen, nominal.resolution * factor),
         drive_noise(
-            session,
+            seen,
             nominal.rated_force,
             lambda force: drive_output(
                 force,
-                seen.get("delay", 0.0),
-                seen.get("tau", 0.0),
-                seen.get("limit", np.inf),
+                late.get("delay", 0.0),
+                late.get("tau", 0.0),
+                late.get("limit", np.inf),
                 nominal.sample_time_s,
             ),
         ),
@@ -161,11 +164,11 @@ def _channels(
     skip = max(SKIP, round(SKIP_S / nominal.sample_time_s))
     problem = Problem(session, noise, skip, end=1.0 if session.final else 1.0 - UNTOUCHED, mapper=o.mapper)
     notes = list(dict.fromkeys([*notes, *check_scale(problem, nominal)]))
-    problem = calibrated(problem, session, model)
+    problem = noise_read(problem, model)
     for _ in range(TRUSTED if points else 0):
-        problem = calibrated(trusted(problem, model), session, model)
+        problem = noise_read(trusted(problem, model), model)
     excluded = {"encoder_quantisation"} | {REFITTED[s] for s in nominal.refine if s in REFITTED}
-    if index_fit(session, nominal) is not None:
+    if index_fit(seen, nominal) is not None:
         excluded.add("encoder_scale")
     if any(r.force_measured is not None for r in session.records):
         excluded |= {"delay", "lag", "saturation"}
@@ -178,7 +181,31 @@ def _channels(
         final = trusted(final, model) if points else final
     if o.resample is not None:
         problem = _resampled(problem, model, o.resample)
-    return Prepared(nominal, model, problem, final, tuple(findings), names, tuple(notes), points=points)
+    return Prepared(
+        nominal,
+        model,
+        problem,
+        final,
+        tuple(findings),
+        names,
+        tuple(notes),
+        points=points,
+        apart=bool(session.final),
+    )
+
+
+def searched(session: Session) -> Session:
+    """Return the samples on which choices are made: all but the last part of every record, or all where whole records are kept apart."""
+    if session.final:
+        return session
+    return replace(session, records=tuple(r.cut(0, int((1.0 - UNTOUCHED) * len(r))) for r in session.records))
+
+
+def noise_read(problem: Problem, model: AxisModel) -> Problem:
+    """Return the problem with the noise that its own samples show, and none after them."""
+    records = tuple(r.cut(0, problem.span(r).stop) for r in problem.session.records)
+    own = replace(problem, session=replace(problem.session, records=records), end=1.0)
+    return replace(problem, noise=calibrated(own, own.session, model).noise)
 
 
 def _resampled(problem: Problem, model: AxisModel, seed: int) -> Problem:

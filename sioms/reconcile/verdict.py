@@ -84,10 +84,11 @@ class Gap:
     """Disagreement on samples that took no part in any choice, before and after.
 
     Attributes:
-        before, after, floor: root mean square, in ``unit``; frozen model parameters. An estimated floor above what is reached is
-            that.
+        before, after: root mean square, in ``unit``; frozen model parameters.
+        floor: what noise alone would leave, in ``unit``: an estimate of its own, which what is reached does not change.
         frozen, session: on the later half of these samples only, frozen and with the session parameters
             re-estimated on the earlier half; None where that was not done.
+        floor_from: how the floor was found, in words.
     """
 
     channel: str
@@ -97,23 +98,29 @@ class Gap:
     floor: float
     frozen: float | None = None
     session: float | None = None
+    floor_from: str = ""
 
     @property
     def closed(self) -> float:
-        """Share of the gap above the floor that the model closes."""
+        """Share of the gap above the floor that the model closes, at most 1; 0 where the gap did not stand above the floor."""
         gap = self.before - self.floor
-        return (self.before - self.after) / gap if gap > 0.0 else 0.0
+        return min((self.before - self.after) / gap, 1.0) if gap > 0.0 else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """Curves of one record for the pictures: measured, and simulated before and after."""
+    """Curves of one record for the pictures: measured, and simulated before and after.
+
+    Attributes:
+        untouched_s: from when on nothing of the record was used for any choice or number [s].
+    """
 
     name: str
     time_s: Array
     measured: Array
     before: Array
     after: Array
+    untouched_s: float
 
 
 @dataclass(frozen=True, slots=True)

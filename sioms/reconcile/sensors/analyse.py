@@ -242,7 +242,7 @@ def _gaps(subject: Subject, before: SensorModel, after: SensorModel) -> tuple[Ga
         if mine.any():
             v = told[name]
             was, left = (v.floor * float(np.sqrt(np.mean(e[mine] ** 2))) for e in (old, new))
-            out.append(Gap(v.title, v.unit, was, left, min(v.floor, left)))
+            out.append(Gap(v.title, v.unit, was, left, v.floor))
     return tuple(out)
 
 
