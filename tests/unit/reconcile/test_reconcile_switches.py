@@ -98,10 +98,12 @@ def test_an_inertia_that_is_hardly_a_payload_is_said(factor: float, said: bool) 
     assert not said or "turns for radians" in notes[0]
 
 
-def test_a_floor_is_never_above_what_is_reached() -> None:
-    for gap in measure(recorded(AXIS, noise=0.5), replace(AXIS, inertia=3e-3), AXIS):
-        assert gap.floor <= gap.after < gap.before
-        assert 0.9 < gap.closed <= 1.0
+def test_a_floor_is_the_same_whatever_model_is_measured_against_it() -> None:
+    problem, wrong = recorded(AXIS, noise=0.5), replace(AXIS, inertia=3e-3)
+    for gap, other in zip(measure(problem, wrong, AXIS), measure(problem, wrong, wrong), strict=True):
+        assert gap.floor == other.floor
+        assert gap.after < gap.before == other.after
+        assert 0.9 < gap.closed <= 1.0 and other.closed == 0.0
 
 
 def test_a_closed_loop_far_above_its_floor_is_explained() -> None:
