@@ -329,23 +329,39 @@ class AxesUnit(LineUnit):
         between_s = min(1.0, (now_ns - self._guarded_ns) / 1e9)
         self._guarded_ns = now_ns
         for axis in _where(self._runs):
-            settings = self.bank.settings[axis]
-            limits = self.bank.get_limits([axis])
-            low, high = limits["position_min"][0], limits["position_max"][0]
-            position, velocity = float(self.bank.fields[0, axis]), float(self.bank.fields[1, axis])
-            # up to two polls and the stop's way over the line pass before the drive brakes
-            ahead = velocity * (2 * between_s + LATENCY_S) + velocity * abs(velocity) / (
-                2 * settings.acceleration_max
-            )
-            passed_low = low is not None and velocity < 0 and position + ahead < low
-            passed_high = high is not None and velocity > 0 and position + ahead > high
-            if passed_low or passed_high:
-                bound = low if passed_low else high
-                text = f"{self.name} {settings.name}: stopped at {position:g}, the soft limit is {bound:g}"
-                self._kit.log("warning", text)
+            if end_at_soft_limit(self.bank, axis, between_s, self.name, self._kit.log, now_ns):
                 self._runs[axis] = False
-                side = AxisStatus.LIMIT_MINUS if passed_low else AxisStatus.LIMIT_PLUS
-                self.bank.stop_at_limit([axis], side, text, now_ns)
+
+
+def end_at_soft_limit(
+    bank: DriveBank, axis: int, between_s: float, who: str, log: Callable[[str, str], None], now_ns: int
+) -> bool:
+    """Stop an axis that runs at a velocity, or by a force, before it passes a soft limit; return whether it did.
+
+    Args:
+        bank: that has just been polled.
+        axis: of the bank.
+        between_s: time between two polls [s].
+        who: the device, for the sentence.
+        log: takes a level and the sentence.
+        now_ns: time of the poll [ns].
+    """
+    settings, limits = bank.settings[axis], bank.get_limits([axis])
+    low, high = limits["position_min"][0], limits["position_max"][0]
+    position, velocity = float(bank.fields[0, axis]), float(bank.fields[1, axis])
+    # up to two polls and the stop's way over the line pass before the drive brakes
+    ahead = velocity * (2 * between_s + LATENCY_S) + velocity * abs(velocity) / (
+        2 * settings.acceleration_max
+    )
+    passed_low = low is not None and velocity < 0 and position + ahead < low
+    passed_high = high is not None and velocity > 0 and position + ahead > high
+    if not passed_low and not passed_high:
+        return False
+    bound = low if passed_low else high
+    text = f"{who} {settings.name}: stopped at {position:g}, the soft limit is {bound:g}"
+    log("warning", text)
+    bank.stop_at_limit([axis], AxisStatus.LIMIT_MINUS if passed_low else AxisStatus.LIMIT_PLUS, text, now_ns)
+    return True
 
 
 def _where(marks: Sequence[bool]) -> list[int]:

@@ -18,6 +18,7 @@ from sioms.motion import ActionKind, AxisSettings, Command, DriveAction, DriveBa
 from sioms.protocol.flags import ControlMode
 
 from .blocks import AnyBlock, AxisBlock, BlockSpec
+from .drive_axes import end_at_soft_limit
 from .driver import Kit, LineUnit
 from .exchange import DeviceError, Pause, Steps, while_wanted
 from .mapped import MappedUnit, Values
@@ -72,11 +73,14 @@ class DriveUnit(LineUnit):
             group: self._mapped.plan(self._rmap.poll.get(group, ())) for group in ("always", "seldom", "open")
         }
         self._alarm_plan = self._mapped.plan([self._rmap.alarms.signal] if self._rmap.alarms else [])
+        self._log = kit.log
         self._guard = Guard(mapped, log=kit.log)
         self._seldom_ns = 0
         self._alarm = 0
         self._homes = False
         self._homed: bool | None = None
+        self._runs = False
+        self._polled_ns = 0
         self._epoch = 0
         self._jog = ""
         self._jog_speed = 0.0
@@ -94,7 +98,7 @@ class DriveUnit(LineUnit):
         Whatever another master or an earlier host left running ends here, before anything is switched on.
         """
         self._jog, self._jog_speed, self._last, self._seldom_ns = "", 0.0, None, 0
-        self._homes, self._alarm = False, 0
+        self._homes, self._runs, self._alarm = False, False, 0
         yield from self._guard.clear()
         yield from self._mapped.identify({"pulses_per_turn": self._mapped.gearing.pulses_per_turn})
         yield from self._bring_to_rest()
@@ -127,6 +131,7 @@ class DriveUnit(LineUnit):
             [fault],
             holds=np.array([self._holds(values)]),
         )
+        self._end_before_soft_limit(now_ns)
 
     def act(self, action: DriveAction) -> Steps:
         """Start a command, stop, home or reset.
@@ -134,7 +139,7 @@ class DriveUnit(LineUnit):
         A stop makes void what was asked before it and is still waiting for the line.
         """
         if action.kind is not ActionKind.RESET:
-            self._jog, self._homes = "", False
+            self._jog, self._homes, self._runs = "", False, False
         if action.is_stop:
             self._epoch += 1
         if action.is_stop or action.kind is ActionKind.RESET:
@@ -143,7 +148,7 @@ class DriveUnit(LineUnit):
 
     def stop(self) -> Steps:
         """Stop, whatever goes on."""
-        self._jog, self._homes = "", False
+        self._jog, self._homes, self._runs = "", False, False
         self._epoch += 1
         return self._mapped.command("fastest")
 
@@ -186,6 +191,12 @@ class DriveUnit(LineUnit):
         if "homed" in self._axis.status and not self._homes:
             self._note_reference(self._bit(values, "homed"), now_ns)
 
+    def _end_before_soft_limit(self, now_ns: int) -> None:
+        """Stop a velocity before it passes a soft limit."""
+        between_s, self._polled_ns = min(1.0, (now_ns - self._polled_ns) / 1e9), now_ns
+        if self._runs and end_at_soft_limit(self.bank, 0, between_s, self.name, self._log, now_ns):
+            self._runs = False
+
     def _holds(self, values: Values) -> bool:
         """Return whether the drive is switched on, so that its axis cannot be turned by hand."""
         return "enabled" not in self._axis.status or self._bit(values, "enabled")
@@ -219,7 +230,9 @@ class DriveUnit(LineUnit):
                 raise DeviceError(errno.EINVAL, text)
             speed = self._speed(command, mode, action)
             yield from self._mapped.command("position", position=command.position, speed=speed, **ramps)
-        elif self._jogs:
+            return
+        self._runs = True
+        if self._jogs:
             yield from self._start_jog(command.velocity)
         else:
             yield from self._mapped.command("velocity", velocity=command.velocity, **ramps)

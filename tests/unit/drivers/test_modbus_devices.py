@@ -598,6 +598,23 @@ def test_a_drive_that_keeps_no_token_is_taken_and_that_is_told() -> None:
     assert rig.said == ["x (address 1): path15_pause does not keep what is written, so it proves nothing"]
 
 
+@RIGS
+@pytest.mark.parametrize("way", [1, -1])
+def test_a_velocity_ends_before_the_soft_limit(make: Callable[..., Rig], way: int) -> None:
+    rig = make()
+    rig.write(ControlMode.POSITION, position=0.45 * way)
+    rig.until_idle()
+    for speed in (0.1, 0.02):
+        rig.write(ControlMode.VELOCITY, velocity=speed * way)
+        rig.until_idle(10.0)
+        assert 0.45 < abs(rig.position) <= 0.5
+        assert rig.status & (AxisStatus.LIMIT_PLUS if way > 0 else AxisStatus.LIMIT_MINUS)
+        assert rig.drive.state()["velocity"] == 0
+    rig.write(ControlMode.VELOCITY, velocity=-0.05 * way)
+    rig.go(0.5)
+    assert rig.drive.state()["velocity"] * way < 0, "away from the limit it may run"
+
+
 def test_a_disabled_drive_is_told() -> None:
     rig = leadshine_rig()
     rig.drive.write(6, 0x000F, [0])
