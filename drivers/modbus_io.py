@@ -222,7 +222,9 @@ class IoUnit(LineUnit):
     ) -> None:
         self.name = name
         self.clock = time.monotonic_ns
-        self.misses = max(1, int(LOST_S / (ATTEMPTS * rmap.turnaround_s)))
+        # on a serial line a silence follows each time-out
+        failed_s = ATTEMPTS * rmap.turnaround_s * (2 if settings.line.serial is not None else 1)
+        self.misses = max(1, int(LOST_S / failed_s))
         self._settings, self._plans = settings, plans
         unit = unit_on(settings.line, settings.address, rmap.turnaround_s)
         counts = {plan.port.signal: plan.count for plan in plans}

@@ -48,6 +48,7 @@ class Guard:
         self._proofs = self._dead.proof if self._sets or "watchdog" not in rmap.commands else ()
         self._witnesses = [name for name in (self._restart.counter, self._restart.token) if name]
         self._missing: set[str] = set()
+        self._said = False
         self._token: float | None = None
         self._counter: float | None = None
         self._due_ns = 0
@@ -74,8 +75,22 @@ class Guard:
                 if wrong := self._fails(proof, values):
                     text = f"set the watchdog of {self._mapped.name}: {wrong}; its outputs would stay when the host dies"
                     raise DeviceError(errno.EIO, text)
+        self._say_what_is_not_proved()
         self._due_ns = 0
         return was_off
+
+    def _say_what_is_not_proved(self) -> None:
+        """Tell once that nobody knows whether the device acts when the host dies."""
+        if self._said or self._proofs or self._dead.by != "link":
+            return
+        self._said = True
+        can_set = "watchdog" in self._mapped.rmap.commands
+        why = (
+            "none is set (watchdog_s = 0)"
+            if can_set
+            else f"whether it is set cannot be read; {self._dead.note}"
+        )
+        self._log("warning", f"{self._mapped.name}: its own watchdog: {why}")
 
     def poll(self, now_ns: int) -> Steps:
         """Read the proofs again when it is time.

@@ -262,18 +262,33 @@ def test_outputs_are_confirmed_by_the_block_and_safe_after_their_writer(
         wait_for(lambda: not any(bench.block.tell("state")["do"]), "safe after the stop", 3.0)
 
 
-def test_an_exception_of_the_device_is_a_sentence(bench: Bench, cell: sioms.Workcell) -> None:
-    """Its own watchdog has dropped the outputs: the block refuses further writes with exception 4."""
+def test_a_block_whose_watchdog_has_acted_is_opened_again(bench: Bench, cell: sioms.Workcell) -> None:
+    """Its outputs fell while the driver was silent: they stay off until somebody writes, and the watchdog watches again."""
     driver = bench.daemon.device("io0")["pid"]
     with cell.open("io0.do", "rw", timeout=3.0) as io:
         io.set(0b1)
         with bench.daemon.frozen(driver):
             time.sleep(0.8)
-        wait_for(lambda: bench.block.tell("state")["alarm"], "the block's watchdog")
-        assert not any(bench.block.tell("state")["do"])
-        with raises(errno.EIO, "io0.do", "exception 4"):
-            io.set(0b1)
+            wait_for(lambda: bench.block.tell("state")["alarm"], "the block's watchdog")
+            assert not any(bench.block.tell("state")["do"])
+        wait_for(lambda: bench.block.tell("state")["armed"], "the watchdog cleared by the opening")
+        wait_for(lambda: bench.daemon.device("io0")["link"] == "good", "the block opened again")
         assert io.wait_new(io.read().number, 3.0).data[0] == 0, "what is read is what the block says"
+        assert not any(bench.block.tell("state")["do"]), "nobody has ordered them on again"
+        io.set(0b10)
+        assert bench.block.tell("state")["outputs"] == 0b10
+
+
+def test_an_exception_of_the_device_is_a_sentence(bench: Bench, cell: sioms.Workcell) -> None:
+    with cell.open("io0.do", "rw", timeout=3.0) as io:
+        bench.block.tell("refuse 1000")
+        try:
+            with raises(errno.EBUSY, "io0.do", "exception 6, busy"):
+                io.set(0b1)
+        finally:
+            bench.block.tell("refuse 0")
+        io.set(0b1)
+        assert bench.block.tell("state")["outputs"] == 1
 
 
 def test_edges_of_the_block_wake(bench: Bench, cell: sioms.Workcell) -> None:

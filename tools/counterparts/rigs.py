@@ -302,7 +302,7 @@ MAP_RIGS: tuple[Rig, ...] = (
         "modbus-io",
         '[device.moxa_e1200]\ndriver = "modbus-io"\nmap = "moxa_e1200"\nmodel = "E1212"\nsafe = { do = 0 }\n'
         + QUICK + 'line = { tcp = "{port}" }\n',
-        ("moxa", "--model", "E1212"), tcp=True,
+        ("moxa", "--model", "E1212", "--watchdog-s", "1.0"), tcp=True,
         inputs=("moxa_e1200",), outputs=(Output("moxa_e1200.do", 8, 0),), name="moxa_e1200",
     ),
     Rig(

@@ -109,6 +109,7 @@ def test_without_a_time_the_watchdog_is_left_alone() -> None:
     joined.open()
     joined.poll(1.0)
     assert not joined.device.state()["armed"]
+    assert joined.kit.said == ["io0: its own watchdog: none is set (watchdog_s = 0)"]
     assert not any(pdu.startswith("06 10") for pdu in joined.sent)
 
 
@@ -152,6 +153,7 @@ class TestMoxa:
         with pytest.raises(StateLost, match="its own watchdog has acted"):
             joined.poll(0.3)
         joined.open()
+        assert "cannot be read; set on the device's web page" in joined.kit.said[0]
         assert joined.kit.said[-1] == "io0: its own watchdog had acted; cleared"
         joined.write("do", 0b10)
         joined.poll(1.0)
@@ -182,7 +184,9 @@ class TestMoxa:
         joined.open()
         joined.poll(1.0)
         assert [text.split(",")[0] for text in joined.kit.said] == [
-            "io0: has no uptime", "io0: has no watchdog_alarm",
+            "io0: has no uptime",
+            "io0: has no watchdog_alarm",
+            "io0: its own watchdog: whether it is set cannot be read; set on the device's web page: communication watchdog and safe values",
         ]  # fmt: skip
 
 
