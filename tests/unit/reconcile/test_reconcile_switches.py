@@ -103,7 +103,6 @@ def test_a_floor_is_the_same_whatever_model_is_measured_against_it() -> None:
     for gap, other in zip(measure(problem, wrong, AXIS), measure(problem, wrong, wrong), strict=True):
         assert gap.floor == other.floor
         assert gap.after < gap.before == other.after
-        assert 0.9 < gap.closed <= 1.0 and other.closed == 0.0
 
 
 def test_a_closed_loop_far_above_its_floor_is_explained() -> None:
