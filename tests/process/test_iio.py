@@ -66,6 +66,17 @@ def test_scans_of_a_buffer(start: Callable[..., Any], short_folder: Path) -> Non
         wire.wait_up("adc0")
         with cell.open("adc0") as again:
             assert all(old.stamp_ns > before_ns for old in again.history(0))
+        # another program switches the buffer off, and sets a scale: both are seen, and set right
+        for fault, words in (
+            ("enable 0", "no good frame for"),
+            ("scale 2.6666", "another program has set it"),
+        ):
+            before = len(wire.daemon.lines)
+            wire.tell(f"foreign {fault}")
+            wait_for(lambda b=before, w=words: any(w in line for line in wire.daemon.lines[b:]), words)
+            wire.wait_up("adc0")
+        with cell.open("adc0") as again:
+            assert again.read().data[1] == pytest.approx(80 * 2.6666e-3)
         # the cable pulled and put back
         wire.tell("unplug")
         wait_for(lambda: not wire.reads("adc0"), "the loss")

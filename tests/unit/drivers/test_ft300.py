@@ -127,6 +127,33 @@ def test_polls_of_registers_that_stand_still_are_a_lost_link() -> None:
     rig.do(unit.poll())
 
 
+def test_another_master_that_starts_or_ends_the_stream() -> None:
+    """A sensor that streams answers no poll, one that was told to stop is silent: both are opened again."""
+    rig = FtRig(mode="modbus")
+    (unit,) = rig.driver.units
+    rig.do(unit.open())
+    rig.do(unit.poll())
+    foreign = rig.device.handlers()["foreign"]
+    foreign("stream")
+    with pytest.raises(LinkError):
+        rig.do(unit.poll())
+    rig.do(unit.open())
+    rig.do(unit.poll())
+    rig = FtRig()
+    rig.do(rig.driver.open())
+    rig.go(0.2)
+    rig.device.handlers()["foreign"]("stop")
+    before = len(rig.published)
+    rig.go(0.5)
+    assert len(rig.published) == before
+    rig.do(rig.driver.open())
+    rig.go(0.2)
+    assert len(rig.published) > before + 10
+    rig.device.handlers()["refuse"]("1")
+    with pytest.raises(DeviceError):
+        rig.do(rig.driver.open())
+
+
 @pytest.mark.parametrize("streams", [True, False])
 @pytest.mark.parametrize("mode", ["stream", "modbus"])
 def test_a_power_cycle(mode: str, streams: bool) -> None:

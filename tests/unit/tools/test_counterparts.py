@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import struct
 
 import pytest
 
-from sioms.tools.counterparts import adc, leadshine, oriental_az
+from sioms.tools.counterparts import adc, ati_rdt, leadshine, oriental_az, schunk_ifb
 from sioms.tools.counterparts.control import obey
 from sioms.tools.counterparts.drive import Mover
 from sioms.tools.counterparts.faults import Faults
@@ -285,3 +286,64 @@ def test_faults_hold_for_their_count() -> None:
     assert not faults.hears() and not faults.hears()
     obey("clear", handlers)
     assert faults.hears()
+
+
+# --- sensors that push ----------------------------------------------------------------------------
+
+
+def test_the_schunk_box_takes_one_segment_for_one_command_and_loses_all_with_its_power() -> None:
+    """As the vendor's simulator does it: see the tables of the driver's page."""
+    clock = Clock()
+    sensor = schunk_ifb.Sensor(schunk_ifb.options_parser().parse_args([]), clock)
+    start, tare = b"\xff\xff\x63\x00\x01\x00\x40", b"\xff\xff\x64\x00\x01\x00\x12"
+    assert sensor.take(start, 1) == b"\xff\xff\x01\x00\x02\x00\x40\x00", "its own number, not the command's"
+    assert sensor.take(start[:6], 2) is None, "the connection ends"
+    assert sensor.take(tare + start, 3) == b"\xff\xff\x03\x00\x02\x00\x12\x02", "one command, too long"
+    sent: list[bytes] = []
+    for _ in range(2):
+        clock.now_s += 0.15
+        sensor.due(sent.append)
+    assert [record[6] for record in sent[:3]] == [1, 2, 3] and sent[260][6] == 261 - 256, (
+        "a byte that counts with every record"
+    )
+    assert sensor.take(tare, 4)[-1] == 0 and sensor.is_tared  # type: ignore[index]
+    sensor.supply.cycle("0.3")
+    clock.now_s += 0.2
+    sent.clear()
+    sensor.due(sent.append)
+    assert not sensor.supply.is_on and not sent
+    clock.now_s += 0.2
+    sensor.due(sent.append)
+    assert sensor.supply.is_on and not sensor.streaming and not sensor.is_tared and not sent
+    sensor.take(start, 1)
+    clock.now_s += 0.01
+    sensor.due(sent.append)
+    assert sent[0][2:4] == b"\x01\x00" and sent[0][6] == 1
+
+
+def test_the_ati_sensor_serves_the_last_client_and_its_bias_goes_with_its_power() -> None:
+    clock = Clock()
+    sensor = ati_rdt.Sensor(
+        ati_rdt.options_parser().parse_args(["--model", "axia", "--internal-hz", "488"]), clock
+    )
+    sensor.load.put(clock(), (1, 2, 3, 0, 0, 0))
+    start = bytes.fromhex("1234000200000000")
+    sent: list[tuple[bytes, ati_rdt.Address]] = []
+    for client in (("a", 1), ("b", 2)):
+        sensor.take(start, client)
+        clock.now_s += 0.01
+        sensor.due(lambda record, to: sent.append((record, to)))
+    numbers = [(struct.unpack(">II", record[:8]), to[0]) for record, to in sent]
+    firsts = {to: number for (number, _), to in reversed(numbers)}
+    assert firsts == {"a": 1, "b": 1} and [to for _, to in numbers] == sorted(to for _, to in numbers)
+    samples = [count for (_, count), _ in numbers]
+    assert len(set(samples)) < 12 and samples == sorted(samples), "records are faster than samples"
+    assert "<setrate>488</setrate>" in sensor.xml() and "runrate" not in sensor.xml()
+    sensor.take(bytes.fromhex("1234004200000000"), ("c", 3))
+    assert "<setbias>1000000;2000000;3000000;0;0;0</setbias>" in sensor.xml()
+    sensor.supply.cycle("0.1")
+    sensor.take(start, ("a", 1))
+    clock.now_s += 0.2
+    sent.clear()
+    sensor.due(lambda record, to: sent.append((record, to)))
+    assert not sent and "<setbias>0;0;0;0;0;0</setbias>" in sensor.xml()
