@@ -67,10 +67,11 @@ class NodeTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class StopSourceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[[emergency_stop]]``: a binary input that stops the workcell while it reads ``active``."""
+    """``[[emergency_stop]]``: a binary input that stops the workcell while it reads ``active``, or cannot be read."""
 
     node: str
     active: Literal[0, 1] = 0
+    on_loss: Literal["stop", "none"] = "stop"
 
 
 class AlarmTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 from sioms.protocol.flags import PageState
 from sioms.protocol.messages import MAX_PACKET, DriverVerb, MalformedMessage, decode, encode
-from sioms.protocol.page import PageReader, set_daemon_state
+from sioms.protocol.page import NotReadable, PageReader, set_daemon_state
 
 from .config import Device
 from .loop import Loop, Timer
@@ -167,6 +167,17 @@ class DriverProcess:
             self.send(verb, *arguments)
         except OSError as error:
             self._log("warning", "notice lost", device=self.name, verb=verb.name, why=error.strerror)
+
+    def why_unreadable(self, block: int) -> str:
+        """Return why readers of a block are refused, empty when they are not."""
+        if self.state is not State.UP:
+            return self.reason or f"device {self.name} is {self.state.value}"
+        try:
+            self._readers[block].check(time.monotonic_ns())
+        except NotReadable as error:
+            late = error.state is PageState.STALE and not self.hung  # not for longer than check() allows
+            return "" if late else error.reason or error.state.name.lower()
+        return ""
 
     def check(self, now_ns: int) -> None:
         """Look at the lease: mark a hung driver stale, end one that stays hung."""

@@ -40,6 +40,7 @@ class Plan:
 
     Attributes:
         stop_sources: for each device with emergency-stop inputs [block, channel, bit, active] lists.
+        watched_inputs: for each device the blocks with emergency-stop inputs that must be readable, and the node of one.
         alarms: for each device with alarm limits [block, channels, lolo, low, high, hihi, hysteresis] lists.
     """
 
@@ -47,6 +48,7 @@ class Plan:
     names: NameTable
     nursery: Nursery
     stop_sources: dict[str, list[list[int]]]
+    watched_inputs: dict[str, dict[int, str]]
     alarms: dict[str, list[list[Any]]]
 
 
@@ -168,7 +170,12 @@ class Loader:
             self._nursery.close()
             self._done(None, self._errors)
             return
-        self._done(Plan(self._config, names, self._nursery, sources, alarms), [])
+        watched: dict[str, dict[int, str]] = {}
+        for source in self._config.stop_sources:
+            if source.on_loss == "stop":
+                node = names.nodes[source.node]
+                watched.setdefault(node.device, {}).setdefault(node.block, source.node)
+        self._done(Plan(self._config, names, self._nursery, sources, watched, alarms), [])
 
     def _stop_sources(self, names: NameTable) -> dict[str, list[list[int]]]:
         found: dict[str, list[list[int]]] = {}

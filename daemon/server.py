@@ -60,6 +60,7 @@ class Server:
         self._nursery: Nursery | None = None
         self._first_process = process
         self._stop_sources: dict[str, list[list[int]]] = {}
+        self._watched_inputs: dict[str, dict[int, str]] = {}
         self._alarms: dict[str, list[list[Any]]] = {}
         self._leaving: dict[str, DriverProcess] = {}
         self._loader: Loader | None = None
@@ -145,6 +146,8 @@ class Server:
         for device in self.devices.values():
             device.tell(DriverVerb.STOP_CHANGED)
             device.reset()
+        for device in self.devices.values():
+            self._look_at_stop_inputs(device)  # as one that is still pressed, it stops the workcell again
 
     # --- what devices tell -----------------------------------------------------------------------
 
@@ -162,6 +165,8 @@ class Server:
         self.clients.nodes.device_gone(device, reason)
         if device.state is not State.DOWN and device.device.common.on_loss == "stop":
             self.stop_workcell(f"device {device.name} lost: {reason}")
+        if device.state is not State.DOWN:
+            self._look_at_stop_inputs(device)
         self._maybe_ready()
 
     def device_hung(self, device: DriverProcess, reason: str) -> None:
@@ -169,6 +174,14 @@ class Server:
         self.log("warning", "device late", device=device.name, reason=reason)
         if device.device.common.on_loss == "stop":
             self.stop_workcell(f"device {device.name}: {reason}")
+        self._look_at_stop_inputs(device)
+
+    def _look_at_stop_inputs(self, device: DriverProcess) -> None:
+        """Stop the workcell when an input of a device that is to stop it cannot be read: it may be pressed."""
+        for block, node in self._watched_inputs.get(device.name, {}).items():
+            if why := device.why_unreadable(block):
+                self.stop_workcell(f"input {node} stops the workcell, and it cannot be read: {why}")
+                return
 
     def device_message(self, device: DriverProcess, verb: DriverVerb, arguments: list[Any]) -> None:
         """Take a notice of a driver."""
@@ -193,6 +206,8 @@ class Server:
                 )
                 if not good and device.device.common.on_loss == "stop":
                     self.stop_workcell(f"device {device.name}: {arguments[1]}")
+                if not good:
+                    self._look_at_stop_inputs(device)
             case DriverVerb.LOG:
                 self.log(str(arguments[0]), "driver", device=device.name, text=arguments[1])
             case _:
@@ -210,6 +225,7 @@ class Server:
         }
         names = self.names
         self.config, self.names, self._stop_sources = plan.config, plan.names, plan.stop_sources
+        self._watched_inputs = plan.watched_inputs
         self._alarms = plan.alarms
         rights = Rights(plan.config.grants, os.getuid(), self.clients.users)
         for name in rights.unknown:

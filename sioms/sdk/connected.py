@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.flags import PageState
@@ -72,7 +73,7 @@ class Connected:
         aside = self._base.aside
         self.line = Line(
             connection, self._gap_s, self._recovery_s, self.counters, self.unsolicited(),
-            None if aside is None else SideConnection(aside),
+            None if aside is None else SideConnection(aside), partial(self._runtime.log, "warning"),
         )  # fmt: skip
         self._runtime.watch(connection.fd, self._readable)
         self.connected(now_ns)

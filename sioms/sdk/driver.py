@@ -191,10 +191,13 @@ class LineUnit(ABC):
         name: for messages, e.g. ``mod0 unit 3``.
         misses: failed exchanges in a row after which the unit counts as lost; it is then reopened
             every few seconds, and the others on the line do not wait for it.
+        silence_s: a poll that has begun and brought nothing for this long [s] loses the unit too, however many
+            exchanges have failed: its readings would pass for new.
     """
 
     name: str
     misses: int = 3
+    silence_s: float = 0.5
 
     @property
     @abstractmethod

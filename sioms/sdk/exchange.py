@@ -83,6 +83,7 @@ class Exchange:
         timeout_s: longest time from the last byte sent to the last byte received [s].
         repeatable: True only for requests without side effects.
         what: the request in words, for messages: ``read 2 registers at 0x1014 of unit 1``.
+        has_checksum: the reply has one that ``decode`` checks, so that stray bytes in front of it may be skipped.
     """
 
     data: bytes
@@ -91,6 +92,7 @@ class Exchange:
     timeout_s: float
     repeatable: bool
     what: str
+    has_checksum: bool = False
 
 
 @dataclass(frozen=True, slots=True)

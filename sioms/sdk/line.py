@@ -24,6 +24,9 @@ ATTEMPTS = 2
 """Times a repeatable request is sent before its exchange counts as failed."""
 LOOK_ASIDE_NS = 1_000_000
 """How often the connection beside the line is looked at while something is asked there, which is at opening."""
+STRAY = 8
+"""Bytes in front of a reply that may be skipped where a checksum says that the rest is one: an adapter that switches
+its direction puts a 0x00 or 0xFF there."""
 BABBLE_NS = 500_000_000
 """How much longer than the silence it owes a line may go on after a bad reply; then the exchange has failed."""
 
@@ -95,11 +98,13 @@ class Line:
         counters: kept over reconnections.
         unsolicited: takes bytes that no exchange waits for; None counts them as noise.
         aside: the connection beside the line, for a driver that has one.
+        told: takes what is worth a line in the log.
     """
 
     def __init__(
         self, connection: Connection, gap_s: float, recovery_s: float, counters: Counters,
         unsolicited: Callable[[bytes, int], None] | None = None, aside: SideConnection | None = None,
+        told: Callable[[str], None] = lambda text: None,
     ) -> None:  # fmt: skip
         self.connection = connection
         self.counters = counters
@@ -118,6 +123,11 @@ class Line:
         self._babble_ns = 0
         self._failure = LinkError("")
         self._quiet_since_ns = 0
+        self._told = told
+        self._is_serial = settings.serial is not None
+        self._has_echo = False
+        self._echo = b""
+        """What has been sent and has not come back yet, on a line that returns what is sent."""
 
     @property
     def deadline_ns(self) -> int | None:
@@ -161,6 +171,9 @@ class Line:
             return
         self.counters.received_bytes += len(data)
         self._quiet_since_ns = now_ns
+        data = self._without_echo(data)
+        if not data:
+            return
         if self._state is not _State.EXPECTING or self._running is None:
             if self._unsolicited is not None and self._state is not _State.RECOVERING:
                 self._unsolicited(data, now_ns)
@@ -173,10 +186,10 @@ class Line:
             return
         running.reply += data
         try:
-            length = exchange.want(bytes(running.reply))
-            if length is None or len(running.reply) < length:
+            found = self._reply_in(exchange, running.reply)
+            if found is None:
                 return
-            value = exchange.decode(bytes(running.reply[:length]))
+            length, value = found
         except LinkError as error:
             self.counters.garbled += 1
             self._recover(str(error), now_ns, heard=True)
@@ -192,6 +205,45 @@ class Line:
             self._resume(value, now_ns)
             if rest and self._unsolicited is not None:
                 self._unsolicited(rest, now_ns)
+
+    def _reply_in(self, exchange: Exchange, reply: bytearray) -> tuple[int, Any] | None:
+        """Return the length of the reply, with what is in front of it, and its value; None while more must come.
+
+        Raises:
+            LinkError: this is no reply, nor the beginning of one.
+            DeviceError: the device refuses.
+        """
+        data = bytes(reply)
+        try:
+            return _whole_reply(exchange, data, 0)
+        except LinkError:
+            if self._is_serial and not self._has_echo:
+                if len(data) < len(exchange.data) and exchange.data.startswith(data):
+                    return None  # it may become the echo of the request
+                if data.startswith(exchange.data):
+                    self._has_echo = True
+                    self._told(
+                        "the line returns what is sent to it; that is dropped (local echo of the adapter)"
+                    )
+                    del reply[: len(exchange.data)]
+                    return self._reply_in(exchange, reply) if reply else None
+            found, waits = _behind_stray(exchange, data) if exchange.has_checksum else (None, False)
+            if found is None and not waits:
+                raise
+            if found is not None:
+                self.counters.noise_bytes += 1
+            return found
+
+    def _without_echo(self, data: bytes) -> bytes:
+        """Return what has come without what was sent, on a line that returns it."""
+        if not self._has_echo or not self._echo:
+            return data
+        count = min(len(data), len(self._echo))
+        if data[:count] != self._echo[:count]:
+            self._echo = b""
+            return data
+        self._echo = self._echo[count:]
+        return data[count:]
 
     def advance_time(self, now_ns: int) -> None:
         """Do what is due: the end of a silence, a time-out."""
@@ -297,6 +349,7 @@ class Line:
         else:
             self.counters.noise_bytes += len(stale)
         self.connection.write(step.data)
+        self._echo = step.data if stale or isinstance(step, Exchange) else self._echo + step.data
         self.counters.requests += 1
         self.counters.sent_bytes += len(step.data)
         on_line_ns = len(step.data) * self._character_ns
@@ -354,3 +407,25 @@ class Line:
             self._transmit(now_ns)
         else:
             self._resume(self._failure, now_ns)
+
+
+def _whole_reply(exchange: Exchange, data: bytes, start: int) -> tuple[int, Any] | None:
+    """Return where the reply that begins at ``start`` ends, and its value; None while it is incomplete."""
+    length = exchange.want(data[start:])
+    if length is None or len(data) - start < length:
+        return None
+    return start + length, exchange.decode(data[start : start + length])
+
+
+def _behind_stray(exchange: Exchange, data: bytes) -> tuple[tuple[int, Any] | None, bool]:
+    """Return the reply behind a few stray bytes if it is there, and whether it may still come."""
+    waits = False
+    for start in range(1, min(STRAY, len(data) - 1) + 1):
+        try:
+            found = _whole_reply(exchange, data, start)
+        except LinkError:
+            continue
+        if found is not None:
+            return found, False
+        waits = True
+    return None, waits or len(data) <= STRAY

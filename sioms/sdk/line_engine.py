@@ -41,6 +41,8 @@ class _UnitState:
         self.fresh = False
         self.as_of_ns = 0
         self.mark = 0
+        self.is_asked = False
+        self.silent_ticks = self.usual_ticks = 0
 
 
 @dataclass(slots=True, eq=False)
@@ -72,7 +74,6 @@ class LineEngine(Connected):
 
     def connected(self, now_ns: int) -> None:
         """Open all units."""
-        self._pause_ns = FIRST_PAUSE_NS
         for state in self._units:
             state.is_up = state.busy = False
             state.due_ns = now_ns
@@ -83,11 +84,19 @@ class LineEngine(Connected):
         if self._closed or not self.connect(now_ns):
             return
         for state in self._units:
+            if state.is_up and self._is_silent(state):
+                error = LinkError(f"nothing for {state.unit.silence_s:g} s")
+                self._lose_unit(state, self._told(state.unit, error), now_ns)
             if state.is_up:
                 for block in state.unit.blocks:
                     self.commands_written(block)  # time and markers may have released commands
             if not state.busy and now_ns >= state.due_ns:
                 self._start(state, now_ns)
+
+    def _is_silent(self, state: _UnitState) -> bool:
+        """Tell whether polls bring nothing, in ticks: time in which this process did not run is no silence."""
+        state.silent_ticks += state.is_asked
+        return state.silent_ticks > state.unit.silence_s * self.tick_hz + 2 * state.usual_ticks
 
     def _start(self, state: _UnitState, now_ns: int) -> None:
         line = self.line
@@ -107,6 +116,7 @@ class LineEngine(Connected):
         """Poll a unit, and note when that began: what it was told until then shows in the readings."""
         state.as_of_ns = self._runtime.as_of_ns()
         state.mark = self._runtime.outputs.mark()
+        state.is_asked = True
         yield from state.unit.poll()
 
     def _opened(self, state: _UnitState, _: Any, error: Exception | None) -> None:
@@ -114,7 +124,7 @@ class LineEngine(Connected):
         now_ns = self._runtime.now_ns()
         if error is None:
             state.is_up, state.misses, state.due_ns = True, 0, now_ns
-            state.pause_ns = FIRST_PAUSE_NS
+            state.is_asked, state.silent_ticks = False, 0
             state.fresh = True
             return
         kind = PageState.FAULT if isinstance(error, DeviceError) else PageState.LINK_LOST
@@ -125,16 +135,23 @@ class LineEngine(Connected):
     def _polled(self, state: _UnitState, _: Any, error: Exception | None) -> None:
         state.busy = False
         now_ns = self._runtime.now_ns()
+        if not state.is_up:
+            return  # it was silent for too long; whatever it says now, it is opened again
         if error is not None:
             state.misses += 1
-            if isinstance(error, StateLost):
+            if isinstance(error, StateLost) and not state.fresh:
                 state.pause_ns = 0
             if state.misses >= state.unit.misses or isinstance(error, StateLost):
                 self._lose_unit(state, self._told(state.unit, error), now_ns)
             return
         state.misses, as_of_ns = 0, state.as_of_ns
+        if not state.fresh:
+            state.usual_ticks = state.silent_ticks
+        state.is_asked, state.silent_ticks = False, 0
         if state.fresh:
             state.fresh = False
+            # only now: a port that accepts and closes is no device, nor is one that is opened and never read
+            self._pause_ns = state.pause_ns = FIRST_PAUSE_NS
             self._runtime.set_link(state.unit.blocks, PageState.GOOD, "")
             for block in state.unit.blocks:
                 # who wrote them may have gone meanwhile
@@ -169,6 +186,7 @@ class LineEngine(Connected):
     def _lose_unit(self, state: _UnitState, reason: str, now_ns: int) -> None:
         state.is_up = False
         state.due_ns = now_ns + state.pause_ns
+        state.pause_ns = min(max(2 * state.pause_ns, FIRST_PAUSE_NS), LONGEST_PAUSE_NS)
         self._runtime.lose(state.unit.blocks, reason)
 
     def _take_actions(self, state: _UnitState, block: AxisBlock, now_ns: int) -> None:
@@ -271,7 +289,7 @@ class LineEngine(Connected):
         wanted = self._runtime.outputs.unsent(block)
         for write in self._writes:
             write.is_void |= write.block is block and any(
-                change.mask & wanted[channel].mask
+                change.contradicts(wanted[channel])
                 for channel, change in write.changes.items()
                 if channel in wanted
             )

@@ -37,6 +37,12 @@ class Change(NamedTuple):
             return self.value
         return int(base) & ~self.mask | int(self.value) & self.mask
 
+    def contradicts(self, other: Change) -> bool:
+        """Tell whether it asks for something else than another change of the channel."""
+        if self.mask == WHOLE:
+            return self.value != other.value
+        return (int(self.value) ^ int(other.value)) & self.mask & other.mask != 0
+
 
 @dataclass(slots=True)
 class _Safe:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import sys
 import tomllib
@@ -139,7 +140,13 @@ def test_the_linear_stage(start: Callable[..., Any], short_folder: Path) -> None
         assert wire.state("velocity") == 0, "nothing resumes"
         node.reset()
         wait_for(lambda: not node.read().status[0] & AxisStatus.FAULT, "the reset of the loss")
-        wire.tell("place -0.299")
+        wire.tell("place -0.299")  # as a stage does whose counter has begun anew
+        wait_for(lambda: node.read().status[0] & AxisStatus.POSITION_LOST, "the lost place")
+        node.reset()
+        wait_for(lambda: not node.read().status[0] & AxisStatus.FAULT, "the reset")
+        with raises(errno.EPERM, "position lost", "CALIBRATE_DEVICE"):
+            node.move(0.0)
+        node.calibrate(-0.299)
         node.command(velocity=-0.05)
         wait_for(lambda: node.read().status[0] & AxisStatus.FAULT, "the limit switch")
         with raises(5, "limit switch"):

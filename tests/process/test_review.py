@@ -309,7 +309,7 @@ def test_a_closed_contact_stops_nothing_before_it_has_been_read(start_daemon: Ca
     device.value = 1
     text = f'[workcell]\nname = "test"\n[device.port0]\ndriver = "./port.py"\nline = {{ udp = "127.0.0.1:{device.port}" }}\n'
     text += '[[emergency_stop]]\nnode = "port0.bit0"\nactive = 0\n'
-    daemon = start_daemon(text, files={"port.py": UDP})
+    daemon = start_daemon(text, files={"port.py": UDP.replace("safe=(0,)", "safe=(None,)")})
     daemon.wait_up("port0")
     with daemon.cell("watcher") as cell, cell.open("port0.bit0.readonly") as contact:
         contact.read()

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import socket
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from struct import pack, unpack
 from typing import Any
@@ -21,9 +24,9 @@ family = "block"
 title = "block of 8 outputs"
 source = "this test"
 word_order = "big"
-turnaround_s = 0.1
+turnaround_s = {turnaround_s}
 [signals]
-do = { table = "coil", address = 0, count = 8 }
+do = {{ table = "coil", address = 0, count = 8 }}
 [ports.do]
 signal = "do"
 node_class = "binary"
@@ -38,6 +41,7 @@ map = "{folder}/block.toml"
 line = {{ tcp = "127.0.0.1:{port}" }}
 channels = {{ do = 8 }}
 safe = {{ do = {safe} }}
+{more}
 """
 BUSY = 6
 
@@ -99,11 +103,19 @@ class Block(threading.Thread):
 class Cell:
     """The block, a daemon, and a client that holds the whole port or single bits of it."""
 
-    def __init__(self, start: Callable[..., Any], folder: Path, block: Block, safe: int) -> None:
+    def __init__(
+        self,
+        start: Callable[..., Any],
+        folder: Path,
+        block: Block,
+        safe: int = 0,
+        turnaround_s: float = 0.3,
+        more: str = "",
+    ) -> None:
         self.block, self.socket = block, str(folder / "s")
-        (folder / "block.toml").write_text(MAP)
+        (folder / "block.toml").write_text(MAP.format(turnaround_s=turnaround_s))
         config = folder / "cell.toml"
-        config.write_text(CONFIG.format(folder=folder, port=block.port, safe=safe))
+        config.write_text(CONFIG.format(folder=folder, port=block.port, safe=safe, more=more))
         command = [
             sys.executable,
             "-m",
@@ -125,6 +137,14 @@ class Cell:
         except OSError:
             return False
 
+    def reads_at_all(self, node: Any) -> bool:
+        """Tell whether an open node can be read."""
+        try:
+            node.read()
+        except OSError:
+            return False
+        return True
+
     def told(self) -> str:
         return str(self.client.status()["devices"][0])
 
@@ -136,7 +156,7 @@ class Cell:
 def make(start: Callable[..., Any], short_folder: Path) -> Iterator[Callable[..., Cell]]:
     block = Block()
     block.start()
-    yield lambda safe=0: Cell(start, short_folder, block, safe)
+    yield lambda **given: Cell(start, short_folder, block, **given)
     block.end()
 
 
@@ -259,3 +279,80 @@ def test_bits_of_two_clients_that_wait_for_the_line_do_not_undo_each_other(make:
         thread.join(60)
     assert not failures, failures[0]
     cell.wait_outputs(0)
+
+
+# --- a silent unit, and a stop input on it --------------------------------------------------------
+
+
+def test_a_silent_unit_reads_as_good_for_no_longer_than_its_silence(make: Callable[..., Cell]) -> None:
+    """Its time-outs would add up to seconds: what counts is the age of what is read."""
+    cell = make(turnaround_s=2.0)
+    with cell.client.open("io0.readonly") as node:
+        node.read()
+        cell.block.silent = True
+        began = time.monotonic()
+        wait_for(lambda: not cell.reads_at_all(node), "the loss", 2.0)
+        took_s = time.monotonic() - began
+        assert 0.3 < took_s < 1.0, f"{took_s:.2f} s"
+        cell.block.silent = False
+        wait_for(lambda: cell.reads_at_all(node), "the link again", 10.0)
+
+
+SOURCE = '[[emergency_stop]]\nnode = "io0.bit0"\nactive = 1\n'
+
+
+@pytest.mark.parametrize("on_loss", ["", 'on_loss = "none"\n'])
+def test_a_stop_input_that_cannot_be_read_stops_the_workcell(make: Callable[..., Cell], on_loss: str) -> None:
+    cell = make(more=SOURCE + on_loss)
+    stopped = lambda: cell.client.status()["stopped_ns"]  # noqa: E731
+    assert not stopped()
+    cell.block.silent = True
+    if on_loss:
+        wait_for(lambda: "lost" in cell.told(), "the loss")
+        time.sleep(0.3)
+        assert not stopped()
+        return
+    wait_for(stopped, "the stop", 1.5)
+    assert "input io0.bit0" in cell.client.status()["stop_source"]
+    cell.client.reset()
+    wait_for(stopped, "the stop again, for it still cannot be read")
+    cell.block.silent = False
+    wait_for(cell.reads, "the link again", 10.0)
+    cell.client.reset()
+    time.sleep(0.3)
+    assert not stopped()
+
+
+def test_a_stop_input_whose_driver_dies_stops_the_workcell(make: Callable[..., Cell]) -> None:
+    cell = make(more=SOURCE)
+    os.kill(cell.client.status()["devices"][0]["pid"], signal.SIGKILL)
+    wait_for(lambda: cell.client.status()["stopped_ns"], "the stop")
+    assert "input io0.bit0" in cell.client.status()["stop_source"]
+
+
+def test_a_port_that_accepts_and_closes_is_tried_more_and_more_seldom(start: Any, short_folder: Path) -> None:
+    """It was four times a second for ever, with eight lines in the log."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    accepted: list[float] = []
+
+    def serve() -> None:
+        while True:
+            try:
+                connection, _ = listener.accept()
+            except OSError:
+                return
+            accepted.append(time.monotonic())
+            connection.close()
+
+    threading.Thread(target=serve, daemon=True).start()
+    (short_folder / "block.toml").write_text(MAP.format(turnaround_s=0.1))
+    config = short_folder / "cell.toml"
+    config.write_text(CONFIG.format(folder=short_folder, port=listener.getsockname()[1], safe=0, more=""))
+    command = ["-m", "sioms.daemon.main", "--config", str(config), "--socket", str(short_folder / "s")]
+    daemon = start([sys.executable, *command])
+    daemon.wait_line("event=ready", 40.0)
+    wait_for(lambda: len(accepted) >= 5, "five attempts", 20.0)
+    listener.close()
+    pauses = [late - early for early, late in pairwise(accepted)]
+    assert pauses[3] > 1.5 and pauses[3] > pauses[1] > pauses[0], pauses
+    assert sum("event=link" in line for line in daemon.lines) <= 2 * len(accepted) + 1

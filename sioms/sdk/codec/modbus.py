@@ -132,7 +132,8 @@ class RtuUnit(Unit):
 
         wait_s = self.turnaround_s if turnaround_s is None else turnaround_s
         timeout_s = wait_s + self.line.duration_s(pdu.size + 3)
-        return Exchange(frame_rtu(unit, pdu.data), want, decode, timeout_s, pdu.repeatable, what)
+        request = frame_rtu(unit, pdu.data)
+        return Exchange(request, want, decode, timeout_s, pdu.repeatable, what, has_checksum=True)
 
 
 class TcpUnit(Unit):

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from sioms.sdk.codec import modbus
 from sioms.sdk.exchange import DeviceError, Exchange, HookError, LinkError, Pause, Send, Steps
 from sioms.sdk.line import ATTEMPTS, Counters, Line, Priority
 from sioms.sdk.settings import LineSettings
@@ -268,3 +269,84 @@ def test_an_exception_of_a_hook_is_the_drivers_and_what_waits_goes_out(rig: Rig)
     assert rig.heard() == b"s"
     rig.answer(b"S")
     assert rig.results == [("stop", b"S")]
+
+
+# --- what does not belong to a reply --------------------------------------------------------------
+
+
+class SerialWire(Wire):
+    settings = LineSettings(serial="/dev/none", baud=12_000_000)
+
+
+@pytest.fixture
+def serial() -> Iterator[Rig]:
+    one = Rig()
+    one.wire.ours.close()
+    one.wire.device.close()
+    one.wire = SerialWire()
+    one.told: list[str] = []
+    one.line = Line(one.wire, GAP_S, RECOVERY_S, one.counters, told=one.told.append)  # type: ignore[arg-type]
+    yield one
+    one.wire.ours.close()
+    one.wire.device.close()
+
+
+READ = modbus.RtuUnit(1, modbus.SerialLine(12_000_000)).read_holding(0x0400, 2)
+WRITE = modbus.RtuUnit(1, modbus.SerialLine(12_000_000)).write_register(0x10, 7)
+GOOD = modbus.frame_rtu(1, bytes.fromhex("03 04 0001 0002"))
+
+
+def one_step(step: Exchange) -> Steps:
+    return (yield step)
+
+
+@pytest.mark.parametrize("stray", [b"\0", b"\xff", b"\x01", b"\x01\x03", bytes(8)])
+@pytest.mark.parametrize("cut", [False, True])
+def test_stray_bytes_before_a_reply_with_a_checksum_are_skipped(serial: Rig, stray: bytes, cut: bool) -> None:
+    serial.submit("a", one_step(READ))
+    assert serial.heard() == READ.data
+    data = stray + GOOD
+    for piece in [data[i : i + 1] for i in range(len(data))] if cut else [data]:
+        serial.answer(piece)
+    assert serial.results == [("a", (1, 2))]
+    assert serial.counters.garbled == 0 and serial.counters.repeats == 0
+
+
+@pytest.mark.parametrize(
+    "data", [bytes(9) + GOOD, b"\0" + GOOD[:-1] + b"\x55", b"\0" + modbus.frame_rtu(2, GOOD[1:-2])]
+)
+def test_what_is_no_reply_behind_stray_bytes_is_none(serial: Rig, data: bytes) -> None:
+    serial.submit("a", one_step(READ))
+    for _ in range(ATTEMPTS):
+        assert serial.heard() == READ.data
+        serial.answer(data)
+        serial.pass_time(1e3 * (READ.timeout_s + RECOVERY_S) + 1)
+    assert isinstance(serial.results[0][1], LinkError)
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_a_line_that_returns_what_is_sent_is_found_out_and_told_once(serial: Rig, cut: bool) -> None:
+    for step, reply, value in ((READ, GOOD, (1, 2)), (WRITE, WRITE.data, None), (READ, GOOD, (1, 2))):
+        serial.submit("a", one_step(step))
+        serial.pass_time(1e3 * GAP_S)
+        assert serial.heard() == step.data
+        data = step.data + reply
+        for piece in [data[i : i + 1] for i in range(len(data))] if cut else [step.data, reply]:
+            assert serial.results == []
+            serial.answer(piece)
+        assert serial.results == [("a", value)]
+        serial.results.clear()
+    assert len(serial.told) == 1 and "echo" in serial.told[0]
+    # the echo of a write is none of its reply, though they are the same bytes
+    serial.submit("a", one_step(WRITE))
+    serial.pass_time(1e3 * GAP_S)
+    serial.answer(WRITE.data)
+    serial.pass_time(3e3 * (WRITE.timeout_s + RECOVERY_S))
+    assert isinstance(serial.results[0][1], LinkError)
+
+
+def test_without_a_checksum_nothing_is_skipped(serial: Rig) -> None:
+    serial.submit("a", ask(b"12"))
+    serial.answer(b"\x0012")
+    serial.pass_time(1e3 * (TIMEOUT_S + RECOVERY_S))
+    assert serial.counters.garbled == 1 and not serial.results

@@ -160,6 +160,13 @@ def test_an_analog_value_is_confirmed_within_the_steps_of_its_converter() -> Non
             outputs.acknowledge(block, [0], [1.0])
 
 
+@pytest.mark.parametrize(
+    ("mask", "value", "expected"), [(0xFF, 3, False), (0xF0, 0, False), (0xFF, 7, True), (0x02, 0, True)]
+)
+def test_a_write_of_what_is_safe_contradicts_nothing(mask: int, value: int, expected: bool) -> None:
+    assert Change(mask, value).contradicts(Change(0xFF, 3)) is expected
+
+
 def test_only_outputs_with_a_safe_value_have_one() -> None:
     port = ChannelInfo("do", minimum=0, maximum=3, width=2)
     assert safe_of(BlockSpec("", NodeClass.BINARY, (port,), writable=True, safe=(None,)), 0) is None
