@@ -28,27 +28,19 @@ from sioms.protocol.flags import NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BinaryBlock, BlockSpec, Description
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
-from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Steps
+from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Steps, until
 from sioms.sdk.golden import Golden
 from sioms.sdk.settings import LineSettings
 
 # --- the codec: bytes and values, no I/O ------------------------------------------------------------
 
 TIMEOUT_S = 0.3
-LONGEST_LINE = 80
+line_of = until(b"\n", longest=80)
 ERRORS = {1: "unknown command", 2: "value out of range", 3: "output is off"}
 MEASURED = re.compile(r"(-?\d+\.\d+),(-?\d+\.\d+),(CV|CC);(-?\d+\.\d+),(-?\d+\.\d+),(CV|CC)")
 
 Measured = tuple[tuple[float, float, bool], tuple[float, float, bool]]
 """Voltage [V], current [A] and current limiting of each output."""
-
-
-def line_of(reply: bytes) -> int | None:
-    """Return where the reply's line ends, None while it has not come."""
-    end = reply.find(b"\n") + 1
-    if not end and len(reply) > LONGEST_LINE:
-        raise LinkError(f"{len(reply)} bytes without an end of line; is the baud rate right")
-    return end or None
 
 
 def text_of(reply: bytes) -> str:

@@ -37,13 +37,13 @@ from sioms.protocol.flags import ControlMode
 from sioms.sdk import drive_axes
 from sioms.sdk.blocks import BlockSpec, Description
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
-from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Steps
+from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Steps, until
 from sioms.sdk.golden import Golden
 
 # --- the codec: bytes and values, no I/O ------------------------------------------------------------
 
 TIMEOUT_S = 0.1
-LONGEST_LINE = 60
+line_of = until(b"\n", longest=60)
 REFUSALS = {1: "unknown command", 2: "number out of range", 3: "in fault; reset it"}
 FAULTS = {0: "", 1: "limit switch", 2: "the motor is stalled", 3: "the motor is too hot"}
 STATE = re.compile(r"([IMF]) (-?\d+) (-?\d+) (\d+)")
@@ -53,14 +53,6 @@ State = tuple[str, int, int, int]
 def framed(body: str) -> bytes:
     """Return a line with its sum."""
     return f"{body}*{sum(body.encode()) & 0xFF:02X}\n".encode()
-
-
-def line_of(reply: bytes) -> int | None:
-    """Return where the reply's line ends, None while it has not come."""
-    end = reply.find(b"\n") + 1
-    if not end and len(reply) > LONGEST_LINE:
-        raise LinkError(f"{len(reply)} bytes without an end of line; is the baud rate right")
-    return end or None
 
 
 def body_of(reply: bytes) -> str:

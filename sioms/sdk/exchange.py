@@ -130,6 +130,28 @@ Steps = Generator[Step, Any, None]
 """What a hook returns: a generator of steps."""
 
 
+def until(end: bytes = b"\n", longest: int = 80) -> Callable[[bytes], int | None]:
+    """Return the ``want`` of an exchange that is answered with a line of text, however long.
+
+    Args:
+        end: how a line ends.
+        longest: more bytes than this without an end are no line.
+
+    Example:
+        >>> until()(b"12.0,1.5\\nrest")
+        9
+        >>> until()(b"12.0,")
+    """
+
+    def want(reply: bytes) -> int | None:
+        at = reply.find(end)
+        if at < 0 and len(reply) > longest:
+            raise LinkError(f"{len(reply)} bytes without an end of line; is the baud rate right")
+        return None if at < 0 else at + len(end)
+
+    return want
+
+
 def while_wanted(steps: Steps, is_wanted: Callable[[], bool]) -> Generator[Step, Any, bool]:
     """Carry out steps one by one, and no further once they are not wanted any more; return whether they came to their end."""
     value: Any = None

@@ -4,9 +4,12 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 import sioms.drivers
+from sioms.drivers.modbus_axis import ModbusAxis
+from sioms.protocol.flags import ControlMode
 from sioms.sdk.regmap import RegisterMapError, load_map, parse_map
 
 MAPS = Path(sioms.drivers.__file__).parent / "maps"
@@ -178,3 +181,20 @@ def test_overrides_and_unreadable_files(tmp_path: Path) -> None:
     (tmp_path / "bad.toml").write_text("family = ")
     with pytest.raises(RegisterMapError, match="no TOML: Invalid value"):
         load_map(tmp_path / "bad.toml")
+
+
+def test_the_smallest_axis_of_the_documentation_is_a_map(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[3] / "docs" / "register-maps.md").read_text()
+    (tmp_path / "mydrive.toml").write_text(text.partition("```toml\n")[2].partition("```")[0])
+    axis = {
+        "name": "x", "address": 1, "travel_per_turn": 0.01, "pulses_per_turn": 10000,
+        "velocity_max": 0.1, "acceleration_max": 1.0,
+    }  # fmt: skip
+    table = {
+        "map": str(tmp_path / "mydrive.toml"),
+        "line": {"serial": "/dev/x", "baud": 115200},
+        "axis": [axis],
+    }
+    settings = msgspec.convert(table, ModbusAxis.Settings)
+    (block,) = ModbusAxis.describe("slide0", settings).blocks
+    assert ControlMode.VELOCITY in ControlMode(block.channels[0].modes)
