@@ -92,6 +92,10 @@ class Guard:
         )
         self._log("warning", f"{self._mapped.name}: its own watchdog: {why}")
 
+    def look_soon(self) -> None:
+        """Read the proofs in the next poll: something looks as if the device had restarted."""
+        self._due_ns = 0
+
     def poll(self, now_ns: int) -> Steps:
         """Read the proofs again when it is time.
 

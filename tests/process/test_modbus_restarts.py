@@ -108,6 +108,11 @@ def test_a_drive_that_was_off_goes_nowhere_until_it_knows_where_it_is(
         wire.tell(f"power_cycle {off_s}")
         time.sleep(off_s)
         wait_for(lambda: status(axis) & AxisStatus.POSITION_LOST, "the lost place told")
+        wait_for(
+            lambda: wire.reads("slide0") and "'link': 'good'" in wire.reason("slide0"),
+            "the drive opened again",
+        )
+        time.sleep(0.3)
         assert status(axis) & AxisStatus.FAULT
         axis.reset()
         wait_for(lambda: not status(axis) & AxisStatus.FAULT, "the fault reset")

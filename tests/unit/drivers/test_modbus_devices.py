@@ -428,6 +428,23 @@ def test_a_drive_that_was_off_has_lost_its_place_and_a_reset_does_not_find_it() 
     assert rig.drive.state()["place"] == 20000
 
 
+def test_a_jump_is_looked_at_at_once_and_is_one_fault() -> None:
+    """The watch sees the jump before the token is due: the token is read in the next poll, not after a RESET."""
+    rig = leadshine_rig()
+    rig.write(ControlMode.POSITION, position=0.08)
+    rig.until_idle()
+    rig.bus.sent.clear()
+    while not any(data[2:4] == bytes.fromhex("627e") for data in rig.bus.sent):
+        rig.poll()  # until one that has just read the token
+        rig.bus.now_s += 0.02
+    power_cycle(rig, 0.01)
+    began_s = rig.bus.now_s
+    with pytest.raises(StateLost, match="was switched off or restarted"):
+        while rig.bus.now_s < began_s + 0.15:
+            rig.poll()
+            rig.bus.now_s += 0.01
+
+
 def test_a_drive_that_was_off_while_its_link_was_lost_has_lost_its_place_too() -> None:
     rig = leadshine_rig()
     rig.write(ControlMode.POSITION, position=0.05)
