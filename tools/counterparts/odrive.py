@@ -25,7 +25,7 @@ from .odrive_axis import CLOSED_LOOP, FLAGS, IDLE, READ_ONLY, STORED, UNSIGNED, 
 
 __all__ = ["CLOSED_LOOP", "IDLE", "Axis", "Board"]
 
-MAX_LINE = 256
+MAX_LINE, MAX_REPLY = 256, 64
 FOREVER = 1 << 30
 _INTEGER = r"\s*([+-]?\d+)"
 _FLOAT = r"\s*([+-]?(?:\d+\.?\d*(?:e[+-]?\d+)?|\.\d+(?:e[+-]?\d+)?|nan|inf(?:inity)?))"
@@ -105,7 +105,8 @@ class Board:
                 return []
         text = (body if has_checksum else raw).partition(b"\0")[0].decode("latin-1")
         replies = [reply.encode("latin-1") for reply in self._obey(text)]
-        return [r + (f"*{_xor(r)}".encode() if has_checksum else b"") + b"\r\n" for r in replies]
+        lines = [r + (f"*{_xor(r)}".encode() if has_checksum else b"") + b"\r\n" for r in replies]
+        return [line if len(line) < MAX_REPLY else line[: MAX_REPLY - 1] + b"\0" for line in lines]
 
     def _obey(self, text: str) -> list[str]:
         letter = text[:1]
@@ -158,7 +159,7 @@ class Board:
         if len(found) < min(2, len(shapes[letter])):
             return ["invalid command format"]
         if not 0 <= found[0] < len(self.axes):
-            return [f"invalid motor {int(found[0]) % 2**32}"]
+            return [f"invalid motor {int(found[0])}"]
         axis, values = self.axes[int(found[0])], found[1:]
         if letter in "pqt":
             axis.move(values[0], trapezoid=letter == "t")
@@ -180,7 +181,7 @@ class Board:
         if len(found) < 2:
             return "invalid command format"
         if not 0 <= found[0] < len(self.axes):
-            return f"invalid motor {int(found[0]) % 2**32}"
+            return f"invalid motor {int(found[0])}"
         axis = self.axes[int(found[0])]
         axis.origin = axis.place - found[1] / 8192
         axis.feed()
@@ -322,7 +323,7 @@ def _scan(text: str, letter: str, kinds: str) -> list[float]:
         match = re.compile(_FLOAT if kind == "f" else _INTEGER, re.IGNORECASE).match(text, at)
         if match is None:
             break
-        values.append(float(match[1]))
+        values.append(float(match[1]) if kind != "u" else int(match[1]) % 2**32)
         at = match.end()
     return values
 

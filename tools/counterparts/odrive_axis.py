@@ -133,7 +133,8 @@ class Axis:
         self._since_s = 0.0
         self._was_pressed = self._pressed
         self._homes: tuple[float, float] | None = None
-        self._homes_back = False
+        self._homes_back = self._arms = False
+        self._switched_at = 0.0
         if self.p["config.startup_closed_loop_control"]:
             self.p["requested_state"] = CLOSED_LOOP
 
@@ -214,8 +215,11 @@ class Axis:
     def _start_closed_loop(self) -> None:
         self._connected = True
         self._control_mode_updated()
-        self._pos_updated = True
-        # arming resets the controller: set-points, not inputs
+        self._pos_updated = self._arms = True
+
+    def _arm(self) -> None:
+        """Arm the motor, a turn of the loop later: a trajectory is planned before that, from the old speed."""
+        self._arms = False
         for name in ("vel_setpoint", "torque_setpoint", "vel_integrator_torque"):
             self.p[f"controller.{name}"] = 0.0
         self.p["motor.is_armed"] = 1
@@ -223,12 +227,20 @@ class Axis:
     def _run_state(self) -> None:
         p = self.p
         wanted, state = int(p["requested_state"]), int(p["current_state"])
-        if wanted == UNDEFINED:
+        if self._arms:
+            self._arm()
+            if state == HOMING and self._homes_back:
+                self._turn_back()
+        elif wanted == UNDEFINED:
             if state == CLOSED_LOOP and not p["motor.is_armed"]:
                 p["current_state"] = IDLE
             elif state == HOMING:
                 self._home()
-            return
+        else:
+            self._enter(wanted, state)
+
+    def _enter(self, wanted: int, state: int) -> None:
+        p = self.p
         if state == HOMING:
             self._end_homing()
         p["requested_state"], p["motor.is_armed"] = UNDEFINED, 0
@@ -248,7 +260,7 @@ class Axis:
         self._homes_back = False
         if not p["min_endstop.config.enabled"]:
             self.fail(NO_ENDSTOP)
-            self._end_homing()
+            self._homes, p["current_state"] = None, IDLE
             return
         p["controller.config.control_mode"], p["controller.config.input_mode"] = VELOCITY, VEL_RAMP
         p["controller.input_pos"] = p["controller.input_torque"] = p["is_homed"] = 0
@@ -277,13 +289,20 @@ class Axis:
             self._pos_updated, p["is_homed"] = True, 1
             self._end_homing()
 
+    def _turn_back(self) -> None:
+        p, here = self.p, self._switched_at
+        p["controller.input_pos"], p["controller.pos_setpoint"] = here + p["min_endstop.config.offset"], here
+        p["controller.vel_setpoint"], p["controller.trajectory_done"], self._pos_updated = 0.0, 0, True
+
     def _end_homing(self) -> None:
         """Let go; the modes are as before, and the axis is idle."""
         p = self.p
+        if p["controller.config.input_mode"] == VEL_RAMP:  # on its way to the switch
+            p["controller.input_vel"] = 0.0
         if self._homes is not None:
             p["controller.config.control_mode"], p["controller.config.input_mode"] = self._homes
-        self._homes = None
-        p["controller.input_vel"], p["motor.is_armed"], p["current_state"] = 0.0, 0, IDLE
+        self._homes, self._arms = None, False
+        p["motor.is_armed"], p["current_state"] = 0, IDLE
 
     # --- the controller ---------------------------------------------------------------------------
 
