@@ -51,7 +51,7 @@ class GrblSettings(DriveSettings, frozen=True, forbid_unknown_fields=True, kw_on
         version: text that its version must contain, e.g. "1.1h"; '' takes any.
         homing: the controller's homing ($H, all axes) may be used.
         homing_timeout_s: longest time that homing may take [s].
-        quick_stop: "reset" stops at once and loses the position, "cancel" brakes and keeps it.
+        quick_stop: "cancel" brakes and keeps the position, and resets what does not obey; "reset" stops at once and loses it.
         poll_hz: rate of status reports; 5 to 10 is the firmware's advice, 20 to 50 works on an idle line.
     """
 
@@ -59,7 +59,7 @@ class GrblSettings(DriveSettings, frozen=True, forbid_unknown_fields=True, kw_on
     version: str = ""
     homing: bool = False
     homing_timeout_s: float = 120.0
-    quick_stop: Literal["reset", "cancel"] = "reset"
+    quick_stop: Literal["cancel", "reset"] = "cancel"
     poll_hz: float = 20.0
 
 

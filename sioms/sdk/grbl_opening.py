@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import Any
@@ -16,50 +17,57 @@ from .exchange import DeviceError, LinkError, Pause, Send, Step, Steps
 TIMEOUT_S = 0.5
 RESET_S = 3.0
 HOLD_S = 5.0
+MOVING = ("Run", "Hold", "Jog")
 Clock = Callable[[], int]
 Hearing = Callable[[Report, Sequence[str]], None]
 """Takes a report and the lines that came before it."""
 
 
-def to_rest(clock: Clock, hear: Hearing) -> Generator[Step, Any, Report]:
-    """End jogs and programs that go on, with the position kept; return the last report."""
-    yield Send(b"\n" + grbl.JOG_CANCEL, "end a cut line, cancel jogs")
+def to_rest(clock: Clock, hear: Hearing) -> Generator[Step, Any, tuple[Report, bool]]:
+    """Bring the controller to rest and to the state of a fresh start, whatever it does and whoever left it so.
+
+    Jogs and programs are braked with their position kept; a reset at rest then clears lines, modes, overrides, spindle and holds.
+
+    Returns:
+        The last report, and whether it had to be reset in motion: its position is then lost.
+    """
+    yield Send(grbl.END_CUT_LINE + grbl.JOG_CANCEL, "end a cut line, cancel jogs")
     yield Pause(0.1)
-    report: Report
-    try:
+    rests, report = True, None
+    with contextlib.suppress(
+        LinkError
+    ):  # booting, or deaf as it homes or waits after an alarm: only a reset ends that
         report, _ = yield grbl.status(TIMEOUT_S)
-    except LinkError:  # booting, or deaf because it homes: only a reset ends that
-        yield grbl.reset(RESET_S)
-        report, _ = yield grbl.status(TIMEOUT_S)
-    if report.state in ("Run", "Hold"):
-        yield from _hold_and_reset(clock)
-    elif report.state == "Jog":  # it brakes; what is asked next it would refuse
-        report = yield from until_rest(clock, hear)
-    return report
+    if report is not None and report.state in MOVING:
+        rests = yield from brake(clock, hear, HOLD_S)
+    lines = yield grbl.reset(RESET_S)
+    report, more = yield grbl.status(TIMEOUT_S)
+    hear(report, (*lines[:-1], *more))
+    return report, not rests
 
 
-def until_rest(clock: Clock, hear: Hearing) -> Generator[Step, Any, Report]:
-    """Wait until cancelled jogs have come to rest; return the last report, and give each to ``hear``."""
-    limit_ns = clock() + int(HOLD_S * 1e9)
-    while True:
-        yield Pause(0.02)
-        report: Report
+def brake(clock: Clock, hear: Hearing, limit_s: float) -> Generator[Step, Any, bool]:
+    """Brake with the position kept, and send that again until the controller rests; return whether it does.
+
+    A line that has waited for room in the planner goes out when a cancel has emptied it, so one report of rest is not enough.
+
+    Args:
+        clock: the time [ns].
+        hear: gets each report.
+        limit_s: longest time for it [s].
+    """
+    limit_ns, rested = clock() + int(limit_s * 1e9), 0
+    while rested < 2:
         report, lines = yield grbl.status(TIMEOUT_S)
         hear(report, lines)
-        if report.state not in ("Jog", "Hold") or clock() >= limit_ns:
-            return report
-
-
-def _hold_and_reset(clock: Clock) -> Steps:
-    """End a program with its position kept: hold, wait for rest, reset."""
-    yield Send(grbl.HOLD, "feed hold")
-    limit_ns = clock() + int(HOLD_S * 1e9)
-    while clock() < limit_ns:
-        yield Pause(0.05)
-        report, _ = yield grbl.status(TIMEOUT_S)
-        if (report.state, report.sub) == ("Hold", 0) or report.state == "Idle":
-            break
-    yield grbl.reset(RESET_S)
+        rests = report.state not in MOVING or (report.state, report.sub) == ("Hold", 0)
+        rested = rested + 1 if rests else 0
+        if not rests:
+            if clock() >= limit_ns:
+                return False
+            yield Send(grbl.HOLD if report.state == "Run" else grbl.JOG_CANCEL, "brake")
+        yield Pause(0.02)
+    return True
 
 
 def identify(name: str, wanted: str) -> Steps:

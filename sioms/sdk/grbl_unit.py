@@ -21,18 +21,22 @@ from .blocks import BlockSpec
 from .codec import grbl
 from .codec.grbl import Answer, Report
 from .codec.grbl_homing import GrblHoming
-from .codec.grbl_jog import JogChain, straight_jog
+from .codec.grbl_jog import CHAIN_BLOCKS, JogChain, straight_jog
 from .codec.grbl_machine import INCHES, MachinePosition
 from .codec.grbl_moves import GrblMoves, Moves
 from .drive_axes import AxesUnit
 from .driver import Kit
-from .exchange import DeviceError, Pause, Send, Steps
+from .exchange import DeviceError, LinkError, Pause, Send, StateLost, Steps
 from .grbl_opening import RESET_S, TIMEOUT_S
 
 STATUS_S = 0.2
 """A status report comes within 5 to 20 ms; ten times that on a slow adapter."""
 TOGETHER_S = 0.0005
 """How long a start waits for the starts of other axes that go out with it."""
+LATE_S = 0.5
+"""What braking may take longer than the motion itself: reports, and a line that waited."""
+OWN_RESET_NS = 1_500_000_000
+"""A greeting so soon after a reset of ours belongs to it."""
 OFFSET_REPORTS = 35
 """The work offset comes with every 30th report at the latest."""
 NOT_READY = {
@@ -108,16 +112,22 @@ class GrblUnit(AxesUnit):
         self._homing = GrblHoming()
         self._last: tuple[int, Any] | None = None
         self._replaces = [False] * n
-        self._clean = False
+        self._clean = self._restarted = self._deaf = False
+        """Nothing was started since all were stopped; the controller has greeted; it waits for a reset."""
+        self._reset_ns = 0
 
     # --- hooks ----------------------------------------------------------------------------------
 
     def open(self) -> Steps:
         """Stop what moves, identify the controller, and compare its limits with the configuration."""
-        self._alarm, self._last = 0, None
+        self._alarm, self._last, self._clean = 0, None, False
         self._homing.forget()
         self._forget()
-        report = yield from grbl_opening.to_rest(self.clock, self._hear_report)
+        self._reset_ns = self.clock()
+        report, in_motion = yield from grbl_opening.to_rest(self.clock, self._hear_report)
+        self._reset_ns, self._restarted, self._deaf = self.clock(), False, False
+        if in_motion:
+            self._lose_places("it did not brake, so it was reset in motion")
         yield from grbl_opening.identify(self.name, self._settings.version)
         answer: Answer = yield grbl.command("$$", TIMEOUT_S, repeatable=True)
         found = answer.settings()
@@ -138,7 +148,15 @@ class GrblUnit(AxesUnit):
                 self._raw = self._positions(report)
             self._report_homing()
             return
+        if self._deaf:
+            yield from self._reset_now()
         report, lines = yield grbl.status(STATUS_S)
+        self._listen(lines)
+        if self._restarted:
+            self._restarted = False
+            text = "the controller has started anew: its place, modes and lines are gone"
+            self._lose_places(text)
+            raise StateLost(f"{self.name}: {text}")
         self._take_heard(report, lines)
         if self._moves.interrupted:
             yield from self._go_on()
@@ -183,19 +201,36 @@ class GrblUnit(AxesUnit):
         self._clean = False
 
     def halt(self, axis: int, *, fastest: bool) -> Steps:
-        """Cancel jogs and keep the position; or reset, which is the fastest and the only end of homing."""
+        """Cancel jogs and keep the position; or reset, which is the only end of homing and loses it in motion."""
         self._chain.wanted[axis] = 0.0
         self._moves.drop(axis)
-        if not self._homing.is_on and not (fastest and self._settings.quick_stop == "reset"):
+        if not self._homing.is_on and not fastest:
             yield self._cancel()
             return
         self._forget()
         if self._clean:
-            return  # nothing was started since the reset for another axis
-        lines = yield grbl.reset(RESET_S)
+            return  # nothing was started since all axes were stopped for another one
+        rests = False
+        if not self._homing.is_on and self._settings.quick_stop != "reset":
+            rests = yield from grbl_opening.brake(self.clock, self._take_heard, self._braking_s())
+        if not rests or self._state == "Hold":  # a hold keeps a program of somebody else
+            yield from self._reset_now()
         self._clean = True
+
+    def _braking_s(self) -> float:
+        """Return how long the slowest axis takes to brake from its top speed, and what the line takes."""
+        return max(axis.velocity_max / axis.acceleration_max for axis in self.bank.settings) + LATE_S
+
+    def _reset_now(self) -> Steps:
+        was = self._state
+        self._reset_ns = self.clock()
+        lines = yield grbl.reset(RESET_S)
+        self._reset_ns = self.clock()
         self._homing.forget()
         self._hear(lines)
+        self._deaf = False
+        if was in ("Jog", "Run", "Home"):
+            self._lose_places(grbl.alarm_text(3))
 
     def stop(self) -> Steps:
         """Stop whatever goes on."""
@@ -215,13 +250,18 @@ class GrblUnit(AxesUnit):
 
     def reset(self, axis: int) -> Steps:
         """Unlock the controller; a critical alarm needs a reset before."""
-        report, lines = yield grbl.status(TIMEOUT_S)
-        self._hear(lines)
-        if report.state in ("Alarm", "Sleep", "Hold", "Door"):
-            yield grbl.reset(RESET_S)
+        state = "Alarm"
+        try:
+            report, lines = yield grbl.status(TIMEOUT_S)
+        except LinkError:  # some alarms wait for a reset, and hear nothing else
+            pass
+        else:
+            self._hear(lines)
+            state = report.state
+        if state in ("Alarm", "Sleep", "Hold", "Door", "Check"):
+            yield from self._reset_now()
+        if state in ("Alarm", "Sleep"):
             yield grbl.command("$X", TIMEOUT_S)
-        elif report.state == "Check":
-            yield grbl.command("$C", TIMEOUT_S)
         self._alarm = 0
 
     def overhear(self, data: bytes, now_ns: int) -> None:
@@ -230,6 +270,7 @@ class GrblUnit(AxesUnit):
         lines = grbl.lines_of(self._rest)
         self._rest = self._rest[self._rest.rfind(b"\n") + 1 :][-grbl.LINE_LIMIT :]
         self._hear(lines)
+        self._listen(lines)
         if self._homing.is_on:  # told to the bank by the next poll, which publishes it
             self._homing.hear(lines, self._alarm)
 
@@ -266,9 +307,18 @@ class GrblUnit(AxesUnit):
     def _hear(self, lines: Sequence[str]) -> None:
         number = grbl.alarm_of(lines)
         if number:
-            self._alarm = number
+            self._alarm, self._deaf = number, number in grbl.DEAF
             if number not in grbl.POSITION_KEPT:
-                self.bank.set_homed(range(self.bank.n), False)
+                self._lose_places(grbl.alarm_text(number))
+
+    def _listen(self, lines: Sequence[str]) -> None:
+        """Hear that the controller has started anew; not of the greeting that a reset of ours has brought."""
+        if grbl.greets(lines) and self.clock() - self._reset_ns > OWN_RESET_NS:
+            self._restarted = True
+
+    def _lose_places(self, text: str) -> None:
+        for axis in range(self.bank.n):
+            self.lose_place(axis, text)
 
     def _hear_report(self, report: Report, lines: Sequence[str]) -> None:
         self._hear(lines)
@@ -297,6 +347,8 @@ class GrblUnit(AxesUnit):
     def _positions(self, report: Report) -> Any:
         """Return the positions of our axes [unit], and keep what the report tells beside them."""
         self._state = report.state
+        if report.state in ("Jog", "Run", "Home"):
+            self._clean = False
         self._place.note(report)
         return self._place.of(report) / self._per_unit
 
@@ -313,7 +365,8 @@ class GrblUnit(AxesUnit):
             return
         self._replaces[axis] = False
         yield self._cancel()
-        yield from grbl_opening.until_rest(self.clock, self._take_heard)
+        if not (yield from grbl_opening.brake(self.clock, self._take_heard, self._braking_s())):
+            raise DeviceError(errno.EIO, "the jog that it replaces was cancelled, and the axes move yet")
 
     def _jog_to(self, together: Moves) -> Steps:
         """Send one line for these axes."""
@@ -321,13 +374,19 @@ class GrblUnit(AxesUnit):
         self._clean = False
         try:
             yield grbl.command(line, TIMEOUT_S)
-        except (DeviceError, ValueError) as error:
-            refusal = error if isinstance(error, DeviceError) else DeviceError(errno.EINVAL, str(error))
+        except StateLost as error:
+            self._restarted = True
+            self._moves.refuse(together, error)
+        except (DeviceError, LinkError, ValueError) as error:
+            errno_ = errno.EINVAL if isinstance(error, ValueError) else errno.EIO
+            refusal = error if isinstance(error, DeviceError) else DeviceError(errno_, str(error))
             self._moves.refuse(together, refusal)
 
     def _lengthen(self, report: Report) -> Steps:
         """Lengthen the chain of jogs until it reaches far enough ahead to run at full speed and to brake at its end."""
-        if 0 <= report.free_blocks < 2:
+        # many controllers are set not to tell how many places are free ($10), so its own are counted
+        busy = self._chain.blocks(self._raw * self._per_unit) + int(self._moves.bound.sum())
+        if 0 <= report.free_blocks < 2 or busy >= CHAIN_BLOCKS:
             return
         offset = self.bank.fields[0] - self._raw
         low, high = self._soft_limits()

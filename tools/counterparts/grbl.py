@@ -1,9 +1,12 @@
 """A Grbl controller on a pty or TCP port: ``python -m sioms.tools.counterparts.grbl --link PATH``.
 
-Behaves as the documents of Grbl 1.1h say: one ``ok`` or ``error:N`` a line, real-time bytes, a planner that looks ahead over
-15 blocks, jogs that can be cancelled, holds, alarms, homing during which ``?`` is ignored, a position that is wrong after a reset in
-motion. Commands on standard input, beside those of the line: ``state``, ``alarm N`` (motion ends, position lost), ``door``,
-``program DISTANCE FEED`` (somebody else's move in X).
+Behaves as the sources of Grbl 1.1h say (gnea/grbl, v1.1h.20190825, 40eb439b; ``grbl/{main,protocol,serial,system,motion_control}.c``): one
+``ok`` or ``error:N`` a line, real-time bytes, a planner that looks ahead over 15 blocks and lets a line wait for its ``ok`` when it is full
+(a jog cancel empties it, and the line that waited goes out after it), holds, alarms of which 1 and 2 leave it deaf until a reset, homing during
+which ``?`` is ignored, a position that is wrong after a reset in motion and 0 after the supply was off. Commands on standard
+input, beside those of the line: ``state``, ``alarm N`` (motion ends, position lost), ``door``, ``program DISTANCE FEED`` (somebody else's
+move in X), ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze [COUNT]``, ``foreign KIND VALUE`` (velocity: a jog in X; position; mode: a
+G word).
 """
 
 from __future__ import annotations
@@ -20,6 +23,12 @@ from .grbl_gcode import Parser
 from .grbl_planner import BLOCKS, Planner
 
 RX_BYTES = 128
+LINE_BYTES = 80
+CRITICAL = (1, 2)
+"""Alarms that wait for a reset: nothing else is heard meanwhile, not even ``?``."""
+FACTORY = {10: 1, 110: 500, 120: 10}
+"""Mask of the reports, speeds [mm/min] and accelerations [mm/s^2] of ``defaults.h``, DEFAULTS_GENERIC."""
+FOREVER = 1 << 30
 REALTIME = set(b"?!~\x18\x84\x85") | set(range(0x90, 0xA2))
 
 
@@ -31,6 +40,7 @@ class Controller:
         axes: int = 3,
         hal: bool = False,
         homing: bool = True,
+        factory: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.letters = "XYZABCUVW"[:axes]
@@ -41,6 +51,9 @@ class Controller:
         }  # fmt: skip
         for i in range(axes):
             self.settings |= {100 + i: 250, 110 + i: 6000, 120 + i: 500, 130 + i: 200}
+        if factory:
+            for key, value in FACTORY.items():
+                self.settings |= {key + i: value for i in range(axes if key > 100 else 1)}
         self.planner = Planner(axes, self.settings, self._admit)
         self.state = "Alarm" if homing else "Idle"
         self.parser = Parser(self.letters)
@@ -50,6 +63,10 @@ class Controller:
         self._pending: list[bytes] = []
         self._homing_s = 0.0
         self._clock = clock
+        self._off_until_s = 0.0
+        self._deaf = False
+        self._refusals = self._frozen = 0
+        self._image = ""
         self.time = Stepper(self._step, lambda: not self.planner.blocks and not self._homing_s, clock)
 
     # -- motion ----------------------------------------------------------------------------------
@@ -76,6 +93,28 @@ class Controller:
         self._homing_s = 0.0
         self.state = "Alarm"
         self._say(f"ALARM:{number}")
+        if number in CRITICAL:
+            self._say("[MSG:Reset to continue]")
+            self._deaf = True
+
+    def power_cycle(self, seconds: str = "0.2") -> None:
+        """Take the supply away for a time: the motors stop where they are, and nothing is heard or said."""
+        self._off_until_s = self.time.catch_up() + float(seconds)
+        self.planner.end_at_once()
+        self._pending.clear()
+
+    def _is_off(self) -> bool:
+        """Tell whether there is no supply; boot when it has come."""
+        now_s = self.time.catch_up()
+        if self._off_until_s and now_s >= self._off_until_s:
+            self._off_until_s = 0.0
+            planner = self.planner
+            planner.slip = [s + p for s, p in zip(planner.slip, planner.position, strict=True)]
+            planner.position = [0.0] * len(planner.position)
+            self._homing_s, self._deaf = 0.0, False
+            self.state = "Alarm" if self.settings[22] else "Idle"
+            self._reset()
+        return self._off_until_s > 0
 
     # -- line ------------------------------------------------------------------------------------
 
@@ -93,18 +132,22 @@ class Controller:
 
     def due(self) -> list[bytes]:
         """Let time pass."""
-        self.time.catch_up()
+        if self._is_off():
+            return []
         self._admit()
         return self._spoken()
 
     def take(self, data: bytes) -> list[bytes]:
         """Take bytes: real-time ones at once, the rest by lines that end in LF or CR."""
-        self.time.catch_up()
+        if self._is_off():
+            return []
         for byte in data:
             if byte in REALTIME or (self.hal and byte in (0x80, 0x81, 0x82, 0x83, 0x87, 0x19)):
                 self._realtime(byte)
+            elif byte >= 0x80 or len(self._line) + sum(map(len, self._lines)) >= RX_BYTES:
+                continue  # no character, or no room for it
             elif byte in b"\r\n":
-                self._lines.append(self._line.decode("latin-1"))
+                self._lines.append(_stripped(self._line.decode("latin-1")))
                 self._line.clear()
             else:
                 self._line.append(byte)
@@ -113,9 +156,13 @@ class Controller:
 
     def _admit(self) -> None:
         """Take lines while the planner has room; a full one lets the line wait for its ok."""
-        while self._lines and len(self.planner.blocks) < BLOCKS and not self._homing_s:
+        while self._lines and len(self.planner.blocks) < BLOCKS and not self._homing_s and not self._deaf:
             line = self._lines.popleft()
-            error = self._obey(line.replace(" ", "").upper()) if len(line) < 80 else 11
+            if self._refusals > 0 and line:
+                self._refusals -= 1
+                error = 8
+            else:
+                error = self._obey(line) if len(line) < LINE_BYTES else 11
             if not self._homing_s or error:
                 self._say(f"error:{error}" if error else "ok")
 
@@ -127,13 +174,15 @@ class Controller:
 
     def _realtime(self, byte: int) -> None:
         match byte:
-            case 0x3F | 0x80 if not self._homing_s:
-                self._say(self.report())
+            case 0x3F | 0x80 if not self._homing_s and not self._deaf:
+                self._frozen -= self._frozen > 0
+                self._image = self._image if self._frozen and self._image else self.report()
+                self._say(self._image)
             case 0x18:
                 self._reset()
             case 0x85 if self.state == "Jog":
                 self.planner.cancelling = True
-            case 0x21 if self.state in ("Run", "Jog"):
+            case 0x21 if self.state in ("Run", "Jog", "Idle"):
                 if self.state == "Jog":
                     self.planner.cancelling = True
                 else:
@@ -149,8 +198,9 @@ class Controller:
             self.crash(6)
         elif self.planner.speed > 0:
             self.crash(3)
-        elif self.state not in ("Alarm", "Sleep"):
-            self.state = "Idle"
+        else:
+            self.state = "Alarm" if self.state in ("Alarm", "Sleep") else "Idle"
+        self._deaf = False
         self.planner.clear()
         self._lines.clear()
         self._line.clear()
@@ -162,18 +212,18 @@ class Controller:
         state = self.state
         if state in ("Hold", "Door"):
             state += ":1" if self.planner.speed and state == "Hold" else ":0"
-        scale = 25.4 if self.settings[13] else 1.0
+        scale, digits = (25.4, 4) if self.settings[13] else (1.0, 3)
         work = not int(self.settings[10]) & 1
         offset = self.parser.offset
         shown = [
             (p - (o if work else 0.0)) / scale for p, o in zip(self.planner.position, offset, strict=True)
         ]
-        fields = [state, f"{'WPos' if work else 'MPos'}:" + ",".join(f"{v:.3f}" for v in shown)]
+        fields = [state, f"{'WPos' if work else 'MPos'}:" + ",".join(f"{v:.{digits}f}" for v in shown)]
         if int(self.settings[10]) & 2:
             fields.append(f"Bf:{BLOCKS - len(self.planner.blocks)},{RX_BYTES}")
         fields.append(f"FS:{self.planner.speed * 60:.0f},0")
         if self.reports % 10 == 0:
-            fields.append("WCO:" + ",".join(f"{o / scale:.3f}" for o in offset))
+            fields.append("WCO:" + ",".join(f"{o / scale:.{digits}f}" for o in offset))
         elif self.reports % 10 == 1:
             fields.append("Ov:100,100,100")
         if self.hal and self.reports % 7 == 0:
@@ -188,7 +238,7 @@ class Controller:
         if not line:
             return 0
         if line.startswith("$J="):
-            return self._jog(line[3:]) if self.state in ("Idle", "Jog") else 9
+            return self._jog(line[3:]) if self.state in ("Idle", "Jog") else 8
         if line.startswith("$"):
             return self._system(line)
         if self.state in ("Alarm", "Jog", "Sleep"):
@@ -200,22 +250,27 @@ class Controller:
         match line:
             case "$":
                 self._say("[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]")
+            case "$G":
+                self._say("[GC:" + self.parser.modes() + " G54 G17 G94 M5 M9 T0 F0 S0]")
+            case "$X":
+                if self.state == "Alarm":
+                    self.state = "Idle"
+                    self._say("[MSG:Caution: Unlocked]")
+            case "$$" if self.state not in ("Run", "Hold"):
+                for key, value in sorted(self.settings.items()):
+                    self._say(f"${key}={value:.3f}" if key >= 100 or value % 1 else f"${key}={int(value)}")
+            case "$C" if self.state == "Check":
+                self._reset()
+                self._say("[MSG:Disabled]")
+            case "$C":
+                if self.state != "Idle":
+                    return 8
+                self.state = "Check"
             case _ if moving:
                 return 8
             case "$I":
                 self._say("[VER:1.1f.20260801:]" if self.hal else "[VER:1.1h.20190830:]")
                 self._say("[OPT:VNML+,100,1024,3,0]" if self.hal else f"[OPT:V,{BLOCKS},{RX_BYTES}]")
-            case "$$":
-                for key, value in sorted(self.settings.items()):
-                    self._say(f"${key}={value:.3f}" if key >= 100 or value % 1 else f"${key}={int(value)}")
-            case "$G":
-                self._say("[GC:G0 G54 G17 G21 G90 G94 M5 M9 T0 F0 S0]")
-            case "$X":
-                if self.state == "Alarm":
-                    self.state = "Idle"
-                    self._say("[MSG:Caution: Unlocked]")
-            case "$C":
-                self.state = "Idle" if self.state == "Check" else "Check"
             case "$H":
                 if not self.settings[22]:
                     return 5
@@ -257,6 +312,19 @@ class Controller:
         self.state = "Run" if self.state == "Idle" else self.state
         return 0
 
+    def foreign(self, kind: str, value: str) -> int:
+        """Obey another sender; return the error."""
+        number = float(value)
+        lines = {
+            "velocity": f"$J=G91G21X{1000 if number > 0 else -1000}F{abs(number) * 60:g}",
+            "position": f"G90G21G1X{number:g}F1000", "mode": f"G{value}",
+        }  # fmt: skip
+        if kind not in lines:
+            raise ValueError(f"kind {kind}: one of {', '.join(lines)} is right")
+        if self.state == "Alarm":
+            self._obey("$X")
+        return self._obey(lines[kind])
+
     def handlers(self) -> dict[str, Callable[..., object]]:
         """Return the commands on standard input."""
 
@@ -277,15 +345,23 @@ class Controller:
         def setting(key: str, value: str) -> None:
             self.settings[int(key)] = float(value)
 
-        def reboot() -> None:
-            self.planner.blocks.clear()
-            self.planner.speed, self.state = 0.0, "Alarm" if self.settings[22] else "Idle"
-            self._greet()
+        def refuse(count: str) -> None:
+            self._refusals = int(count)
+
+        def freeze(count: str = str(FOREVER)) -> None:
+            self._frozen, self._image = int(count), ""
 
         return {
-            "state": state, "alarm": alarm, "program": program, "set": setting, "reboot": reboot,
+            "state": state, "alarm": alarm, "program": program, "set": setting, "power_cycle": self.power_cycle,
+            "refuse": refuse, "freeze": freeze, "foreign": self.foreign,
             "door": lambda: self._realtime(0x84), "hold": lambda: self._realtime(0x21),
         }  # fmt: skip
+
+
+def _stripped(line: str) -> str:
+    """Return a line as it is kept: without blanks, comments and slashes, in capitals."""
+    line = re.sub(r"\([^)]*\)?|;.*", "", line)
+    return "".join(c for c in line if c > " " and c != "/").upper()
 
 
 async def main() -> None:
@@ -294,8 +370,9 @@ async def main() -> None:
     parser.add_argument("--axes", type=int, default=3)
     parser.add_argument("--hal", action="store_true", help="grblHAL")
     parser.add_argument("--no-homing", action="store_true", help="$22=0: starts unlocked")
+    parser.add_argument("--factory", action="store_true", help="$10, $110.. and $120.. as Grbl ships")
     options = parser.parse_args()
-    controller = Controller(options.axes, options.hal, not options.no_homing)
+    controller = Controller(options.axes, options.hal, not options.no_homing, options.factory)
     await wire.run(controller, options, controller.handlers())
 
 

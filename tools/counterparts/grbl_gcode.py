@@ -40,6 +40,10 @@ class Parser:
         """Take the modal state of a fresh start; the offsets stay."""
         self._absolute, self._scale, self._motion, self._feed = True, 1.0, 0, 0.0
 
+    def modes(self) -> str:
+        """Return the modal state in words."""
+        return f"G{self._motion} G{20 if self._scale > 1 else 21} G{90 if self._absolute else 91}"
+
     def jog(self, text: str, start: Sequence[float]) -> Straight | int:
         """Return what a jog asks for, or an error; the modal state is untouched."""
         words = _words(text)

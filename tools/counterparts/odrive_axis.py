@@ -270,18 +270,13 @@ class Axis:
 
     def _home(self) -> None:
         p = self.p
-        if not p["motor.is_armed"]:
+        if not p["motor.is_armed"]:  # an error, or the last turn of the loop has let go
             self._end_homing()
         elif not self._homes_back and self._pressed:
-            here = self.position
-            p["controller.input_vel"] = 0.0
+            p["controller.input_vel"], p["motor.is_armed"], self._homes_back = 0.0, 0, True
             p["controller.config.control_mode"], p["controller.config.input_mode"] = POSITION, TRAP_TRAJ
+            self._switched_at = self.position
             self._start_closed_loop()
-            p["controller.input_pos"], p["controller.pos_setpoint"] = (
-                here + p["min_endstop.config.offset"],
-                here,
-            )
-            p["controller.trajectory_done"], self._homes_back = 0, True
         elif self._homes_back and p["controller.trajectory_done"]:
             self.origin = self.place
             for name in ("input_pos", "pos_setpoint", "vel_setpoint"):

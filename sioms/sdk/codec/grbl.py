@@ -11,11 +11,13 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from sioms.sdk.exchange import DeviceError, Exchange, LinkError
+from sioms.sdk.exchange import DeviceError, Exchange, LinkError, StateLost
 
 STATUS, HOLD, RESUME, RESET, JOG_CANCEL = b"?", b"!", b"~", b"\x18", b"\x85"
 LINE_LIMIT = 80
 """Longest line with its end; longer ones draw error 11."""
+END_CUT_LINE = b"@\n"
+"""Ends a line that was cut off without its being obeyed: no line with this letter is right."""
 LETTERS = "XYZABCUVW"
 _FLOOD = 16384
 """More bytes than this without an answer are no controller."""
@@ -40,6 +42,9 @@ ALARMS = {
 }  # fmt: skip
 POSITION_KEPT = (2, 4, 5)
 """Alarms after which the position is still true; of all others, unknown ones too, it is not."""
+
+DEAF = (1, 2)
+"""Alarms after which the controller hears nothing but a reset, not even ``?``."""
 
 
 def alarm_text(number: int) -> str:
@@ -150,6 +155,16 @@ _HELLO = re.compile(rb"(?:^|\n)\s*(?:Grbl|GrblHAL|grblHAL|FluidNC)\b[^\r\n]*\[[^
 _ANGLE = re.compile(rb"<[^\r\n]*>\r?\n")
 
 
+def greets(lines: Iterable[str]) -> bool:
+    """Tell whether the controller has started anew, by its greeting among lines.
+
+    Example:
+        >>> greets(["", "Grbl 1.1h ['$' for help]"])
+        True
+    """
+    return any(_HELLO.search(line.encode() + b"\n") for line in lines)
+
+
 def command(line: str, timeout_s: float, *, repeatable: bool = False) -> Exchange:
     """Return the exchange of a line; its value is an :class:`Answer`.
 
@@ -162,11 +177,12 @@ def command(line: str, timeout_s: float, *, repeatable: bool = False) -> Exchang
     what = f"send {line!r}" if line else "ask for an ok"
 
     def want(reply: bytes) -> int | None:
-        if _HELLO.search(reply):
-            raise LinkError(f"{what}: the controller was reset meanwhile")
-        return _end_of(reply, _OK)
+        hello = _HELLO.search(reply)
+        return hello.end() if hello else _end_of(reply, _OK)
 
     def decode(reply: bytes) -> Answer:
+        if _HELLO.search(reply):
+            raise StateLost(f"{what}: the controller has started anew meanwhile")
         *before, last = lines_of(reply)
         if last == "ok":
             return Answer(tuple(before))

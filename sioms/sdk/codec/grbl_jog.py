@@ -6,6 +6,7 @@ Numbers are in the controller's units, mm or degrees; axes are indices into arra
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -14,6 +15,9 @@ from numpy.typing import NDArray
 from .grbl import jog
 
 PLANNER_BLOCKS = 15
+CHAIN_BLOCKS = 8
+"""Jogs of a chain that may be under way: the rest of the planner is left to moves. A full planner withholds its ok, and a line that
+waits there goes out after a cancel."""
 SHORTEST_S = 0.01
 """The planner wants at least this between two jogs of a chain."""
 
@@ -56,6 +60,8 @@ class JogChain:
         self._letters, self._rates, self._poll_hz = letters, rates, poll_hz
         self._end = np.zeros(len(letters))
         self._until_ns = 0
+        self._ways: deque[tuple[NDArray[np.float64], NDArray[np.float64]]] = deque()
+        """Jogs under way: where each begins and ends."""
 
     def start(self, axis: int, velocity: float, here: float) -> None:
         """Begin or change the velocity of an axis."""
@@ -66,10 +72,18 @@ class JogChain:
     def cut(self) -> None:
         """Note that the jogs that were sent ahead have been cancelled."""
         self._until_ns = 0
+        self._ways.clear()
 
     def restart(self, here: NDArray[np.float64]) -> None:
         """Go on from where the axes came to rest."""
         self._end, self._until_ns = here.copy(), 0
+        self._ways.clear()
+
+    def blocks(self, here: NDArray[np.float64]) -> int:
+        """Return how many of its jogs are under way yet, by where the axes are: not every controller tells."""
+        while self._ways and float((here - self._ways[0][1]) @ (self._ways[0][1] - self._ways[0][0])) >= 0:
+            self._ways.popleft()
+        return len(self._ways)
 
     def next(
         self, now_ns: int, low: NDArray[np.float64], high: NDArray[np.float64]
@@ -85,7 +99,7 @@ class JogChain:
         )
         begin_ns = max(self._until_ns, now_ns)
         duration_s = now_ns / 1e9 + ahead_s - begin_ns / 1e9
-        if duration_s < max(SHORTEST_S, ahead_s / (PLANNER_BLOCKS - 3)):
+        if duration_s < max(SHORTEST_S, ahead_s / (CHAIN_BLOCKS - 2)):
             return None
         targets = np.clip(self._end + self.wanted * duration_s, low, high)
         targets = np.where(self.wanted != 0, targets, self._end)
@@ -97,4 +111,5 @@ class JogChain:
 
     def sent(self, targets: NDArray[np.float64], until_ns: int) -> None:
         """Note that the controller has taken a jog."""
+        self._ways.append((self._end, targets))
         self._end, self._until_ns = targets, until_ns

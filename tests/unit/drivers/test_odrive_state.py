@@ -366,3 +366,18 @@ def test_a_restart_while_the_link_is_lost_is_noticed_by_the_opening() -> None:
     assert rig.unit.bank._queue.latched[0] & AxisStatus.POSITION_LOST
     assert axis.p["current_state"] == IDLE
     run(rig, 1.0)  # and is not told again
+
+
+def test_homing_turns_back_from_the_switch_and_holds() -> None:
+    axis = {"name": "x", "number": 0, "travel_per_turn": TURN, "force_max": 400.0, "homing": True, **LIMITS}
+    rig = Joined(Odrive, {"axis": [axis]}, lambda clock: odrive.Board(clock=clock))
+    rig.do(rig.unit.open())
+    rotor = rig.device.axes[0]
+    rig.device.handlers()["switch"]("-2")
+    rig.do(rig.unit.home(0))
+    watch = Farthest(rotor)
+    run(rig, 6.0, watch)
+    assert rotor.p["is_homed"] and rotor.p["current_state"] == CLOSED_LOOP
+    assert rotor.place == pytest.approx(-1.75, abs=0.02), "by the offset away from the switch"
+    assert rotor.position == pytest.approx(0.0, abs=0.02)
+    assert watch.low > -2.1 and watch.high < 0.01 and watch.speed < 2.5

@@ -1,0 +1,231 @@
+"""Grbl: what others and restarts leave in the controller, and a driver that reckons with it."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from drive_rig import Joined
+
+from sioms.drivers.grbl import Grbl
+from sioms.motion import ActionKind, DriveAction
+from sioms.motion.watch import Order
+from sioms.protocol.flags import AxisStatus
+from sioms.sdk.exchange import DeviceError, StateLost
+from sioms.tools.counterparts import grbl
+
+AXIS = {"name": "x", "letter": "X", "velocity_max": 0.1, "acceleration_max": 0.5}
+
+
+def board(*, homing: bool = False, factory: bool = False, **keys: Any) -> Joined:
+    axis = {**AXIS, "velocity_max": 0.008, "acceleration_max": 0.01} if factory else AXIS
+    return Joined(
+        Grbl,
+        {"axis": [axis], **keys},
+        lambda clock: grbl.Controller(1, homing=homing, factory=factory, clock=clock),
+    )
+
+
+def opened(**keys: Any) -> tuple[Joined, grbl.Controller]:
+    rig = board(**keys)
+    rig.do(rig.unit.open())
+    poll(rig, 3)
+    return rig, rig.device
+
+
+def poll(rig: Joined, times: int) -> None:
+    for _ in range(times):
+        rig.do(rig.unit.poll())
+        rig.wait(0.04)
+
+
+def lost(rig: Joined) -> bool:
+    return bool(rig.unit.bank._queue.latched[0] & AxisStatus.POSITION_LOST)
+
+
+def jog(rig: Joined, velocity: float) -> None:
+    rig.do(rig.unit.start_velocity(0, velocity, DriveAction(ActionKind.START, 0, None, 0.1, 0.5)))
+
+
+def test_a_full_planner_lets_a_line_wait_and_the_line_goes_out_after_a_cancel() -> None:
+    rig = board()
+    device = rig.device
+    said = b"".join(device.take(b"".join(b"$J=G91X%dF6000\n" % n for n in range(41, 48))))
+    said += b"".join(device.take(b"".join(b"$J=G91X%dF6000\n" % n for n in range(8, 15))))
+    said += b"".join(device.take(b"$J=G91X15F6000\n$J=G91X16F6000\n"))
+    assert said.count(b"ok") == 15 and len(device.planner.blocks) == 15
+    rig.wait(0.05)
+    device.take(b"\x85")
+    rig.wait(1.0)
+    assert device.planner.position[0] > 10, "the line that waited has gone out"
+
+
+def test_the_supply_off_is_place_0_and_a_reset_at_rest_keeps_it() -> None:
+    rig = board()
+    device = rig.device
+    device.take(b"$J=G91X10F6000\n")
+    rig.wait(1.0)
+    assert b"Grbl" in b"".join(device.take(b"\x18")) and device.planner.position == [10.0]
+    device.power_cycle("0.1")
+    assert device.take(b"?") == []
+    rig.wait(0.12)
+    assert device.planner.position == [0.0] and device.planner.slip == [10.0] and device.state == "Idle"
+
+
+def test_factory_settings_run_a_velocity_without_a_withheld_ok() -> None:
+    rig, device = opened(factory=True)
+    assert "Bf" not in device.report()
+    jog(rig, 0.008)
+    fullest, speeds = 0, []
+    for _ in range(80):
+        poll(rig, 1)
+        fullest = max(fullest, len(device.planner.blocks))
+        speeds.append(device.planner.speed)
+    assert 2 <= fullest <= 12
+    assert min(speeds[40:]) > 7.9, "without gaps"
+
+
+@pytest.mark.parametrize("delay_polls", [0, 3])
+def test_a_stopped_chain_of_a_slow_controller_does_not_start_again(delay_polls: int) -> None:
+    rig, device = opened(factory=True)
+    device.settings[110] = 60.0  # it runs at an eighth of what was believed
+    jog(rig, 0.008)
+    poll(rig, 60 + delay_polls)
+    assert len(device.planner.blocks) <= 12 and not device._lines
+    rig.do(rig.unit.halt(0, fastest=False))
+    poll(rig, 10)
+    place = device.planner.position[0]
+    poll(rig, 30)
+    assert device.planner.position[0] == place and device.state == "Idle"
+
+
+@pytest.mark.parametrize("stop", ["fault", "stop"])
+def test_a_jog_that_is_not_acknowledged_is_braked_with_its_place_kept(stop: str) -> None:
+    rig, device = opened()
+    heard = device.take
+    device.take = lambda data: [] if data.startswith(b"$J") and heard(data) is not None else heard(data)  # type: ignore[method-assign]
+    rig.sent.clear()
+    rig.unit._moves.asked[0] = (0.2, 0.1)  # as act() does, and the bank
+    rig.unit.bank._watch.order(0, Order.POINT, 0.2)
+    with pytest.raises(DeviceError, match="no reply"):
+        rig.do(rig.unit.start_position(0, 0.2, 0.1, DriveAction(ActionKind.START, 0, None, 0.1, 0.5)))
+    rig.wait(0.3)
+    assert device.planner.speed > 50
+    if stop == "fault":
+        rig.do(rig.unit.halt(0, fastest=True))
+    else:
+        rig.do(rig.unit.stop())
+    assert device.planner.speed == 0 and device.planner.slip == [0.0] and device.state == "Idle"
+    assert b"\x18" not in b"".join(rig.sent) and not lost(rig)
+
+
+def test_what_does_not_brake_is_reset_and_its_place_is_lost() -> None:
+    rig, device = opened()
+    device.foreign("velocity", "50")
+    poll(rig, 20)
+    heard = device.take
+    device.take = lambda data: heard(data.replace(b"\x85", b""))  # type: ignore[method-assign]
+    rig.do(rig.unit.halt(0, fastest=True))
+    assert device.state == "Alarm" and device.planner.speed == 0 and lost(rig)
+
+
+@pytest.mark.parametrize("wish", ["cancel", "reset"])
+def test_a_quick_stop_brakes_or_resets_as_configured(wish: str) -> None:
+    rig, device = opened(quick_stop=wish)
+    jog(rig, 0.1)
+    poll(rig, 20)
+    assert device.planner.speed > 90
+    rig.do(rig.unit.halt(0, fastest=True))
+    poll(rig, 2)
+    assert device.planner.speed == 0
+    assert (device.state, device.planner.slip[0] > 0, lost(rig)) == (
+        ("Idle", False, False) if wish == "cancel" else ("Alarm", True, True)
+    )
+
+
+@pytest.mark.parametrize("homing", [False, True])
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_restart_is_told_its_place_is_lost_and_nothing_goes_on(homing: bool, moving: bool) -> None:
+    rig, device = opened(homing=homing)
+    device.state = "Idle"
+    rig.do(rig.unit.start_velocity(0, 0.05, DriveAction(ActionKind.START, 0, None, 0.1, 0.5)))
+    poll(rig, 25)
+    if not moving:
+        rig.do(rig.unit.halt(0, fastest=True))
+    rig.wait(2.0)
+    device.power_cycle("0.02")
+    rig.wait(0.01)
+    said = b""
+    for _ in range(20):
+        rig.now_s += 0.002
+        said += b"".join(device.due())
+    rig.unit.overhear(said, rig.unit.clock())
+    with pytest.raises(StateLost, match="started anew"):
+        rig.do(rig.unit.poll())
+    assert lost(rig)
+    rig.do(rig.unit.open())
+    poll(rig, 20)
+    assert device.planner.position == [0.0] and device.state == ("Alarm" if homing else "Idle")
+    rig.unit.bank.reset(np.array([0]))
+    rig.do(rig.unit.reset(0))
+    poll(rig, 10)
+    assert device.planner.position == [0.0] and device.state == "Idle" and lost(rig)
+
+
+@pytest.mark.parametrize(
+    "left",
+    [
+        b"G91\nG20\nG92X5\n", b"$J=G91X500F6000\n", b"G91G1X500F600\n", b"!", b"$C\n", b"$J=G91X50F6000", b"$110=1",
+        b"$SLP\n", b"\x84",
+    ],
+)  # fmt: skip
+def test_what_another_sender_left_is_ended_by_the_opening(left: bytes) -> None:
+    rig = board()
+    device = rig.device
+    device.take(left)
+    rig.wait(0.2)
+    rig.do(rig.unit.open())
+    assert device.planner.speed == 0 and device.state == ("Alarm" if b"SLP" in left else "Idle")
+    assert device.parser.modes() == "G0 G21 G90" and device.settings[110] == 6000
+    place = device.planner.position[0]
+    poll(rig, 20)
+    assert device.planner.position[0] == place and not device.planner.slip[0]
+
+
+@pytest.mark.parametrize("alarm", [1, 2])
+def test_an_alarm_that_leaves_the_controller_deaf_is_ended_by_opening_and_reset(alarm: int) -> None:
+    rig, device = opened()
+    device.crash(alarm)
+    device.due()
+    rig.do(rig.unit.reset(0))
+    assert device.state == "Idle"
+    device.crash(alarm)
+    device.due()
+    rig.do(rig.unit.open())
+    assert device.state == "Alarm" and not device._deaf
+
+
+def test_a_quick_stop_that_is_not_obeyed_is_sent_again() -> None:
+    rig, device = opened()
+    rig.do(rig.unit.halt(0, fastest=True))
+    device.foreign("velocity", "50")
+    poll(rig, 5)
+    assert device.planner.speed > 40
+    rig.do(rig.unit.halt(0, fastest=True))
+    assert device.planner.speed == 0
+
+
+def test_the_example_of_its_page_fits_a_controller_as_it_ships() -> None:
+    page = (Path(__file__).parents[3] / "docs/drivers/grbl.md").read_text()
+    text = "\n".join(line[4:] for line in page.splitlines() if line.startswith("    "))
+    table = tomllib.loads(text)["device"]["mod0"]
+    table.pop("driver"), table.pop("line")
+    rig = Joined(Grbl, table, lambda clock: grbl.Controller(3, homing=False, factory=True, clock=clock))
+    rig.do(rig.unit.open())
+    poll(rig, 3)
+    jog(rig, -0.008)
+    poll(rig, 25)
+    assert rig.device.planner.speed == pytest.approx(8.0)
