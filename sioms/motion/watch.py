@@ -312,10 +312,8 @@ class MotionWatch:
         return state.aways > 1
 
     def _fast_text(self, axis: int, velocity: float) -> str:
-        unit = self._settings[axis].unit
-        return (
-            f"it moves at {velocity:.4g} {unit}/s; velocity_max is {float(self._velocity[axis]):.4g} {unit}/s"
-        )
+        name, unit, most = self._settings[axis].name, self._settings[axis].unit, float(self._velocity[axis])
+        return f"axis {name} moves at {velocity:.4g} {unit}/s; velocity_max is {most:.4g} {unit}/s"
 
     def _away_text(self, axis: int, state: _State, velocity: float) -> str:
         name, unit = self._settings[axis].name, self._settings[axis].unit

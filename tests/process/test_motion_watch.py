@@ -95,7 +95,7 @@ def test_a_place_that_is_lost_takes_no_positions_until_it_is_found(
     cell = wire.serve(SLIDE)
     wire.wait_up("slide0")
     with cell.open("slide0", "rw") as axis:
-        axis.move(0.05, max_velocity=0.1, timeout=1.0)
+        axis.move(0.05, timeout=1.0)
         axis.wait_until_idle(5.0)
         wire.tell("power_cycle 0.3")
         wait_for(

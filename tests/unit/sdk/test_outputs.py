@@ -172,3 +172,12 @@ def test_only_outputs_with_a_safe_value_have_one() -> None:
     assert safe_of(BlockSpec("", NodeClass.BINARY, (port,), writable=True, safe=(None,)), 0) is None
     assert safe_of(BlockSpec("", NodeClass.BINARY, (port,), writable=True), 0) is None
     assert safe_of(BlockSpec("", NodeClass.BINARY, (port,)), 0) is None
+
+
+def test_a_reading_from_before_the_safe_value_confirms_nothing(rig: Rig) -> None:
+    rig.want()
+    mark = rig.outputs.mark()
+    rig.send_safe()
+    rig.block.set(0, 3, 1)  # what it read before: the write of something else may have been under way
+    rig.outputs.read(rig.block, mark, lambda channel: False)
+    assert rig.outputs.unconfirmed(rig.block)
