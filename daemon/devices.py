@@ -79,6 +79,7 @@ class DriverProcess:
         self.info = info
         self.state = State.DOWN
         self.reason = ""
+        self.trouble = ""
         self.link: tuple[PageState, str] = (PageState.STARTING, "")
         self.generation = 0
         self.pid = 0

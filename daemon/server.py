@@ -63,6 +63,7 @@ class Server:
         self._watched_inputs: dict[str, dict[int, str]] = {}
         self._alarms: dict[str, list[list[Any]]] = {}
         self._leaving: dict[str, DriverProcess] = {}
+        self.node_stops: dict[str, str] = {}
         self._loader: Loader | None = None
         self._manager = ServiceManager()
         self._told_ready = False
@@ -143,7 +144,9 @@ class Server:
         self._request_seen = self.shared.request.mark
         self.shared.latch.reset(self._request_seen)
         self.log("info", "reset", by=who)
+        self.node_stops.clear()
         for device in self.devices.values():
+            device.trouble = ""
             device.tell(DriverVerb.STOP_CHANGED)
             device.reset()
         for device in self.devices.values():
@@ -162,6 +165,7 @@ class Server:
 
     def device_gone(self, device: DriverProcess, reason: str) -> None:
         """Void the handles of a process that is no more, and stop what is tied to it."""
+        device.trouble = ""
         self.clients.nodes.device_gone(device, reason)
         if device.state is not State.DOWN and device.device.common.on_loss == "stop":
             self.stop_workcell(f"device {device.name} lost: {reason}")
@@ -209,6 +213,8 @@ class Server:
                 if not good:
                     self._look_at_stop_inputs(device)
             case DriverVerb.LOG:
+                if str(arguments[1]).startswith("fault of "):
+                    device.trouble = str(arguments[1])
                 self.log(str(arguments[0]), "driver", device=device.name, text=arguments[1])
             case _:
                 device.kill(f"its driver sent {verb.name}, which is not for a driver to send")

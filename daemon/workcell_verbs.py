@@ -62,10 +62,11 @@ class WorkcellVerbs:
                     "name": d.name, "driver": d.info.driver, "state": d.state.value, "pid": d.pid,
                     "generation": d.generation, "reason": d.reason, "link": d.link[0].name.lower(),
                     "link_reason": d.link[1], "tick_hz": d.info.tick_hz, "deaths": len(d.restarts.deaths_ns),
-                    "age_s": (now - d.started_ns) / 1e9 if d.started_ns else 0.0,
+                    "trouble": d.trouble, "age_s": (now - d.started_ns) / 1e9 if d.started_ns else 0.0,
                 }
                 for d in server.devices.values()
             ],
+            "node_stops": [[node, source] for node, source in server.node_stops.items()],
             "sessions": [[str(s), len(s.handles), len(s.waits), self._clients.markers.count(s)] for s in self._clients.sessions],
             "holders": [[h.node.name, str(h.session), (now - h.since_ns) / 1e9] for h in self._clients.nodes.holders()],
         }  # fmt: skip
@@ -87,6 +88,7 @@ class WorkcellVerbs:
                 errno.EPERM, f"emergency stop of {name}: {session.peer.user} has no right to stop it"
             )
         self._to_device(node, DriverVerb.NODE_STOP, source)
+        self._server.node_stops[node.name] = source
         self._server.log("warning", "emergency stop", node=name, source=source)
 
     def reset(self, session: Session, name: str) -> None:
@@ -104,6 +106,7 @@ class WorkcellVerbs:
         device = self._server.devices.get(node.device)
         if device is not None and device.state is State.FAULT:
             device.reset()
+            self._server.log("info", "reset", node=node.name, device=device.name, by=session)
             return
         latch = self._server.shared.latch
         if latch.stopped_ns:
@@ -111,6 +114,10 @@ class WorkcellVerbs:
                 errno.EPERM, f"reset {name}: the whole workcell is stopped ({latch.source}); reset that"
             )
         self._to_device(node, DriverVerb.NODE_RESET, str(session))
+        self._server.node_stops.pop(node.name, None)
+        if device is not None:
+            device.trouble = ""
+        self._server.log("info", "reset", node=node.name, by=session)
 
     def _to_device(self, node: Node, verb: DriverVerb, text: str) -> None:
         device = self._server.devices.get(node.device)

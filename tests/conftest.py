@@ -27,6 +27,10 @@ settings.register_profile("search", deadline=None, suppress_health_check=[Health
 settings.register_profile("sioms", settings.get_profile("search"), derandomize=True)
 settings.load_profile("sioms")
 
+# A suite in the background of a non-interactive shell is started with SIGINT ignored, and its children would inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 MARKERS = {
     "slow": "takes more than five seconds",
     "root": "needs the rights of root; skipped without",

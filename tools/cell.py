@@ -68,11 +68,11 @@ def run(args: argparse.Namespace) -> int:
             return _list(args.verbose, args.names, args.json)
         case "info":
             with Workcell(name="sioms") as cell:
-                info = cell.info(args.node)
+                info, status = cell.info(args.node), cell.status()
             if args.json:
                 print_json(info_fields(info))
             else:
-                print("\n".join(describe(info)))
+                print("\n".join(describe(info) + troubles(status, info.device, info.name)))
         case "status":
             with Workcell(name="sioms") as cell:
                 status = cell.status()
@@ -196,7 +196,7 @@ def _list(verbose: bool, names_only: bool, as_json: bool) -> int:
             return 0
         return 0
     with Workcell(name="sioms") as cell:
-        entries = cell.nodes()
+        entries, status = cell.nodes(), cell.status()
     shown = entries if verbose else [entry for entry in entries if not is_part(entry, entries)]
     if as_json:
         print_json([entry_fields(entry) for entry in shown])
@@ -206,8 +206,37 @@ def _list(verbose: bool, names_only: bool, as_json: bool) -> int:
          e.state, e.holder)
         for e in shown
     ]  # fmt: skip
-    print("\n".join(table(("node", "class", "channels", "access", "device", "state", "held by"), rows)))
+    print(
+        "\n".join(
+            table(("node", "class", "channels", "access", "device", "state", "held by"), rows)
+            + troubles(status)
+        )
+    )
     return 0
+
+
+def troubles(status: dict[str, Any], device: str = "", node: str = "") -> list[str]:
+    """Return what is stopped or in fault, by whom or why, and which command clears it; of one node's device, or of all."""
+    lines = []
+    if status["stopped_ns"]:
+        lines.append(f"EMERGENCY STOP by {status['stop_source']}; `sioms reset` clears it")
+    for name, source in status["node_stops"]:
+        if not node or _touch(name, node):
+            lines.append(f"{name}: emergency stop by {source}; `sioms reset {name}` clears it")
+    for each in status["devices"]:
+        if device not in ("", each["name"]):
+            continue
+        if each["state"] == "fault":
+            lines.append(f"{each['name']}: device in fault: {each['reason']}; `sioms reset` tries it again")
+        elif each["trouble"]:
+            lines.append(f"{each['name']}: {each['trouble']}; `sioms reset {node or each['name']}` clears it")
+    return ["", *lines] if lines else []
+
+
+def _touch(one: str, other: str) -> bool:
+    """Tell whether of two nodes one is the other or a part of it."""
+    one, other = one.removesuffix(READONLY), other.removesuffix(READONLY)
+    return one == other or one.startswith(other + ".") or other.startswith(one + ".")
 
 
 def is_part(entry: NodeEntry, entries: Iterable[NodeEntry]) -> bool:
@@ -266,11 +295,12 @@ def status_lines(status: dict[str, Any], now_ns: int) -> list[str]:
         )
     rows = [
         (d["name"], d["driver"], d["state"], d["link"], str(d["pid"] or ""), f"{d['tick_hz']:g} Hz", f"{d['age_s']:.0f} s",
-         str(d["deaths"]), d["reason"] or d["link_reason"])
+         str(d["deaths"]), d["reason"] or d["link_reason"] or d["trouble"])
         for d in status["devices"]
     ]  # fmt: skip
     head = ("device", "driver", "state", "link", "pid", "rate", "up for", "deaths", "why")
     lines += ["", *table(head, rows), ""]
+    lines += [f"{line}" for line in troubles({**status, "stopped_ns": 0})[1:]]
     holders = [(name, who, f"{held_s:.1f} s") for name, who, held_s in status["holders"]]
     sessions = [
         (who, str(handles), str(waits), str(markers)) for who, handles, waits, markers in status["sessions"]

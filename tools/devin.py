@@ -11,14 +11,17 @@ from time import monotonic_ns, sleep
 from sioms.client.workcell import Workcell
 
 from .options import Line, UsageError, fold
-from .pipe import open_node, run, write_all
+from .pipe import complain, open_node, run, write_all
 from .rows import Rows
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from typing import Any
 
 DEFAULT_COUNT = 100
+LOOK_S = 0.01
+"""How often a recording looks for new readings [s]; the page keeps more than come meanwhile."""
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -40,6 +43,9 @@ def _work(words: Sequence[str]) -> None:
     cell = Workcell(name="devin")
     # A reader never stands in anybody's way: it takes the read-only companion of an output.
     nodes = [open_node(cell, target.name, "r", companion=True) for target in line.targets]
+    if "record" in line.common:
+        _record(line, nodes)
+        return
     rows = [Rows(t, n.info, timed, digits) for t, n in zip(line.targets, nodes, strict=True)]
     pairs = list(zip(rows, nodes, strict=True))
 
@@ -51,6 +57,45 @@ def _work(words: Sequence[str]) -> None:
         return
     numbered = "N" in line.trailing or any("N" in target.flags for target in line.targets)
     repeat(sample, line.common.get("t", 1.0), int(line.common.get("L", DEFAULT_COUNT)), numbered)
+
+
+def _record(line: Line, nodes: Sequence[Any]) -> None:
+    """Print a table of readings, each once, with the stamps that the driver gave them."""
+    from .recording import Table
+
+    if len(nodes) != 1:
+        raise UsageError("--record takes one device: stamps of several are not alike; run one devin for each")
+    target, node = line.targets[0], nodes[0]
+    other = [key for key in target.flags if key not in "lhn"]
+    if other:
+        raise UsageError(f"-{other[0]}: --record prints everything; choose structures by -l, -h and -n")
+    digits = int(line.common["digits"]) if "digits" in line.common else None
+    table = Table(node.info, target.channels(len(node.info.channels)), digits)
+    count, period_s = int(line.common.get("L", DEFAULT_COUNT)), line.common.get("t", 0.0)
+    write_all(table.head.encode())
+    seen = node.read().number
+    printed = lost = 0
+    due_ns = monotonic_ns()
+    while printed != count:
+        fresh = node.history(seen)
+        if fresh and seen:
+            lost += fresh[0].number - seen - 1
+        if period_s and fresh:
+            del fresh[:-1]
+        if fresh:
+            seen = fresh[-1].number
+            del fresh[count - printed if count >= 0 else len(fresh) :]
+            write_all("".join([table.row(snapshot) for snapshot in fresh]).encode())
+            printed += len(fresh)
+        due_ns = max(due_ns + int((period_s or LOOK_S) * 1e9), monotonic_ns() - 1)
+        if printed != count:
+            sleep(max(0.0, (due_ns - monotonic_ns()) / 1e9))
+    if lost and not period_s:
+        complain(
+            "devin",
+            f"{lost} readings are missing in the table: they were overwritten before they were read",
+            0,
+        )
 
 
 def _check_trailing(line: Line, timed: bool) -> None:

@@ -40,6 +40,10 @@ def _work(words: Sequence[str]) -> None:
         raise UsageError(
             f"-{next(iter(line.trailing))} holds for the device that follows it, and none follows"
         )
+    if "H" in line.common and "lease" in line.common:
+        raise UsageError(
+            "-H and --lease exclude each other: one goes on without rows, the other ends without them"
+        )
     tokens = Tokens("skip-bad-lines" in line.common)
     if line.numbers:
         tokens.feed((" ".join(line.numbers) + " ").encode())
@@ -48,20 +52,37 @@ def _work(words: Sequence[str]) -> None:
     cell = Workcell(name="devout")
     nodes = [open_node(cell, t.name, "rw", lease_s=line.common.get("lease", 0.0)) for t in line.targets]
     columns = [Columns(t, n.info) for t, n in zip(line.targets, nodes, strict=True)]
+    repeats = "r" in line.common or "L" in line.common
+    count = int(line.common.get("L", DEFAULT_COUNT)) if repeats else 1
+    width = sum(c.count for c in columns)
+    if 0 <= count * width < len(line.numbers):
+        for node in nodes:
+            node.close()
+        raise UsageError(
+            f"{len(line.numbers)} numbers; {'an iteration takes' if count == 1 else f'{count} iterations take'} "
+            f"{count * width}, and more would be lost; -r writes several one after the other"
+        )
     writer = Writer(cell, [Stream(node) for node in nodes], columns, tokens)
     try:
-        _iterate(line, writer)
+        _iterate(line, writer, count)
+        if "H" in line.common:
+            writer.hold()
     except BadInput as bad:
         raise OSError(errno.EINVAL, f"{bad}; stopped after {writer.iterations} complete iterations") from None
     finally:
         # Each close answers when the axes of the node are halting and it is free for the next.
         for node in nodes:
             node.close()
+    outputs = [t.name for t, c in zip(line.targets, columns, strict=True) if not c.is_axis]
+    if outputs and line.numbers and count == 1 and "H" not in line.common:
+        complain(
+            "devout",
+            f"{', '.join(outputs)}: safe again now that devout ends; -H holds what was written",
+            0,
+        )
 
 
-def _iterate(line: Line, writer: Writer) -> None:
-    repeats = "r" in line.common or "L" in line.common
-    count = int(line.common.get("L", DEFAULT_COUNT)) if repeats else 1
+def _iterate(line: Line, writer: Writer, count: int) -> None:
     wait = "w" in line.common
     if wait and not all(c.has_end for c in writer.columns if c.is_axis):
         raise UsageError(
@@ -145,6 +166,18 @@ class Writer:
         """Wait until everything written is acknowledged."""
         for stream in self._streams:
             stream.drain()
+
+    def hold(self) -> None:
+        """Keep the devices, and with them outputs and motions, until a signal ends us, or until one of them is lost."""
+        self.drain()
+        poller = poll()
+        for fd in (self._cell.fileno(), *[stream.fileno() for stream in self._streams]):
+            poller.register(fd, POLLIN)
+        while True:
+            poller.poll()
+            self._cell.status()  # raises what ended it
+            for stream in self._streams:
+                stream.settle()
 
     def wait_until_idle(self) -> None:
         """Wait until the axes stand still, except those whose motion has no end."""

@@ -7,6 +7,7 @@ A module of commands has ``add_parser(subparsers)``, which adds one or more of t
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import signal
 import sys
@@ -48,7 +49,9 @@ DESCRIPTION = "The devices of a workcell behind one small interface. `sioms COMM
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run a command; return its exit status."""
-    words = sys.argv[1:] if words is None else words
+    if as_program := words is None:
+        words = sys.argv[1:]
+        _begin()
     parser = argparse.ArgumentParser(prog="sioms", description=DESCRIPTION)
     parser.add_argument("--version", action="store_true", help="print the version and exit")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required="--version" not in words)
@@ -61,12 +64,36 @@ def main(words: Sequence[str] | None = None) -> int:
     else:
         for name, command in there.items():
             subparsers.add_parser(name, help=command.text)
-    args = parser.parse_args(words)
+    args, rest = parser.parse_known_args(words)
+    if rest:
+        _innermost(parser, words).error(f"unrecognized arguments: {' '.join(rest)}")
     if args.version:
         from .manual import answer
 
         return answer("sioms", "version")
+    if as_program and signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        signal.signal(
+            signal.SIGINT, signal.default_int_handler
+        )  # the command may have something to put in order
     return _guarded(wanted, module, args)
+
+
+def _begin() -> None:
+    """Be a program: an interrupt while modules are imported is the end and no traceback, a closed output an error."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if sys.stdout is None:  # what is printed fails then, and commands that print nothing work
+        sys.stdout = open(os.open(os.devnull, os.O_RDONLY), "w", encoding="utf-8")  # noqa: SIM115
+
+
+def _innermost(parser: argparse.ArgumentParser, words: Sequence[str]) -> argparse.ArgumentParser:
+    """Return the parser of the innermost command that the words name, whose usage helps."""
+    for word in words:
+        for action in parser._actions:
+            if isinstance(action, argparse._SubParsersAction) and word in action.choices:
+                parser = action.choices[word]
+                break
+    return parser
 
 
 def installed() -> dict[str, Command]:
@@ -95,6 +122,10 @@ def _guarded(name: str, module: Any, args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
     except OSError as error:
+        if error.errno == errno.EBADF and not error.filename:
+            error.strerror = f"write standard output: {(error.strerror or '').lower()}"
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # nothing is flushed at exit
         text = error.strerror or str(error)
         where = f": {error.filename}" if error.filename else ""
         print(f"sioms {name}: {text}{where}", file=sys.stderr)

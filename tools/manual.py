@@ -45,6 +45,9 @@ MANUALS: dict[str, Manual] = {
             "out and does not count. With -N anywhere, each sample is a line that begins with the time since the "
             "first sample in seconds and the number of the sample on the schedule. On a busy machine a steady period wants "
             "real-time priority, for those who may: chrt -f 1 devin ...",
+            "--record makes a table for programs: one line of names with units, then one line for each reading that the "
+            "driver publishes, none twice, with the driver's own time stamp. What it writes of an axis is read by "
+            "`sioms reconcile axis` as it is.",
             "Reading disturbs nobody: an output node is read through its read-only companion, also while another "
             "program owns it. A device that is lost, hung or in fault ends devin with an error; old data are never "
             "printed as new.",
@@ -55,6 +58,7 @@ MANUALS: dict[str, Manual] = {
             ("a bare number", "devin -p atod0"),
             ("position of axis 0, with its number", "devin -n0pN mod0"),
             ("velocities of axes 1 to 3", "devin -l1h3v mod0"),
+            ("record ten seconds of an axis at 1 kHz", "devin --record -L10000 mod0.xaxis > run.csv"),
             (
                 "a damper: 500 samples at 20 Hz into a velocity",
                 "devin -t0.05 -n0 -L500 lord1 | devout -rv -L-1 -W mod0.xaxis",
@@ -77,6 +81,9 @@ MANUALS: dict[str, Manual] = {
             "At the end of the input devout waits until the axes stand still, except for motion that has no end (a "
             "velocity, acceleration, jerk or force without a time), and then closes the devices. Closing halts the "
             "axes; so does the end of devout for whatever reason, SIGKILL included.",
+            "Outputs of analog and binary devices go to their safe values when the device is closed, as at every end of "
+            "devout: `devout gripper0 1` closes a gripper for a moment only. With -H devout stays at the end of the "
+            "input and holds outputs and motions until it is interrupted or killed.",
             "With --lease=# the drivers halt the axes when no row has come for that time, be it that the program before "
             "devout in the pipe hangs or devout itself.",
             "A word that is no finite number stops devout with an error that names line and word, because in a stream "
@@ -86,7 +93,8 @@ MANUALS: dict[str, Manual] = {
         ],
         [
             ("move an axis and wait", "devout mod0.xaxis 0.1"),
-            ("close the gripper", "devout gripper0 1"),
+            ("close the gripper and hold it until Ctrl-C", "devout -H gripper0 1"),
+            ("hold it while something else is done", "devout -H gripper0 1 & sleep 5; kill $!"),
             ("pieces of velocity and time from a file", "devout -rvt -L-1 mod0.xaxis < pieces.txt"),
             ("move, then signal a marker", "devout -ps mod0.xaxis 0.2 $(smarkers -r)"),
         ],

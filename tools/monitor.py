@@ -39,6 +39,8 @@ _INK = {
     Style.PLAIN: "", Style.HEAD: "\x1b[1m", Style.DIM: "\x1b[2m", Style.GOOD: "\x1b[32m", Style.WARN: "\x1b[33m",
     Style.ALARM: "\x1b[1;37;41m",
 }  # fmt: skip
+_PLAIN_INK = {**dict.fromkeys(Style, ""), Style.HEAD: "\x1b[1m", Style.ALARM: "\x1b[1;7m"}
+"""Without colours, as $NO_COLOR asks for: what must be seen is bold and reversed."""
 _ENTER, _LEAVE = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"
 _SCROLL = {"\x1b[A": -1, "k": -1, "\x1b[B": 1, "j": 1, "\x1b[5~": -10, "\x1b[6~": 10}
 
@@ -52,6 +54,10 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Watch until q is pressed, or print one picture; return the exit status."""
     watch = Watch(args.nodes)
+    if args.nodes:
+        watch.ask()
+        if watch.cell is not None and (unknown := watch.unknown()):
+            raise OSError(errno.ENOENT, f"no such node: {', '.join(unknown)}; `sioms list -v` lists all")
     if not sys.stdout.isatty() or not sys.stdin.isatty():
         watch.ask()
         if watch.cell is None:
@@ -115,6 +121,10 @@ class Watch:
             if error.errno != errno.ETIMEDOUT and self.cell is not None:
                 self.cell.close()
                 self.cell = None
+
+    def unknown(self) -> list[str]:
+        """Return the names that were asked for and that no node has."""
+        return [name for name in self._only if name not in {entry.name for entry in self._entries}]
 
     def _open(self, cell: Workcell) -> None:
         """Open what is not open, or not any more; the daemon's death ends it all."""
@@ -291,7 +301,8 @@ def _jog_keys(typed: str) -> list[str]:
 
 def _paint(lines: list[Text]) -> None:
     # Each line is cleared behind its end, not the screen before it: no flicker.
-    out = "\r\n".join([f"{_INK[line.style]}{line.text}\x1b[0m\x1b[K" for line in lines])
+    ink = _PLAIN_INK if os.environ.get("NO_COLOR") else _INK
+    out = "\r\n".join([f"{ink[line.style]}{line.text}\x1b[0m\x1b[K" for line in lines])
     sys.stdout.write(f"\x1b[H{out}\x1b[J")
     sys.stdout.flush()
 
@@ -300,13 +311,31 @@ def _paint(lines: list[Text]) -> None:
 def _terminal() -> Iterator[None]:
     """Take the terminal: keys at once and unechoed, another screen; give it back whatever happens."""
     before = termios.tcgetattr(0)
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda got, _: sys.exit(128 + got))
-    tty.setcbreak(0)
-    sys.stdout.write(_ENTER)
-    try:
-        yield
-    finally:
+
+    def take() -> None:
+        tty.setcbreak(0)
+        sys.stdout.write(_ENTER)
+        sys.stdout.flush()
+
+    def give_back() -> None:
         sys.stdout.write(_LEAVE)
         sys.stdout.flush()
         termios.tcsetattr(0, termios.TCSADRAIN, before)
+
+    def suspend(number: int, _frame: object) -> None:
+        """Give the terminal back, stop as the shell expects, take it again when we are let go on."""
+        give_back()
+        signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+        os.kill(os.getpid(), number)
+        signal.signal(signal.SIGTSTP, suspend)
+        take()
+
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda got, _: sys.exit(128 + got))
+    signal.signal(signal.SIGTSTP, suspend)
+    take()
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+        give_back()

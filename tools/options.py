@@ -71,6 +71,8 @@ TOOLS: dict[str, list[Option]] = {
         Option("r", "repeat", "", ALL, "timed output, one sample a second"),
         Option("t", "period", SECONDS, ALL, "timed output, one sample every SECONDS"),
         Option("L", "count", COUNT, ALL, "timed output of COUNT samples, 100 unless told; -1: no end"),
+        Option("", "record", "", ALL, "a table of every reading, COUNT of them, for programs: a line of names with units, then "
+               "time stamps of the readings and values, parted by tabs; with -t one reading every SECONDS"),
         Option("", "digits", DIGITS, ALL, "digits after the point, instead of 4 (position, velocity) and 2 (others)"),
     ],
     "devout": [
@@ -89,6 +91,7 @@ TOOLS: dict[str, list[Option]] = {
         Option("L", "count", COUNT, ALL, "repeat COUNT times; -1: to the end of the input"),
         Option("w", "wait", "", ALL, "wait for the axes after each iteration"),
         Option("W", "no-wait", "", ALL, "do not wait for the axes at the end of the input"),
+        Option("H", "hold", "", ALL, "at the end of the input go on holding outputs and motions until devout is interrupted"),
         Option("", "lease", SECONDS, ALL, "halt the axes and end when no row has come for SECONDS, also when devout hangs"),
         Option("", "skip-bad-lines", "", ALL, "leave out a line that holds anything but numbers, instead of stopping there"),
     ],
@@ -100,12 +103,14 @@ TOOLS: dict[str, list[Option]] = {
         Option("w", "wait", "", NODE, "wait until the axes are idle"),
         Option("c", "calibrate", "", NODE, "give the axes new positions, one number an axis, without motion"),
         Option("g", "gains", "", NODE, "set the gain matrix of a tactile array: n*n numbers, row by row"),
+        Option("t", "timeout", SECONDS, ALL, "-w waits at most SECONDS, and fails then"),
     ],
     "smarkers": [
         Option("r", "reserve", "", ALL, "reserve a marker, or as many as the number after it says; print their tokens"),
         Option("f", "free", "", ALL, "free the markers; wants their tokens"),
         Option("s", "signal", "", ALL, "signal the markers; wants their tokens"),
         Option("w", "wait", "", ALL, "wait for the markers, one after the other; a number without key is enough"),
+        Option("t", "timeout", SECONDS, ALL, "-w waits at most SECONDS for all of them together, and fails then"),
     ],
 }  # fmt: skip
 

@@ -17,7 +17,8 @@ Column description (``columns.toml`` beside the data, or ``--columns``)::
     feedforward    = { name = "ff",   unit = "N" }       # the part of force that is no feedback, a test signal for instance
     external       = { name = "push", unit = "N" }       # known force on the axis beside the drive's
 
-A column that the data do not have, or a key that nobody reads, is an error; a file may be without the last two when another
+Files whose heads are these very names, each with its unit (``position [m]``), need no description; ``devin --record`` writes
+such. A column that the data do not have, or a key that nobody reads, is an error; a file may be without the last two when another
 has them.
 """
 
@@ -106,6 +107,8 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
         files = _files(data)
         if not files:
             raise BadInputError(f"read {data}: no data files; expects one of {', '.join(SUFFIXES)}")
+        if columns is None and (plain := _plain(files)) is not None:
+            return Session(tuple(_record(f, plain, model) for f in files), True, (), None)
         raise BadInputError(
             f"read {data}: no column description (or give --columns): {_draft(files, description)}"
         )
@@ -209,6 +212,18 @@ def _per_count(where: str, spec: Mapping[str, Any], scale: float, model: AxisMod
             f"{where}: it is in counts, and the model states no resolution; give resolution = ... in [axis]"
         )
     return 1.0 if itself else model.resolution
+
+
+def _plain(files: Sequence[Path]) -> dict[str, Any] | None:
+    """Return the columns of files that need no description: each quantity under its own name, with its unit in the head.
+
+    ``devin --record`` writes such files. None where the first is none.
+    """
+    table = load_table(files[0])
+    stated = {name: unit for head in table.columns for name, unit in [named(head)] if unit is not None}
+    if not {"time", "position", "force"} <= stated.keys():
+        return None
+    return {quantity: {"name": quantity} for quantity in QUANTITIES if quantity in stated}
 
 
 def _draft(files: Sequence[Path], description: Path) -> str:

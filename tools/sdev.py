@@ -42,7 +42,9 @@ def _work(words: Sequence[str]) -> None:
         return
     cell = Workcell(name="sdev")
     _stop(cell, line)
-    Setter(cell, numbers, bool(line.numbers)).carry_out(
+    if "t" in line.common and not any("w" in target.flags for target in line.targets):
+        raise UsageError("-t is for -w, and there is none")
+    Setter(cell, numbers, bool(line.numbers), line.common.get("t")).carry_out(
         [Target(t.name, {key: 0 for key in t.flags if key != "e"}) for t in line.targets]
     )
 
@@ -74,12 +76,14 @@ class Setter:
         cell: the connection.
         numbers: those of the command line; more are read from standard input when they are needed.
         given: whether there were any on the command line: then none may be left over.
+        timeout_s: how long -w waits [s]; None: for ever.
     """
 
-    def __init__(self, cell: Workcell, numbers: Tokens, given: bool) -> None:
+    def __init__(self, cell: Workcell, numbers: Tokens, given: bool, timeout_s: float | None = None) -> None:
         self._cell = cell
         self._numbers = numbers
         self._given = given
+        self._timeout_s = timeout_s
 
     def carry_out(self, targets: list[Target]) -> None:
         """Open what is needed, check the numbers, then act.
@@ -134,7 +138,7 @@ class Setter:
             case "z":
                 node.zero()
             case "w":
-                node.wait_until_idle()
+                node.wait_until_idle(self._timeout_s)
             case "c":
                 node.calibrate(*numbers)
             case "g":

@@ -6,6 +6,8 @@ Decisions where the text leaves a choice are in docs/pipe-tools.md.
 
 from __future__ import annotations
 
+from time import monotonic
+
 from sioms.client.workcell import Workcell
 
 from .options import FLAG, NAME, UsageError, scan
@@ -24,7 +26,9 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def _work(words: Sequence[str]) -> None:
-    actions, numbers = _read(words)
+    actions, numbers, timeout_s = _read(words)
+    if timeout_s is not None and "w" not in actions:
+        raise UsageError("-t is for -w, and there is none")
     if actions == ["r"]:
         if len(numbers) > 1:
             raise UsageError(f"-r takes one number, how many markers; {len(numbers)} are given")
@@ -37,21 +41,27 @@ def _work(words: Sequence[str]) -> None:
     if not numbers:
         raise UsageError(f"-{actions[0]}: no marker named")
     cell = Workcell(name="smarkers")
+    deadline = None if timeout_s is None else monotonic() + timeout_s
     act: dict[str, Callable[[int], object]] = {
         "f": cell.free_marker,
         "s": cell.signal_marker,
-        "w": cell.wait_marker,
+        "w": lambda token: cell.wait_marker(
+            token, None if deadline is None else max(0.0, round(deadline - monotonic(), 3))
+        ),
     }
     for action in actions:
         for token in numbers:
             act[action](token)
 
 
-def _read(words: Sequence[str]) -> tuple[list[str], list[int]]:
+def _read(words: Sequence[str]) -> tuple[list[str], list[int], float | None]:
     actions: list[str] = []
     numbers: list[int] = []
+    timeout_s: float | None = None
     for item in scan("smarkers", words):
-        if item.kind == FLAG:
+        if item.kind == FLAG and item.text == "t":
+            timeout_s = item.value
+        elif item.kind == FLAG:
             actions.append(item.text)
         elif (
             item.kind == NAME or not item.text.isascii() or not item.text.isdigit() or int(item.text) > _MOST
@@ -59,4 +69,4 @@ def _read(words: Sequence[str]) -> tuple[list[str], list[int]]:
             raise UsageError(f"{item.text}: want a marker, a whole number as smarkers -r prints it")
         else:
             numbers.append(int(item.text))
-    return actions, numbers
+    return actions, numbers, timeout_s

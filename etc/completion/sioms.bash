@@ -3,10 +3,10 @@ _sioms_nodes() { sioms list --names 2>/dev/null; }
 _sioms_tool() {
     local word=${COMP_WORDS[COMP_CWORD]} options=""
     case $1 in
-    devin) options='-p -v -f -m -N -V -l -h -n -r -t -L --position --velocity --force --moving --lines --verbose --from= --to= --only= --repeat --period= --count= --digits= --help --version' ;;
-    devout) options='-p -v -a -j -f -F -o -t -m -s -l -h -n -r -L -w -W --position --velocity --acceleration --jerk --force --force-velocity --force-offset --time --wait-marker --signal-marker --from= --to= --only= --repeat --count= --wait --no-wait --lease= --skip-bad-lines --help --version' ;;
-    sdev) options='-z -s -e -w -c -g --zero --synch --emergency-stop --wait --calibrate --gains --help --version' ;;
-    smarkers) options='-r -f -s -w --reserve --free --signal --wait --help --version' ;;
+    devin) options='-p -v -f -m -N -V -l -h -n -r -t -L --position --velocity --force --moving --lines --verbose --from= --to= --only= --repeat --period= --count= --record --digits= --help --version' ;;
+    devout) options='-p -v -a -j -f -F -o -t -m -s -l -h -n -r -L -w -W -H --position --velocity --acceleration --jerk --force --force-velocity --force-offset --time --wait-marker --signal-marker --from= --to= --only= --repeat --count= --wait --no-wait --hold --lease= --skip-bad-lines --help --version' ;;
+    sdev) options='-z -s -e -w -c -g -t --zero --synch --emergency-stop --wait --calibrate --gains --timeout= --help --version' ;;
+    smarkers) options='-r -f -s -w -t --reserve --free --signal --wait --timeout= --help --version' ;;
     esac
     if [[ $word == -* ]]; then
         mapfile -t COMPREPLY < <(compgen -W "$options" -- "$word")

@@ -71,6 +71,9 @@ class Call:
         ahead: tuple[bytes, ...] = (),
         limit_s: float | None = 0.0,
     ) -> None:
+        if limit_s is not None and not (isinstance(limit_s, int | float) and limit_s == limit_s):
+            # Here it costs the caller an error; the other side would take it for a broken client.
+            raise TypeError(f"{what}: time-out {limit_s!r}; want seconds as a number, or None for ever")
         self.what = what
         self.verb = verb
         self.arguments = arguments

@@ -581,3 +581,119 @@ def test_monitor_jogs_while_a_key_repeats_and_no_longer(
         os.kill(monitor.pid, signal.SIGCONT)
         monitor.shows(b"taken away")
     assert monitor.end() == 0
+
+
+# --- manners ---------------------------------------------------------------------------------------
+
+
+def test_numbers_that_would_be_lost_are_refused(shell: Shell, cell: sioms.Workcell) -> None:
+    refused(shell("devout mod0.xaxis 0.1 0.2"), "2 numbers; an iteration takes 1", status=2)
+    refused(shell("devout -L2 mod0.xaxis 0.1 0.2 0.3"), "2 iterations take 2", status=2)
+    with cell.open("mod0.readonly") as node:
+        assert not any(node.read().in_motion)
+
+
+def test_outputs_are_held_until_an_interrupt(shell: Shell, cell: sioms.Workcell) -> None:
+    with cell.open("gripper0.readonly") as node:
+        result = shell("devout gripper0 1")
+        assert result.returncode == 0 and "-H holds what was written" in result.stderr
+        wait_for(lambda: node.read().data[0] == 0, "safe again")
+        holding = subprocess.Popen(
+            ["bash", "-c", "exec devout -H gripper0 1"],
+            env=environment(shell("echo $SIOMS_SOCKET").stdout.strip()),
+        )
+        try:
+            wait_for(lambda: node.read().data[0] == 1, "closed")
+            time.sleep(0.5)
+            assert node.read().data[0] == 1 and holding.poll() is None
+        finally:
+            holding.send_signal(signal.SIGINT)
+            assert holding.wait(10.0) == -signal.SIGINT
+        wait_for(lambda: node.read().data[0] == 0, "open again")
+
+
+def test_waits_of_sdev_and_smarkers_end(shell: Shell, cell: sioms.Workcell) -> None:
+    token = good(shell("smarkers -r")).strip()
+    began = time.monotonic()
+    refused(shell(f"smarkers -w -t0.2 {token}"), "wait for marker", "not within 0.2")
+    with cell.open("mod0.xaxis", "rw") as axis:
+        axis.command(velocity=0.01)
+        refused(shell("sdev -w -t0.2 mod0.xaxis"), "not within")
+    assert time.monotonic() - began < 20.0
+    refused(shell(f"smarkers -s -t1 {token}"), "-t is for -w", status=2)
+    good(shell(f"smarkers -f {token}"))
+    halted(cell)
+
+
+def test_usage_of_the_command_that_was_meant_and_closed_output(shell: Shell) -> None:
+    assert "usage: sioms list" in shell("sioms list --nonsense").stderr
+    assert "usage: sioms reconcile axis" in shell("sioms reconcile axis --nonsense x").stderr
+    refused(shell("sioms info mod0 >&-"), "sioms info: write standard output: bad file descriptor")
+    refused(shell("sioms monitor nosuch"), "no such node: nosuch")
+
+
+def test_who_stopped_a_node_and_what_resets_it(shell: Shell, daemon: Daemon) -> None:
+    good(shell("sioms stop mod0.xaxis"))
+    for command in ("sioms list", "sioms info mod0", "sioms status"):
+        text = good(shell(command))
+        assert "mod0.xaxis: emergency stop by pid" in text and "`sioms reset mod0.xaxis` clears it" in text
+    assert "emergency stop" not in good(shell("sioms info mod1"))
+    good(shell("sioms reset mod0.xaxis"))
+    assert "emergency stop" not in good(shell("sioms list"))
+    daemon.said("event=reset node=mod0.xaxis by=")
+
+
+def test_a_recording_has_names_units_and_the_stamps_of_the_readings(shell: Shell) -> None:
+    lines = good(shell("devin --record -L50 mod0.xaxis")).splitlines()
+    assert lines[0].split("\t") == ["time [s]", "position [m]", "velocity [m/s]", "force [N]", "command [m]"]
+    stamps = [round(float(line.split("\t")[0]) * 1e9) for line in lines[1:]]
+    assert len(set(stamps)) == 50 and stamps == sorted(stamps)
+    off = [(stamp - stamps[0] + 500_000) % 1_000_000 - 500_000 for stamp in stamps]
+    assert max(map(abs, off)) < 1000, "the driver's schedule, not the time when somebody looked"
+    assert good(shell("devin --record -L1 lord1")).startswith("time [s]\tfx [N]\t")
+    refused(shell("devin --record mod0 mod1"), "takes one device", status=2)
+
+
+def test_a_time_out_that_is_no_number_costs_the_caller_and_not_the_node(cell: sioms.Workcell) -> None:
+    with cell.open("mod0.xaxis", "rw") as axis:
+        for wrong in ("1", float("nan"), [1]):
+            with pytest.raises(TypeError, match="want seconds as a number"):
+                axis.wait_until_idle(timeout=wrong)  # type: ignore[arg-type]
+        axis.wait_until_idle(timeout=1)
+
+
+@pytest.mark.parametrize("no_color", ["", "1"])
+def test_a_stopped_monitor_gives_the_terminal_back(shell: Shell, no_color: str) -> None:
+    socket = shell("echo $SIOMS_SOCKET").stdout.strip()
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execvpe(
+            "sioms", ["sioms", "monitor"], {**environment(socket), "TERM": "xterm", "NO_COLOR": no_color}
+        )
+    seen = b""
+
+    def read(until: bytes) -> None:
+        nonlocal seen
+        deadline = time.monotonic() + 30.0
+        while until not in seen:
+            assert time.monotonic() < deadline, seen[-300:]
+            if select.select([terminal], [], [], 0.1)[0]:
+                seen += os.read(terminal, 65536)
+
+    try:
+        read(b"\x1b[?1049h")
+        read(b"mod0")
+        assert (b"\x1b[32m" in seen or b"\x1b[33m" in seen) <= (not no_color)
+        seen = b""
+        os.write(terminal, b"\x1a")
+        read(b"\x1b[?1049l")
+        # The kernel stops no process without a shell above it, as here: the monitor goes on at once.
+        read(b"\x1b[?1049h")
+        seen = b""
+        read(b"mod0")
+        os.write(terminal, b"q")
+        read(b"\x1b[?1049l")
+    finally:
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+        os.close(terminal)

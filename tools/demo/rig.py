@@ -75,6 +75,11 @@ class Process:
                 self.kill()
 
 
+def bold(text: str) -> str:
+    """Return a heading: bold on a terminal, plain elsewhere."""
+    return f"\033[1m{text}\033[0m" if sys.stdout.isatty() else text
+
+
 def daemon(config: str, socket_path: str) -> Process:
     """Start a daemon; clients of this process and its children will find it."""
     os.environ["SIOMS_SOCKET"] = socket_path

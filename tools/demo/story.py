@@ -13,7 +13,7 @@ from sioms.client.command import command
 
 from . import measure
 from .recorder import Recorder
-from .rig import PATIENCE_S, Process, daemon, tool
+from .rig import PATIENCE_S, Process, bold, daemon, tool
 
 
 def tell(out: str, quick: bool, wire: bool) -> int:
@@ -40,7 +40,7 @@ def tell(out: str, quick: bool, wire: bool) -> int:
 
 
 def _chapter(title: str, text: str = "") -> None:
-    print(f"\n\033[1m{title}\033[0m" + (f"   {text}" if text else ""), flush=True)
+    print(f"\n{bold(title)}" + (f"   {text}" if text else ""), flush=True)
 
 
 def _say(text: str) -> None:

@@ -8,7 +8,7 @@ from importlib.resources import files
 
 import sioms
 
-from .rig import PATIENCE_S, Process, daemon
+from .rig import PATIENCE_S, Process, bold, daemon
 
 PORTS = {"/dev/ttyUSB0": "drives", "/dev/ttyACM0": "finger", "192.168.127.254:502": "io"}
 """Port names of the configuration, and the counterpart that takes the place of each."""
@@ -35,7 +35,7 @@ def bench(folder: str, stack: ExitStack) -> str:
 def show(folder: str) -> None:
     """Run the bench configuration and use its nodes like any others."""
     print(
-        "\n\033[1mReal protocols\033[0m   the same verbs on a Modbus RTU drive, a framed sample stream and a Modbus TCP block",
+        f"\n{bold('Real protocols')}   the same verbs on a Modbus RTU drive, a framed sample stream and a Modbus TCP block",
         flush=True,
     )
     with ExitStack() as stack:

@@ -92,3 +92,16 @@ def test_a_test_signal_is_in_some_files_only(tmp_path: Path) -> None:
     first, second = read_data(tmp_path, AXIS).records
     assert first.feedforward is None
     np.testing.assert_allclose(second.feedforward, [0.0, 0.05, 0.1])
+
+
+def test_a_recording_needs_no_description(tmp_path: Path) -> None:
+    """What ``devin --record`` writes: names that say what they are, each with its unit, and one that is not needed."""
+    head = "time [s]\tposition [rad]\tvelocity [rad/s]\tforce [N m]\tcommand [rad]\n"
+    rows = "".join([f"5148.{i:03d}000001\t{i / 10}\t0\t{i}\t{i / 5}\n" for i in range(5)])
+    (r,) = read_data(_folder(tmp_path, head + rows, ""), AXIS).records
+    np.testing.assert_allclose(r.position, np.arange(5) / 10)
+    np.testing.assert_allclose(r.force, np.arange(5))
+    assert r.command is not None and r.time_s is not None
+    np.testing.assert_allclose(np.diff(r.time_s), 1e-3, atol=1e-9)
+    with pytest.raises(BadInputError, match="no column description"):  # without units they are only words
+        read_data(_folder(tmp_path, head.replace(" [rad]", "") + rows, ""), AXIS)
