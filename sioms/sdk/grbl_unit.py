@@ -37,6 +37,7 @@ LATE_S = 0.5
 """What braking may take longer than the motion itself: reports, and a line that waited."""
 OWN_RESET_NS = 1_500_000_000
 """A greeting so soon after a reset of ours belongs to it."""
+STARTED_ANEW = "the controller has started anew: its place, modes and lines are gone"
 OFFSET_REPORTS = 35
 """The work offset comes with every 30th report at the latest."""
 NOT_READY = {
@@ -154,9 +155,8 @@ class GrblUnit(AxesUnit):
         self._listen(lines)
         if self._restarted:
             self._restarted = False
-            text = "the controller has started anew: its place, modes and lines are gone"
-            self._lose_places(text)
-            raise StateLost(f"{self.name}: {text}")
+            self._lose_places(STARTED_ANEW)
+            raise StateLost(f"{self.name}: {STARTED_ANEW}")
         self._take_heard(report, lines)
         if self._moves.interrupted:
             yield from self._go_on()
@@ -397,7 +397,11 @@ class GrblUnit(AxesUnit):
             return
         line, targets, until_ns = found
         wanted = self._chain.wanted.copy()
-        yield grbl.command(line, TIMEOUT_S)
+        try:
+            yield grbl.command(line, TIMEOUT_S)
+        except StateLost:  # the line has gone out to a controller at another place; the opening cancels it
+            self._lose_places(STARTED_ANEW)
+            raise
         if (self._chain.wanted == wanted).all() and not self._moves.interrupted:
             self._chain.sent(targets, until_ns)
 
