@@ -64,6 +64,8 @@ FLUSH = bytes(200)
 TICKS, DRIFT, JITTER_MS, TICKS_MS, LONGEST_MS = 32768, 0.1, 200, 1000, 20_000
 """The servo's clock: where it begins anew [ms], how far it may be from this one (part of the time since a reading, and more [ms]), after
 how long that reading is renewed, and from where on it tells nothing [ms]."""
+CONFIRM_S = 0.05
+"""After what pause a finding is looked at again."""
 OUTAGE_NS = 2_000_000_000
 """How long after a reading a servo that stood may be told to be in the same turn."""
 
@@ -269,8 +271,8 @@ class ServoUnit(AxesUnit):
         goal = place + round(way)
         if self._axis.mode == "position":  # beyond its limits the servo would refuse the goal, and go on
             goal = min(max(goal, self._limits[0]), self._limits[1])
-        fastest = self._count(self.bank.settings[0].velocity_max * self._speed)
-        yield from self._aim(self._count(highest * self._rate), fastest, goal, repeatable=True)
+        no_faster = self._count(abs(speed) * self._speed)
+        yield from self._aim(self._count(highest * self._rate), no_faster, goal, repeatable=True)
 
     def _aim(self, acceleration: int, velocity: int, goal: int, *, repeatable: bool = False) -> Steps:
         """Write profile and goal at once, so that no goal goes without its limits."""
@@ -370,8 +372,15 @@ class ServoUnit(AxesUnit):
             self._fault = "the bus watchdog expired: the servo heard nothing for too long"
             return
         self._fault = ""
-        self._jumped = self._time_jumped(image)
-        lost = self._jumped or self._otherwise(image)
+        lost = self._time_jumped(image) or self._otherwise(image)
+        if lost:  # a reply that came late tells of an earlier time
+            writes = self._writes
+            yield Pause(CONFIRM_S)
+            image = yield from self._read()
+            if writes != self._writes or image.alert:
+                return
+            self._jumped = self._time_jumped(image)
+            lost = self._jumped or self._otherwise(image)
         if lost:
             raise StateLost(f"{self.name}: {lost}: it restarted, or somebody else has written to it")
 
@@ -388,9 +397,9 @@ class ServoUnit(AxesUnit):
         passed = (image.tick - before.tick + JITTER_MS) % TICKS - JITTER_MS
         least = max(0, image.asked_ns - before.answered_ns) / 1e6
         most = (image.answered_ns - before.asked_ns) / 1e6
-        if most > TICKS_MS or self._clock_read is None:
-            self._clock_read = image
         if most > LONGEST_MS or least * (1 - DRIFT) - JITTER_MS <= passed <= most * (1 + DRIFT) + JITTER_MS:
+            if most > TICKS_MS or self._clock_read is None:
+                self._clock_read = image
             return ""
         return f"the servo's clock (register 120) went from {before.tick} to {image.tick} ms in {most:.0f} ms"
 

@@ -21,9 +21,10 @@ from __future__ import annotations
 
 import errno
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -367,15 +368,15 @@ class TmclUnit(AxesUnit):
         Raises:
             StateLost: they are not; the kit opens the module again.
         """
-        self._lost = yield from self._time_jumped()
+        self._lost = yield from self._believed(self._time_jumped)
         heartbeat = [None] if self._settings.heartbeat_s else []
         turns = heartbeat + list(self._ramps)
         self._turn = (self._turn + 1) % len(turns)
         key, lost = turns[self._turn], self._lost
         if heartbeat and not lost and (key is None or not self._has_ticks):
-            lost = yield from self._heartbeat_lost()
+            lost = yield from self._believed(self._heartbeat_lost)
         if key is not None and not lost:
-            lost = yield from self._ramp_lost(*key)
+            lost = yield from self._believed(partial(self._ramp_lost, *key))
         if lost:
             self._lost = self._lost or ("" if self._has_ticks else lost)
             raise StateLost(f"{self.name}: {lost}: it restarted, or somebody else has set it")
@@ -384,14 +385,25 @@ class TmclUnit(AxesUnit):
         """Return how a module that was opened before shows that it restarted since, so that its place is not to be trusted."""
         if not self._ramps:
             return ""
-        lost: str = yield from self._time_jumped()
+        lost: str = yield from self._believed(self._time_jumped)
         if self._has_ticks:
             return lost
         if self._settings.heartbeat_s:
-            lost = yield from self._heartbeat_lost()
+            lost = yield from self._believed(self._heartbeat_lost)
         for axis, parameter in list(self._ramps):
-            lost = lost or (yield from self._ramp_lost(axis, parameter))
+            lost = lost or (yield from self._believed(partial(self._ramp_lost, axis, parameter)))
         return lost
+
+    def _believed(self, look: Callable[[], Generator[Any, Any, str]]) -> Generator[Any, Any, str]:
+        """Return what is found twice: a reply does not tell of which parameter it is, and one that came late is that of another."""
+        found: str = yield from look()
+        if not found:
+            return ""
+        yield Pause(self._settings.recovery_s)
+        found = yield from look()
+        if found:
+            self._ticks = None
+        return found
 
     def _time_jumped(self) -> Generator[Any, Any, str]:
         """Return what is wrong with the module's clock, '' when it went on as this one did, or when it has none."""
@@ -407,11 +419,10 @@ class TmclUnit(AxesUnit):
         before = self._ticks or (ticks, asked_ns, answered_ns)
         passed = (ticks - before[0]) % 2**32
         least, most = max(0, asked_ns - before[2]) / 1e6, (answered_ns - before[1]) / 1e6
-        if most > TICKS_MS or self._ticks is None:
-            self._ticks = ticks, asked_ns, answered_ns
         if least * (1 - DRIFT) - JITTER_MS <= passed <= most * (1 + DRIFT) + JITTER_MS:
+            if most > TICKS_MS or self._ticks is None:
+                self._ticks = ticks, asked_ns, answered_ns
             return ""
-        self._ticks = None
         return f"the module's clock (parameter 132) went from {before[0]} to {ticks} ms in {most:.0f} ms"
 
     def _heartbeat_lost(self) -> Generator[Any, Any, str]:

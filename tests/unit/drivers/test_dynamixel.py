@@ -188,6 +188,19 @@ def test_a_stop_between_a_poll_and_its_reply_makes_the_poll_void() -> None:
         poll.send(reply)
 
 
+def test_one_late_image_is_no_restart() -> None:
+    rig, _ = opened("velocity")
+    old = rig.unit._bus.read(1, 64, 72)
+    late = rig.device.take(old.data)
+    rig.do(rig.unit.start_velocity(0, 0.01, ACTION))
+    rig.wait(0.4)
+    rig.poll(3)
+    take = rig.device.take
+    rig.device.take = lambda data: setattr(rig.device, "take", take) or take(data) and late
+    rig.do(rig.unit.poll())
+    rig.poll(3)
+
+
 # --- watchdog -------------------------------------------------------------------------------------
 
 

@@ -272,3 +272,27 @@ def test_single_bytes_take_their_time_at_9600() -> None:
     rig = Joined(Tmcl, table, lambda clock: tmcl.Module(clock=clock))
     assert rig.unit._pad_s == pytest.approx(0.01 + 10 * 10 / 9600)
     assert CHARACTER_S < 10 / 9600
+
+
+@pytest.mark.parametrize("wrong", range(5))
+def test_one_reply_of_another_parameter_is_no_restart(wrong: int) -> None:
+    """Replies do not tell of which parameter they are: one that comes late answers what was asked after it."""
+    rig = opened()
+    take, asked = rig.device.take, []
+
+    def late(data: bytes) -> list[bytes]:
+        replies: list[bytes] = take(data)
+        if data[1] in (6, 10):
+            asked.append(data)
+            if len(asked) == wrong + 1 and data[2] in (4, 5, 68, 132):
+                head = replies[0][:4] + (12345678).to_bytes(4, "big")
+                return [head + bytes((sum(head) % 256,))]
+        return replies
+
+    for _ in range(12):
+        asked.clear()
+        rig.device.take = late
+        rig.do(rig.unit.poll())
+        rig.device.take = take
+        rig.wait(0.02)
+    assert not rig.unit.bank.fault_text(0)
