@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import errno
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -160,6 +160,10 @@ class ServoUnit(AxesUnit):
 
     def open(self) -> Steps:
         """Identify the servo, stop it, prove its mode, limits and watchdog, and switch it on unless a stop is latched."""
+        yield from self._begin(self.stop)
+
+    def _begin(self, stop: Callable[[], Steps]) -> Steps:
+        """Open; ``stop`` stops it, and makes starts void that wait for the line, or leaves them to follow a reset."""
         bus, servo, axis = self._bus, self._id, self._axis
         answer: Status = yield from self._sure(bus.ping(servo))
         model = int.from_bytes(answer.data[:2], "little")
@@ -179,7 +183,7 @@ class ServoUnit(AxesUnit):
         self._fault = self._jumped = ""
         self._set[RETURN_LEVEL] = (2, 1)
         yield from self._set_mode()
-        yield from self.stop()
+        yield from stop()
         yield from self._write(WATCHDOG, 0, 1)
         yield from self._check_limits()
         yield from self._set_profile()
@@ -247,7 +251,7 @@ class ServoUnit(AxesUnit):
         if errors.data[0]:
             yield self._bus.reboot(self._id)
             yield Pause(REBOOT_S)
-        yield from self.open()
+        yield from self._begin(lambda: self.halt(0, fastest=True))
         if self._fault:
             raise DeviceError(errno.EIO, self._fault)
 

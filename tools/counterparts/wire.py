@@ -148,8 +148,12 @@ async def run(
     def garbage(count: str) -> None:
         port.write(faults.chance.randbytes(int(count)))
 
+    def stray(count: str = "1") -> None:
+        """Let the device hear noise."""
+        device.take(b"\xa5" * int(count))
+
     everything = {
         **faults.handlers(), **handlers,
-        "unplug": unplug, "plug": port.plug, "garbage": garbage, "requests": lambda: requests,
+        "unplug": unplug, "plug": port.plug, "garbage": garbage, "stray": stray, "requests": lambda: requests,
     }  # fmt: skip
     await serve(port.name if tcp >= 0 else str(options.link or port.name), everything, close)

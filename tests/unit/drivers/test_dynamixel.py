@@ -9,7 +9,7 @@ import pytest
 from drive_rig import LIMITS, Joined
 
 from sioms.drivers.dynamixel import Dynamixel
-from sioms.motion import ActionKind, DriveAction
+from sioms.motion import ActionKind, Command, DriveAction
 from sioms.protocol.flags import ControlMode
 from sioms.sdk.codec import dynamixel as codec
 from sioms.sdk.exchange import DeviceError, LinkError, StateLost
@@ -196,7 +196,7 @@ def test_one_late_image_is_no_restart() -> None:
     rig.wait(0.4)
     rig.poll(3)
     take = rig.device.take
-    rig.device.take = lambda data: setattr(rig.device, "take", take) or take(data) and late
+    rig.device.take = lambda data: setattr(rig.device, "take", take) or (take(data) and late)
     rig.do(rig.unit.poll())
     rig.poll(3)
 
@@ -250,6 +250,20 @@ def test_a_shutdown_is_cleared_by_reset_and_loses_turns_only() -> None:
         rig.do(rig.unit.reset(0))
         assert one.table[70] == 0
         assert ("position lost" in rig.unit.bank.fault_text(0)) == lost
+
+
+def test_a_start_that_follows_a_reset_is_not_made_void_by_it() -> None:
+    rig, one = opened()
+    reset = rig.unit.act(DriveAction(ActionKind.RESET, 0, None, 0.07, 1.0))
+    command = Command(*[0] * len(Command._fields))._replace(
+        control_mode=int(ControlMode.POSITION), position=0.03
+    )
+    start = rig.unit.act(
+        DriveAction(ActionKind.START, 0, command, 0.07, 1.0)
+    )  # handed out while the reset runs
+    rig.do(reset)
+    rig.do(start)
+    assert one.get(116, 4) == round(0.03 * STEPS_PER_M)
 
 
 # --- the line -------------------------------------------------------------------------------------
