@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import Meta
 
-from sioms.wording import choices, did_you_mean, explain, field_names
+from sioms.wording import choices, did_you_mean, every_error, explain, field_names
 
 Table = TypeVar("Table", bound=msgspec.Struct)
 RightName = Literal["read", "write", "stop", "administer"]
@@ -206,7 +206,9 @@ def _device(name: str, table: dict[str, Any], errors: list[str]) -> Device | Non
     where = f"[device.{name}]"
     common = _convert({k: v for k, v in table.items() if k in _COMMON}, DeviceTable, where, errors)
     if common is None:
-        return None
+        if not isinstance(table.get("driver"), str):
+            return None
+        common = DeviceTable(table["driver"])  # so that its driver tells the other errors of the table
     return Device(name, common, {k: v for k, v in table.items() if k not in _COMMON})
 
 
@@ -214,5 +216,5 @@ def _convert(table: object, kind: type[Table], where: str, errors: list[str]) ->
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
-        errors.append(explain(where, error, field_names(kind), choices(kind)))
+        errors += every_error(where, table, kind) or [explain(where, error, field_names(kind), choices(kind))]
         return None

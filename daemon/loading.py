@@ -18,6 +18,7 @@ from typing import Any
 import msgpack
 
 from .config import Config, parse
+from .lines import with_lines
 from .loop import Loop
 from .names import DeviceInfo, NameTable
 from .nursery import Nursery
@@ -90,8 +91,10 @@ class Loader:
             why = error.strerror if isinstance(error, OSError) else str(error)
             self._done(None, [f"read configuration {self._path}: {str(why).lower()}"])
             return
+        self._text = text
         config, self._errors = parse(text, os.path.dirname(os.path.abspath(self._path)))
         if config is None or not config.devices:
+            with_lines(text, self._errors)
             self._done(None, self._errors)
             return
         self._config = config
@@ -167,6 +170,7 @@ class Loader:
         if not self._errors:
             self._errors += names.errors
         if self._errors:
+            with_lines(self._text, self._errors)
             self._nursery.close()
             self._done(None, self._errors)
             return

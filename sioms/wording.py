@@ -50,6 +50,39 @@ def explain(
     return f"{where}: {text[0].lower() + text[1:]}"
 
 
+def every_error(where: str, value: object, annotation: object) -> list[str]:
+    """Return all that is wrong with a table, where the validator names the first alone; for when it has named one.
+
+    Args:
+        where: the table, e.g. ``[device.mod0]``.
+        value: what was read.
+        annotation: what it should be: a Struct, a list of them, or anything that the validator knows.
+    """
+    errors: list[str] = []
+    inner: Sequence[object] = getattr(annotation, "__args__", ())
+    if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct) and isinstance(value, dict):
+        fields = {field.encode_name: field for field in msgspec.structs.fields(annotation)}
+        if annotation.__struct_config__.forbid_unknown_fields:
+            errors += [f"{where}: unknown key {k}{did_you_mean(k, fields)}" for k in value if k not in fields]
+        for key, field in fields.items():
+            if key in value:
+                errors += every_error(f"{where}.{key}", value[key], field.type)
+            elif field.required:
+                errors.append(f"{where}: key {key} is missing")
+    elif get_origin(annotation) is list and isinstance(value, list):
+        for index, each in enumerate(value):
+            errors += every_error(f"{where}[{index}]", each, inner[0])
+    if errors:
+        return errors
+    try:
+        msgspec.convert(value, annotation)
+    except msgspec.ValidationError as error:
+        if (words := _literals(annotation)) and "enum value" in str(error):
+            return [f"{where} = {value!r}: want one of {', '.join(map(repr, words))}"]
+        return [explain(where, error, ())]
+    return []
+
+
 def choices(kind: type[msgspec.Struct]) -> dict[str, tuple[object, ...]]:
     """Return the keys of a table, and of the tables in it, that take certain words alone, with these words."""
     return {field.encode_name: words for field in _fields(kind) if (words := _literals(field.type))}

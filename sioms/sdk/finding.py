@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from sioms.protocol.flags import NodeClass
-from sioms.wording import choices, did_you_mean, explain, field_names
+from sioms.wording import choices, did_you_mean, every_error, explain, field_names
 
 from .driver import Driver, LineDriver, StreamDriver, TickDriver
 
@@ -102,7 +102,7 @@ def read_settings(driver: type[Driver], table: Mapping[str, Any], folder: str) -
     table = dict(_anchored(table, folder))
     known = field_names(kind)
     errors = []
-    # One error at a time is what the validator gives; unknown keys are collected beside it.
+    # The validator names one error; all are looked for only when there is one.
     top = {field.encode_name for field in msgspec.structs.fields(kind)}
     for key in [k for k in table if k not in top]:
         errors.append(f": unknown key {key}{did_you_mean(key, top)}")
@@ -110,8 +110,7 @@ def read_settings(driver: type[Driver], table: Mapping[str, Any], folder: str) -
     try:
         return msgspec.convert(table, kind), errors
     except msgspec.ValidationError as error:
-        errors.append(explain("", error, known, choices(kind)))
-        return None, errors
+        return None, errors + (every_error("", table, kind) or [explain("", error, known, choices(kind))])
 
 
 def _anchored(value: Any, folder: str, key: str = "") -> Any:
@@ -152,6 +151,13 @@ def _block_errors(blocks: Any) -> list[str]:
         channels = [channel.name for channel in block.channels]
         if not channels:
             errors.append(f": block {block.name!r} has no channel; want at least one")
+        for name in [c for c in channels if not c or any(letter.isspace() or letter == "/" for letter in c)]:
+            errors.append(f": a channel is named {name!r}; want a name without blanks and without /")
+        if block.node_class is NodeClass.AXIS:
+            for channel in [c for c in block.channels if c.unit not in ("m", "rad")]:
+                errors.append(
+                    f": axis {channel.name}: unit = {channel.unit}; want m or rad, as all numbers are SI"
+                )
         for name in [c for c, count in Counter(channels).items() if count > 1]:
             errors.append(f": two channels are named {name}; names must differ")
         if names.count(block.name) > 1:

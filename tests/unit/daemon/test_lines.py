@@ -1,0 +1,73 @@
+"""All errors of a configuration in one run, each with its line."""
+
+from __future__ import annotations
+
+import msgspec
+
+from sioms.daemon.config import parse
+from sioms.daemon.lines import with_lines
+from sioms.wording import every_error
+
+TEXT = """[workcell]
+nam = "x"
+max_sessions = 0
+
+[[grant]]
+rights = ["read"]
+[[grant]]
+rights = ["fly"]
+[device.a]
+driver = "d"
+on_loss = "halt"
+realtime_priority = 100
+[[device.a.axis]]
+name = "x"
+[[device.a.axis]]
+mass = "heavy"
+"""
+
+
+def test_every_wrong_value_is_told_with_its_line() -> None:
+    config, errors = parse(TEXT, "")
+    with_lines(TEXT, errors)
+    assert [error.split(": ")[0] for error in errors] == ["line 2", "line 3", "line 11", "line 12", "line 8"]
+    assert config is not None and "a" in config.devices, (
+        "its driver is asked all the same, and tells its own errors"
+    )
+    told = [
+        "[device.a].axis[1].mass: wrong",
+        "[device.a].axis[0]: key unit is missing",
+        "[device.z]: not there",
+    ]
+    with_lines(TEXT, told)
+    assert [each.partition(" ")[2][:3].strip(": ") for each in told[:2]] == ["16", "13"] and told[
+        2
+    ].startswith("[device.z]")
+
+
+class Axis(msgspec.Struct, forbid_unknown_fields=True):
+    name: str
+    mass: float = 1.0
+
+
+class Device(msgspec.Struct, forbid_unknown_fields=True):
+    axis: list[Axis]
+    rate: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.rate < 0:
+            raise ValueError("rate below 0")
+
+
+def test_all_errors_of_nested_tables() -> None:
+    table = {"axis": [{"name": 1, "mass": "x"}, {"mas": 2.0}], "rate": "fast", "raet": 1}
+    assert every_error("d", table, Device) == [
+        "d: unknown key raet; did you mean rate?",
+        "d.axis[0].name: expected `str`, got `int`",
+        "d.axis[0].mass: expected `float`, got `str`",
+        "d.axis[1]: unknown key mas; did you mean mass?",
+        "d.axis[1]: key name is missing",
+        "d.rate: expected `float`, got `str`",
+    ]
+    assert every_error("d", {"axis": [], "rate": -1.0}, Device) == ["d: rate below 0"]
+    assert every_error("d", {"axis": []}, Device) == []
