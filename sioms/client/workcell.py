@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 STARTING_S = 5.0
 """How long a client waits for a daemon that says that it is starting [s]."""
+CLOSE_S = 10.0
+"""How long a close may take [s]: its driver must get a processor and halt the axes before the node is free."""
 _ACCESS = {"r": Access.READ, "w": Access.WRITE, "rw": Access.READ | Access.WRITE}
 
 
@@ -232,7 +234,7 @@ class Workcell:
         """Tell the daemon that a node was closed, and wait until its channels are free (nodes call this)."""
         self._nodes.pop(handle, None)
         try:
-            self._channel.call(Call("close", ClientVerb.CLOSE, handle))
+            self._channel.call(Call("close", ClientVerb.CLOSE, handle, limit_s=CLOSE_S))
         except OSError as error:
             # The daemon has gone, or knows no such handle any more: the driver has halted the axes
             # at the end of file of the node's own socket either way.
