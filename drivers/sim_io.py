@@ -141,7 +141,7 @@ class SimIo(TickDriver):
         self._blocks = blocks
         self._outputs = blocks[0] if settings.outputs else None
         self._inputs = blocks[-1] if settings.inputs else None
-        self._wanted = 0
+        self._wanted: list[int] = []
         self._nodes = _nodes(settings)
         self._beams = [(table.bit, Beam(_boxes(table, self._nodes))) for table in settings.beam]
         self._grippers = [
@@ -159,25 +159,32 @@ class SimIo(TickDriver):
         return self._blocks
 
     def write_outputs(self, block: BlockSpec, channels: Sequence[int], values: Sequence[float]) -> None:
-        """Take the outputs; they are set in the next tick."""
-        self._wanted = int(values[-1])
+        """Take the outputs; they are set in the next tick, one write after the other."""
+        self._wanted.append(int(values[-1]))
 
     def tick(self, now_ns: int) -> None:
         """Set the outputs, find the edges of the inputs since the last tick, publish them one by one."""
+        wanted, self._wanted = self._wanted, []
         if self._outputs is not None:
-            self._drive(self._outputs, now_ns)
+            for index, value in enumerate(wanted):
+                if index:  # each write is an edge of its own, also where its outputs are wired to
+                    self.kit.publish(self._outputs, now_ns)
+                    if self._inputs is not None:
+                        self._show(self._inputs, self._loop_edges(now_ns), now_ns)
+                        self.kit.publish(self._inputs, now_ns)
+                self._drive(self._outputs, value, now_ns)
         edges = self._wave_edges(now_ns) + self._beam_edges(now_ns) + self._gripper_edges(now_ns)
         edges += self._loop_edges(now_ns)
         self._last_ns = now_ns
         if self._inputs is not None:
             self._show(self._inputs, edges, now_ns)
 
-    def _drive(self, port: BinaryBlock, now_ns: int) -> None:
-        rising = self._wanted & ~int(port.data[0])
-        falling = ~self._wanted & int(port.data[0])
-        port.set(0, self._wanted, now_ns)
+    def _drive(self, port: BinaryBlock, wanted: int, now_ns: int) -> None:
+        rising = wanted & ~int(port.data[0])
+        falling = ~wanted & int(port.data[0])
+        port.set(0, wanted, now_ns)
         for table, gripper in self._grippers:
-            gripper.command(bool(self._wanted >> table.bit & 1), now_ns)
+            gripper.command(bool(wanted >> table.bit & 1), now_ns)
         for table in self.settings.wave:
             if table.trigger_bit is not None and rising >> table.trigger_bit & 1:
                 self._waves[table.bit] = _wave(table, now_ns)

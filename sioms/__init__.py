@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .client.node import BinaryNode as BinaryNode
     from .client.node import Node as Node
     from .client.node import select as select
+    from .client.node_core import EdgesLost as EdgesLost
     from .client.node_core import Event as Event
     from .client.workcell import Marker as Marker
     from .client.workcell import Workcell as Workcell
@@ -35,6 +36,7 @@ _HOME = {
     "AnalogNode": "client.node",
     "BinaryNode": "client.node",
     "Event": "client.node_core",
+    "EdgesLost": "client.node_core",
     "select": "client.node",
     "command": "client.command",
     "ControlMode": "protocol.flags",

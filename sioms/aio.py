@@ -30,7 +30,7 @@ from sioms.protocol.stopfile import StopRequest
 from .client.channel import GRACE_S, Answer, Call, Channel
 from .client.channel import connect as connect_socket
 from .client.command import command
-from .client.node_core import Event, NodeCore
+from .client.node_core import Edges, Event, NodeCore
 from .client.shown import acknowledged_by_daemon
 from .client.workcell import STARTING_S, node_parts, open_call
 
@@ -221,17 +221,15 @@ class AsyncNode(NodeCore):
         """Wait until a masked bit differs from the last state seen; see ``BinaryNode.wait_event``."""
         if last is None:
             await self.fresh()
-        state, number = self._start_of(last)
+        edges = Edges(self, mask, last)
         if self._subscribed == 0:
             await self.subscribed(-1)
         try:
             async with asyncio.timeout(timeout):
                 while True:
-                    head = self._page.head  # what comes while we look is for the next look
-                    event = self._find_event(mask, state, number)
+                    event = edges.look()
                     if event is not None:
                         return event
-                    number = max(number, head)
                     await self._wake()
         except TimeoutError as error:
             if error.errno:

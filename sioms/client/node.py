@@ -16,7 +16,7 @@ from sioms.protocol.page import NotReadable
 
 from .channel import Call
 from .command import command
-from .node_core import Event, NodeCore
+from .node_core import Edges, Event, NodeCore
 from .snapshot import AnalogSnapshot, AxisSnapshot, BinarySnapshot
 
 TYPE_CHECKING = False
@@ -342,17 +342,17 @@ class BinaryNode(Node):
 
         Raises:
             TimeoutError: nothing changed.
+            EdgesLost: more edges came since ``last`` than can be told; its ``lost`` says how many, its ``event`` is
+                where to go on from.
         """
-        state, number = self._start_of(last)
+        edges = Edges(self, mask, last)
         if self._subscribed == 0:
             self.subscribe(-1)
         deadline = None if timeout is None else monotonic() + timeout
         while True:
-            head = self._page.head  # what comes while we look is for the next look
-            event = self._find_event(mask, state, number)
+            event = edges.look()
             if event is not None:
                 return event
-            number = max(number, head)
             self._poll(deadline, f"wait for an event on {self.name}")
 
 

@@ -22,7 +22,7 @@ from .snapshot import SNAPSHOT, BinarySnapshot, Layout
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
     from typing import Any, TypeAlias
 
     Records: TypeAlias = bytes | bytearray | memoryview | Iterable[bytes]
@@ -41,19 +41,94 @@ class Event:
     Attributes:
         initial, final: data when waiting began, and after the edge.
         stamp_ns: time of the edge as the device gave it [ns, CLOCK_MONOTONIC].
-        number: snapshot that showed it; pass the event to the next wait and none is lost.
+        number: snapshot that showed it; pass the event to the next wait and none is lost unnoticed.
+        edges: count of the port's edges, this one included.
     """
 
-    __slots__ = ("final", "initial", "number", "stamp_ns")
+    __slots__ = ("edges", "final", "initial", "number", "stamp_ns")
 
-    def __init__(self, initial: int, final: int, stamp_ns: int, number: int) -> None:
+    def __init__(self, initial: int, final: int, stamp_ns: int, number: int, edges: int) -> None:
         self.initial = initial
         self.final = final
         self.stamp_ns = stamp_ns
         self.number = number
+        self.edges = edges
 
     def __repr__(self) -> str:
         return f"Event(initial={self.initial:#x}, final={self.final:#x}, stamp_ns={self.stamp_ns})"
+
+
+class EdgesLost(OSError):
+    """EOVERFLOW: edges went by that nobody can tell any more: too many since the last look, or for the device.
+
+    Attributes:
+        lost: how many edges of the port.
+        event: the last edge; pass it to the next wait to go on from there.
+    """
+
+    def __init__(self, text: str, lost: int, event: Event) -> None:
+        super().__init__(errno.EOVERFLOW, text)
+        self.lost = lost
+        self.event = event
+
+
+class Edges:
+    """The edges of a binary node, one after the other, out of its page.
+
+    The port's own count of edges tells whether one is missing between two snapshots.
+
+    Args:
+        node: of one binary channel.
+        mask: bits to watch.
+        last: the event or snapshot seen last; None: the present state.
+
+    Raises:
+        OSError: EINVAL, a node of another kind.
+    """
+
+    def __init__(self, node: NodeCore, mask: int, last: Event | BinarySnapshot | None) -> None:
+        if node.info.node_class is not NodeClass.BINARY or len(node.info.channels) != 1:
+            raise OSError(
+                errno.EINVAL, f"wait for an event on {node.name}: want a node of one binary channel"
+            )
+        self._node = node
+        self._mask = mask
+        if isinstance(last, Event):
+            self._state, self._number, self._edges = last.final, last.number, last.edges
+        else:
+            start: BinarySnapshot = last if last is not None else node.read()
+            self._state, self._number, self._edges = start.data[0], start.number, start.edges[0]
+
+    def look(self) -> Event | None:
+        """Return the next edge of the watched bits, None while there is none.
+
+        Raises:
+            EdgesLost: the port had more edges than can be told.
+        """
+        newest: BinarySnapshot = self._node.read()
+        if newest.edges[0] != self._edges:
+            for snapshot in self._node.kept(self._number, newest.number):
+                event = self._judge(snapshot)
+                if event is not None:
+                    return event
+        self._number = max(self._number, newest.number)
+        return None
+
+    def _judge(self, snapshot: BinarySnapshot) -> Event | None:
+        edges, final = snapshot.edges[0], snapshot.data[0]
+        lost = edges - self._edges - 1
+        if lost < 0:
+            return None
+        event = Event(self._state, final, snapshot.changed_ns[0], snapshot.number, edges)
+        self._edges, self._number = edges, snapshot.number
+        if lost:
+            kept, name = self._node.slots, self._node.name
+            text = (
+                f"wait for an event on {name}: {lost} edges of its port came between two looks and cannot be told "
+                f"any more; {kept} publications are kept: look more often, or give the device a longer history"
+            )
+            raise EdgesLost(text, lost, event)
+        return event if (final ^ self._state) & self._mask else None
 
 
 class NodeCore:
@@ -158,10 +233,20 @@ class NodeCore:
         """
         if not gone:
             self.read()
+        return list(self.kept(after, self._page.head))
+
+    def kept(self, after: int, last: int) -> Iterator[Any]:
+        """Yield the snapshots after a number, up to a last one, that the page still holds, as they are looked at."""
         page = self._page
-        first = max(after + 1, page.head - page.slots + 2, 1)
-        raws = [page.numbered(number) for number in range(first, page.head + 1)]
-        return [self._snapshot(raw, self._layout) for raw in raws if raw is not None]
+        for number in range(max(after + 1, page.head - page.slots + 2, 1), last + 1):
+            raw = page.numbered(number)  # one by one: who is far behind pays for one edge at a time
+            if raw is not None:
+                yield self._snapshot(raw, self._layout)
+
+    @property
+    def slots(self) -> int:
+        """How many snapshots the page keeps."""
+        return self._page.slots
 
     def fileno(self) -> int:
         """Return a descriptor that is readable when there is new data, for selectors and asyncio.
@@ -241,31 +326,6 @@ class NodeCore:
         if self.info.node_class is NodeClass.BINARY:
             return b"".join([BINARY_WRITE.pack(i, 0, int(value), 0) for i, value in enumerate(values)])
         return b"".join([ANALOG_WRITE.pack(i, 0, value) for i, value in enumerate(values)])
-
-    def _find_event(self, mask: int, state: int, after: int) -> Event | None:
-        """Look through the snapshots after a number for a change of the masked bits."""
-        self.read()
-        page = self._page
-        for number in range(max(after + 1, page.head - page.slots + 2, 1), page.head + 1):
-            raw = page.numbered(number)  # one by one: who is far behind pays for one edge at a time
-            if raw is None:
-                continue
-            snapshot: Any = self._snapshot(raw, self._layout)
-            final = snapshot.data[0]
-            if (final ^ state) & mask:
-                return Event(state, final, snapshot.changed_ns[0], snapshot.number)
-        return None
-
-    def _start_of(self, last: Event | BinarySnapshot | None) -> tuple[int, int]:
-        """Return (state, number) from which a wait for an event begins."""
-        if self.info.node_class is not NodeClass.BINARY or len(self.info.channels) != 1:
-            raise OSError(
-                errno.EINVAL, f"wait for an event on {self.name}: want a node of one binary channel"
-            )
-        if isinstance(last, Event):
-            return last.final, last.number
-        start: BinarySnapshot = last if last is not None else self.read()
-        return start.data[0], start.number
 
     def _drain(self) -> None:
         try:

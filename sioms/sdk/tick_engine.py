@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.flags import PageState
 
-from .blocks import AnyBlock
+from .blocks import AnyBlock, BinaryBlock
 from .connected import FIRST_PAUSE_NS, LONGEST_PAUSE_NS
 from .driver import Refusal, TickDriver
 from .exchange import HookError, LinkError, Steps
@@ -103,6 +103,7 @@ class TickEngine:
 
     def _write(self, block: AnyBlock, changes: Mapping[int, Change]) -> None:
         channels, values = self._runtime.outputs.merged(block, changes)
+        edges = block.words[2].copy() if isinstance(block, BinaryBlock) else None
         try:
             self._driver.write_outputs(block.spec, channels, values)
         except Refusal as error:
@@ -112,6 +113,10 @@ class TickEngine:
         except Exception as error:
             raise HookError(f"{type(self._driver).__name__}.write_outputs") from error
         self._runtime.outputs.acknowledge(block, channels, values)
+        if edges is not None and (edges != block.words[2]).any():  # type: ignore[union-attr]
+            self._runtime.publish(
+                block, time.monotonic_ns()
+            )  # an edge of its own, though the tick sees only the last
 
     def carry_out(self, handle: Handle, number: int, steps: Steps, what: str) -> Any:
         """Refuse: a driver without a line has none to send steps on."""

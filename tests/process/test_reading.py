@@ -378,3 +378,51 @@ def test_a_node_of_many_axes_and_a_workcell_of_many_nodes(start_daemon: Callable
             wait_for(
                 lambda: big.read().position == pytest.approx([0.001] * 800, abs=5e-4), "settled, at 5 Hz"
             )
+
+
+def test_edges_that_are_not_kept_are_counted_and_told(start_daemon: Callable[..., Daemon]) -> None:
+    """Twenty edges within half a second, of which the page keeps a quarter of a second: all, or a sentence with their number."""
+    daemon = start_daemon('[workcell]\nname = "edges"\n[device.io0]\ndriver = "sim-io"\noutputs = 4\n')
+    with daemon.cell() as cell, cell.open("io0", "rw") as port:
+        start: sioms.Event | sioms.client.snapshot.BinarySnapshot = port.read()
+        for i in range(20):
+            port.set(i % 2 + 1)
+            time.sleep(0.03)
+        with pytest.raises(
+            sioms.EdgesLost, match=r"\d+ edges of its port .* 256 publications are kept"
+        ) as gap:
+            port.wait_event(last=start, timeout=1.0)
+        last, told, lost = gap.value.event, 1, gap.value.lost
+        assert gap.value.errno == errno.EOVERFLOW
+        with pytest.raises(TimeoutError):
+            while True:
+                last = port.wait_event(last=last, timeout=0.05)
+                told += 1
+        assert told + lost == 20 and last.final == 2
+
+        async def main() -> None:
+            async with await sioms.aio.connect(daemon.socket) as aio, await aio.open("io0.readonly") as eye:
+                with pytest.raises(sioms.EdgesLost):
+                    await eye.wait_event(last=start, timeout=1.0)
+
+        asyncio.run(main())
+
+
+def test_two_writes_within_a_tick_are_two_edges(cell: sioms.Workcell) -> None:
+    from sioms.client.stream import Stream
+
+    with cell.open("io0", "rw") as port, cell.open("io0.in") as wired:
+        port.set(0)
+        last, seen = port.read(), wired.read()
+        stream = Stream(port)
+        for _ in range(50):
+            for value in (1, 0):
+                stream.write(BINARY_WRITE.pack(0, 0, value, 0))
+        stream.drain()
+        for i in range(100):
+            event = port.wait_event(last=last, timeout=2.0)
+            assert event.final == (i + 1) % 2
+            last = event
+            looped = wired.wait_event(0b1, seen, 2.0)
+            assert looped.final & 1 == (i + 1) % 2
+            seen = looped
