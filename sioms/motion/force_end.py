@@ -4,7 +4,7 @@ The place to be held follows from a profile of braking. Where something stands w
 press on it with all it has, although a few newtons were asked for. So the actuator may work against the motion with
 all its force, but in the direction of the motion, or of the force when the axis stood, at most with the force that was
 asked for, beside the offset. Where that is not enough to follow the set-point, the set-point yields: the axis holds
-where it is. An axis that is thrown back yields, too, and is damped. At rest the bound is lifted; what is held then is
+where it is. An axis that is thrown back is braked with a tenth of its force if that is more. At rest the bound is lifted; what is held then is
 held against what pushes from outside.
 
 Pure; concurrency: that of its bank.
@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 REST = 0.01
 """Part of the velocity limit below which an axis may be at rest."""
+BACK = 0.1
+"""Part of the force limit with which an axis that is thrown back may be braked in any case."""
 REST_NS = 50_000_000
 """So long it must be so [ns]."""
 
@@ -67,14 +69,19 @@ class ForceEnds:
         self.any = bool(self._direction.any())
 
     def bound(
-        self, output: NDArray[np.float64], velocity: NDArray[np.float64], limit: NDArray[np.float64]
+        self,
+        output: NDArray[np.float64],
+        velocity: NDArray[np.float64],
+        velocity_limit: NDArray[np.float64],
+        force_limit: NDArray[np.float64],
     ) -> None:
-        """Bound the output of axes that do not move away from what they press on, in place; all (n,)."""
+        """Bound the output in place; all (n,)."""
         direction = self._direction
+        thrown_back = velocity * direction < -REST * velocity_limit
+        most = np.where(thrown_back, np.maximum(self._most, BACK * force_limit), self._most)
         np.greater(output * direction, self._most, out=self._presses)
         self._presses &= direction != 0.0
-        towards = velocity * direction >= -REST * limit
-        np.copyto(output, self._most * direction, where=self._presses & towards)
+        np.copyto(output, np.minimum(output * direction, most) * direction, where=self._presses)
 
     def look(
         self, velocity: NDArray[np.float64], limit: NDArray[np.float64], now_ns: int

@@ -161,7 +161,7 @@ class ControlLaw:
         np.maximum(self._u, self._low, out=self.output)
         np.minimum(self.output, self.force_limit, out=self.output)
         if self.force_ends.any:
-            self.force_ends.bound(self.output, velocity, self.velocity_limit)
+            self.force_ends.bound(self.output, velocity, self.velocity_limit, self.force_limit)
         np.not_equal(self.output, self._u, out=self.saturated)
 
     def _slew(
