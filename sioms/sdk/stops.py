@@ -96,8 +96,11 @@ class Stops:
         latch, (seen_stop, seen_resets, seen_request) = self._latch, self._seen
         mark = self._request.mark
         fresh = mark not in (seen_request, latch.answered_request)
-        if fresh and latch.stop(time.monotonic_ns(), self._request.source):
-            self._runtime.tell(DriverVerb.STOPPED, latch.source)
+        if fresh:
+            source = self._request.source
+            # A reset may have answered it since: a stop that is over must not be latched again.
+            if mark != latch.answered_request and latch.stop(time.monotonic_ns(), source):
+                self._runtime.tell(DriverVerb.STOPPED, latch.source)
         stopped_ns, resets = latch.stopped_ns, latch.resets
         self._seen = (stopped_ns, resets, mark)
         if (stopped_ns and stopped_ns != seen_stop) or resets != seen_resets:
