@@ -104,9 +104,9 @@ def _rests(station: Station, fast: float, after: str, seconds: float = NOTICE_S)
 
 
 def _in_fault(node: Any) -> bool:
-    """Whether an axis is in fault or its link is lost."""
+    """Whether an axis is in fault, its place or its link lost."""
     try:
-        return bool(node.read().status[0] & AxisStatus.FAULT)
+        return bool(node.read().status[0] & (AxisStatus.FAULT | AxisStatus.POSITION_LOST))
     except OSError:
         return True
 
@@ -208,9 +208,9 @@ def _cable(station: Station, node: Any, fast: float) -> None:
 
 def _supply(station: Station, node: Any, fast: float) -> None:
     _device(station, "power_cycle").tell("power_cycle 0.3")
-    _rests(station, fast, "a power cycle", 0.3)
-    _stays(station, fast, WATCH_S, "a power cycle")
+    _noticed(station, node, "a power cycle")  # until then what the client commanded may be going on
     check_back(station)
+    _rests(station, fast, "a power cycle")
 
 
 def restarted(station: Station, full: bool) -> str:
@@ -487,6 +487,8 @@ def misframed(station: Station, full: bool) -> str:
     if not station.rig.axes:
         return "reached again"
     axis = station.rig.axes[0]
+    with station.cell.open(axis.node, "rw", timeout=5.0) as node:
+        _restore(station, node, axis)  # the disturbance may have lost the link
     fast = _usual_speed(station, axis)
     with station.cell.open(axis.node, "rw", timeout=5.0) as node:
         for way in ("stop", "emergency stop"):
