@@ -11,11 +11,15 @@ gauss becomes V, Pa and T.
     mode = "buffer"
     rate_hz = 860.0
     trigger = "sioms-hrtimer"
+
+Whose channels are the elements of a calibrated tactile finger has a table ``shape``, see ``tactile_nodes``, and ``to_percent``: the
+finger's file is in per cent of the untouched output, the kernel's values are in SI.
 """
 
 from __future__ import annotations
 
 import errno
+import math
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -24,7 +28,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.protocol.flags import AnalogStatus, NodeClass
+from sioms.drivers import tactile_nodes
+from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
 from sioms.sdk.codec.iio_scan import Element, ElementType, Layout, ScanReceiver, parse_type, unit_of
@@ -51,6 +56,8 @@ class IioSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         watermark: scans after which the driver is woken.
         minimum, maximum: range of the values, in SI.
         history: snapshots kept for readers.
+        shape: of a tactile finger: shows its strains and the shape that touches it, too.
+        to_percent: factor from the values to the finger's raw unit, per cent of the untouched output; one number, or one a channel.
         sysfs: where the devices are.
         dev: where their buffers are.
     """
@@ -65,6 +72,8 @@ class IioSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     minimum: float | None = None
     maximum: float | None = None
     history: int = 256
+    shape: tactile_nodes.ShapeSettings | None = None
+    to_percent: float | list[float] = 1.0
     sysfs: str = "/sys/bus/iio/devices"
     dev: str = "/dev"
 
@@ -105,7 +114,7 @@ class Iio(StreamDriver):
 
     def __init__(self, name: str, settings: IioSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
-        self._block = AnalogBlock(_describe(settings).blocks[0])
+        self._block, self._finger = _blocks(settings, kit)
         self.silence_s = max(0.5, (20 + 3 * settings.watermark) / settings.rate_hz)
         self._stamp_ns = 0
         self._newest_ns = 0
@@ -123,8 +132,14 @@ class Iio(StreamDriver):
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
-        """The channels."""
-        return (self._block,)
+        """The channels; of a finger its strains and shape, too."""
+        return _all(self._block, self._finger)
+
+    def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
+        """Answer the requests of a finger's nodes."""
+        if self._finger is None or not block.name:
+            return super().ioctl(block, request, channels, argument)
+        return self._finger.ioctl(block, request, argument)
 
     def open(self) -> Steps:
         """Set up the scan, then switch the buffer on; a driver that was killed may have left it on."""
@@ -173,6 +188,10 @@ class Iio(StreamDriver):
             self._block.flags[:] = flag | self._overrun(stamp_ns)
             self._stamp_ns = self._block.stamp_ns = max(stamp_ns, self._stamp_ns + 1)
             self.kit.publish(self._block, self._block.stamp_ns)
+            if self._finger is not None:
+                self._finger.take(row, self._block.flags, self._block.stamp_ns, now_ns)
+                for derived in self._finger.blocks:
+                    self.kit.publish(derived, derived.stamp_ns)
             taken += 1
         self._scans += taken
         if taken:
@@ -246,13 +265,19 @@ class IioRaw(TickDriver):
 
     def __init__(self, name: str, settings: IioSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
-        self._block = AnalogBlock(_describe(settings).blocks[0])
+        self._block, self._finger = _blocks(settings, kit)
         self._failed = 0
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
-        """The channels."""
-        return (self._block,)
+        """The channels; of a finger its strains and shape, too."""
+        return _all(self._block, self._finger)
+
+    def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
+        """Answer the requests of a finger's nodes."""
+        if self._finger is None or not block.name:
+            return super().ioctl(block, request, channels, argument)
+        return self._finger.ioctl(block, request, argument)
 
     def open(self) -> None:
         """Find the device and how its channels are scaled."""
@@ -278,10 +303,40 @@ class IioRaw(TickDriver):
                 self._failed += 1
                 self._block.flags[index] = int(AnalogStatus.INVALID)
         self._block.stamp_ns = time.monotonic_ns()
+        if self._finger is not None:
+            self._finger.take(self._block.data, self._block.flags, self._block.stamp_ns, now_ns)
 
     def counters(self) -> Mapping[str, int | str]:
         """Return how many readings the device did not give."""
         return {"failed_readings": self._failed}
+
+
+class _Finger:
+    """The nodes of a finger behind a converter: values become the finger's raw unit first.
+
+    Concurrency: the one thread of the driver process.
+    """
+
+    def __init__(self, nodes: tactile_nodes.TactileNodes, to_percent: float | list[float]) -> None:
+        self._nodes, self._factor = nodes, np.asarray(to_percent, dtype=np.float64)
+        self.blocks, self.ioctl = nodes.blocks, nodes.ioctl
+
+    def take(self, values: NDArray[np.float64], flags: NDArray[np.int64], stamp_ns: int, now_ns: int) -> None:
+        """Sense one frame, as ``TactileNodes.take``."""
+        self._nodes.take(values * self._factor, flags, stamp_ns, now_ns)
+
+
+def _blocks(settings: IioSettings, kit: Kit) -> tuple[AnalogBlock, _Finger | None]:
+    first, *more = _describe(settings).blocks
+    if settings.shape is None:
+        return AnalogBlock(first), None
+    return AnalogBlock(first), _Finger(
+        tactile_nodes.TactileNodes(settings.shape, more, kit), settings.to_percent
+    )
+
+
+def _all(block: AnalogBlock, finger: _Finger | None) -> Sequence[AnyBlock]:
+    return (block,) if finger is None else (block, *finger.blocks)
 
 
 class _Scaling:
@@ -333,7 +388,9 @@ def _describe(settings: IioSettings) -> Description:
         ChannelInfo(name, unit_of(name)[0], settings.minimum, settings.maximum) for name in settings.channels
     )
     block = BlockSpec("", NodeClass.ANALOG, channels, history=settings.history)
-    return Description((block,), settings.rate_hz, lease_s=max(0.5, 10 / settings.rate_hz))
+    more = tactile_nodes.specs(settings.shape, len(settings.channels), settings.history)
+    inputs, lease_s = tactile_nodes.inputs(settings.shape), max(0.5, 10 / settings.rate_hz)
+    return Description((block, *more), settings.rate_hz, inputs, lease_s)
 
 
 def _check(settings: IioSettings) -> None:
@@ -347,6 +404,13 @@ def _check(settings: IioSettings) -> None:
             )
         if channel.startswith("in_") or channel.endswith("_raw") or channel == TIMESTAMP:
             raise ValueError(f"channels: {channel}; want the name alone, e.g. voltage0 for in_voltage0_raw")
+    factors = settings.to_percent if isinstance(settings.to_percent, list) else [settings.to_percent]
+    if isinstance(settings.to_percent, list) and len(factors) != len(settings.channels):
+        raise ValueError(
+            f"to_percent: {len(factors)} for {len(settings.channels)} channels; want one number, or one each"
+        )
+    if not all(math.isfinite(factor) and factor != 0.0 for factor in factors):
+        raise ValueError(f"to_percent = {settings.to_percent}; want finite numbers, not 0")
     most_hz = 1000 if settings.mode == "raw" else 20_000
     if not 0.1 <= settings.rate_hz <= most_hz:
         raise ValueError(f"rate_hz = {settings.rate_hz:g}; want 0.1 to {most_hz} in mode {settings.mode}")

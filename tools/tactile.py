@@ -54,6 +54,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--edge-deg", type=float, default=45.0, help="half angle of the edge indenter (default 45)"
     )
 
+    calibrate.add_argument(
+        "--doubtful", action="store_true", help="write the finger even if it is not to be believed"
+    )
+
     score = commands.add_parser(
         "score", help="calibrate on part of the touches, fit the rest, tabulate what is reached"
     )

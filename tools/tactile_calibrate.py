@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -40,12 +41,22 @@ def calibrate(args: argparse.Namespace) -> int:
     ramp = data.recordings.get("ramp")
     ramps = [] if ramp is None else ramps_of(ramp, data.nominal.signal.scale)
     result = fit(data.nominal, join(list(data.touches.values())), options, progress, ramps)
-    args.output.write_text(to_toml(result.finger), encoding="utf-8")
-    from_toml(args.output.read_text(encoding="utf-8"))  # what was written can be read
     report = args.report or args.output.with_suffix(".html")
+    finger = result.finger
+    if result.doubts:
+        if not args.doubtful:
+            write_report(data, result, report, progress)
+            progress.close()
+            raise ValueError(
+                f"calibrate {args.data}: not to be believed, no finger was written: {'; '.join(result.doubts)}. See {report}; record "
+                "again, or write it all the same with --doubtful"
+            )
+        finger = msgspec.structs.replace(finger, notes={**finger.notes, "doubts": "; ".join(result.doubts)})
+    args.output.write_text(to_toml(finger), encoding="utf-8")
+    from_toml(args.output.read_text(encoding="utf-8"))  # what was written can be read
     write_report(data, result, report, progress)
     progress.close()
-    for warning in result.warnings:
+    for warning in (*result.doubts, *result.warnings):
         print(f"warning: {warning}")
     print(
         f"wrote {args.output} ({result.finger.contact.model}, map: {result.finger.notes['map']}) and {report}"
@@ -56,7 +67,7 @@ def calibrate(args: argparse.Namespace) -> int:
 def write_report(data: Data, result: Calibration, path: Path, progress: Callable[[str], None]) -> None:
     """Write the report: what was found, how well it predicts, and what the finger can tell."""
     page = Page(f"Calibration of finger {result.finger.name}")
-    for warning in result.warnings:
+    for warning in (*result.doubts, *result.warnings):
         page.warn(warning)
     _summary(page, result)
     _elements(page, result)
@@ -273,14 +284,21 @@ def _row(
     load = np.array([free[m].load_n_per_m for m in mine]) - touches.load[mine]
     cells = [
         "flat" if math.isinf(rc) else f"{1e3 * rc:.2f}", f"{1e3 * equivalent_radius(finger.cylinder, rc):.2f}",
-        f"{np.nanmean(radius):.2f}", f"{np.nanstd(radius):.2f}",
+        *_spread(radius, ".2f"), "none" if np.isnan(radius).all() else
         f"{1e3 * indenter_radius(finger.cylinder, 1e-3 * float(np.nanmean(radius))):.2f}",
-        f"{np.nanmean(place):+.3f}", f"{np.nanstd(place):.3f}", f"{np.nanmean(load):+.1f}", f"{np.nanstd(load):.1f}",
+        *_spread(place, "+.3f"), *_spread(load, "+.1f"),
     ]  # fmt: skip
     if loaded is not None:
         other = np.array([1e3 * loaded[m].equivalent_radius_m for m in mine])
-        cells += [f"{np.nanmean(other):.2f}", f"{np.nanstd(other):.2f}"]
+        cells += _spread(other, ".2f")
     return tuple(cells)
+
+
+def _spread(values: Floats, form: str) -> list[str]:
+    """Return mean and deviation of the values that there are."""
+    if np.isnan(values).all():
+        return ["none", "none"]
+    return [f"{np.nanmean(values):{form}}", f"{np.nanstd(values):{form.lstrip('+')}}"]
 
 
 def _characters(page: Page, recordings: dict[str, Recording], result: Calibration) -> None:
@@ -308,7 +326,7 @@ def _characters(page: Page, recordings: dict[str, Recording], result: Calibratio
                 time = "" if math.isnan(late.time_s) else f", time constant {late.time_s:.2f} s"
                 rows.append((what, f"{100 * late.share:+.1f} +- {100 * late.deviation:.1f} %{time}"))
         rows.append(
-            ("far elements under a touch (proximity), raw units", f"{np.nanmean(proximity_of(held)):+.4f}")
+            ("far elements under a touch (proximity), raw units", _spread(proximity_of(held), "+.4f")[0])
         )
     ramp = recordings.get("ramp")
     if ramp is not None:

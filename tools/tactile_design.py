@@ -48,6 +48,13 @@ def design(args: argparse.Namespace) -> int:
         f"Finger design: {args.core_mm:g}/{args.outer_mm:g} mm, {args.elements} elements at {args.pitch_deg:g} deg"
     )
     rows = _figures(body, radius, finger, args)
+    limit = math.degrees(spacing_needed(body, radius))
+    coarse = (
+        f"elements {args.pitch_deg:g} deg apart are too coarse: {limit:.2f} deg are needed, half a wavelength of the cut-off; "
+        "between two of them touches are told less well, and two touches pass for one"
+    )
+    if args.pitch_deg > limit:
+        page.warn(coarse)
     page.table(("quantity", "value", "meaning"), rows)
     progress("errors")
     _errors(page, finger)
@@ -57,6 +64,8 @@ def design(args: argparse.Namespace) -> int:
     progress.close()
     for name, value, _ in rows:
         print(f"{name:38s} {value}")
+    if args.pitch_deg > limit:
+        print(f"warning: {coarse}")
     print(f"wrote {args.output}")
     return 0
 

@@ -71,6 +71,10 @@ def score_folder(folder: Path, truth: Path | None, edge_half_angle: float) -> Sc
     kept = np.arange(len(touches)) % KEPT == 1
     result = calibrate(data.nominal, touches.pick(~kept), Options(edge_half_angle), ramps=ramps)
     errors, flagged = fit_errors(result.finger, touches.pick(kept))
+    if not np.isfinite(errors).any():
+        raise ValueError(
+            f"score {folder}: none of the {len(errors)} touches kept back could be fitted; see what calibrate says of it"
+        )
     spread, mean = np.nanstd(errors, axis=0), np.nanmean(errors, axis=0)
     mapped = result.residuals.get("corrected", np.array([np.nan]))
     told = truth / f"{folder.name}.json" if truth is not None else None

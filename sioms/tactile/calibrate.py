@@ -28,6 +28,7 @@ REFERENCE_LOAD = 200.0  # N/m, of the edge whose peak strain is the unit of resi
 _SILENT = 0.05  # of what the others answer: an element that answers less is dead
 TURN = 0.15  # rad, how far an element may lie from its nominal place
 SMALLEST, LARGEST = 0.35, 0.5  # Poisson's ratio
+SHALLOW, DEEP = 0.02, 0.9  # of the layer, between which an element's effective radius lies
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,8 +145,8 @@ def fit_element(
         return one.miss(values)
 
     thick = cylinder.outer_m - cylinder.core_m
-    low = np.array([full[0] - TURN, cylinder.core_m + 0.02 * thick, SMALLEST, 0.0])
-    high = np.array([full[0] + TURN, cylinder.core_m + 0.9 * thick, LARGEST, MOST_EXTENT**2])
+    low = np.array([full[0] - TURN, cylinder.core_m + SHALLOW * thick, SMALLEST, 0.0])
+    high = np.array([full[0] + TURN, cylinder.core_m + DEEP * thick, LARGEST, MOST_EXTENT**2])
     # twice as far from the bounds as the difference quotient reaches
     inside = np.clip(full, low + 1e-4 * (high - low), high - 1e-4 * (high - low))
     scale = np.array([0.01, 0.05 * thick, 0.02, 1e-3])

@@ -15,21 +15,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.tactile.calibrate import (
+    DEEP,
     FEWEST,
+    LARGEST,
     NEAR,
     REFERENCE_LOAD,
+    SHALLOW,
+    SMALLEST,
+    TURN,
     Freedom,
     fit_elements,
     strain_of,
 )
 from sioms.tactile.contact import width_for_load
 from sioms.tactile.cylinder import Cylinder, respond
-from sioms.tactile.emap import e_map, felt, highest_needed
+from sioms.tactile.emap import MOST_EXTENT, e_map, felt, highest_needed
 from sioms.tactile.finger import ContactKind, ContactModel, Elements, Finger, Geometry, IdentifiedMap
 from sioms.tactile.identify import Identified, corrected, series_of, truncated
 from sioms.tactile.indenter import Wedge
 from sioms.tactile.linearity import Quadratic
 from sioms.tactile.preparation import Faults, Fits, begin_at, clean_outputs
+from sioms.tactile.proximity import LONGEST, SHORTEST
 from sioms.tactile.together import Common, fit_together
 from sioms.tactile.touches import Ramp, Touches, TouchLoads, touch_loads
 from sioms.tactile.width import WidthTable, hertz_table, rigid_core_table
@@ -50,6 +56,10 @@ _ROUNDS = 3
 _PEAK_WAVES = 60
 _POISSON_MATTERS = 4e-3
 _QUADRATIC_MATTERS = 0.15  # 1/output
+MOST_MISFIT = 2.0  # per cent of the peak that a good finger leaves unexplained
+_CLOSE = 0.005  # of a range, to its end
+_MOST_QUADRATIC = 15.0  # 1/output
+_FAR_CELL = 2.0
 _FAR_GAIN = 5.0  # from nominal, either way: rather a wrong unit than scatter
 
 
@@ -85,6 +95,7 @@ class Calibration:
         corrected: E by the smallest change of the model.
         residuals: root mean square over left-out touches per element, of peak, by method.
         warnings: what the data could not support.
+        doubts: why the finger is not to be believed; none of a good one.
     """
 
     finger: Finger
@@ -99,6 +110,7 @@ class Calibration:
     corrected: Identified | None
     residuals: dict[str, Floats]
     warnings: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
 
 
 def calibrate(
@@ -144,7 +156,7 @@ def calibrate(
         kind, adhesion, contacts, tractions, table = _contact(
             body, begin, touches, loads, widths, options, faults, tick
         )
-        own, nu = _together(body, begin, touches, tractions, adhesion, warnings)
+        own, nu, sought = _together(body, begin, touches, tractions, adhesion, warnings)
         tick("element fit")
         straight, again = faults.straightened(body, own, tractions, adhesion)
         if abs(nu - body.poisson) < _POISSON_MATTERS and not _bent(again.quadratic, faults.quadratic):
@@ -176,6 +188,7 @@ def calibrate(
             residuals[name] = np.full(known.size, np.nan)
             residuals[name][known] = found.left_out / peak
     finger = _finger(nominal, body, best, kind, adhesion, widths, faults, touches, residuals, direct, peak)
+    doubts = _doubts(nominal, finger, best, sought, faults, touches.force / touches.load)
     return Calibration(
         finger,
         touches,
@@ -189,7 +202,62 @@ def calibrate(
         direct,
         residuals,
         warnings,
+        doubts,
     )
+
+
+def _doubts(
+    nominal: Finger, finger: Finger, fits: Fits, poisson: float, faults: Faults, cell: Floats
+) -> list[str]:
+    """Return why the finger is not to be believed: parameters at the end of what they may be, residuals, contradictions."""
+    doubts, body = [], finger.cylinder
+    known = [(element, fit) for element, fit in enumerate(fits) if fit is not None]
+    off = 100.0 * float(np.mean([finger.elements.misfit[element] for element, _ in known]))
+    if off > MOST_MISFIT:
+        doubts.append(
+            f"the touches leave {off:.1f} % of the peak strain unexplained beside their noise; a sound finger leaves less than "
+            f"{MOST_MISFIT:g} %: something acts that no model here knows, or the recordings contradict each other"
+        )
+    thick = body.outer_m - body.core_m
+    low, high = body.core_m + SHALLOW * thick, body.core_m + DEEP * thick
+    for element, fit in known:
+        if not low + _CLOSE * thick < fit.radius_m < high - _CLOSE * thick:
+            doubts.append(
+                f"element {element}: its effective radius runs to the end of what it can be, {1e3 * fit.radius_m:.2f} mm between a "
+                f"core of {1e3 * body.core_m:.2f} and a surface of {1e3 * body.outer_m:.2f} mm"
+            )
+        turned = abs(fit.angle_rad - nominal.elements.angle_rad[element])
+        if turned > (1.0 - _CLOSE) * TURN:
+            doubts.append(
+                f"element {element}: its place runs to the end of what was searched, {np.degrees(turned):.1f} degrees from the nominal one"
+            )
+    if min(finger.geometry.extent_rad, MOST_EXTENT) > (1.0 - _CLOSE) * MOST_EXTENT:
+        doubts.append(
+            f"the arc of an element runs to the widest that was searched, {np.degrees(MOST_EXTENT):.1f} degrees"
+        )
+    if poisson < SMALLEST + _CLOSE * (LARGEST - SMALLEST):
+        doubts.append(f"Poisson's ratio runs to the least that was searched, {SMALLEST:g}")
+    gains = [fit.gain / nominal.elements.gain[element] for element, fit in known]
+    ratio = float(np.median(gains))
+    if not 1.0 / _FAR_GAIN < ratio < _FAR_GAIN:
+        doubts.append(
+            f"the gains come out {ratio:.3g} times the nominal ones: a wrong unit, or a wrong nominal finger"
+        )
+    quadratic, pull = faults.quadratic, faults.proximity
+    if quadratic is not None and float(np.max(np.abs(quadratic.value))) > _MOST_QUADRATIC:
+        doubts.append(
+            f"the quadratic comes out as {float(np.max(np.abs(quadratic.value))) / 100.0:.2f} per per cent: at {_MOST_QUADRATIC / 100.0:.2f} and "
+            "more an output of a few per cent is at the end of its range"
+        )
+    if pull is not None and not SHORTEST < pull.range_rad < LONGEST:
+        doubts.append(
+            f"the pull of the conductor reaches {np.degrees(pull.range_rad):.0f} degrees, the end of what was searched"
+        )
+    if np.isfinite(cell).all() and not 1.0 / _FAR_CELL < float(np.median(cell)) < _FAR_CELL:
+        doubts.append(
+            f"the load cell reads {float(np.median(cell)):.2f} times the commanded load: strains and loads contradict each other in scale"
+        )
+    return doubts
 
 
 def _check(nominal: Finger, touches: Touches, warnings: list[str]) -> None:
@@ -330,19 +398,19 @@ def _with_extent(body: Cylinder, begin: Fits, touches: Touches, loads: TouchLoad
 
 def _together(
     body: Cylinder, begin: Fits, touches: Touches, loads: TouchLoads, adhesion: float, warnings: list[str]
-) -> tuple[Fits, float]:
-    """Fit depths of all elements with one Poisson's ratio, the body's if the data do not support another."""
+) -> tuple[Fits, float, float]:
+    """Fit depths of all elements with one Poisson's ratio, the body's if the data do not support another, and the one sought."""
     wide = any(fit is not None and fit.extent_rad > 0.0 for fit in begin)
     found, shared = fit_together(body, begin, touches, loads, adhesion, Common(extent=wide))
     nu, deviation = shared.poisson, shared.poisson_deviation
     if deviation < _POISSON_DEVIATION and 0.36 < nu < 0.4995:
-        return found, nu
+        return found, nu, nu
     warnings.append(
         f"Poisson's ratio is not supported by the data ({nu:.3f} +- {deviation:.3f}): kept at {body.poisson:.3g}"
     )
     held = [None if fit is None else replace(fit, poisson=body.poisson) for fit in begin]
     found, _ = fit_together(body, held, touches, loads, adhesion, Common(poisson=False, extent=wide))
-    return found, body.poisson
+    return found, body.poisson, nu
 
 
 def _left_out(
@@ -449,7 +517,7 @@ def _finger(
         elements=elements,
         contact=ContactModel(
             kind, adhesion, tuple(table.half_widths.tolist()), tuple(table.ratio.tolist()),
-            nominal.contact.most_load_n_per_m,
+            nominal.contact.most_load_n_per_m, "elliptic" if kind == "hertz" else "exact", 1.0,
         ),
         signal=nominal.signal if proximity is None else msgspec.structs.replace(
             nominal.signal, proximity=proximity.amplitude, proximity_range_rad=proximity.range_rad

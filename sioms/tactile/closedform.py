@@ -34,8 +34,20 @@ def indenter_radius(cylinder: Cylinder, equivalent_m: float) -> float:
     return 1.0 / (1.0 / equivalent_m - 1.0 / cylinder.outer_m) if equivalent_m > 0.0 else 0.0
 
 
+def _check_press(what: str, load: float, equivalent_m: float = 0.0) -> None:
+    if not 0.0 <= load < np.inf:
+        raise ValueError(f"{what}: load is {load} N/m; need 0 or a pressing one, which is positive")
+    if not 0.0 <= equivalent_m < np.inf:
+        raise ValueError(f"{what}: equivalent radius is {equivalent_m} m; need 0 or more, finite")
+
+
 def hertz_width(cylinder: Cylinder, load: float, equivalent_m: float) -> float:
-    """Return theta_w [rad] of a round indenter: (2/rb) sqrt(2 P (1 - nu) R/(pi mu))."""
+    """Return theta_w [rad] of a round indenter: (2/rb) sqrt(2 P (1 - nu) R/(pi mu)).
+
+    Raises:
+        ValueError: a load or an R that is negative or no number.
+    """
+    _check_press("take Hertz width", load, equivalent_m)
     square = 2.0 * load * (1.0 - cylinder.poisson) * equivalent_m / (np.pi * cylinder.shear_pa)
     return float(2.0 / cylinder.outer_m * np.sqrt(square))
 
@@ -48,7 +60,16 @@ def hertz_product(cylinder: Cylinder, half_width: ArrayLike) -> Floats:
 
 
 def wedge_width(cylinder: Cylinder, load: float, half_angle: float) -> float:
-    """Return theta_w [rad] of a wedge of half angle tp [rad]: P (1 - nu) tan(tp)/(mu rb)."""
+    """Return theta_w [rad] of a wedge of half angle tp [rad]: P (1 - nu) tan(tp)/(mu rb).
+
+    Raises:
+        ValueError: a load that is negative or no number, or a half angle not between 0 and pi/2.
+    """
+    _check_press("take wedge width", load)
+    if not 0.0 < half_angle < 0.5 * np.pi:
+        raise ValueError(
+            f"take wedge width: half angle is {half_angle} rad; need between 0 and pi/2, measured from its axis"
+        )
     return float(
         load * (1.0 - cylinder.poisson) * np.tan(half_angle) / (cylinder.shear_pa * cylinder.outer_m)
     )
@@ -105,7 +126,14 @@ def _rounded_to(cylinder: Cylinder, half_width: float, half_angle: float, radius
 
 
 def equivalent_wedge(cylinder: Cylinder, load: float, equivalent_m: float) -> float:
-    """Return the half angle [rad] of the wedge with the width of a cylinder, both in closed form (2.58)."""
+    """Return the half angle [rad] of the wedge with the width of a cylinder, both in closed form (2.58).
+
+    Raises:
+        ValueError: a load that is not positive, or an R that is negative or no number.
+    """
+    _check_press("take equivalent wedge", load, equivalent_m)
+    if load == 0.0:
+        raise ValueError("take equivalent wedge: load is 0 N/m; need a positive (pressing) load")
     square = 8.0 * cylinder.shear_pa * equivalent_m / (np.pi * load * (1.0 - cylinder.poisson))
     return float(np.arctan(np.sqrt(square)))
 

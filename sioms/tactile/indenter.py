@@ -32,6 +32,12 @@ class Round:
 
     radius_m: float
 
+    def __post_init__(self) -> None:
+        if not self.radius_m > 0.0:
+            raise ValueError(
+                f"describe round indenter: radius_m is {self.radius_m} m; need > 0, infinite for a flat, Wedge for an edge"
+            )
+
     def slope(self, cylinder: Cylinder, t: Floats) -> Floats:
         """Return (rb^2/R) t."""
         return (cylinder.outer_m + cylinder.outer_m**2 / self.radius_m) * t
@@ -47,6 +53,16 @@ class Wedge:
 
     half_angle: float
     radius_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.half_angle < 0.5 * np.pi:
+            raise ValueError(
+                f"describe wedge: half_angle is {self.half_angle} rad; need between 0 and pi/2, measured from its axis"
+            )
+        if not 0.0 <= self.radius_m < np.inf:
+            raise ValueError(
+                f"describe wedge: radius_m of its edge is {self.radius_m} m; need 0 (sharp) or more, finite"
+            )
 
     def slope(self, cylinder: Cylinder, t: Floats) -> Floats:
         """Return the round slope up to |t| = rc/(rb tan tp) and the constant one beyond."""

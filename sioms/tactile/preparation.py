@@ -25,7 +25,7 @@ Fits = list[ElementFit | None]
 _WAVES, _MOST_WAVES = 60, 250  # of calibration: the least, and the most for elements just below the surface
 _MISSED = 1e-3  # of a line load's peak
 _WIDER = 0.02  # of the half width, for a difference quotient
-_FOLLOWS = 0.3  # correlation of touches and load cell above which the cell is believed
+_EVIDENT = 4.0  # standard deviations of the share of the cell's variation that the touches follow
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,12 +103,13 @@ def clean_outputs(
         touches = undrawn = recorded.with_output(recorded.output - pull)
         drawn = proximity is not None
         last = number == (2 if drawn else 1)
-        if number == 0 and _cell_is_better(nominal, touches, loads):
-            recorded = _cell_loads(recorded)
+        if number == 0 and (share := _cell_share(nominal, touches, loads)) > 0.0:
+            recorded = _cell_loads(recorded, share)
             touches = undrawn = recorded.with_output(touches.output)
             loads = touch_loads(body, widths, recorded, highest, edge_half_angle)
             warnings.append(
-                "the outputs follow the load cell from touch to touch: its variation was used, at the commanded level"
+                "the outputs follow the load cell from touch to touch: its variation was used"
+                f"{'' if share == 1.0 else f' by {100 * share:.0f} %, the rest is its noise,'} at the commanded level"
             )
         source = recorded if drawn else touches
         quadratic = ramped.join(
@@ -140,6 +141,18 @@ def clean_outputs(
 
 
 def _strips(
+    body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, wider: TouchLoads
+) -> Strips | None:
+    """Look for strips in all touches, else in the edges alone: what round indenters leave besides does not hide them then."""
+    found = _strips_in(body, fits, touches, loads, wider)
+    edge = touches.radius_m == 0.0
+    if found is not None or edge.all() or not edge.any():
+        return found
+    some, broad = (TouchLoads(p.normal[edge], p.shear[edge]) for p in (loads, wider))
+    return _strips_in(body, fits, touches.pick(edge), some, broad)
+
+
+def _strips_in(
     body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, wider: TouchLoads
 ) -> Strips | None:
     """Look for strips in what the elements' fits leave of touches over the elements."""
@@ -211,10 +224,14 @@ def _expected(
     return output
 
 
-def _cell_is_better(nominal: Finger, touches: Touches, loads: TouchLoads) -> bool:
-    """Return whether the strength of the touches goes with the load cell's reading beyond the commanded load."""
+def _cell_share(nominal: Finger, touches: Touches, loads: TouchLoads) -> float:
+    """Return the share of the load cell's variation that the strength of the touches follows, beyond the commanded load.
+
+    It is the best guess of the load from a noisy reading, 0 where it is not evident. More touches make it more evident, whatever
+    else varies in them.
+    """
     if not np.isfinite(touches.force).all() or np.any(touches.force <= 0.0):
-        return False
+        return 0.0
     e = nominal.elements
     begin = begin_at(nominal, touches)
     model = _model(nominal.cylinder, begin, touches, loads)
@@ -229,15 +246,18 @@ def _cell_is_better(nominal: Finger, touches: Touches, loads: TouchLoads) -> boo
             heard.append(strength[mine] / strength[mine].mean() - 1.0)
             told.append(touches.force[mine] / touches.force[mine].mean() - 1.0)
     if not told:
-        return False
+        return 0.0
     x, y = np.concatenate(told), np.concatenate(heard)
-    return bool(x @ y > _FOLLOWS * np.sqrt((x @ x) * (y @ y)))
+    share = float(x @ y) / max(float(x @ x), 1e-300)
+    left = y - share * x
+    deviation = math.sqrt(float(left @ left) / (max(x.size - 2, 1) * max(float(x @ x), 1e-300)))
+    return min(share, 1.0) if share > _EVIDENT * deviation else 0.0
 
 
-def _cell_loads(touches: Touches) -> Touches:
-    """Return the touches with the cell's loads, scaled to the commanded level."""
-    load = touches.force * float(np.median(touches.load / touches.force))
-    return replace(touches, load=load)
+def _cell_loads(touches: Touches, share: float) -> Touches:
+    """Return the touches with loads that follow the cell's by a share, at the commanded level."""
+    told = touches.force * float(np.median(touches.load / touches.force))
+    return replace(touches, load=touches.load + share * (told - touches.load))
 
 
 class _Ramps:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float64]
 
 _RANGES = np.radians(np.arange(6.0, 41.0, 1.0))
+SHORTEST, LONGEST = float(_RANGES[0]), float(_RANGES[-1])
 _GAIN = 0.7  # the fit must leave less than this share of the squares
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from sioms.tactile.calibrate import LARGEST, SMALLEST, TURN, ElementFit, NearTouches
+from sioms.tactile.calibrate import DEEP, LARGEST, SHALLOW, SMALLEST, TURN, ElementFit, NearTouches
 from sioms.tactile.cylinder import Cylinder
 from sioms.tactile.emap import MOST_EXTENT
 from sioms.tactile.touches import Touches, TouchLoads
@@ -69,8 +69,8 @@ class _Problem:
         self._work, self._start = work, start
         self._scale = np.array([0.01, 0.05 * thick, 0.02, 1e-3])
         self._step = np.array([1e-6, 1e-4 * thick, 1e-4, 1e-6])
-        self._low = np.array([-np.inf, cylinder.core_m + 0.02 * thick, SMALLEST, 0.0])
-        self._high = np.array([np.inf, cylinder.core_m + 0.9 * thick, LARGEST, MOST_EXTENT**2])
+        self._low = np.array([-np.inf, cylinder.core_m + SHALLOW * thick, SMALLEST, 0.0])
+        self._high = np.array([np.inf, cylinder.core_m + DEEP * thick, LARGEST, MOST_EXTENT**2])
         self._place = _places(count, common)
         self._moving = self._place >= 0
         self._column = np.zeros(int(self._place.max()) + 1, dtype=np.intp)

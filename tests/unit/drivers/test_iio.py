@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from sioms.drivers.iio import Iio, IioRaw
+from sioms.plant.finger import FingerShape, TactileArray
 from sioms.sdk.exchange import LinkError
 from sioms.sdk.iio_device import IioDevice, find_device
+from sioms.tactile.sensing import CHANNELS
 from sioms.tools.counterparts.iio import Dummy
 
 
@@ -232,3 +234,39 @@ def test_the_mode_chooses_the_class() -> None:
             Iio.variant(msgspec.convert({"device": "adc", "channels": ["temp"], "mode": mode}, Iio.Settings))
             is kind
         )
+
+
+def test_channels_of_a_converter_are_a_finger(sysfs: Path, bench: Any) -> None:
+    """Volts of sixteen elements, 2 V untouched: a touch is told as behind any other front end."""
+    folder, finger = sysfs / "iio:device1", Path(__file__).parents[3] / "etc" / "finger.toml"
+    values = attributes(folder, in_voltage_scale=1.0)  # the kernel's millivolts
+    table: dict[str, Any] = {
+        "device": "gyro", "channels": [f"voltage{n}" for n in range(16)], "sysfs": str(sysfs), "rate_hz": 100.0,
+        "shape": {"finger_file": str(finger)}, "to_percent": 50.0,
+    }  # fmt: skip
+    array, random = TactileArray(FingerShape(gain=3.0)), np.random.default_rng(3)
+
+    def read(load: float) -> dict[str, float]:
+        output = -100.0 / 3.0 * array.strain(load, 1.2, 6e-3) + 0.02 * random.normal(size=16)
+        for number, value in enumerate(output):
+            attributes(values.folder, **{f"in_voltage{number}_raw": 2000.0 + 20.0 * value})
+        made.tick(bench.now_ns)
+        return dict(zip((name for name, _, _ in CHANNELS), made.blocks[2].data.tolist(), strict=True))
+
+    made = bench.make(IioRaw, "adc0", table)
+    for number in range(16):
+        attributes(folder, **{f"in_voltage{number}_raw": 2000.0})
+    made.open()
+    for _ in range(30):
+        rest = read(0.0)
+    assert rest["touched"] == 0.0 and rest["load"] == 0.0
+    felt = [read(200.0) for _ in range(10)]
+    assert np.mean([one["load"] for one in felt]) == pytest.approx(200.0, abs=4.0)
+    assert felt[-1]["angle"] == pytest.approx(1.2, abs=0.01) and felt[-1]["quality"] == 0.0
+    assert made.blocks[0].data[0] == pytest.approx(2.0, abs=0.1)  # its own node stays in SI
+    for wrong, words in (
+        ({"to_percent": [1.0, 2.0]}, "2 for 16 channels"),
+        ({"to_percent": 0.0}, "want finite numbers, not 0"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            Iio.describe("adc0", msgspec.convert({**table, **wrong}, Iio.Settings))
