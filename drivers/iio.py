@@ -12,8 +12,8 @@ gauss becomes V, Pa and T.
     rate_hz = 860.0
     trigger = "sioms-hrtimer"
 
-Whose channels are the elements of a calibrated tactile finger has a table ``shape``, see ``tactile_nodes``, and ``to_percent``: the
-finger's file is in per cent of the untouched output, the kernel's values are in SI.
+A converter behind the elements of a calibrated tactile finger has a table ``shape``, see ``tactile_nodes``; ``element_offset`` and
+``element_scale`` turn its values, which are in SI, into what the finger was calibrated in: per cent of the untouched output.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class IioSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         minimum, maximum: range of the values, in SI.
         history: snapshots kept for readers.
         shape: of a tactile finger: shows its strains and the shape that touches it, too.
-        to_percent: factor from the values to the finger's raw unit, per cent of the untouched output; one number, or one a channel.
+        element_scale, element_offset: per cent for the finger's file = (value - offset) * scale; one number, or one a channel.
         sysfs: where the devices are.
         dev: where their buffers are.
     """
@@ -73,7 +73,8 @@ class IioSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     maximum: float | None = None
     history: int = 256
     shape: tactile_nodes.ShapeSettings | None = None
-    to_percent: float | list[float] = 1.0
+    element_scale: float | list[float] = 1.0
+    element_offset: float | list[float] = 0.0
     sysfs: str = "/sys/bus/iio/devices"
     dev: str = "/dev"
 
@@ -317,22 +318,21 @@ class _Finger:
     Concurrency: the one thread of the driver process.
     """
 
-    def __init__(self, nodes: tactile_nodes.TactileNodes, to_percent: float | list[float]) -> None:
-        self._nodes, self._factor = nodes, np.asarray(to_percent, dtype=np.float64)
+    def __init__(self, nodes: tactile_nodes.TactileNodes, settings: IioSettings) -> None:
+        self._nodes, self._factor = nodes, np.asarray(settings.element_scale, dtype=np.float64)
+        self._offset = np.asarray(settings.element_offset, dtype=np.float64)
         self.blocks, self.ioctl = nodes.blocks, nodes.ioctl
 
     def take(self, values: NDArray[np.float64], flags: NDArray[np.int64], stamp_ns: int, now_ns: int) -> None:
         """Sense one frame, as ``TactileNodes.take``."""
-        self._nodes.take(values * self._factor, flags, stamp_ns, now_ns)
+        self._nodes.take((values - self._offset) * self._factor, flags, stamp_ns, now_ns)
 
 
 def _blocks(settings: IioSettings, kit: Kit) -> tuple[AnalogBlock, _Finger | None]:
     first, *more = _describe(settings).blocks
     if settings.shape is None:
         return AnalogBlock(first), None
-    return AnalogBlock(first), _Finger(
-        tactile_nodes.TactileNodes(settings.shape, more, kit), settings.to_percent
-    )
+    return AnalogBlock(first), _Finger(tactile_nodes.TactileNodes(settings.shape, more, kit), settings)
 
 
 def _all(block: AnalogBlock, finger: _Finger | None) -> Sequence[AnyBlock]:
@@ -404,13 +404,15 @@ def _check(settings: IioSettings) -> None:
             )
         if channel.startswith("in_") or channel.endswith("_raw") or channel == TIMESTAMP:
             raise ValueError(f"channels: {channel}; want the name alone, e.g. voltage0 for in_voltage0_raw")
-    factors = settings.to_percent if isinstance(settings.to_percent, list) else [settings.to_percent]
-    if isinstance(settings.to_percent, list) and len(factors) != len(settings.channels):
-        raise ValueError(
-            f"to_percent: {len(factors)} for {len(settings.channels)} channels; want one number, or one each"
-        )
-    if not all(math.isfinite(factor) and factor != 0.0 for factor in factors):
-        raise ValueError(f"to_percent = {settings.to_percent}; want finite numbers, not 0")
+    for key in ("element_scale", "element_offset"):
+        value = getattr(settings, key)
+        numbers = value if isinstance(value, list) else [value]
+        if isinstance(value, list) and len(value) != len(settings.channels):
+            raise ValueError(
+                f"{key}: {len(value)} for {len(settings.channels)} channels; want one number, or one each"
+            )
+        if not all(map(math.isfinite, numbers)) or (key == "element_scale" and 0 in numbers):
+            raise ValueError(f"{key} = {value}; want finite numbers{', not 0' * (key == 'element_scale')}")
     most_hz = 1000 if settings.mode == "raw" else 20_000
     if not 0.1 <= settings.rate_hz <= most_hz:
         raise ValueError(f"rate_hz = {settings.rate_hz:g}; want 0.1 to {most_hz} in mode {settings.mode}")

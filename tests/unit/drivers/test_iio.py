@@ -242,7 +242,7 @@ def test_channels_of_a_converter_are_a_finger(sysfs: Path, bench: Any) -> None:
     values = attributes(folder, in_voltage_scale=1.0)  # the kernel's millivolts
     table: dict[str, Any] = {
         "device": "gyro", "channels": [f"voltage{n}" for n in range(16)], "sysfs": str(sysfs), "rate_hz": 100.0,
-        "shape": {"finger_file": str(finger)}, "to_percent": 50.0,
+        "shape": {"finger_file": str(finger)}, "element_scale": 50.0, "element_offset": 2.0,
     }  # fmt: skip
     array, random = TactileArray(FingerShape(gain=3.0)), np.random.default_rng(3)
 
@@ -265,8 +265,8 @@ def test_channels_of_a_converter_are_a_finger(sysfs: Path, bench: Any) -> None:
     assert felt[-1]["angle"] == pytest.approx(1.2, abs=0.01) and felt[-1]["quality"] == 0.0
     assert made.blocks[0].data[0] == pytest.approx(2.0, abs=0.1)  # its own node stays in SI
     for wrong, words in (
-        ({"to_percent": [1.0, 2.0]}, "2 for 16 channels"),
-        ({"to_percent": 0.0}, "want finite numbers, not 0"),
+        ({"element_offset": [1.0, 2.0]}, "2 for 16 channels"),
+        ({"element_scale": 0.0}, "want finite numbers, not 0"),
     ):
         with pytest.raises(ValueError, match=words):
             Iio.describe("adc0", msgspec.convert({**table, **wrong}, Iio.Settings))
