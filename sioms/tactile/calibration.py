@@ -30,10 +30,11 @@ from sioms.tactile.calibrate import (
 from sioms.tactile.contact import width_for_load
 from sioms.tactile.cylinder import Cylinder, respond
 from sioms.tactile.emap import MOST_EXTENT, e_map, felt, highest_needed
+from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import ContactKind, ContactModel, Elements, Finger, Geometry, IdentifiedMap
 from sioms.tactile.identify import Identified, corrected, series_of, truncated
 from sioms.tactile.indenter import Wedge
-from sioms.tactile.linearity import Quadratic
+from sioms.tactile.linearity import Quadratic, linearise
 from sioms.tactile.preparation import Faults, Fits, begin_at, clean_outputs
 from sioms.tactile.proximity import LONGEST, SHORTEST
 from sioms.tactile.together import Common, fit_together
@@ -60,6 +61,9 @@ MOST_MISFIT = 2.0  # per cent of the peak that a good finger leaves unexplained
 _CLOSE = 0.005  # of a range, to its end
 _MOST_QUADRATIC = 15.0  # 1/output
 _FAR_CELL = 2.0
+_MOST_BENT = 0.9  # 4 q A, at 1 of which a pull A is the lowest output of a quadratic q
+_FOUND, _FOUND_LOAD = 80, 100.0  # touches looked for again, from so many N/m on
+_FOUND_DOUBTFUL, _FOUND_DEG, _FOUND_PERCENT = 0.4, 1.0, 8.0
 _FAR_GAIN = 5.0  # from nominal, either way: rather a wrong unit than scatter
 
 
@@ -133,6 +137,7 @@ def calibrate(
         ValueError: too few touches, wrong number of elements, or outputs of the wrong sign.
     """
     warnings: list[str] = []
+    recorded = touches
     _check(nominal, touches, warnings)
     body = nominal.cylinder
     widths = rigid_core_table(body)
@@ -189,6 +194,7 @@ def calibrate(
             residuals[name][known] = found.left_out / peak
     finger = _finger(nominal, body, best, kind, adhesion, widths, faults, touches, residuals, direct, peak)
     doubts = _doubts(nominal, finger, best, sought, faults, touches.force / touches.load)
+    doubts += _found_again(finger, recorded)
     return Calibration(
         finger,
         touches,
@@ -249,6 +255,13 @@ def _doubts(
             f"the quadratic comes out as {float(np.max(np.abs(quadratic.value))) / 100.0:.2f} per per cent: at {_MOST_QUADRATIC / 100.0:.2f} and "
             "more an output of a few per cent is at the end of its range"
         )
+    if pull is not None and quadratic is not None:
+        bent = 4.0 * float(np.max(quadratic.value)) * abs(pull.amplitude)
+        if bent > _MOST_BENT:
+            doubts.append(
+                f"the pull of the conductor, {100.0 * pull.amplitude:.1f} % of output, lies {'beyond' if bent > 1.0 else 'near'} the lowest "
+                "output that a quadratic of this size can give: what is below cannot be undone; shield the elements"
+            )
     if pull is not None and not SHORTEST < pull.range_rad < LONGEST:
         doubts.append(
             f"the pull of the conductor reaches {np.degrees(pull.range_rad):.0f} degrees, the end of what was searched"
@@ -257,6 +270,43 @@ def _doubts(
         doubts.append(
             f"the load cell reads {float(np.median(cell)):.2f} times the commanded load: strains and loads contradict each other in scale"
         )
+    return doubts
+
+
+def _found_again(finger: Finger, touches: Touches) -> list[str]:
+    """Return why the finger is not to be believed that does not find the touches that it was made from."""
+    angles = np.array(finger.angles_rad)[np.array(finger.elements.used)]
+    inside = (touches.angle_rad > angles.min()) & (touches.angle_rad < angles.max())
+    chosen = np.flatnonzero(inside & (touches.load >= _FOUND_LOAD))
+    if chosen.size == 0:
+        return []
+    chosen = chosen[:: max(1, chosen.size // _FOUND)]
+    estimator = Estimator(finger, averaged=max(touches.averaged, 1.0))
+    strains = -np.array(finger.elements.gain) * linearise(
+        touches.output[chosen], np.array(finger.elements.quadratic)
+    )
+    shapes = list(estimator.batch(strains))
+    doubtful = float(np.mean([shape.doubtful for shape in shapes]))
+    off = np.array(
+        [
+            (shape.angle_rad - touches.angle_rad[n], shape.load_n_per_m / touches.load[n] - 1.0)
+            for shape, n in zip(shapes, chosen, strict=True)
+            if shape.usable
+        ]
+    ).reshape(-1, 2)
+    doubts = []
+    if doubtful > _FOUND_DOUBTFUL:
+        doubts.append(
+            f"{100.0 * doubtful:.0f} % of the touches that it was made from are doubtful when it estimates them; of a sound finger "
+            f"less than {100.0 * _FOUND_DOUBTFUL:.0f} % are"
+        )
+    if off.size:
+        place, load = np.degrees(np.median(np.abs(off[:, 0]))), 100.0 * float(np.median(off[:, 1]))
+        if place > _FOUND_DEG or abs(load) > _FOUND_PERCENT:
+            doubts.append(
+                f"it finds the touches that it was made from {place:.2f} degrees beside their places and {load:+.1f} % off their loads, "
+                f"in the median; want less than {_FOUND_DEG:g} degrees and {_FOUND_PERCENT:g} %"
+            )
     return doubts
 
 

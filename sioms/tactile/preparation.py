@@ -25,7 +25,7 @@ Fits = list[ElementFit | None]
 _WAVES, _MOST_WAVES = 60, 250  # of calibration: the least, and the most for elements just below the surface
 _MISSED = 1e-3  # of a line load's peak
 _WIDER = 0.02  # of the half width, for a difference quotient
-_EVIDENT = 4.0  # standard deviations of the share of the cell's variation that the touches follow
+_EVIDENT = 2.5  # standard deviations of the share of the cell's variation that the touches follow
 
 
 @dataclass(frozen=True, slots=True)

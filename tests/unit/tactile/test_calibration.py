@@ -293,31 +293,31 @@ def test_what_no_model_explains_is_doubted(start: Finger, made) -> None:  # type
 
 
 def _placed(touches: Touches, angle_rad: np.ndarray) -> Touches:
-    return Touches(
-        touches.output, angle_rad, touches.load, touches.radius_m, touches.force, touches.noise
-    )
+    return Touches(touches.output, angle_rad, touches.load, touches.radius_m, touches.force, touches.noise)
 
 
 def test_a_noisy_cell_is_believed_by_its_share_and_more_touches_lose_nothing(nominal: Finger, made) -> None:  # type: ignore[no-untyped-def]
     """Half of the cell's variation is its own noise; the touches of indenters have scatter of another origin beside."""
     random = np.random.default_rng(4)
     touches = made.touches()
-    share = 1.0 + 0.02 * random.normal(size=len(touches))
-    told = share + 0.02 * random.normal(size=len(touches))
+    share = 1.0 + 0.04 * random.normal(size=len(touches))
+    told = share + 0.04 * random.normal(size=len(touches))
     scatter = np.where(touches.radius_m == 0.0, 1.0, 1.0 + 0.08 * random.normal(size=len(touches)))
     real = Touches(
         touches.output * (share * scatter)[:, None], touches.angle_rad, touches.load, touches.radius_m,
         touches.load * told, touches.noise,
     )  # fmt: skip
-    start = msgspec.structs.replace(nominal, elements=msgspec.structs.replace(nominal.elements, gain=(3.0,) * 16))
+    start = msgspec.structs.replace(
+        nominal, elements=msgspec.structs.replace(nominal.elements, gain=(3.0,) * 16)
+    )
     widths = nominal.width_table()
     found = []
     for part in (real.pick(real.radius_m == 0.0), real):
         found.append(_cell_share(start, part, touch_loads(nominal.cylinder, widths, part, 60)))
-    assert 0.2 < found[0] < 0.8  # the regression on a reading of which half is noise
+    assert 0.2 < found[0] < 0.9  # the regression on a reading of which half is noise
     assert found[1] > 0.2
     nothing = Touches(
-        real.output, real.angle_rad, real.load, real.radius_m, real.load * (1.0 + 0.02 * random.normal(size=len(real))),
+        real.output, real.angle_rad, real.load, real.radius_m, real.load * (1.0 + 0.04 * random.normal(size=len(real))),
         real.noise,
     )  # fmt: skip
     assert _cell_share(start, nothing, touch_loads(nominal.cylinder, widths, nothing, 60)) == 0.0
