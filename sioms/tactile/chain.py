@@ -43,7 +43,7 @@ Flags = NDArray[np.bool_]
 SETTLE_FRAMES = 20  # averaged for the first baseline
 DEAD_FRAMES = 200  # without a change, where readings are noisy: dead
 RECOVER_S = 2.0  # an element that moved alone must stand still so long, untouched, to be believed again
-HELD_FRAMES = 16  # of a steady touch, that are first averaged; then twice as many, and so on
+HELD_FRAMES = 16  # of a steady touch, of which two means must agree; then twice as many, and so on
 MOST_HELD = 1024
 _NOISY, _MOST_NOISY = 0.25, 0.75  # an element that changes in so many frames; share of all elements
 _MEMORY = 64  # frames over which changes are counted
@@ -381,7 +381,7 @@ class SignalChain:
 
 
 class _Average:
-    """Averages the strains of a touch while it is steady, and says so after 16 frames, after 32, and so on."""
+    """Averages the strains of a touch while it is steady, and says so after 32 frames, after 64, and so on."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -429,7 +429,8 @@ class _Average:
                 self._sum, self._frames, self._held = np.zeros(self._count), 0, None
         self._sum += block * HELD_FRAMES
         self._frames += HELD_FRAMES
-        if self._frames & (self._frames - 1) == 0:
+        # one block alone may be a mean over a touch that moves
+        if self._frames > HELD_FRAMES and self._frames & (self._frames - 1) == 0:
             kept = 1.0 if stepped else 1.0 / self._frames
             variance = noise * (kept + np.minimum(baseline, 1.0))
             self._held = Held(self._sum / self._frames, variance, self._frames)
