@@ -173,7 +173,8 @@ class NodeVerbs:
                 raise Refused(errno.EIO, f"open {node.name}: {error.strerror}") from None
             self._handles[handle.number] = session.handles[handle.number] = handle
             self._claims.take(handle.claims, handle)
-            value = [handle.number, self._server.names.pack(node), node.channels, node.bit]
+            behind = [os.getpid(), device.pid]
+            value = [handle.number, self._server.names.pack(node), node.channels, node.bit, behind]
             self._clients.send(
                 session, reply(number, value), [device.page_fds[node.block], readable, ours.fileno()]
             )

@@ -129,13 +129,9 @@ class Server:
     def stop_workcell(self, source: str) -> None:
         """Latch the emergency stop and wake every driver."""
         latch = self.shared.latch
-        first = latch.stop(time.monotonic_ns(), source)
-        if first:
+        if latch.stop(time.monotonic_ns(), source) or latch.source == self.shared.request.source != source:
             self.log("warning", "emergency stop", source=source)
-        if first or latch.source == self.shared.request.source:
-            latch.name_source(
-                source
-            )  # drivers see the request page with, or before, the message that says why
+            latch.name_source(source)  # drivers see the request page before the message that says who
         for device in self.devices.values():
             device.tell(DriverVerb.STOP_CHANGED)
 

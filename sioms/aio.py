@@ -18,6 +18,7 @@ import asyncio
 import errno
 import os
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from time import monotonic, monotonic_ns
 from typing import TYPE_CHECKING, Any, Self
 
@@ -27,15 +28,18 @@ from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.socketpath import socket_path
 from sioms.protocol.stopfile import StopRequest
 
-from .client.channel import GRACE_S, Answer, Call, Channel
+from .client.channel import FIRST_LOOK_S, Answer, Call, Channel
 from .client.channel import connect as connect_socket
 from .client.command import command
 from .client.node_core import Edges, Event, NodeCore
 from .client.shown import acknowledged_by_daemon
-from .client.workcell import STARTING_S, node_parts, open_call
+from .client.workcell import STARTING_S, node_parts, open_call, request_stop
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from .client.node_core import Records
+    from .client.overdue import Overdue
 
 
 class _Requests:
@@ -46,6 +50,7 @@ class _Requests:
         self._cancel_verb = cancel_verb
         self._futures: dict[int, asyncio.Future[Answer]] = {}
         self._abandoned: dict[int, Call] = {}
+        self._looks: dict[int, asyncio.TimerHandle] = {}
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(channel.fileno(), self._readable)
 
@@ -54,22 +59,41 @@ class _Requests:
         number = self._channel.send(call)
         future: asyncio.Future[Answer] = self._loop.create_future()
         self._futures[number] = future
+        if call.limit_s is not None:
+            first_s = monotonic() + call.limit_s + FIRST_LOOK_S
+            self._looks[number] = self._loop.call_later(
+                call.limit_s + FIRST_LOOK_S, self._look, number, call, first_s, None
+            )
         try:
-            async with asyncio.timeout(None if call.limit_s is None else call.limit_s + GRACE_S):
-                return await future
-        except TimeoutError:
-            if not future.cancelled():
-                raise  # the other side's own answer
-            self._cancel(number, call)
-            raise self._channel.late(call) from None
+            return await future
         except asyncio.CancelledError:
             self._cancel(number, call)
             raise
+        finally:
+            look = self._looks.pop(number, None)
+            if look is not None:
+                look.cancel()
+
+    def _look(self, number: int, call: Call, first_s: float, overdue: Overdue | None) -> None:
+        """Judge by the process that owes an overdue answer whether to wait on."""
+        overdue = overdue or self._channel.overdue(call, first_s)
+        now_s = monotonic()
+        until_s = overdue.until(now_s)
+        if until_s:
+            self._looks[number] = self._loop.call_later(
+                until_s - now_s, self._look, number, call, first_s, overdue
+            )
+            return
+        future = self._futures.get(number)
+        if future is not None and not future.done():
+            future.set_exception(self._channel.late(call))
+            self._cancel(number, call)
 
     def _cancel(self, number: int, call: Call) -> None:
         if self._futures.pop(number, None) is not None:
             self._abandoned[number] = call
-            self._channel.send(Call("cancel", self._cancel_verb, number))
+            with suppress(OSError):  # the other side has gone, and the request with it
+                self._channel.send(Call("cancel", self._cancel_verb, number))
 
     @property
     def closed(self) -> bool:
@@ -308,19 +332,13 @@ class AsyncWorkcell:
 
     async def emergency_stop(self, node: str = "", why: str = "") -> None:
         """Stop the workcell or a node, latched until reset; the workcell also while the daemon hangs."""
-        stopping = asyncio.ensure_future(self._call("emergency stop", ClientVerb.EMERGENCY_STOP, node, why))
+        taken = request_stop(None if node else self._page, why)
         try:
-            await asyncio.sleep(0)  # sent first, because the daemon knows who and why
-        finally:
-            page, word = None if node else self._page, 0
-            if page is not None:
-                word = page.request(monotonic_ns(), os.getpid(), why)
-        await asyncio.wait({stopping}, timeout=None if page is None else GRACE_S)
-        if page is not None and page.taken(word) and not (stopping.done() and not stopping.exception()):
-            stopping.cancel()  # the drivers have latched it without the daemon
+            await self._call("emergency stop", ClientVerb.EMERGENCY_STOP, node, why, enough=taken)
+        except OSError:
+            if taken is None or not taken():
+                raise  # else the drivers have latched it without the daemon
             acknowledged_by_daemon(monotonic_ns())
-            return
-        await stopping
 
     async def reset(self, node: str = "") -> None:
         """Clear the latched stop of the workcell or of a node."""
@@ -334,8 +352,10 @@ class AsyncWorkcell:
             if error.errno not in (errno.EIO, errno.EBADF):
                 raise
 
-    async def _call(self, what: str, verb: ClientVerb, *arguments: object) -> Any:
-        return (await self._requests.call(Call(what, verb, *arguments))).value
+    async def _call(
+        self, what: str, verb: ClientVerb, *arguments: object, enough: Callable[[], bool] | None = None
+    ) -> Any:
+        return (await self._requests.call(Call(what, verb, *arguments, enough=enough))).value
 
 
 async def connect(path: str | None = None, name: str = "") -> AsyncWorkcell:

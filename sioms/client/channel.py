@@ -15,13 +15,14 @@ from _socket import (
     CMSG_SPACE,
     SCM_RIGHTS,
     SHUT_RDWR,
+    SO_PEERCRED,
     SO_RCVTIMEO,
     SOCK_SEQPACKET,
     SOL_SOCKET,
     socket,
 )
 from _thread import allocate_lock
-from struct import pack
+from struct import pack, unpack
 from time import monotonic
 
 from sioms.protocol.messages import (
@@ -38,8 +39,10 @@ from .shown import acknowledged_by_daemon
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from typing import Any
+
+    from .overdue import Overdue
 
 _CMSG_CLOEXEC = 0x40000000
 _DONTWAIT = 0x40
@@ -48,8 +51,8 @@ _FOREVER = pack("ll", 0, 0)
 KEEPALIVE = encode(HandleVerb.KEEPALIVE, 0)
 INTERRUPTIBLE_S = 1.0
 """A signal that comes just before the interpreter goes to sleep is seen when that wakes: it sleeps this long [s]."""
-GRACE_S = 2.0
-"""How much longer than its own time-out an answer may take before the other side counts as hung."""
+FIRST_LOOK_S = 1.0
+"""How long after its own time-out an answer is overdue: then the process that owes it is looked at (``overdue``) [s]."""
 
 
 class Call:
@@ -59,9 +62,10 @@ class Call:
         what: the request in words, for messages.
         ahead: records that are sent ahead of it, in parts.
         limit_s: the time-out that the other side has been given [s], None = it may take for ever.
+        enough: tells of an overdue answer whether it is not needed any more.
     """
 
-    __slots__ = ("ahead", "arguments", "limit_s", "verb", "what")
+    __slots__ = ("ahead", "arguments", "enough", "limit_s", "verb", "what")
 
     def __init__(
         self,
@@ -70,6 +74,7 @@ class Call:
         *arguments: object,
         ahead: tuple[bytes, ...] = (),
         limit_s: float | None = 0.0,
+        enough: Callable[[], bool] | None = None,
     ) -> None:
         if limit_s is not None and not (isinstance(limit_s, int | float) and limit_s == limit_s):
             # Here it costs the caller an error; the other side would take it for a broken client.
@@ -79,6 +84,7 @@ class Call:
         self.arguments = arguments
         self.ahead = ahead
         self.limit_s = limit_s
+        self.enough = enough
 
 
 class Answer:
@@ -129,6 +135,8 @@ class Channel:
         passed: whether answers may bring descriptors along; those of drivers never do, and looking for
             them takes time.
         acknowledged: told of the instant of the effect of what has been answered [ns], before the answer is.
+        behind: the process that made the socket and the one that answers on it, as the former numbers them;
+            empty: it is the one that made it.
 
     Attributes:
         keepalive_s: while a thread waits for an answer, it tells the other side this often [s] that it
@@ -141,11 +149,13 @@ class Channel:
         name: str,
         passed: bool = True,
         acknowledged: Callable[[int], None] = acknowledged_by_daemon,
+        behind: Sequence[int] = (),
     ) -> None:
         self.name = name
         self.acknowledged = acknowledged
         self._sock = sock
         self._passed = passed
+        self._behind = behind
         self._number = 0
         self._mutex = allocate_lock()
         self._reading = False
@@ -170,7 +180,7 @@ class Channel:
 
         Raises:
             OSError: the refusal, with its errno and sentence; EIO when the other side is gone,
-                ETIMEDOUT when it does not answer within the time-out and a grace.
+                ETIMEDOUT when it does not answer within the time-out and what ``overdue`` adds to it.
         """
         number = 0
         try:
@@ -223,7 +233,8 @@ class Channel:
 
     def wait(self, number: int, call: Call) -> Answer:
         """Wait for the answer to a sent request."""
-        deadline = None if call.limit_s is None else monotonic() + call.limit_s + GRACE_S
+        deadline = None if call.limit_s is None else monotonic() + call.limit_s + FIRST_LOOK_S
+        overdue: Overdue | None = None
         while True:
             with self._mutex:
                 found = self._answers.pop(number, None)
@@ -244,7 +255,11 @@ class Channel:
                 turn.acquire(True, max(0.0, min(left, INTERRUPTIBLE_S)))
                 with self._mutex:
                     self._waiting.pop(number, None)
-                    late = number not in self._answers and deadline is not None and monotonic() >= deadline
+                    late = False
+                    if number not in self._answers and deadline is not None and monotonic() >= deadline:
+                        overdue = overdue or self.overdue(call, deadline)
+                        deadline = overdue.until(monotonic())
+                        late = not deadline
                     if late and not self._reading:  # the reading may just have been passed to us
                         self._pass_on()
                 if late:
@@ -256,9 +271,13 @@ class Channel:
                 with self._mutex:
                     self._reading = False
                     self._pass_on()
-            if found is None:
-                raise self.late(call)
-            return self.result(found)
+            if found is not None:
+                return self.result(found)
+            if deadline is not None:
+                overdue = overdue or self.overdue(call, deadline)
+                deadline = overdue.until(monotonic())
+                if not deadline:
+                    raise self.late(call)
 
     def _pass_on(self) -> None:
         """Let another thread read; when there is nothing to read any more, tell all."""
@@ -386,6 +405,25 @@ class Channel:
             except (OSError, MalformedMessage):
                 continue
         return None
+
+    def overdue(self, call: Call, first_s: float) -> Overdue:
+        """Return who tells how long an overdue answer is still waited for.
+
+        Args:
+            call: the request.
+            first_s: the moment at which it is overdue [s, time.monotonic].
+        """
+        from .overdue import Overdue
+
+        try:
+            maker = unpack("3i", self._sock.getsockopt(SOL_SOCKET, SO_PEERCRED, 12))[0]
+        except OSError:  # closed meanwhile
+            maker = 0
+        if self._behind:
+            known, pid = self._behind
+            # Elsewhere processes have other numbers than here.
+            return Overdue(pid if known == maker else 0, first_s, call.enough)
+        return Overdue(maker if maker != os.getpid() else 0, first_s, call.enough)
 
     def late(self, call: Call) -> OSError:
         """Return the error of a request that nobody has answered in time."""

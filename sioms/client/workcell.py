@@ -20,14 +20,13 @@ from .shown import acknowledged_by_daemon
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from typing import Any, Self, TypeVar, overload
 
     N = TypeVar("N", bound=Node)
 
 STARTING_S = 5.0
 """How long a client waits for a daemon that says that it is starting [s]."""
-CLOSE_S = 10.0
-"""How long a close may take [s]: its driver must get a processor and halt the axes before the node is free."""
 _ACCESS = {"r": Access.READ, "w": Access.WRITE, "rw": Access.READ | Access.WRITE}
 
 
@@ -95,7 +94,7 @@ def open_call(name: str, mode: str, timeout: float | None, lease: float) -> Call
 
 def node_parts(value: Any, fds: list[int]) -> tuple[Any, ...]:
     """Turn the answer to an open into the arguments of a node."""
-    handle, packed, channels, bit = value
+    handle, packed, channels, bit, behind = value
     info = NodeInfo(packed)
     return (
         info,
@@ -103,8 +102,23 @@ def node_parts(value: Any, fds: list[int]) -> tuple[Any, ...]:
         fds[:2],
         list(channels),
         bit,
-        Channel(socket(fileno=fds[2]), f"node {info.name}", False),
+        Channel(socket(fileno=fds[2]), f"node {info.name}", False, behind=behind),
     )
+
+
+def request_stop(request: StopRequest | None, why: str) -> Callable[[], bool] | None:
+    """Request a stop of the workcell past the daemon; return what tells whether it has been taken.
+
+    Comes before the request to the daemon: what is written after it may be found after a reset, as a new stop.
+
+    Args:
+        request: the stop-request file; None: this client has no right to it, or does not want it.
+        why: for the log.
+    """
+    if request is None:
+        return None
+    word = request.request(monotonic_ns(), os.getpid(), why)
+    return lambda: request.taken(word)
 
 
 class Workcell:
@@ -234,7 +248,7 @@ class Workcell:
         """Tell the daemon that a node was closed, and wait until its channels are free (nodes call this)."""
         self._nodes.pop(handle, None)
         try:
-            self._channel.call(Call("close", ClientVerb.CLOSE, handle, limit_s=CLOSE_S))
+            self._channel.call(Call("close", ClientVerb.CLOSE, handle))
         except OSError as error:
             # The daemon has gone, or knows no such handle any more: the driver has halted the axes
             # at the end of file of the node's own socket either way.
@@ -322,17 +336,11 @@ class Workcell:
             node: a node, '' for the whole workcell.
             why: for the log and for who asks why nothing moves.
         """
-        call = Call("emergency stop", ClientVerb.EMERGENCY_STOP, node, why)
-        request, word = None if node else self._request, 0
+        taken = request_stop(None if node else self._request, why)
         try:
-            number = self._channel.send(call)  # first, because the daemon knows who and why
-        finally:
-            if request is not None:
-                word = request.request(monotonic_ns(), os.getpid(), why)
-        try:
-            self._channel.wait(number, call)
+            self._channel.call(Call("emergency stop", ClientVerb.EMERGENCY_STOP, node, why, enough=taken))
         except OSError:
-            if request is None or not request.taken(word):
+            if taken is None or not taken():
                 raise  # else the drivers have latched it without the daemon
             acknowledged_by_daemon(monotonic_ns())
 

@@ -11,7 +11,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from sioms.client.channel import GRACE_S, Call, Channel
+from sioms.client.channel import Call, Channel
+from sioms.client.overdue import GRACE_S
 from sioms.protocol.messages import decode, encode, refusal, reply
 
 
