@@ -12,7 +12,7 @@ from sioms.motion import AxisSettings
 from .codec import grbl
 from .codec.grbl import Answer, Report
 from .codec.grbl_machine import compare_limits
-from .exchange import DeviceError, LinkError, Pause, Send, Step, Steps
+from .exchange import DeviceError, LinkError, Pause, Send, StateLost, Step, Steps
 
 TIMEOUT_S = 0.5
 RESET_S = 3.0
@@ -23,27 +23,35 @@ Hearing = Callable[[Report, Sequence[str]], None]
 """Takes a report and the lines that came before it."""
 
 
-def to_rest(clock: Clock, hear: Hearing) -> Generator[Step, Any, tuple[Report, bool]]:
+def to_rest(clock: Clock, hear: Hearing) -> Generator[Step, Any, tuple[Report, bool, bool]]:
     """Bring the controller to rest and to the state of a fresh start, whatever it does and whoever left it so.
 
     Jogs and programs are braked with their position kept; a reset at rest then clears lines, modes, overrides, spindle and holds.
 
     Returns:
-        The last report, and whether it had to be reset in motion: its position is then lost.
+        The last report, whether it had to be reset in motion (its position is then lost), and whether it greeted before that.
     """
     yield Send(grbl.END_CUT_LINE + grbl.JOG_CANCEL, "end a cut line, cancel jogs")
     yield Pause(0.1)
-    rests, report = True, None
+    rests, greeted, report = True, False, None
     with contextlib.suppress(
         LinkError
     ):  # booting, or deaf as it homes or waits after an alarm: only a reset ends that
-        report, _ = yield grbl.status(TIMEOUT_S)
+        try:
+            report, lines = yield grbl.status(TIMEOUT_S)
+            greeted = grbl.greets(lines)
+        except StateLost:
+            greeted = True
     if report is not None and report.state in MOVING:
         rests = yield from brake(clock, hear, HOLD_S)
     lines = yield grbl.reset(RESET_S)
-    report, more = yield grbl.status(TIMEOUT_S)
+    try:
+        report, more = yield grbl.status(TIMEOUT_S)
+    except StateLost:  # it was booting: the first greeting was of its start, the second answers the reset
+        greeted = True
+        report, more = yield grbl.status(TIMEOUT_S)
     hear(report, (*lines[:-1], *more))
-    return report, not rests
+    return report, not rests, greeted
 
 
 def brake(clock: Clock, hear: Hearing, limit_s: float) -> Generator[Step, Any, bool]:

@@ -22,7 +22,7 @@ from .codec import grbl
 from .codec.grbl import Answer, Report
 from .codec.grbl_homing import GrblHoming
 from .codec.grbl_jog import CHAIN_BLOCKS, JogChain, straight_jog
-from .codec.grbl_machine import INCHES, MachinePosition
+from .codec.grbl_machine import INCHES, SPEED, MachinePosition
 from .codec.grbl_moves import GrblMoves, Moves
 from .drive_axes import AxesUnit
 from .driver import Kit
@@ -35,9 +35,11 @@ TOGETHER_S = 0.0005
 """How long a start waits for the starts of other axes that go out with it."""
 LATE_S = 0.5
 """What braking may take longer than the motion itself: reports, and a line that waited."""
-OWN_RESET_NS = 1_500_000_000
-"""A greeting so soon after a reset of ours belongs to it."""
+OWN_RESET_NS = 300_000_000
+"""A second greeting so soon after that of a reset of ours belongs to it: the reset met a controller that was starting."""
 STARTED_ANEW = "the controller has started anew: its place, modes and lines are gone"
+SAME_PLACE = 0.01
+"""What a place at rest may differ by from one report to another [mm or degrees]; reports have three digits."""
 OFFSET_REPORTS = 35
 """The work offset comes with every 30th report at the latest."""
 NOT_READY = {
@@ -112,6 +114,14 @@ class GrblUnit(AxesUnit):
         self._chain = JogChain(self._letters, rates, settings.poll_hz)
         self._homing = GrblHoming()
         self._last: tuple[int, Any] | None = None
+        self._seen: Any = None
+        """Positions that were read last [unit]; None before the first report, and from a homing to its end."""
+        self._seen_ns = [0, 0]
+        """When the last report but one came, and the last."""
+        self._top = np.zeros(n)
+        """Speeds that the controller can reach [unit/s]."""
+        self._still = False
+        """The last report was of rest, and nothing that moves was sent since."""
         self._replaces = [False] * n
         self._clean = self._restarted = self._deaf = False
         """Nothing was started since all were stopped; the controller has greeted; it waits for a reset."""
@@ -121,11 +131,15 @@ class GrblUnit(AxesUnit):
 
     def open(self) -> Steps:
         """Stop what moves, identify the controller, and compare its limits with the configuration."""
+        yield from self._noting_restart(self._open())
+
+    def _open(self) -> Steps:
         self._alarm, self._last, self._clean = 0, None, False
         self._homing.forget()
         self._forget()
-        self._reset_ns = self.clock()
-        report, in_motion = yield from grbl_opening.to_rest(self.clock, self._hear_report)
+        was_locked = self._state == "Alarm"
+        report, in_motion, greeted = yield from grbl_opening.to_rest(self.clock, self._hear_report)
+        greeted = greeted or self._restarted
         self._reset_ns, self._restarted, self._deaf = self.clock(), False, False
         if in_motion:
             self._lose_places("it did not brake, so it was reset in motion")
@@ -133,6 +147,9 @@ class GrblUnit(AxesUnit):
         answer: Answer = yield grbl.command("$$", TIMEOUT_S, repeatable=True)
         found = answer.settings()
         self._place.in_report = 25.4 if found.get(INCHES) else 1.0
+        told = [found.get(SPEED + index, 0.0) / 60 for index in self._index]
+        own = np.array([axis.velocity_max for axis in self.bank.settings])
+        self._top = np.maximum(np.array(told) / self._per_unit, own)
         axes, log = self.bank.settings, self._kit.log
         grbl_opening.compare(self.name, found, axes, self._index, self._per_unit.tolist(), log)
         for _ in range(OFFSET_REPORTS):
@@ -140,6 +157,11 @@ class GrblUnit(AxesUnit):
             if self._place.note(report):
                 break
             report, _ = yield grbl.status(TIMEOUT_S)
+        here = self._place.of(report) / self._per_unit
+        is_locked = report.state == "Alarm" and not was_locked
+        if self._seen is not None and (greeted or is_locked or self._is_elsewhere(here)):
+            self._lose_places(STARTED_ANEW)
+        self._note_place(report, here)
 
     def poll(self) -> Steps:
         """Read the status, and keep velocities going."""
@@ -151,13 +173,20 @@ class GrblUnit(AxesUnit):
             return
         if self._deaf:
             yield from self._reset_now()
-        report, lines = yield grbl.status(STATUS_S)
+        try:
+            report, lines = yield grbl.status(STATUS_S)
+        except StateLost:
+            self._note_restart()
+            if self._restarted:
+                self._lose_places(STARTED_ANEW)
+            raise
         self._listen(lines)
+        self._look_for_jump(report)
         if self._restarted:
-            self._restarted = False
             self._lose_places(STARTED_ANEW)
             raise StateLost(f"{self.name}: {STARTED_ANEW}")
-        self._take_heard(report, lines)
+        self._hear(lines)
+        self._take(report)
         if self._moves.interrupted:
             yield from self._go_on()
         elif self._chain.wanted.any() and self._state in ("Idle", "Jog"):
@@ -176,7 +205,7 @@ class GrblUnit(AxesUnit):
                 self._chain.wanted[axis] = 0.0
         if action.kind is ActionKind.START and moves and command is not None:
             self._moves.asked[axis] = (command.position, action.velocity_max)
-        return super().act(action)
+        return self._noting_restart(super().act(action))
 
     def start_position(self, axis: int, position: float, speed: float, action: DriveAction) -> Steps:
         """Jog to a position, together with all axes whose moves were asked for at the same time."""
@@ -236,14 +265,14 @@ class GrblUnit(AxesUnit):
         """Stop whatever goes on."""
         self._clean = False
         self._forget()
-        yield from super().stop()
+        yield from self._noting_restart(super().stop())
 
     def home(self, axis: int) -> Steps:
         """Begin homing, of all axes; those that are told to home together home once."""
         if self._homing.is_on:
             return
         self._homing.begin(self.clock())
-        self._clean = False
+        self._clean, self._seen = False, None
         for each in range(self.bank.n):
             self._moves.drop(each)
         yield Send(b"$H\n", "home all axes")
@@ -313,8 +342,44 @@ class GrblUnit(AxesUnit):
 
     def _listen(self, lines: Sequence[str]) -> None:
         """Hear that the controller has started anew; not of the greeting that a reset of ours has brought."""
-        if grbl.greets(lines) and self.clock() - self._reset_ns > OWN_RESET_NS:
+        if grbl.greets(lines):
+            self._note_restart()
+
+    def _note_restart(self) -> None:
+        """Note that it has greeted: the next poll tells; not of the second greeting that a reset of ours has brought."""
+        if self.clock() - self._reset_ns > OWN_RESET_NS:
             self._restarted = True
+
+    def _noting_restart(self, steps: Steps) -> Steps:
+        """Carry out steps; a greeting in the middle of them is told by the next poll."""
+        try:
+            yield from steps
+        except StateLost:
+            self._note_restart()
+            raise
+
+    def _look_for_jump(self, report: Report) -> None:
+        """Hear of a new start by the place, should the greeting be lost: it counts from 0, where no axis can have come so soon."""
+        if self._seen is None or not self._place.note(report):
+            return
+        here = self._place.of(report) / self._per_unit
+        # its report of before may be as old as the one before that, if this process or the line was late
+        way = 1.1 * self._top * (self.clock() - self._seen_ns[0]) / 1e9
+        if self._is_zero(here) and (np.abs(self._seen) > way + SAME_PLACE / self._per_unit).any():
+            self._restarted = True
+
+    def _is_zero(self, here: Any) -> bool:
+        return bool((np.abs(here) * self._per_unit < SAME_PLACE / 10).all())
+
+    def _is_elsewhere(self, here: Any) -> bool:
+        """Tell whether the controller counts otherwise than before the line was lost, or somebody has moved it since."""
+        other = (np.abs(here - self._seen) * self._per_unit > SAME_PLACE).any()
+        return bool(other and (self._still or self._is_zero(here)))
+
+    def _note_place(self, report: Report, here: Any) -> None:
+        self._seen, self._seen_ns = here, [self._seen_ns[1], self.clock()]
+        goes = self._moves.bound.any() or self._chain.wanted.any()
+        self._still = report.state not in grbl_opening.MOVING and not goes
 
     def _lose_places(self, text: str) -> None:
         for axis in range(self.bank.n):
@@ -325,12 +390,15 @@ class GrblUnit(AxesUnit):
 
     def _take_heard(self, report: Report, lines: Sequence[str]) -> None:
         self._hear(lines)
+        self._listen(lines)
+        self._look_for_jump(report)
         self._take(report)
 
     def _take(self, report: Report) -> None:
         """Tell the bank what a report says."""
         now_ns = self.clock()
         position = self._positions(report)
+        self._note_place(report, position)
         velocity = np.zeros(self.bank.n)
         if self._last is not None and now_ns > self._last[0]:
             velocity = (position - self._last[1]) / ((now_ns - self._last[0]) / 1e9)
@@ -371,7 +439,7 @@ class GrblUnit(AxesUnit):
     def _jog_to(self, together: Moves) -> Steps:
         """Send one line for these axes."""
         line = straight_jog(self._letters, self._raw * self._per_unit, self._moves.begin(together))
-        self._clean = False
+        self._clean = self._still = False
         try:
             yield grbl.command(line, TIMEOUT_S)
         except StateLost as error:
@@ -397,6 +465,7 @@ class GrblUnit(AxesUnit):
             return
         line, targets, until_ns = found
         wanted = self._chain.wanted.copy()
+        self._still = False
         try:
             yield grbl.command(line, TIMEOUT_S)
         except StateLost:  # the line has gone out to a controller at another place; the opening cancels it

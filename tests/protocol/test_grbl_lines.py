@@ -38,6 +38,10 @@ def test_answers(step: int) -> None:
         feed(grbl.command("$H", 0.5), b"[MSG:x]\r\nerror:79\r\n", step)
     with pytest.raises(StateLost, match="started anew meanwhile"):
         feed(grbl.command("$X", 0.5), b"\r\nGrbl 1.1h ['$' for help]\r\nok\r\n", step)
+    with pytest.raises(
+        StateLost, match="started anew meanwhile"
+    ):  # a "?" is lost on a controller that starts
+        feed(grbl.status(0.5), b"\r\nGrbl 1.1h ['$' for help]\r\n[MSG:'$H'|'$X' to unlock]\r\n", step)
     with pytest.raises(LinkError, match="incomplete"):  # "ok" inside a line is none
         feed(grbl.command("$X", 0.5), b"[MSG:not ok]\r\n[echo:ok]\r\n", step)
     banner = b"ALARM:3\r\n\r\nGrblHAL 1.1f ['$' or '$HELP' for help]\r\n"

@@ -194,13 +194,22 @@ def command(line: str, timeout_s: float, *, repeatable: bool = False) -> Exchang
 
 
 def status(timeout_s: float) -> Exchange:
-    """Return the exchange of ``?``; its value is the report and the lines that came before it."""
+    """Return the exchange of ``?``; its value is the report and the lines that came before it.
+
+    A greeting without a report ends it, as StateLost: the ``?`` went to a controller that was starting, which does not answer it.
+    """
+
+    def want(reply: bytes) -> int | None:
+        end, hello = _end_of(reply, _ANGLE), _HELLO.search(reply)
+        return hello.end() if end is None and hello else end
 
     def decode(reply: bytes) -> tuple[Report, tuple[str, ...]]:
+        if not _ANGLE.search(reply):
+            raise StateLost("read the status: the controller has started anew meanwhile")
         *before, last = lines_of(reply)
         return parse_report(last[last.find("<") :]), tuple(before)
 
-    return Exchange(STATUS, lambda reply: _end_of(reply, _ANGLE), decode, timeout_s, True, "read the status")
+    return Exchange(STATUS, want, decode, timeout_s, True, "read the status")
 
 
 def reset(timeout_s: float) -> Exchange:

@@ -14,7 +14,7 @@ from sioms.drivers.grbl import Grbl
 from sioms.motion import ActionKind, DriveAction
 from sioms.motion.watch import Order
 from sioms.protocol.flags import AxisStatus
-from sioms.sdk.exchange import DeviceError, StateLost
+from sioms.sdk.exchange import DeviceError, LinkError, StateLost
 from sioms.tools.counterparts import grbl
 
 AXIS = {"name": "x", "letter": "X", "velocity_max": 0.1, "acceleration_max": 0.5}
@@ -173,6 +173,106 @@ def test_a_restart_is_told_its_place_is_lost_and_nothing_goes_on(homing: bool, m
     rig.do(rig.unit.reset(0))
     poll(rig, 10)
     assert device.planner.position == [0.0] and device.state == "Idle" and lost(rig)
+
+
+def at(place_mm: float, **keys: Any) -> tuple[Joined, grbl.Controller]:
+    """Return an opened controller at rest at a place."""
+    rig = board(**keys)
+    rig.device.state, rig.device.planner.position = "Idle", [place_mm]
+    rig.do(rig.unit.open())
+    poll(rig, 3)
+    assert not lost(rig) and rig.device.state == "Idle"
+    return rig, rig.device
+
+
+def test_a_restart_soon_after_a_reset_of_ours_is_told() -> None:
+    rig, device = opened()
+    rig.wait(0.4)
+    device.power_cycle("0")
+    rig.unit.overhear(b"".join(device.take(b"")), rig.unit.clock())
+    with pytest.raises(StateLost, match="started anew"):
+        rig.do(rig.unit.poll())
+    assert lost(rig)
+
+
+@pytest.mark.parametrize("asked", ["poll", "stop", "reset"])
+def test_a_greeting_in_place_of_an_answer_is_a_restart(asked: str) -> None:
+    rig, device = at(20.0)
+    rig.wait(2.0)
+    heard = device.take
+    device.take = lambda data: device.connected() if data == b"?" else heard(data)  # type: ignore[method-assign]
+    reset = DriveAction(ActionKind.RESET, 0, None, 0.1, 0.5)
+    hooks = {"poll": rig.unit.poll, "stop": rig.unit.stop, "reset": lambda: rig.unit.act(reset)}
+    with pytest.raises(StateLost, match="started anew"):
+        rig.do(hooks[asked]())
+    device.take = heard  # type: ignore[method-assign]
+    if asked != "poll":
+        with pytest.raises(StateLost, match="started anew"):
+            rig.do(rig.unit.poll())
+    assert lost(rig)
+
+
+def test_a_restart_whose_greeting_is_lost_shows_in_the_place() -> None:
+    rig, device = opened()
+    jog(rig, 0.05)
+    poll(rig, 25)
+    assert device.planner.position[0] > 30
+    device.power_cycle("0.04")
+    rig.wait(0.06)  # what it says unasked is lost
+    with pytest.raises(StateLost, match="started anew"):
+        rig.do(rig.unit.poll())
+    assert lost(rig)
+    rig.do(rig.unit.open())
+    poll(rig, 20)
+    assert device.planner.position == [0.0]
+
+
+def test_a_pass_through_zero_is_no_restart() -> None:
+    rig, device = at(4.0)
+    jog(rig, -0.05)
+    for _ in range(60):
+        poll(rig, 1)
+        device.planner.position = [0.0 if abs(p) < 2.0 else p for p in device.planner.position]
+    assert device.planner.position[0] < -10 and not lost(rig)
+
+
+@pytest.mark.parametrize("homing", [False, True])
+@pytest.mark.parametrize("place_mm", [20.0, -0.05, 0.0])
+def test_a_supply_off_behind_a_lost_link_loses_the_place(homing: bool, place_mm: float) -> None:
+    rig, device = at(place_mm, homing=homing)
+    device.power_cycle("1.5")
+    for _ in range(3):
+        with pytest.raises(LinkError):
+            rig.do(rig.unit.poll())
+        rig.wait(0.6)
+    rig.do(rig.unit.open())
+    # at 0, and not locked: nothing that it says without its greeting differs
+    told = homing or place_mm != 0
+    assert lost(rig) == told
+    rig.unit.bank.reset(np.array([0]))
+    rig.do(rig.unit.reset(0))
+    poll(rig, 5)
+    assert lost(rig) == told
+
+
+def test_a_greeting_at_the_opening_loses_the_place() -> None:
+    rig, device = at(0.0)
+    heard, told = device.take, [device.connected()]
+    device.take = lambda data: told.pop() if told and data == b"?" else heard(data)  # type: ignore[method-assign]
+    rig.do(rig.unit.open())
+    assert lost(rig)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_reopening_without_a_restart_keeps_the_place(moving: bool) -> None:
+    rig, device = at(20.0)
+    if moving:
+        jog(rig, 0.05)
+        poll(rig, 5)
+    rig.wait(1.0)
+    rig.do(rig.unit.open())
+    poll(rig, 5)
+    assert (device.planner.position[0] > 21) == moving and not lost(rig)
 
 
 @pytest.mark.parametrize(
