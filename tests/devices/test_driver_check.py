@@ -20,7 +20,7 @@ from sioms.tools.author.station import Station, wait_for
 from sioms.tools.author.trial import Trial, Verdict, attempt
 from sioms.tools.counterparts.rigs import MAP_RIGS
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = pytest.mark.timeout(700)
 
 AUTHORS = Path(__file__).parent / "authors"
 WIRED = [rig.title for rig in RIGS if rig.line]
@@ -34,7 +34,7 @@ def run(*words: str) -> tuple[int, list[dict[str, Any]], str]:
     with TemporaryDirectory() as folder:
         out = Path(folder) / "out.json"
         command = [sys.executable, "-m", "sioms.tools.front", "driver", "check", *words, "--json", str(out)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=280)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=660)
         reports = json.loads(out.read_text()) if out.exists() else []
         return done.returncode, reports, done.stdout + done.stderr
 
@@ -79,7 +79,7 @@ def test_the_example_passes() -> None:
 def broken() -> dict[str, tuple[int, dict[str, dict[str, Any]], str]]:
     trials_of = {
         "scale": "golden,chopped,noisy,late,random", "brittle": "golden,noisy", "hasty": "late",
-        "runaway": "stop running,kill client",
+        "runaway": "stop running,kill client", "trusting": "restart,shoved",
     }  # fmt: skip
 
     def one(name: str) -> tuple[int, dict[str, dict[str, Any]], str]:
@@ -119,6 +119,15 @@ def test_a_driver_that_does_not_stop_fails() -> None:
     assert status == 1, said
     for name in ("stop running", "kill client"):
         assert trials[name]["verdict"] == "FAILED" and "rest" in trials[name]["expected"], trials[name]
+
+
+def test_a_driver_that_trusts_its_module_fails() -> None:
+    status, trials, said = broken()["trusting"]
+    assert status == 1, said
+    assert trials["shoved"]["verdict"] == "FAILED" and "motion by itself" in trials["shoved"]["expected"], (
+        said
+    )
+    assert trials["restart"]["verdict"] == "FAILED", said
 
 
 @pytest.mark.parametrize(("times", "verdict"), [(1, Verdict.PASSED), (9, Verdict.FAILED)])
