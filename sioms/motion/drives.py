@@ -307,6 +307,7 @@ class DriveBank:
         fault: Sequence[str] | None = None,
         force: NDArray[np.float64] | None = None,
         holds: NDArray[np.bool_] | None = None,
+        asked_ns: int = 0,
     ) -> None:
         """Take the drives' reports, look whether they move as they were told, end what has ended and begin what follows.
 
@@ -320,17 +321,20 @@ class DriveBank:
             fault: fault text of each axis, empty when it has none; None when none has.
             force: measured forces or torques (n,), None when the drive tells none.
             holds: drive is switched on and holds its axis where nothing is commanded (n,); None: all do.
+            asked_ns: when the drives were asked: what was confirmed later may not show in the report yet. 0: not known.
         """
         self._last_ns = now_ns
+        asked_ns = asked_ns or now_ns
+        heard = self._acknowledged & (asked_ns >= self._started_ns)
         if self.keeper is not None and not self._seen:
             self._offset[:], homed = self.keeper.restored(position)
             self.set_homed(np.flatnonzero(homed))
         self._seen = True
         self._moving = moving.copy()
         self._take(now_ns, position, velocity, fault, force)
-        self._look(now_ns, position, velocity, holds)
+        self._look(now_ns, position, velocity, holds, heard, asked_ns)
         self._repeat_stops(now_ns, moving)
-        self._end_reached(now_ns, moving, done)
+        self._end_reached(now_ns, moving, done, heard, asked_ns)
         self.advance(now_ns)
         self._keep()
 
@@ -425,6 +429,8 @@ class DriveBank:
         raw: NDArray[np.float64],
         velocity: NDArray[np.float64],
         holds: NDArray[np.bool_] | None,
+        heard: NDArray[np.bool_],
+        asked_ns: int,
     ) -> None:
         """Put axes in fault that move as nobody has told them."""
         for axis in range(self.n):
@@ -434,7 +440,8 @@ class DriveBank:
                 float(raw[axis]),
                 float(velocity[axis]),
                 moving=bool(self._moving[axis]),
-                confirmed=bool(self._acknowledged[axis]),
+                confirmed=bool(heard[axis] and self._acknowledged[axis]),
+                late_ns=now_ns - asked_ns,
                 holds=holds is None or bool(holds[axis]),
                 latched=bool(self._queue.latched[axis] & LATCHED),
             )
@@ -487,10 +494,17 @@ class DriveBank:
             self._queue.emit(EventKind.DROPPED, np.array([axis]), now_ns, errno.EPIPE, text)
             self._halt(np.array([axis]), fastest=False)
 
-    def _end_reached(self, now_ns: int, moving: NDArray[np.bool_], done: NDArray[np.bool_]) -> None:
-        heard = self._active & self._acknowledged
+    def _end_reached(
+        self,
+        now_ns: int,
+        moving: NDArray[np.bool_],
+        done: NDArray[np.bool_],
+        heard: NDArray[np.bool_],
+        asked_ns: int,
+    ) -> None:
+        heard = heard & self._active & self._acknowledged
         self._moved |= moving & heard
-        settled = now_ns - self._started_ns >= self._settle_ns
+        settled = asked_ns - self._started_ns >= self._settle_ns
         stands = heard & ~moving
         reached = stands & done & (self._moved | settled)
         for axis in np.flatnonzero(stands).tolist():

@@ -35,6 +35,10 @@ JITTER_S = 0.01
 """Time at velocity_max that a speed may be exceeded by in all, and that an axis may be pushed by where no tolerance is given [s]."""
 LATE_S = 0.05
 """How much later than the reading its time stamp may be: a reply that was asked for twice [s]."""
+LATEST_S = 0.5
+"""Likewise, of what was read so long after it was asked for: a machine that is busier loses the link [s]."""
+PROMPT_NS = 20_000_000
+"""So soon after it was asked for a reading is not late; nor as soon as the soonest."""
 GAP_NS = 200_000_000
 """Looks farther apart are a lost link: whether the axis was held meanwhile is not known."""
 SETTLE_NS = 500_000_000
@@ -103,11 +107,18 @@ class _State:
     """The last look that was believed."""
     doubted: float = 0.0
     doubted_ns: int = 0
+    doubted_late_s: float = 0.0
     doubts: int = 0
     excess: float = 0.0
     fast: int = 0
     aways: int = 0
     free_until_ns: int = 0
+    soonest_ns: int = PROMPT_NS
+    """Least time from asking to reading: what one takes longer may have passed after it was taken."""
+    late_s: float = 0.0
+    """By how much the last reading that was believed may be older than its stamp."""
+    late_before_s: float = 0.0
+    """Likewise, of the one from which ``excess`` counts."""
 
 
 class MotionWatch:
@@ -165,6 +176,7 @@ class MotionWatch:
         confirmed: bool = True,
         holds: bool = True,
         latched: bool = False,
+        late_ns: int = 0,
     ) -> Finding | None:
         """Judge a reading.
 
@@ -177,13 +189,17 @@ class MotionWatch:
             confirmed: the drive has confirmed what it was told last.
             holds: the drive is switched on and holds its axis when nothing is commanded.
             latched: a fault or an emergency stop is latched; the drive may have let go, and is told to stop anyway.
+            late_ns: how long ago the drive was asked: a process that had to wait for the machine reads late [ns].
         """
         state = self._states[axis]
+        state.soonest_ns = min(state.soonest_ns, late_ns)
+        late_s = min((late_ns - state.soonest_ns) / 1e9, LATEST_S)
         if state.order is Order.FREE:
             state.free_until_ns = now_ns + SETTLE_NS
         if not state.stamp_ns or now_ns < state.free_until_ns:
             state.held = holds
             self._rest_at(state, now_ns, place, velocity)
+            state.late_s = late_s
             brakes_s = 2 * abs(velocity) / float(self._acceleration[axis]) if moving else 0.0
             state.rests_ns = now_ns + int(min(brakes_s, LONGEST_BRAKE_S) * 1e9) + SETTLE_NS * moving
             return None
@@ -194,12 +210,12 @@ class MotionWatch:
         watched = watched and self._settings[axis].watch.uncommanded and now_ns >= state.rests_ns
         low, high = self._reach(axis, state, gap_ns, confirmed, watched)
         if not low <= place <= high:
-            return self._doubt(axis, state, now_ns, place, velocity, watched)
+            return self._doubt(axis, state, now_ns, place, velocity, watched, late_s)
         state.doubts = 0
         fast = self._is_too_fast(axis, state, now_ns, place, velocity)
         away = self._is_away(axis, state, place, velocity, confirmed)
         self._believe(state, now_ns, place, velocity)
-        state.held = holds
+        state.held, state.late_s = holds, late_s
         if confirmed:
             state.before = ()
         if not watched:
@@ -235,7 +251,7 @@ class MotionWatch:
         slack, place = self._tolerance(axis), state.place
         if state.order is Order.HOLD and watched:
             return state.reference - slack, state.reference + slack
-        way = self._fastest(axis) * (gap_ns / 1e9 + LATE_S)
+        way = self._fastest(axis) * (gap_ns / 1e9 + max(LATE_S, state.late_s))
         if gap_ns <= GAP_NS or not confirmed or state.order in (Order.HOLD, Order.FORCE):
             return place - way - slack, place + way + slack
         reached = [place, place + math.copysign(self._braking(axis, state.velocity), state.velocity)]
@@ -250,12 +266,19 @@ class MotionWatch:
         return min(reached) - slack, max(reached) + slack
 
     def _doubt(
-        self, axis: int, state: _State, now_ns: int, place: float, velocity: float, watched: bool
+        self,
+        axis: int,
+        state: _State,
+        now_ns: int,
+        place: float,
+        velocity: float,
+        watched: bool,
+        late_s: float,
     ) -> Finding | None:
         """Look a second time at what cannot be, and say what it is."""
         state.doubts += 1
         if state.doubts == 1:
-            state.doubted, state.doubted_ns = place, now_ns
+            state.doubted, state.doubted_ns, state.doubted_late_s = place, now_ns, late_s
             return None
         first, second = abs(state.doubted - state.place), abs(place - state.doubted)
         between_s = (now_ns - state.doubted_ns) / 1e9
@@ -267,9 +290,10 @@ class MotionWatch:
             stands = second * first_s <= STILL * first * between_s  # looks may come unevenly
             jumped = gap or (first > self._tolerance(axis) and stands)
         else:
-            jumped = gap or second <= self._fastest(axis) * (between_s + LATE_S)
+            jumped = gap or second <= self._fastest(axis) * (between_s + max(LATE_S, state.doubted_late_s))
         tolerance, reference = self._tolerance(axis), state.reference
         self._rest_at(state, now_ns, place, velocity)
+        state.late_s = late_s
         if jumped:
             within_s = (now_ns - state.doubted_ns) / 1e9 if not gap else 0.0
             text = f"position lost: axis {name} read {before:.6g} {unit} and reads {place:.6g} {unit}"
@@ -287,9 +311,15 @@ class MotionWatch:
     def _is_too_fast(self, axis: int, state: _State, now_ns: int, place: float, velocity: float) -> bool:
         fastest = self._fastest(axis)
         beyond = abs(place - state.place) - fastest * (now_ns - state.stamp_ns) / 1e9
+        if not state.excess:
+            state.late_before_s = state.late_s
         state.excess = max(0.0, state.excess + beyond)
         state.fast = state.fast + 1 if beyond > 0 else 0
-        return state.fast > 1 and state.excess > JITTER_S * fastest and abs(velocity) > fastest
+        return (
+            state.fast > 1
+            and state.excess > (JITTER_S + state.late_before_s) * fastest
+            and abs(velocity) > fastest
+        )
 
     def _is_away(self, axis: int, state: _State, place: float, velocity: float, confirmed: bool) -> bool:
         if state.order is Order.POINT:

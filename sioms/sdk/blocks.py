@@ -168,11 +168,17 @@ class BinaryBlock(Block):
 
 @dataclass(slots=True)
 class AxisBlock:
-    """Axes: the bank that commands them; its ``fields`` are what is published."""
+    """Axes: the bank that commands them; its ``fields`` are what is published.
+
+    Attributes:
+        stamp_ns: time the readings hold for [ns, CLOCK_MONOTONIC].
+        asked_ns: when the poll began that brought them, 0: not known.
+    """
 
     spec: BlockSpec
     bank: AxisBank | DriveBank
     stamp_ns: int = 0
+    asked_ns: int = 0
     n: int = field(init=False)
 
     def __post_init__(self) -> None:

@@ -230,7 +230,7 @@ class AxesUnit(LineUnit):
         now_ns = self.clock()
         self.block.stamp_ns = now_ns
         self._raw = position.copy()
-        self.bank.poll(now_ns, position, velocity, moving, done, fault, force, holds)
+        self.bank.poll(now_ns, position, velocity, moving, done, fault, force, holds, self.block.asked_ns)
         self._guard(now_ns)
         self._look_for_short_moves(now_ns, moving, done)
 

@@ -103,6 +103,9 @@ class LineEngine(Connected):
         if line is None or self._closed:
             return
         state.busy = True
+        for block in state.unit.blocks:
+            if isinstance(block, AxisBlock):
+                block.asked_ns = now_ns
         if state.is_up:
             state.due_ns = max(state.due_ns + self._period_ns, now_ns)
             steps, done = self._poll(state), self._polled

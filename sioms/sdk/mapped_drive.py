@@ -132,6 +132,7 @@ class DriveUnit(LineUnit):
             np.array([done]),
             [fault],
             holds=np.array([self._holds(values)]),
+            asked_ns=self._block.asked_ns,
         )
         self._end_before_soft_limit(now_ns)
         lost = bool(int(self.bank.fields.view(np.int64)[STATUS, 0]) & AxisStatus.POSITION_LOST)

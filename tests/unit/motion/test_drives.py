@@ -161,6 +161,22 @@ def test_homing_is_the_drives_own():
     assert cell.status() & S.HOMED and cell.bank.is_idle([0])
 
 
+def test_a_report_that_was_asked_for_before_the_start_does_not_end_the_move():
+    """The reply was taken before the drive got the start, and a busy machine hands it on long after that."""
+    bank = DriveBank([axis(modes=MODE.POSITION)], markers=Markers(), settle_s=0.05)
+    still, no, yes = np.zeros(1), np.array([False]), np.array([True])
+    now = 1_000_000_000
+    bank.poll(now, still, still, no, yes, asked_ns=now)
+    bank.append(records(mode=MODE.POSITION, position=0.1), [0], now)
+    for action in bank.take_actions():
+        bank.action_done(action, now + 1_000_000)
+    for asked_ns in (now, now + 2_000_000):
+        bank.poll(now + 200_000_000, still, still, no, yes, asked_ns=asked_ns)
+        assert not bank.is_idle([0])
+    bank.poll(now + 260_000_000, still, still, no, yes, asked_ns=now + 250_000_000)
+    assert bank.is_idle([0])
+
+
 def test_a_soft_limit_that_ends_a_run_or_a_force_is_told():
     for mode, bits in ((MODE.VELOCITY, 0), (MODE.FORCE, S.FORCE_ENDED)):
         bank = DriveBank(

@@ -119,6 +119,19 @@ def test_noise_and_overshoot_are_no_speed_above_the_limit():
         place += FAST * late_ns * 1e-9 if late_ns else 0.0
 
 
+@pytest.mark.parametrize("fault", [0.0, 0.5])
+def test_readings_that_a_busy_machine_stamps_late_are_no_finding(fault):
+    """Stamps are up to 0.3 s late, the least late ones last: each interval looks shorter than it was."""
+    watch = watch_of_one()
+    watch.order(0, Order.RUN, FAST)
+    speed, found = (1 + fault) * FAST, []
+    for i in range(400):
+        taken, late = i * 0.06, max(0.0, 0.3 - 0.04 * (i % 40))
+        stamp_ns, late_ns = 10**9 + round((taken + late) * 1e9), round((late + 0.004) * 1e9)
+        found.append(watch.look(0, stamp_ns, taken * speed, 1.5 * speed, moving=True, late_ns=late_ns))
+    assert any(found) == bool(fault)
+
+
 def watch_of_one(**settings):
     one = axis(k=None, **settings)
     return MotionWatch([one], np.array([one.velocity_max]), np.array([one.acceleration_max]))
