@@ -101,7 +101,8 @@ class Grbl(LineDriver):
         super().__init__(name, settings, kit)
         self.line = settings.line
         spec = self.describe(name, settings).blocks[0]
-        unit = GrblUnit(name, settings, _axes(settings), spec, kit, settle_s=0.1)
+        axes, on_tcp = _axes(settings), bool(settings.line.tcp)
+        unit = GrblUnit(name, settings, axes, spec, kit, greets_each=on_tcp, settle_s=0.1)
         self._units = (unit,)
         self.overheard = unit.overhear
 

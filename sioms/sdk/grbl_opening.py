@@ -42,6 +42,7 @@ def to_rest(clock: Clock, hear: Hearing) -> Generator[Step, Any, tuple[Report, b
             greeted = grbl.greets(lines)
         except StateLost:
             greeted = True
+            report, _ = yield grbl.status(TIMEOUT_S)
     if report is not None and report.state in MOVING:
         rests = yield from brake(clock, hear, HOLD_S)
     lines = yield grbl.reset(RESET_S)

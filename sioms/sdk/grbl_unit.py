@@ -85,6 +85,7 @@ class GrblUnit(AxesUnit):
         axes: its axes as the bank knows them.
         spec: their block.
         kit: services.
+        greets_each: it greets each new connection, so that a greeting at the opening is no restart.
         given: as of AxesUnit.
 
     Concurrency: the one thread of the driver process.
@@ -97,10 +98,13 @@ class GrblUnit(AxesUnit):
         axes: Sequence[AxisSettings],
         spec: BlockSpec,
         kit: Kit,
+        *,
+        greets_each: bool = False,
         **given: Any,
     ) -> None:
         super().__init__(name, axes, spec, kit, **given)
         self._settings = settings
+        self._greets_each = greets_each
         n = len(settings.axis)
         self._letters = [axis.letter for axis in settings.axis]
         self._index = [grbl.LETTERS.index(letter) for letter in self._letters]
@@ -120,8 +124,6 @@ class GrblUnit(AxesUnit):
         """When the last report but one came, and the last."""
         self._top = np.zeros(n)
         """Speeds that the controller can reach [unit/s]."""
-        self._still = False
-        """The last report was of rest, and nothing that moves was sent since."""
         self._replaces = [False] * n
         self._clean = self._restarted = self._deaf = False
         """Nothing was started since all were stopped; the controller has greeted; it waits for a reset."""
@@ -139,7 +141,7 @@ class GrblUnit(AxesUnit):
         self._forget()
         was_locked = self._state == "Alarm"
         report, in_motion, greeted = yield from grbl_opening.to_rest(self.clock, self._hear_report)
-        greeted = greeted or self._restarted
+        greeted = (greeted or self._restarted) and not self._greets_each
         self._reset_ns, self._restarted, self._deaf = self.clock(), False, False
         if in_motion:
             self._lose_places("it did not brake, so it was reset in motion")
@@ -159,9 +161,9 @@ class GrblUnit(AxesUnit):
             report, _ = yield grbl.status(TIMEOUT_S)
         here = self._place.of(report) / self._per_unit
         is_locked = report.state == "Alarm" and not was_locked
-        if self._seen is not None and (greeted or is_locked or self._is_elsewhere(here)):
+        if self._seen is not None and (greeted or is_locked or self._counts_anew(here)):
             self._lose_places(STARTED_ANEW)
-        self._note_place(report, here)
+        self._note_place(here)
 
     def poll(self) -> Steps:
         """Read the status, and keep velocities going."""
@@ -371,15 +373,12 @@ class GrblUnit(AxesUnit):
     def _is_zero(self, here: Any) -> bool:
         return bool((np.abs(here) * self._per_unit < SAME_PLACE / 10).all())
 
-    def _is_elsewhere(self, here: Any) -> bool:
-        """Tell whether the controller counts otherwise than before the line was lost, or somebody has moved it since."""
-        other = (np.abs(here - self._seen) * self._per_unit > SAME_PLACE).any()
-        return bool(other and (self._still or self._is_zero(here)))
+    def _counts_anew(self, here: Any) -> bool:
+        """Tell whether the controller is at 0 and was not before the line was lost; the bank tells of any other place at rest."""
+        return self._is_zero(here) and bool((np.abs(self._seen) * self._per_unit > SAME_PLACE).any())
 
-    def _note_place(self, report: Report, here: Any) -> None:
+    def _note_place(self, here: Any) -> None:
         self._seen, self._seen_ns = here, [self._seen_ns[1], self.clock()]
-        goes = self._moves.bound.any() or self._chain.wanted.any()
-        self._still = report.state not in grbl_opening.MOVING and not goes
 
     def _lose_places(self, text: str) -> None:
         for axis in range(self.bank.n):
@@ -398,7 +397,7 @@ class GrblUnit(AxesUnit):
         """Tell the bank what a report says."""
         now_ns = self.clock()
         position = self._positions(report)
-        self._note_place(report, position)
+        self._note_place(position)
         velocity = np.zeros(self.bank.n)
         if self._last is not None and now_ns > self._last[0]:
             velocity = (position - self._last[1]) / ((now_ns - self._last[0]) / 1e9)
@@ -439,7 +438,7 @@ class GrblUnit(AxesUnit):
     def _jog_to(self, together: Moves) -> Steps:
         """Send one line for these axes."""
         line = straight_jog(self._letters, self._raw * self._per_unit, self._moves.begin(together))
-        self._clean = self._still = False
+        self._clean = False
         try:
             yield grbl.command(line, TIMEOUT_S)
         except StateLost as error:
@@ -465,7 +464,6 @@ class GrblUnit(AxesUnit):
             return
         line, targets, until_ns = found
         wanted = self._chain.wanted.copy()
-        self._still = False
         try:
             yield grbl.command(line, TIMEOUT_S)
         except StateLost:  # the line has gone out to a controller at another place; the opening cancels it

@@ -255,12 +255,16 @@ def test_a_supply_off_behind_a_lost_link_loses_the_place(homing: bool, place_mm:
     assert lost(rig) == told
 
 
-def test_a_greeting_at_the_opening_loses_the_place() -> None:
-    rig, device = at(0.0)
+@pytest.mark.parametrize("tcp", [False, True])
+def test_a_greeting_at_the_opening_loses_the_place_unless_each_connection_is_greeted(tcp: bool) -> None:
+    rig, device = at(5.0, **({"line": {"tcp": "127.0.0.1:23"}} if tcp else {}))
+    device.foreign("velocity", "50")
+    rig.wait(0.3)
     heard, told = device.take, [device.connected()]
     device.take = lambda data: told.pop() if told and data == b"?" else heard(data)  # type: ignore[method-assign]
     rig.do(rig.unit.open())
-    assert lost(rig)
+    assert device.planner.slip == [0.0], "braked"
+    assert lost(rig) != tcp
 
 
 @pytest.mark.parametrize("moving", [False, True])
