@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os.path
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
@@ -118,6 +118,8 @@ class Config(msgspec.Struct, frozen=True):
         return os.path.join(self.folder, named) if named else ""
 
 
+DEEPEST = 16
+"""Arrays and tables in one another that a device may have."""
 _SECTIONS = ("workcell", "device", "node", "grant", "emergency_stop", "alarm")
 _COMMON = tuple(field.name for field in msgspec.structs.fields(DeviceTable))
 
@@ -136,6 +138,12 @@ def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
         root = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         return None, [f"read configuration: {str(error)[0].lower() + str(error)[1:]}"]
+    except RecursionError:
+        return None, [
+            f"read configuration: arrays or tables nested too deep; at most {DEEPEST} deep is right"
+        ]
+    except ValueError as error:  # an integer of more digits than Python converts
+        return None, [f"read configuration: {error}"]
     if {"family", "signals"} <= root.keys():
         text = 'this is a register map; name it in the table of a device, map = "FILE", and give that configuration'
         return None, [text]
@@ -204,12 +212,30 @@ def _is_name(name: str) -> bool:
 
 def _device(name: str, table: dict[str, Any], errors: list[str]) -> Device | None:
     where = f"[device.{name}]"
+    strange = list(_strange(table, where))
+    if strange:  # what no driver can be told
+        errors += strange
+        return None
     common = _convert({k: v for k, v in table.items() if k in _COMMON}, DeviceTable, where, errors)
     if common is None:
         if not isinstance(table.get("driver"), str):
             return None
         common = DeviceTable(table["driver"])  # so that its driver tells the other errors of the table
     return Device(name, common, {k: v for k, v in table.items() if k not in _COMMON})
+
+
+def _strange(value: object, where: str, depth: int = 0) -> Iterator[str]:
+    """Tell the values that no message to a driver can carry: dates and times, integers over 64 bits, deep nesting."""
+    if isinstance(value, (dict, list)):
+        if depth > DEEPEST:
+            yield f"{where}: nested deeper than {DEEPEST}; no key of a device is"
+            return
+        for key, each in value.items() if isinstance(value, dict) else enumerate(value, 1):
+            yield from _strange(each, f"{where}.{key}" if isinstance(value, dict) else where, depth + 1)
+    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+        yield f"{where}: an integer of more than 64 bits; no key of a device takes one"
+    elif not isinstance(value, (str, int, float)):
+        yield f"{where} = {value}: no key of a device takes a {type(value).__name__}"
 
 
 def _convert(table: object, kind: type[Table], where: str, errors: list[str]) -> Table | None:

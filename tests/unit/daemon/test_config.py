@@ -90,3 +90,19 @@ def test_errors(text: str, words: str) -> None:
 def test_values_at_their_ends_are_taken() -> None:
     text = "[workcell]\nmax_markers = 1023\nmax_sessions = 1\nsocket_mode = '660'\n[device.a-b_1]\ndriver = 'd'\nrealtime_priority = 0\n"
     assert errors(text) == []
+
+
+@pytest.mark.parametrize(
+    "value", ["1979-05-27", "[1, 07:32:00]", f"{2**64}", "{a = [1979-05-27]}", "[" * 30 + "]" * 30]
+)
+def test_values_that_no_driver_can_be_told_are_errors_beside_the_others(value: str) -> None:
+    text = f'[device.a]\ndriver = "sim-io"\nodd = {value}\n[device.b]\ndriver = 3\n'
+    _, errors = parse(text, "/")
+    assert [e for e in errors if e.startswith("[device.a].odd")], errors
+    assert [e for e in errors if e.startswith("[device.b]")], errors
+
+
+@pytest.mark.parametrize("value", ["[" * 3000 + "]" * 3000, "9" * 5000])
+def test_what_cannot_be_read_is_one_error(value: str) -> None:
+    config, errors = parse(f"x = {value}\n", "/")
+    assert config is None and len(errors) == 1 and errors[0].startswith("read configuration: ")
