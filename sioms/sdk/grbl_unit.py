@@ -122,6 +122,8 @@ class GrblUnit(AxesUnit):
         """Positions that were read last [unit]; None before the first report, and from a homing to its end."""
         self._seen_ns = [0, 0]
         """When the last report but one came, and the last."""
+        self._still = False
+        """The last report was of rest, and nothing that moves was sent since."""
         self._top = np.zeros(n)
         """Speeds that the controller can reach [unit/s]."""
         self._replaces = [False] * n
@@ -163,6 +165,8 @@ class GrblUnit(AxesUnit):
         is_locked = report.state == "Alarm" and not was_locked
         if self._seen is not None and (greeted or is_locked or self._counts_anew(here)):
             self._lose_places(STARTED_ANEW)
+        elif self._seen is not None and self._still and self._is_off(here - self._seen):
+            self._lose_places("position lost: it rested, and is elsewhere than before the link was lost")
         self._note_place(here)
 
     def poll(self) -> Steps:
@@ -374,8 +378,11 @@ class GrblUnit(AxesUnit):
         return bool((np.abs(here) * self._per_unit < SAME_PLACE / 10).all())
 
     def _counts_anew(self, here: Any) -> bool:
-        """Tell whether the controller is at 0 and was not before the line was lost; the bank tells of any other place at rest."""
-        return self._is_zero(here) and bool((np.abs(self._seen) * self._per_unit > SAME_PLACE).any())
+        """Tell whether the controller is at 0 and was not before the line was lost."""
+        return self._is_zero(here) and self._is_off(self._seen)
+
+    def _is_off(self, way: Any) -> bool:
+        return bool((np.abs(way) * self._per_unit > SAME_PLACE).any())
 
     def _note_place(self, here: Any) -> None:
         self._seen, self._seen_ns = here, [self._seen_ns[1], self.clock()]
@@ -398,6 +405,8 @@ class GrblUnit(AxesUnit):
         now_ns = self.clock()
         position = self._positions(report)
         self._note_place(position)
+        self._still = report.state not in grbl_opening.MOVING
+        self._still &= not (self._moves.bound.any() or self._chain.wanted.any())
         velocity = np.zeros(self.bank.n)
         if self._last is not None and now_ns > self._last[0]:
             velocity = (position - self._last[1]) / ((now_ns - self._last[0]) / 1e9)
@@ -438,7 +447,7 @@ class GrblUnit(AxesUnit):
     def _jog_to(self, together: Moves) -> Steps:
         """Send one line for these axes."""
         line = straight_jog(self._letters, self._raw * self._per_unit, self._moves.begin(together))
-        self._clean = False
+        self._clean = self._still = False
         try:
             yield grbl.command(line, TIMEOUT_S)
         except StateLost as error:
@@ -464,6 +473,7 @@ class GrblUnit(AxesUnit):
             return
         line, targets, until_ns = found
         wanted = self._chain.wanted.copy()
+        self._still = False
         try:
             yield grbl.command(line, TIMEOUT_S)
         except StateLost:  # the line has gone out to a controller at another place; the opening cancels it

@@ -255,11 +255,19 @@ def test_a_supply_off_behind_a_lost_link_loses_the_place(homing: bool, place_mm:
     assert lost(rig) == told
 
 
+def test_a_move_behind_a_lost_link_loses_the_place() -> None:
+    rig, device = at(20.0)
+    device.foreign("velocity", "10")
+    rig.wait(0.1)
+    rig.do(rig.unit.open())
+    assert lost(rig) and "elsewhere" in rig.unit.bank.fault_text(0)
+
+
 @pytest.mark.parametrize("tcp", [False, True])
 def test_a_greeting_at_the_opening_loses_the_place_unless_each_connection_is_greeted(tcp: bool) -> None:
     rig, device = at(5.0, **({"line": {"tcp": "127.0.0.1:23"}} if tcp else {}))
-    device.foreign("velocity", "50")
-    rig.wait(0.3)
+    jog(rig, 0.05)
+    poll(rig, 7)
     heard, told = device.take, [device.connected()]
     device.take = lambda data: told.pop() if told and data == b"?" else heard(data)  # type: ignore[method-assign]
     rig.do(rig.unit.open())
