@@ -55,6 +55,7 @@ class DeviceTable(msgspec.Struct, frozen=True):
     on_loss: Literal["none", "stop"] = "none"
     realtime_priority: Annotated[int, Meta(ge=0, le=99)] | None = None
     hang_s: Seconds = 1.0
+    lease_s: Seconds | None = None
     user: str = ""
 
 

@@ -101,6 +101,7 @@ class DriverProcess:
         self._timer: Timer | None = None
         self._patience: Patience | None = None
         self._look_ns = 0
+        self._lease_s = device.common.lease_s or info.lease_s
 
     @property
     def name(self) -> str:
@@ -125,6 +126,7 @@ class DriverProcess:
             self._options,
             realtime_priority=self.device.common.realtime_priority,
             user=self.device.common.user,
+            lease_s=self._lease_s,
         )
         self._loop.watch(ours.fileno(), self._receive)  # first, because a spawn may be refused at once
         self._nursery().spawn(
@@ -190,12 +192,12 @@ class DriverProcess:
             return
         reader = self._readers[0]
         age_ns = max(0, now_ns - reader.alive_ns)  # it may have ticked since the daemon looked at the clock
-        if age_ns > self.info.lease_s * 1e9 and not self.hung:
+        if age_ns > self._lease_s * 1e9 and not self.hung:
             self.hung = True
             self._patience = Patience(self.pid, self.device.common.hang_s)
             self._patience.renew(now_ns / 1e9)
             self._owner.device_hung(self, f"its driver has not ticked for {age_ns / 1e9:.3f} s")
-        elif age_ns < self.info.lease_s * 1e9:
+        elif age_ns < self._lease_s * 1e9:
             self.hung = False
         if self.hung and self._patience is not None and (why := self._patience.stuck(now_ns / 1e9)):
             self.kill(f"its driver hung for {age_ns / 1e9:.2f} s and was killed: {why}")

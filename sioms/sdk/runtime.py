@@ -77,7 +77,7 @@ def run(
         device: device name.
         settings: its validated settings.
         generation: number of this process among the device's.
-        options: stop_sources, alarms, daemon_lease_s, realtime_priority, user, phase of the tick [period], state_folder.
+        options: stop_sources, alarms, daemon_lease_s, lease_s, realtime_priority, user, phase of the tick [period], state_folder.
         fds: control socket, latch page, stop-request file, file of the requests taken, marker table.
     """
     name_process(f"sioms:{device}")
@@ -129,7 +129,7 @@ class Runtime:
         self.blocks = list(self.driver.blocks)
         set_alarms(self.blocks, options["alarms"])
         self._kept = keep_positions(str(options["state_folder"]), device, self.blocks, self.log)
-        lease_ns = int(description.lease_s * 1e9)
+        lease_ns = int(float(options.get("lease_s") or description.lease_s) * 1e9)
         self.pages = Pages(device, self.blocks, lease_ns, generation)
         self.clients = Attachments(self)
         self.engine = self._make_engine()

@@ -130,6 +130,21 @@ def test_hung_driver_is_stale_then_killed_and_restarted(daemon: Daemon, cell: si
         assert node.read().data[2] == pytest.approx(3.0)
 
 
+def test_the_lease_of_readings_can_be_configured(start_daemon: Callable[..., Daemon]) -> None:
+    text = 'driver = "sim-io"\noutputs = 1\nhang_s = 30.0\n'
+    daemon = start_daemon(f"[device.short]\n{text}lease_s = 0.5\n[device.long]\n{text}lease_s = 20.0\n")
+    pids = [daemon.device(name)["pid"] for name in ("short", "long")]
+    with (
+        daemon.cell("reader") as cell, cell.open("short") as short, cell.open("long") as long,
+        daemon.frozen(pids[0]), daemon.frozen(pids[1]),
+    ):  # fmt: skip
+        wait_for(lambda: _errno(short.read) == errno.EIO, "stale", 5.0)
+        with raises(errno.EIO, "lease 0.500 s"):
+            short.read()
+        time.sleep(1.2)  # beyond the driver's own lease
+        long.read()
+
+
 def test_killed_nursery_harms_no_driver_and_a_new_one_restarts_them(
     daemon: Daemon, cell: sioms.Workcell
 ) -> None:

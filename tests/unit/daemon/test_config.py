@@ -57,6 +57,7 @@ def test_all_errors_at_once_in_the_order_of_the_sections() -> None:
         ("[device.x]\ndriver = 'd'\non_loss = 'halt'", "on_loss"),
         ("[device.x]\ndriver = 'd'\nrealtime_priority = 100", "realtime_priority"),
         ("[device.x]\ndriver = 'd'\nhang_s = 0", "hang_s"),
+        ("[device.x]\ndriver = 'd'\nlease_s = 0", "lease_s"),
         ("[device.readonly]\ndriver = 'd'", "a device name is"),
         ("[device.'ä']\ndriver = 'd'", "a device name is"),
         ("[device.'a.b']\ndriver = 'd'", "a device name is"),
