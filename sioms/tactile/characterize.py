@@ -122,8 +122,8 @@ def _creep(share: float, deviation: float, time_s: float) -> Creep:
     return Creep(share, deviation, time_s if abs(share) > 2.0 * deviation else np.nan)
 
 
-def _courses(recording: Recording, released: bool) -> list[tuple[Floats, Floats]]:
-    """Return time from the first frame and output over its mean under load, of the loudest element of each touch."""
+def _courses(recording: Recording, released: bool) -> list[tuple[Floats, Floats, float]]:
+    """Return of the loudest element of each touch the time from the first frame, its output over its mean under load, and that mean [raw]."""
     out = []
     for number in np.unique(recording.touch[recording.touch >= 0]):
         mine = recording.touch == number
@@ -136,27 +136,31 @@ def _courses(recording: Recording, released: bool) -> list[tuple[Floats, Floats]
         chosen = after if released else under
         if chosen.sum() >= 5 and rise[loudest] > 0.0:
             course = (recording.raw[chosen, loudest] - recording.raw[before, loudest].mean()) / rise[loudest]
-            out.append((recording.time_s[chosen] - recording.time_s[chosen][0], course))
+            out.append((recording.time_s[chosen] - recording.time_s[chosen][0], course, float(rise[loudest])))
     return out
 
 
-def _fit_course(courses: list[tuple[Floats, Floats]]) -> tuple[float, float, float, float, float] | None:
-    """Fit first (1 + share (1 - exp(-t/time))) to the mean; return first, share, their deviations, time [s]."""
+def _fit_course(
+    courses: list[tuple[Floats, Floats, float]],
+) -> tuple[float, float, float, float, float] | None:
+    """Fit first (1 + share (1 - exp(-t/time))) to the mean; return first, share, their deviations, time [s].
+
+    Touches count by the square of their output: one beside the array is mostly noise.
+    """
     if not courses:
         return None
-    shortest = min(course.size for _, course in courses)
-    mean = np.mean([course[:shortest] for _, course in courses], axis=0)
-    clock = np.mean([time[:shortest] for time, _ in courses], axis=0)
+    shortest = min(course.size for _, course, _ in courses)
+    weights = np.square([rise for _, _, rise in courses])
+    mean = np.average([course[:shortest] for _, course, _ in courses], axis=0, weights=weights)
+    clock = np.mean([time[:shortest] for time, _, _ in courses], axis=0)
 
     def miss(v: Floats) -> Floats:
         out: Floats = v[0] + v[1] * -np.expm1(-clock / np.exp(v[2])) - mean
         return out
 
-    found = least_squares(
-        miss,
-        [mean[0], mean[-1] - mean[0], np.log(0.3 * clock[-1] + 1e-9)],
-        bounds=([-1, -5, -7], [2, 5, 3]),
-    )
+    low, high = np.array([-1.0, -5.0, -7.0]), np.array([2.0, 5.0, 3.0])
+    begin = [mean[0], mean[-1] - mean[0], np.log(0.3 * clock[-1] + 1e-9)]
+    found = least_squares(miss, np.clip(begin, low + 1e-3, high - 1e-3), bounds=(low, high))
     jacobian = np.asarray(found.jac, dtype=np.float64)
     variance = 2.0 * found.cost / max(shortest - 3, 1)
     deviation = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * variance)

@@ -71,6 +71,21 @@ def test_creep() -> None:
     assert creep_of(recording(np.zeros((10, 16)))) is None
 
 
+def test_creep_is_not_told_by_touches_beside_the_array() -> None:
+    """Their output is all noise, which divided by itself is anything."""
+    clock = np.arange(100) / 100.0
+    held = touches(4.0 * (1.0 + 0.15 * -np.expm1(-clock / 0.3)))
+    raw = held.raw.copy()
+    wild = np.random.default_rng(1).normal(size=raw.shape)
+    few = (held.touch >= 0) & (held.touch % 10 == 0)
+    raw[few] = 0.05 * wild[few]
+    first = few & (held.phase == 1)
+    raw[np.flatnonzero(first)[:1]] += 0.5  # as a pull that ends while the touch begins
+    found = creep_of(recording(raw, touch=held.touch, phase=held.phase))
+    assert found is not None
+    assert found.share == pytest.approx(0.15, rel=0.1) and found.deviation < 0.02
+
+
 def test_relaxation_after_release() -> None:
     clock = np.arange(150) / 100.0
     course = np.where(clock < 0.5, 4.0, 0.4 * np.exp(-(clock - 0.5) / 0.25))
