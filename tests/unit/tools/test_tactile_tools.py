@@ -8,10 +8,13 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from sioms.tactile.calibration import Calibration
+from sioms.tactile.calibration import calibrate as fit
 from sioms.tactile.cylinder import FINGER_B
 from sioms.tactile.design import conditioning, predicted_errors
 from sioms.tactile.emap import e_map
@@ -19,7 +22,7 @@ from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import from_toml, nominal_finger
 from sioms.tactile.sensing import CHANNELS, LoadTare, ShapeSensor, numbers
 from sioms.tactile.series import line_load
-from sioms.tools import tactile
+from sioms.tools import tactile, tactile_calibrate
 from sioms.tools.report_page import Page
 from sioms.tools.tactile_claims import chapter_2
 from sioms.tools.tactile_experiment import RADII_M, plan
@@ -91,6 +94,36 @@ def test_calibrate_writes_a_finger_and_a_report(folder: Path, capsys: pytest.Cap
     told = capsys.readouterr()
     assert "quadratic not fitted" in told.out
     assert "contact model frictionless" in told.err
+
+
+def test_a_doubtful_calibration_writes_its_report_but_no_finger(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nominal = json.loads((folder / "nominal.json").read_text())
+    nominal["gain_percent_strain_per_percent_output"] = [0.3] * 16  # a tenth of what they are
+    (folder / "nominal.json").write_text(json.dumps(nominal))
+    results: list[Calibration] = []
+
+    def once(*given: Any) -> Calibration:
+        if not results:
+            results.append(fit(*given))
+        return results[0]
+
+    monkeypatch.setattr(tactile_calibrate, "fit", once)
+    out = folder / "finger.toml"
+    words = ("calibrate", str(folder), "-o", str(out), "--contact", "frictionless", "--no-map")
+    assert command(*words) == 1
+    page = out.with_suffix(".html")
+    told = capsys.readouterr()
+    assert not out.exists() and "times the nominal ones" in page.read_text()
+    assert (
+        "no finger was written" in told.err and "times the nominal ones" in told.err and str(page) in told.err
+    )
+    page.unlink()
+    assert command(*words, "--doubtful") == 0
+    finger = from_toml(out.read_text())
+    assert "times the nominal ones" in finger.notes["doubts"] and page.exists()
+    assert "times the nominal ones" in capsys.readouterr().out
 
 
 def test_score_fits_touches_that_calibration_has_not_seen(
