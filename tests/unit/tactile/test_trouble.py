@@ -21,8 +21,10 @@ from sioms.plant.finger import FingerShape, TactileArray
 from sioms.protocol.flags import AnalogStatus
 from sioms.sdk.codec import sample_stream as stream
 from sioms.sdk.codec.cobs import frame
+from sioms.tactile import sensing
 from sioms.tactile.chain import RECOVER_S
-from sioms.tactile.estimator import Quality, State, state_of
+from sioms.tactile.estimator import Estimator, Quality, State, state_of
+from sioms.tactile.finger import Finger as CalibratedFinger
 from sioms.tactile.sensing import CHANNELS
 
 FINGER = str(Path(__file__).parents[3] / "etc" / "finger.toml")
@@ -84,7 +86,7 @@ class Finger:
         """A touch is told as it is, and its end."""
         rest = self.go(0.3)
         assert state_of(Quality(int(rest["quality"]))) is State.UNTOUCHED and rest["load"] == 0.0
-        self.go(0.3, touch(70.0, 200.0))
+        self.go(0.15, touch(70.0, 200.0))
         assert {State.TOUCHED} == set(self.states)
         for name, truth, most in (
             ("load", 200.0, 3.0),
@@ -92,8 +94,24 @@ class Finger:
             ("equivalent_radius", 4.07e-3, 3e-4),
         ):
             assert np.mean([one[name] for one in self.seen]) == pytest.approx(truth, abs=most)  # fmt: skip
-        rest = self.go(0.3)
+        rest = self.go(0.05)
         assert rest["touched"] == 0.0 and rest["load"] == 0.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_estimator() -> Iterator[None]:
+    """Build the estimator of the finger once for all cases: it holds no state from frame to frame."""
+    with pytest.MonkeyPatch.context() as patch:
+        built: dict[bytes, Estimator] = {}
+
+        def estimator(finger: CalibratedFinger, **options: Any) -> Estimator:
+            key = msgspec.json.encode((finger, options))
+            if key not in built:
+                built[key] = Estimator(finger, **options)
+            return built[key]
+
+        patch.setattr(sensing, "Estimator", estimator)
+        yield
 
 
 def cases(*values: Any) -> Any:
@@ -144,12 +162,12 @@ def test_an_element_that_moves_alone_is_no_touch(case: tuple[int, float]) -> Non
     element, jump = case
     finger = Finger(seed=element)
     off = jump * np.eye(16)[element]
-    one = finger.go(0.8, off)
+    one = finger.go(0.4, off)
     assert one["touched"] == 0.0 and one["load"] == 0.0
     assert Quality.BAD_ELEMENTS in Quality(int(one["quality"]))
     if abs(jump) == 5.0:
         assert State.TOUCHED not in finger.states
-    under = finger.go(0.3, off + touch(70.0, 200.0))
+    under = finger.go(0.15, off + touch(70.0, 200.0))
     assert under["load"] == pytest.approx(200.0, abs=8.0)
     finger.go(RECOVER_S + 0.3, off)
     finger.offset = finger.offset + off
@@ -158,18 +176,18 @@ def test_an_element_that_moves_alone_is_no_touch(case: tuple[int, float]) -> Non
 
 @cases(*((step, under) for step in (3.0, -3.0, 1.0) for under in (False, True)))
 def test_a_step_of_all_elements_is_no_touch_and_leaves_nothing(case: tuple[float, bool]) -> None:
-    """For a second, with scatter, at rest and under a touch; ten times: 6 cases."""
+    """For a second and shorter, with scatter, at rest and under a touch; three times: 6 cases."""
     step, under = case
     finger = Finger(seed=round(10.0 * step) % 7)
     shift = step * (1.0 + 0.03 * finger.random.normal(size=16))
     held = touch(60.0, 200.0) if under else NONE
-    for _ in range(3):
-        finger.go(0.3, held)
-        one = finger.go(1.0, shift + held)
+    for seconds in (1.0, 0.3, 0.3):
+        finger.go(0.15, held)
+        one = finger.go(seconds, shift + held)
         assert one["load"] == pytest.approx(200.0 if under else 0.0, abs=15.0)
         if not under:
             assert set(finger.states) == {State.UNTOUCHED}
-        finger.go(0.3, held)
+        finger.go(0.15, held)
     finger.works()
 
 
@@ -208,15 +226,21 @@ def test_a_pull_is_called_one(case: tuple[float, float]) -> None:
     (12.0, 100.0, 6e-3), (12.0, 200.0, 0.5e-3), (10.0, 100.0, 1e-3), (10.0, 150.0, 3e-3), (9.0, 150.0, 1e-3), (8.0, 150.0, 1e-3), (7.0, 200.0, 0.5e-3),
     (7.0, 200.0, 6e-3), (10.0, 200.0, math.inf), (8.0, 100.0, math.inf))))  # fmt: skip
 def test_two_touches_are_not_one_good_one(case: tuple[float, float, float]) -> None:
-    """Five to twelve degrees apart, once they have been held for two seconds: 11 cases."""
+    """Five to twelve degrees apart, once they have been held for up to 2.7 seconds: 10 cases."""
     apart, load, rc = case
     finger = Finger(seed=int(apart))
-    finger.go(1.0)
-    finger.go(2.7, touch(75.0 - apart / 2, load, rc) + touch(75.0 + apart / 2, load, rc))
-    assert finger.seen[-1]["touched"] == 1.0
-    assert finger.states[-1] is State.DOUBTFUL or Quality.FLAT_OR_HOLLOW in Quality(
-        int(finger.seen[-1]["quality"])
-    )
+    both = touch(75.0 - apart / 2, load, rc) + touch(75.0 + apart / 2, load, rc)
+
+    def told() -> bool:
+        quality = Quality(int(finger.seen[-1]["quality"]))
+        return state_of(quality) is State.DOUBTFUL or Quality.FLAT_OR_HOLLOW in quality
+
+    for _ in range(9):
+        finger.go(0.3, both)
+        if told():
+            break
+    finger.go(0.05, both)  # and it stays so
+    assert finger.seen[-1]["touched"] == 1.0 and told()
     finger.works()
 
 
@@ -234,7 +258,7 @@ def singles() -> Iterator[tuple[float, float, float]]:
 def test_a_single_touch_is_not_doubted(case: tuple[float, float, float]) -> None:
     """However long it is held."""
     finger = Finger(seed=11)
-    finger.go(1.0)
+    finger.go(0.2)
     finger.go(2.0, touch(*case))
     assert finger.states.count(State.TOUCHED) >= 0.997 * len(
         finger.states
