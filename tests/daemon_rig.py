@@ -101,12 +101,11 @@ class Daemon:
         real_time: bool = True,
     ) -> None:
         self.folder = folder
-        if real_time:
-            text = re.sub(r'(driver = "sim-\w+"\n)(?!realtime_priority)', r"\1realtime_priority = 50\n", text)
+        self._real_time = real_time
         for name, content in (files or {}).items():
             (folder / name).write_text(content)
         self.config = folder / "cell.toml"
-        self.config.write_text(text)
+        self.configure(text)
         self.socket = str(folder / "d.sock")
         command = [
             sys.executable,
@@ -121,6 +120,12 @@ class Daemon:
         self._frozen: set[int] = set()
         if ready:
             self.running.wait_line("event=ready", 60.0)
+
+    def configure(self, text: str) -> None:
+        """Write the configuration, for the start or for a reload."""
+        if self._real_time:
+            text = re.sub(r'(driver = "sim-\w+"\n)(?!realtime_priority)', r"\1realtime_priority = 50\n", text)
+        self.config.write_text(text)
 
     @property
     def pid(self) -> int:

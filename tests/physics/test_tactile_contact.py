@@ -268,4 +268,5 @@ def test_the_tabulated_spectra_are_those_of_the_contacts():
     for row in (0, 3, 20):
         square = spectra.half_widths[row] ** 2
         risen = (table(np.sqrt(square + step)) - table(np.sqrt(square))) / step
-        assert spectra.normal_slope[row] == pytest.approx(risen, rel=5e-3, abs=1e-3 * np.abs(risen).max())
+        # the difference is one-sided, and the table is curved: 0.7 % at the waves where it is most
+        assert spectra.normal_slope[row] == pytest.approx(risen, rel=1e-2, abs=1e-3 * np.abs(risen).max())

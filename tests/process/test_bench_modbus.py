@@ -133,15 +133,20 @@ def test_limits_hold_and_a_refused_move_moves_nothing(bench: Bench, cell: sioms.
 def test_a_disturbed_line_is_repeated_and_counted(bench: Bench, cell: sioms.Workcell) -> None:
     with cell.open("slide0", "rw") as axis:
         before = axis.statistics()["link"]
-        for fault, counter in (
-            ("noise 1", "garbled"),
-            ("late 0.3 1", "timeouts"),
-            ("cut 1 2", "timeouts"),
-            ("mute 1", "timeouts"),
+        for fault, counters in (
+            ("noise 1", ("garbled", "timeouts")),  # a flipped bit of the head may be one of a longer reply
+            ("late 0.3 1", ("timeouts",)),
+            ("cut 1 2", ("timeouts",)),
+            ("mute 1", ("timeouts",)),
         ):
-            seen = axis.statistics()["link"][counter]
+
+            def counted(names: tuple[str, ...] = counters) -> int:
+                link = axis.statistics()["link"]
+                return sum(link[name] for name in names)
+
+            seen = counted()
             bench.drive.tell(fault)
-            wait_for(lambda c=counter, s=seen: axis.statistics()["link"][c] > s, f"{fault} counted")
+            wait_for(lambda c=counted, s=seen: c() > s, f"{fault} counted")
             assert axis.wait_new(axis.read().number, 3.0).position[0] == pytest.approx(0.0, abs=1e-5), fault
         assert axis.statistics()["link"]["repeats"] > before["repeats"]
         assert axis.statistics()["link"]["reconnects"] == before["reconnects"], "nothing was lost by that"

@@ -183,8 +183,14 @@ def test_bad_message_ends_its_handle_only(
         cell.open("mod0.xaxis", "rw", timeout=2.0).close()
 
 
-def test_end_of_a_session_is_told_in_the_log(daemon: Daemon, raw: Callable[[], Raw]) -> None:
-    raw().sock.send(encode(250, 1, "oddity"))
+def test_end_of_a_session_is_told_in_the_log(start_daemon: Callable[..., Daemon]) -> None:
+    daemon = (
+        start_daemon()
+    )  # of its own: what many sessions do at once is counted in the log, not told one by one
+    session = Raw(daemon.socket)
+    session.sock.send(encode(250, 1, "oddity"))
+    assert session.is_ended()
+    session.close()
     daemon.said(r'level=warning event="session ended" peer="pid \d+ \(\w+\)" why="verb 250 is none"')
 
 

@@ -383,12 +383,12 @@ def test_a_right_that_a_reload_takes_away_ends_what_was_open(
     os.chmod(daemon.folder.parent, 0o755)
     client = start([sys.executable, "-c", HOLDING, daemon.socket])
     client.wait_line("moving")
-    daemon.config.write_text(text + grant.replace('"read", "write"', '"read"'))
+    daemon.configure(text + grant.replace('"read", "write"', '"read"'))
     with daemon.cell() as cell, cell.open("mod0.xaxis.readonly") as watch:
         pid = daemon.device("mod0")["pid"]
         cell.reload()
         at_rest(watch)
-        assert client.wait_exit() == 0
+        assert client.wait_exit() == 0, client.lines
         assert any(f"{errno.EACCES} mod0.xaxis: the right to write it" in line for line in client.lines), (
             client.lines
         )

@@ -72,7 +72,7 @@ def test_all_errors_of_all_devices_come_at_once(tmp_path: Path) -> None:
         r"^\[\[grant\]\] number 1.*reed",
         r"^\[\[emergency_stop\]\] number 1: unknown key nod",
     ):
-        assert any(re.search(pattern, line) for line in said), (pattern, said)
+        assert any(re.search(pattern, re.sub(r"^line \d+: ", "", line)) for line in said), (pattern, said)
     assert any("velocity_max" in line for line in said), said
 
 
@@ -91,7 +91,7 @@ def test_errors_of_names_come_at_once(tmp_path: Path) -> None:
         r"^\[\[emergency_stop\]\]: node = force0; want the name of one binary input",
         r"^\[device.force0\]: reads node mod9.plant, which there is not",
     ):
-        assert any(re.search(pattern, line) for line in said), (pattern, said)
+        assert any(re.search(pattern, re.sub(r"^line \d+: ", "", line)) for line in said), (pattern, said)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_reload_takes_up_changes_and_touches_nothing_else(start_daemon: Callable
         # force0 removed, mod1 changed, mod2 and a name added
         changed = axes("mod1", "xaxis").replace("velocity_max = 1.0", "velocity_max = 0.5")
         added = axes("mod2", "zaxis") + '[node.lift]\nof = "mod2"\n'
-        daemon.config.write_text(
+        daemon.configure(
             '[workcell]\nname = "test"\n' + axes("mod0", "xaxis", "yaxis") + changed + IO + added
         )
         cell.reload()
@@ -175,7 +175,7 @@ def test_reload_with_errors_keeps_everything(start_daemon: Callable[..., Daemon]
     before = pids(daemon)
     with daemon.cell() as cell, cell.open("mod0.xaxis", "rw") as axis:
         axis.command(velocity=0.05)
-        daemon.config.write_text(WORKCELL.replace("velocity_max", "velocity_maxi") + "[nodes]\n")
+        daemon.configure(WORKCELL.replace("velocity_max", "velocity_maxi") + "[nodes]\n")
         with raises(
             errno.EINVAL, "nothing taken up", "velocity_maxi", "unknown section [nodes]", "device.mod1"
         ):
@@ -186,20 +186,20 @@ def test_reload_with_errors_keeps_everything(start_daemon: Callable[..., Daemon]
         assert pids(daemon) == before
         assert axis.read().in_motion[0]
         axis.stop()
-        daemon.config.write_text(WORKCELL)
+        daemon.configure(WORKCELL)
         cell.reload()
         assert pids(daemon) == before
 
 
 def test_sighup_reloads(start_daemon: Callable[..., Daemon]) -> None:
     daemon = start_daemon('[device.io0]\ndriver = "sim-io"\ninputs = 1\n')
-    daemon.config.write_text(
+    daemon.configure(
         '[device.io0]\ndriver = "sim-io"\ninputs = 1\n[device.io1]\ndriver = "sim-io"\ninputs = 2\n'
     )
     daemon.running.signal(signal.SIGHUP)
     daemon.said("event=reload errors=0")
     daemon.wait_up("io1")
-    daemon.config.write_text("[device.io0]\n")
+    daemon.configure("[device.io0]\n")
     daemon.running.signal(signal.SIGHUP)
     daemon.said("event=reload errors=1")
     assert pids(daemon).keys() == {"io0", "io1"}
@@ -209,7 +209,7 @@ def test_holders_of_a_changed_device_are_told(start_daemon: Callable[..., Daemon
     daemon = start_daemon(WORKCELL)
     with daemon.cell() as cell:
         node = cell.open("force0")
-        daemon.config.write_text(WORKCELL.replace("1.0, 2.0, 3.0", "4.0, 5.0, 6.0"))
+        daemon.configure(WORKCELL.replace("1.0, 2.0, 3.0", "4.0, 5.0, 6.0"))
         cell.reload()
         with raises(errno.EIO, "force0"):
             wait_for(lambda: node.read() and False, "refused")
