@@ -171,7 +171,7 @@ class AsyncNode(NodeCore):
         self, axis: int | str = 0, *, timeout: float | None = 0.0, replace: bool = False, **words: Any
     ) -> int:
         """Append one command to an axis, given by index or name; see ``sioms.command`` for the words."""
-        return await self.write(command(self.channel(axis), **words), timeout, replace=replace)
+        return await self.write(command(self.index_of(axis), **words), timeout, replace=replace)
 
     async def move(
         self,

@@ -194,13 +194,13 @@ class AxisNode(Node):
         Returns:
             The driver's tick when it was taken; ``wait_until_idle`` waits for the end of the motion.
         """
-        return self.write(command(self.channel(axis), position=position, **words), timeout, replace=replace)
+        return self.write(command(self.index_of(axis), position=position, **words), timeout, replace=replace)
 
     def command(
         self, axis: int | str = 0, *, timeout: float | None = 0.0, replace: bool = False, **words: Any
     ) -> int:
         """Append one command to an axis, given by index or name; see ``sioms.command`` for the words."""
-        return self.write(command(self.channel(axis), **words), timeout, replace=replace)
+        return self.write(command(self.index_of(axis), **words), timeout, replace=replace)
 
     def jog(self, velocity: float, axis: int | str = 0, *, acceleration: float | None = None) -> int:
         """Go over to a velocity at once, instead of what the axis does, until told otherwise; ``stop`` ends it.
@@ -217,7 +217,7 @@ class AxisNode(Node):
 
     def tweak(self, step: float, axis: int | str = 0, **words: Any) -> int:
         """Append a step [unit] from where the preceding command ends, so that quick tweaks add up; see ``command``."""
-        return self.write(command(self.channel(axis), position=step, relative=True, **words))
+        return self.write(command(self.index_of(axis), position=step, relative=True, **words))
 
     def user(self, axis: int | str = 0, *, offset: float = 0.0, direction: int = 1) -> UserAxis:
         """Return one axis in coordinates of one's own: user = direction * position + offset."""

@@ -290,6 +290,10 @@ class NodeCore:
             f"choose channel {which!r} of {self.name}: it has {', '.join(names)} (0 to {len(names) - 1})",
         )
 
+    def index_of(self, axis: int | str) -> int:
+        """Return the index of an axis that is named; one that is numbered is the driver's to judge."""
+        return self.channel(axis) if isinstance(axis, str) else axis
+
     def __repr__(self) -> str:
         what = f"<{type(self).__name__} {self.name}"
         if self.closed:
