@@ -80,3 +80,24 @@ def test_a_step_ends_when_it_is_silent_and_not_when_it_is_slow(dev, monkeypatch,
     assert "hangs: killed; it has printed nothing" in capfd.readouterr().err
     monkeypatch.setattr(dev.os, "getloadavg", lambda: (100.0 * dev.os.cpu_count(), 0.0, 0.0))
     assert dev.run_step("starved", [sys.executable, "-c", "import time; time.sleep(4)"]) == 0
+
+
+def test_what_failed_is_run_once_more_and_a_second_failure_counts(dev, monkeypatch, capsys):
+    ran = []
+
+    def step(name, command):
+        ran.append(command)
+        return next(codes)
+
+    monkeypatch.setattr(dev, "run_step", step)
+    timed = ("timed", ["python", "-m", "pytest", "-q", "-n", "2", "tests"])
+    codes = iter([1, 0])
+    assert dev.run_steps([timed]) == 0
+    assert ran[1] == ["python", "-m", "pytest", "-q", "tests", "--lf", "--lfnf=none"]
+    assert "what failed once more" in capsys.readouterr().err
+    codes = iter([1, 1])
+    assert dev.run_steps([timed]) == 1
+    codes = iter([2, 0])  # an interrupted or broken run is not run again
+    assert dev.run_steps([timed]) == 1
+    codes = iter([1, 0])
+    assert dev.run_steps([("style", ["ruff", "check"])]) == 1
