@@ -112,7 +112,7 @@ def test_select_waits_for_room(cell: sioms.Workcell) -> None:
     with cell.open("mod0.xaxis", "rw") as axis:
         capacity = axis.info.buffer_capacity
         assert sioms.select(room=[axis], timeout=0.0) == ([], [axis])
-        axis.command(velocity=0.0, time=0.15)
+        axis.command(velocity=0.0, time=2.0)
         wait_for(lambda: axis.read().in_motion[0], "running")
         axis.write([sioms.command(0, velocity=0.0, time=0.001)] * capacity)
         wait_for(lambda: axis.room() <= 0, "full")
