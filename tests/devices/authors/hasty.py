@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from sioms.drivers.tmcl import Tmcl
+from sioms.drivers.tmcl import Tmcl, TmclUnit
 from sioms.sdk.driver import Kit
+from sioms.sdk.exchange import Steps
 
 TABLES = """
 [device.hasty]
@@ -24,11 +25,20 @@ position_max = 1.0
 """
 
 
+class HastyUnit(TmclUnit):
+    def _prove(self) -> Steps:
+        yield from ()
+
+    def _into_step(self, *, search: bool) -> Steps:
+        yield from ()
+
+
 class Hasty(Tmcl):
     rig: ClassVar = {"counterpart": ["tmcl"], "tables": TABLES}
 
     def __init__(self, name: str, settings: Any, kit: Kit) -> None:
         super().__init__(name, settings, kit)
+        self._units = (HastyUnit(name, settings, self.describe(name, settings).blocks[0], kit),)
         self.recovery_s = 0.0
 
 
