@@ -20,7 +20,7 @@ from sioms.tools.author.station import Station, wait_for
 from sioms.tools.author.trial import Trial, Verdict, attempt
 from sioms.tools.counterparts.rigs import MAP_RIGS
 
-pytestmark = pytest.mark.timeout(700)
+pytestmark = pytest.mark.timeout(1000)
 
 AUTHORS = Path(__file__).parent / "authors"
 WIRED = [rig.title for rig in RIGS if rig.line]
@@ -34,14 +34,14 @@ def run(*words: str) -> tuple[int, list[dict[str, Any]], str]:
     with TemporaryDirectory() as folder:
         out = Path(folder) / "out.json"
         command = [sys.executable, "-m", "sioms.tools.front", "driver", "check", *words, "--json", str(out)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=660)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=900)
         reports = json.loads(out.read_text()) if out.exists() else []
         return done.returncode, reports, done.stdout + done.stderr
 
 
 @cache
 def shipped() -> tuple[dict[str, dict[str, Any]], str]:
-    _, reports, said = run(*SHIPPED, "iio", "-j", "5")
+    _, reports, said = run(*SHIPPED, "iio", "-j", "4")
     return {report["driver"]: report for report in reports}, said
 
 
