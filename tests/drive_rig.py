@@ -7,11 +7,12 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from steps_rig import carry_out
 
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
 from sioms.protocol.records import NodeClass, numpy_dtype
 from sioms.sdk.driver import LineDriver
-from sioms.sdk.exchange import DeviceError, LinkError, Pause, Send, Steps
+from sioms.sdk.exchange import Exchange, LinkError, Pause, Send, Step, Steps
 from sioms.sdk.markers import Markers
 
 LIMITS = {"velocity_max": 0.1, "acceleration_max": 1.0}
@@ -82,31 +83,22 @@ class Joined:
 
     def do(self, steps: Steps, look: Callable[[], object] = lambda: None) -> None:
         """Carry out a hook as the kit does; characters take their time."""
-        value: Any = None
-        failure: Exception | None = None
-        while True:
-            try:
-                step = steps.throw(failure) if failure else steps.send(value)
-            except StopIteration:
-                return
-            value, failure = None, None
-            match step:
-                case Pause(duration_s):
-                    self.wait(duration_s, look)
-                case Send(data) | data:
-                    data = getattr(data, "data", data)
-                    self.sent.append(data)
-                    self.wait(max(0.001, len(data) * CHARACTER_S), look)
-                    reply = b"".join(self.device.take(data))
-                    self.wait(len(reply) * CHARACTER_S, look)
-                    if isinstance(step, Send):
-                        if self._overheard is not None and reply:
-                            self._overheard(reply, round(self.now_s * 1e9))
-                    else:
-                        try:
-                            value = self._decoded(step, reply)
-                        except (LinkError, DeviceError) as error:
-                            failure = error
+        carry_out(steps, lambda step: self._carry(step, look))
+
+    def _carry(self, step: Step, look: Callable[[], object]) -> Any:
+        if isinstance(step, Pause):
+            self.wait(step.duration_s, look)
+            return None
+        assert isinstance(step, Send | Exchange)
+        self.sent.append(step.data)
+        self.wait(max(0.001, len(step.data) * CHARACTER_S), look)
+        reply = b"".join(self.device.take(step.data))
+        self.wait(len(reply) * CHARACTER_S, look)
+        if isinstance(step, Exchange):
+            return self._decoded(step, reply)
+        if self._overheard is not None and reply:
+            self._overheard(reply, round(self.now_s * 1e9))
+        return None
 
     def _decoded(self, exchange: Any, reply: bytes) -> Any:
         size = exchange.want(reply)

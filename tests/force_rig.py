@@ -8,10 +8,11 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from steps_rig import carry_out
 
 from sioms.protocol.flags import AnalogStatus
 from sioms.sdk.driver import Driver
-from sioms.sdk.exchange import Aside, DeviceError, Exchange, LinkError, Pause, Send, Steps
+from sioms.sdk.exchange import Aside, Exchange, LinkError, Pause, Send, Step, Steps
 
 SATURATED, INVALID, OVERRUN = (int(AnalogStatus[name]) for name in ("SATURATED", "INVALID", "OVERRUN"))
 LOAD = (10.0, -20.0, 30.0, 1.0, -2.0, 3.0)
@@ -46,30 +47,24 @@ class Rig:
 
     def do(self, steps: Steps) -> Any:
         """Carry out a hook, as the kit does it."""
-        value: Any = None
-        failure: Exception | None = None
-        while True:
-            try:
-                step = steps.throw(failure) if failure else steps.send(value)
-            except StopIteration as end:
-                rest, self.rest = self.rest, b""
-                if rest:
-                    self.arrive(rest)  # what came behind a reply is fed, as the kit does it
-                return end.value
-            value, failure = None, None
-            match step:
-                case Pause(duration_s):
-                    self.now_s += duration_s
-                case Send(data):
-                    self.now_s += len(data) * 10 / 19200
-                    self.on_line(data)
-                case _:
-                    exchange = step.exchange if isinstance(step, Aside) else step
-                    send = self.aside if isinstance(step, Aside) else self.on_line
-                    try:
-                        value = self._ask(exchange, send)
-                    except (LinkError, DeviceError) as error:
-                        failure = error
+        value = carry_out(steps, self._carry)
+        rest, self.rest = self.rest, b""
+        if rest:
+            self.arrive(rest)  # what came behind a reply is fed, as the kit does it
+        return value
+
+    def _carry(self, step: Step) -> Any:
+        match step:
+            case Pause(duration_s):
+                self.now_s += duration_s
+            case Send(data):
+                self.now_s += len(data) * 10 / 19200
+                self.on_line(data)
+            case Aside():
+                return self._ask(step.exchange, self.aside)
+            case Exchange():
+                return self._ask(step, self.on_line)
+        return None
 
     def _ask(self, exchange: Exchange, send: Callable[[bytes], bytes]) -> Any:
         reply = send(exchange.data)

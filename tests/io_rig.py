@@ -7,10 +7,11 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from steps_rig import carry_out
 
 from sioms.drivers.modbus_io import IoUnit, ModbusIo
 from sioms.sdk.codec.modbus import frame_tcp
-from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Pause, Steps
+from sioms.sdk.exchange import Exchange, Pause, Step, Steps
 from sioms.tools.counterparts import moxa, wago
 
 EXCHANGE_S = 0.002
@@ -74,28 +75,18 @@ class Joined:
 
     def run(self, steps: Steps) -> Any:
         """Carry out a hook to its end."""
-        value: Any = None
-        failure: Exception | None = None
-        try:
-            while True:
-                step = steps.throw(failure) if failure else steps.send(value)
-                value, failure = None, None
-                if isinstance(step, Pause):
-                    self.now_s += step.duration_s
-                    continue
-                assert isinstance(step, Exchange)
-                self.now_s += EXCHANGE_S
-                self.sent.append(step.data[7:].hex(" "))
-                reply = frame_tcp(
-                    int.from_bytes(step.data[:2], "big"), step.data[6], self._answer(step.data[7:])
-                )
-                assert step.want(reply) == len(reply)
-                try:
-                    value = step.decode(reply)
-                except (LinkError, DeviceError) as error:
-                    failure = error
-        except StopIteration as end:
-            return end.value
+        return carry_out(steps, self._carry)
+
+    def _carry(self, step: Step) -> Any:
+        if isinstance(step, Pause):
+            self.now_s += step.duration_s
+            return None
+        assert isinstance(step, Exchange)
+        self.now_s += EXCHANGE_S
+        self.sent.append(step.data[7:].hex(" "))
+        reply = frame_tcp(int.from_bytes(step.data[:2], "big"), step.data[6], self._answer(step.data[7:]))
+        assert step.want(reply) == len(reply)
+        return step.decode(reply)
 
     def _answer(self, pdu: bytes) -> bytes:
         function, address = pdu[0], int.from_bytes(pdu[1:3], "big")

@@ -81,7 +81,12 @@ def run(args: argparse.Namespace) -> int:
         ports = found()
         text += "".join(_block(port, i) for i, port in enumerate(ports))
         told = _told(ports)
-    path.write_text(text, encoding="utf-8")
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OSError(
+            error.errno, f"write {path}: {error.strerror}; give a FILE in a folder that is there"
+        ) from None
     print(f"{path} written{told}")
     status = check(path)
     if status == 0:

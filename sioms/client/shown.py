@@ -10,6 +10,7 @@ Concurrency: any thread.
 
 from __future__ import annotations
 
+import os
 from _thread import allocate_lock
 
 TYPE_CHECKING = False
@@ -23,6 +24,15 @@ _lock = allocate_lock()
 _nodes: dict[int, list[NodeCore]] = {}
 _last_ns: dict[int, int] = {}
 _everywhere_ns = 0
+
+
+def _unlock() -> None:
+    """Begin with a free lock in a forked child: the thread that held it is not there."""
+    global _lock
+    _lock = allocate_lock()
+
+
+os.register_at_fork(after_in_child=_unlock)
 
 
 def join(node: NodeCore, device: int) -> None:

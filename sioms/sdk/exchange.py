@@ -152,8 +152,18 @@ def until(end: bytes = b"\n", longest: int = 80) -> Callable[[bytes], int | None
     return want
 
 
-def while_wanted(steps: Steps, is_wanted: Callable[[], bool]) -> Generator[Step, Any, bool]:
-    """Carry out steps one by one, and no further once they are not wanted any more; return whether they came to their end."""
+def while_wanted(
+    steps: Steps, is_wanted: Callable[[], bool], each: Callable[[Step], Step] = lambda step: step
+) -> Generator[Step, Any, bool]:
+    """Carry out steps one by one, and no further once they are not wanted any more.
+
+    Args:
+        is_wanted: asked before every step.
+        each: what is carried out instead of a step.
+
+    Returns:
+        Whether they came to their end.
+    """
     value: Any = None
     failure: Exception | None = None
     while is_wanted():
@@ -163,7 +173,7 @@ def while_wanted(steps: Steps, is_wanted: Callable[[], bool]) -> Generator[Step,
             return True
         value, failure = None, None
         try:
-            value = yield step
+            value = yield each(step)
         except (LinkError, DeviceError) as error:
             failure = error
     return False
@@ -171,20 +181,13 @@ def while_wanted(steps: Steps, is_wanted: Callable[[], bool]) -> Generator[Step,
 
 def noting(steps: Steps, note: Callable[[], None]) -> Steps:
     """Carry out steps, and note each good reply when it comes: others may have their turn before the steps go on."""
-    value: Any = None
-    failure: Exception | None = None
-    while True:
-        try:
-            step = steps.throw(failure) if failure else steps.send(value)
-        except StopIteration:
-            return
-        value, failure = None, None
+
+    def noted(step: Step) -> Step:
         if isinstance(step, Exchange):
-            step = replace(step, decode=partial(_decode_and_note, step.decode, note))
-        try:
-            value = yield step
-        except (LinkError, DeviceError) as error:
-            failure = error
+            return replace(step, decode=partial(_decode_and_note, step.decode, note))
+        return step
+
+    yield from while_wanted(steps, lambda: True, noted)
 
 
 def _decode_and_note(decode: Callable[[bytes], Any], note: Callable[[], None], reply: bytes) -> Any:

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from steps_rig import carry_out
 
 from sioms.drivers.modbus_axis import MAPS, ModbusAxis
 from sioms.drivers.modbus_io import ModbusIo
@@ -17,7 +18,7 @@ from sioms.protocol.flags import AxisStatus, ControlMode
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
 from sioms.protocol.records import NodeClass, numpy_dtype
 from sioms.sdk.codec.modbus import frame_rtu, frame_tcp
-from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Pause, StateLost, Steps
+from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Pause, StateLost, Step, Steps
 from sioms.sdk.markers import Markers
 from sioms.sdk.regmap import named_map
 from sioms.tools.counterparts import leadshine, moxa, oriental_az
@@ -66,26 +67,18 @@ class Bus:
 
     def run(self, steps: Steps) -> Any:
         """Run a hook to its end."""
-        value: Any = None
-        failure: Exception | None = None
-        try:
-            while True:
-                step = steps.throw(failure) if failure else steps.send(value)
-                value, failure = None, None
-                if isinstance(step, Pause):
-                    self.now_s += step.duration_s
-                    continue
-                assert isinstance(step, Exchange)
-                self.now_s += EXCHANGE_S
-                self.sent.append(step.data)
-                try:
-                    reply = self.broken(step) or self.answer(step.data)
-                    assert step.want(reply) == len(reply)
-                    value = step.decode(reply)
-                except (LinkError, DeviceError) as error:
-                    failure = error
-        except StopIteration as end:
-            return end.value
+        return carry_out(steps, self._carry)
+
+    def _carry(self, step: Step) -> Any:
+        if isinstance(step, Pause):
+            self.now_s += step.duration_s
+            return None
+        assert isinstance(step, Exchange)
+        self.now_s += EXCHANGE_S
+        self.sent.append(step.data)
+        reply = self.broken(step) or self.answer(step.data)
+        assert step.want(reply) == len(reply)
+        return step.decode(reply)
 
 
 class Rig:
