@@ -8,14 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..counterparts.rigs import Rig
-from . import death_trials, device_trials, golden, line_trials, motion_trials
+from . import death_trials, defect_trials, golden, line_trials, motion_trials, refusal_trials, restart_trials
 from .station import Station, Unanswered
 from .trial import Result, Trial, Verdict, attempt
 
 TRIALS: tuple[Trial, ...] = (
     *line_trials.TRIALS,
     *motion_trials.TRIALS,
-    *device_trials.TRIALS,
+    *restart_trials.TRIALS,
+    *refusal_trials.TRIALS,
+    *defect_trials.TRIALS,
     *death_trials.TRIALS,
 )
 
