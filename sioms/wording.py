@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Literal, get_origin
+from types import UnionType
+from typing import Literal, Union, get_origin
 
 import msgspec
 
@@ -59,6 +60,7 @@ def every_error(where: str, value: object, annotation: object) -> list[str]:
         annotation: what it should be: a Struct, a list of them, or anything that the validator knows.
     """
     errors: list[str] = []
+    annotation = _of_kind(value, annotation)
     inner: Sequence[object] = getattr(annotation, "__args__", ())
     if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct) and isinstance(value, dict):
         fields = {field.encode_name: field for field in msgspec.structs.fields(annotation)}
@@ -81,6 +83,20 @@ def every_error(where: str, value: object, annotation: object) -> list[str]:
             return [f"{where} = {value!r}: want one of {', '.join(map(repr, words))}"]
         return [explain(where, error, ())]
     return []
+
+
+def _of_kind(value: object, annotation: object) -> object:
+    """Return which one of several types a table or a list is meant to be, where one of them alone can be it."""
+    if get_origin(annotation) not in (Union, UnionType):
+        return annotation
+    kinds: Sequence[object] = getattr(annotation, "__args__", ())
+    fits = [
+        kind
+        for kind in kinds
+        if (isinstance(value, dict) and isinstance(kind, type) and issubclass(kind, msgspec.Struct))
+        or (isinstance(value, list) and get_origin(kind) is list)
+    ]
+    return fits[0] if len(fits) == 1 else annotation
 
 
 def choices(kind: type[msgspec.Struct]) -> dict[str, tuple[object, ...]]:

@@ -13,6 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 import sioms
 from sioms.client.node import AxisNode
@@ -168,7 +169,8 @@ def uniform(name: str, seen: Sequence[AxisSnapshot], dt: float) -> list[Record]:
     """Lay snapshots on the grid of the axis's rate, by their time stamps, from one long hole to the next.
 
     On a busy machine a tick comes late and the next one early. Of two in one period the later counts, and a period without one
-    is filled in (its force is the one that was held).
+    is filled in: its force is the one that was held, its position lies on a cubic spline, since a straight line would end in
+    jumps of the speed that no force has made.
     """
     periods = np.rint(np.diff([s.stamp_ns for s in seen]) * 1e-9 / dt).astype(np.int64)
     edges = [0, *(np.flatnonzero(periods > MOST_FILLED) + 1).tolist(), len(seen)]
@@ -189,8 +191,9 @@ def _even(name: str, seen: Sequence[AxisSnapshot], periods: NDArray[np.int64], d
     held = force[np.searchsorted(at, grid, side="right") - 1]
     return Record(
         name,
-        np.interp(grid, at, position),
+        CubicSpline(at, position)(grid),
         held,
         np.interp(grid, at, command),
         time_s=grid.astype(np.float64) * dt,
+        filled=~np.isin(grid, at),
     )

@@ -302,6 +302,9 @@ class AxisBank:
         self._queue.find_places(chosen)
         for axis, position in zip(chosen.tolist(), wanted.tolist(), strict=True):
             self.shift(axis, position - float(self._position[axis]))
+            # A sum of differences rounds: the place that was named is the place that is read.
+            self._offset[axis] = position - float(self._raw[axis])
+            self._position[axis] = float(self._raw[axis]) + float(self._offset[axis])
 
     def zero(self, axes: AxesLike) -> None:
         """Make the present place of each axis position 0; see calibrate()."""

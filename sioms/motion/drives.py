@@ -84,7 +84,7 @@ class DriveBank:
         self._end_ns = np.full(n, NEVER_NS, dtype=np.int64)
         self._end_fraction = np.zeros(n)
         self._release_ns = np.zeros(n, dtype=np.int64)
-        self._offset = np.zeros(n)
+        self._raw, self._offset = np.zeros(n), np.zeros(n)
         self._target = np.zeros(n)
         self._settle_ns = int(settle_s * 1e9)
         self._acknowledged = np.zeros(n, dtype=bool)
@@ -238,7 +238,7 @@ class DriveBank:
         chosen, wanted = np.asarray(axes, dtype=np.int64), np.asarray(positions, dtype=np.float64)
         self._queue.check_calibration(chosen, wanted, self._idle(chosen))
         self._queue.find_places(chosen)
-        self._offset[chosen] += wanted - self._position[chosen]
+        self._offset[chosen] = wanted - self._raw[chosen]  # a sum of differences would round: 0 must read as 0
         self._position[chosen] = wanted
         self._target[chosen] = wanted
 
@@ -283,8 +283,7 @@ class DriveBank:
     def particulars(self, axes: AxesLike) -> dict[str, list[float]]:
         """Return what the readings do not tell of these axes, by name; see AxisBank.particulars()."""
         chosen = np.asarray(axes)
-        raw, offset = self._position - self._offset, self._offset
-        report = {"raw": raw[chosen].tolist(), "offset": offset[chosen].tolist()}
+        report = {"raw": self._raw[chosen].tolist(), "offset": self._offset[chosen].tolist()}
         return report | self._arrivals.report(chosen)
 
     def take_events(self) -> list[Event]:
@@ -342,9 +341,8 @@ class DriveBank:
         """Note where the axes are; before the drives hear of a motion."""
         if self.keeper is not None and self._seen:
             homed = (self._queue.latched & int(AxisStatus.HOMED)) != 0
-            raw = self._position - self._offset
             lost = (self._queue.latched & LOST) != 0
-            self.keeper.note(~self._active & ~self._moving & ~lost, homed, raw, self._position, self._last_ns)
+            self.keeper.note(~self._active & ~self._moving & ~lost, homed, self._raw, self._position, self._last_ns)
 
     def advance(self, now_ns: int) -> None:
         """Do what time and markers allow without a new report: end timed commands, begin what waits."""
@@ -472,7 +470,8 @@ class DriveBank:
         force: NDArray[np.float64] | None,
     ) -> None:
         good = np.isfinite(position) & np.isfinite(velocity)
-        np.add(position, self._offset, out=self._position, where=good)
+        np.copyto(self._raw, position, where=good)
+        np.add(self._raw, self._offset, out=self._position)
         np.copyto(self._velocity, velocity, where=good)
         if force is not None:
             self.fields[2] = force

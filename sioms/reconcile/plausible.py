@@ -14,6 +14,8 @@ from sioms.reconcile.variation import named
 
 #: A refitted candidate: fit, held-out losses, share saved, standard errors.
 Tried = tuple[Fit, Array, float, float]
+#: Of a displacement within so many steps of the encoder nothing is seen.
+UNSEEN_STEPS = 2.0
 AND = " and "
 
 
@@ -86,7 +88,8 @@ def leans(model: AxisModel, name: str) -> bool:
     """Say whether a number of an effect leans on its bound: then it belongs to something else.
 
     The stiffness and damping of a contact may: harder than what is seen is as good as hard. So may a time constant that is longer
-    than the records. Of friction with a path of its own, a drop within no speed or a build-up within no path is another friction.
+    than the records. Of friction with a path of its own, a drop within no speed or a build-up within no path, or within a path
+    that the encoder does not see, is another friction.
     """
     effect, given = known()[name], model.effects[name]
     if any(given[a] > most * given[b] for a, b, most in effect.ratios):
@@ -94,6 +97,9 @@ def leans(model: AxisModel, name: str) -> bool:
     free = [q for q in effect.parameters if not q.phase and not q.fixed]
     least = (Ref.TIME, Ref.SPEED, Ref.PITCH) if effect.slot is Slot.HYSTERESIS else (Ref.TIME,)
     if any(q.ref in least and 0.0 < given[q.symbol] < 1.02 * q.lower * model.scale(q) for q in free):
+        return True
+    paths = [q for q in free if q.ref is Ref.PITCH and effect.slot is Slot.HYSTERESIS]
+    if any(0.0 < given[q.symbol] < UNSEEN_STEPS * model.resolution for q in paths):
         return True
     for q in [effect.primary] if effect.slot in (Slot.BACKLASH, Slot.THERMAL) else free:
         low, high = (bound * model.scale(q) for bound in (q.lower, q.upper))

@@ -268,7 +268,9 @@ def test_positions_are_waited_for(shell: Shell, cell: sioms.Workcell) -> None:
 
 def test_pieces_with_times_queue_up_and_none_is_lost(shell: Shell, cell: sioms.Workcell) -> None:
     before = cell.open("mod0.readonly").read().position[1]
-    rows = "".join([f"{0.2 * i / 100} 0.001\n" for i in range(100)] + ["0.2 0.001\n"] * 400 + ["0 0.2\n"])
+    # The first piece stands, so that those of a millisecond wait behind it however late they come.
+    ramp = [f"{0.2 * i / 100} 0.001\n" for i in range(100)]
+    rows = "".join(["0 1\n", *ramp, *["0.2 0.001\n"] * 400, "0 0.2\n"])
     good(shell("devout -rvt -L-1 mod0.yaxis", rows))
     moved = cell.open("mod0.readonly").read().position[1] - before
     assert abs(moved - (0.01 + 0.08 + 0.2**2 / 2 / 10)) < 0.003  # ramp, run, and the way of braking

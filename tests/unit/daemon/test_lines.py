@@ -53,6 +53,8 @@ class Axis(msgspec.Struct, forbid_unknown_fields=True):
 class Device(msgspec.Struct, forbid_unknown_fields=True):
     axis: list[Axis]
     rate: float = 1.0
+    spare: Axis | None = None
+    more: list[Axis] | None = None
 
     def __post_init__(self) -> None:
         if self.rate < 0:
@@ -68,6 +70,12 @@ def test_all_errors_of_nested_tables() -> None:
         "d.axis[1]: unknown key mas; did you mean mass?",
         "d.axis[1]: key name is missing",
         "d.rate: expected `float`, got `str`",
+    ]
+    optional = {"axis": [], "spare": {"name": "x", "mas": 1.0}, "more": [{"name": "x"}, {"nam": "x"}]}
+    assert every_error("d", optional, Device) == [
+        "d.spare: unknown key mas; did you mean mass?",
+        "d.more[1]: unknown key nam; did you mean name?",
+        "d.more[1]: key name is missing",
     ]
     assert every_error("d", {"axis": [], "rate": -1.0}, Device) == ["d: rate below 0"]
     assert every_error("d", {"axis": []}, Device) == []

@@ -34,6 +34,18 @@ def test_a_lost_tick_is_filled_in_with_the_force_that_was_held() -> None:
     np.testing.assert_allclose(record.position, SPEED * DT * np.arange(600), atol=1e-12)
     assert record.force[[99, 100, 101]] == pytest.approx([99.0, 99.0, 101.0])
     assert record.force[[300, 301, 302]] == pytest.approx([299.0, 299.0, 302.0])
+    assert record.filled is not None
+    assert np.flatnonzero(record.filled).tolist() == [100, 300, 301]
+
+
+def test_a_place_that_is_filled_in_goes_on_as_the_motion_did() -> None:
+    """A straight line between 299 and 302 would lie 1e-6 off: a jump of the speed that no force has made."""
+    ticks = [t for t in range(600) if t not in (100, 300, 301)]
+    seen = snapshots(ticks)
+    for each, t in zip(seen, ticks, strict=True):
+        each.position = [0.5 * 1.0 * (t * DT) ** 2]
+    (record,) = uniform("run", seen, DT)  # type: ignore[arg-type]
+    np.testing.assert_allclose(record.position, 0.5 * (DT * np.arange(600)) ** 2, atol=1e-12)
 
 
 def test_a_long_hole_parts_the_record_and_a_short_piece_is_left_out() -> None:
