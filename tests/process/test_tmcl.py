@@ -162,6 +162,7 @@ def test_stray_bytes_restarts_and_other_masters(start: Callable[..., Any], short
         x.reset()
         with raises(1, "position lost"):
             x.move(0.01)
+        at_rest(x)
         x.calibrate(0.0)
         x.reset()
         x.move(0.01)
