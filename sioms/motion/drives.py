@@ -238,7 +238,9 @@ class DriveBank:
         chosen, wanted = np.asarray(axes, dtype=np.int64), np.asarray(positions, dtype=np.float64)
         self._queue.check_calibration(chosen, wanted, self._idle(chosen))
         self._queue.find_places(chosen)
-        self._offset[chosen] = wanted - self._raw[chosen]  # a sum of differences would round: 0 must read as 0
+        self._offset[chosen] = (
+            wanted - self._raw[chosen]
+        )  # a sum of differences would round: 0 must read as 0
         self._position[chosen] = wanted
         self._target[chosen] = wanted
 
@@ -342,7 +344,9 @@ class DriveBank:
         if self.keeper is not None and self._seen:
             homed = (self._queue.latched & int(AxisStatus.HOMED)) != 0
             lost = (self._queue.latched & LOST) != 0
-            self.keeper.note(~self._active & ~self._moving & ~lost, homed, self._raw, self._position, self._last_ns)
+            self.keeper.note(
+                ~self._active & ~self._moving & ~lost, homed, self._raw, self._position, self._last_ns
+            )
 
     def advance(self, now_ns: int) -> None:
         """Do what time and markers allow without a new report: end timed commands, begin what waits."""
