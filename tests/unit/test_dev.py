@@ -73,7 +73,7 @@ def test_a_moved_environment_is_mended(dev, tmp_path, monkeypatch, places):
 def test_a_step_ends_when_it_is_silent_and_not_when_it_is_slow(dev, monkeypatch, capfd):
     monkeypatch.setattr(dev, "QUIET_S", 2.0)
     monkeypatch.setattr(dev.os, "getloadavg", lambda: (0.0, 0.0, 0.0))
-    slow = "import time\nfor _ in range(4): print('.', flush=True); time.sleep(1)"
+    slow = "import time\nfor _ in range(3): print('.', flush=True); time.sleep(1.5)"
     assert dev.run_step("slow", [sys.executable, "-c", slow]) == 0
     hangs = "import time; time.sleep(60)"
     assert dev.run_step("hangs", [sys.executable, "-c", hangs]) == -1
