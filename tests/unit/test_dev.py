@@ -90,7 +90,7 @@ def test_what_failed_is_run_once_more_and_a_second_failure_counts(dev, monkeypat
         return next(codes)
 
     monkeypatch.setattr(dev, "run_step", step)
-    timed = ("timed", ["python", "-m", "pytest", "-q", "-n", "2", "tests"])
+    timed = ("timed", ["python", "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "tests"])
     codes = iter([1, 0])
     assert dev.run_steps([timed]) == 0
     assert ran[1] == ["python", "-m", "pytest", "-q", "tests", "--lf", "--lfnf=none"]

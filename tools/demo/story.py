@@ -244,7 +244,7 @@ class _Show:
             victim = Process(["sioms.tools.demo.victim", "mod0.xaxis", "0.2"], "moving")
             time.sleep(0.6)
             try:
-                self._cell.open("mod0.xaxis", "rw")
+                self._cell.open("mod0.xaxis", "rw").close()
             except OSError as error:
                 _say(f"before: {error.strerror}")
             self._note("SIGKILL to the client", victim.kill())
