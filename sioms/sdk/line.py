@@ -27,6 +27,8 @@ LOOK_ASIDE_NS = 1_000_000
 STRAY = 8
 """Bytes in front of a reply that may be skipped where a checksum says that the rest is one: an adapter that switches
 its direction puts a 0x00 or 0xFF there."""
+PAUSE_NS = 20_000_000
+"""Longest pause within a reply that begins with stray bytes, or is damaged; a USB adapter hands on what it has every 16 ms."""
 BABBLE_NS = 500_000_000
 """How much longer than the silence it owes a line may go on after a bad reply; then the exchange has failed."""
 
@@ -86,6 +88,8 @@ class _Running:
     step: Step | None = None
     attempts: int = 0
     reply: bytearray = field(default_factory=bytearray)
+    damage: str = ""
+    """What is wrong with the reply so far, if nothing comes behind it that would make its beginning stray bytes."""
 
 
 class Line:
@@ -186,8 +190,11 @@ class Line:
             return
         running.reply += data
         try:
+            running.damage = ""
             found = self._reply_in(exchange, running.reply)
             if found is None:
+                if running.damage:
+                    self._until_ns = min(self._until_ns, now_ns + PAUSE_NS)
                 return
             length, value = found
         except LinkError as error:
@@ -216,7 +223,7 @@ class Line:
         data = bytes(reply)
         try:
             return _whole_reply(exchange, data, 0)
-        except LinkError:
+        except LinkError as error:
             if self._is_serial and not self._has_echo:
                 if len(data) < len(exchange.data) and exchange.data.startswith(data):
                     return None  # it may become the echo of the request
@@ -228,10 +235,12 @@ class Line:
                     del reply[: len(exchange.data)]
                     return self._reply_in(exchange, reply) if reply else None
             found, waits = _behind_stray(exchange, data) if exchange.has_checksum else (None, False)
-            if found is None and not waits:
-                raise
             if found is not None:
                 self.counters.noise_bytes += 1
+            elif not waits:
+                raise
+            elif self._running is not None:
+                self._running.damage = str(error)
             return found
 
     def _without_echo(self, data: bytes) -> bytes:
@@ -259,6 +268,9 @@ class Line:
                     self._resume(None, now_ns)
                 else:
                     self._transmit(now_ns)
+            case _State.EXPECTING if running.damage:
+                self.counters.garbled += 1
+                self._recover(running.damage, now_ns, heard=True)
             case _State.EXPECTING:
                 self.counters.timeouts += 1
                 step = running.step
@@ -363,6 +375,7 @@ class Line:
             return
         running.attempts += 1
         running.reply.clear()
+        running.damage = ""
         self._state = _State.EXPECTING
         self._until_ns = now_ns + on_line_ns + int(step.timeout_s * 1e9)
 

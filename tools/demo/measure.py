@@ -10,8 +10,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import sioms
+from sioms.protocol.flags import AxisStatus
 
 from .rig import PATIENCE_S, Process
+
+MIDDLE = 0.24
+"""Of the range of each axis that is moved [m]: from here the way to either limit is the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,11 +87,8 @@ def kill_to_halt(cell: sioms.Workcell, trials: int) -> Row:
     """From SIGKILL of a client to its axis braking."""
     times = []
     with cell.open("mod0.xaxis.readonly") as watch:
-        for trial in range(trials):
-            victim = Process(
-                ["sioms.tools.demo.victim", "mod0.xaxis", "0.1" if trial % 2 == 0 else "-0.1"], "moving"
-            )
-            _wait(lambda: abs(watch.read().commanded_velocity[0]) > 0.099)
+        for _ in range(trials):
+            victim = _running_victim(watch)
             killed_ns = victim.kill()
             times.append((_first_slower(watch, 0.0999, killed_ns) - killed_ns) / 1e3)
             _wait(lambda: not watch.read().in_motion[0])
@@ -98,13 +99,8 @@ def stop_to_halt(cell: sioms.Workcell, trials: int) -> Row:
     """From the call of the emergency stop to the last of eight axes braking."""
     times = []
     with cell.open("mod0", "rw", PATIENCE_S) as first, cell.open("mod1", "rw", PATIENCE_S) as second:
-        for trial in range(trials):
-            velocity = 0.05 if trial % 2 == 0 else -0.05
-            for node in (first, second):
-                node.write([sioms.command(axis, velocity=velocity) for axis in range(2)])
-            _wait(
-                lambda: all(abs(v) > 0.0499 for n in (first, second) for v in n.read().commanded_velocity[:2])
-            )
+        for _ in range(trials):
+            _run_together(first, second)
             called_ns = time.monotonic_ns()
             cell.emergency_stop(why="measurement")
             slower_ns = max(_first_slower(node, 0.0499, called_ns) for node in (first, second))
@@ -113,6 +109,50 @@ def stop_to_halt(cell: sioms.Workcell, trials: int) -> Row:
             cell.reset()
             time.sleep(0.01)
     return row("emergency stop to all axes braking", times)
+
+
+def _running_victim(watch: Any) -> Process:
+    """Start a client that moves its axis, and see it move; a busy machine may let it come to its limit before."""
+    while True:
+        velocity = 0.1 if watch.read().position[0] < MIDDLE else -0.1
+        victim = Process(["sioms.tools.demo.victim", "mod0.xaxis", str(velocity)], "moving")
+        if _seen_running([watch], [[velocity]]):
+            return victim
+        victim.kill()
+        _wait(lambda: not watch.read().in_motion[0])
+
+
+def _run_together(*nodes: Any) -> None:
+    """Run two axes of each node, and see them run together."""
+    while True:
+        velocities = [
+            [0.05 if place < MIDDLE else -0.05 for place in node.read().position[:2]] for node in nodes
+        ]
+        for node, chosen in zip(nodes, velocities, strict=True):
+            node.write([sioms.command(axis, velocity=v) for axis, v in enumerate(chosen)])
+        if _seen_running(nodes, velocities):
+            return
+        for node in nodes:
+            node.stop()
+        _wait(lambda: not any(any(node.read().in_motion) for node in nodes))
+
+
+def _seen_running(nodes: Sequence[Any], velocities: Sequence[Any]) -> bool:
+    """Wait until axes run as commanded; False when one has come to its limit before that was seen."""
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        running = True
+        for node, wanted in zip(nodes, velocities, strict=True):
+            reading = node.read()
+            for axis, v in enumerate(wanted):
+                running &= abs(reading.commanded_velocity[axis] - v) < 1e-3 * abs(v)
+                ahead = AxisStatus.LIMIT_PLUS if v > 0 else AxisStatus.LIMIT_MINUS
+                if reading.status[axis] & ahead:
+                    return False
+        if running:
+            return True
+        time.sleep(0.001)
+    raise RuntimeError("the axes did not do what they were told to do")
 
 
 def _first_slower(node: Any, velocity: float, after_ns: int) -> int:

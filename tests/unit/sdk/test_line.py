@@ -324,6 +324,24 @@ def test_what_is_no_reply_behind_stray_bytes_is_none(serial: Rig, data: bytes) -
     assert isinstance(serial.results[0][1], LinkError)
 
 
+def test_a_damaged_reply_costs_a_pause_and_no_time_out(serial: Rig) -> None:
+    """Whatever bit of it is wrong: its beginning may be stray bytes, but then the rest comes at once."""
+    for bit in range(8 * len(GOOD)):
+        bent = bytearray(GOOD)
+        bent[bit // 8] ^= 1 << bit % 8
+        serial.results.clear()
+        garbled = serial.counters.garbled
+        serial.submit("a", one_step(READ))
+        serial.pass_time(1e3 * GAP_S)
+        assert serial.heard() == READ.data
+        serial.answer(bytes(bent))
+        serial.pass_time(25 + 1e3 * RECOVERY_S)
+        assert serial.counters.garbled == garbled + 1, bit
+        assert serial.heard() == READ.data, bit
+        serial.answer(GOOD)
+        assert serial.results == [("a", (1, 2))], bit
+
+
 @pytest.mark.parametrize("cut", [False, True])
 def test_a_line_that_returns_what_is_sent_is_found_out_and_told_once(serial: Rig, cut: bool) -> None:
     for step, reply, value in ((READ, GOOD, (1, 2)), (WRITE, WRITE.data, None), (READ, GOOD, (1, 2))):
