@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import math
 import os
+import shutil
 import tempfile
 import time
 from importlib.resources import files
@@ -13,6 +14,7 @@ import sioms
 from sioms.client.command import command
 
 from . import measure
+from .pace import RATES, paced, rate_for, share
 from .recorder import Recorder
 from .rig import PATIENCE_S, Process, bold, daemon, tool
 
@@ -23,6 +25,7 @@ def tell(out: str, quick: bool, wire: bool) -> int:
     config = str(files("sioms.tools.demo").joinpath("demo.toml"))
     with tempfile.TemporaryDirectory(prefix="sioms-demo-") as folder:
         _chapter("Start the daemon", f"siomsd --config {os.path.relpath(config)}")
+        config = _paced(config, folder)
         began = time.monotonic()
         process = daemon(config, f"{folder}/demo.sock")
         try:
@@ -38,6 +41,23 @@ def tell(out: str, quick: bool, wire: bool) -> int:
             show(folder)
     print(f"\nPicture: {out}/demo.png")
     return 0
+
+
+def _paced(config: str, folder: str) -> str:
+    """Return the configuration to use: on a busy machine a copy with slower ticks."""
+    rate_hz = rate_for(share())
+    if rate_hz == RATES[0][1]:
+        return config
+    _say(f"this machine is busy: the simulated devices tick at {rate_hz:.0f} Hz instead of {RATES[0][1]:.0f}")
+    shutil.copytree(
+        os.path.dirname(config), f"{folder}/config", ignore=shutil.ignore_patterns("*.py", "__pycache__")
+    )
+    slower = f"{folder}/config/demo.toml"
+    with open(config, encoding="utf-8") as file:
+        text = paced(file.read(), rate_hz)
+    with open(slower, "w", encoding="utf-8") as file:
+        file.write(text)
+    return slower
 
 
 def _chapter(title: str, text: str = "") -> None:
