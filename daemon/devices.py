@@ -54,6 +54,9 @@ class Owner(Protocol):
     def device_hung(self, device: DriverProcess, reason: str) -> None:
         """The driver has missed its lease."""
 
+    def stopped_of(self, device: str) -> list[list[Any]]:
+        """Return what of a device is stopped and must be so from its driver's start."""
+
     def device_message(self, device: DriverProcess, verb: DriverVerb, arguments: list[Any]) -> None:
         """The driver tells something."""
 
@@ -109,6 +112,11 @@ class DriverProcess:
         return self.device.name
 
     @property
+    def is_there(self) -> bool:
+        """Whether there is a process to send messages to."""
+        return self._sock is not None
+
+    @property
     def settled(self) -> bool:
         """Whether the first start has succeeded or failed for good."""
         return self.state not in (State.DOWN, State.STARTING)
@@ -127,6 +135,7 @@ class DriverProcess:
             realtime_priority=self.device.common.realtime_priority,
             user=self.device.common.user,
             lease_s=self._lease_s,
+            stopped=self._owner.stopped_of(self.name),
         )
         self._loop.watch(ours.fileno(), self._receive)  # first, because a spawn may be refused at once
         self._nursery().spawn(

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from .clients import Clients
     from .server import Server
 
+_TO_DO = {right: name for name, right in RIGHTS.items()}
 _SEND_BUFFER = 1 << 18
 _START_S = 1.5
 """How long an open that is not to wait for other clients waits for a device that is just starting; below the client's grace."""
@@ -48,8 +49,8 @@ class NodeVerbs:
         self._opens: list[tuple[Wait, Callable[[], bool]]] = []
         self._numbers = itertools.count(1)
 
-    def find(self, session: Session, what: str, name: str) -> Node:
-        """Return a node that the session may read.
+    def find(self, session: Session, what: str, name: str, right: Right = Right.READ) -> Node:
+        """Return a node with which the session may do something, as read it.
 
         Raises:
             Refused: ENOENT, EACCES.
@@ -60,10 +61,10 @@ class NodeVerbs:
                 errno.ENOENT,
                 f"{what} of {name}: no such node{did_you_mean(str(name), self._server.names.nodes)}",
             )
-        if not self._clients.rights.on_node(session.peer, node.name) & Right.READ:
+        if not self._clients.rights.on_node(session.peer, node.name) & right:
             raise Refused(
-                errno.EACCES,
-                f"{what} of {name}: {session.peer.user} has no right to read it; ask for a [[grant]]",
+                errno.EACCES if right is Right.READ else errno.EPERM,
+                f"{what} of {name}: {session.peer.user} has no right to {_TO_DO[right]} it; ask for a [[grant]]",
             )
         return node
 

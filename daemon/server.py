@@ -15,6 +15,7 @@ from typing import Any
 
 from sioms.protocol.flags import PageState
 from sioms.protocol.messages import DriverVerb
+from sioms.protocol.stopjournal import node_entry, parts_of, workcell_entry
 
 from .clients import Clients
 from .config import Config
@@ -22,13 +23,14 @@ from .devices import DriverProcess, State
 from .loading import Loader, Plan
 from .log import Log
 from .loop import Loop
-from .names import NameTable
+from .names import NameTable, Node
 from .notify import ServiceManager
 from .nursery import Nursery
 from .nursery_process import NurseryProcess
 from .realtime import LOOK_S, Budget, make_ordinary, realtime_use
 from .rights import Rights
 from .shared import Shared
+from .stop_record import StopRecord
 
 ALIVE_S = 0.02
 
@@ -41,16 +43,17 @@ class Server:
         listener: the listening SOCK_SEQPACKET socket.
         config_path: where the configuration is read from, again at every reload.
         log: its log.
+        record: what has been stopped before it, and is so still.
         process: the nursery for the first configuration, already started; None: start one.
     """
 
     def __init__(
         self, loop: Loop, listener: socket.socket, config_path: str, log: Log,
-        process: NurseryProcess | None = None,
+        record: StopRecord, process: NurseryProcess | None = None,
     ) -> None:  # fmt: skip
         self.loop = loop
         self.log = log
-        self.shared = Shared(str(listener.getsockname()))
+        self.shared = Shared(str(listener.getsockname()), record)
         self.names = NameTable({}, {})
         self.devices: dict[str, DriverProcess] = {}
         self.config: Config | None = None
@@ -63,13 +66,13 @@ class Server:
         self._watched_inputs: dict[str, dict[int, str]] = {}
         self._alarms: dict[str, list[list[Any]]] = {}
         self._leaving: dict[str, DriverProcess] = {}
-        self.node_stops: dict[str, str] = {}
         self._loader: Loader | None = None
         self._manager = ServiceManager()
         self._told_ready = False
         self._ending = False
         self._request_seen = self.shared.request.mark
         self._budget = Budget(log)
+        self._restore_stops()
         self.clients.welcome()
         self._alive()
         self._look_at_budget()
@@ -126,27 +129,105 @@ class Server:
             self._retire(device)
         self._maybe_end()
 
+    # --- stops -----------------------------------------------------------------------------------
+
+    def _restore_stops(self) -> None:
+        """Be stopped from the beginning when it was so at the end."""
+        stopped = self.shared.record.state
+        if stopped.workcell:
+            since = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(stopped.since_s))
+            self.shared.latch.stop(time.monotonic_ns(), f"{stopped.workcell} (since {since})")
+            self.log("warning", "still stopped", source=self.shared.latch.source)
+        for node, source in stopped.nodes():
+            self.log("warning", "still stopped", node=node, source=source)
+        if self.shared.files.unheard:
+            self.stop_workcell(self.shared.files.unheard)
+
     def stop_workcell(self, source: str) -> None:
-        """Latch the emergency stop and wake every driver."""
+        """Latch the emergency stop, wake every driver, and keep it."""
         latch = self.shared.latch
-        if latch.stop(time.monotonic_ns(), source) or latch.source == self.shared.request.source != source:
+        known = not latch.stop(time.monotonic_ns(), source) and not (
+            latch.source == self.shared.request.source != source
+        )
+        if not known:
             self.log("warning", "emergency stop", source=source)
             latch.name_source(source)  # drivers see the request page before the message that says who
         for device in self.devices.values():
             device.tell(DriverVerb.STOP_CHANGED)
+        self.shared.record.look()
+        if not known or not self.shared.record.state.workcell:
+            self._note(workcell_entry(source, stop=True, named=True))
+
+    def hear_request(self) -> str:
+        """Obey the stop-request file; return who has asked for a stop that nobody had heard yet, '' for nobody.
+
+        A client that could not reach us has asked the drivers directly; they have acted already, as a rule.
+        """
+        request = self.shared.request
+        if (mark := request.mark) == self._request_seen:
+            return ""
+        self._request_seen = mark
+        source, heard = request.source, request.taken(mark[0])
+        self.stop_workcell(source)
+        request.take(mark)
+        return "" if heard else source
 
     def reset_workcell(self, who: str) -> None:
         """Clear the latch and give devices in fault another try; nothing moves by itself."""
+        self._note(workcell_entry(who, stop=False))  # first: a stop that comes next is noted after it
         self._request_seen = self.shared.request.mark
         self.shared.latch.reset(self._request_seen)
         self.log("info", "reset", by=who)
-        self.node_stops.clear()
         for device in self.devices.values():
             device.trouble = ""
             device.tell(DriverVerb.STOP_CHANGED)
             device.reset()
         for device in self.devices.values():
             self._look_at_stop_inputs(device)  # as one that is still pressed, it stops the workcell again
+
+    def stop_node(self, node: Node, source: str) -> None:
+        """Stop a node and keep that; one whose driver is not there starts stopped.
+
+        Raises:
+            OSError: EIO, its driver takes no messages.
+        """
+        self._order(node, DriverVerb.NODE_STOP, source)
+        self._note(self._node_entry(node, source, stop=True))
+        self.log("warning", "emergency stop", node=node.name, source=source)
+
+    def reset_node(self, node: Node, who: str) -> None:
+        """Clear the stop and the faults of a node.
+
+        Raises:
+            OSError: EIO, its driver takes no messages.
+        """
+        self._order(node, DriverVerb.NODE_RESET, who)
+        self._note(self._node_entry(node, who, stop=False))
+        self.log("info", "reset", node=node.name, by=who)
+
+    def _order(self, node: Node, verb: DriverVerb, text: str) -> None:
+        device = self.devices.get(node.device)
+        if device is not None and device.is_there:
+            device.send(verb, node.block, node.channels, node.bit, text)
+            self.shared.latch.ordered()
+
+    def _node_entry(self, node: Node, source: str, *, stop: bool) -> dict[str, Any]:
+        block = self.names.devices[node.device].blocks[node.block]
+        parts = [
+            part for c in node.channels for part in parts_of(c, node.bit, block.channels[c].width)
+        ]  # fmt: skip
+        return node_entry(node.name, node.device, block.name, parts, source, stop=stop)
+
+    def _note(self, entry: dict[str, Any]) -> None:
+        try:
+            self.shared.record.note(entry)
+        except OSError as error:
+            self.log("error", "not kept", what=str(entry), path=self.shared.record.path, why=error.strerror)
+
+    def stopped_of(self, device: str) -> list[list[Any]]:
+        """Return what of a device is stopped and must be so from its driver's start."""
+        self.shared.record.look()
+        return self.shared.record.state.of_device(device)
 
     # --- what devices tell -----------------------------------------------------------------------
 
@@ -236,7 +317,7 @@ class Server:
         if why := self.shared.files.entitle(rights.who_may_stop()):
             self.log("warning", "stop without the daemon", why=why)
         if first and plan.config.workcell.start_stopped:
-            self.shared.latch.stop(time.monotonic_ns(), "started stopped, as configured")
+            self.stop_workcell("started stopped, as configured")
         for name, device in list(self.devices.items()):
             wanted = plan.config.devices.get(name)
             same = wanted == device.device and plan.names.devices[name].facts() == device.info.facts()
@@ -327,11 +408,8 @@ class Server:
     def _alive(self) -> None:
         now = time.monotonic_ns()
         self.shared.latch.daemon_alive(now)
-        if (mark := self.shared.request.mark) != self._request_seen:
-            # A client that could not reach us has asked the drivers directly; they have acted already.
-            self._request_seen = mark
-            self.stop_workcell(self.shared.request.source)
-            self.shared.request.take(mark)
+        self.hear_request()
+        self.shared.record.look()
         for device in list(self.devices.values()):
             device.check(now)
         self.loop.after(ALIVE_S, self._alive)

@@ -20,6 +20,7 @@ from .loop import Loop
 from .nursery import Nursery
 from .nursery_process import NurseryProcess
 from .server import Server
+from .stop_record import StopRecord
 
 PRIORITY = 50
 """SCHED_FIFO priority of the daemon: that of a driver, so that it gets its turn whenever a tick is done."""
@@ -37,13 +38,23 @@ def serve(config_path: str, given_path: str | None, level: str, process: Nursery
     log = Log(journal="JOURNAL_STREAM" in os.environ and "NOTIFY_SOCKET" in os.environ, level=level)
     loop = Loop()
     try:
-        listener, path = _listen(config_path, given_path)
+        listener, path, record_path = _listen(config_path, given_path)
     except OSError as error:
         print(f"siomsd: listen: {error.strerror or error}", file=sys.stderr)
         return 1
+    try:
+        record = StopRecord(record_path)
+    except OSError as error:
+        os.unlink(path)
+        print(
+            f"siomsd: keep stops in {record_path}: {error.strerror}; want a folder that the daemon may write to "
+            "(state_folder in [workcell])",
+            file=sys.stderr,
+        )
+        return 1
     _become_prompt(log)
     try:
-        server = Server(loop, listener, config_path, log, process)
+        server = Server(loop, listener, config_path, log, record, process)
     except OSError as error:
         os.unlink(path)
         print(f"siomsd: make {error.filename}: {error.strerror}", file=sys.stderr)
@@ -62,6 +73,7 @@ def serve(config_path: str, given_path: str | None, level: str, process: Nursery
         if os.path.exists(path):
             os.unlink(path)
         server.shared.files.remove()
+        record.close()
     return server.exit_status
 
 
@@ -111,8 +123,8 @@ def _status(errors: Sequence[str]) -> int:
     return 2
 
 
-def _listen(config_path: str, given: str | None) -> tuple[socket.socket, str]:
-    """Bind the listening socket; refuse when another daemon answers on it."""
+def _listen(config_path: str, given: str | None) -> tuple[socket.socket, str, str]:
+    """Bind the listening socket; refuse when another daemon answers on it; return it, its path and that of the record of stops."""
     config: Config | None = None
     try:
         with open(config_path, encoding="utf-8") as file:
@@ -146,7 +158,8 @@ def _listen(config_path: str, given: str | None) -> tuple[socket.socket, str]:
         except (KeyError, OSError) as error:
             raise OSError(errno.EPERM, f"give {path} to group {table.socket_group}: {error}") from None
     listener.listen(128)
-    return listener, path
+    folder = config.state_folder(os.environ) if config else ""
+    return listener, path, os.path.join(folder, "stops") if folder else path + ".stops"
 
 
 def _take_signals(loop: Loop, server: Server) -> None:

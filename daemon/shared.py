@@ -11,25 +11,29 @@ from sioms.protocol.markers import TABLE_SIZE, MarkerTable
 from sioms.protocol.stopfile import StopRequest
 
 from .stop_files import StopFiles
+from .stop_record import StopRecord
 
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 
 
 class Shared:
-    """Memory files, the stop files, and the daemon's views of them.
+    """Memory files, the stop files, the record of stops, and the daemon's views of them.
 
     Args:
         path: of the daemon's socket, beside which the stop files lie.
+        record: what is stopped.
 
     Attributes:
-        fds: descriptors of latch, stop-request file, file of the requests taken and marker table, as a driver gets them.
+        fds: descriptors of latch, stop-request file, file of the requests taken, marker table and journal of stops, as a
+            driver gets them.
     """
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, record: StopRecord) -> None:
+        self.record = record
         self.files = StopFiles(path)
         latch_fd, latch = _memory("sioms-latch", LATCH_SIZE)
         markers_fd, markers = _memory("sioms-markers", TABLE_SIZE)
-        self.fds = [latch_fd, self.files.fd, self.files.taken_fd, markers_fd]
+        self.fds = [latch_fd, self.files.fd, self.files.taken_fd, markers_fd, record.drivers_fd]
         self.latch = Latch(latch)
         self.request = StopRequest(self.files.fd, self.files.taken_fd)
         self.markers = MarkerTable(markers)

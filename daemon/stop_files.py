@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from struct import Struct
 
-from sioms.protocol.stopfile import REQUEST, TAKEN
+from sioms.protocol.stopfile import REQUEST, TAKEN, StopRequest
 
 from .rights import Entitled
 
@@ -35,10 +35,12 @@ class StopFiles:
         fd: of the request file, for the daemon and the drivers.
         taken_fd: of the file that says which request has been taken, for the same.
         client_fds: the two for clients that may stop: to write the one, to read the other.
+        unheard: who asked for a stop that the daemon before this one and its drivers did not live to hear, '' for nobody.
     """
 
     def __init__(self, path: str) -> None:
         self._path = path
+        self.unheard = _unheard(path)
         self.remove()
         self.fd = self._make(path + REQUEST, 0o600)
         self.taken_fd = self._make(path + TAKEN, 0o644)
@@ -82,6 +84,26 @@ class StopFiles:
         for end in (REQUEST, TAKEN):
             with suppress(FileNotFoundError):
                 os.unlink(self._path + end)
+
+
+def _unheard(path: str) -> str:
+    """Return who has written to files left by another daemon and has not been heard."""
+    fds: list[int] = []
+    try:
+        for end in (REQUEST, TAKEN):
+            fds.append(os.open(path + end, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC))
+            about = os.fstat(fds[-1])
+            if not stat.S_ISREG(about.st_mode) or about.st_uid != os.getuid():
+                return ""
+        request = StopRequest(fds[0], os.dup(fds[1]))
+        fds.pop(0)
+        word = request.mark[0]
+        return request.source if word and not request.taken(word) else ""
+    except FileNotFoundError:
+        return ""
+    finally:
+        for fd in fds:
+            os.close(fd)
 
 
 def access_list(uids: Iterable[int], gids: Iterable[int]) -> bytes:

@@ -11,10 +11,9 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.flags import PROTOCOL_VERSION, Right
-from sioms.protocol.messages import DriverVerb, reply
+from sioms.protocol.messages import reply
 
 from .devices import State
-from .names import Node
 from .sessions import LATER, Refused, Session
 
 if TYPE_CHECKING:
@@ -50,6 +49,7 @@ class WorkcellVerbs:
     def status(self) -> dict[str, object]:
         """Return what `sioms status` shows."""
         server = self._server
+        server.shared.record.look()
         now = time.monotonic_ns()
         latch = server.shared.latch
         return {
@@ -66,7 +66,7 @@ class WorkcellVerbs:
                 }
                 for d in server.devices.values()
             ],
-            "node_stops": [[node, source] for node, source in server.node_stops.items()],
+            "node_stops": server.shared.record.state.nodes(),
             "sessions": [[str(s), len(s.handles), len(s.waits), self._clients.markers.count(s)] for s in self._clients.sessions],
             "holders": [[h.node.name, str(h.session), (now - h.since_ns) / 1e9] for h in self._clients.nodes.holders()],
         }  # fmt: skip
@@ -80,16 +80,14 @@ class WorkcellVerbs:
                     errno.EPERM,
                     f"emergency stop: {session.peer.user} has no right to stop; ask for a [[grant]]",
                 )
+            self._server.hear_request()
             self._server.stop_workcell(source)
             return
-        node = self._clients.nodes.find(session, "emergency stop", name)
-        if not self._clients.rights.on_node(session.peer, node.name) & Right.STOP:
-            raise Refused(
-                errno.EPERM, f"emergency stop of {name}: {session.peer.user} has no right to stop it"
-            )
-        self._to_device(node, DriverVerb.NODE_STOP, source)
-        self._server.node_stops[node.name] = source
-        self._server.log("warning", "emergency stop", node=name, source=source)
+        node = self._clients.nodes.find(session, "emergency stop", name, Right.STOP)
+        try:
+            self._server.stop_node(node, source)
+        except OSError as error:
+            raise Refused(errno.EIO, f"emergency stop of {name}: {error.strerror}") from None
 
     def reset(self, session: Session, name: str) -> None:
         """Reset the workcell, or a node, or the fault of its device."""
@@ -97,6 +95,10 @@ class WorkcellVerbs:
             if not self._clients.rights.on_workcell(session.peer) & (Right.ADMINISTER | Right.WRITE):
                 raise Refused(
                     errno.EPERM, f"reset: {session.peer.user} has no right to write or administer every node"
+                )
+            if source := self._server.hear_request():
+                raise Refused(
+                    errno.EAGAIN, f"reset: a stop has just been asked for ({source}); look, and reset again"
                 )
             self._server.reset_workcell(str(session))
             return
@@ -113,21 +115,12 @@ class WorkcellVerbs:
             raise Refused(
                 errno.EPERM, f"reset {name}: the whole workcell is stopped ({latch.source}); reset that"
             )
-        self._to_device(node, DriverVerb.NODE_RESET, str(session))
-        self._server.node_stops.pop(node.name, None)
+        try:
+            self._server.reset_node(node, str(session))
+        except OSError as error:
+            raise Refused(errno.EIO, f"reset {name}: {error.strerror}") from None
         if device is not None:
             device.trouble = ""
-        self._server.log("info", "reset", node=node.name, by=session)
-
-    def _to_device(self, node: Node, verb: DriverVerb, text: str) -> None:
-        device = self._server.devices.get(node.device)
-        try:
-            if device is None:
-                raise OSError(errno.EIO, "not configured any more")
-            device.send(verb, node.block, node.channels, text)
-            self._server.shared.latch.ordered()
-        except OSError as error:
-            raise Refused(errno.EIO, f"{verb.name.lower()} {node.name}: {error.strerror}") from None
 
     def reload(self, session: Session, number: int) -> Any:
         """Take up the configuration anew; answered with all errors."""

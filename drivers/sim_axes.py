@@ -193,16 +193,24 @@ class SimAxes(TickDriver):
         self._turn(now_ns, behind)
 
     def _turn(self, now_ns: int, ticks: int) -> None:
+        beside_ns = 0
         if self._command is not None:
             for _ in range(self._ahead, min(ticks, _CATCH_UP)):
                 self._advance(self._command)
             self._ahead = max(0, self._ahead - ticks)
-        self._last_ns = now_ns
+            beside_ns = now_ns - self._last_ns - ticks * self._tick_ns
+        if 20 * abs(beside_ns) < self._tick_ns or abs(beside_ns) > self._tick_ns:
+            beside_ns = 0
+        self._last_ns = (
+            now_ns - beside_ns
+        )  # where the world is: it goes by whole ticks, also when one came early
         self._measure()
+        if beside_ns:
+            self._shift(beside_ns * 1e-9)
         self.inputs_ns = time.monotonic_ns()
         self._command = self.bank.tick(now_ns, self._reading, self._switches)
         self._show()
-        if self._port is not None:
+        if self._port is not None and not beside_ns:
             self._look(self._port, now_ns)
 
     def slack(self, now_ns: int, until_ns: int) -> None:
@@ -226,6 +234,13 @@ class SimAxes(TickDriver):
         if self._steppers is not None:
             self._reading[self._stepper_rows] = self._steppers.reading
             self._switches[self._stepper_rows] = _switch_bits(self._steppers)
+
+    def _shift(self, by_s: float) -> None:
+        """Let a tick that came early read what would be read by then."""
+        if self._servos is not None:
+            self._reading[self._servo_rows] += self._servos.velocity * by_s
+        if self._steppers is not None:
+            self._reading[self._stepper_rows] += self._steppers.velocity * by_s
 
     def _show(self) -> None:
         data = self._plant.data.reshape(-1, 2)

@@ -199,9 +199,11 @@ def daemons() -> Iterator[Callable[..., Daemon]]:
     started: list[Daemon] = []
     folder = Path(tempfile.mkdtemp(prefix="sioms-", dir="/tmp"))
 
-    def start(text: str = WORKCELL, env: Mapping[str, str] | None = None, **options: Any) -> Daemon:
-        mine = folder / str(len(started))
-        mine.mkdir()
+    def start(
+        text: str = WORKCELL, env: Mapping[str, str] | None = None, *, at: Path | None = None, **options: Any
+    ) -> Daemon:
+        mine = at or folder / str(len(started))
+        mine.mkdir(exist_ok=True)
         started.append(Daemon(mine, text, env, **options))
         return started[-1]
 

@@ -107,13 +107,17 @@ class World:
         self.chance = chance
         self.device = device
         self.clients: list[Client] = []
-        latch, request, taken, markers = (_memory(n) for n in (LATCH_SIZE, 4096, 4096, TABLE_SIZE))
+        latch, request, taken, markers, journal = (
+            _memory(n) for n in (LATCH_SIZE, 4096, 4096, TABLE_SIZE, 0)
+        )
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.control = ours
         self.control.setblocking(False)
         settings = msgspec.convert(table, driver.Settings)
-        options = {"stop_sources": [], "alarms": [], "daemon_lease_s": 1e6, "phase": 0.0, "state_folder": ""}
-        fds = [theirs.detach(), latch, request, taken, markers]
+        options = {
+            "stop_sources": [], "alarms": [], "daemon_lease_s": 1e6, "phase": 0.0, "state_folder": "", "stopped": [],
+        }  # fmt: skip
+        fds = [theirs.detach(), latch, request, taken, markers, journal]
         self.runtime = Runtime(driver, "dev", settings, 1, options, fds)
         import mmap
 

@@ -191,6 +191,7 @@ class Attachments:
             if isinstance(handle.block, AxisBlock):
                 handle.block.bank.stop(handle.channels, time.monotonic_ns())
                 self._runtime.engine.commands_written(handle.block)
+                self._runtime.tick_early()
             else:
                 self._make_safe(handle)
         handle.close()

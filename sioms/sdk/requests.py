@@ -77,9 +77,12 @@ def ioctl(
         raise _refuse(errno.EPERM, f"{what}: the user has no right to do that; ask for a [[grant]]")
     match request:
         case Request.EMERGENCY_STOP:
-            return runtime.stops.stop_node(handle.block, handle.channels, f"{handle.who} on {handle.node}")
+            source = f"{handle.who} on {handle.node}"
+            runtime.stops.stop_node(handle.block, handle.channels, handle.bit, source)
+            return runtime.stops.note_node(handle, source, stop=True)
         case Request.RESET:
-            return runtime.stops.reset_node(handle.block, handle.channels, what)
+            runtime.stops.reset_node(handle.block, handle.channels, handle.bit, what)
+            return runtime.stops.note_node(handle, handle.who, stop=False)
         case Request.CANCEL_WAITS:
             ours = {int(c) for c in handle.channels}
             return runtime.waits.end_where(

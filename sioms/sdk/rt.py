@@ -1,4 +1,4 @@
-"""Real-time services of Linux that Python 3.11 does not wrap: timerfd, mlockall, timer slack.
+"""Real-time services of Linux that Python 3.11 does not wrap: timerfd, inotify, mlockall, timer slack.
 
 Everything that needs a privilege is tried and, when refused, done without: SIOMS then runs with the
 latencies of an ordinary process.
@@ -14,10 +14,12 @@ import resource
 import signal
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _TFD_CLOEXEC, _TFD_NONBLOCK, _TFD_TIMER_ABSTIME = 0o2000000, 0o4000, 1
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_IN_MODIFY, _IN_ATTRIB = 0x02, 0x04
 _PR_SET_NAME, _PR_SET_TIMERSLACK = 15, 29
 
 
@@ -64,6 +66,34 @@ class TimerFd:
     def close(self) -> None:
         """Release the descriptor."""
         os.close(self.fd)
+
+
+class ChangeWatch:
+    """A descriptor that is readable when somebody has written to a file (inotify(7)).
+
+    Args:
+        fd: of the file.
+
+    Raises:
+        OSError: there are too many such watches already.
+
+    Concurrency: one thread.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self.fd: int = _libc.inotify_init1(os.O_CLOEXEC | os.O_NONBLOCK)
+        if self.fd < 0:
+            raise OSError(ctypes.get_errno(), "watch a file: inotify_init1 failed")
+        if _libc.inotify_add_watch(self.fd, f"/proc/self/fd/{fd}".encode(), _IN_MODIFY | _IN_ATTRIB) < 0:
+            number = ctypes.get_errno()
+            os.close(self.fd)
+            raise OSError(number, "watch a file: inotify_add_watch failed")
+
+    def drain(self) -> None:
+        """Forget what has been written until now."""
+        with suppress(BlockingIOError):
+            while os.read(self.fd, 4096):
+                pass
 
 
 def name_process(name: str) -> None:

@@ -6,6 +6,7 @@ Concurrency: the one thread of the driver process.
 from __future__ import annotations
 
 import errno
+import os
 import time
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -16,11 +17,13 @@ from sioms.protocol.flags import PageState
 from sioms.protocol.latch import Latch
 from sioms.protocol.messages import DriverVerb
 from sioms.protocol.stopfile import StopRequest
+from sioms.protocol.stopjournal import StopJournal, channels_and_bits, node_entry, parts_of, workcell_entry
 
 from .blocks import AnyBlock, AxisBlock, BinaryBlock
-from .outputs import safe_of
+from .outputs import WHOLE, safe_of
 
 if TYPE_CHECKING:
+    from .handles import Handle
     from .runtime import Runtime
 
 
@@ -35,23 +38,27 @@ class Stops:
         runtime: the driver process.
         latch: the workcell's emergency-stop latch.
         request: file in which any client asks for an emergency stop.
+        journal: where stops are noted before they are acknowledged, so that they outlive this process.
         sources: inputs of this device that stop the workcell, each (block, channel, bit, active level).
 
     Attributes:
         stopped: whether the workcell is stopped.
-        latched_outputs: output channels (block, channel) under an emergency stop of their node, and by whom.
+        latched_outputs: parts of outputs (block, channel, bit) under an emergency stop of their node, and by whom; bit 0 for
+            channels without bits.
     """
 
     def __init__(
-        self, runtime: Runtime, latch: Latch, request: StopRequest, sources: Iterable[Sequence[int]]
-    ) -> None:
+        self, runtime: Runtime, latch: Latch, request: StopRequest, journal: StopJournal,
+        sources: Iterable[Sequence[int]],
+    ) -> None:  # fmt: skip
         self.stopped = False
-        self.latched_outputs: dict[tuple[int, int], str] = {}
+        self.latched_outputs: dict[tuple[int, int, int], str] = {}
         self._unsafe: dict[int, tuple[int, int]] = {}
         """Blocks with safe values that could not be set: when that was logged, and failures since."""
         self._runtime = runtime
         self._latch = latch
         self._request = request
+        self._journal = journal
         self._sources = [tuple(source) for source in sources]
         self._seen = (0, latch.resets, request.mark)
         self._orders = latch.orders
@@ -65,9 +72,12 @@ class Stops:
 
     def stop_workcell(self, source: str) -> None:
         """Stop the whole workcell."""
-        if self._latch.stop(time.monotonic_ns(), source):
-            self._runtime.tell(DriverVerb.STOPPED, source)
+        fresh = self._latch.stop(time.monotonic_ns(), source)
         self.look()
+        if fresh:
+            self._note(workcell_entry(source, stop=True))
+            self._request.request(time.monotonic_ns(), os.getpid(), source)  # wakes the other drivers
+            self._runtime.tell(DriverVerb.STOPPED, source)
 
     @property
     def is_up_to_date(self) -> bool:
@@ -107,6 +117,8 @@ class Stops:
             self._runtime.effects.note()
             self._stop_all()
         if fresh:
+            if stopped_ns:  # also by another driver, which may not have come to note it
+                self._note(workcell_entry(latch.source, stop=True))
             self._request.take(mark)
         if not stopped_ns and self.stopped:
             self._runtime.effects.note()
@@ -150,20 +162,22 @@ class Stops:
 
     # --- nodes -----------------------------------------------------------------------------------
 
-    def stop_node(self, block: AnyBlock, channels: Any, source: str) -> None:
-        """Emergency stop of some channels: latched until reset."""
+    def stop_node(self, block: AnyBlock, channels: Any, bit: int, source: str) -> None:
+        """Emergency stop of some channels, or of one bit of them: latched until reset."""
         runtime = self._runtime
         runtime.effects.note()
         if isinstance(block, AxisBlock):
             block.bank.emergency_stop(channels, time.monotonic_ns())
             runtime.engine.stop([block])
             runtime.end_axis_waits(block, channels, errno.ECANCELED, f"emergency stop by {source}")
-        else:
-            self.latched_outputs.update({(id(block), int(channel)): source for channel in channels})
-            self.make_safe(block, channels)
+            return
+        for channel in channels:
+            for part in parts_of(int(channel), bit, block.spec.channels[channel].width):
+                self.latched_outputs[id(block), *part] = source
+        self.make_safe(block, channels, bit)
 
-    def reset_node(self, block: AnyBlock, channels: Any, what: str) -> None:
-        """Clear the latched stop and faults of some channels.
+    def reset_node(self, block: AnyBlock, channels: Any, bit: int, what: str) -> None:
+        """Clear the latched stop and faults of some channels, or the stop of one bit of them.
 
         Raises:
             OSError: EPERM, the whole workcell is stopped.
@@ -173,9 +187,41 @@ class Stops:
         self._runtime.effects.note()
         if isinstance(block, AxisBlock):
             self._reset_axes(block, channels)
-        else:
-            for channel in channels:
-                self.latched_outputs.pop((id(block), int(channel)), None)
+            return
+        for channel in channels:
+            for part in parts_of(int(channel), bit, block.spec.channels[channel].width):
+                self.latched_outputs.pop((id(block), *part), None)
+
+    def note_node(self, handle: Handle, source: str, *, stop: bool) -> None:
+        """Note that a client has stopped or reset the node that it holds or watches."""
+        spec = handle.block.spec
+        parts = [
+            part for c in handle.channels.tolist() for part in parts_of(c, handle.bit, spec.channels[c].width)
+        ]
+        self._note(node_entry(handle.node, self._runtime.device, spec.name, parts, source, stop=stop))
+
+    def restore(self, stopped: Iterable[tuple[str, list[list[int]], str, str]]) -> None:
+        """Stop what was stopped when the process before this one ended, before anything can move.
+
+        Args:
+            stopped: as Stopped.of_device.
+        """
+        blocks = {block.spec.name: block for block in self._runtime.blocks}
+        for name, runs, source, _ in stopped:
+            block = blocks.get(name)
+            if block is None:
+                continue
+            for channel, bit in channels_and_bits(runs):
+                if channel < block.n:
+                    self.stop_node(
+                        block, [channel], bit if block.spec.channels[channel].width else -1, source
+                    )
+
+    def _note(self, entry: dict[str, Any]) -> None:
+        try:
+            self._journal.append(entry, time.time())
+        except OSError as error:
+            self._runtime.log("error", f"a stop or reset is not kept beyond this process: {error.strerror}")
 
     # --- outputs ---------------------------------------------------------------------------------
 
@@ -209,7 +255,7 @@ class Stops:
             mark: of Outputs, from before the reading.
         """
         outputs, key = self._runtime.outputs, id(block)
-        outputs.read(block, mark, lambda channel: self.stop_of(block, channel) is not None)
+        outputs.read(block, mark, lambda channel: self.held(block, channel)[0] != 0)
         if outputs.unsent(block):
             self._runtime.engine.make_safe(block)
         elif key in self._unsafe and not outputs.unconfirmed(block):
@@ -233,9 +279,22 @@ class Stops:
             "error", f"{self._name(block)}: {text}; they are sent until the device confirms them{tries}"
         )
 
-    def stop_of(self, block: AnyBlock, channel: int) -> str | None:
-        """Return who has stopped an output channel, None when it is not stopped."""
-        return self.source if self.stopped else self.latched_outputs.get((id(block), channel))
+    def held(self, block: AnyBlock, channel: int) -> tuple[int, str]:
+        """Return which bits of an output channel are stopped (WHOLE: all), and by whom."""
+        if self.stopped:
+            return WHOLE, self.source
+        latched = self.latched_outputs
+        if not latched:
+            return 0, ""
+        width = block.spec.channels[channel].width
+        sources = {
+            bit: latched[id(block), channel, bit]
+            for bit in range(width or 1)
+            if (id(block), channel, bit) in latched
+        }
+        if not sources:
+            return 0, ""
+        return (sum(1 << bit for bit in sources) if width else WHOLE), next(iter(sources.values()))
 
     def _name(self, block: AnyBlock) -> str:
         return ".".join(part for part in (self._runtime.device, block.spec.name) if part)

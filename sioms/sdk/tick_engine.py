@@ -139,7 +139,8 @@ class TickEngine:
         """Nothing: the next tick sees it."""
 
     def stop(self, blocks: Sequence[AnyBlock]) -> None:
-        """Nothing: the banks command the device in the next tick."""
+        """Have a tick soon: in it the banks command the device."""
+        self._runtime.tick_early()
 
     def recover(self, reason: str) -> None:
         """Nothing is under way between two ticks."""

@@ -226,15 +226,15 @@ def _take_responsibility(runtime: Runtime, block: AnyBlock, changes: Mapping[int
     """
     stops, stopped = runtime.stops, []
     for channel, change in changes.items():
-        source = stops.stop_of(block, channel)
-        if source is None:
+        held, source = stops.held(block, channel)
+        if not held & change.mask:
             continue
-        safe = safe_of(block.spec, channel)
-        if safe is None or Change(change.mask, safe.value).over(0) != change.over(0):
+        safe, part = safe_of(block.spec, channel), held & change.mask
+        if safe is None or Change(part, safe.value).over(0) != Change(part, change.value).over(0):
             first = "reset first" if stops.stopped else "reset the node first"
             but = "" if safe is None else ", or write its safe value"
             raise OSError(errno.EPERM, f"{what}: stopped by emergency stop ({source}); {first}{but}")
-        stopped.append((channel, Change(change.mask, safe.value)))
+        stopped.append((channel, Change(part, safe.value)))
     runtime.outputs.release(block, changes)
     for channel, safe_part in stopped:
         runtime.outputs.want(block, channel, safe_part)

@@ -1,0 +1,162 @@
+"""What is stopped, as the daemon keeps it over its own end, that of drivers, and a restart of the machine.
+
+Why so: docs/decisions/0140-a-stop-outlives-everything.md.
+
+Concurrency: the daemon's loop; a thread of its own waits for the disk, so that nobody else does.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from sioms.protocol.stopjournal import CHECKPOINT, StopJournal, Stopped, entries_from, replay
+
+MOST_BYTES = 1 << 18
+"""From so many bytes after the last checkpoint on, there is a new one, and what lies before it is freed."""
+_PUNCH_HOLE, _BLOCK = 0x02 | 0x01, 4096
+
+
+class StopRecord:
+    """The journal of stops of a workcell.
+
+    Args:
+        path: of the file; its folder is made.
+
+    Raises:
+        OSError: it cannot be kept there, or another daemon does.
+
+    Attributes:
+        state: what is stopped, after the last ``look``.
+        drivers_fd: descriptor for drivers, to append to.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        os.makedirs(os.path.dirname(path) or ".", mode=0o750, exist_ok=True)
+        flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+        self._fd = os.open(path, flags, 0o600)
+        try:
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(self._fd)
+            raise OSError(errno.EBUSY, "another daemon keeps its stops there") from None
+        self.drivers_fd = os.open(path, flags, 0o600)  # without the lock: drivers may outlive the daemon
+        self._journal = StopJournal(self._fd)
+        size = os.fstat(self._fd).st_size
+        start = _first_byte(self._fd, size)
+        self.state: Stopped = replay(_read(self._fd, start, size), start, time.time())
+        self._at = size
+        self._checked_at = start
+        self._flusher = _Flusher(self._fd)
+        if size:
+            self._check()  # whatever was damaged is not read again, and told by the state
+
+    def look(self) -> None:
+        """Take into account what drivers have noted."""
+        size = os.fstat(self._fd).st_size
+        if size == self._at:
+            return
+        if size < self._at:
+            self.state.take(None, "it has become shorter", time.time())
+            self._at = size
+        entries, read = entries_from(_read(self._fd, self._at, size))
+        self._at += read
+        for entry in entries:
+            self.state.take(entry, now_s=time.time())
+        if read:
+            self._flusher.flush()
+        if self._at - self._checked_at > MOST_BYTES:
+            self._check()
+
+    def note(self, entry: Mapping[str, Any]) -> None:
+        """Note a stop or a reset.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self._journal.append(entry, time.time())
+        self.look()
+
+    def close(self) -> None:
+        """Close the file, and take it away when nothing is stopped."""
+        self._flusher.end()
+        if not self.state.workcell and not self.state.parts:
+            os.unlink(self.path)
+        os.close(self.drivers_fd)
+        self._journal.close()
+
+    def _check(self) -> None:
+        """Append a checkpoint, and free what is not needed any more."""
+        at = self._at
+        self._journal.append({CHECKPOINT: self.state.entries(), "from": at}, time.time(), after_damage=True)
+        self._checked_at = at
+        self._flusher.flush(at)
+        self.look()
+
+
+class _Flusher:
+    """Sees that the file reaches the disk, and frees its beginning; both may take long."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._wanted = threading.Event()
+        self._free_to = 0
+        self._ends = False
+        self._thread: threading.Thread | None = None
+
+    def flush(self, free_to: int = 0) -> None:
+        """Have what has been written reach the disk, and then free the file up to a place."""
+        self._free_to = max(self._free_to, free_to)
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, daemon=True, name="stops")
+            self._thread.start()
+        self._wanted.set()
+
+    def end(self) -> None:
+        """Finish what is wanted, and end."""
+        self._ends = True
+        if self._thread is not None:
+            self._wanted.set()
+            self._thread.join()
+
+    def _run(self) -> None:
+        freed = 0
+        while not self._ends or self._wanted.is_set():
+            self._wanted.wait()
+            self._wanted.clear()
+            free_to = self._free_to // _BLOCK * _BLOCK
+            try:
+                os.fdatasync(self._fd)
+                if free_to > freed:
+                    _punch(self._fd, free_to)
+                    freed = free_to
+            except OSError:
+                continue  # a file system that cannot: the file is in memory all the same, and grows
+
+
+def _punch(fd: int, size: int) -> None:
+    import ctypes
+
+    ctypes.CDLL(None).fallocate(fd, _PUNCH_HOLE, ctypes.c_int64(0), ctypes.c_int64(size))
+
+
+def _first_byte(fd: int, size: int) -> int:
+    """Return where the file begins that has not been freed."""
+    try:
+        return os.lseek(fd, 0, os.SEEK_DATA) if size else 0
+    except OSError:
+        return 0
+
+
+def _read(fd: int, start: int, end: int) -> bytes:
+    pieces = []
+    while start < end and (piece := os.pread(fd, end - start, start)):
+        pieces.append(piece)
+        start += len(piece)
+    return b"".join(pieces)

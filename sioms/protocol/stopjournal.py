@@ -1,0 +1,235 @@
+"""The journal of stops: what is stopped outlives every process that acts on it.
+
+A file of lines that are only ever appended, each one JSON object: a stop, or a reset, of the workcell or of a node. Daemon
+and drivers append to it before they acknowledge the request; who starts reads it and finds what was stopped, by whom, and
+that nobody has reset it since. A line is one write(2), which no death of a process can divide; what the power takes from
+the last one is found, and counts as a stop of the workcell.
+
+From time to time the daemon appends a checkpoint, the state as of an earlier place in the file, and frees what lies before
+that place.
+
+Concurrency: any number of processes append; only the daemon makes checkpoints.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any, TypeAlias
+
+    Part: TypeAlias = tuple[str, str, int, int]
+    """(device, block, channel, bit): a piece that can be stopped by itself; bit 0 for a channel without bits."""
+
+NODE, WORKCELL, CHECKPOINT = "node", "workcell", "checkpoint"
+
+
+def node_entry(
+    name: str, device: str, block: str, parts: Iterable[tuple[int, int]], source: str, *, stop: bool
+) -> dict[str, Any]:
+    """Return the entry of the stop or the reset of a node: its name, its parts (channel, bit), and who did it."""
+    return {NODE: name, "device": device, "block": block, "parts": _packed(parts), "stop": stop, "by": source}
+
+
+def parts_of(channel: int, bit: int, width: int) -> list[tuple[int, int]]:
+    """Return the parts of a channel of so many bits (0: it has none), or of one bit of it (-1: of all)."""
+    return [(channel, bit)] if bit >= 0 else [(channel, b) for b in range(width or 1)]
+
+
+def workcell_entry(source: str, *, stop: bool, named: bool = False) -> dict[str, Any]:
+    """Return the entry of the stop or the reset of the workcell; ``named``: it says better who has stopped it."""
+    return {WORKCELL: "", "stop": stop, "by": source, **({"named": True} if named else {})}
+
+
+def _packed(parts: Iterable[tuple[int, int]]) -> list[list[int]]:
+    """Return parts as [first channel, last channel, bits]: a node of 10,000 channels is one line of 60 bytes."""
+    bits: dict[int, int] = {}
+    for channel, bit in parts:
+        bits[channel] = bits.get(channel, 0) | 1 << bit
+    runs: list[list[int]] = []
+    for channel in sorted(bits):
+        if runs and runs[-1][1] == channel - 1 and runs[-1][2] == bits[channel]:
+            runs[-1][1] = channel
+        else:
+            runs.append([channel, channel, bits[channel]])
+    return runs
+
+
+def _unpacked(runs: Iterable[Iterable[int]]) -> Iterable[tuple[int, int]]:
+    for first, last, bits in runs:
+        for channel in range(first, last + 1):
+            yield from ((channel, bit) for bit in range(bits.bit_length()) if bits >> bit & 1)
+
+
+@dataclass(slots=True)
+class Stopped:
+    """What is stopped.
+
+    Attributes:
+        workcell: who has stopped the workcell, '' when it is not stopped.
+        since_s: when that was [s since 1970].
+        parts: of nodes that are stopped: who did it, and the name of the node.
+    """
+
+    workcell: str = ""
+    since_s: float = 0.0
+    parts: dict[Part, tuple[str, str]] = field(default_factory=dict)
+
+    def apply(self, entry: Mapping[str, Any]) -> None:
+        """Take an entry into account.
+
+        Raises:
+            ValueError, TypeError, LookupError: it is none.
+        """
+        stop, by = bool(entry["stop"]), str(entry["by"])
+        if WORKCELL in entry:
+            if not stop:
+                self.workcell, self.since_s = "", 0.0
+                self.parts.clear()
+            elif not self.workcell or entry.get("named"):
+                self.workcell, self.since_s = by or "somebody", self.since_s or float(entry["at"])
+            return
+        name, device, block = str(entry[NODE]), str(entry["device"]), str(entry["block"])
+        for channel, bit in _unpacked(entry["parts"]):
+            if stop:
+                self.parts.setdefault((device, block, channel, bit), (by, name))
+            else:
+                self.parts.pop((device, block, channel, bit), None)
+
+    def take(
+        self, entry: Mapping[str, Any] | None, damage: str = "a line that is no entry", now_s: float = 0.0
+    ) -> None:
+        """Take an entry of a journal into account; what is none stops the workcell, since now."""
+        try:
+            if entry is None:
+                raise ValueError
+            self.apply(entry)
+        except (ValueError, TypeError, LookupError):
+            if not self.workcell:
+                self.workcell = f"the journal of stops, which is damaged: {damage}"
+                self.since_s = now_s
+
+    def nodes(self) -> list[list[str]]:
+        """Return the nodes that are stopped, in whole or in part, each [name, who did it]."""
+        return [[name, by] for by, name in dict.fromkeys(self.parts.values())]
+
+    def of_device(self, device: str) -> list[list[Any]]:
+        """Return what is stopped of a device, each [block, [[first channel, last channel, bits], ...], who, name of the node]."""
+        groups: dict[tuple[str, str, str], list[tuple[int, int]]] = {}
+        for (of, block, channel, bit), (by, name) in self.parts.items():
+            if of == device:
+                groups.setdefault((block, by, name), []).append((channel, bit))
+        return [[block, _packed(parts), by, name] for (block, by, name), parts in groups.items()]
+
+    def entries(self) -> list[dict[str, Any]]:
+        """Return entries that lead from nothing to this state."""
+        entries: list[dict[str, Any]] = []
+        if self.workcell:
+            entries.append({**workcell_entry(self.workcell, stop=True), "at": self.since_s})
+        for device in dict.fromkeys(part[0] for part in self.parts):
+            for block, runs, by, name in self.of_device(device):
+                entries.append(node_entry(name, device, block, _unpacked(runs), by, stop=True))
+        return entries
+
+
+def channels_and_bits(runs: Iterable[Iterable[int]]) -> list[tuple[int, int]]:
+    """Return the parts (channel, bit) of ``Stopped.of_device``."""
+    return list(_unpacked(runs))
+
+
+def replay(data: bytes, start: int, now_s: float) -> Stopped:
+    """Return what is stopped after a journal.
+
+    Args:
+        data: of the file, from a place on.
+        start: that place; above 0 there must be a checkpoint in what follows.
+        now_s: the time [s since 1970], from which on a damaged journal stops the workcell.
+    """
+    state, at = Stopped(), start
+    lines = _lines(data, start)
+    checkpoint = next((entry for _, entry in reversed(lines) if entry and CHECKPOINT in entry), None)
+    if checkpoint is None and start:
+        state.take(None, f"nothing is known of what was before byte {start}", now_s)
+    if checkpoint is not None:
+        state, at = _from_checkpoint(checkpoint, start, now_s)
+    for place, entry in lines:
+        if place >= at and not (entry and CHECKPOINT in entry):
+            state.take(entry, f"it cannot be read at byte {place}", now_s)
+    return state
+
+
+def _from_checkpoint(checkpoint: Mapping[str, Any], start: int, now_s: float) -> tuple[Stopped, int]:
+    """Return the state of a checkpoint, and the place from which on entries add to it."""
+    state = Stopped()
+    try:
+        for entry in checkpoint[CHECKPOINT]:
+            state.apply(entry)
+        return state, int(checkpoint["from"])
+    except (ValueError, TypeError, LookupError):
+        state.take(None, "its checkpoint cannot be read", now_s)
+        return state, start
+
+
+def entries_from(data: bytes) -> tuple[list[dict[str, Any] | None], int]:
+    """Return the entries of the whole lines in what has come to a journal, and how many bytes these are."""
+    whole = data[: data.rfind(b"\n") + 1]
+    return [entry for _, entry in _lines(whole) if not (entry and CHECKPOINT in entry)], len(whole)
+
+
+def _lines(data: bytes, start: int = 0) -> list[tuple[int, dict[str, Any] | None]]:
+    """Return the lines of a journal, each its place and its entry, None for what is none, as a last line without its end."""
+    lines: list[tuple[int, dict[str, Any] | None]] = []
+    *whole, rest = data.split(b"\n")
+    for line in whole:
+        if line.strip(b"\0"):
+            lines.append((start, _entry(line)))
+        start += len(line) + 1
+    if rest.strip(b"\0"):
+        lines.append((start, None))
+    return lines
+
+
+def _entry(line: bytes) -> dict[str, Any] | None:
+    try:
+        entry = json.loads(line.strip(b"\0"))
+    except (ValueError, RecursionError):
+        return None
+    return entry if isinstance(entry, dict) else None
+
+
+class StopJournal:
+    """An open journal.
+
+    Args:
+        fd: of the file, opened for appending; closed by ``close``.
+
+    Concurrency: one thread.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self.fd = fd
+
+    def append(self, entry: Mapping[str, Any], at_s: float, *, after_damage: bool = False) -> None:
+        """Append an entry.
+
+        Args:
+            entry: of a stop, a reset or a checkpoint.
+            at_s: the time [s since 1970].
+            after_damage: begin a line of its own, whatever the last one is.
+
+        Raises:
+            OSError: it could not be written, as on a full disk.
+        """
+        line = json.dumps({"at": round(at_s, 3), **entry}, separators=(",", ":")).encode() + b"\n"
+        line = b"\n" * after_damage + line
+        if os.write(self.fd, line) != len(line):
+            raise OSError(errno.ENOSPC, "the disk is full")
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self.fd)

@@ -1,0 +1,194 @@
+"""The journal of stops: whatever was acknowledged is in it, whatever it holds is obeyed, and damage is a stop."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sioms.daemon import stop_record
+from sioms.daemon.stop_record import StopRecord
+from sioms.protocol.stopjournal import (
+    StopJournal,
+    Stopped,
+    channels_and_bits,
+    node_entry,
+    parts_of,
+    replay,
+    workcell_entry,
+)
+
+AXES = [(c, 0) for c in range(4)]
+
+
+def stop_of_axes(source: str = "ann", *, stop: bool = True) -> dict[str, Any]:
+    return node_entry("mod0", "mod0", "", AXES, source, stop=stop)
+
+
+def bit(number: int, *, stop: bool = True) -> dict[str, Any]:
+    return node_entry(f"io0.bit{number}", "io0", "do", parts_of(0, number, 8), "bob", stop=stop)
+
+
+def byte(*, stop: bool = True) -> dict[str, Any]:
+    return node_entry("io0", "io0", "do", parts_of(0, -1, 8), "bob", stop=stop)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> str:
+    return str(tmp_path / "state" / "stops")
+
+
+def kept(path: str) -> Stopped:
+    """Return what a daemon that starts now would find."""
+    data = Path(path).read_bytes()
+    held = data.lstrip(b"\0")
+    return replay(held, len(data) - len(held), 1.8e9)
+
+
+def test_what_is_noted_is_there_after_a_death_without_an_end(path: str) -> None:
+    record = StopRecord(path)
+    record.note(stop_of_axes())
+    record.note(bit(3))
+    record.note(workcell_entry("input estop reads 0", stop=True))
+    state = kept(path)  # as after SIGKILL: nothing was closed
+    assert state.workcell == "input estop reads 0" and state.since_s > 1.7e9
+    assert state.nodes() == [["mod0", "ann"], ["io0.bit3", "bob"]]
+    assert state.of_device("mod0") == [["", [[0, 3, 1]], "ann", "mod0"]]
+    record.close()
+    again = StopRecord(path)
+    assert again.state.workcell == "input estop reads 0"
+    again.note(workcell_entry("operator", stop=False))
+    assert not again.state.workcell and not again.state.parts
+    again.close()
+    assert not os.path.exists(path)
+
+
+def test_a_bit_is_stopped_and_reset_by_itself(path: str) -> None:
+    record = StopRecord(path)
+    record.note(byte())
+    record.note(bit(0, stop=False))
+    assert channels_and_bits(record.state.of_device("io0")[0][1]) == [(0, b) for b in range(1, 8)]
+    record.note(bit(0))
+    record.note(byte(stop=False))
+    assert record.state.parts == {}
+    record.close()
+
+
+def test_a_driver_notes_beside_the_daemon(path: str) -> None:
+    record = StopRecord(path)
+    driver = StopJournal(os.dup(record.drivers_fd))
+    driver.append(stop_of_axes("input limit"), 1.0)
+    record.look()
+    assert record.state.nodes() == [["mod0", "input limit"]]
+    driver.close()
+    record.close()
+
+
+def test_two_daemons_do_not_keep_one_record(path: str) -> None:
+    record = StopRecord(path)
+    drivers = os.dup(record.drivers_fd)
+    with pytest.raises(OSError, match="another daemon"):
+        StopRecord(path)
+    record.note(stop_of_axes())
+    record.close()
+    StopRecord(path).close()  # a driver that lives on does not keep the next daemon out
+    os.close(drivers)
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "zeros", "garbage", "shortened"])
+def test_damage_stops_the_workcell_and_is_told(path: str, damage: str) -> None:
+    record = StopRecord(path)
+    record.note(stop_of_axes())
+    record.note(stop_of_axes(stop=False))
+    record.note(bit(1))
+    record.look()
+    data = Path(path).read_bytes()
+    match damage:
+        case "cut":
+            data = data[:-7]
+        case "flipped":
+            data = data.replace(b'"stop":true', b'"st\xfep":true', 1)
+        case "zeros":
+            data += bytes(300) + b"x"
+        case "garbage":
+            data += b"[]\n[[[[[[[\n" + b"[" * 100_000 + b"\n"
+        case "shortened":
+            os.truncate(path, 10)
+            record.look()
+            assert "damaged" in record.state.workcell
+            return
+    Path(path).write_bytes(data)
+    state = kept(path)
+    assert "damaged" in state.workcell
+    record._flusher.end()
+    os.close(record._fd)
+    again = StopRecord(path)
+    assert "damaged" in again.state.workcell
+    again.note(workcell_entry("operator", stop=False))
+    assert not kept(path).workcell  # a reset clears it for good
+    again.close()
+
+
+def test_checkpoints_free_the_file_and_lose_nothing(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stop_record, "MOST_BYTES", 6000)
+    chance = random.Random(5)
+    record, model = StopRecord(path), Stopped()
+    drivers = StopJournal(os.dup(record.drivers_fd))
+    for step in range(3000):
+        entry = chance.choice([stop_of_axes, bit, byte])  # type: ignore[list-item]
+        kind: Any = entry
+        stop = chance.random() < 0.5
+        made = kind(chance.randrange(8), stop=stop) if entry is bit else kind(stop=stop)
+        if chance.random() < 0.02:
+            made = workcell_entry(f"number {step}", stop=stop)
+        model.apply({"at": 1.0, **made})
+        if chance.random() < 0.5:
+            drivers.append(made, 1.0)
+        else:
+            record.note(made)
+        if step % 100 == 0:
+            record.look()
+            assert (record.state.workcell, record.state.parts) == (model.workcell, model.parts)
+    record.look()
+    record._flusher.end()
+    about = os.stat(path)
+    assert about.st_size > 300_000 and about.st_blocks * 512 < 40_000
+    fd = os.open(path, os.O_RDONLY)
+    start = os.lseek(fd, 0, os.SEEK_DATA)
+    state = replay(os.pread(fd, 1 << 20, start), start, 0.0)
+    assert start > 0 and (state.workcell, state.parts) == (model.workcell, model.parts)
+    os.close(fd)
+    drivers.close()
+
+
+def test_what_comes_beside_a_checkpoint_is_not_lost() -> None:
+    """A driver appends between the look of the daemon and its checkpoint."""
+    lines = [{"at": 1.0, **stop_of_axes()}]
+    first = json.dumps(lines[0]).encode() + b"\n"
+    beside = json.dumps({"at": 2.0, **workcell_entry("beam", stop=True)}).encode() + b"\n"
+    state = Stopped()
+    state.apply(lines[0])
+    checkpoint = json.dumps({"checkpoint": state.entries(), "from": len(first), "at": 3.0}).encode() + b"\n"
+    for start in (0, len(first)):
+        found = replay((first + beside + checkpoint)[start:], start, 0.0)
+        assert found.workcell == "beam" and found.nodes() == [["mod0", "ann"]]
+    assert "nothing is known" in replay(beside, 4096, 0.0).workcell
+
+
+def test_ten_thousand_channels_are_a_short_line() -> None:
+    entry = node_entry("big", "big", "", [(c, 0) for c in range(10_000)], "x", stop=True)
+    assert len(json.dumps(entry)) < 200
+    state = Stopped()
+    state.apply({"at": 0.0, **entry})
+    assert len(state.parts) == 10_000 and state.of_device("big")[0][1] == [[0, 9999, 1]]
+
+
+def test_a_full_disk_is_told(path: str) -> None:
+    journal = StopJournal(os.open("/dev/full", os.O_WRONLY))
+    with pytest.raises(OSError, match="space"):
+        journal.append(workcell_entry("x", stop=True), 1.0)
+    journal.close()
