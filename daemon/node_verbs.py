@@ -22,6 +22,7 @@ from .devices import DriverProcess, State
 from .names import READONLY, Node
 from .rights import RIGHTS, Rights
 from .sessions import LATER, Handle, Refused, Session, Wait
+from .suspended import Suspended
 
 if TYPE_CHECKING:
     from .clients import Clients
@@ -48,6 +49,7 @@ class NodeVerbs:
         self._claims: Claims[Handle] = Claims()
         self._opens: list[tuple[Wait, Callable[[], bool]]] = []
         self._numbers = itertools.count(1)
+        self._suspended = Suspended()
 
     def find(self, session: Session, what: str, name: str, right: Right = Right.READ) -> Node:
         """Return a node with which the session may do something, as read it.
@@ -225,7 +227,18 @@ class NodeVerbs:
             if lost and device is not None and device.generation == handle.generation:
                 names = ", ".join(name for name, right in RIGHTS.items() if right & lost)
                 text = f"{handle.node.name}: the right to {names} it was taken away; open it again"
-                device.tell(DriverVerb.DETACH, handle.number, text)
+                device.tell(DriverVerb.DETACH, handle.number, errno.EACCES, text)
+
+    def end_suspended(self) -> None:
+        """End the handles of clients that are stopped by a signal: what they moved halts."""
+        stopped = self._suspended.look(handle.session.peer.pid for handle in self.holders())
+        for handle in [h for h in self.holders() if h.session.peer.pid in stopped]:
+            device = self._server.devices.get(handle.node.device)
+            if device is not None and device.generation == handle.generation and not handle.ending:
+                handle.ending = True
+                text = f"{handle.node.name}: its client was stopped, as by Ctrl-Z; open it again"
+                device.tell(DriverVerb.DETACH, handle.number, errno.ETIMEDOUT, text)
+                self._server.log("warning", "client stopped", node=handle.node.name, client=handle.session)
 
     def detached(self, device: DriverProcess, number: int) -> None:
         """The driver has ended a handle: its axes are being halted."""

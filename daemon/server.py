@@ -17,6 +17,7 @@ from sioms.protocol.flags import PageState
 from sioms.protocol.messages import DriverVerb
 from sioms.protocol.stopjournal import node_entry, parts_of, workcell_entry
 
+from . import suspended
 from .clients import Clients
 from .config import Config
 from .devices import DriverProcess, State
@@ -76,6 +77,7 @@ class Server:
         self.clients.welcome()
         self._alive()
         self._look_at_budget()
+        self._look_at_clients()
         if self._manager.watchdog_ns:
             self._feed_watchdog()
 
@@ -419,6 +421,10 @@ class Server:
         if greedy := self._budget.look(time.monotonic(), use):
             make_ordinary(greedy[1])
         self.loop.after(LOOK_S, self._look_at_budget)
+
+    def _look_at_clients(self) -> None:
+        self.clients.nodes.end_suspended()
+        self.loop.after(suspended.LOOK_S, self._look_at_clients)
 
     def _feed_watchdog(self) -> None:
         self._manager.tell("WATCHDOG=1")

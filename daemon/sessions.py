@@ -47,6 +47,7 @@ class Handle:
         generation: of the driver process it is attached to.
         rights: what its user may do with it, as the driver was told.
         closing: message number of the close that waits for the driver, if any.
+        ending: whether the driver has been told to end it.
     """
 
     number: int
@@ -57,6 +58,7 @@ class Handle:
     generation: int
     rights: Right
     closing: int = 0
+    ending: bool = False
 
     @property
     def claims(self) -> list[Claim]:

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import errno
 from select import POLLIN, poll
+from time import monotonic
 
-from sioms.client.stream import Stream
+from sioms.client.stream import Stream, keep_together
 from sioms.client.workcell import Workcell
 
 from .columns import Columns
@@ -19,8 +20,11 @@ from .tokens import Tokens
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from typing import Any
 
 DEFAULT_COUNT = 100
+FROZEN_S = 2.0
+"""A devout that is silent for so long is stopped, frozen or swapped out, and its axes halt [s]; it does not depend on rows."""
 
 
 class BadInput(Exception):
@@ -50,7 +54,9 @@ def _work(words: Sequence[str]) -> None:
     if tokens.bad:
         raise UsageError(tokens.bad.partition(": ")[2])
     cell = Workcell(name="devout")
-    nodes = [open_node(cell, t.name, "rw", lease_s=line.common.get("lease", 0.0)) for t in line.targets]
+    lease_s = line.common.get("lease", FROZEN_S)
+    nodes = [open_node(cell, t.name, "rw", lease_s=lease_s) for t in line.targets]
+    keep_together(nodes)
     columns = [Columns(t, n.info) for t, n in zip(line.targets, nodes, strict=True)]
     repeats = "r" in line.common or "L" in line.common
     count = int(line.common.get("L", DEFAULT_COUNT)) if repeats else 1
@@ -62,7 +68,8 @@ def _work(words: Sequence[str]) -> None:
             f"{len(line.numbers)} numbers; {'an iteration takes' if count == 1 else f'{count} iterations take'} "
             f"{count * width}, and more would be lost; -r writes several one after the other"
         )
-    writer = Writer(cell, [Stream(node) for node in nodes], columns, tokens)
+    beat_s = 0.0 if "lease" in line.common else FROZEN_S / 4
+    writer = Writer(cell, [Stream(node) for node in nodes], columns, tokens, beat_s)
     try:
         _iterate(line, writer, count)
         if "H" in line.common:
@@ -106,13 +113,23 @@ class Writer:
         streams: one per device, in the order of the command line.
         columns: their columns.
         tokens: the numbers, those of the command line first.
+        beat_s: how often to tell the drivers that this program lives while there is no input [s]; 0: not at all.
 
     Attributes:
         iterations: how many have been written.
     """
 
-    def __init__(self, cell: Workcell, streams: list[Stream], columns: list[Columns], tokens: Tokens) -> None:
+    def __init__(
+        self,
+        cell: Workcell,
+        streams: list[Stream],
+        columns: list[Columns],
+        tokens: Tokens,
+        beat_s: float = 0.0,
+    ) -> None:
         self.columns = columns
+        self._beat_s = beat_s
+        self._next_beat_s = 0.0
         self.iterations = 0
         self._streams = streams
         self._cell = cell
@@ -174,8 +191,8 @@ class Writer:
         for fd in (self._cell.fileno(), *[stream.fileno() for stream in self._streams]):
             poller.register(fd, POLLIN)
         while True:
-            poller.poll()
-            self._cell.status()  # raises what ended it
+            if self._wait_on(poller):
+                self._cell.status()  # raises what ended it
             for stream in self._streams:
                 stream.settle()
 
@@ -186,8 +203,17 @@ class Writer:
             if columns.is_axis and not open_ended:
                 stream.node.wait_until_idle()  # type: ignore[attr-defined]
 
+    def _wait_on(self, poller: Any) -> list[tuple[int, int]]:
+        """Wait until something is readable, or until the drivers have to be told that this program lives; tell them."""
+        ready: list[tuple[int, int]] = poller.poll(1e3 * self._beat_s if self._beat_s else None)
+        if self._beat_s and (now_s := monotonic()) >= self._next_beat_s:
+            self._next_beat_s = now_s + self._beat_s
+            if self._streams:
+                self._streams[0].node.keepalive()  # and with it the others
+        return ready
+
     def _await_input(self) -> None:
-        for fd, _ in self._poller.poll():
+        for fd, _ in self._wait_on(self._poller):
             if fd == 0:
                 data = read_input()
                 self._ended = not data

@@ -141,6 +141,7 @@ class Channel:
     Attributes:
         keepalive_s: while a thread waits for an answer, it tells the other side this often [s] that it
             lives; 0 = never. The waiting thread itself does, so that a program that hangs is silent.
+        fellows: channels that are told together with this one, itself among them; none: this one alone.
     """
 
     def __init__(
@@ -164,6 +165,7 @@ class Channel:
         self._waiting: dict[int, object] = {}
         self._timeout = 0.0
         self.keepalive_s = 0.0
+        self.fellows: Sequence[Channel] = ()
         self._ended: tuple[int, str] | None = None
 
     @property
@@ -230,6 +232,11 @@ class Channel:
             self._sock.send(packet)
         except OSError as error:
             raise self._gone(error, "send") from None
+
+    def keepalive(self) -> None:
+        """Tell the other side, and those of the channels that are kept alive with this one, that this client is alive."""
+        for channel in self.fellows or (self,):
+            channel.notice(KEEPALIVE)
 
     def wait(self, number: int, call: Call) -> Answer:
         """Wait for the answer to a sent request."""
@@ -321,7 +328,7 @@ class Channel:
                 message, fds = self._packet(0)
             except BlockingIOError:
                 if self.keepalive_s:
-                    self.notice(KEEPALIVE)
+                    self.keepalive()
                 continue
             if message[1] == number:
                 return message, fds

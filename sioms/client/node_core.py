@@ -17,7 +17,7 @@ from sioms.protocol.page import NotReadable, PageReader, as_of_ns
 from sioms.protocol.records import ANALOG_WRITE, BINARY_WRITE
 
 from . import shown
-from .channel import KEEPALIVE, Call, Channel
+from .channel import Call, Channel
 from .snapshot import SNAPSHOT, BinarySnapshot, Layout
 
 TYPE_CHECKING = False
@@ -263,7 +263,7 @@ class NodeCore:
 
     def keepalive(self) -> None:
         """Tell the driver that this client is alive, for nodes opened with a lease; any request does, too."""
-        self._channel.notice(KEEPALIVE)
+        self._channel.keepalive()
 
     def room(self) -> int:
         """Return how many commands the fullest of the node's command buffers still takes."""

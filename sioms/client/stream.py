@@ -10,6 +10,8 @@ from select import POLLIN, poll
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from .channel import Call
     from .node import Node
     from .node_core import Records
@@ -76,3 +78,10 @@ class Stream:
     def _oldest(self) -> None:
         number, call = self._pending.pop(0)
         self._channel.wait(number, call)
+
+
+def keep_together(nodes: Sequence[Node]) -> None:
+    """Renew the leases of all these nodes whenever that of one is renewed, as by a call that waits on it."""
+    channels = [node._channel for node in nodes]
+    for channel in channels:
+        channel.fellows = channels

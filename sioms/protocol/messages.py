@@ -88,7 +88,7 @@ class DriverVerb(IntEnum):
     """D: [handle, block, channels, bit, access, exclusive, rights, lease_ns, who, node]; descriptors: socket,
     writing end of the wake pipe, pidfd if any."""
     DETACH = 2
-    """D: [handle, reason]: end it, as if its socket had closed; without a reason its client closed it."""
+    """D: [handle], its client has closed it; [handle, errno, reason]: end it, as if its socket had closed, and say why."""
     STOP_CHANGED = 3
     """D: [what]: the latch has changed, look at once."""
     SHUTDOWN = 4

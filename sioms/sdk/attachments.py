@@ -61,13 +61,13 @@ class Attachments:
             if handle.exclusive or not exclusive_only:
                 self.end(handle, errno_, f"{handle.node}: {text}")
 
-    def detach(self, number: int, reason: str = "") -> None:
-        """End a handle because the daemon says so; one that has ended already is confirmed again."""
+    def detach(self, number: int, errno_: int = 0, reason: str = "") -> None:
+        """End a handle because the daemon says so, and tell its client why; one that has ended already is confirmed again."""
         handle = self.handles.get(number)
         if handle is None:
             self._runtime.tell(DriverVerb.DETACHED, number)
         elif reason:
-            self.end(handle, errno.EACCES, reason)
+            self.end(handle, errno_, reason)
         else:
             self.drop(handle)
 

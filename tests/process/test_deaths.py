@@ -300,3 +300,24 @@ def test_sigterm_is_obeyed_on_a_full_core(start_daemon: Callable[..., Daemon]) -
     assert daemon.running.wait_exit(10.0) == 0
     print(f"SIGTERM heard after {heard_s:.3f} s, ended after {time.monotonic() - began:.3f} s")
     assert heard_s < 1.0
+
+
+def test_a_client_that_is_stopped_loses_its_axes_without_a_lease(
+    daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client]
+) -> None:
+    """As by Ctrl-Z; one that goes on at once does not."""
+    victim = client(
+        daemon,
+        jog("mod0.xaxis", 0.02) + "while True:\n    time.sleep(0.05)\n    node.limits()\n",
+    )
+    with cell.open("mod0.readonly") as seen:
+        wait_for(lambda: seen.read().in_motion[0], "moving")
+        with daemon.frozen(victim.pid):
+            time.sleep(0.01)
+        time.sleep(0.3)
+        assert seen.read().in_motion[0], "stopped for a moment only"
+        with daemon.frozen(victim.pid):
+            assert at_rest(seen, 2.0) < 1.0
+            with cell.open("mod0.xaxis", "rw", timeout=1.0):
+                pass
+        victim.wait_line("its client was stopped, as by Ctrl-Z")

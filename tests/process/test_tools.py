@@ -17,6 +17,7 @@ import pytest
 from daemon_rig import FORCE, Client, Daemon, axes, daemons, wait_for
 
 import sioms
+from sioms.tools.devout import FROZEN_S
 
 BIN = Path(sys.prefix) / "bin"
 CELL = (
@@ -259,6 +260,55 @@ def test_a_lease_halts_when_the_rows_stay_away(
     assert process.stderr.read().count(b"\n") == 1
 
 
+def test_a_devout_that_is_stopped_halts_its_axes(
+    devout: Callable[..., subprocess.Popen[bytes]], cell: sioms.Workcell
+) -> None:
+    """Ctrl-Z, without any option."""
+    process = devout("-rv", "-L-1", "mod0.xaxis")
+    feed(process, b"0.1 ")
+    moving(cell, 0.1)
+    process.send_signal(signal.SIGSTOP)
+    halted(cell)
+    process.send_signal(signal.SIGCONT)
+    assert process.wait(10) == 1
+    assert process.stderr is not None
+    assert b"its client was stopped, as by Ctrl-Z" in process.stderr.read()
+
+
+def test_a_devout_that_lives_keeps_all_its_axes(
+    devout: Callable[..., subprocess.Popen[bytes]], cell: sioms.Workcell
+) -> None:
+    """Also when no rows come for longer than a frozen one would be waited for, and while it waits for one of two."""
+    process = devout("-rv", "-L-1", "mod0.xaxis", "-v", "mod0.yaxis")
+    feed(process, b"0.01 0.01\n0.0")  # with half a number left over
+    deadline = time.monotonic() + 1.3 * FROZEN_S
+    with cell.open("mod0.readonly") as seen:
+        wait_for(lambda: seen.read().in_motion[:2] == (1, 1), "moving")
+        while time.monotonic() < deadline:
+            assert all(seen.read().in_motion[:2])
+            time.sleep(0.05)
+    feed(process, b" 0\n")
+    process.communicate(timeout=10)
+    assert process.returncode == 0
+    timed = devout(
+        "-pt", "mod0.xaxis", "-pt", "mod0.yaxis", "0.01", str(1.3 * FROZEN_S), "0.01", str(1.4 * FROZEN_S)
+    )
+    assert timed.wait(20) == 0
+
+
+def test_a_frozen_devout_halts_its_axes_also_while_the_daemon_hangs(
+    devout: Callable[..., subprocess.Popen[bytes]],
+) -> None:
+    with daemons() as start:
+        daemon = start("[workcell]\ndaemon_lease_s = 60\n" + axes("mod0", "xaxis"))
+        with daemon.cell() as cell, cell.open("mod0.readonly") as seen:
+            process = devout("-rv", "-L-1", "mod0.xaxis", socket=daemon.socket)
+            feed(process, b"0.1 ")
+            moving(cell, 0.1)
+            with daemon.frozen(daemon.pid), daemon.frozen(process.pid):
+                wait_for(lambda: not seen.read().in_motion[0], "its lease", 2 * FROZEN_S)
+
+
 def test_positions_are_waited_for(shell: Shell, cell: sioms.Workcell) -> None:
     good(shell("devout -n2 mod0 0.1"))
     assert abs(cell.open("mod0.readonly").read().position[2] - 0.1) < 1e-3
@@ -270,7 +320,7 @@ def test_pieces_with_times_queue_up_and_none_is_lost(shell: Shell, cell: sioms.W
     before = cell.open("mod0.readonly").read().position[1]
     # The first piece stands, so that those of a millisecond wait behind it however late they come.
     ramp = [f"{0.2 * i / 100} 0.001\n" for i in range(100)]
-    rows = "".join(["0 1\n", *ramp, *["0.2 0.001\n"] * 400, "0 0.2\n"])
+    rows = "".join(["0 2\n", *ramp, *["0.2 0.001\n"] * 400, "0 0.2\n"])
     good(shell("devout -rvt -L-1 mod0.yaxis", rows))
     moved = cell.open("mod0.readonly").read().position[1] - before
     assert abs(moved - (0.01 + 0.08 + 0.2**2 / 2 / 10)) < 0.003  # ramp, run, and the way of braking
