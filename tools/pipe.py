@@ -134,16 +134,23 @@ def open_node(cell: Workcell, word: str, mode: str, *, companion: bool = False, 
     Raises:
         OSError: it cannot be opened; of several names tried the error of the first.
     """
+    return by_any_name(word, lambda name: cell.open(name, mode, lease=lease_s), companion=companion)
+
+
+def by_any_name(word: str, act: Callable[[str], Any], *, companion: bool = False) -> Any:
+    """Do something with the first node that there is of those that a word may name.
+
+    Raises:
+        OSError: it cannot be done; when there is none of the names, what was said of the word itself.
+    """
     names = names_of(word)
-    first: OSError | None = None
+    missing: dict[str, OSError] = {}
     for name in names:
-        tries = [name + READONLY, name] if companion and not name.endswith(READONLY) else [name]
-        for attempt in tries:
+        for attempt in [name + READONLY, name] if companion and not name.endswith(READONLY) else [name]:
             try:
-                return cell.open(attempt, mode, lease=lease_s)
+                return act(attempt)
             except OSError as error:
                 if error.errno != errno.ENOENT:
                     raise
-                if attempt == names[0]:
-                    first = error
-    raise first or OSError(errno.ENOENT, f"open {word}: no such node")
+                missing[attempt] = error
+    raise missing[names[0]]

@@ -12,7 +12,7 @@ from sioms.client.workcell import Workcell
 from sioms.protocol.flags import NodeClass
 
 from .options import Line, Target, UsageError, fold
-from .pipe import READONLY, complain, open_node, read_input, run
+from .pipe import READONLY, by_any_name, complain, open_node, read_input, run
 from .tokens import Tokens
 
 TYPE_CHECKING = False
@@ -65,8 +65,7 @@ def _stop(cell: Workcell, line: Line) -> None:
     """Carry out the emergency stops, which overtake everything else on the command line."""
     for target in line.targets:
         if "e" in target.flags:
-            node = open_node(cell, target.name, "r", companion=True)
-            cell.emergency_stop(node.name.removesuffix(READONLY), "sdev -e")
+            by_any_name(target.name, lambda name: cell.emergency_stop(name.removesuffix(READONLY), "sdev -e"))
 
 
 class Setter:

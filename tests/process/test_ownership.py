@@ -235,7 +235,9 @@ def test_too_many_waits_on_a_handle(cell: sioms.Workcell) -> None:
 
 FOREIGN = """
 import errno, json, os, pwd, sys, sioms
+from sioms.tools import sdev
 [getattr(sioms, name) for name in sioms.__all__]  # nobody may not read the tree
+os.environ['SIOMS_SOCKET'] = sys.argv[1]
 nobody = pwd.getpwnam('nobody')
 os.setgroups([]); os.setgid(nobody.pw_gid); os.setuid(nobody.pw_uid)
 try:
@@ -254,6 +256,7 @@ attempt('write mod0', lambda: cell.open('mod0', 'rw'))
 attempt('write io0', lambda: cell.open('io0', 'rw').close())
 attempt('read force0', lambda: cell.open('force0'))
 attempt('stop mod0', lambda: cell.emergency_stop('mod0'))
+attempt('sdev stop', lambda: sdev._work(['-e', 'mod0.xaxis']))
 attempt('stop', lambda: cell.emergency_stop())
 attempt('reset', lambda: cell.reset())
 attempt('reload', lambda: cell.reload())
@@ -297,7 +300,7 @@ def test_foreign_user_is_kept_out_by_the_mode_of_the_socket(
 
 STOPPER = """
 [[grant]]
-rights = ["read", "stop"]
+rights = ["stop"]
 users = ["nobody"]
 [[grant]]
 rights = ["read", "write", "stop"]
@@ -313,6 +316,13 @@ def test_foreign_user_with_a_grant_to_stop_needs_no_daemon(
     os.chmod(daemon.folder.parent, 0o755)
     said = _foreign(daemon, start)
     assert said["stop file"][0] == 0 and said["taken file"][0] == errno.EACCES
+    allowed = {name for name, (number, _) in said.items() if number == 0}
+    assert allowed == {"list", "nodes", "stop", "stop mod0", "sdev stop", "page", "stop file"}, (
+        "a right to stop is enough"
+    )
+    with daemon.cell() as cell:
+        status = cell.status()
+    assert status["stopped_ns"] and [node for node, _ in status["node_stops"]] == ["mod0"]
 
 
 @pytest.mark.root
