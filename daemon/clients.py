@@ -55,12 +55,13 @@ class Clients:
     Args:
         server: the daemon.
         listener: the listening SOCK_SEQPACKET socket.
+        address: its path.
     """
 
-    def __init__(self, server: Server, listener: socket.socket) -> None:
+    def __init__(self, server: Server, listener: socket.socket, address: str) -> None:
         self.users = Users()
         self.rights = Rights([], os.getuid(), self.users)
-        self.address = str(listener.getsockname())
+        self.address = address
         self._server = server
         self._listener = listener
         self.sessions: set[Session] = set()

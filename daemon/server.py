@@ -8,7 +8,6 @@ Concurrency: everything runs in the one loop; nothing blocks in it.
 from __future__ import annotations
 
 import os
-import socket
 import time
 from collections.abc import Callable
 from typing import Any
@@ -21,6 +20,7 @@ from . import suspended
 from .clients import Clients
 from .config import Config
 from .devices import DriverProcess, State
+from .listening import Listening
 from .loading import Loader, Plan
 from .log import Log
 from .loop import Loop
@@ -41,7 +41,7 @@ class Server:
 
     Args:
         loop: the loop it lives in.
-        listener: the listening SOCK_SEQPACKET socket.
+        listening: where clients connect.
         config_path: where the configuration is read from, again at every reload.
         log: its log.
         record: what has been stopped before it, and is so still.
@@ -49,16 +49,16 @@ class Server:
     """
 
     def __init__(
-        self, loop: Loop, listener: socket.socket, config_path: str, log: Log,
+        self, loop: Loop, listening: Listening, config_path: str, log: Log,
         record: StopRecord, process: NurseryProcess | None = None,
     ) -> None:  # fmt: skip
         self.loop = loop
         self.log = log
-        self.shared = Shared(str(listener.getsockname()), record)
+        self.shared = Shared(listening.path, record)
         self.names = NameTable({}, {})
         self.devices: dict[str, DriverProcess] = {}
         self.config: Config | None = None
-        self.clients = Clients(self, listener)
+        self.clients = Clients(self, listening.sock, listening.path)
         self.exit_status = 0
         self._path = config_path
         self._nursery: Nursery | None = None

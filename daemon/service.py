@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import errno
-import grp
 import os
 import signal
 import socket
-import stat
 import sys
 from collections.abc import Sequence
 
 from sioms.protocol.socketpath import socket_path
 
 from .config import Config, parse
+from .listening import Listening
 from .loading import Loader, NotDescribed, Plan
 from .log import Log
 from .loop import Loop
@@ -38,14 +36,14 @@ def serve(config_path: str, given_path: str | None, level: str, process: Nursery
     log = Log(journal="JOURNAL_STREAM" in os.environ and "NOTIFY_SOCKET" in os.environ, level=level)
     loop = Loop()
     try:
-        listener, path, record_path = _listen(config_path, given_path)
+        listening, record_path = _listen(config_path, given_path)
     except OSError as error:
         print(f"siomsd: listen: {error.strerror or error}", file=sys.stderr)
         return 1
     try:
         record = StopRecord(record_path)
     except OSError as error:
-        os.unlink(path)
+        listening.close()
         print(
             f"siomsd: keep stops in {record_path}: {error.strerror}; want a folder that the daemon may write to "
             "(state_folder in [workcell])",
@@ -54,9 +52,9 @@ def serve(config_path: str, given_path: str | None, level: str, process: Nursery
         return 1
     _become_prompt(log)
     try:
-        server = Server(loop, listener, config_path, log, record, process)
+        server = Server(loop, listening, config_path, log, record, process)
     except OSError as error:
-        os.unlink(path)
+        listening.close()
         print(f"siomsd: make {error.filename}: {error.strerror}", file=sys.stderr)
         return 1
     _take_signals(loop, server)
@@ -70,10 +68,9 @@ def serve(config_path: str, given_path: str | None, level: str, process: Nursery
     try:
         loop.run()
     finally:
-        if os.path.exists(path):
-            os.unlink(path)
         server.shared.files.remove()
         record.close()
+        listening.close()
     return server.exit_status
 
 
@@ -123,8 +120,8 @@ def _status(errors: Sequence[str]) -> int:
     return 2
 
 
-def _listen(config_path: str, given: str | None) -> tuple[socket.socket, str, str]:
-    """Bind the listening socket; refuse when another daemon answers on it; return it, its path and that of the record of stops."""
+def _listen(config_path: str, given: str | None) -> tuple[Listening, str]:
+    """Return the listening socket, and the path of the record of stops."""
     config: Config | None = None
     try:
         with open(config_path, encoding="utf-8") as file:
@@ -133,33 +130,11 @@ def _listen(config_path: str, given: str | None) -> tuple[socket.socket, str, st
         pass  # the loader will report it, with all other errors
     table = config.workcell if config else None
     path = given or (table.socket if table else "") or socket_path()
-    os.makedirs(os.path.dirname(path) or ".", mode=0o755, exist_ok=True)
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    if os.path.exists(path):
-        if not stat.S_ISSOCK(os.stat(path).st_mode):
-            raise OSError(errno.EEXIST, f"{path} is there and is no socket; remove it or choose another path")
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
-            if probe.connect_ex(path) == 0:
-                raise OSError(
-                    errno.EADDRINUSE, f"another daemon answers at {path}; stop it or choose another path"
-                )
-        os.unlink(path)
-    mode = int(table.socket_mode, 8) if table else 0o660
-    mask = os.umask(0o777 & ~mode)
-    try:
-        listener.bind(path)
-    except OSError as error:
-        raise OSError(error.errno, f"{path}: {error.strerror}") from None
-    finally:
-        os.umask(mask)
-    if table and table.socket_group:
-        try:
-            os.chown(path, -1, grp.getgrnam(table.socket_group).gr_gid)
-        except (KeyError, OSError) as error:
-            raise OSError(errno.EPERM, f"give {path} to group {table.socket_group}: {error}") from None
-    listener.listen(128)
+    listening = Listening(
+        path, int(table.socket_mode, 8) if table else 0o660, table.socket_group if table else ""
+    )
     folder = config.state_folder(os.environ) if config else ""
-    return listener, path, os.path.join(folder, "stops") if folder else path + ".stops"
+    return listening, os.path.join(folder, "stops") if folder else path + ".stops"
 
 
 def _take_signals(loop: Loop, server: Server) -> None:

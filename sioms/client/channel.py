@@ -34,6 +34,7 @@ from sioms.protocol.messages import (
     encode,
     value_of,
 )
+from sioms.protocol.socketpath import may_serve
 
 from .shown import acknowledged_by_daemon
 
@@ -114,6 +115,14 @@ def connect(path: str) -> socket:
             errno.EACCES: "no permission; ask to be put into the group of the socket",
         }.get(error.errno or 0, os.strerror(error.errno or errno.EIO).lower())
         raise OSError(error.errno, f"connect to {path}: {hint}") from None
+    uid = unpack("3i", sock.getsockopt(SOL_SOCKET, SO_PEERCRED, 12))[1]
+    if not may_serve(uid, path):
+        sock.close()
+        raise OSError(
+            errno.EPERM,
+            f"connect to {path}: user {uid} listens there, who is neither you nor root nor the owner of its folder; a "
+            "daemon for others has its socket in a folder of its own user, as /run/sioms",
+        )
     return sock
 
 

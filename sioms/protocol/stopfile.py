@@ -14,7 +14,10 @@ everybody who has mapped it.
 from __future__ import annotations
 
 import os
+from stat import S_ISREG
 from struct import Struct
+
+from .socketpath import may_serve
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -81,13 +84,23 @@ class StopRequest:
 
 
 def open_stop_request(path: str) -> StopRequest | None:
-    """Open the files beside a daemon's socket for requesting; None where there are none or one has no right to."""
+    """Open the files beside a daemon's socket for requesting; None where there are none of a daemon or one has no right to."""
     try:
-        fd = os.open(path + REQUEST, os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        fd = _open(path + REQUEST, os.O_WRONLY, path)
     except OSError:
         return None
     try:
-        return StopRequest(fd, os.open(path + TAKEN, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW))
+        return StopRequest(fd, _open(path + TAKEN, os.O_RDONLY, path))
     except OSError:
         os.close(fd)
         return None
+
+
+def _open(name: str, how: int, path: str) -> int:
+    # Not to wait for whom a pipe of that name is for.
+    fd = os.open(name, how | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    about = os.fstat(fd)
+    if not S_ISREG(about.st_mode) or not may_serve(about.st_uid, path):
+        os.close(fd)
+        raise PermissionError(name)
+    return fd

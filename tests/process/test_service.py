@@ -297,7 +297,7 @@ def test_a_second_daemon_on_one_socket_is_refused(start_daemon: Callable[..., Da
     assert second.returncode == 1
     assert (
         second.stderr
-        == f"siomsd: listen: another daemon answers at {daemon.socket}; stop it or choose another path\n"
+        == f"siomsd: listen: another daemon (pid {daemon.pid}) serves {daemon.socket}; stop it or choose another path\n"
     )
     daemon.cell().close()
 
