@@ -149,7 +149,7 @@ def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
         text = 'this is a register map; name it in the table of a device, map = "FILE", and give that configuration'
         return None, [text]
     errors = [
-        f"unknown section [{key}]{did_you_mean(key, _SECTIONS)}" for key in root if key not in _SECTIONS
+        f"[{key}]: unknown section{did_you_mean(key, _SECTIONS)}" for key in root if key not in _SECTIONS
     ]
     workcell = _convert(root.get("workcell", {}), WorkcellTable, "[workcell]", errors) or WorkcellTable()
     devices: dict[str, Device] = {}
@@ -180,7 +180,7 @@ def _tables(root: Mapping[str, Any], section: str, errors: list[str]) -> list[tu
     good = []
     for name, table in found.items():
         if not isinstance(table, dict):
-            errors.append(f"[{section}] {name}: want a table [{section}.{name}]")
+            errors.append(f"[{section}].{name}: want a table [{section}.{name}]")
         elif not _is_name(name) and section == "device":
             errors.append(
                 f"[device.{name}]: a device name is letters, digits, - and _, beginning with a letter"
@@ -195,7 +195,7 @@ def _tables(root: Mapping[str, Any], section: str, errors: list[str]) -> list[tu
 def _list(root: Mapping[str, Any], section: str, kind: type[Table], errors: list[str]) -> list[Table]:
     found = root.get(section, [])
     if not isinstance(found, list):
-        errors.append(f"{section}: want tables [[{section}]]")
+        errors.append(f"[{section}]: want tables [[{section}]]")
         return []
     each = [_convert(table, kind, f"[[{section}]] number {i}", errors) for i, table in enumerate(found, 1)]
     return [table for table in each if table is not None]
@@ -231,8 +231,10 @@ def _strange(value: object, where: str, depth: int = 0) -> Iterator[str]:
         if depth > DEEPEST:
             yield f"{where}: nested deeper than {DEEPEST}; no key of a device is"
             return
-        for key, each in value.items() if isinstance(value, dict) else enumerate(value, 1):
-            yield from _strange(each, f"{where}.{key}" if isinstance(value, dict) else where, depth + 1)
+        for key, each in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _strange(
+                each, f"{where}.{key}" if isinstance(value, dict) else f"{where}[{key}]", depth + 1
+            )
     elif isinstance(value, int) and not -(2**63) <= value < 2**63:
         yield f"{where}: an integer of more than 64 bits; no key of a device takes one"
     elif not isinstance(value, (str, int, float)):

@@ -183,11 +183,11 @@ class Loader:
 
     def _stop_sources(self, names: NameTable) -> dict[str, list[list[int]]]:
         found: dict[str, list[list[int]]] = {}
-        for source in self._config.stop_sources:
+        for number, source in enumerate(self._config.stop_sources, 1):
             node = names.nodes.get(source.node)
             if node is None or names.block(node).node_class.name != "BINARY" or len(node.channels) != 1:
                 names.errors.append(
-                    f"[[emergency_stop]]: node = {source.node}; want the name of one binary input"
+                    f"[[emergency_stop]] number {number}: node = {source.node}; want the name of one binary input"
                 )
                 continue
             found.setdefault(node.device, []).append(
@@ -197,10 +197,12 @@ class Loader:
 
     def _alarms(self, names: NameTable) -> dict[str, list[list[Any]]]:
         found: dict[str, list[list[Any]]] = {}
-        for alarm in self._config.alarms:
+        for number, alarm in enumerate(self._config.alarms, 1):
             node = names.nodes.get(alarm.node)
             if node is None or names.block(node).node_class.name != "ANALOG":
-                names.errors.append(f"[[alarm]]: node = {alarm.node}; want the name of an analog node")
+                names.errors.append(
+                    f"[[alarm]] number {number}: node = {alarm.node}; want the name of an analog node"
+                )
                 continue
             low = [-math.inf if limit is None else limit for limit in (alarm.lolo, alarm.low)]
             high = [math.inf if limit is None else limit for limit in (alarm.high, alarm.hihi)]

@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
             # Another program by design: tools know no daemon.
             os.execv(
                 sys.executable,
-                [sys.executable, "-m", "sioms.daemon.main", "--check", "--config", args.config],
+                [sys.executable, "-P", "-m", "sioms.daemon.main", "--check", "--config", args.config],
             )
     return 0
 

@@ -103,7 +103,7 @@ def read_settings(driver: type[Driver], table: Mapping[str, Any], folder: str) -
     known = field_names(kind)
     errors = []
     # The validator names one error; all are looked for only when there is one.
-    top = {field.encode_name for field in msgspec.structs.fields(kind)}
+    top = [field.encode_name for field in msgspec.structs.fields(kind)]
     for key in [k for k in table if k not in top]:
         errors.append(f": unknown key {key}{did_you_mean(key, top)}")
         del table[key]

@@ -169,5 +169,5 @@ def test_alarms_show_and_a_wrong_one_is_told(start_daemon: Callable[..., Daemon]
         assert reading.data[:2] == (pytest.approx(1.0), pytest.approx(2.0))
         assert (flags[0], flags[1], flags[0].severity) == (sioms.AnalogStatus.HIGH, 0, 1)
     daemon.configure(text.replace("hihi = 2.0", "hihi = 1.0").replace('node = "force0.fy"', 'node = "io0"'))
-    with daemon.cell() as cell, raises(errno.EINVAL, "[[alarm]]: node = io0"):
+    with daemon.cell() as cell, raises(errno.EINVAL, "[[alarm]] number 2: node = io0"):
         cell.reload()

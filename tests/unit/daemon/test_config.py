@@ -45,7 +45,7 @@ def test_all_errors_at_once_in_the_order_of_the_sections() -> None:
         '[workcel]\n[workcell]\nnam = "x"\n[device.a]\n[device.b]\ndriver = 3\n[node.n]\n[[grant]]\nrights = []\nuser = ["x"]\n'
     )
     assert [line.split(":")[0].split(";")[0] for line in found] == [
-        "unknown section [workcel]", "[workcell]", "[device.a]", "[device.b].driver", "[node.n]", "[[grant]] number 1",
+        "[workcel]", "[workcell]", "[device.a]", "[device.b].driver", "[node.n]", "[[grant]] number 1",
     ]  # fmt: skip
     assert "did you mean workcell?" in found[0] and "did you mean name?" in found[1]
     assert "key driver is missing" in found[2] and "did you mean users?" in found[5]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import msgspec
+import pytest
 
 from sioms.daemon.config import parse
 from sioms.daemon.lines import with_lines
@@ -79,3 +80,51 @@ def test_all_errors_of_nested_tables() -> None:
     ]
     assert every_error("d", {"axis": [], "rate": -1.0}, Device) == ["d: rate below 0"]
     assert every_error("d", {"axis": []}, Device) == []
+
+
+AXES = '''name = "top"
+[workcel]
+[[workcell.x]]
+a = 1
+[ device . "mod0" ]
+description = """
+history = 1
+[device.no]
+"""
+  history = "x"   # here
+[[device.mod0.axis]]
+name = "x"
+motor.mass = "heavy"
+[[device.mod0.axis]]
+name = "y"
+position_max = 0.0
+  position_min = 1.0
+[[workcell]]
+[[emergency_stop]]
+node = "nosuch"
+'''
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        ("[name]: unknown section", 1),
+        ("[workcel]: unknown section; did you mean workcell?", 2),
+        ("[workcell]: unknown key x; there are: name", 3),
+        ("[device.mod0].history: expected `int`, got `str`", 10),
+        ("[device.mod0]: key rate is missing", 5),
+        ("[device.mod0].axis[0].motor.mass: expected `float`, got `str`", 13),
+        ("[device.mod0].axis[1].motor.mass: expected", 14),
+        ("[device.mod0]: axis y: position_min 1 is not below position_max 0", 17),
+        ("[device.mod0]: axis y: it has no encoder", 14),
+        ("[device.mod0]: axis z: no such axis", 5),
+        ("[device.mod0].axis[1].position_min = 2020-01-01: no key of a device takes a date", 17),
+        ("[workcell]: expected `object`, got `array`", 18),
+        ("[[emergency_stop]] number 1: node = nosuch; want the name of one binary input", 20),
+        ("[device.other]: not there", 0),
+    ],
+)
+def test_lines_of_tables_keys_and_named_axes(error: str, line: int) -> None:
+    told = [error]
+    with_lines(AXES, told)
+    assert told == [f"line {line}: {error}" if line else error]
