@@ -8,8 +8,8 @@ then has a table ``shape``:
     load_node = "lord1.fz"               # optional: a force sensor under the finger
     load_scale = 50.0                    # N/m for a newton: one over the length of contact in metres
 
-Requests on ``strain`` and ``shape``: ZERO_DEVICE takes a new baseline from the next frames, CALIBRATE_DEVICE with
-the text of a finger's file loads that finger; on ``strain`` SET_GAINS and GET_GAINS hold strain per output.
+Requests on ``strain`` and ``shape``: ZERO_DEVICE takes a new baseline from the next frames and is answered when it is in force, or refused when
+something touches or the elements fail; CALIBRATE_DEVICE with the text of a finger's file loads that finger, without an argument its own again; on ``strain`` SET_GAINS and GET_GAINS hold strain per output.
 
 The physics is imported when there is a finger: it brings scipy, which takes a second, and drivers of many other sensors have
 this part, too.
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, BlockSpec
-from sioms.sdk.driver import Kit, Refusal
+from sioms.sdk.driver import Awaited, Kit, Refusal
 
 if TYPE_CHECKING:
     from sioms.tactile.finger import Finger
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 STRAIN, SHAPE = "strain", "shape"
+MOST_FRAMES = 100_000
+"""Frames that a baseline may be averaged from."""
 
 
 class ShapeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -154,19 +156,41 @@ class TactileNodes:
         try:
             match request:
                 case Request.ZERO_DEVICE:
-                    self._sensor.zero()
-                    return [0.0] * len(block.channels)
+                    return self._rebase(block, argument)
                 case Request.CALIBRATE_DEVICE:
                     return self._load_finger(argument)
                 case Request.GET_GAINS if on_strain:
                     return self._sensor.gains.ravel().tolist()
                 case Request.SET_GAINS if on_strain:
                     return self._set_gains(argument)
+        except OSError as error:
+            raise Refusal(errno.EIO, f"finger_file {self._settings.finger_file}: {error.strerror}") from None
         except ValueError as error:
             raise Refusal(errno.EINVAL, str(error)) from None
         raise Refusal(errno.ENOTTY, f"{request.name} is not a request {block.name} knows")
 
+    def _rebase(self, block: BlockSpec, argument: Any) -> Awaited:
+        frames = 1 if argument is None else argument
+        if type(frames) is not int or not 1 <= frames <= MOST_FRAMES:
+            raise Refusal(errno.EINVAL, f"{argument!r} frames; want 1 to {MOST_FRAMES}")
+        sensor = self._sensor
+        try:
+            rebase = sensor.rebase(frames, self._kit.now_ns())
+        except ValueError as error:
+            raise Refusal(errno.EBUSY, f"{error}; the baseline stays as it was") from None
+
+        def ready() -> tuple[list[float]] | None:
+            if rebase.refused:
+                raise Refusal(errno.EBUSY, f"{rebase.refused}; the baseline stays as it was")
+            if self._sensor is not sensor:
+                raise Refusal(errno.ECANCELED, "another finger has been loaded meanwhile")
+            return ([0.0] * len(block.channels),) if rebase.done else None
+
+        return Awaited(ready)
+
     def _load_finger(self, text: Any) -> str:
+        if text is None or text == []:
+            text = Path(self._settings.finger_file).read_text(encoding="utf-8")
         if not isinstance(text, str):
             raise Refusal(errno.EINVAL, f"{type(text).__name__} given; want the text of a finger's file")
         from sioms.tactile.finger import from_toml

@@ -250,6 +250,24 @@ def own_time(world: list[World]) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def worlds() -> Iterator[Callable[..., World]]:
+    """Give what makes a world of a driver's class, its settings, a seed and perhaps a device, the last of which is the one there is."""
+    made: list[World] = []
+    with own_time(made):
+
+        def make(
+            driver: type[Driver], table: dict[str, Any], seed: int, device: Device | None = None
+        ) -> World:
+            made[:] = [World.__new__(World)]
+            made[0].__init__(driver, table, random.Random(seed), device)  # type: ignore[misc]
+            return made[0]
+
+        yield make
+        for world in made:
+            world.close()
+
+
 def world_device(world: list[World], settings: LineSettings) -> Any:
     """Return the connection to the device of the world that is being made."""
     device = DEVICE[-1]

@@ -304,7 +304,20 @@ class AnalogNode(Node):
         return self.write(self._outputs(values))
 
     def zero(self, samples: int = 1, timeout: float | None = 10.0) -> list[float]:
-        """Take the mean of the next readings as offset; return what it was."""
+        """Take the mean of the next readings as offset; return what it was.
+
+        Readings that were measured before the request, INVALID or SATURATED ones do not count. What is read after it counts from
+        the new zero.
+
+        Args:
+            samples: readings to be averaged, from 1.
+            timeout: longest wait [s], None = for ever.
+
+        Raises:
+            OSError: EIO as many bad readings came as good ones were asked for, or the device is lost; EBUSY a tactile finger is touched
+                or blind; the offset is then as before.
+            TimeoutError: too few readings came in time.
+        """
         value: list[float] = self.ioctl(Request.ZERO_DEVICE, samples, timeout)
         return value
 

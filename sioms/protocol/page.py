@@ -141,6 +141,11 @@ class PageWriter:
         """Number of the newest snapshot, 0 before the first."""
         return self._number
 
+    @property
+    def as_of_ns(self) -> int:
+        """``as_of_ns`` of the newest snapshot, 0 before the first."""
+        return self._words[(HEADER_SIZE + (self._number & self._mask) * self._size >> 3) + 3]
+
     def alive(self, now_ns: int) -> None:
         """Stamp the driver as alive [ns, CLOCK_MONOTONIC]."""
         self._words[_ALIVE] = now_ns

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.protocol.flags import NodeClass
+from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.protocol.records import READ_FIELDS
 
@@ -97,6 +97,14 @@ class Block:
         return self.fields.data.cast("B")
 
 
+_NO_MEASUREMENT = int(AnalogStatus.INVALID | AnalogStatus.SATURATED)
+
+
+def unfit(flags: NDArray[np.int64], data: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which readings are no measurement."""
+    return np.asarray((flags & _NO_MEASUREMENT != 0) | ~np.isfinite(data))
+
+
 class AnalogBlock(Block):
     """Analog channels: ``data`` (n,) in declared units and ``flags`` (n,) of AnalogStatus.
 
@@ -121,6 +129,14 @@ class AnalogBlock(Block):
         self._shown = np.zeros_like(self.fields)
         self._shown_flags = self._shown.view(np.int64)[1]
         self._bytes = self._shown.data.cast("B")
+
+    def unfit(self) -> NDArray[np.bool_]:
+        """Return which readings are no measurement, so that no offset may come from them, shape (n,)."""
+        return unfit(self.flags, self.data)
+
+    def set_offset(self, channels: NDArray[np.intp], offset: NDArray[np.float64]) -> None:
+        """Take readings of some channels for their zero from now on."""
+        self.offset[channels] = offset
 
     def payload(self) -> memoryview:
         """Return the readings, corrected, as bytes in page order."""

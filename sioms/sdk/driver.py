@@ -21,6 +21,7 @@ from __future__ import annotations
 import errno
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import msgspec
@@ -75,6 +76,21 @@ class Kit(Protocol):
 
     def publish(self, block: AnyBlock, stamp_ns: int) -> None:
         """Publish a block now; only stream drivers need it, for several frames in one feed."""
+
+    def now_ns(self) -> int:
+        """Return the time [ns, CLOCK_MONOTONIC]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Awaited:
+    """The answer of ``Driver.ioctl`` to a request that readings to come will have done.
+
+    Args:
+        ready: asked after each publication: (value,) when it is done, None while it is not; raises Refusal when it cannot be.
+            A device that is lost, and the client's time-out, end the request without it.
+    """
+
+    ready: Callable[[], tuple[Any] | None]
 
 
 class Refusal(Exception):
@@ -145,7 +161,7 @@ class Driver(ABC):
         """Answer a request that the kit does not answer itself: CALIBRATE_DEVICE of a sensor with a tare of its own ...
 
         The kit answers all axis requests through the bank, and zero and gains of analog blocks. Return a
-        msgpack-able value, or in a driver with a line the steps that end in one.
+        msgpack-able value, ``Awaited`` for one that comes with later readings, or in a driver with a line the steps that end in one.
 
         Raises:
             Refusal: not supported or not now.

@@ -8,11 +8,12 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 
-from .blocks import AnalogBlock, BlockSpec
+from .blocks import AnalogBlock, BlockSpec, unfit
 from .driver import Kit, Refusal
 from .settings import LineSettings
 
@@ -88,7 +89,8 @@ class ForceBlock(AnalogBlock):
         self.saturated = self.invalid = 0
         self.is_zeroed = False
         self._lost_zero = ""
-        self._offset_then = self.offset.copy()
+        self._zeroless = np.zeros(self.n, dtype=np.bool_)  # without a zero since it was lost
+        self._measured = np.zeros(self.n, dtype=np.int64)  # the flags but for that
         self._status = "ok"
         self._told, self._told_ns = "ok", -SAY_AGAIN_NS
 
@@ -113,8 +115,21 @@ class ForceBlock(AnalogBlock):
             return
         self.is_zeroed = False
         self._lost_zero = f"zero lost: {why}; zero it again"
-        self._offset_then = self.offset.copy()
+        self._zeroless[:] = True
+        self._measured[:] = self.flags
         self._kit.log("error", f"{self._device}: {self._lost_zero}: its readings are INVALID until then")
+
+    def unfit(self) -> NDArray[np.bool_]:
+        """Return which readings are no measurement; one that only lacks a zero is."""
+        return unfit(self._measured if self._lost_zero else self.flags, self.data)
+
+    def set_offset(self, channels: NDArray[np.intp], offset: NDArray[np.float64]) -> None:
+        """Take readings of some channels for their zero; when all have one again, none is lost any more."""
+        super().set_offset(channels, offset)
+        self._zeroless[channels] = False
+        if self._lost_zero and not self._zeroless.any():
+            self._lost_zero = ""
+            self._kit.log("info", f"{self._device}: zeroed again")
 
     def set_scale(self, force_n: float, torque_nm: float) -> None:
         """Tell what one of the sensor's numbers is [N], [N m]."""
@@ -135,8 +150,6 @@ class ForceBlock(AnalogBlock):
         """
         data = self.data
         np.multiply(values, self._scale, out=data)
-        if self._lost_zero:
-            flags |= self._judge_zero()
         np.abs(data, out=self._size)
         self.flags[:] = flags
         # one comparison for the ordinary case: not-a-number is not smaller either
@@ -144,6 +157,10 @@ class ForceBlock(AnalogBlock):
             self.flags[self._size >= self._limit] |= int(AnalogStatus.SATURATED)
             self.flags[~np.isfinite(data)] |= int(AnalogStatus.INVALID)
             flags = int(np.bitwise_or.reduce(self.flags))
+        if self._lost_zero:
+            self._measured[:] = self.flags
+            self.flags[self._zeroless] |= int(AnalogStatus.INVALID)
+            flags |= int(AnalogStatus.INVALID)
         if flags:
             self.saturated += bool(flags & AnalogStatus.SATURATED)
             self.invalid += bool(flags & AnalogStatus.INVALID)
@@ -155,10 +172,3 @@ class ForceBlock(AnalogBlock):
         if status != self._told and now_ns - self._told_ns >= SAY_AGAIN_NS:
             self._told, self._told_ns = status, now_ns
             self._kit.log("info" if status == "ok" else "warning", f"{self._device}: status: {status}")
-
-    def _judge_zero(self) -> int:
-        if np.array_equal(self.offset, self._offset_then):
-            return int(AnalogStatus.INVALID)
-        self._lost_zero = ""  # ZERO_DEVICE has set another one since
-        self._kit.log("info", f"{self._device}: zeroed again")
-        return 0

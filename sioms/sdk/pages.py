@@ -69,6 +69,10 @@ class Pages:
         """Return the number of a block's newest snapshot."""
         return self._writers[id(block)].number
 
+    def as_of_ns(self, block: AnyBlock) -> int:
+        """Return the instant before which everything shows in a block's newest snapshot, 0 without one."""
+        return self._writers[id(block)].as_of_ns
+
     def subscribers(self, block: AnyBlock) -> list[Handle]:
         """Return who is woken by a block's publications; the list itself, to be changed."""
         return self._subscribers[id(block)]

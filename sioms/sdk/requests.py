@@ -17,7 +17,7 @@ from sioms.motion import CommandError
 from sioms.protocol.flags import Request, Right
 
 from .blocks import AnalogBlock, AxisBlock
-from .driver import Refusal
+from .driver import Awaited, Refusal
 from .handles import LATER, Handle, Wait
 from .writing import check_link
 
@@ -116,6 +116,8 @@ def ioctl(
     except Exception as error:  # what a client asks for must not end what others do with the device
         runtime.log("error", f"{what} with {argument!r:.80}: the driver failed: {error!r}")
         raise _refuse(errno.EIO, f"{what}: the driver failed: {error!r}") from None
+    if isinstance(answer, Awaited):
+        return _await(runtime, handle, number, answer, timeout_s, what)
     if not isinstance(answer, Generator):
         return answer
     check_link(runtime, handle, what)
@@ -195,30 +197,57 @@ def _axis_request(
 def _zero_analog(
     runtime: Runtime, handle: Handle, number: int, argument: Any, timeout_s: float | None, what: str
 ) -> Any:
-    """Take the mean of the next readings as offset."""
-    block = handle.block
+    """Take the mean of the next good readings as offset; as many bad ones as good ones are asked for refuse it."""
+    block, channels = handle.block, handle.channels
+    assert isinstance(block, AnalogBlock)
     samples = 1 if argument is None else argument
     if type(samples) is not int or not 1 <= samples <= 1_000_000:
         raise _refuse(errno.EINVAL, f"{what}: {samples!r} samples; want 1 to 1000000")
-    total = np.zeros(len(handle.channels))
-    seen = 0
-    last = runtime.published(block)
+    check_link(runtime, handle, what)
+    total = np.zeros(len(channels))
+    good = bad = 0
+    last, asked_ns = runtime.published(block), runtime.now_ns()
 
     def ready() -> tuple[Any] | None:
-        nonlocal seen, last
+        nonlocal good, bad, last
         now = runtime.published(block)
-        if now == last:
-            return None
+        if now == last or runtime.pages.as_of_ns(block) < asked_ns:
+            return None  # nothing new, or something measured before
         last = now
-        total[:] += block.data[handle.channels]  # type: ignore[union-attr]
-        seen += 1
-        if seen < samples:
+        unfit = block.unfit()[channels]
+        if unfit.any():
+            bad += 1
+            if bad < samples:
+                return None
+            names = ", ".join(block.spec.channels[channel].name for channel in channels[unfit])
+            raise _refuse(
+                errno.EIO,
+                f"{what}: {bad} readings of {good + bad} were no measurement (last {names}: INVALID, SATURATED or not finite); "
+                "the offset stays as it was",
+            )
+        total[:] += block.data[channels]
+        good += 1
+        if good < samples:
             return None
         mean = total / samples
-        if not np.isfinite(mean).all():
-            raise _refuse(errno.EIO, f"{what}: the readings are not finite; the offset stays as it was")
-        block.offset[handle.channels] = mean  # type: ignore[union-attr]
+        block.set_offset(channels, mean)
         return (mean.tolist(),)
+
+    runtime.waits.add(Wait(handle, number, what, runtime.deadline(timeout_s), ready))
+    return LATER
+
+
+def _await(
+    runtime: Runtime, handle: Handle, number: int, answer: Awaited, timeout_s: float | None, what: str
+) -> Any:
+    """Answer when the driver has seen done what was asked."""
+    check_link(runtime, handle, what)
+
+    def ready() -> tuple[Any] | None:
+        try:
+            return answer.ready()
+        except Refusal as error:
+            raise _refuse(error.errno, f"{what}: {error}") from None
 
     runtime.waits.add(Wait(handle, number, what, runtime.deadline(timeout_s), ready))
     return LATER

@@ -11,8 +11,8 @@ While untouched the baseline follows the readings, each element by a Kalman filt
 drift time in long rests (temperature moves it by per cents an hour), faster after a touch in which nothing was seen of
 it, and hardly while what the touch left of creep is above the noise. So touches in quick succession leave it what
 little their pauses tell. A touch is what rises above the noise in sum over all elements, what all have in common
-left out; it ends at half that level.  A touch from the first frame on cannot be told from an offset: call `zero`
-untouched.
+left out; it ends at half that level.  A touch from the first frame on cannot be told from an offset: call `rebase`
+untouched, which keeps the old baseline until the new one is there and found to be steady, or `zero`, which trusts its caller.
 
 What is no touch is kept from freezing the baseline (`sioms.tactile.witness`):
 an element that moves alone is suspect and left out, until it has stood still for `RECOVER_S` while nothing touched: then it gets a
@@ -35,6 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from sioms.tactile.finger import Finger
 from sioms.tactile.linearity import linearise
 from sioms.tactile.model import StrainTable
+from sioms.tactile.rest import Rebase, Rest
 from sioms.tactile.witness import FEWEST, TOUCH_SIGMA, Sight, Witness, moves_alone
 
 Floats = NDArray[np.float64]
@@ -125,20 +126,43 @@ class SignalChain:
         self._last: Floats = np.full(self._count, np.nan)
         self._same: NDArray[np.int64] = np.zeros(self._count, dtype=np.int64)
         self._stamp_ns: int | None = None
+        self._rebasing: Rebase | None = None
         self.zero()
 
     def zero(self) -> None:
         """Forget the baseline and take a new one from the next frames; the finger must be untouched."""
-        self._sum = np.zeros(self._count)
-        self._seen = np.zeros(self._count)
-        self._left = self._settle
-        self._baseline = np.zeros(self._count)
+        self._rebasing = None
+        self._first: Rest | None = Rest(self._count, self._settle)
+        self._scale = 1.0
+        self._begin(np.zeros(self._count), self._settle)
+
+    def rebase(self, frames: int = 0, since_ns: int = 0) -> Rebase:
+        """Take a new baseline from the next frames; the old one holds until that is done, or if it is refused.
+
+        Args:
+            frames: to be averaged, the finger being untouched and still; at least those of the first baseline.
+            since_ns: frames with older stamps do not count.
+
+        Returns:
+            How it goes; it ends with one of the next frames.
+        """
+        rest = Rest(self._count, max(frames, self._settle))
+        if self._first is not None:
+            self._first = rest
+        if self._rebasing is None:
+            self._rebasing = Rebase(rest, since_ns, self._touched)
+        else:  # who asked before is served by this one, too
+            rest.left = rest.frames = max(rest.frames, self._rebasing.rest.frames)
+            self._rebasing.rest, self._rebasing.since_ns = rest, since_ns
+        return self._rebasing
+
+    def _begin(self, baseline: Floats, frames: int) -> None:
+        """Begin anew, untouched, with a baseline that so many frames made."""
+        self._baseline = baseline
         self._touched = False
         # of the baseline, in squares of the noise; and what creep may have left in the readings
-        self._variance = np.full(self._count, 1.0 / self._settle)
+        self._variance = np.full(self._count, 1.0 / frames)
         self._crept = np.zeros(self._count)
-        self._first, self._square = np.zeros(self._count), np.zeros(self._count)
-        self._scale = 1.0
         self._is_noisy = False
         self._suspect: Flags = np.zeros(self._count, dtype=np.bool_)
         self._still_s, self._stood, self._mark = (np.zeros(self._count) for _ in range(3))
@@ -207,8 +231,8 @@ class SignalChain:
         dead = self._watch(reading, finite)
         alive = finite & ~saturated & ~dead & self._used
         output = np.where(alive, reading, 0.0) * self._signal.scale
-        if self._left > 0:
-            self._start(output, alive)
+        if self._first is not None:
+            self._start(self._first, output, alive, stamp_ns)
             return StrainFrame(np.full(self._count, np.nan), alive, saturated, dead, False, False, math.nan)
         usable = alive & ~self._suspect
         sight = self._witness.sight(usable)
@@ -220,7 +244,10 @@ class SignalChain:
             usable, strength = self._judge(change, usable, sight)
             self._follow(change, usable, elapsed_s)
             self._recover(output, alive, elapsed_s)
-        return self._told(change, usable, saturated, dead, strength, sight.blind)
+        told = self._told(change, usable, saturated, dead, strength, sight.blind)
+        if self._rebasing is not None:
+            self._rebase(self._rebasing, output, alive, stamp_ns, sight.blind)
+        return told
 
     def _judge(self, change: Floats, usable: Flags, sight: Sight) -> tuple[Flags, float]:
         """Find whether there is a touch; an element that moves alone is suspect from then on, a step of all is taken up."""
@@ -331,30 +358,85 @@ class SignalChain:
         count = int(np.count_nonzero(elements))
         return bool(count > 0 and np.count_nonzero(self._changes[elements] > _NOISY) >= _MOST_NOISY * count)
 
-    def _start(self, output: Floats, alive: Flags) -> None:
+    def _start(self, rest: Rest, output: Floats, alive: Flags, stamp_ns: int) -> None:
         """Take a frame for the first baseline; frames in which few elements read anything do not count."""
-        if np.count_nonzero(alive) < max(FEWEST, 0.5 * np.count_nonzero(self._used)):
+        asked = self._rebasing
+        if asked is not None and stamp_ns < asked.since_ns:
             return
-        self._first = np.where(alive & (self._seen == 0.0), output, self._first)
-        self._sum += output
-        self._square += np.where(alive, (output - self._first) ** 2, 0.0)
-        self._seen += alive
-        self._left -= 1
-        if self._left == 0:
-            seen = np.maximum(self._seen, 1.0)
-            self._baseline = self._sum / seen
-            self._suspect = self._used & (self._seen < 0.5 * self._settle)
-            self._scale = self._louder(seen)
-            self._weigh()
+        if self._is_seen(alive):
+            rest.take(output, alive)
+        elif asked is not None:
+            self._miss(asked, alive)
+            if asked.refused:
+                self._rebasing = None
+        if rest.left == 0:
+            self._first = None
+            self._settled(rest)
 
-    def _louder(self, seen: Floats) -> float:
+    def _rebase(self, asked: Rebase, output: Floats, alive: Flags, stamp_ns: int, blind: bool) -> None:
+        """Take a frame for another baseline, unless it shows that there can be none."""
+        if stamp_ns < asked.since_ns:
+            return
+        rest = asked.rest
+        if blind or not self._is_seen(alive):
+            self._miss(asked, alive)
+        elif self._touched is not asked.touched:
+            asked.refused = (
+                "it was touched or released while its baseline was taken; keep off, and zero it again"
+            )
+        else:
+            rest.take(output, alive)
+            if rest.left == 0:
+                self._judge_rest(asked)
+        if rest.left == 0 or asked.refused:
+            self._rebasing = None
+
+    def _judge_rest(self, asked: Rebase) -> None:
+        """Take the baseline that has been averaged if the elements stood still; those that moved alone are suspect."""
+        rest = asked.rest
+        step = rest.moved(self._noise)
+        usable = rest.known & ~self._suspect
+        if self._has_moved(step, usable):
+            alone = moves_alone(np.where(usable, step, 0.0), self._witness.sight(usable).followed)
+            if alone is not None:
+                usable[alone] = False
+            if alone is None or self._has_moved(step, usable):
+                asked.refused = (
+                    "its readings moved while the baseline was taken, as those of something that touches; "
+                    "keep off, and zero it again"
+                )
+                return
+        self._settled(rest)
+        self._suspect |= step > _STILL**2
+
+    def _has_moved(self, step: Floats, usable: Flags) -> bool:
+        count = int(np.count_nonzero(usable))
+        return float(step[usable].sum()) > count + TOUCH_SIGMA * math.sqrt(2.0 * count)
+
+    def _is_seen(self, alive: Flags) -> bool:
+        return bool(np.count_nonzero(alive) >= max(FEWEST, 0.5 * np.count_nonzero(self._used)))
+
+    def _miss(self, asked: Rebase, alive: Flags) -> None:
+        asked.missed += 1
+        if asked.missed >= asked.rest.frames:
+            asked.refused = (
+                f"it is blind: {np.count_nonzero(alive)} of {self._count} elements gave readings that can be believed; "
+                "see to the elements and their converter"
+            )
+
+    def _settled(self, rest: Rest) -> None:
+        self._scale = self._louder(rest)
+        self._begin(rest.mean, rest.frames)
+        self._suspect = self._used & ~rest.known
+        if self._rebasing is not None:
+            self._rebasing.done, self._rebasing = True, None
+
+    def _louder(self, rest: Rest) -> float:
         """Return the noise's variance over that of the finger's file, 1 if the first readings do not tell it is more."""
-        known, freedom = self._seen > 1.0, float(np.sum(seen - 1.0))
-        if not known.any():
+        ratio, freedom = rest.variance / self._own_noise, float(np.sum(np.maximum(rest.seen - 1.0, 0.0)))
+        if not np.isfinite(ratio).any():
             return 1.0
-        away = (self._baseline - self._first) ** 2
-        ratio = (self._square - seen * away)[known] / (seen - 1.0)[known] / self._own_noise[known]
-        found = float(np.median(ratio))
+        found = float(np.nanmedian(ratio))
         return min(found, _MOST_SCALE) if found > 1.0 + 6.0 * math.sqrt(2.0 / freedom) + 0.2 else 1.0
 
     def _touch(self, strength: float, count: int) -> None:

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sioms.tactile.chain import SETTLE_FRAMES, Held, SignalChain, StrainFrame
-from sioms.tactile.estimator import Estimator, Load, Quality, ShapeEstimate, nothing
+from sioms.tactile.estimator import Estimator, Load, Quality, ShapeEstimate, State, nothing, state_of
 from sioms.tactile.finger import Finger
+from sioms.tactile.rest import Rebase
 from sioms.tactile.witness import FEWEST
 
 Floats = NDArray[np.float64]
@@ -133,12 +134,44 @@ class ShapeSensor:
         self._verdict = Quality.GOOD
         self._tare = tare
         self._stamp_ns: int | None = None
+        self._rebasing: Rebase | None = None
+        self._last = nothing(Quality.NO_BASELINE)
 
     def zero(self) -> None:
-        """Take a new baseline from the next frames; the finger must be untouched."""
+        """Forget the baseline and take a new one from the next frames, whatever they show; the finger must be untouched."""
         self._chain.zero()
+        self._rebasing = None
         if self._tare is not None:
             self._tare.zero()
+
+    def rebase(self, frames: int = 0, since_ns: int = 0) -> Rebase:
+        """Take a new baseline, and what the force sensor reads untouched, from the next frames; the old one holds until then.
+
+        A pull is no hindrance: it is what a finger shows that got its baseline under a touch.
+
+        Args:
+            frames: to be averaged, at least `settle_frames`.
+            since_ns: frames with older stamps do not count.
+
+        Returns:
+            How it goes: done, or refused where something touches meanwhile, or the elements fail, with one of the next `frame` calls.
+
+        Raises:
+            ValueError: something touches, or the finger is blind.
+        """
+        quality = self._last.quality
+        state = state_of(quality)
+        if state is State.BLIND and Quality.NO_BASELINE not in quality:
+            raise ValueError(
+                "it is blind: its elements cannot tell whether anything touches; see to them and their converter"
+            )
+        if state in (State.TOUCHED, State.DOUBTFUL) and Quality.WRONG_SIGN not in quality:
+            raise ValueError(
+                f"{_told(self._last)}: lift that off and zero it again; if nothing touches, load the finger's file anew, which "
+                "takes what is there for untouched"
+            )
+        self._rebasing = self._chain.rebase(frames, since_ns)
+        return self._rebasing
 
     @property
     def gains(self) -> Floats:
@@ -165,7 +198,8 @@ class ShapeSensor:
             ValueError: wrong number of readings, or a stamp before the last one.
         """
         strain, load = self.strain(raw, stamp_ns, reading)
-        return Sensed(strain, self.shape(strain, load))
+        self._last = self.shape(strain, load)
+        return Sensed(strain, self._last)
 
     def strain(
         self, raw: ArrayLike, stamp_ns: int, reading: float | None = None
@@ -174,6 +208,10 @@ class ShapeSensor:
         strain = self._chain.frame(raw, stamp_ns)
         elapsed_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
         self._stamp_ns = stamp_ns
+        if self._rebasing is not None and (self._rebasing.done or self._rebasing.refused):
+            if self._rebasing.done and self._tare is not None:
+                self._tare.zero()
+            self._rebasing = None
         if not strain.settled or strain.blind or self._tare is None or reading is None:
             return strain, None
         return strain, self._tare.load(reading, strain.touched, elapsed_s)
@@ -212,6 +250,13 @@ class ShapeSensor:
         if shape.quality & _NOT_ONE or (shape.usable and shape.misfit > MEAN_MISFIT):
             return Quality.POOR_FIT
         return Quality.GOOD
+
+
+def _told(shape: ShapeEstimate) -> str:
+    """Return in words what touches."""
+    if not shape.usable:
+        return "something touches it"
+    return f"it is touched ({shape.load_n_per_m:.0f} N/m at {math.degrees(shape.angle_rad):.0f} degrees)"
 
 
 def numbers(sensed: Sensed) -> tuple[float, ...]:

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 from daemon_rig import axes
-from own_writes_rig import DEVICE, Client, Device, OnLine, Pushing, World, own_time
+from own_writes_rig import DEVICE, Client, Device, OnLine, Pushing, World, worlds
 
 from sioms.client import shown
 from sioms.client.command import command
@@ -91,19 +91,8 @@ def _play(
 
 @pytest.fixture
 def make_world() -> Any:
-    made: list[World] = []
-    with own_time(made):
-
-        def make(driver: Any, table: dict[str, Any], seed: int, device: Device | None = None) -> World:
-            made[:] = []
-            world = World.__new__(World)
-            made.append(world)
-            world.__init__(driver, table, random.Random(seed), device)  # type: ignore[misc]
-            return world
-
+    with worlds() as make:
         yield make
-        for world in made:
-            world.close()
 
 
 def _axis_acts(

@@ -17,12 +17,15 @@ class Bench:
     """Runs drivers tick by tick and couples them through pages, as the daemon does."""
 
     def __init__(self):
-        self.now_ns = 1_000_000_000
+        self.clock_ns = 1_000_000_000
         self.published = []
         self.inputs = {}
         self.markers = Markers(MarkerTable(memoryview(bytearray(TABLE_SIZE))), lambda number: None)
         self._pages = []
         self._drivers = []
+
+    def now_ns(self):
+        return self.clock_ns
 
     def log(self, level, text):
         raise AssertionError(f"{level}: {text}")
@@ -52,12 +55,12 @@ class Bench:
         """Tick all drivers, in the order in which they were made."""
         period = min(period for _, period in self._drivers)
         for _ in range(round(seconds * 1e9 / period)):
-            self.now_ns += period
+            self.clock_ns += period
             for driver, own in self._drivers:
-                if self.now_ns % own == 0:
-                    driver.tick(self.now_ns)
+                if self.clock_ns % own == 0:
+                    driver.tick(self.clock_ns)
                     for block in driver.blocks:
-                        self._publish(block, self.now_ns)
+                        self._publish(block, self.clock_ns)
             if until is not None and until():
                 return
         if until is not None:
@@ -70,7 +73,7 @@ class Bench:
         records = np.zeros(1, numpy_dtype(NodeClass.AXIS))
         for name, value in fields.items():
             records[name] = value
-        driver.bank.append(records, np.arange(driver.bank.n), self.now_ns)
+        driver.bank.append(records, np.arange(driver.bank.n), self.clock_ns)
 
     def _page(self, device, block):
         spec = block.spec
@@ -88,7 +91,7 @@ class Bench:
 
     def _publish(self, block, stamp_ns):
         writer = next(writer for candidate, writer in self._pages if candidate is block)
-        writer.alive(self.now_ns)
+        writer.alive(self.clock_ns)
         writer.publish(block.payload(), stamp_ns, 0, 0)
 
 

@@ -250,7 +250,7 @@ def test_channels_of_a_converter_are_a_finger(sysfs: Path, bench: Any) -> None:
         output = -100.0 / 3.0 * array.strain(load, 1.2, 6e-3) + 0.02 * random.normal(size=16)
         for number, value in enumerate(output):
             attributes(values.folder, **{f"in_voltage{number}_raw": 2000.0 + 20.0 * value})
-        made.tick(bench.now_ns)
+        made.tick(bench.clock_ns)
         return dict(zip((name for name, _, _ in CHANNELS), made.blocks[2].data.tolist(), strict=True))
 
     made = bench.make(IioRaw, "adc0", table)

@@ -113,7 +113,7 @@ def test_homing_finds_the_switch_edge(bench):
     }
     mod = bench.make(SimAxes, "mod0", {"axis": [axis]})
     bench.run(0.01)
-    mod.bank.home([0], bench.now_ns)
+    mod.bank.home([0], bench.clock_ns)
     bench.run(5.0, until=lambda: bool(status(mod) & AxisStatus.HOMED))
     bench.run(0.5)
     # The new coordinate counts from the edge of the switch.
@@ -136,7 +136,7 @@ def test_late_ticks_cost_the_world_no_time(bench):
     axis = SERVO | {"motor": {"mass": 1.0, "load_force": 1.0}, "k": 0.0}
     mod = bench.make(SimAxes, "mod0", {"axis": [axis]})
     bench.run(0.005)
-    bench.now_ns += 20_000_000
+    bench.clock_ns += 20_000_000
     bench.run(0.005)
     seconds = 0.005 + 0.020 + 0.005 - 0.001
     assert mod.blocks[1].data[0] == pytest.approx(1.0 * seconds**2 / 2, rel=1e-9)
@@ -146,11 +146,11 @@ def test_the_world_is_the_same_whether_it_goes_on_before_the_tick_or_in_the_slac
     mods = [bench.make(SimAxes, name, {"axis": [SERVO, STEPPER]}) for name in ("mod0", "mod1")]
     told = [[], []]
     for at in (1, 2, 3, 4, 7, 8, 9, 300, 301, 302):  # some ticks late; the second device is given its slack
-        bench.now_ns = 1_000_000_000 + at * 1_000_000
+        bench.clock_ns = 1_000_000_000 + at * 1_000_000
         for mod, seen in zip(mods, told, strict=True):
-            mod.tick(bench.now_ns)
+            mod.tick(bench.clock_ns)
             seen.append(mod.bank.fields.copy())
-        mods[1].slack(bench.now_ns, bench.now_ns)
+        mods[1].slack(bench.clock_ns, bench.clock_ns)
         if at == 2:
             for mod in mods:
                 bench.write(mod, control_mode=ControlMode.VELOCITY, velocity=0.1)
@@ -177,7 +177,7 @@ def test_own_beams_show_the_crossing_in_the_tick_in_which_it_happens(bench):
     bench.run(0.01)
     bench.write(mod, control_mode=ControlMode.POSITION, position=0.2)
     bench.run(1.0, until=lambda: port.data[0] == 0b10)
-    assert 0 <= bench.now_ns - port.words[1, 0] < 1_000_000
+    assert 0 <= bench.clock_ns - port.words[1, 0] < 1_000_000
     bench.run(1.0, until=lambda: port.data[0] == 0)
     # 10 mm at 0.5 m/s at most, in the acceleration of 5 m/s^2 from 0.05 m on.
     assert port.words[2, 0] == 2 and mod.blocks[1].data[0] > 0.06
@@ -278,7 +278,7 @@ def test_a_starved_machine_moves_as_a_free_one(bench, bandwidth_hz):
     mod = bench.make(SimAxes, "mod0", {"axis": [axis, axis | {"name": "y"}]})
     bench.run(0.01)
     bench.write(mod, control_mode=ControlMode.POSITION, position=0.3)
-    random, now_ns, worst = np.random.default_rng(1), bench.now_ns, 0.0
+    random, now_ns, worst = np.random.default_rng(1), bench.clock_ns, 0.0
     for _ in range(60):
         now_ns += int(random.integers(10, 80)) * 1_000_000
         mod.tick(now_ns)

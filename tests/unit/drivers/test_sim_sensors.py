@@ -29,7 +29,7 @@ def test_beam_edges_carry_the_instant_of_the_crossing(bench):
     log, seen = [], set()
     for _ in range(300):
         bench.run(0.001)
-        log.append((bench.now_ns, mod.blocks[1].data[0]))
+        log.append((bench.clock_ns, mod.blocks[1].data[0]))
         seen.add((int(port.data[0]), int(port.words[1, 0])))
     assert port.data[0] == 0 and port.words[2, 0] == 2
     # Found by interpolating the record of the positions; the object is passed in 1 ms.
@@ -80,7 +80,7 @@ def test_gripper_and_loop(bench):
     assert inputs.data[0] == 0b010
     io.write_outputs(outputs.spec, [0], [0b1000_0100])
     bench.run(0.001)
-    began = bench.now_ns
+    began = bench.clock_ns
     assert outputs.data[0] == 0b1000_0100 and inputs.data[0] == 0b110
     bench.run(0.3, until=lambda: inputs.data[0] == 0b101)
     assert inputs.words[1, 0] == began + 120_000_000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import msgspec
@@ -100,10 +101,13 @@ def test_requests_rebase_load_fingers_and_hold_gains(bench, hand):
     finger = bench.make(SimTactile, "tactile0", table())
     _, strain, shape = (block.spec for block in finger.blocks)
     bench.run(0.15)
-    assert finger.ioctl(shape, Request.ZERO_DEVICE, [], 20) == [0.0] * len(CHANNELS)
-    bench.run(0.01)
-    assert sense(finger)["quality"] == Quality.NO_BASELINE.value
+    zero = finger.ioctl(shape, Request.ZERO_DEVICE, [], 20)
+    bench.run(0.05)
+    assert (
+        zero.ready() is None and sense(finger)["quality"] == Quality.NO_CONTACT.value
+    )  # by the old baseline
     bench.run(0.15)
+    assert zero.ready() == ([0.0] * len(CHANNELS),)
     finger.ioctl(strain, Request.SET_GAINS, [], [6.0] * 16)
     gains = np.array(finger.ioctl(strain, Request.GET_GAINS, [], None)).reshape(16, 16)
     np.testing.assert_array_equal(gains, 6.0 * np.eye(16))
@@ -116,6 +120,103 @@ def test_requests_rebase_load_fingers_and_hold_gains(bench, hand):
     hand.force = 4.0
     bench.run(0.05)
     assert sense(finger)["load"] == pytest.approx(200.0, rel=0.05)
+
+
+def ask_zero(finger, argument=None):
+    return finger.ioctl(finger.blocks[2].spec, Request.ZERO_DEVICE, [], argument).ready
+
+
+def test_a_touched_finger_is_not_zeroed(bench, hand):
+    finger = bench.make(SimTactile, "tactile0", table())
+    bench.run(0.15)
+    hand.force = 4.0
+    bench.run(0.05)
+    with pytest.raises(Refusal, match=r"touched \(\d+ N/m at 80 degrees\).*baseline stays") as caught:
+        ask_zero(finger)
+    assert caught.value.errno == errno.EBUSY
+    bench.run(0.05)
+    assert sense(finger)["load"] == pytest.approx(200.0, rel=0.05)
+    # one who knows better has a way
+    assert finger.ioctl(finger.blocks[2].spec, Request.CALIBRATE_DEVICE, [], []) == "demo"
+    bench.run(0.15)
+    assert sense(finger)["touched"] == 0.0
+    hand.force = 0.0  # what had its baseline under a touch shows a pull, and may be zeroed
+    bench.run(0.05)
+    assert Quality.WRONG_SIGN in Quality(int(sense(finger)["quality"]))
+    ready = ask_zero(finger)
+    bench.run(0.2)
+    assert ready() is not None and sense(finger)["touched"] == 0.0
+    hand.force = 4.0
+    bench.run(0.05)
+    assert sense(finger)["load"] == pytest.approx(200.0, rel=0.05)
+
+
+@pytest.mark.parametrize("force", [4.0, 0.05])
+def test_what_touches_while_the_baseline_is_taken_refuses_it(bench, hand, force):
+    """A load of 2.5 N/m is below what a frame notices, but not below what a baseline of 200 frames does."""
+    finger = bench.make(SimTactile, "tactile0", table())
+    bench.run(0.15)
+    ready = ask_zero(finger, 200)
+    bench.run(0.55)
+    hand.force = force
+    bench.run(0.55)
+    with pytest.raises(Refusal, match="baseline was taken") as caught:
+        ready()
+    assert caught.value.errno == errno.EBUSY
+    bench.run(0.05)
+    assert sense(finger)["touched"] == float(force > 1.0)
+
+
+def test_readings_from_before_the_request_make_no_baseline(bench, hand):
+    """A frame carries the time at which it was measured; those that were on their way do not count."""
+    finger = bench.make(SimTactile, "tactile0", table())
+    bench.run(0.15)
+    bench.clock_ns += 100_000_000  # the request comes late, and the frames since then come after it
+    ready = ask_zero(finger)
+    bench.clock_ns -= 100_000_000
+    bench.run(0.16)
+    assert ready() is None
+    bench.run(0.05)
+    assert ready() is not None
+
+
+def test_a_blind_finger_is_not_zeroed(bench):
+    """The node that it feels is not there: its readings are INVALID."""
+    finger = bench.make(SimTactile, "tactile0", table())
+    bench.inputs["hand.force"].read = lambda now_ns: np.zeros((1, 1))
+    bench.run(0.15)
+    still = ask_zero(finger)
+    bench.inputs["hand.force"].read = lambda now_ns: None
+    bench.run(0.05)
+    with pytest.raises(Refusal, match=r"blind: its elements cannot tell.*baseline stays"):
+        ask_zero(finger)
+    bench.run(0.1)
+    with pytest.raises(Refusal, match="blind: 0 of 16 elements gave readings"):
+        still()
+    begun = bench.make(SimTactile, "tactile1", table())
+    ready = ask_zero(begun)  # it never had a baseline
+    bench.run(0.15)
+    with pytest.raises(Refusal, match="blind: 0 of 16"):
+        ready()
+
+
+def test_zeros_at_the_same_time_are_one_and_end_with_the_finger(bench, hand):
+    finger = bench.make(SimTactile, "tactile0", table())
+    bench.run(0.15)
+    ready = ask_zero(finger)
+    bench.run(0.05)
+    later = ask_zero(finger)
+    bench.run(0.08)
+    assert ready() is None and later() is None
+    bench.run(0.05)
+    assert ready() == later() is not None
+    ready = ask_zero(finger)
+    finger.ioctl(finger.blocks[2].spec, Request.CALIBRATE_DEVICE, [], None)
+    with pytest.raises(Refusal, match="another finger"):
+        ready()
+    for wrong in (0, -1, 1.5, [1], "2", True):
+        with pytest.raises(Refusal, match="want 1 to 100000"):
+            ask_zero(finger, wrong)
 
 
 @pytest.mark.parametrize(
