@@ -412,6 +412,8 @@ class Server:
         self.shared.latch.daemon_alive(now)
         self.hear_request()
         self.shared.record.look()
+        if (source := self.shared.record.state.workcell) and not self.shared.latch.stopped_ns:
+            self.stop_workcell(source)  # a driver could not keep a stop
         for device in list(self.devices.values()):
             device.check(now)
         self.loop.after(ALIVE_S, self._alive)

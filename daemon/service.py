@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import socket
@@ -44,9 +45,11 @@ def serve(config_path: str, given_path: str | None, level: str, process: Nursery
         record = StopRecord(record_path)
     except OSError as error:
         listening.close()
+        want = (
+            "free 1 MB there" if error.errno == errno.ENOSPC else "want a folder that the daemon may write to"
+        )
         print(
-            f"siomsd: keep stops in {record_path}: {error.strerror}; want a folder that the daemon may write to "
-            "(state_folder in [workcell])",
+            f"siomsd: keep stops in {record_path}: {error.strerror}; {want} (state_folder in [workcell])",
             file=sys.stderr,
         )
         return 1
@@ -55,7 +58,8 @@ def serve(config_path: str, given_path: str | None, level: str, process: Nursery
         server = Server(loop, listening, config_path, log, record, process)
     except OSError as error:
         listening.close()
-        print(f"siomsd: make {error.filename}: {error.strerror}", file=sys.stderr)
+        what = error.filename or f"the stop-request files beside {listening.path}"
+        print(f"siomsd: make {what}: {error.strerror}", file=sys.stderr)
         return 1
     _take_signals(loop, server)
 

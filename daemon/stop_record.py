@@ -7,6 +7,7 @@ Concurrency: the daemon's loop; a thread of its own waits for the disk, so that 
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import os
@@ -19,7 +20,7 @@ from sioms.protocol.stopjournal import CHECKPOINT, StopJournal, Stopped, entries
 
 MOST_BYTES = 1 << 18
 """From so many bytes after the last checkpoint on, there is a new one, and what lies before it is freed."""
-_PUNCH_HOLE, _BLOCK = 0x02 | 0x01, 4096
+_KEEP_SIZE, _PUNCH_HOLE, _BLOCK = 0x01, 0x02 | 0x01, 4096
 
 
 class StopRecord:
@@ -54,8 +55,12 @@ class StopRecord:
         self._at = size
         self._checked_at = start
         self._flusher = _Flusher(self._fd)
-        if size:
+        try:
             self._check()  # whatever was damaged is not read again, and told by the state
+        except OSError:
+            os.close(self.drivers_fd)
+            os.close(self._fd)
+            raise
 
     def look(self) -> None:
         """Take into account what drivers have noted."""
@@ -72,15 +77,23 @@ class StopRecord:
         if read:
             self._flusher.flush()
         if self._at - self._checked_at > MOST_BYTES:
-            self._check()
+            with contextlib.suppress(OSError):  # the next entry tells
+                self._check()
 
     def note(self, entry: Mapping[str, Any]) -> None:
         """Note a stop or a reset.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: it cannot be written, and holds for the daemon's life only; after it the workcell is stopped.
         """
-        self._journal.append(entry, time.time())
+        now_s = time.time()
+        self.look()
+        try:
+            self._journal.append(entry, now_s)
+        except OSError:
+            self._at = os.fstat(self._fd).st_size
+            self.state.take({"at": now_s, **entry}, now_s=now_s)
+            raise
         self.look()
 
     def close(self) -> None:
@@ -94,14 +107,14 @@ class StopRecord:
     def _check(self) -> None:
         """Append a checkpoint, and free what is not needed any more."""
         at = self._at
-        self._journal.append({CHECKPOINT: self.state.entries(), "from": at}, time.time(), after_damage=True)
+        self._journal.append({CHECKPOINT: self.state.entries(), "from": at}, time.time())
         self._checked_at = at
         self._flusher.flush(at)
         self.look()
 
 
 class _Flusher:
-    """Sees that the file reaches the disk, and frees its beginning; both may take long."""
+    """Sees that the file reaches the disk, has room for what comes next, and frees its beginning; all of it may take long."""
 
     def __init__(self, fd: int) -> None:
         self._fd = fd
@@ -126,24 +139,27 @@ class _Flusher:
             self._thread.join()
 
     def _run(self) -> None:
-        freed = 0
+        freed, kept = 0, 0
         while not self._ends or self._wanted.is_set():
             self._wanted.wait()
             self._wanted.clear()
             free_to = self._free_to // _BLOCK * _BLOCK
             try:
+                if free_to > freed or not kept:
+                    kept = os.fstat(self._fd).st_size
+                    _fallocate(self._fd, _KEEP_SIZE, kept, 2 * MOST_BYTES)
                 os.fdatasync(self._fd)
                 if free_to > freed:
-                    _punch(self._fd, free_to)
+                    _fallocate(self._fd, _PUNCH_HOLE, 0, free_to)
                     freed = free_to
             except OSError:
                 continue  # a file system that cannot: the file is in memory all the same, and grows
 
 
-def _punch(fd: int, size: int) -> None:
+def _fallocate(fd: int, mode: int, start: int, size: int) -> None:
     import ctypes
 
-    ctypes.CDLL(None).fallocate(fd, _PUNCH_HOLE, ctypes.c_int64(0), ctypes.c_int64(size))
+    ctypes.CDLL(None).fallocate(fd, mode, ctypes.c_int64(start), ctypes.c_int64(size))
 
 
 def _first_byte(fd: int, size: int) -> int:

@@ -3,7 +3,7 @@
 A file of lines that are only ever appended, each one JSON object: a stop, or a reset, of the workcell or of a node. Daemon
 and drivers append to it before they acknowledge the request; who starts reads it and finds what was stopped, by whom, and
 that nobody has reset it since. A line is one write(2), which no death of a process can divide; what the power takes from
-the last one is found, and counts as a stop of the workcell.
+the last one, or a full disk, is found, and counts as a stop of the workcell. So the file is never empty.
 
 From time to time the daemon appends a checkpoint, the state as of an earlier place in the file, and frees what lies before
 that place.
@@ -206,7 +206,7 @@ class StopJournal:
     """An open journal.
 
     Args:
-        fd: of the file, opened for appending; closed by ``close``.
+        fd: of the file, opened for reading and appending; closed by ``close``.
 
     Concurrency: one thread.
     """
@@ -214,21 +214,30 @@ class StopJournal:
     def __init__(self, fd: int) -> None:
         self.fd = fd
 
-    def append(self, entry: Mapping[str, Any], at_s: float, *, after_damage: bool = False) -> None:
-        """Append an entry.
+    def append(self, entry: Mapping[str, Any], at_s: float) -> None:
+        """Append an entry; begin a line of its own, whatever has become of the last one.
+
+        A stop that cannot be written damages the journal, which takes no room on the disk: whoever reads it finds that and
+        stops the workcell. Of a reset that cannot be written nothing is left, so that what was stopped stays so.
 
         Args:
             entry: of a stop, a reset or a checkpoint.
             at_s: the time [s since 1970].
-            after_damage: begin a line of its own, whatever the last one is.
 
         Raises:
             OSError: it could not be written, as on a full disk.
         """
         line = json.dumps({"at": round(at_s, 3), **entry}, separators=(",", ":")).encode() + b"\n"
-        line = b"\n" * after_damage + line
-        if os.write(self.fd, line) != len(line):
-            raise OSError(errno.ENOSPC, "the disk is full")
+        size = os.fstat(self.fd).st_size
+        if size and os.pread(self.fd, 1, size - 1) != b"\n":
+            line = b"\n" + line
+        try:
+            if os.write(self.fd, line) != len(line):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError:
+            if entry.get("stop") and size:
+                os.ftruncate(self.fd, max(1, size - 2))  # its last line is none then, whatever comes after it
+            raise
 
     def close(self) -> None:
         """Close the file."""

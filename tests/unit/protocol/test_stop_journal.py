@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
+import resource
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -187,8 +190,68 @@ def test_ten_thousand_channels_are_a_short_line() -> None:
     assert len(state.parts) == 10_000 and state.of_device("big")[0][1] == [[0, 9999, 1]]
 
 
-def test_a_full_disk_is_told(path: str) -> None:
-    journal = StopJournal(os.open("/dev/full", os.O_WRONLY))
-    with pytest.raises(OSError, match="space"):
-        journal.append(workcell_entry("x", stop=True), 1.0)
-    journal.close()
+@contextlib.contextmanager
+def no_room_beyond(size: int) -> Iterator[None]:
+    """Let no file of this process grow beyond a size, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("room", [0, 20])
+@pytest.mark.parametrize("by_driver", [False, True])
+@pytest.mark.parametrize("freed", [False, True])
+def test_a_stop_that_a_full_disk_does_not_take_stops_the_next_daemon(
+    path: str, room: int, by_driver: bool, freed: bool
+) -> None:
+    record = StopRecord(path)
+    driver = StopJournal(os.dup(record.drivers_fd))
+    with no_room_beyond(os.stat(path).st_size + room), pytest.raises(OSError):
+        if by_driver:
+            driver.append(stop_of_axes(), 1.0)
+        else:
+            record.note(stop_of_axes())
+    if freed:
+        driver.append(bit(3), 2.0)  # what comes after it does not make it whole
+    record.look()
+    if by_driver:
+        assert "damaged" in record.state.workcell
+    else:
+        assert ["mod0", "ann"] in record.state.nodes()
+    assert "damaged" in kept(path).workcell
+    record._flusher.end()
+    os.close(record._fd)
+    again = StopRecord(path)
+    assert "damaged" in again.state.workcell
+    again.note(workcell_entry("operator", stop=False))
+    assert not kept(path).workcell
+    again.close()
+    driver.close()
+
+
+def test_a_reset_that_a_full_disk_does_not_take_leaves_what_was_stopped(path: str) -> None:
+    record = StopRecord(path)
+    record.note(stop_of_axes())
+    with no_room_beyond(os.stat(path).st_size), pytest.raises(OSError):
+        record.note(stop_of_axes(stop=False))
+    assert not record.state.parts
+    state = kept(path)
+    assert state.nodes() == [["mod0", "ann"]] and not state.workcell
+
+
+def test_where_there_is_no_room_for_stops_no_daemon_starts(path: str) -> None:
+    with no_room_beyond(0), pytest.raises(OSError):
+        StopRecord(path)
+    StopRecord(path).close()
+    assert not os.path.exists(path)
+
+
+def test_room_for_many_stops_is_kept(path: str) -> None:
+    record = StopRecord(path)
+    record._flusher.end()
+    assert os.stat(path).st_size < 200
+    assert os.stat(path).st_blocks * 512 >= stop_record.MOST_BYTES
+    os.close(record._fd)
