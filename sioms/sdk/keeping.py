@@ -12,6 +12,7 @@ that one on its way out cannot write into it.
 
 from __future__ import annotations
 
+import errno
 import mmap
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -207,13 +208,29 @@ def _replace(path: str, data: bytes) -> int:
     os.makedirs(os.path.dirname(path), exist_ok=True)
     fresh = f"{path}.new"
     fd = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o640)
-    os.write(fd, data)
-    os.fsync(fd)
-    os.replace(fresh, path)
+    try:
+        if os.write(fd, data) != len(data):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), fresh)
+        os.fsync(fd)
+        os.replace(fresh, path)
+    except OSError:
+        os.close(fd)
+        os.unlink(fresh)
+        raise
     folder = os.open(os.path.dirname(path), os.O_RDONLY | os.O_DIRECTORY)
     os.fsync(folder)
     os.close(folder)
     return fd
+
+
+def _forget(path: str, log: Log) -> None:
+    """Take away what was kept before, as the axes will move without being followed."""
+    try:
+        os.unlink(path)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:
+        log("error", f"remove {path}: {error.strerror}; remove it before the next start: it will be wrong")
 
 
 def boot_id() -> str:
@@ -245,12 +262,12 @@ def keep_positions(folder: str, device: str, blocks: Sequence[AnyBlock], log: Lo
         if not folder:
             log("warning", f"{name}: positions are not kept: give [workcell] a state_folder")
             continue
+        path = os.path.join(folder, f"{name}.positions")
         try:
-            file = PositionFile(
-                os.path.join(folder, f"{name}.positions"), block.bank.settings, boot_id(), log
-            )
+            file = PositionFile(path, block.bank.settings, boot_id(), log)
         except OSError as error:
             log("error", f"{name}: positions are not kept: {error}")
+            _forget(path, log)
             continue
         block.bank.keeper = file
         files.append(file)

@@ -1,6 +1,7 @@
 """Positions over a restart: files, what of them is believed, and that no interruption leaves a wrong entry."""
 
 import math
+import resource
 
 import numpy as np
 import pytest
@@ -263,6 +264,25 @@ def test_only_banks_that_ask_for_it_get_a_file_and_a_missing_folder_is_told(tmp_
     kept = keep_positions(str(tmp_path / "new" / "folder"), "mod0", [block, plain], log)
     assert kept == [block.bank.keeper] and plain.bank.keeper is None and len(said) == 2
     assert [p.name for p in (tmp_path / "new" / "folder").iterdir()] == ["mod0.positions"]
+
+
+def test_where_the_disk_is_full_no_place_of_an_earlier_run_is_left_to_be_believed(tmp_path):
+    block = AxisBlock(
+        BlockSpec("", NodeClass.AXIS, (ChannelInfo("x", "m"),)), Rig([axis(restore=ALWAYS)]).bank
+    )
+    (file,) = keep_positions(str(tmp_path), "mod0", [block], lambda *_: None)
+    file.close()
+    block.bank.keeper = None
+    said = []
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20, hard))
+    try:
+        kept = keep_positions(str(tmp_path), "mod0", [block], lambda level, text: said.append((level, text)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert kept == [] and block.bank.keeper is None
+    assert [level for level, _ in said] == ["error"] and "positions are not kept" in said[0][1]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_offsets_are_those_of_the_rule():
