@@ -74,8 +74,9 @@ class AxisBank:
         self._law = ControlLaw(settings, tick_s, self.fields[ROW["k"] : ROW["kb"] + 1])
         self.stepper = self._law.stepper
         self._sequencer = Sequencer(
-            settings, self._queue, self._law, self._position, self._velocity, integers[ROW["in_motion"]]
-        )
+            settings, self._queue, self._law, self._position, self._velocity, integers[ROW["in_motion"]],
+            tick_s,
+        )  # fmt: skip
         self._guard = LimitGuard(self._queue, self._sequencer)
         self._homing = HomingRuns(settings, self._queue, self)
         self._limp = np.zeros(n, dtype=bool)
@@ -393,7 +394,9 @@ class AxisBank:
         if now_ns - last_ns > self._late_ns:
             self._stop_late(last_ns, now_ns)
         self._measure(position, dt, now_ns)
+        self._sequencer.begin_tick(dt)
         self._inbox.work_in(now_ns)
+        self._sequencer.release_held(now_ns)
         if self._queue.waits_for_markers:
             self._poll_markers(now_ns)
         sequencer = self._sequencer

@@ -32,6 +32,10 @@ Axes = NDArray[np.int64]
 Floats = NDArray[np.float64]
 REST = 1e-9
 """Speed below which a set-point is at rest [unit/s]."""
+PIECES = 2
+"""Pieces of a period that are not short: time itself bounds how many of them end in a tick, and they keep their instants."""
+SPARE_SHARE, BEGIN_S = 0.05, 50e-6
+"""Share of the period, and what beginning a command takes of it [s]: how many may follow short ones on axes at rest."""
 
 # What the running plan of an axis is. Plain integers: they live in arrays.
 HOLD: Final = 0
@@ -69,6 +73,11 @@ class Sequencer:
         position, velocity: measured, (n,), kept up to date by the bank; axes in force mode begin
             what follows from there.
         in_motion: (n,) int64, written here.
+        tick_s: nominal period [s].
+
+    How many commands begin from one tick to the next is bounded, however short they are. After a short one (less than a
+    PIECES-th of the period) an axis in motion begins as many as longer ones could have been, one at rest only its first
+    and what is left of a few that all share. What follows waits at rest for the next tick.
     """
 
     def __init__(
@@ -79,6 +88,7 @@ class Sequencer:
         position: Floats,
         velocity: Floats,
         in_motion: NDArray[np.int64],
+        tick_s: float,
     ) -> None:
         n = len(settings)
         self.store = PlanStore(n)
@@ -108,6 +118,13 @@ class Sequencer:
         self._start_velocity = [s.start_velocity for s in settings]
         self._ready = np.zeros(n, dtype=bool)
         self._todo: dict[int, None] = {}
+        self._tick_s = tick_s
+        self._begun = np.zeros(n, dtype=np.int64)
+        """Commands begun after short ones since the last tick began."""
+        self._pieces = 2 * PIECES
+        self._spare = self._spare_a_tick = max(2, int(SPARE_SHARE * tick_s / BEGIN_S))
+        self._held: dict[int, bool] = {}
+        """Axes whose next command waits for the next tick; whether it then takes over from what runs."""
 
     # -- what the bank asks for ---------------------------------------------------------------
 
@@ -123,8 +140,31 @@ class Sequencer:
         self._todo.update(dict.fromkeys(axes.tolist()))
         rows = self.store.row[axes]
         self._row_signals[rows] = self._row_checked[rows] = self._row_taken[rows] = False
+        often = self._begun[axes] >= self._pieces
+        if often.any():  # they go on with what they do until the next tick
+            self._held.update(dict.fromkeys(axes[often].tolist(), True))
+            self.refresh(axes[often])
+            axes = axes[~often]
+            if not axes.size:
+                return
         self.store.cut(axes, now_ns)
         self.advance(now_ns)  # all of these plans end now, and what follows is what refreshes
+
+    def begin_tick(self, dt: float) -> None:
+        """A tick begins, dt after the last [s]: further commands may begin."""
+        self._begun[:] = 0
+        self._pieces = PIECES + int(PIECES * dt / self._tick_s)
+        self._spare = self._spare_a_tick
+
+    def release_held(self, now_ns: int) -> None:
+        """Let the commands that waited for this tick begin at now."""
+        if not self._held:
+            return
+        held, self._held = self._held, {}
+        self.release(np.array(list(held)), now_ns)
+        taking = np.array([axis for axis, takes_over in held.items() if takes_over], dtype=np.int64)
+        if taking.size:
+            self.store.cut(taking, now_ns)
 
     def release(self, axes: Axes, start_ns: int) -> None:
         """End the open-ended plans of these axes at start_ns where the head has no gate (any more)."""
@@ -156,9 +196,10 @@ class Sequencer:
         """Forget all waiting commands of these axes, and the plans made for them."""
         self._queue.clear(axes)
         self._ready[axes] = False
-        if self._todo:
+        if self._todo or self._held:
             for axis in axes.tolist():
                 self._todo.pop(axis, None)
+                self._held.pop(axis, None)
 
     def halt(self, axes: Axes, now_ns: int) -> None:
         """Drop the commands and brake at maximum deceleration from the present state."""
@@ -241,6 +282,9 @@ class Sequencer:
             self._signal(row, now_ns)
         queue.load_heads(axes)
         free = queue.has_head[axes] & ~queue.gated_synch[axes] & ~queue.gated_marker[axes]
+        short = store.duration[rows] * PIECES < self._tick_s
+        if short.any():
+            self._hold_back(axes, state, short, free)
         for i in np.flatnonzero(free & ~self._ready[axes]).tolist():
             p, v, a = state[i].tolist()
             self._plan_head(int(axes[i]), (p, v, a), now_ns)
@@ -252,6 +296,20 @@ class Sequencer:
                 self._start(axes[go], start_ns[go], fraction[go], now_ns)
             rest = ~go
             self._rest(axes[rest], state[rest], start_ns[rest], fraction[rest], now_ns)
+
+    def _hold_back(
+        self, axes: Axes, state: Floats, short: NDArray[np.bool_], free: NDArray[np.bool_]
+    ) -> None:
+        """Count what follows short commands; take out of ``free`` the axes that have had their share of this tick."""
+        begun, rests = self._begun[axes], np.abs(state[:, 1]) <= REST
+        over = free & short & (begun >= np.where(rests, 1, self._pieces))
+        for i in np.flatnonzero(over).tolist():
+            if rests[i] and self._spare:
+                self._spare -= 1
+            else:
+                free[i] = False
+                self._held[int(axes[i])] = False
+        self._begun[axes] = begun + (short & free)
 
     def _look_at_arrivals(self, axes: Axes, now_ns: int) -> Axes:
         """Try point moves that missed their targets again, as often as is allowed; return the axes that have ended."""
@@ -305,6 +363,9 @@ class Sequencer:
         store.begin(axes, start_ns, fraction)
         self._ready[axes] = False
         self._queue.has_head[axes] = False
+        if self._held:
+            for axis in axes.tolist():
+                self._held.pop(axis, None)
         if self.any_force or self._law.force_ends.any:
             self._law.force_ends.end(axes)
         self.kind[axes] = self._row_kind[rows]
@@ -359,6 +420,8 @@ class Sequencer:
             deceleration = self._limits.acceleration[chosen]
             store.put_brake(store.row[chosen], state[~still, 0], state[~still, 1], deceleration)
             self._set_kind(chosen, BRAKE)
+            self._ready[chosen] = False  # what was planned ahead would begin in motion
+            self._todo.update(dict.fromkeys(chosen.tolist()))
             store.begin(chosen, start_ns[~still], fraction[~still])
         self._settle_masks()
         self.refresh(axes)

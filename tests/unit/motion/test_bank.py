@@ -519,3 +519,17 @@ def test_the_bound_of_a_force_is_lifted_at_rest() -> None:
         push[0] = 20.0
         rig.tick(1000)
         assert abs(rig.field("position") - held) < 0.02
+
+
+def test_what_waits_behind_a_passing_command_begins_at_rest():
+    rig = Rig([axis()])
+    token = rig.markers.reserve(3)
+    rig.write(
+        mode=[MODE.POSITION | MODE.VELOCITY, MODE.POSITION | MODE.SPECIFIED_WAIT_MARKER],
+        position=[0.2, 0.3], velocity=[0.3, 0.0], wait_marker_number=[0, token],
+    )  # fmt: skip
+    rig.tick(1000)  # it has passed 0.2, and braked, for the marker is not signalled
+    rig.markers.signal(3, rig.markers.table.generation(3), rig.now_ns)
+    rig.run()
+    assert rig.field("commanded_position") == pytest.approx(0.3)
+    assert np.abs(np.diff(rig.trace("commanded_velocity"))).max() <= 5.0 * 1e-3 * (1 + 1e-6)
