@@ -9,6 +9,7 @@ import errno
 import os
 import socket
 import time
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,19 +48,32 @@ class Attachments:
 
     def check_leases(self, now_ns: int) -> None:
         """End the handles whose clients have been silent for longer than their leases."""
-        for handle in self._leased:
-            if now_ns - handle.heard_ns > handle.lease_ns:
-                self.end(
-                    handle, errno.ETIMEDOUT,
-                    f"{handle.node}: its client was silent for longer than its lease of {handle.lease_ns / 1e9:g} s",
-                )  # fmt: skip
-                return  # the list has changed; the others have their turn next tick
+        late = [handle for handle in self._leased if now_ns - handle.heard_ns > handle.lease_ns]
+        if late:
+            self._halt_all(late)
+        for handle in late:
+            lease_s = handle.lease_ns / 1e9
+            text = f"{handle.node}: its client was silent for longer than its lease of {lease_s:g} s"
+            self.end(handle, errno.ETIMEDOUT, text)
 
     def end_all(self, errno_: int, text: str, exclusive_only: bool = False) -> None:
         """End all handles, or those that own outputs."""
-        for handle in list(self.handles.values()):
-            if handle.exclusive or not exclusive_only:
-                self.end(handle, errno_, f"{handle.node}: {text}")
+        ending = [h for h in self.handles.values() if h.exclusive or not exclusive_only]
+        self._halt_all(ending)
+        for handle in ending:
+            self.end(handle, errno_, f"{handle.node}: {text}")
+
+    def _halt_all(self, handles: Sequence[Handle]) -> None:
+        """Halt what these handles own, before any of them takes time to be ended."""
+        axes: dict[int, tuple[AxisBlock, list[int]]] = {}
+        for handle in handles:
+            if handle.exclusive and isinstance(handle.block, AxisBlock):
+                axes.setdefault(id(handle.block), (handle.block, []))[1].extend(handle.axes)
+                handle.halted = True
+        for block, owned in axes.values():
+            block.bank.stop(owned, time.monotonic_ns())
+            self._runtime.engine.commands_written(block)
+            self._runtime.tick_early()
 
     def detach(self, number: int, errno_: int = 0, reason: str = "") -> None:
         """End a handle because the daemon says so, and tell its client why; one that has ended already is confirmed again."""
@@ -188,12 +202,10 @@ class Attachments:
             self._runtime.pages.subscribers(handle.block).remove(handle)
         self._runtime.waits.forget(handle)
         if handle.exclusive:
-            if isinstance(handle.block, AxisBlock):
-                handle.block.bank.stop(handle.channels, time.monotonic_ns())
-                self._runtime.engine.commands_written(handle.block)
-                self._runtime.tick_early()
-            else:
+            if not isinstance(handle.block, AxisBlock):
                 self._make_safe(handle)
+            elif not handle.halted:
+                self._halt_all([handle])
         handle.close()
         self._runtime.tell(DriverVerb.DETACHED, handle.number)
 

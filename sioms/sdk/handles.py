@@ -54,6 +54,7 @@ class Handle:
         waits: unanswered requests by message number; each has a way to be ended.
         writes: whether it may write.
         axes: ``channels`` as plain integers.
+        halted: whether the axes that it owns have been halted because it ends.
     """
 
     number: int
@@ -77,6 +78,7 @@ class Handle:
     waits: dict[int, Wait] = field(default_factory=dict)
     writing: list[AxesWrite] = field(default_factory=list)
     ahead: tuple[int, list[bytes]] = (0, [])
+    halted: bool = False
     writes: bool = field(init=False)
     axes: list[int] = field(init=False)
 
