@@ -78,6 +78,10 @@ def main(words: Sequence[str] | None = None) -> int:
     return _guarded(wanted, module, args)
 
 
+EXTRAS = {"gpiod": "gpio", "matplotlib": "report", "numba": "fast"}
+"""Packages that not everybody needs, and the extra of SIOMS that brings each."""
+
+
 def _begin() -> None:
     """Be a program: an interrupt while modules are imported is the end and no traceback, a closed output an error."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -121,6 +125,15 @@ def _guarded(name: str, module: Any, args: argparse.Namespace) -> int:
         return 128 + signal.SIGPIPE
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in EXTRAS:
+            raise
+        print(
+            f"sioms {name}: {package} is not installed; run: pip install 'sioms[{EXTRAS[package]}]'",
+            file=sys.stderr,
+        )
+        return 1
     except OSError as error:
         if error.errno == errno.EBADF and not error.filename:
             error.strerror = f"write standard output: {(error.strerror or '').lower()}"

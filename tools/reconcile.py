@@ -100,6 +100,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             library.write(args.out)
         return 0
+    _say_when_plain()
     if args.subject == "selftest":
         if args.kind != "axis":
             from sioms.tools.reconcile_selftest_sensors import selftest as sensors
@@ -111,6 +112,17 @@ def run(args: argparse.Namespace) -> int:
     if args.subject in ("tactile", "force", "score"):
         return run_sensor(args)
     return run_axis(args)
+
+
+def _say_when_plain() -> None:
+    from sioms.reconcile.jit import numba
+
+    if numba() is None and "SIOMS_PLAIN" not in os.environ:
+        print(
+            "sioms reconcile: numba is not installed, and without it this takes ten times as long and more; "
+            "run: pip install 'sioms[fast]'",
+            file=sys.stderr,
+        )
 
 
 def _live_arguments(axis: argparse.ArgumentParser) -> None:

@@ -138,9 +138,6 @@ def run(args: argparse.Namespace) -> int:
     except (ValueError, OSError, KeyError, RuntimeError) as error:
         print(f"sioms tactile {args.tactile_command}: {_sentence(error)}", file=sys.stderr)
         return 1
-    except ImportError as error:
-        print(f"sioms tactile {args.tactile_command}: {error}; pip install sioms[report]", file=sys.stderr)
-        return 1
     raise AssertionError(args.tactile_command)
 
 

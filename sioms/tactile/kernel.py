@@ -334,11 +334,11 @@ def compiled() -> Solve:
     """Return the solver compiled by numba; takes seconds the first time on a machine, then is read from the cache.
 
     Raises:
-        ImportError: numba is not installed (it is a dependency of SIOMS).
+        ImportError: numba is not installed (the extra ``fast`` of SIOMS brings it).
     """
     if importlib.util.find_spec("numba") is None:
         raise ImportError(
-            "compile tactile fit: numba cannot be imported; install SIOMS again, which brings it, or fit in plain numpy"
+            "compile tactile fit: numba is not installed; run: pip install 'sioms[fast]', or fit in plain numpy"
         )
     numba: Any = importlib.import_module("numba")
     jit = numba.njit(cache=True, error_model="numpy")

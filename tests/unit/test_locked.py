@@ -15,7 +15,11 @@ from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 TREE = Path(__file__).resolve().parents[2]
-PROFILES = {"service": ["gpio"], "run": ["report"], "test": ["gpio", "report", "test"]}
+PROFILES = {
+    "service": ["gpio"],
+    "run": ["fast", "gpio", "report"],
+    "test": ["fast", "gpio", "report", "test"],
+}
 AGAIN = "run ./dev lock"
 Pins = dict[str, list[tuple[Version, Marker | None, int]]]
 

@@ -127,7 +127,7 @@ class _Show:
         try:
             from .picture import draw
         except ImportError:
-            _say("left out: matplotlib is not installed (pip install sioms[report])")
+            _say("left out: matplotlib is not installed (pip install 'sioms[report]')")
         else:
             draw(f"{self._out}/demo.png", self._rows, self._recorder.events, self._chapters)
             _say(f"{self._out}/demo.png")
