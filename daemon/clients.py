@@ -14,14 +14,8 @@ import time
 import traceback
 from typing import TYPE_CHECKING, Any
 
-from sioms.protocol.messages import (
-    MAX_PACKET,
-    ClientVerb,
-    MalformedMessage,
-    decode,
-    refusal,
-    reply,
-)
+from sioms.protocol.incoming import FROM_CLIENT, take
+from sioms.protocol.messages import MAX_PACKET, ClientVerb, MalformedMessage, refusal, reply
 
 from .config import WorkcellTable
 from .marker_owners import MarkerError
@@ -43,10 +37,6 @@ _SHOWN = frozenset(
     }
 )  # fmt: skip
 """What readings of nodes show: who has the answer shall read nothing older."""
-
-
-class _Malformed(Exception):
-    """A request whose arguments have no business being there; ends the session."""
 
 
 class Clients:
@@ -126,8 +116,8 @@ class Clients:
                 self._end_session(session, "")
                 return
             try:
-                self._dispatch(session, decode(packet) if len(packet) <= MAX_PACKET else None)
-            except (MalformedMessage, _Malformed) as error:
+                self._dispatch(session, *take(packet, FROM_CLIENT))
+            except MalformedMessage as error:
                 self._end_session(session, str(error))
                 return
             except Exception as error:  # our own mistake costs one session, not the workcell
@@ -137,27 +127,19 @@ class Clients:
                     self._end_session(session, f"internal error: {error!r}")
                 return
 
-    def _dispatch(self, session: Session, message: list[Any] | None) -> None:
-        if message is None:
-            raise _Malformed(f"packet longer than {MAX_PACKET} bytes")
-        try:
-            verb = ClientVerb(message[0])
-        except ValueError:
-            raise _Malformed(f"verb {message[0]} is none") from None
-        number, arguments = message[1], message[2:]
+    def _dispatch(self, session: Session, of_client: int, number: int, arguments: list[Any]) -> None:
+        verb = ClientVerb(of_client)
         if starting := self._server.starting:
             text = f"connect: the daemon is starting: {starting}; `sioms wait` waits until it is ready"
             self.send(session, refusal(number, errno.EAGAIN, text))
             return
         if number == 0 or number in session.waits:
-            raise _Malformed(f"message number {number} is zero or in use")
+            raise MalformedMessage(f"message number {number} is zero or in use")
         try:
             value = self._verb(session, verb, number, arguments)
         except (Refused, MarkerError) as error:
             # Also then: who closes a handle that its driver has ended already shall see the axes halted.
             self.send(session, refusal(number, error.errno, str(error), _as_of_ns(verb)))
-        except (ValueError, TypeError, LookupError, OverflowError) as error:
-            raise _Malformed(f"{verb.name} with arguments {arguments!r:.80}: {error}") from None
         else:
             if value is not LATER:
                 self.send(session, reply(number, value, _as_of_ns(verb)))

@@ -15,7 +15,8 @@ from functools import partial
 from typing import Any, Protocol
 
 from sioms.protocol.flags import PageState
-from sioms.protocol.messages import MAX_PACKET, DriverVerb, MalformedMessage, decode, encode
+from sioms.protocol.incoming import FROM_DRIVER, take
+from sioms.protocol.messages import MAX_PACKET, DriverVerb, MalformedMessage, encode
 from sioms.protocol.page import NotReadable, PageReader, set_daemon_state
 
 from .config import Device
@@ -240,7 +241,7 @@ class DriverProcess:
         if self._sock is None:
             return None
         try:
-            packet, fds, _, _ = socket.recv_fds(self._sock, MAX_PACKET, 250)
+            packet, fds, _, _ = socket.recv_fds(self._sock, MAX_PACKET + 1, 250)
         except BlockingIOError:
             return None
         except ConnectionResetError:
@@ -250,9 +251,11 @@ class DriverProcess:
         if not packet:
             return False
         try:
-            message: list[Any] = decode(packet)
-            verb = DriverVerb(message[0])
-        except (MalformedMessage, ValueError) as error:
+            of_driver, _, arguments = take(packet, FROM_DRIVER)
+            verb = DriverVerb(of_driver)
+        except MalformedMessage as error:
+            for fd in fds:
+                os.close(fd)
             self.kill(f"its driver sent a malformed message: {error}")
             return None
         if verb is DriverVerb.READY:
@@ -261,8 +264,8 @@ class DriverProcess:
         for fd in fds:
             os.close(fd)
         if verb is DriverVerb.LINK:
-            self.link = (PageState(message[2]), message[3])
-        self._owner.device_message(self, verb, message[2:])
+            self.link = (PageState(arguments[0]), arguments[1])
+        self._owner.device_message(self, verb, arguments)
         return True
 
     def _ready(self, fds: list[int]) -> None:

@@ -9,13 +9,12 @@ import math
 import os
 import pwd
 import time
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import msgpack
+from sioms.protocol.messages import MalformedMessage, unpack_compressed
 
 from .config import Config, parse
 from .lines import with_lines
@@ -120,8 +119,8 @@ class Loader:
             self._errors.append(f"[device.{name}]: {text}")
         else:
             try:
-                self._take(name, *msgpack.unpackb(zlib.decompress(value)))
-            except (ValueError, TypeError, zlib.error) as error:
+                self._take(name, *unpack_compressed(value))
+            except (MalformedMessage, ValueError, TypeError, LookupError) as error:
                 # A nursery of another version: the software was changed under the running daemon.
                 self._errors.append(
                     f"[device.{name}]: its description is not understood ({error}); restart the daemon"

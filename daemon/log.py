@@ -6,6 +6,8 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 
+from sioms.protocol.text import printable
+
 _SYSTEMD = {"debug": 7, "info": 6, "warning": 4, "error": 3}
 
 
@@ -66,7 +68,7 @@ class Log:
 
 
 def _quote(text: str) -> str:
-    text = text.replace("\n", " ")
+    text = printable(text.replace("\n", " "), 8000)
     if text and all(c not in ' "=' for c in text):
         return text
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -57,11 +57,11 @@ class NodeVerbs:
         Raises:
             Refused: ENOENT, EACCES.
         """
-        node = self._server.names.nodes.get(str(name))
+        node = self._server.names.nodes.get(name)
         if node is None:
             raise Refused(
                 errno.ENOENT,
-                f"{what} of {name}: no such node{did_you_mean(str(name), self._server.names.nodes)}",
+                f"{what} of {name}: no such node{did_you_mean(name, self._server.names.nodes)}",
             )
         if not self._clients.rights.on_node(session.peer, node.name) & right:
             raise Refused(
@@ -75,10 +75,10 @@ class NodeVerbs:
     ) -> Any:
         """Open a node, at once or when it becomes free."""
         node = self.find(session, "open", name)
-        access = Access(int(mode))
         rights = self._clients.rights.on_node(session.peer, node.name)
-        if not access:
-            raise Refused(errno.EINVAL, f"open {name}: mode 0; want read, write or both")
+        if not 1 <= mode <= 3:
+            raise Refused(errno.EINVAL, f"open {name}: mode {mode}; want read (1), write (2) or both (3)")
+        access = Access(mode)
         if access & Access.WRITE and node.read_only:
             raise Refused(
                 errno.EACCES, f"open {name} for writing: it is a read-only node; open it for reading"
@@ -213,7 +213,7 @@ class NodeVerbs:
         device = self._server.devices.get(handle.node.device)
         there = device is not None and device.generation == handle.generation and device.state is State.UP
         if device is not None and there:
-            device.tell(DriverVerb.DETACH, handle.number)
+            device.tell(DriverVerb.DETACH, handle.number, 0, "")
             if handle.claims:
                 return True
         self._forget(handle)

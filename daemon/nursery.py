@@ -12,11 +12,13 @@ import socket
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sioms.protocol.messages import MAX_PACKET, MalformedMessage, NurseryVerb, decode, encode
+from sioms.protocol.messages import MAX_PACKET, MalformedMessage, NurseryVerb, decode_reply, encode
 
 from .loop import Loop
 from .nursery_process import NurseryProcess, start_nursery
 
+MAX_ANSWER = 1 << 20
+"""Bytes of an answer of the nursery: the description of a device of many thousands of channels is long, even compressed."""
 Answer = Callable[[Any, int, str, list[int]], None]
 """Called with (value, errno, text, descriptors)."""
 
@@ -74,7 +76,7 @@ class Nursery:
 
     def _receive(self) -> None:
         try:
-            packet, fds, _, _ = socket.recv_fds(self._sock, 1 << 20, 8)
+            packet, fds, _, _ = socket.recv_fds(self._sock, MAX_ANSWER, 8)
         except BlockingIOError:
             return
         except OSError:
@@ -83,7 +85,7 @@ class Nursery:
             self._end()
             return
         try:
-            message: list[Any] = decode(packet)
+            message = decode_reply(packet, MAX_ANSWER)
         except MalformedMessage:
             self._end()
             return

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.flags import PROTOCOL_VERSION, Right
 from sioms.protocol.messages import reply
+from sioms.protocol.text import printable
 
 from .devices import State
 from .sessions import LATER, Refused, Session
@@ -39,7 +40,7 @@ class WorkcellVerbs:
             raise Refused(
                 errno.EPROTO, f"hello: protocol version {version}; this daemon speaks {PROTOCOL_VERSION}"
             )
-        session.name = str(name)[:80]
+        session.name = printable(name, 80)
         rights = self._clients.rights.on_workcell(session.peer)
         value = [PROTOCOL_VERSION, self._clients.bounds.name, int(rights)]
         fds = self._server.shared.files.client_fds if rights & Right.STOP else []
@@ -73,7 +74,7 @@ class WorkcellVerbs:
 
     def emergency_stop(self, session: Session, name: str, why: str) -> None:
         """Stop the workcell, or a node."""
-        source = f"{session}" + (f": {str(why)[:80]}" if why else "")
+        source = f"{session}" + (f": {printable(why, 80)}" if why else "")
         if not name:
             if not self._clients.rights.on_workcell(session.peer) & Right.STOP:
                 raise Refused(

@@ -30,7 +30,7 @@ from sioms.protocol.messages import (
     ClientVerb,
     HandleVerb,
     MalformedMessage,
-    decode,
+    decode_reply,
     encode,
     value_of,
 )
@@ -367,12 +367,12 @@ class Channel:
         if not packet:
             raise self._gone(None, "receive")
         try:
-            message = decode(packet)
+            message = decode_reply(packet)
         except MalformedMessage as error:
             raise self._gone(OSError(errno.EPROTO, str(error)), "receive") from None
         if message[1] == 0:
             # The last word before the other side closes: errno and why.
-            self._ended = (int(message[2]), str(message[3]))  # type: ignore[call-overload]
+            self._ended = (message[2], str(message[3]))
             raise OSError(*self._ended)
         return message, fds
 
@@ -387,7 +387,7 @@ class Channel:
     def result(self, found: tuple[list, list[int]]) -> Answer:  # type: ignore[type-arg]
         """Turn a packet into an answer, or raise its refusal."""
         message, fds = found
-        if len(message) > 5 and message[5]:
+        if message[5]:
             self.acknowledged(message[5])
         if message[2]:
             for fd in fds:
@@ -414,9 +414,9 @@ class Channel:
         for _ in range(2):  # a reset is reported once, ahead of what is still there to read
             try:
                 while packet := self._sock.recv(MAX_PACKET, _DONTWAIT):
-                    message: list[Any] = decode(packet)
+                    message = decode_reply(packet)
                     if message[1] == 0:
-                        return int(message[2]), str(message[3])
+                        return message[2], str(message[3])
                     self._answers[message[1]] = (message, [])
             except (OSError, MalformedMessage):
                 continue

@@ -7,6 +7,8 @@ the stop-request file (``stopfile``); they can thus cause a stop but never clear
 This is a software stop (category 1 or 2 of IEC 60204-1 at best), not a safety-rated function.
 """
 
+from .text import printable
+
 LATCH_SIZE = 4096
 _STOPPED, _RESETS, _ALIVE, _ANSWERED, _ANSWERED_AT, _ORDERS = 0, 1, 2, 3, 4, 5
 _TEXT, _NAMED, _TEXT_SIZE = 64, 320, 256
@@ -87,10 +89,12 @@ class Latch:
         self._words[_ALIVE] = now_ns
 
     def _text(self, at: int) -> str:
-        return bytes(self._bytes[at : at + _TEXT_SIZE]).split(b"\0")[0].decode("utf-8", "replace")
+        return printable(bytes(self._bytes[at : at + _TEXT_SIZE]).split(b"\0")[0].decode("utf-8", "replace"))
 
     def _set_text(self, at: int, text: str) -> None:
-        self._bytes[at : at + _TEXT_SIZE] = text.encode()[: _TEXT_SIZE - 1].ljust(_TEXT_SIZE, b"\0")
+        self._bytes[at : at + _TEXT_SIZE] = (
+            printable(text).encode()[: _TEXT_SIZE - 1].ljust(_TEXT_SIZE, b"\0")
+        )
 
     def release(self) -> None:
         """Drop the views, so that the mapping can be closed."""

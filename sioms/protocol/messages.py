@@ -13,11 +13,17 @@ two may then be left out.
 Packets are bounded by MAX_PACKET; a larger write sends the beginning of its records ahead, in notices
 that carry its number. No client passes a descriptor to anybody: closing what a stranger opened may block.
 Whoever receives something else ends that connection, and nothing else.
+
+Everything that a process receives goes through ``decode``, which knows bounds of size, nesting and kinds of values
+before it builds any; ``incoming`` adds what each verb takes.
 """
 
 from __future__ import annotations
 
 import sys
+
+from . import wire
+from .text import printable
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -26,6 +32,17 @@ if TYPE_CHECKING:
 else:
     from .enumeration import IntEnum
 
+MAX_PACKET = 65536
+MAX_INLINE = 49152
+"""Bytes of records that one packet carries."""
+MAX_WRITE = 1 << 24
+"""Bytes of records in one write at most."""
+MAX_UNPACKED = 1 << 24
+"""Bytes that a compressed value unpacks to at most."""
+MAX_VALUES = 8192
+"""Values in the arrays and maps of a request at most: more than a packet holds floating-point numbers."""
+EMSGSIZE = 90
+
 if "site" in sys.modules:
     from msgpack import packb, unpackb
 
@@ -33,21 +50,21 @@ if "site" in sys.modules:
         packed: bytes = packb(value, use_bin_type=True)
         return packed
 
-    def _unpack(data: bytes) -> Any:
-        return unpackb(data, raw=False, use_list=True, strict_map_key=True)
+    def _unpack(data: bytes, most: int = MAX_UNPACKED) -> Any:
+        wire.check(data, most)
+        return unpackb(
+            data, raw=False, use_list=True, strict_map_key=True, max_ext_len=0, ext_hook=_no_extension
+        )
+
+    def _no_extension(kind: int, data: bytes) -> None:
+        raise ValueError(f"extension type {kind}; messages hold no such thing")
 
 else:
     # A shell tool, started with -S to be quick (docs/decisions/0002-start-of-pipe-tools.md).
-    from .wire import pack as _pack
-    from .wire import unpack as _unpack
+    _pack = wire.pack
 
-MAX_PACKET = 65536
-MAX_INLINE = 49152
-"""Bytes of records that one packet carries."""
-MAX_WRITE = 1 << 24
-"""Bytes of records in one write at most."""
-MAX_TEXT = 1024
-EMSGSIZE = 90
+    def _unpack(data: bytes, most: int = MAX_UNPACKED) -> Any:
+        return wire.unpack(data)
 
 
 class ClientVerb(IntEnum):
@@ -88,9 +105,9 @@ class DriverVerb(IntEnum):
     """D: [handle, block, channels, bit, access, exclusive, rights, lease_ns, who, node]; descriptors: socket,
     writing end of the wake pipe, pidfd if any."""
     DETACH = 2
-    """D: [handle], its client has closed it; [handle, errno, reason]: end it, as if its socket had closed, and say why."""
+    """D: [handle, errno, reason]: end it, as if its socket had closed, and say why; no reason: its client has closed it."""
     STOP_CHANGED = 3
-    """D: [what]: the latch has changed, look at once."""
+    """D: []: the latch has changed, look at once."""
     SHUTDOWN = 4
     """D: stop, make outputs safe, exit."""
     INPUT = 5
@@ -131,8 +148,13 @@ def encode(*parts: object) -> bytes:
     return _pack(parts)
 
 
-def decode(packet: bytes) -> list[object]:
+def decode(packet: bytes, most: int = MAX_PACKET, values: int = MAX_UNPACKED) -> list[Any]:
     """Unpack a message and check its head.
+
+    Args:
+        packet: as it was received.
+        most: bytes that a packet may have here.
+        values: values that its arrays and maps may hold.
 
     Returns:
         The list [verb, id, ...], both integers within range.
@@ -140,18 +162,74 @@ def decode(packet: bytes) -> list[object]:
     Raises:
         MalformedMessage: anything else.
     """
+    if len(packet) > most:
+        raise MalformedMessage(f"packet longer than {most} bytes")
     try:
-        message = _unpack(packet)
+        message = _unpack(packet, values)
     except Exception as error:  # msgpack raises a wide family for bad input, all of them meaning just this
         raise MalformedMessage(
-            f"decode packet of {len(packet)} bytes: {type(error).__name__}: {error}"
+            f"decode packet of {len(packet)} bytes: {type(error).__name__}: {printable(str(error), 200)}"
         ) from None
     if not isinstance(message, list) or len(message) < 2:
         raise MalformedMessage("decode packet: not an array of verb, id and arguments")
     verb, number = message[0], message[1]
-    if type(verb) is not int or type(number) is not int or not (0 <= verb < 256 and 0 <= number < 1 << 53):
-        raise MalformedMessage(f"decode packet: verb {verb!r}, id {number!r}; want integers from 0")
+    if type(verb) is not int or type(number) is not int:
+        raise MalformedMessage(
+            f"decode packet: {type(verb).__name__} as verb, {type(number).__name__} as id; want integers"
+        )
+    if not (0 <= verb < 256 and 0 <= number < 1 << 53):
+        raise MalformedMessage(f"decode packet: verb {verb}, id {number}; want integers from 0")
     return message
+
+
+def decode_reply(packet: bytes, most: int = MAX_PACKET) -> list[Any]:
+    """Unpack a reply and check its shape.
+
+    Returns:
+        The list [0, id, errno, value or text, zipped, as_of_ns], its texts fit to be shown.
+
+    Raises:
+        MalformedMessage: anything else.
+    """
+    message = decode(packet, most)
+    if 4 <= len(message) <= 6 and type(message[2]) is int:
+        message += (False, 0)[len(message) - 4 :]
+        if message[2] and type(message[3]) is str:
+            message[3] = printable(message[3])
+        if (
+            type(message[4]) is bool
+            and type(message[5]) is int
+            and (not message[2] or type(message[3]) is str)
+        ):
+            return message
+    raise MalformedMessage("decode reply: not an array of 0, id, errno and value or text")
+
+
+def pack_compressed(value: object, level: int = -1) -> bytes:
+    """Pack a value of many parts that are much alike: thousands of nodes or channels."""
+    from zlib import compress
+
+    return compress(_pack(value), level)
+
+
+def unpack_compressed(data: object) -> Any:
+    """Unpack what ``pack_compressed`` has packed.
+
+    Raises:
+        MalformedMessage: it is something else, or more than MAX_UNPACKED bytes.
+    """
+    from zlib import decompressobj
+
+    try:
+        zipped = decompressobj()
+        plain = zipped.decompress(data, MAX_UNPACKED + 1)  # type: ignore[arg-type]
+        if len(plain) > MAX_UNPACKED or not zipped.eof or zipped.unused_data:
+            raise ValueError(f"not one whole stream of at most {MAX_UNPACKED} bytes")
+        return _unpack(plain)
+    except Exception as error:
+        raise MalformedMessage(
+            f"decompress answer: {type(error).__name__}: {printable(str(error), 200)}"
+        ) from None
 
 
 def reply(number: int, value: object = None, as_of_ns: int = 0) -> bytes:
@@ -159,9 +237,7 @@ def reply(number: int, value: object = None, as_of_ns: int = 0) -> bytes:
     packet = encode(0, number, 0, value, False, as_of_ns) if as_of_ns else encode(0, number, 0, value)
     if len(packet) <= MAX_PACKET:
         return packet
-    from zlib import compress  # thousands of nodes or channels, much alike
-
-    packet = encode(0, number, 0, compress(_pack(value)), True, as_of_ns)
+    packet = encode(0, number, 0, pack_compressed(value), True, as_of_ns)
     if len(packet) <= MAX_PACKET:
         return packet
     text = f"the answer takes {len(packet)} bytes; at most {MAX_PACKET} fit"
@@ -174,17 +250,10 @@ def value_of(message: list[Any]) -> Any:
     Raises:
         MalformedMessage: it says that it is compressed, and is not.
     """
-    if len(message) < 5 or not message[4]:
-        return message[3]
-    from zlib import decompress
-
-    try:
-        return _unpack(decompress(message[3]))
-    except Exception as error:
-        raise MalformedMessage(f"decompress answer: {type(error).__name__}: {error}") from None
+    return unpack_compressed(message[3]) if message[4] else message[3]
 
 
 def refusal(number: int, errno_: int, text: str, as_of_ns: int = 0) -> bytes:
-    """Pack a refusal with its errno and its sentence."""
-    text = text[:MAX_TEXT]
+    """Pack a refusal with its errno and its sentence; number 0 tells why a connection ends."""
+    text = printable(text)
     return encode(0, number, errno_, text, False, as_of_ns) if as_of_ns else encode(0, number, errno_, text)

@@ -33,6 +33,7 @@ from struct import Struct, pack_into, unpack_from
 
 from .flags import NodeClass, PageState
 from .records import READ_FIELDS
+from .text import printable
 
 MAGIC = b"SIOMSpg1"
 VERSION = 2
@@ -94,7 +95,7 @@ def page_size(node_class: NodeClass, channels: int, slots: int) -> int:
 
 
 def _write_reason(buffer: memoryview, text: str) -> None:
-    encoded = text.encode()[: REASON_SIZE - 1]
+    encoded = printable(text).encode()[: REASON_SIZE - 1]
     buffer[REASON_OFFSET : REASON_OFFSET + REASON_SIZE] = encoded.ljust(REASON_SIZE, b"\0")
 
 
@@ -285,11 +286,8 @@ class PageReader:
         """Raise NotReadable with the reason, unless the page has become good meanwhile."""
         words = self._words
         driver, daemon = unpack_from("<II", self._buffer, 64)
-        text = (
-            self._buffer[REASON_OFFSET : REASON_OFFSET + REASON_SIZE]
-            .split(b"\0")[0]
-            .decode("utf-8", "replace")
-        )
+        reason = self._buffer[REASON_OFFSET : REASON_OFFSET + REASON_SIZE].split(b"\0")[0]
+        text = printable(reason.decode("utf-8", "replace"))
         if daemon != PageState.GOOD:
             raise NotReadable(PageState(daemon), text)
         if driver != PageState.GOOD:

@@ -18,6 +18,7 @@ from stat import S_ISREG
 from struct import Struct
 
 from .socketpath import may_serve
+from .text import printable
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -54,9 +55,7 @@ class StopRequest:
         """Who requested last and why, as far as it said."""
         data = os.pread(self._fd, _REQUEST.size, 0).ljust(_REQUEST.size, b"\0")
         _, pid, why = _REQUEST.unpack(data)
-        text = "".join(
-            [c if c.isprintable() else "?" for c in why.split(b"\0")[0].decode("utf-8", "replace")]
-        )
+        text = printable(why.split(b"\0")[0].decode("utf-8", "replace"))
         return f"pid {pid}{': ' + text if text else ''}, through the stop-request page"
 
     def request(self, now_ns: int, pid: int, why: str = "") -> int:

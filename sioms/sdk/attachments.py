@@ -9,12 +9,14 @@ import errno
 import os
 import socket
 import time
+import traceback
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sioms.protocol.flags import Access, Right
+from sioms.protocol.incoming import ON_HANDLE, take
 from sioms.protocol.messages import (
     MAX_INLINE,
     MAX_PACKET,
@@ -22,10 +24,11 @@ from sioms.protocol.messages import (
     DriverVerb,
     HandleVerb,
     MalformedMessage,
-    decode,
 )
+from sioms.protocol.text import shown
 
 from .blocks import AxisBlock
+from .exchange import HookError
 from .handles import LATER, Handle
 from .requests import LOOKS, ioctl
 from .writing import write
@@ -127,17 +130,21 @@ class Attachments:
             if not packet:
                 self.drop(handle)
                 return
-            if len(packet) > MAX_PACKET:
-                raise MalformedMessage(f"packet longer than {MAX_PACKET} bytes")
-            self._serve(handle, decode(packet))
-        except (MalformedMessage, ValueError, TypeError, LookupError, OverflowError) as error:
+            self._serve(handle, *take(packet, ON_HANDLE))
+        except MalformedMessage as error:
             self._runtime.log(
                 "warning", f"{handle.node}: connection of {handle.who} ended: malformed message: {error}"
             )
             self.end(handle, errno.EPROTO, f"{handle.node}: malformed message: {error}")
+        except HookError:
+            raise  # the driver may have done half of it: it stops its device
+        except Exception as error:  # a mistake of ours costs this handle, which halts what it moved
+            trace = "".join(traceback.format_exception(error)[-3:])
+            self._runtime.log("error", f"{handle.node}: the driver failed to serve {handle.who}: {trace}")
+            self.end(handle, errno.EIO, f"{handle.node}: the driver failed: {shown(error)}")
 
-    def _serve(self, handle: Handle, message: list[Any]) -> None:
-        verb, number, arguments = HandleVerb(message[0]), message[1], message[2:]
+    def _serve(self, handle: Handle, of_client: int, number: int, arguments: list[Any]) -> None:
+        verb = HandleVerb(of_client)
         if verb is HandleVerb.KEEPALIVE:
             return
         if verb is HandleVerb.PART:
@@ -154,17 +161,17 @@ class Attachments:
                     self._runtime.effects.note()
                     if handle.ahead[1]:
                         data = _whole(handle, number, data)
-                    value = write(self._runtime, handle, number, int(flags), _seconds(timeout_s), data)
+                    value = write(self._runtime, handle, number, flags, timeout_s, data)
                 case HandleVerb.IOCTL:
                     request, argument, timeout_s = arguments
                     if request not in LOOKS:
                         self._runtime.effects.note()
-                    value = ioctl(self._runtime, handle, number, int(request), argument, _seconds(timeout_s))
+                    value = ioctl(self._runtime, handle, number, request, argument, timeout_s)
                 case HandleVerb.SUBSCRIBE:
-                    self._subscribe(handle, int(arguments[0]))
+                    self._subscribe(handle, arguments[0])
                     value = None
                 case HandleVerb.CANCEL:
-                    wait = handle.waits.get(int(arguments[0]))
+                    wait = handle.waits.get(arguments[0])
                     value = wait is not None
                     if wait is not None:
                         self._runtime.waits.end(wait, errno.ECANCELED, f"{wait.what}: cancelled")
@@ -216,8 +223,8 @@ class Attachments:
 
 def _keep_part(handle: Handle, number: int, records: bytes) -> None:
     """Keep records that come ahead of their write; those of a write that never came are dropped."""
-    if type(number) is not int or not isinstance(records, bytes) or len(records) > MAX_INLINE:
-        raise MalformedMessage(f"a part of a write without its number, or without up to {MAX_INLINE} bytes")
+    if len(records) > MAX_INLINE:
+        raise MalformedMessage(f"a part of a write of {len(records)} bytes; want up to {MAX_INLINE}")
     if not handle.writes:
         return  # its write will be refused
     if handle.ahead[0] != number:
@@ -234,11 +241,3 @@ def _whole(handle: Handle, number: int, rest: bytes) -> bytes:
     if len(whole) > MAX_WRITE:
         raise OSError(errno.EMSGSIZE, f"write {handle.node}: more than {MAX_WRITE} bytes of records")
     return whole
-
-
-def _seconds(value: Any) -> float | None:
-    if value is None:
-        return None
-    if not isinstance(value, int | float) or value != value:
-        raise MalformedMessage(f"time-out {value!r}; want a number of seconds or nil")
-    return float(value)

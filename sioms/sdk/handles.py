@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.protocol.flags import Access, Right
-from sioms.protocol.messages import encode, refusal, reply
+from sioms.protocol.messages import refusal, reply
 
 from .blocks import AnyBlock
 from .effects import Effects
@@ -96,7 +96,7 @@ class Handle:
 
     def tell_end(self, errno_: int, text: str) -> None:
         """Tell the client why its handle ends, before the socket closes."""
-        self._send(encode(0, 0, errno_, text))
+        self._send(refusal(0, errno_, text))
 
     def wake(self) -> None:
         """Make the client's end of the pipe readable."""

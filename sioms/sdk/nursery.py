@@ -14,13 +14,11 @@ import signal
 import socket
 import sys
 import traceback
-import zlib
 from collections.abc import Sequence
 from typing import Any
 
-import msgpack
-
-from sioms.protocol.messages import NurseryVerb, decode, encode, refusal, reply
+from sioms.protocol.incoming import TO_NURSERY, take
+from sioms.protocol.messages import MAX_UNPACKED, NurseryVerb, encode, pack_compressed, refusal, reply
 
 from .finding import DriverNotFound, describe, find_driver, read_settings
 
@@ -30,8 +28,8 @@ def main(fd: int) -> None:
     gc.disable()  # until the first fork: what is imported stays, and is not looked through again and again
     sock = socket.socket(fileno=fd)
     os.set_inheritable(fd, False)
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # what these mean is for the daemon to decide
+    for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(ignored, signal.SIG_IGN)  # what these mean is for the daemon to decide
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel reaps; the daemon watches by pidfd
     asked = select.poll()
     asked.register(sock, select.POLLIN)
@@ -41,16 +39,15 @@ def main(fd: int) -> None:
         packet, fds, _, _ = socket.recv_fds(sock, 1 << 20, 8)
         if not packet:
             return
-        message: list[Any] = decode(packet)
-        number = message[1]
+        verb, number, arguments = take(packet, TO_NURSERY, values=MAX_UNPACKED)
         try:
-            match NurseryVerb(message[0]):
+            match NurseryVerb(verb):
                 case NurseryVerb.DESCRIBE:
                     # Thousands of alike channels would not fit into a packet.
-                    described = zlib.compress(msgpack.packb(_describe(*message[2:])), 1)
+                    described = pack_compressed(_describe(*arguments), 1)
                     _tell(sock, encode(0, number, 0, described))
                 case NurseryVerb.SPAWN:
-                    _spawn(sock, number, fds, *message[2:])
+                    _spawn(sock, number, fds, *arguments)
         except Exception as error:  # a driver's describe may raise anything; the daemon must hear of it
             traceback.print_exc()
             _tell(sock, refusal(number, 5, f"{type(error).__name__}: {error}"))

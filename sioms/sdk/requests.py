@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import errno
 import math
+import traceback
 from collections.abc import Generator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sioms.motion import CommandError
+from sioms.motion.queue import LIMIT_NAMES
 from sioms.protocol.flags import Request, Right
+from sioms.protocol.text import shown
 
 from .blocks import AnalogBlock, AxisBlock
 from .driver import Awaited, Refusal
@@ -96,7 +99,7 @@ def ioctl(
             )
         case Request.GET_STATISTICS:
             if argument is not None and (type(argument) is not int or argument < 1):
-                raise _refuse(errno.EINVAL, f"{what}: {argument!r} ticks; want a number from 1, or none")
+                raise _refuse(errno.EINVAL, f"{what}: {shown(argument)} ticks; want a number from 1, or none")
             return runtime.statistics_report(argument or FEW_TICKS)
         case Request.WAIT_UNTIL_EVENT:
             raise _refuse(errno.ENOTTY, f"{what}: is answered by the client library, out of the page")
@@ -114,8 +117,9 @@ def ioctl(
     except Refusal as error:
         raise _refuse(error.errno, f"{what}: {error}") from None
     except Exception as error:  # what a client asks for must not end what others do with the device
-        runtime.log("error", f"{what} with {argument!r:.80}: the driver failed: {error!r}")
-        raise _refuse(errno.EIO, f"{what}: the driver failed: {error!r}") from None
+        trace = "".join(traceback.format_exception(error)[-3:])
+        runtime.log("error", f"{what} with {shown(argument)}: the driver failed: {trace}")
+        raise _refuse(errno.EIO, f"{what}: the driver failed: {shown(error)}") from None
     if isinstance(answer, Awaited):
         return _await(runtime, handle, number, answer, timeout_s, what)
     if not isinstance(answer, Generator):
@@ -152,7 +156,11 @@ def _axis_request(
             )  # fmt: skip
             return LATER
         case Request.SEND_EXTERNAL_SYNCH:
-            start_ns = int(argument) if argument else now_ns
+            if argument is not None and type(argument) is not int:
+                raise _refuse(
+                    errno.EINVAL, f"{what}: {shown(argument)} as start; want a time in ns, or none for now"
+                )
+            start_ns = argument or now_ns
             if start_ns < now_ns - runtime.period_ns:
                 raise _refuse(
                     errno.ETIME,
@@ -178,12 +186,7 @@ def _axis_request(
             check_link(runtime, handle, what)
             bank.home(axes, now_ns)
         case Request.SET_LIMITS:
-            if not isinstance(argument, dict) or not all(isinstance(k, str) for k in argument):
-                raise _refuse(errno.EINVAL, f"{what}: want limits by name, e.g. {{position_max: 0.2}}")
-            try:
-                bank.set_limits(axes, **argument)
-            except TypeError as error:
-                raise _refuse(errno.EINVAL, f"{what}: {error}") from None
+            bank.set_limits(axes, **_limits(argument, what))
         case Request.GET_LIMITS:
             return bank.get_limits(axes)
         case Request.GET_PARTICULARS:
@@ -202,7 +205,7 @@ def _zero_analog(
     assert isinstance(block, AnalogBlock)
     samples = 1 if argument is None else argument
     if type(samples) is not int or not 1 <= samples <= 1_000_000:
-        raise _refuse(errno.EINVAL, f"{what}: {samples!r} samples; want 1 to 1000000")
+        raise _refuse(errno.EINVAL, f"{what}: {shown(samples)} samples; want 1 to 1000000")
     check_link(runtime, handle, what)
     total = np.zeros(len(channels))
     good = bad = 0
@@ -272,11 +275,24 @@ def _gains(handle: Handle, request: Request, argument: Any, what: str) -> list[f
     return None
 
 
+def _limits(argument: Any, what: str) -> dict[str, Any]:
+    """Check limits by name: a number, None for the configured one, or one of them an axis."""
+    if not isinstance(argument, dict):
+        raise _refuse(errno.EINVAL, f"{what}: want limits by name, e.g. {{position_max: 0.2}}")
+    for name, given in argument.items():
+        if name not in LIMIT_NAMES:
+            raise _refuse(errno.EINVAL, f"{what}: no limit {shown(name)}; one of {', '.join(LIMIT_NAMES)}")
+        for value in given if isinstance(given, list) else [given]:
+            if value is not None and (type(value) not in (int, float) or value != value):
+                raise _refuse(errno.EINVAL, f"{what}: {name} {shown(value)}; want a number, or none")
+    return argument
+
+
 def _numbers(argument: Any, count: int, what: str, name: str) -> Sequence[float]:
     values = argument if isinstance(argument, list) else [argument]
     if len(values) != count:
         raise _refuse(errno.EINVAL, f"{what}: {len(values)} values of {name}; want {count}")
     for value in values:
         if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
-            raise _refuse(errno.EINVAL, f"{what}: {name} {value!r}; want a finite number")
+            raise _refuse(errno.EINVAL, f"{what}: {name} {shown(value)}; want a finite number")
     return [float(value) for value in values]

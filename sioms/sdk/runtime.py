@@ -24,16 +24,18 @@ import numpy as np
 
 from sioms.motion import CommandError, EventKind
 from sioms.protocol.flags import PageState
+from sioms.protocol.incoming import TO_DRIVER, take
 from sioms.protocol.latch import LATCH_SIZE, Latch
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
 from sioms.protocol.messages import (
     MAX_PACKET,
+    MAX_UNPACKED,
     DriverVerb,
-    decode,
     encode,
 )
 from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.stopjournal import StopJournal
+from sioms.protocol.text import printable
 
 from .attachments import Attachments
 from .blocks import AnyBlock, AxisBlock, set_alarms
@@ -146,7 +148,7 @@ class Runtime:
 
     def log(self, level: str, text: str) -> None:
         """Write a line to the daemon's log."""
-        self.tell(DriverVerb.LOG, level, text[:1000])
+        self.tell(DriverVerb.LOG, level, printable(text.replace("\n", " "), 1000))
 
     def emergency_stop(self, source: str) -> None:
         """Stop the whole workcell."""
@@ -197,7 +199,7 @@ class Runtime:
     def set_link(self, blocks: Sequence[AnyBlock], state: PageState, reason: str) -> None:
         """Say how the device behind some blocks is: in their pages, and to the daemon once a change."""
         if self.pages.set_link(blocks, state, reason):
-            self.tell(DriverVerb.LINK, int(state), reason)
+            self.tell(DriverVerb.LINK, int(state), printable(reason))
 
     def is_good(self, blocks: Sequence[AnyBlock]) -> bool:
         """Whether all these blocks have a good link."""
@@ -526,8 +528,8 @@ class Runtime:
             self.unwatch(self._control.fileno())
             self.end("the daemon has gone")
             return False
-        message: list[Any] = decode(packet)
-        self._obey(DriverVerb(message[0]), message[2:], fds)
+        verb, _, arguments = take(packet, TO_DRIVER, values=MAX_UNPACKED)
+        self._obey(DriverVerb(verb), arguments, fds)
         return True
 
     def _obey(self, verb: DriverVerb, arguments: list[Any], fds: list[int]) -> None:

@@ -143,8 +143,25 @@ BAD_SESSION = [
     encode(ClientVerb.INFO, 1),
     bytes(MAX_PACKET + 1),
 ]
+DEEP = [
+    head + b"\x91" * depth + b"\xc0" + tail
+    for depth in (17, 1000, 1015, 20_000)
+    for head, tail in (
+        (b"\x95\x02\x01" + bytes([Request.GET_STATISTICS]), b"\x00"),  # as the argument of a request
+        (b"\x92", b"\x01"),  # as the verb
+        (b"\x95\x02", b"\x00\x00\x00"),  # as the message number
+    )
+]
+"""Lists within lists, at places where a value is wanted."""
 BAD_HANDLE = [
     *HUGE,
+    *DEEP,
+    encode(HandleVerb.IOCTL, 1, Request.GET_STATISTICS, [[]] * 10_000, 0.0),
+    encode(HandleVerb.IOCTL, 1, Request.GET_STATISTICS, msgpack.Timestamp(0), 0.0),
+    encode(HandleVerb.IOCTL, 1, Request.GET_STATISTICS, msgpack.ExtType(5, b"x"), 0.0),
+    encode(HandleVerb.IOCTL, 1, Request.GET_STATISTICS, None, True),
+    b"\x95\x02\x01" + bytes([Request.GET_STATISTICS]) + b"\xa3\xed\xa0\x80\x00",  # a surrogate as text
+    encode(HandleVerb.KEEPALIVE, 0, 1),
     encode(HandleVerb.WRITE, 0, 0, 0.0, b""),
     encode(HandleVerb.WRITE, 1),
     encode(HandleVerb.WRITE, 1, 0, 0.0, None),
@@ -154,7 +171,6 @@ BAD_HANDLE = [
     encode(HandleVerb.WRITE, 1, 0, 0.0, 7),
     encode(HandleVerb.IOCTL, 1, math.inf, None, 0.0),
     encode(HandleVerb.IOCTL, 1, [], None, 0.0),
-    encode(HandleVerb.IOCTL, 1, Request.SEND_EXTERNAL_SYNCH, math.inf, 0.0),
     encode(HandleVerb.SUBSCRIBE, 1, math.inf),
     encode(HandleVerb.SUBSCRIBE, 1),
     encode(HandleVerb.CANCEL, 1, math.inf),
@@ -169,6 +185,37 @@ def test_bad_message_ends_its_session_only(
     session = raw()
     session.sock.send(packet)
     assert session.is_ended()
+
+
+ODD_ARGUMENTS: list[tuple[Request, object]] = [
+    (Request.SEND_EXTERNAL_SYNCH, math.inf),
+    (Request.SEND_EXTERNAL_SYNCH, []),
+    (Request.SEND_EXTERNAL_SYNCH, True),
+    (Request.GET_STATISTICS, [[[[[[[1]]]]]]]),
+    (Request.GET_STATISTICS, 1 << 63),
+    (Request.GET_STATISTICS, "x" * 40_000 + "\x1b[2J"),
+    (Request.SET_LIMITS, []),
+    (Request.SET_LIMITS, {"axes": [0]}),
+    (Request.SET_LIMITS, {"self": 1}),
+    (Request.SET_LIMITS, {"velocity_max": "fast"}),
+    (Request.SET_LIMITS, {"velocity_max": [{}]}),
+    (Request.SET_LIMITS, {"velocity_max": True}),
+    (Request.CALIBRATE_DEVICE, {"a": 1}),
+    (Request.CALIBRATE_DEVICE, [[]]),
+    (Request.SET_GAINS, 1),
+]
+
+
+def test_an_odd_argument_is_refused_with_a_sentence_fit_to_be_shown(
+    bystander: Bystander, handle: Callable[..., tuple[Raw, Raw]]
+) -> None:
+    _, node = handle("mod0.xaxis")
+    for number, (request, argument) in enumerate(ODD_ARGUMENTS, 1):
+        if (request, argument) == (Request.GET_STATISTICS, 1 << 63):
+            continue  # as good as all ticks
+        reply, _ = node.ask(HandleVerb.IOCTL, number, request, argument, 0.0)
+        assert reply[1] == number and reply[2] in (errno.EINVAL, errno.ENOTTY), (request, argument, reply)
+        assert reply[3].isprintable() and len(reply[3]) < 300, reply
 
 
 @pytest.mark.parametrize("packet", BAD_HANDLE, ids=lambda p: p[:12].hex() or "empty")
@@ -192,6 +239,32 @@ def test_end_of_a_session_is_told_in_the_log(start_daemon: Callable[..., Daemon]
     assert session.is_ended()
     session.close()
     daemon.said(r'level=warning event="session ended" peer="pid \d+ \(\w+\)" why="verb 250 is none"')
+
+
+def _texts(value: object) -> Iterator[str]:
+    """Every text in an answer."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list | tuple):
+        for each in value.values() if isinstance(value, dict) else value:
+            yield from _texts(each)
+
+
+def test_no_text_of_a_client_reaches_log_or_status_raw(start_daemon: Callable[..., Daemon]) -> None:
+    daemon = start_daemon()
+    name = "eva\x1b[2J\r\nlevel=error event=forged \u202eoperator"
+    with daemon.cell(name) as cell, cell.open("mod0", "rw", timeout=5.0) as node:
+        cell.emergency_stop("mod0", why="hot\x07\x1b]0;x\x07")
+        texts = [*_texts(cell.status()), *(entry.holder for entry in cell.nodes())]
+        with pytest.raises(OSError, match="held by") as caught, daemon.cell() as other:
+            other.open("mod0", "rw")
+        texts.append(str(caught.value))
+        cell.reset("mod0")
+        node.close()
+    lines = [line.rstrip("\n") for line in daemon.running.lines]
+    assert sum("eva" in text for text in texts) >= 3 and any("eva" in line for line in lines)
+    assert all(text.isprintable() for text in texts + lines), texts
+    assert not any(line.startswith("level=error event=forged") for line in lines)
 
 
 def test_a_client_learns_why_its_handle_ended(daemon: Daemon, cell: sioms.Workcell) -> None:

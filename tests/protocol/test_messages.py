@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import math
 import random
+import zlib
 
 import msgpack
 import pytest
@@ -20,21 +21,26 @@ from sioms.protocol.flags import (
     Right,
     WriteFlag,
 )  # fmt: skip
+from sioms.protocol.incoming import FROM_CLIENT, FROM_DRIVER, ON_HANDLE, TO_DRIVER, TO_NURSERY, take
 from sioms.protocol.messages import (
     MAX_PACKET,
-    MAX_TEXT,
+    MAX_UNPACKED,
+    MAX_VALUES,
     ClientVerb,
     DriverVerb,
     HandleVerb,
     MalformedMessage,
     NurseryVerb,
     decode,
+    decode_reply,
     encode,
     refusal,
     reply,
     value_of,
 )  # fmt: skip
 from sioms.protocol.records import ANALOG_WRITE, AXIS_WRITE, BINARY_WRITE
+from sioms.protocol.text import MAX_TEXT
+from sioms.protocol.wire import MAX_DEPTH
 
 GOLDEN = [
     (encode(ClientVerb.HELLO, 1, 1, "eva"), "94010101a3657661"),
@@ -107,8 +113,8 @@ def test_a_long_reply_is_compressed_and_one_too_long_is_a_refusal() -> None:
     assert len(encode(0, 7, 0, value)) > MAX_PACKET >= len(packet)
     message = decode(packet)
     assert message[:3] == [0, 7, 0] and message[4] is True and value_of(message) == value
-    assert value_of(decode(reply(7, [1]))) == [1]
-    assert value_of(decode(reply(7, [1], 99))) == [1] and decode(reply(7, [1], 99))[5] == 99
+    assert value_of(decode_reply(reply(7, [1]))) == [1]
+    assert value_of(decode_reply(reply(7, [1], 99))) == [1] and decode(reply(7, [1], 99))[5] == 99
     assert decode(reply(7, value, 99))[5] == decode(refusal(7, 5, "no", 99))[5] == 99
     noise = random.Random(1).randbytes(2 * MAX_PACKET)
     refused = decode(reply(7, noise))
@@ -161,3 +167,69 @@ def test_golden_records() -> None:
     )  # fmt: skip
     assert BINARY_WRITE.pack(2, 0, 5, 7).hex() == "02000000" "00000000" "0500000000000000" "0700000000000000"  # fmt: skip
     assert ANALOG_WRITE.pack(3, 0, 0.5).hex() == "03000000" "00000000" "000000000000e03f"  # fmt: skip
+
+
+def test_nothing_is_nested_deeper_than_messages_need() -> None:
+    for depth in (MAX_DEPTH - 1, MAX_DEPTH, 1000, 30_000):
+        packet = b"\x93\x01\x01" + b"\x91" * depth + b"\xc0"
+        if depth < MAX_DEPTH:
+            assert decode(packet)[2] != []
+        else:
+            with pytest.raises(MalformedMessage, match="nested more than 16 deep"):
+                decode(packet)
+
+
+def test_a_request_holds_a_bounded_number_of_values() -> None:
+    argument = [[] for _ in range(MAX_VALUES)]
+    packet = encode(HandleVerb.IOCTL, 1, 27, argument, 0.0)
+    with pytest.raises(MalformedMessage, match="too many values"):
+        take(packet, ON_HANDLE)
+    assert decode(packet)[3] == argument, "a reply may hold more"
+
+
+def test_what_unpacks_to_too_much_is_refused_before_it_is_unpacked() -> None:
+    bomb = zlib.compress(b"\xc6" + (2 * MAX_UNPACKED).to_bytes(4, "big") + bytes(2 * MAX_UNPACKED))
+    assert len(bomb) < MAX_PACKET
+    with pytest.raises(MalformedMessage, match=str(MAX_UNPACKED)):
+        value_of([0, 1, 0, bomb, True, 0])
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        [0, 1], [0, 1, 0], [0, 1, None, 1], [0, 1, [], "x"], [0, 1, 5, None], [0, 1, 5, [1]], [0, 1, 0, None, 1],
+        [0, 1, 0, None, False, None], [0, 1, 0, None, False, 1.5], [0, 1, 0, None, False, 0, 0], [0, 1, True, "x"],
+    ],
+)  # fmt: skip
+def test_what_is_no_reply(message: list[object]) -> None:
+    with pytest.raises(MalformedMessage):
+        decode_reply(encode(*message))
+
+
+def test_every_verb_takes_certain_kinds_and_nothing_else() -> None:
+    for verbs in (FROM_CLIENT, ON_HANDLE, TO_DRIVER, FROM_DRIVER, TO_NURSERY):
+        for verb, kinds in verbs.items():
+            good = [kind.types[0]() if kind.types else None for kind in kinds]
+            assert take(encode(verb, 1, *good), verbs) == (verb, 1, good)
+            with pytest.raises(MalformedMessage, match="arguments"):
+                take(encode(verb, 1, *good, None), verbs)
+            for place, kind in enumerate(kinds):
+                for odd in (None, True, 1, 1.5, math.nan, "x", "x" * 300, b"x", [1], {"a": 1}):
+                    parts = [*good[:place], odd, *good[place + 1 :]]
+                    fits = not kind.types or (type(odd) in kind.types and odd == odd)
+                    if fits and not (kind.most and len(str(odd)) > kind.most):
+                        take(encode(verb, 1, *parts), verbs)
+                    else:
+                        with pytest.raises(MalformedMessage, match="want"):
+                            take(encode(verb, 1, *parts), verbs)
+        with pytest.raises(MalformedMessage, match="none"):
+            take(encode(99, 1), verbs)
+
+
+@pytest.mark.parametrize(
+    "text", ["a\x1b[2J", "a\r\nb", "\x00", "\u202e", "\ud800", "\x9b1m", "x" * 3000, "\n" * 3000]
+)
+def test_a_text_is_made_fit_for_a_terminal(text: str) -> None:
+    shown = decode_reply(refusal(1, 5, text))[3]
+    assert shown.isprintable() and 0 < len(shown) <= MAX_TEXT
+    assert decode_reply(encode(0, 1, 5, text.encode("utf-8", "replace").decode()))[3].isprintable()

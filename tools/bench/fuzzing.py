@@ -32,7 +32,7 @@ HISTORY = 4096
 NAN = float("nan")
 STRANGE: tuple[Any, ...] = (
     None, True, -1, 0, 1, 2**31, 2**53, 2**63, -(2**63), 1e308, NAN, float("inf"), "", "mod0", "x" * 300, b"", b"\0" * 144,
-    [], [[]], {}, {"a": 1}, [None] * 40,
+    [], [[]], {}, {"a": 1}, [None] * 40, [[[[[[[[[[1]]]]]]]]]], "eva\x1b[2J\r\n",
 )  # fmt: skip
 STRAY = ("Traceback", "driver failed", "level=error")
 

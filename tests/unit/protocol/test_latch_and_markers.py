@@ -67,7 +67,7 @@ def test_every_request_changes_the_mark(request_file: StopRequest) -> None:
         request_file.request(now, 42, "a reason\x1b[31m")
         assert request_file.mark not in marks
         marks.append(request_file.mark)
-    assert request_file.source == "pid 42: a reason?[31m, through the stop-request page"
+    assert request_file.source == "pid 42: a reason\\x1b[31m, through the stop-request page"
 
 
 def test_writing_the_old_word_takes_no_request_back(request_file: StopRequest, tmp_path: Path) -> None:

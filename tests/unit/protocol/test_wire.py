@@ -38,6 +38,7 @@ EDGES = [
 
 
 def theirs(data: bytes) -> object:
+    wire.check(data, 1 << 30)
     return msgpack.unpackb(data, raw=False, use_list=True, strict_map_key=True)
 
 
