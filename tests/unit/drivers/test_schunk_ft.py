@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from typing import Any
 
+import numpy as np
 import pytest
 from force_rig import INVALID, LOAD, SATURATED, Rig, check_refused, steps_of
 
@@ -197,7 +198,7 @@ def test_a_tare_is_told_as_lost_when_the_sensor_was_without_power(off_s: float, 
     rig.go(0.1)
     assert (rig.flags == INVALID) is lost
     if lost:
-        block.offset[0] = 0.5  # as ZERO_DEVICE sets it
+        block.set_offset(np.arange(6), np.full(6, 0.5))  # as ZERO_DEVICE does
         rig.go(0.1)
         assert rig.flags == 0 and rig.driver.counters()["status"] == "ok"
 
