@@ -28,7 +28,7 @@ from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.socketpath import socket_path
 from sioms.protocol.stopfile import StopRequest
 
-from .client.channel import FIRST_LOOK_S, Answer, Call, Channel
+from .client.channel import Answer, Call, Channel
 from .client.channel import connect as connect_socket
 from .client.command import command
 from .client.node_core import Edges, Event, NodeCore
@@ -60,9 +60,9 @@ class _Requests:
         future: asyncio.Future[Answer] = self._loop.create_future()
         self._futures[number] = future
         if call.limit_s is not None:
-            first_s = monotonic() + call.limit_s + FIRST_LOOK_S
+            due_s = monotonic() + call.limit_s
             self._looks[number] = self._loop.call_later(
-                call.limit_s + FIRST_LOOK_S, self._look, number, call, first_s, None
+                call.limit_s + call.first_look_s, self._look, number, call, due_s, None
             )
         try:
             return await future
@@ -74,14 +74,14 @@ class _Requests:
             if look is not None:
                 look.cancel()
 
-    def _look(self, number: int, call: Call, first_s: float, overdue: Overdue | None) -> None:
+    def _look(self, number: int, call: Call, due_s: float, overdue: Overdue | None) -> None:
         """Judge by the process that owes an overdue answer whether to wait on."""
-        overdue = overdue or self._channel.overdue(call, first_s)
+        overdue = overdue or self._channel.overdue(call, due_s)
         now_s = monotonic()
         until_s = overdue.until(now_s)
         if until_s:
             self._looks[number] = self._loop.call_later(
-                until_s - now_s, self._look, number, call, first_s, overdue
+                until_s - now_s, self._look, number, call, due_s, overdue
             )
             return
         future = self._futures.get(number)

@@ -17,6 +17,7 @@ from _socket import (
     SHUT_RDWR,
     SO_PEERCRED,
     SO_RCVTIMEO,
+    SO_SNDTIMEO,
     SOCK_SEQPACKET,
     SOL_SOCKET,
     socket,
@@ -54,6 +55,10 @@ INTERRUPTIBLE_S = 1.0
 """A signal that comes just before the interpreter goes to sleep is seen when that wakes: it sleeps this long [s]."""
 FIRST_LOOK_S = 1.0
 """How long after its own time-out an answer is overdue: then the process that owes it is looked at (``overdue``) [s]."""
+ENOUGH_LOOK_S = 0.25
+"""The same for an answer that may be needless when it is overdue [s]."""
+CONNECT_S = 2.0
+"""How long a daemon may take to let a client in when many are waiting [s]; one that hangs lets nobody in."""
 
 
 class Call:
@@ -87,6 +92,11 @@ class Call:
         self.limit_s = limit_s
         self.enough = enough
 
+    @property
+    def first_look_s(self) -> float:
+        """How long after its time-out its answer is overdue [s]."""
+        return FIRST_LOOK_S if self.enough is None else ENOUGH_LOOK_S
+
 
 class Answer:
     """A successful reply: its value, and the descriptors that came along."""
@@ -98,15 +108,23 @@ class Answer:
         self.fds = fds
 
 
-def connect(path: str) -> socket:
+def connect(path: str, timeout_s: float = CONNECT_S) -> socket:
     """Connect to the daemon.
 
     Raises:
-        OSError: nobody listens there, with a sentence that says how to start a daemon.
+        OSError: nobody listens there, with a sentence that says how to start a daemon; ETIMEDOUT it lets nobody in.
     """
     sock = socket(AF_UNIX, SOCK_SEQPACKET)
     try:
+        sock.setsockopt(SOL_SOCKET, SO_SNDTIMEO, pack("ll", int(timeout_s), int(timeout_s % 1 * 1e6)))
         sock.connect(path)
+        sock.setsockopt(SOL_SOCKET, SO_SNDTIMEO, _FOREVER)
+    except BlockingIOError:
+        sock.close()
+        raise OSError(
+            errno.ETIMEDOUT,
+            f"connect to {path}: many wait there, and the daemon lets nobody in; is its process hung?",
+        ) from None
     except OSError as error:
         sock.close()
         hint = {
@@ -249,7 +267,8 @@ class Channel:
 
     def wait(self, number: int, call: Call) -> Answer:
         """Wait for the answer to a sent request."""
-        deadline = None if call.limit_s is None else monotonic() + call.limit_s + FIRST_LOOK_S
+        due_s = monotonic() + (call.limit_s or 0.0)
+        deadline = None if call.limit_s is None else due_s + call.first_look_s
         overdue: Overdue | None = None
         while True:
             with self._mutex:
@@ -273,12 +292,13 @@ class Channel:
                     self._waiting.pop(number, None)
                     late = False
                     if number not in self._answers and deadline is not None and monotonic() >= deadline:
-                        overdue = overdue or self.overdue(call, deadline)
+                        overdue = overdue or self.overdue(call, due_s)
                         deadline = overdue.until(monotonic())
                         late = not deadline
                     if late and not self._reading:  # the reading may just have been passed to us
                         self._pass_on()
                 if late:
+                    self._abandon(number)
                     raise self.late(call)
                 continue
             try:
@@ -290,9 +310,10 @@ class Channel:
             if found is not None:
                 return self.result(found)
             if deadline is not None:
-                overdue = overdue or self.overdue(call, deadline)
+                overdue = overdue or self.overdue(call, due_s)
                 deadline = overdue.until(monotonic())
                 if not deadline:
+                    self._abandon(number)
                     raise self.late(call)
 
     def _pass_on(self) -> None:
@@ -422,12 +443,12 @@ class Channel:
                 continue
         return None
 
-    def overdue(self, call: Call, first_s: float) -> Overdue:
+    def overdue(self, call: Call, due_s: float) -> Overdue:
         """Return who tells how long an overdue answer is still waited for.
 
         Args:
             call: the request.
-            first_s: the moment at which it is overdue [s, time.monotonic].
+            due_s: the moment of its time-out [s, time.monotonic].
         """
         from .overdue import Overdue
 
@@ -438,8 +459,8 @@ class Channel:
         if self._behind:
             known, pid = self._behind
             # Elsewhere processes have other numbers than here.
-            return Overdue(pid if known == maker else 0, first_s, call.enough)
-        return Overdue(maker if maker != os.getpid() else 0, first_s, call.enough)
+            return Overdue(pid if known == maker else 0, due_s, call.enough)
+        return Overdue(maker if maker != os.getpid() else 0, due_s, call.enough)
 
     def late(self, call: Call) -> OSError:
         """Return the error of a request that nobody has answered in time."""

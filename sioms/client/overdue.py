@@ -6,8 +6,6 @@ Nothing of this is loaded, or costs anything, before an answer has taken a secon
 
 from __future__ import annotations
 
-from .channel import FIRST_LOOK_S
-
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -44,12 +42,12 @@ def look_at(pid: int) -> Seen:
 
 
 class Overdue:
-    """A request that has not been answered within FIRST_LOOK_S of its time-out.
+    """A request whose answer is overdue.
 
     Args:
         pid: the process that owes the answer, 0 when nobody knows: then GRACE_S is all it gets.
-        first_s: the moment FIRST_LOOK_S after its time-out [s, time.monotonic].
-        enough: tells whether the answer is not needed any more.
+        due_s: the moment of its time-out [s, time.monotonic].
+        enough: tells whether the answer is not needed any more; it is asked at each look.
         look: as look_at.
     """
 
@@ -58,13 +56,13 @@ class Overdue:
     def __init__(
         self,
         pid: int,
-        first_s: float,
+        due_s: float,
         enough: Callable[[], bool] | None = None,
         look: Callable[[int], Seen] = look_at,
     ) -> None:
         self._pid = pid
-        self._due_s = first_s - FIRST_LOOK_S + GRACE_S
-        self._progress_s = first_s - FIRST_LOOK_S
+        self._due_s = due_s + GRACE_S
+        self._progress_s = due_s
         self._enough = enough
         self._look = look
         self._seen: Seen | None = None
@@ -77,7 +75,8 @@ class Overdue:
         until_s = min(until_s, self._due_s - GRACE_S + MOST_S)
         if now_s >= until_s:
             return 0.0
-        return min(until_s, max(now_s + LOOK_S, self._due_s))
+        look_s = now_s + LOOK_S
+        return min(until_s, look_s if self._enough is not None else max(look_s, self._due_s))
 
     def _alive_s(self, now_s: float) -> float:
         """Return when the process last did something, or could not because others had the processors."""

@@ -38,7 +38,7 @@ def emergency_stop(why: str = "", path: str | None = None, name: str | None = No
             return ""
         word = request.request(monotonic_ns(), os.getpid(), why)  # first: it is heard within a tick
         try:
-            with Workcell(path, name) as cell:
+            with Workcell(path, name, enough=lambda: request.taken(word)) as cell:
                 cell.emergency_stop(why=why)  # the daemon knows who it was
         except OSError as error:
             if error.errno == errno.EPERM or not taken(request, word):

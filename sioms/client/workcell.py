@@ -14,7 +14,7 @@ from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.socketpath import socket_path
 from sioms.protocol.stopfile import StopRequest
 
-from .channel import Answer, Call, Channel, connect
+from .channel import CONNECT_S, ENOUGH_LOOK_S, Answer, Call, Channel, connect
 from .node import NODE, SYNCH_LEAD_S, AxisNode, Node
 from .shown import acknowledged_by_daemon
 
@@ -127,6 +127,7 @@ class Workcell:
     Args:
         path: the daemon's socket; None for $SIOMS_SOCKET or the usual places.
         name: what this client calls itself in messages and lists.
+        enough: tells of a daemon that does not answer at once whether the session is not needed any more.
 
     Raises:
         OSError: no daemon there, or of another protocol version.
@@ -134,11 +135,15 @@ class Workcell:
     Concurrency: may be used by many threads.
     """
 
-    def __init__(self, path: str | None = None, name: str | None = None) -> None:
+    def __init__(
+        self, path: str | None = None, name: str | None = None, *, enough: Callable[[], bool] | None = None
+    ) -> None:
         self._path = path or socket_path()
-        self._channel = Channel(connect(self._path), "the daemon")
+        self._channel = Channel(
+            connect(self._path, CONNECT_S if enough is None else ENOUGH_LOOK_S), "the daemon"
+        )
         title = os.path.basename(sys.argv[0]) if name is None and sys.argv and sys.argv[0] else name or ""
-        answer = self._hello(Call("hello", ClientVerb.HELLO, PROTOCOL_VERSION, title))
+        answer = self._hello(Call("hello", ClientVerb.HELLO, PROTOCOL_VERSION, title, enough=enough))
         _, self.name, self.rights = answer.value
         self._request: StopRequest | None = None
         self._nodes: dict[int, Node] = {}

@@ -147,6 +147,7 @@ def test_a_fresh_stop_while_the_daemon_hangs_stays_latched(
         at_rest(axis, 1.0)
         _, said = tool.communicate(timeout=20.0)
         assert tool.returncode == 0, said
+        assert time.monotonic() - began < latched_s + 1.5, "what is latched is told at once"
         assert "stopped and latched by the drivers; hello: the daemon does not answer" in said
     print(f"start of {module} to latched: {latched_s * 1e3:.0f} ms")
     wait_for(lambda: f"pid {tool.pid}" in cell.status()["stop_source"], "the daemon knows who")

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import _socket
 import errno
+import os
 import socket
 import threading
 from _thread import allocate_lock
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from sioms.client.channel import Call, Channel
+from sioms.client.channel import Call, Channel, connect
 from sioms.client.overdue import GRACE_S
-from sioms.protocol.messages import decode, encode, refusal, reply
+from sioms.protocol.messages import ClientVerb, decode, encode, refusal, reply
 
 
 class Peer:
@@ -142,6 +144,37 @@ def test_a_peer_that_talks_nonsense_ends_the_channel(peer: Peer) -> None:
     peer.sock.send(b"\xc1nonsense")
     error = peer.join()["x"]
     assert isinstance(error, OSError) and error.errno == errno.EPROTO
+
+
+def test_an_answer_that_comes_too_late_is_cancelled_and_leaves_nothing_behind(peer: Peer) -> None:
+    number = peer.ask("late", -GRACE_S)
+    assert isinstance(peer.join()["late"], OSError)
+    verb, cancelling, *what = decode(peer.sock.recv(65536))
+    assert (verb, what) == (ClientVerb.CANCEL, [number])
+    read_end, write_end = os.pipe()
+    socket.send_fds(peer.sock, [reply(number, "a node")], [write_end])
+    os.close(write_end)
+    peer.sock.send(reply(int(cancelling), None))
+    last = peer.ask("next")
+    peer.sock.send(reply(last, 1))
+    assert peer.join()["next"] == 1
+    assert os.read(read_end, 1) == b"", "its descriptor is closed, and who sent it sees that"
+    os.close(read_end)
+    assert not peer.channel._answers and not peer.channel._abandoned
+
+
+def test_a_daemon_that_lets_nobody_in_is_not_waited_for_long(short_folder: Path) -> None:
+    path = str(short_folder / "s")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listening:
+        listening.bind(path)
+        listening.listen(0)
+        waiting = [connect(path)]
+        with pytest.raises(OSError, match="lets nobody in") as refused:
+            while len(waiting) < 10:
+                waiting.append(connect(path, 0.05))
+        assert refused.value.errno == errno.ETIMEDOUT
+        for sock in waiting:
+            sock.close()
 
 
 def test_take_does_not_wait(peer: Peer) -> None:

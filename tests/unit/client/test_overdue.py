@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def waited(does: Callable[[float], Seen], pid: int = 7, enough: Callable[[], bool] | None = None) -> float:
     """Return how long after its time-out a request is given up, with a process that does this at each instant."""
     now_s = FIRST_LOOK_S
-    overdue = Overdue(pid, now_s, enough, lambda _: does(now_s))
+    overdue = Overdue(pid, 0.0, enough, lambda _: does(now_s))
     while until_s := overdue.until(now_s):
         assert until_s > now_s, "no time passes between two looks"
         now_s = until_s
@@ -67,6 +67,10 @@ def test_one_that_nobody_knows_or_may_see_gets_the_grace() -> None:
 
 def test_an_answer_that_is_not_needed_any_more_is_not_waited_for() -> None:
     assert waited(lambda _: ("R", 0, 0), enough=lambda: True) == FIRST_LOOK_S
+    looks = iter((False, False, True))
+    assert waited(lambda _: ("R", 0, 0), enough=lambda: next(looks)) == FIRST_LOOK_S + 2 * LOOK_S, (
+        "it is asked again soon"
+    )
 
 
 @pytest.fixture
