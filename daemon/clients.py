@@ -39,6 +39,14 @@ _SHOWN = frozenset(
 """What readings of nodes show: who has the answer shall read nothing older."""
 
 
+_NEEDS_ANY_RIGHT = {
+    ClientVerb.RESERVE_MARKER: "reserve markers",
+    ClientVerb.SIGNAL_MARKER: "signal a marker",
+    ClientVerb.WAIT_MARKER: "wait for a marker",
+}
+"""Requests on what belongs to no node: of anybody who may do something here."""
+
+
 class Clients:
     """All sessions of a daemon.
 
@@ -145,6 +153,9 @@ class Clients:
                 self.send(session, reply(number, value, _as_of_ns(verb)))
 
     def _verb(self, session: Session, verb: ClientVerb, number: int, arguments: list[Any]) -> Any:
+        if verb in _NEEDS_ANY_RIGHT and not self.rights.anywhere(session.peer):
+            what = f"{_NEEDS_ANY_RIGHT[verb]}: {session.peer.user}"
+            raise Refused(errno.EPERM, f"{what} has no right on any node; ask for a [[grant]]")
         match verb:
             case ClientVerb.HELLO:
                 return self._workcell.hello(session, number, *arguments)
@@ -203,9 +214,13 @@ class Clients:
             os.close(session.pidfd)
 
     def take_up_rights(self, rights: Rights) -> None:
-        """Let new grants hold, also for what is open already."""
+        """Let new names and grants hold, also for what is open already, and for who has left a group."""
         self.rights = rights
-        self.nodes.take_up_rights(rights)
+        for session in list(self.sessions):
+            session.peer = peer_of(session.sock, self.users)
+            if not rights.anywhere(session.peer):
+                self.markers.end_session(session)
+        self.nodes.take_up_rights()
 
     # --- waiting requests ------------------------------------------------------------------------
 

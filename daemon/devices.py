@@ -10,6 +10,7 @@ import signal
 import socket
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from enum import Enum
 from functools import partial
 from typing import Any, Protocol
@@ -73,6 +74,7 @@ class DriverProcess:
         shared: descriptors of latch, request page and marker table, passed to each process.
         owner: who is told.
         log: the daemon's log.
+        options: what the driver is told beside its settings.
     """
 
     def __init__(
@@ -91,7 +93,7 @@ class DriverProcess:
         self.restarts = Restarts()
         self.page_fds: list[int] = []
         self.hung = False
-        self._options = options
+        self.options = options
         self._maps: list[mmap.mmap] = []
         self._readers: list[PageReader] = []
         self._loop = loop
@@ -102,6 +104,8 @@ class DriverProcess:
         self._log = log
         self._sock: socket.socket | None = None
         self._pidfd = -1
+        self._dying: set[int] = set()
+        self._then: Callable[[], None] | None = None
         self._timer: Timer | None = None
         self._patience: Patience | None = None
         self._look_ns = 0
@@ -123,34 +127,42 @@ class DriverProcess:
         return self.state not in (State.DOWN, State.STARTING)
 
     def start(self) -> None:
-        """Fork the driver process."""
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        ours.setblocking(False)
-        self._sock = ours
+        """Fork the driver process, as soon as the one before it is gone: it may hold the device still."""
+        self._when_gone(self._fork)
+
+    def _fork(self) -> None:
         self.generation += 1
         self.state = State.STARTING
         self.started_ns = time.monotonic_ns()
         self.hung = False
+        try:
+            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        except OSError as error:
+            self._lost(f"its process could not be started: {error.strerror}")
+            return
+        ours.setblocking(False)
+        self._sock = ours
         options = dict(
-            self._options,
+            self.options,
             realtime_priority=self.device.common.realtime_priority,
             user=self.device.common.user,
             lease_s=self._lease_s,
             stopped=self._owner.stopped_of(self.name),
         )
         self._loop.watch(ours.fileno(), self._receive)  # first, because a spawn may be refused at once
-        self._nursery().spawn(
-            self.name, self.device.common.driver, self.device.settings, self.generation, options,
-            [theirs.fileno(), *self._shared], partial(self._spawned, self.generation),
-        )  # fmt: skip
-        theirs.close()
+        with theirs:
+            try:
+                self._nursery().spawn(
+                    self.name, self.device.common.driver, self.device.settings, self.generation, options,
+                    [theirs.fileno(), *self._shared], partial(self._spawned, self.generation),
+                )  # fmt: skip
+            except OSError as error:
+                self._end(f"its process could not be started: {error.strerror}")
 
     def _spawned(self, generation: int, pid: Any, errno_: int, text: str, fds: list[int]) -> None:
         if self._sock is None or generation != self.generation:  # ended while the nursery was forking
-            if not errno_:
-                os.kill(pid, signal.SIGKILL)
             for fd in fds:
-                os.close(fd)
+                self._bury(fd)
         elif errno_:
             self._end(f"its process could not be started: {text}")
         else:
@@ -158,6 +170,27 @@ class DriverProcess:
             self._patience = Patience(pid)
             self._patience.renew(time.monotonic())
             self._loop.watch(self._pidfd, self._exited)
+
+    def _bury(self, pidfd: int) -> None:
+        """Kill a process and see it gone: until then it may hold the device."""
+        with suppress(ProcessLookupError):
+            signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+
+        def gone() -> None:
+            self._loop.unwatch(pidfd)
+            os.close(pidfd)
+            self._dying.discard(pidfd)
+            self._when_gone(self._then)
+
+        self._dying.add(pidfd)
+        self._loop.watch(pidfd, gone)
+
+    def _when_gone(self, then: Callable[[], None] | None) -> None:
+        """Do one thing when no process of the past is left, instead of what was to be done."""
+        self._then = then
+        if not self._dying and then is not None:
+            self._then = None
+            then()
 
     def send(self, verb: DriverVerb, *arguments: object, fds: Sequence[int] = ()) -> None:
         """Send a notice to the driver.
@@ -214,8 +247,6 @@ class DriverProcess:
 
     def kill(self, reason: str) -> None:
         """End the process at once (SIGKILL) and let the restart policy go on."""
-        self.reason = reason
-        self._kill_process()
         self._end(reason)
 
     def shutdown(self, done: Callable[[], None] | None = None) -> None:
@@ -225,8 +256,7 @@ class DriverProcess:
         self._ended = done
         if self._sock is None:
             self.state = State.DOWN
-            if done is not None:
-                done()
+            self._when_gone(done)
             return
         self.state = State.ENDING
         self.tell(DriverVerb.SHUTDOWN)
@@ -281,19 +311,12 @@ class DriverProcess:
         self._log("info", "device up", device=self.name, pid=self.pid, generation=self.generation)
         self._owner.device_up(self)
 
-    def _kill_process(self) -> None:
-        if self._pidfd >= 0:
-            try:
-                signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
-            except ProcessLookupError:
-                return
-
     def _exited(self) -> None:
         while self._take():
             pass  # its last words: why it failed, which handles it has ended
         if self._sock is None:
             return
-        self._kill_process()  # a driver that closed its control socket has no business living on
+        # A driver that closed its control socket has no business living on.
         self._end(self.reason or "its driver process ended")
 
     def _end(self, reason: str) -> None:
@@ -313,8 +336,11 @@ class DriverProcess:
         self._sock = None
         if self._pidfd >= 0:
             self._loop.unwatch(self._pidfd)
-            os.close(self._pidfd)
+            self._bury(self._pidfd)
             self._pidfd = -1
+        self._lost(reason)
+
+    def _lost(self, reason: str) -> None:
         if self._timer is not None:
             self._timer.cancel()
         was, self.pid = self.state, 0
@@ -323,8 +349,7 @@ class DriverProcess:
         if was is State.ENDING:
             self.state = State.DOWN
             self._owner.device_gone(self, reason)
-            if self._ended is not None:
-                self._ended()
+            self._when_gone(self._ended)
             return
         again_ns = self.restarts.died(time.monotonic_ns())
         self.state = State.FAULT if again_ns is None else State.RESTARTING

@@ -5,11 +5,15 @@ Everything is checked before anything is touched, and all errors of all devices 
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import pwd
+import stat
 import time
+import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -18,16 +22,24 @@ from sioms.protocol.messages import MalformedMessage, unpack_compressed
 
 from .config import Config, parse
 from .lines import with_lines
-from .loop import Loop
+from .loop import Loop, Timer
 from .names import DeviceInfo, NameTable
-from .nursery import Nursery
+from .nursery import DIED, Nursery
 from .nursery_process import NurseryProcess
 from .patience import Patience
 
+LARGEST = 16 << 20
+"""Of a configuration [bytes]."""
 LOOK_S = 1.0
 """How often the nursery that describes is looked at [s]."""
 TELL_S = 5.0
 """How often it is told that describing takes long [s]."""
+
+
+def mistake(what: str, error: Exception) -> str:
+    """Return the sentence about an error of the daemon itself."""
+    trace = "".join(traceback.format_exception(error)[-3:])
+    return f"{what}: a mistake of the daemon, please report it: {error!r}: {trace}"
 
 
 class NotDescribed(str):
@@ -78,44 +90,78 @@ class Loader:
         self._done = done
         self._died = nursery_died
         self._process = process
+        self._text = ""
         self._infos: dict[str, DeviceInfo] = {}
         self._errors: list[str] = []
+        self._nursery: Nursery | None = None
+        self._timer: Timer | None = None
+        self._ended = False
 
     def start(self) -> None:
         """Begin; the rest happens in the loop."""
+        self._guarded(self._start)
+
+    def _start(self) -> None:
         try:
-            with open(self._path, encoding="utf-8") as file:
-                text = file.read()
+            self._text = _read(self._path)
         except (OSError, UnicodeDecodeError) as error:
             why = error.strerror if isinstance(error, OSError) else str(error)
-            self._done(None, [f"read configuration {self._path}: {str(why).lower()}"])
+            self._end(None, [f"read configuration {self._path}: {str(why).lower()}"])
             return
-        self._text = text
-        config, self._errors = parse(text, os.path.dirname(os.path.abspath(self._path)))
+        config, self._errors = parse(self._text, os.path.dirname(os.path.abspath(self._path)))
         if config is None or not config.devices:
-            with_lines(text, self._errors)
-            self._done(None, self._errors)
+            self._end(None, self._errors)
             return
         self._config = config
         self._waiting = set(config.devices)
         self._count = len(self._waiting)
-        self._nursery = Nursery(self._loop, self._died, self._process)
-        self._patience = Patience(self._nursery.pid)
+        self._nursery = nursery = Nursery(self._loop, self._died, self._process)
+        self._patience = Patience(nursery.pid)
         self._patience.renew(time.monotonic())
         self._told_s = self._began_s
         self._timer = self._loop.after(LOOK_S, self._look)
         for name, device in config.devices.items():
-            self._nursery.describe(
+            nursery.describe(
                 name, device.common.driver, device.settings, config.folder,
                 partial(self._described, name),
             )  # fmt: skip
+
+    def _guarded(self, step: Callable[[], None]) -> None:
+        """Take a step; whatever fails in it, the load comes to an end."""
+        try:
+            step()
+        except Exception as error:
+            if self._ended:
+                raise
+            self._end(None, [NotDescribed(mistake("load the configuration", error))])
+
+    def _end(self, plan: Plan | None, errors: list[str]) -> None:
+        """Tell the result, once; without a plan nothing is left of the attempt."""
+        if self._ended:
+            return
+        self._ended = True
+        self._waiting = set()
+        if self._timer is not None:
+            self._timer.cancel()
+        if plan is None:
+            if self._nursery is not None:
+                self._nursery.close()
+            with suppress(Exception):  # better an error without its line than none
+                with_lines(self._text, errors)
+        self._done(plan, errors)
 
     def _described(self, name: str, value: Any, errno_: int, text: str, _fds: list[int]) -> None:
         if name not in self._waiting:
             return
         self._waiting.discard(name)
         self._patience.renew(time.monotonic())
-        if errno_:
+        if errno_ == DIED:
+            self._errors.append(
+                NotDescribed(
+                    f"describe [device.{name}]: {text}; a driver that is asked before may have ended it"
+                )
+            )
+        elif errno_:
             self._errors.append(f"[device.{name}]: {text}")
         else:
             try:
@@ -126,7 +172,7 @@ class Loader:
                     f"[device.{name}]: its description is not understood ({error}); restart the daemon"
                 )
         if not self._waiting:
-            self._finish()
+            self._guarded(self._finish)
 
     def _take(self, name: str, errors: list[str], packed: list[Any] | None) -> None:
         self._errors += [f"[device.{name}]{error}" for error in errors]
@@ -150,7 +196,7 @@ class Loader:
                 )
                 for name in [n for n in self._config.devices if n in self._waiting][:1]
             ]
-            self._finish()
+            self._guarded(self._finish)
             return
         if now_s - self._told_s > TELL_S:
             self._told_s = now_s
@@ -158,8 +204,6 @@ class Loader:
         self._timer = self._loop.after(LOOK_S, self._look)
 
     def _finish(self) -> None:
-        self._timer.cancel()
-        self._waiting = set()
         # Names of devices that failed would only be missed again as targets of aliases.
         names = NameTable(
             {n: self._infos[n] for n in self._config.devices if n in self._infos}, self._config.nodes
@@ -168,17 +212,15 @@ class Loader:
         sources, alarms = self._stop_sources(names), self._alarms(names)
         if not self._errors:
             self._errors += names.errors
-        if self._errors:
-            with_lines(self._text, self._errors)
-            self._nursery.close()
-            self._done(None, self._errors)
+        if self._errors or self._nursery is None:
+            self._end(None, self._errors)
             return
         watched: dict[str, dict[int, str]] = {}
         for source in self._config.stop_sources:
             if source.on_loss == "stop":
                 node = names.nodes[source.node]
                 watched.setdefault(node.device, {}).setdefault(node.block, source.node)
-        self._done(Plan(self._config, names, self._nursery, sources, watched, alarms), [])
+        self._end(Plan(self._config, names, self._nursery, sources, watched, alarms), [])
 
     def _stop_sources(self, names: NameTable) -> dict[str, list[list[int]]]:
         found: dict[str, list[list[int]]] = {}
@@ -209,6 +251,23 @@ class Loader:
                 [node.block, list(node.channels), *low, *high, alarm.hysteresis]
             )
         return found
+
+
+def _read(path: str) -> str:
+    """Return the text of a configuration.
+
+    Raises:
+        OSError: it cannot be read; EINVAL, it is no file, or one of more than LARGEST bytes.
+        UnicodeDecodeError: it is no UTF-8.
+    """
+    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe would hold up the daemon
+    with open(fd, "rb") as file:
+        if not stat.S_ISREG(os.fstat(fd).st_mode):
+            raise OSError(errno.EINVAL, "it is no regular file")
+        data = file.read(LARGEST + 1)
+    if len(data) > LARGEST:
+        raise OSError(errno.EFBIG, f"it has more than {LARGEST >> 20} MiB")
+    return data.decode()
 
 
 def _unknown_users(config: Config) -> list[str]:

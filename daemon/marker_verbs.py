@@ -95,9 +95,13 @@ class MarkerVerbs:
                 self._clients.answer(wait, reply(wait.number, stamp_ns, time.monotonic_ns()))
 
     def end_session(self, session: Session) -> None:
-        """Free what a session owns."""
+        """Free what a session owns, and end its waits: it has ended, or lost its last right."""
         for reservation in self._owners.owned_by(session):
             self._release(reservation)
+        gone = f"{session.peer.user} has no right on any node any more"
+        for _, wait in list(self._waits):
+            if wait.session is session:
+                self._clients.answer(wait, refusal(wait.number, errno.EPERM, f"{wait.what}: {gone}"))
 
     def forget(self, wait: Wait) -> None:
         """Drop a wait that has ended in another way."""

@@ -20,7 +20,7 @@ from sioms.wording import did_you_mean
 from .claims import Claims
 from .devices import DriverProcess, State
 from .names import READONLY, Node
-from .rights import RIGHTS, Rights
+from .rights import in_words
 from .sessions import LATER, Handle, Refused, Session, Wait
 from .suspended import Suspended
 
@@ -28,10 +28,11 @@ if TYPE_CHECKING:
     from .clients import Clients
     from .server import Server
 
-_TO_DO = {right: name for name, right in RIGHTS.items()}
 _SEND_BUFFER = 1 << 18
 _START_S = 1.5
 """How long an open that is not to wait for other clients waits for a device that is just starting; below the client's grace."""
+_AGAIN_S = 0.02
+"""A driver that had no room for the message that ends a handle is told again after so long [s]."""
 
 
 class NodeVerbs:
@@ -47,12 +48,13 @@ class NodeVerbs:
         self._clients = clients
         self._handles: dict[int, Handle] = {}
         self._claims: Claims[Handle] = Claims()
-        self._opens: list[tuple[Wait, Callable[[], bool]]] = []
+        self._opens: list[tuple[Wait, Callable[[], None]]] = []
         self._numbers = itertools.count(1)
         self._suspended = Suspended()
+        self._then: list[tuple[set[int], Callable[[], None]]] = []
 
     def find(self, session: Session, what: str, name: str, right: Right = Right.READ) -> Node:
-        """Return a node with which the session may do something, as read it.
+        """Return a node on which the session has a right, or one of several.
 
         Raises:
             Refused: ENOENT, EACCES.
@@ -66,7 +68,7 @@ class NodeVerbs:
         if not self._clients.rights.on_node(session.peer, node.name) & right:
             raise Refused(
                 errno.EACCES if right is Right.READ else errno.EPERM,
-                f"{what} of {name}: {session.peer.user} has no right to {_TO_DO[right]} it; ask for a [[grant]]",
+                f"{what} of {name}: {session.peer.user} has no right to {in_words(right, ' or ')} it; ask for a [[grant]]",
             )
         return node
 
@@ -74,19 +76,13 @@ class NodeVerbs:
         self, session: Session, number: int, name: str, mode: int, timeout_s: float | None, lease_s: float
     ) -> Any:
         """Open a node, at once or when it becomes free."""
-        node = self.find(session, "open", name)
-        rights = self._clients.rights.on_node(session.peer, node.name)
+        node = self._openable(session, name)
         if not 1 <= mode <= 3:
             raise Refused(errno.EINVAL, f"open {name}: mode {mode}; want read (1), write (2) or both (3)")
         access = Access(mode)
         if access & Access.WRITE and node.read_only:
             raise Refused(
                 errno.EACCES, f"open {name} for writing: it is a read-only node; open it for reading"
-            )
-        if not node.read_only and not rights & Right.WRITE:
-            raise Refused(
-                errno.EACCES,
-                f"open {name}: {session.peer.user} has no right to write it; use {name}{READONLY} to observe",
             )
         if not 0 <= float(lease_s) <= 3600:
             raise Refused(errno.EINVAL, f"open {name}: lease {lease_s} s; want 0 (none) to 3600")
@@ -108,26 +104,39 @@ class NodeVerbs:
             f"open {name}: "
         )
 
-        def retry() -> bool:
-            if self._server.names.nodes.get(node.name) != node:  # a reload came in between
-                why = f"open {name}: it has been removed or changed meanwhile; open it again"
-                self._clients.answer(wait, refusal(wait.number, errno.EIO, why))
-                return True
-            obstacle = self._obstacle(node)
-            if obstacle is not None:
-                if patient or self._is_starting(node):
-                    return False
-                self._clients.answer(wait, refusal(wait.number, obstacle.errno, str(obstacle)))
-                return True
-            if self._clients.drop(wait):
-                try:
+        def retry() -> None:
+            try:
+                if self._server.names.nodes.get(node.name) != node:  # a reload came in between
+                    why = f"open {name}: it has been removed or changed meanwhile; open it again"
+                    raise Refused(errno.EIO, why)
+                self._openable(session, name)
+                obstacle = self._obstacle(node)
+                if obstacle is not None:
+                    if patient or self._is_starting(node):
+                        return
+                    raise obstacle
+                if self._clients.drop(wait):
                     self._grant(session, number, node, access, float(lease_s))
-                except Refused as error:
-                    self._clients.send(session, refusal(number, error.errno, str(error)))
-            return True
+            except Refused as error:
+                self._clients.drop(wait)
+                self._clients.send(session, refusal(number, error.errno, str(error)))
 
         self._opens.append((wait, retry))
         return LATER
+
+    def _openable(self, session: Session, name: str) -> Node:
+        """Return a node that the session may open: asked first, and again whenever that may have changed.
+
+        Raises:
+            Refused: ENOENT, EACCES.
+        """
+        node = self.find(session, "open", name)
+        if not node.read_only and not self._clients.rights.on_node(session.peer, node.name) & Right.WRITE:
+            raise Refused(
+                errno.EACCES,
+                f"open {name}: {session.peer.user} has no right to write it; use {name}{READONLY} to observe",
+            )
+        return node
 
     def _obstacle(self, node: Node) -> Refused | None:
         """Return why a node cannot be opened now, or None."""
@@ -188,7 +197,7 @@ class NodeVerbs:
             theirs.close()
 
     def retry_opens(self) -> None:
-        """Try the waiting opens again, the oldest first."""
+        """Try the waiting opens again, the oldest first, and ask again whether they may."""
         for _, retry in list(self._opens):
             retry()
 
@@ -213,32 +222,54 @@ class NodeVerbs:
         device = self._server.devices.get(handle.node.device)
         there = device is not None and device.generation == handle.generation and device.state is State.UP
         if device is not None and there:
-            device.tell(DriverVerb.DETACH, handle.number, 0, "")
+            self._order_end(device, handle, 0, "")
             if handle.claims:
                 return True
         self._forget(handle)
         return False
 
-    def take_up_rights(self, rights: Rights) -> None:
-        """Let new grants hold, also for what is open already: a handle that lost a right ends."""
+    def take_up_rights(self) -> None:
+        """End what is open by a name that is no more, or by a right that was taken away."""
         for handle in list(self._handles.values()):
-            lost = handle.rights & ~rights.on_node(handle.session.peer, handle.node.name)
-            device = self._server.devices.get(handle.node.device)
-            if lost and device is not None and device.generation == handle.generation:
-                names = ", ".join(name for name, right in RIGHTS.items() if right & lost)
-                text = f"{handle.node.name}: the right to {names} it was taken away; open it again"
-                device.tell(DriverVerb.DETACH, handle.number, errno.EACCES, text)
+            name = handle.node.name
+            lost = handle.rights & ~self._clients.rights.on_node(handle.session.peer, name)
+            if self._server.names.nodes.get(name) != handle.node:
+                self._end(handle, errno.EIO, f"{name}: it has been removed or changed; open it again")
+            elif lost:
+                text = f"{name}: the right to {in_words(lost, ', ')} it was taken away; open it again"
+                self._end(handle, errno.EACCES, text)
+
+    def when_ended(self, then: Callable[[], None]) -> None:
+        """Call back when all handles whose end has been decided have ended, perhaps at once."""
+        ending = {handle.number for handle in self._handles.values() if handle.ending}
+        if ending:
+            self._then.append((ending, then))
+        else:
+            then()
 
     def end_suspended(self) -> None:
         """End the handles of clients that are stopped by a signal: what they moved halts."""
         stopped = self._suspended.look(handle.session.peer.pid for handle in self.holders())
         for handle in [h for h in self.holders() if h.session.peer.pid in stopped]:
-            device = self._server.devices.get(handle.node.device)
-            if device is not None and device.generation == handle.generation and not handle.ending:
-                handle.ending = True
-                text = f"{handle.node.name}: its client was stopped, as by Ctrl-Z; open it again"
-                device.tell(DriverVerb.DETACH, handle.number, errno.ETIMEDOUT, text)
+            text = f"{handle.node.name}: its client was stopped, as by Ctrl-Z; open it again"
+            if self._end(handle, errno.ETIMEDOUT, text):
                 self._server.log("warning", "client stopped", node=handle.node.name, client=handle.session)
+
+    def _end(self, handle: Handle, errno_: int, text: str) -> bool:
+        """Have a handle end and its client told why; return whether that is news. It cannot get lost."""
+        device = self._server.devices.get(handle.node.device)
+        if handle.ending or device is None or device.generation != handle.generation:
+            return False  # the end of a driver process ends its handles
+        handle.ending = True
+        self._order_end(device, handle, errno_, text)
+        return True
+
+    def _order_end(self, device: DriverProcess, handle: Handle, errno_: int, text: str) -> None:
+        try:
+            device.send(DriverVerb.DETACH, handle.number, errno_, text)
+        except OSError:
+            if device.is_there and device.generation == handle.generation:
+                self._server.loop.after(_AGAIN_S, lambda: self._order_end(device, handle, errno_, text))
 
     def detached(self, device: DriverProcess, number: int) -> None:
         """The driver has ended a handle: its axes are being halted."""
@@ -256,6 +287,15 @@ class NodeVerbs:
             self._clients.answer(wait, reply(handle.closing, None, time.monotonic_ns()))
         if self._opens:
             self.retry_opens()
+        if self._then:
+            self._tell_ended(handle.number)
+
+    def _tell_ended(self, number: int) -> None:
+        for entry in list(self._then):
+            entry[0].discard(number)
+            if not entry[0] and entry in self._then:
+                self._then.remove(entry)
+                entry[1]()
 
     def device_gone(self, device: DriverProcess, reason: str) -> None:
         """Void all handles of a driver process that is no more."""

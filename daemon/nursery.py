@@ -8,6 +8,7 @@ A reload starts a fresh nursery, which sees changed driver files.
 from __future__ import annotations
 
 import os
+import signal
 import socket
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,6 +20,10 @@ from .nursery_process import NurseryProcess, start_nursery
 
 MAX_ANSWER = 1 << 20
 """Bytes of an answer of the nursery: the description of a device of many thousands of channels is long, even compressed."""
+_END_S = 2.0
+"""A nursery that has been told to end is killed after so long [s]."""
+DIED = -1
+"""In the place of the errno of an answer: there is nobody to answer."""
 Answer = Callable[[Any, int, str, list[int]], None]
 """Called with (value, errno, text, descriptors)."""
 
@@ -38,9 +43,11 @@ class Nursery:
         self._loop = loop
         self._died = died
         self._sock, self.pid = process or start_nursery()
+        self._pidfd = os.pidfd_open(self.pid)
         self._answers: dict[int, Answer] = {}
         self._number = 0
         loop.watch(self._sock.fileno(), self._receive)
+        loop.watch(self._pidfd, self._gone)
 
     def describe(
         self, device: str, driver: str, settings: dict[str, Any], folder: str, answer: Answer
@@ -56,10 +63,22 @@ class Nursery:
         self._request(answer, fds, NurseryVerb.SPAWN, device, driver, settings, generation, options)
 
     def close(self) -> None:
-        """End the nursery; the drivers it forked live on."""
+        """End the nursery, also one that is stuck; the drivers it forked live on."""
         if self._sock.fileno() >= 0:
             self._loop.unwatch(self._sock.fileno())
             self._sock.close()
+            self._loop.after(_END_S, self._kill)
+
+    def _kill(self) -> None:
+        if self._pidfd >= 0:
+            signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
+
+    def _gone(self) -> None:
+        self._loop.unwatch(self._pidfd)
+        os.close(self._pidfd)
+        self._pidfd = -1
+        if self._sock.fileno() >= 0:
+            self._end()
 
     def _request(self, answer: Answer, fds: Sequence[int], verb: NurseryVerb, *arguments: object) -> None:
         self._number += 1
@@ -72,7 +91,7 @@ class Nursery:
             socket.send_fds(self._sock, [packet], list(fds))
         except OSError as error:
             del self._answers[self._number]
-            answer(None, error.errno or 5, f"the nursery does not answer: {error}", [])
+            answer(None, DIED, f"the nursery does not answer: {error}", [])
 
     def _receive(self) -> None:
         try:
@@ -102,5 +121,5 @@ class Nursery:
         self.close()
         pending, self._answers = self._answers, {}
         for answer in pending.values():
-            answer(None, 5, "the nursery died", [])
+            answer(None, DIED, "the nursery died", [])
         self._died(self)

@@ -18,6 +18,16 @@ from .users import Users
 RIGHTS = {"read": Right.READ, "write": Right.WRITE, "stop": Right.STOP, "administer": Right.ADMINISTER}
 
 
+def in_words(rights: Right, between: str) -> str:
+    """Return rights by their names in a configuration.
+
+    Example:
+        >>> in_words(Right.READ | Right.STOP, " and ")
+        'read and stop'
+    """
+    return between.join(name for name, right in RIGHTS.items() if right & rights)
+
+
 @dataclass(frozen=True, slots=True)
 class Peer:
     """Credentials of a connected process, as the kernel vouches for them; ``user`` is for messages."""
@@ -120,6 +130,16 @@ class Rights:
         for grant in self._grants:
             if grant.concerns(peer):
                 rights |= grant.rights if "*" in grant.nodes else grant.rights & Right.STOP
+        return rights
+
+    def anywhere(self, peer: Peer) -> Right:
+        """Return what the peer may do with at least one node."""
+        if peer.uid in (0, self._owner) or not self._grants:
+            return self.on_node(peer, "*")
+        rights = Right(0)
+        for grant in self._grants:
+            if grant.concerns(peer):
+                rights |= grant.rights
         return rights
 
     def who_may_stop(self) -> Entitled:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from sioms.protocol.flags import PageState
@@ -21,7 +22,7 @@ from .clients import Clients
 from .config import Config
 from .devices import DriverProcess, State
 from .listening import Listening
-from .loading import Loader, Plan
+from .loading import Loader, Plan, mistake
 from .log import Log
 from .loop import Loop
 from .names import NameTable, Node
@@ -63,11 +64,11 @@ class Server:
         self._path = config_path
         self._nursery: Nursery | None = None
         self._first_process = process
-        self._stop_sources: dict[str, list[list[int]]] = {}
+        self._options: dict[str, dict[str, Any]] = {}
         self._watched_inputs: dict[str, dict[int, str]] = {}
-        self._alarms: dict[str, list[list[Any]]] = {}
         self._leaving: dict[str, DriverProcess] = {}
         self._loader: Loader | None = None
+        self._asked: list[tuple[Callable[[list[str]], None], Callable[[], bool]]] = []
         self._manager = ServiceManager()
         self._told_ready = False
         self._ending = False
@@ -81,14 +82,24 @@ class Server:
         if self._manager.watchdog_ns:
             self._feed_watchdog()
 
-    def load(self, done: Callable[[list[str]], None]) -> None:
-        """Read the configuration and take it up: what has not changed is not touched.
+    def load(self, done: Callable[[list[str]], None], begin: Callable[[], bool] = lambda: True) -> None:
+        """Read the configuration and take it up, all or nothing, as soon as no other load is under way.
 
         Args:
-            done: called with the errors; with any, everything stays as it was.
+            done: called with the errors; with any, everything stays as it was. What a right that was taken away had
+                opened has ended then.
+            begin: asked when its turn has come, before the file is read: whether it is wanted still.
         """
-        if self._loader is not None:
-            done(["reload: another one is under way; try again when it is done"])
+        if (done, begin) not in self._asked:
+            self._asked.append((done, begin))
+        if self._loader is None:
+            self._load()
+
+    def _load(self) -> None:
+        """Load for all who have asked."""
+        asked, self._asked = self._asked, []
+        turn = [done for done, begin in asked if begin()]
+        if not turn or self._ending:
             return
         if self._told_ready:
             self._manager.tell(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
@@ -96,12 +107,18 @@ class Server:
         def loaded(plan: Plan | None, errors: list[str]) -> None:
             self._loader = None
             if plan is not None:
-                self._take_up(plan)
-            for error in errors:
-                self.log("error", "configuration", text=error)
+                try:
+                    self._take_up(plan)
+                except Exception as error:  # no reload may be under way for ever
+                    errors = [mistake("take up the configuration", error)]
+            for text in errors:
+                self.log("error", "configuration", text=text)
             if self._told_ready:
                 self._manager.tell("READY=1")
-            done(errors)
+            for done in turn:
+                self.clients.nodes.when_ended(partial(done, errors))
+            if self._asked:
+                self._load()
 
         process, self._first_process = self._first_process, None
         self._loader = Loader(self.loop, self._path, loaded, self._nursery_died, process, self._slow)
@@ -301,29 +318,30 @@ class Server:
     # --- inside ----------------------------------------------------------------------------------
 
     def _take_up(self, plan: Plan) -> None:
+        """Let a configuration hold in which nothing is wrong: no step of this can be refused."""
         first = self.config is None
-        old, self._nursery = self._nursery, plan.nursery
-        changed_sources = {n for n in {*plan.stop_sources, *self._stop_sources}
-                           if plan.stop_sources.get(n) != self._stop_sources.get(n)}  # fmt: skip
-        changed_alarms = {
-            n for n in {*plan.alarms, *self._alarms} if plan.alarms.get(n) != self._alarms.get(n)
-        }
-        names = self.names
-        self.config, self.names, self._stop_sources = plan.config, plan.names, plan.stop_sources
-        self._watched_inputs = plan.watched_inputs
-        self._alarms = plan.alarms
+        if not first and not self.clients.users.look_again():
+            self.log("warning", "groups as before", why="the name service does not answer")
         rights = Rights(plan.config.grants, os.getuid(), self.clients.users)
         for name in rights.unknown:
             self.log("warning", "grant to nobody", who=name, why="not known on this machine, or no answer")
+        names, old = self.names, self._nursery
+        self.config, self.names, self._nursery = plan.config, plan.names, plan.nursery
+        self._watched_inputs = plan.watched_inputs
+        self._options = {name: self._options_of(name, plan) for name in plan.config.devices}
         self.clients.take_up_rights(rights)
-        if why := self.shared.files.entitle(rights.who_may_stop()):
+        try:
+            why = self.shared.files.entitle(rights.who_may_stop())
+        except OSError as error:
+            why = f"{error.filename or 'the stop-request file'}: {error.strerror}"
+        if why:
             self.log("warning", "stop without the daemon", why=why)
         if first and plan.config.workcell.start_stopped:
             self.stop_workcell("started stopped, as configured")
         for name, device in list(self.devices.items()):
             wanted = plan.config.devices.get(name)
             same = wanted == device.device and plan.names.devices[name].facts() == device.info.facts()
-            if not same or name in changed_sources | changed_alarms:
+            if not same or {**self._options[name], "phase": 0} != {**device.options, "phase": 0}:
                 self.log("info", "device ends", device=name, why="removed" if wanted is None else "changed")
                 self._retire(device)
         for name in plan.config.devices:
@@ -334,24 +352,28 @@ class Server:
                     self._send_input(device, name)  # the name shows something else now
         if old is not None:
             old.close()
+        self.clients.nodes.retry_opens()
         self._maybe_ready()
+
+    def _options_of(self, name: str, plan: Plan) -> dict[str, Any]:
+        """Return what a driver is told beside its own settings."""
+        return {
+            "stop_sources": plan.stop_sources.get(name, []),
+            "alarms": plan.alarms.get(name, []),
+            "daemon_lease_s": plan.config.workcell.daemon_lease_s,
+            "folder": plan.config.folder,
+            "state_folder": plan.config.state_folder(os.environ),
+            # Golden-ratio steps: however many drivers there are, their ticks do not fall together.
+            "phase": (list(plan.config.devices).index(name) * 0.6180339887) % 1.0,
+        }
 
     def _start(self, name: str) -> None:
         """Start a configured device that is not there yet; one that is leaving starts when it has left."""
         if self.config is None or self._ending or name in self.devices or name in self._leaving:
             return
-        options = {
-            "stop_sources": self._stop_sources.get(name, []),
-            "alarms": self._alarms.get(name, []),
-            "daemon_lease_s": self.config.workcell.daemon_lease_s,
-            "folder": self.config.folder,
-            "state_folder": self.config.state_folder(os.environ),
-            # Golden-ratio steps: however many drivers there are, their ticks do not fall together.
-            "phase": (list(self.config.devices).index(name) * 0.6180339887) % 1.0,
-        }
         device = DriverProcess(
             self.loop, self._current_nursery, self.config.devices[name], self.names.devices[name],
-            self.shared.fds, self, self.log, options,
+            self.shared.fds, self, self.log, self._options[name],
         )  # fmt: skip
         self.devices[name] = device
         device.start()

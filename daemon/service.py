@@ -8,6 +8,7 @@ import signal
 import socket
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 
 from sioms.protocol.socketpath import socket_path
 
@@ -146,16 +147,28 @@ def _take_signals(loop: Loop, server: Server) -> None:
     ours.setblocking(False)
     theirs.setblocking(False)
     signal.set_wakeup_fd(theirs.fileno())
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGCHLD):
         signal.signal(number, lambda *_: None)
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+
+    def reloaded(errors: list[str]) -> None:
+        server.log("info", "reload", errors=len(errors))
 
     def take() -> None:
         for number in ours.recv(64):
             if number == signal.SIGHUP:
-                server.load(lambda errors: server.log("info", "reload", errors=len(errors)))
+                server.load(reloaded)
             elif number in (signal.SIGTERM, signal.SIGINT):
                 server.shutdown()
+            elif number == signal.SIGCHLD:
+                _reap()
 
     take.sockets = (ours, theirs)  # type: ignore[attr-defined]  # keep them open
     loop.watch(ours.fileno(), take)
+
+
+def _reap() -> None:
+    """Let go of all children that have ended: nurseries, and as the first process of a container also drivers."""
+    with suppress(ChildProcessError):
+        while os.waitpid(-1, os.WNOHANG)[0]:
+            pass

@@ -47,7 +47,7 @@ class Handle:
         generation: of the driver process it is attached to.
         rights: what its user may do with it, as the driver was told.
         closing: message number of the close that waits for the driver, if any.
-        ending: whether the driver has been told to end it.
+        ending: whether its end has been decided; the driver carries it out.
     """
 
     number: int
@@ -107,13 +107,14 @@ class Session:
 
 
 def peer_of(sock: socket.socket, users: Users) -> Peer:
-    """Return the credentials of the other end, vouched for by the kernel."""
+    """Return the credentials of the other end as they were when it connected, vouched for by the kernel, without groups left since."""
     pid, uid, gid = struct.unpack("3i", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
     try:
         others = array("I", sock.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, 4 * _MOST_GROUPS))
     except OSError:
         others = array("I")  # more than fit: only the first counts
-    return Peer(pid, uid, users.name(uid), frozenset([gid, *others]))
+    name = users.name(uid)
+    return Peer(pid, uid, name, users.remaining(uid, frozenset([gid, *others])))
 
 
 def pidfd_of(sock: socket.socket, pid: int) -> int:

@@ -11,7 +11,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.flags import PROTOCOL_VERSION, Right
-from sioms.protocol.messages import reply
+from sioms.protocol.messages import refusal, reply
 from sioms.protocol.text import printable
 
 from .devices import State
@@ -103,9 +103,7 @@ class WorkcellVerbs:
                 )
             self._server.reset_workcell(str(session))
             return
-        node = self._clients.nodes.find(session, "reset", name)
-        if not self._clients.rights.on_node(session.peer, node.name) & (Right.ADMINISTER | Right.WRITE):
-            raise Refused(errno.EPERM, f"reset {name}: {session.peer.user} has no right to write it")
+        node = self._clients.nodes.find(session, "reset", name, Right.WRITE | Right.ADMINISTER)
         device = self._server.devices.get(node.device)
         if device is not None and device.state is State.FAULT:
             device.reset()
@@ -124,13 +122,25 @@ class WorkcellVerbs:
             device.trouble = ""
 
     def reload(self, session: Session, number: int) -> Any:
-        """Take up the configuration anew; answered with all errors."""
-        if not self._clients.rights.on_workcell(session.peer) & Right.ADMINISTER:
-            raise Refused(errno.EPERM, f"reload: {session.peer.user} has no right to administer every node")
-        wait = self._clients.wait(session, number, None, "reload")
+        """Take up the configuration anew, when it has its turn; answered with all errors."""
+
+        def check() -> None:
+            if not self._clients.rights.on_workcell(session.peer) & Right.ADMINISTER:
+                text = f"reload: {session.peer.user} has no right to administer every node"
+                raise Refused(errno.EPERM, text)
+
+        def begin() -> bool:
+            try:
+                check()  # again: the reload before it may have taken the right away
+            except Refused as error:
+                self._clients.answer(wait, refusal(number, error.errno, str(error)))
+                return False
+            return True
 
         def done(errors: list[str]) -> None:
             self._clients.answer(wait, reply(number, errors))
 
-        self._server.load(done)
+        check()
+        wait = self._clients.wait(session, number, None, "reload")
+        self._server.load(done, begin)
         return LATER

@@ -45,15 +45,15 @@ _NEEDS_OWNER = {
     Request.CALIBRATE_DEVICE, Request.HOME, Request.SET_LIMITS, Request.FLUSH, Request.ZERO_DEVICE, Request.SET_GAINS,
 }  # fmt: skip
 _NEEDS_RIGHT = {
+    **dict.fromkeys(Request, Right.WRITE),
+    **dict.fromkeys(LOOKS, Right.READ),
+    Request.WAIT_UNTIL_EVENT: Right.READ,
     Request.EMERGENCY_STOP: Right.STOP,
     Request.STOP: Right.STOP | Right.WRITE,
-    Request.SEND_EXTERNAL_SYNCH: Right.WRITE,
     Request.RESET: Right.WRITE | Right.ADMINISTER,
     Request.CANCEL_WAITS: Right.WRITE | Right.ADMINISTER,
-    Request.ZERO_DEVICE: Right.WRITE,
-    Request.SET_GAINS: Right.WRITE,
-    Request.CALIBRATE_DEVICE: Right.WRITE,
 }
+"""Any of these will do."""
 
 
 def ioctl(
@@ -75,8 +75,7 @@ def ioctl(
     owns = handle.exclusive or not _writable(handle)
     if request in _NEEDS_OWNER and not owns:
         raise _refuse(errno.EBADF, f"{what}: needs the output node itself, not its read-only companion")
-    right = _NEEDS_RIGHT.get(request, Right.READ)
-    if not handle.rights & right:
+    if not handle.rights & _NEEDS_RIGHT[request]:
         raise _refuse(errno.EPERM, f"{what}: the user has no right to do that; ask for a [[grant]]")
     match request:
         case Request.EMERGENCY_STOP:

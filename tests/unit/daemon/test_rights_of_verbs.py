@@ -1,0 +1,336 @@
+"""Every verb with every right, bit by bit: granted, refused, and taken away by a reload."""
+
+from __future__ import annotations
+
+import errno
+import fnmatch
+import os
+import socket
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from sioms.daemon import clients as clients_module
+from sioms.daemon.clients import Clients
+from sioms.daemon.config import GrantTable, NodeTable
+from sioms.daemon.devices import State
+from sioms.daemon.loop import Loop
+from sioms.daemon.names import BlockInfo, DeviceInfo, NameTable
+from sioms.daemon.rights import RIGHTS, Peer, Rights
+from sioms.daemon.sessions import Session
+from sioms.daemon.users import Users
+from sioms.protocol.flags import PROTOCOL_VERSION, Access, NodeClass, Right
+from sioms.protocol.markers import TABLE_SIZE, MarkerTable
+from sioms.protocol.messages import ClientVerb, DriverVerb, decode
+from sioms.protocol.nodeinfo import ChannelInfo
+
+PORT = BlockInfo("", NodeClass.BINARY, (ChannelInfo("do", width=2),), True, 64, 0)
+INFOS = {"io0": DeviceInfo("io0", "sim-io", (PORT,), 100.0, (), 0.1)}
+BITS = {"grip": NodeTable("io0.bit0")}
+
+
+class Device:
+    """A driver process that takes messages while ``takes``."""
+
+    def __init__(self) -> None:
+        self.name, self.state, self.generation, self.pid, self.reason = "io0", State.UP, 1, os.getpid(), ""
+        self.info, self.takes, self.trouble = INFOS["io0"], True, ""
+        self.page_fds = [os.memfd_create("page")]
+        self.restarts = SimpleNamespace(deaths_ns=[])
+        self.link, self.started_ns = (SimpleNamespace(name="GOOD"), ""), 0
+        self.orders: list[tuple[DriverVerb, tuple[Any, ...]]] = []
+
+    @property
+    def is_there(self) -> bool:
+        return True
+
+    def send(self, verb: DriverVerb, *arguments: Any, fds: Any = ()) -> None:
+        if not self.takes:
+            raise OSError(errno.EIO, "takes no messages")
+        self.orders.append((verb, arguments))
+
+    def ended(self) -> list[tuple[Any, ...]]:
+        return [arguments for verb, arguments in self.orders if verb is DriverVerb.DETACH]
+
+
+class Workcell:
+    """A daemon's clients around one device, without processes. Eva and Tom are users with sessions."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.peers = {"eva": Peer(1, 1001, "eva", frozenset()), "tom": Peer(2, 1002, "tom", frozenset())}
+        self.device = Device()
+        self.loop = Loop()
+        self.loads: list[tuple[Callable[..., None], Callable[[], bool]]] = []
+        self.done: list[str] = []
+        latch = SimpleNamespace(stopped_ns=0, source="")
+        record = SimpleNamespace(look=lambda: None, state=SimpleNamespace(nodes=list))
+        self.server: Any = SimpleNamespace(
+            names=NameTable(INFOS, BITS), devices={"io0": self.device}, loop=self.loop, config=None, starting="",
+            log=lambda *_a, **_k: None, hear_request=str,
+            shared=SimpleNamespace(
+                markers=MarkerTable(memoryview(bytearray(TABLE_SIZE))), latch=latch, record=record,
+                files=SimpleNamespace(client_fds=[]),
+            ),
+            stop_workcell=lambda source: self.done.append("stop"),
+            reset_workcell=lambda who: self.done.append("reset"),
+            stop_node=lambda node, source: self.done.append(f"stop {node.name}"),
+            reset_node=lambda node, who: self.done.append(f"reset {node.name}"),
+            load=lambda done, begin: self.loads.append((done, begin)),
+        )  # fmt: skip
+        self.listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.clients = Clients(self.server, self.listener, "test.sock")
+        self.sessions: dict[str, Session] = {}
+        self.ends: dict[str, socket.socket] = {}
+        self._number = 0
+        whose = {}
+        for name, peer in self.peers.items():
+            ours, self.ends[name] = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            self.sessions[name] = Session(ours, peer, -1)
+            self.clients.sessions.add(self.sessions[name])
+            self.loop.watch(ours.fileno(), lambda: None)
+            self.ends[name].setblocking(False)
+            whose[ours] = name
+        monkeypatch.setattr(clients_module, "peer_of", lambda sock, _users: self.peers[whose[sock]])
+
+    def grant(self, *grants: tuple[list[str], str, str]) -> None:
+        """Let grants (rights, user, pattern) hold, as a reload does."""
+        users = Users()
+        users.uid = {"eva": 1001, "tom": 1002}.get  # type: ignore[method-assign, assignment]
+        tables = [GrantTable(list(rights), [user], [], [nodes]) for rights, user, nodes in grants]  # type: ignore[arg-type]
+        tables.append(GrantTable(["read"], ["somebody else"]))
+        self.clients.take_up_rights(Rights(tables, 0, users))
+        self.clients.nodes.retry_opens()
+
+    def ask(self, who: str, verb: ClientVerb, *arguments: object) -> int | None:
+        """Ask for something; return the errno of the answer, None when there is none yet."""
+        self._number += 1
+        self.clients._dispatch(self.sessions[who], int(verb), self._number, list(arguments))
+        return self.answer(who)
+
+    def answer(self, who: str) -> int | None:
+        try:
+            packet, fds, _, _ = socket.recv_fds(self.ends[who], 65536, 8)
+        except BlockingIOError:
+            return None
+        for fd in fds:
+            os.close(fd)
+        self.value: Any
+        _, _, errno_, self.value, *_ = decode(packet)
+        return int(errno_)
+
+    def open(self, who: str, node: str, timeout_s: float | None = 0.0) -> int | None:
+        mode = Access.READ if node.endswith("readonly") else Access.READ | Access.WRITE
+        return self.ask(who, ClientVerb.OPEN, node, int(mode), timeout_s, 0.0)
+
+    def detached(self, number: int) -> None:
+        self.clients.nodes.detached(self.device, number)  # type: ignore[arg-type]
+
+    def close(self) -> None:
+        for each in (*self.ends.values(), self.listener, *(s.sock for s in self.sessions.values())):
+            each.close()
+        os.close(self.device.page_fds[0])
+        self.loop.close()
+
+
+@pytest.fixture
+def cell(monkeypatch: pytest.MonkeyPatch) -> Iterator[Workcell]:
+    made = Workcell(monkeypatch)
+    yield made
+    made.close()
+
+
+EITHER, ANY = Right.WRITE | Right.ADMINISTER, Right.ALL
+ON_NODES: dict[str, tuple[Callable[[Workcell, str], int | None], list[Right]]] = {
+    "open": (lambda c, node: c.open("eva", node), [Right.READ, Right.WRITE]),
+    "observe": (lambda c, node: c.open("eva", f"{node}.readonly"), [Right.READ]),
+    "info": (lambda c, node: c.ask("eva", ClientVerb.INFO, node), [Right.READ]),
+    "stop": (lambda c, node: c.ask("eva", ClientVerb.EMERGENCY_STOP, node, ""), [Right.STOP]),
+    "reset": (lambda c, node: c.ask("eva", ClientVerb.RESET, node), [EITHER]),
+}
+"""What is asked for on a node, and the rights that it takes: one of each entry."""
+ON_ALL: dict[str, tuple[Callable[[Workcell], int | None], Right]] = {
+    "stop": (lambda c: c.ask("eva", ClientVerb.EMERGENCY_STOP, "", ""), Right.STOP),
+    "reset": (lambda c: c.ask("eva", ClientVerb.RESET, ""), EITHER),
+    "reload": (lambda c: c.ask("eva", ClientVerb.RELOAD), Right.ADMINISTER),
+}
+ON_NOTHING: dict[ClientVerb, tuple[list[object], int]] = {
+    ClientVerb.RESERVE_MARKER: ([1, False], 0),
+    ClientVerb.WAIT_MARKER: ([5, 0.0], errno.EINVAL),
+    ClientVerb.SIGNAL_MARKER: ([5], errno.EINVAL),
+}
+"""What belongs to no node, and the answer to somebody with any right."""
+FREE: dict[ClientVerb, tuple[list[object], int]] = {
+    ClientVerb.HELLO: ([PROTOCOL_VERSION, "test"], 0),
+    ClientVerb.LIST: ([], 0),
+    ClientVerb.STATUS: ([], 0),
+    ClientVerb.CANCEL: ([77], 0),
+    ClientVerb.CLOSE: ([77], errno.EBADF),
+    ClientVerb.FREE_MARKER: ([5], errno.EINVAL),
+}
+"""What needs no right: to look whether there is a workcell, and to give back."""
+SUBSETS = [[name for i, name in enumerate(RIGHTS) if bits >> i & 1] for bits in range(16)]
+
+
+def test_no_verb_is_left_out() -> None:
+    on_nodes = {
+        ClientVerb.OPEN,
+        ClientVerb.INFO,
+        ClientVerb.EMERGENCY_STOP,
+        ClientVerb.RESET,
+        ClientVerb.RELOAD,
+    }
+    assert on_nodes | {*ON_NOTHING} | {*FREE} == {*ClientVerb}
+
+
+@pytest.mark.parametrize("rights", SUBSETS, ids="+".join)
+@pytest.mark.parametrize("pattern", ["io0.bit0*", "io0", "grip*", "*"])
+def test_a_verb_on_a_node_takes_its_right_on_that_node(
+    cell: Workcell, rights: list[str], pattern: str
+) -> None:
+    granted = Right(sum(RIGHTS[name] for name in rights))
+    cell.grant((rights, "eva", pattern))
+    for name, (ask, needs) in ON_NODES.items():
+        for node in ("io0", "io0.bit0", "io0.bit1", "grip"):
+            shown = f"{node}.readonly" if name == "observe" else node
+            may = fnmatch.fnmatchcase(shown, pattern) and all(granted & need for need in needs)
+            answer = ask(cell, node)
+            assert (answer == 0) is may, (name, node, answer, cell.value)
+            assert may or answer in (errno.EPERM, errno.EACCES), (name, node, answer)
+            for number in list(cell.sessions["eva"].handles):
+                cell.detached(number)
+
+
+@pytest.mark.parametrize("rights", SUBSETS, ids="+".join)
+@pytest.mark.parametrize("pattern", ["io0.bit0", "*"])
+def test_a_verb_on_the_workcell_takes_its_right_on_every_node(
+    cell: Workcell, rights: list[str], pattern: str
+) -> None:
+    granted = Right(sum(RIGHTS[name] for name in rights))
+    cell.grant((rights, "eva", pattern))
+    for name, (ask, need) in ON_ALL.items():
+        may = bool(granted & need) and (pattern == "*" or name == "stop")
+        assert ask(cell) == ((None if name == "reload" else 0) if may else errno.EPERM), name
+    for verb, (arguments, answer) in ON_NOTHING.items():
+        assert cell.ask("eva", verb, *arguments) == (answer if granted else errno.EPERM), verb
+    for verb, (arguments, answer) in FREE.items():
+        assert cell.ask("eva", verb, *arguments) == answer, verb
+        if verb is ClientVerb.LIST:
+            shown = [entry[0] for entry in cell.value]
+            wanted = [n for n in cell.server.names.nodes if fnmatch.fnmatchcase(n, pattern)]
+            assert shown == (wanted if granted & Right.READ else [])
+
+
+@pytest.mark.parametrize("taken", ["write", "stop", "administer", "read"])
+@pytest.mark.parametrize("node", ["io0", "io0.bit0", "grip", "io0.readonly"])
+def test_a_right_that_a_reload_takes_away_ends_the_handle(cell: Workcell, taken: str, node: str) -> None:
+    cell.grant(([*RIGHTS], "eva", "*"))
+    assert cell.open("eva", node) == 0
+    number = cell.value[0]
+    cell.grant(([*RIGHTS], "eva", "*"))
+    assert not cell.device.ended(), "nothing was taken away"
+    told: list[str] = []
+    cell.grant(([name for name in RIGHTS if name != taken], "eva", "*"))
+    cell.clients.nodes.when_ended(lambda: told.append("ended"))
+    assert cell.device.ended() == [
+        (number, errno.EACCES, f"{node}: the right to {taken} it was taken away; open it again")
+    ]
+    assert not told, "the reload is not done before that"
+    cell.grant(([], "eva", "*"))
+    assert len(cell.device.ended()) == 1, "it is told once"
+    cell.detached(number)
+    assert told == ["ended"]
+
+
+def test_a_right_that_is_taken_on_one_bit_ends_what_that_bit_was_opened_by(cell: Workcell) -> None:
+    cell.grant((["read", "write"], "eva", "io0.bit*"))
+    assert cell.open("eva", "io0.bit0") == 0
+    bit0 = cell.value[0]
+    assert cell.open("eva", "io0.bit1") == 0
+    cell.grant((["read", "write"], "eva", "io0.bit1*"))
+    assert [arguments[0] for arguments in cell.device.ended()] == [bit0]
+
+
+def test_an_end_that_the_driver_had_no_room_for_is_told_again(cell: Workcell) -> None:
+    cell.grant((["read", "write"], "eva", "*"))
+    assert cell.open("eva", "io0") == 0
+    cell.device.takes = False
+    cell.grant((["read"], "eva", "*"))
+    assert not cell.device.ended()
+    cell.device.takes = True
+    for _ in range(100):
+        cell.loop.step()
+        if cell.device.ended():
+            return
+    raise AssertionError("the driver was not told again")
+
+
+@pytest.mark.parametrize("left", [[], ["read"], ["write"], ["read", "stop", "administer"]])
+def test_an_open_that_waits_is_refused_when_its_right_is_taken_away(cell: Workcell, left: list[str]) -> None:
+    cell.grant((["read", "write"], "eva", "*"), (["read", "write"], "tom", "*"))
+    assert cell.open("tom", "io0") == 0
+    held = cell.value[0]
+    assert cell.open("eva", "io0.bit0", None) is None, "it waits"
+    cell.grant((left, "eva", "*"), (["read", "write"], "tom", "*"))
+    assert cell.answer("eva") == errno.EACCES and "has no right to" in cell.value
+    cell.detached(held)
+    assert cell.answer("eva") is None
+    assert not cell.sessions["eva"].handles and not cell.sessions["eva"].waits
+
+
+def test_an_open_that_waits_and_may_still_is_granted(cell: Workcell) -> None:
+    cell.grant((["read", "write"], "eva", "*"), (["read", "write"], "tom", "*"))
+    assert cell.open("tom", "io0") == 0
+    held = cell.value[0]
+    assert cell.open("eva", "io0.bit0", None) is None
+    cell.grant((["read", "write"], "eva", "io0.bit0"))
+    assert cell.answer("eva") is None
+    cell.detached(held)
+    assert cell.answer("eva") == 0
+
+
+def test_a_name_that_shows_something_else_ends_what_was_opened_by_it(cell: Workcell) -> None:
+    cell.grant((["read", "write"], "eva", "grip*"))
+    assert cell.open("eva", "grip") == 0
+    number = cell.value[0]
+    cell.server.names = NameTable(INFOS, {"grip": NodeTable("io0.bit1")})
+    cell.grant((["read", "write"], "eva", "grip*"))
+    assert [(a[0], a[1]) for a in cell.device.ended()] == [(number, errno.EIO)]
+
+
+def test_who_loses_the_last_right_loses_markers_and_waits_for_them(cell: Workcell) -> None:
+    cell.grant((["read"], "eva", "*"), (["stop"], "tom", "io0.bit0"))
+    assert cell.ask("tom", ClientVerb.RESERVE_MARKER, 1, False) == 0
+    [theirs] = cell.value
+    assert cell.ask("eva", ClientVerb.RESERVE_MARKER, 1, False) == 0
+    [mine] = cell.value
+    assert cell.ask("eva", ClientVerb.WAIT_MARKER, theirs, None) is None
+    assert cell.ask("tom", ClientVerb.WAIT_MARKER, mine, None) is None
+    cell.grant((["read"], "eva", "*"))
+    assert cell.answer("tom") == errno.EPERM and "no right on any node any more" in cell.value
+    assert cell.answer("eva") == errno.EPIPE, "the marker that it waits for went with its owner's rights"
+
+
+def test_a_reload_that_waits_is_refused_when_the_one_before_took_the_right(cell: Workcell) -> None:
+    cell.grant((["administer"], "eva", "*"))
+    assert cell.ask("eva", ClientVerb.RELOAD) is None
+    [(done, begin)] = cell.loads
+    assert begin()
+    cell.grant((["read"], "eva", "*"))
+    assert not begin()
+    assert cell.answer("eva") == errno.EPERM
+    done([])
+    assert cell.answer("eva") is None
+
+
+def test_who_has_left_a_group_is_seen_at_a_reload(cell: Workcell) -> None:
+    users = Users()
+    users.gid = {"lab": 20}.get  # type: ignore[method-assign, assignment]
+    cell.peers["eva"] = Peer(1, 1001, "eva", frozenset({20}))
+    rights = Rights([GrantTable(["read", "write"], [], ["lab"])], 0, users)
+    cell.clients.take_up_rights(rights)
+    assert cell.open("eva", "io0") == 0
+    cell.peers["eva"] = Peer(1, 1001, "eva", frozenset())
+    cell.clients.take_up_rights(rights)
+    assert [arguments[1] for arguments in cell.device.ended()] == [errno.EACCES]
