@@ -83,11 +83,19 @@ EXTRAS = {"gpiod": "gpio", "matplotlib": "report", "numba": "fast"}
 
 
 def _begin() -> None:
-    """Be a program: an interrupt while modules are imported is the end and no traceback, a closed output an error."""
+    """Be a program: one that is told to end leaves nothing behind, an interrupt while modules are imported is the end and no traceback, a closed output an error."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, _end)
     if sys.stdout is None:  # what is printed fails then, and commands that print nothing work
         sys.stdout = open(os.open(os.devnull, os.O_RDONLY), "w", encoding="utf-8")  # noqa: SIM115
+
+
+def _end(number: int, _frame: object) -> None:
+    """End in order: what a command has started ends with it."""
+    sys.exit(128 + number)
 
 
 def _innermost(parser: argparse.ArgumentParser, words: Sequence[str]) -> argparse.ArgumentParser:

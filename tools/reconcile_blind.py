@@ -16,6 +16,8 @@ import numpy as np
 
 from sioms.reconcile_selftest.score import Hidden, Scored, table
 
+from .children import ends_with_us
+
 H = TypeVar("H", bound=Hidden)
 
 #: The mixture of kinds, repeated: out of twenty.
@@ -49,10 +51,15 @@ def solve(folder: Path, subject: str, *options: str, report: str = "report") -> 
         report: name of the folder in it for the answer.
     """
     out = folder / report
-    command = [sys.executable, "-m", "sioms.tools.reconcile", subject, str(folder)]
+    command = [sys.executable, "-P", "-m", "sioms.tools.reconcile", subject, str(folder)]
     command += ["--model", str(folder / "nominal.toml"), "--out", str(out), "--quiet", *options]
     done = subprocess.run(
-        command, capture_output=True, text=True, check=False, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+        command,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        preexec_fn=ends_with_us(),
     )
     answer = out / "verdict.json"
     if not answer.exists():

@@ -12,6 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 
 import sioms
+from sioms.tools.children import ends_with_us
 from sioms.tools.tactile_prober import START_S, wait_links
 
 FINGER = (
@@ -26,7 +27,11 @@ class Counterpart:
 
     def __init__(self, words: Sequence[str]) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-P", "-m", *words],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            preexec_fn=ends_with_us(),
         )
         self._wait("ready")
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from sioms.wording import did_you_mean
 
+from ..children import ends_with_us
 from ..counterparts.rigs import MAP_RIGS, RIGS, Rig, find_rig, rig_of
 from .check import Subject, check, trial_names
 from .golden import ProbeFailed, probe
@@ -72,23 +73,45 @@ def _one(name: str, args: argparse.Namespace, only: list[str]) -> dict[str, Any]
 def _many(names: list[str], args: argparse.Namespace) -> list[dict[str, Any]]:
     """Check drivers in processes of their own, some at a time; what each says is printed when it has ended."""
 
+    running: list[subprocess.Popen[str]] = []
+
     def one(name: str) -> dict[str, Any]:
         with tempfile.TemporaryDirectory(prefix="sioms-check-") as folder:
             out = Path(folder) / "out.json"
-            command = [sys.executable, "-m", "sioms.tools.front", "driver", "check", name, "--json", str(out)]
+            command = [
+                sys.executable,
+                "-P",
+                "-m",
+                "sioms.tools.front",
+                "driver",
+                "check",
+                name,
+                "--json",
+                str(out),
+            ]
             command += ["--full"] if args.full else []
             command += ["--only", args.only] if args.only else []
-            done = subprocess.run(command, capture_output=True, text=True)
-            print(done.stdout.rpartition("\n\n")[0] + done.stderr.rstrip(), flush=True)
+            with subprocess.Popen(
+                command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=ends_with_us()
+            ) as process:
+                running.append(process)
+                said, complaint = process.communicate()
+            print(said.rpartition("\n\n")[0] + complaint.rstrip(), flush=True)
             if not out.exists():
                 raise Unusable(
-                    f"{name}: {(done.stderr.strip().splitlines() or ['it ended without a report'])[-1]}"
+                    f"{name}: {(complaint.strip().splitlines() or ['it ended without a report'])[-1]}"
                 )
             report: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))[0]
             return report
 
     with ThreadPoolExecutor(max(1, args.jobs)) as pool:
-        return list(pool.map(one, names))
+        try:
+            return list(pool.map(one, names))
+        except BaseException:  # also when we are told to end
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in running:
+                process.terminate()
+            raise
 
 
 def subject_of(name: str, counterpart: str = "", config: Path | None = None) -> Subject:

@@ -27,6 +27,7 @@ from sioms.protocol.flags import AxisStatus, ControlMode, NodeClass
 
 from ..bench.rig import Daemon
 from ..cell import READONLY, is_part
+from ..children import ends_with_us
 from ..counterparts.rigs import Axis, Output, Rig
 
 ANSWER_S = 5.0
@@ -52,6 +53,7 @@ class Peer:
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=folder,
             env={**os.environ, "PYTHONUNBUFFERED": "1"}, bufsize=0,
+            preexec_fn=ends_with_us(),
         )  # fmt: skip
         self._rest = b""
         try:
@@ -436,7 +438,7 @@ class Client:
     def __init__(self, script: str, *words: str) -> None:
         self._process = subprocess.Popen(
             [sys.executable, "-c", PROLOGUE + script, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            text=True,
+            text=True, preexec_fn=ends_with_us(),
         )  # fmt: skip
         line = self._process.stdout.readline() if self._process.stdout else ""
         if not line:

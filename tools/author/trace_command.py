@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ..bench.rig import Daemon
+from ..children import ends_with_us
 from ..counterparts.rigs import LINES
 from .station import Peer, wait_for
 from .traces import BadTrace, Trace, read_trace
@@ -33,8 +34,19 @@ def run_trace(args: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory(prefix="sioms-trace-") as folder:
         path = args.socket or str(Path(folder) / "siomsd.sock")
         environment = {**os.environ, "SIOMS_TRACE": f"{args.device}={out.resolve()}"}
-        command = [sys.executable, "-m", "sioms.daemon.main", "--config", str(args.config), "--socket", path]
-        daemon = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL)
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "sioms.daemon.main",
+            "--config",
+            str(args.config),
+            "--socket",
+            path,
+        ]
+        daemon = subprocess.Popen(
+            command, env=environment, stdin=subprocess.DEVNULL, preexec_fn=ends_with_us()
+        )
         print(f"recording {args.device} to {out}; commands reach it with SIOMS_SOCKET={path}", flush=True)
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         with contextlib.suppress(KeyboardInterrupt, subprocess.TimeoutExpired):

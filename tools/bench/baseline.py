@@ -9,6 +9,8 @@ import sys
 import time
 from typing import Self
 
+from ..children import ends_with_us
+
 _ECHO = """
 import socket, sys
 sock = socket.socket(fileno=int(sys.argv[1]))
@@ -33,7 +35,9 @@ class RoundTrip:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._sock = ours
         self._process = subprocess.Popen(
-            [sys.executable, "-IS", "-c", _ECHO, str(theirs.fileno())], pass_fds=[theirs.fileno()]
+            [sys.executable, "-IS", "-c", _ECHO, str(theirs.fileno())],
+            pass_fds=[theirs.fileno()],
+            preexec_fn=ends_with_us(),
         )
         theirs.close()
         ours.recv(16)
@@ -66,6 +70,7 @@ class Wake:
         self._process = subprocess.Popen(
             [sys.executable, "-IS", "-c", _WAKE, str(self._event), str(theirs)],
             pass_fds=[self._event, theirs],
+            preexec_fn=ends_with_us(),
         )
         os.close(theirs)
         os.read(self._answer, 8)

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ..children import ends_with_us
 from .baseline import interpreter_ns, run_ns
 from .figures import Bar, Report
 from .options import Options
@@ -74,9 +75,14 @@ def _loop(
     """Let rows pass through our hands: when they come, which are left out, and whether devout keeps up."""
     rows = 1000 * options.count(2, 60)
     source = subprocess.Popen(
-        [devin, "-t0.001", f"-L{rows}", "-n0p", "beam0", "-N"], env=environment, stdout=subprocess.PIPE
+        [devin, "-t0.001", f"-L{rows}", "-n0p", "beam0", "-N"],
+        env=environment,
+        stdout=subprocess.PIPE,
+        preexec_fn=ends_with_us(),
     )
-    sink = subprocess.Popen([devout, "-rv", "-L-1", "mod0.a0"], env=environment, stdin=subprocess.PIPE)
+    sink = subprocess.Popen(
+        [devout, "-rv", "-L-1", "mod0.a0"], env=environment, stdin=subprocess.PIPE, preexec_fn=ends_with_us()
+    )
     arrivals: list[tuple[int, int]] = []
     sampled: list[float] = []
     if source.stdout is None or sink.stdin is None:
@@ -116,8 +122,11 @@ def _steps(
         [devin, "-t0.001", f"-L{1000 * (seconds + 2)}", "-n0p", "beam0"],
         env=environment,
         stdout=subprocess.PIPE,
+        preexec_fn=ends_with_us(),
     )
-    sink = subprocess.Popen([devout, "-rv", "-L-1", "mod0.a0"], env=environment, stdin=source.stdout)
+    sink = subprocess.Popen(
+        [devout, "-rv", "-L-1", "mod0.a0"], env=environment, stdin=source.stdout, preexec_fn=ends_with_us()
+    )
     if source.stdout is not None:
         source.stdout.close()  # theirs alone: the end of one must be seen by the other
     with daemon.cell() as cell, cell.open("beam0") as beam, cell.open("mod0.a0.readonly") as axis:

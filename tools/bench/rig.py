@@ -23,6 +23,8 @@ from typing import Any, Self
 
 from sioms.client.workcell import Workcell
 
+from ..children import ends_with_us
+
 READY_S = 30.0
 
 
@@ -49,13 +51,24 @@ class Daemon:
         notify.settimeout(0.2)
         environment = dict(os.environ, NOTIFY_SOCKET=str(self.folder / "notify"))
         environment.pop("WATCHDOG_USEC", None)
-        command = [sys.executable, "-m", "sioms.daemon.main", "--config", str(self.folder / "bench.toml")]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "sioms.daemon.main",
+            "--config",
+            str(self.folder / "bench.toml"),
+        ]
         if pin is not None:
             command = ["taskset", "-c", str(pin), *command]
         with open(self.log_path, "wb") as log:
             self.start_ns = time.monotonic_ns()
             self.process = subprocess.Popen(
-                [*command, "--socket", self.socket], env=environment, stderr=log, stdin=subprocess.DEVNULL
+                [*command, "--socket", self.socket],
+                env=environment,
+                stderr=log,
+                stdin=subprocess.DEVNULL,
+                preexec_fn=ends_with_us(),
             )
         self.pid = self.process.pid
         try:
@@ -108,10 +121,12 @@ class Daemon:
     def fork(self, work: Callable[[], object]) -> int:
         """Run a function in a forked client process; return its pid. It is killed with the daemon."""
         sys.stdout.flush()
+        tie = ends_with_us()
         pid = os.fork()
         if pid == 0:
             status = 1
             try:
+                tie()
                 signal.signal(signal.SIGINT, signal.SIG_DFL)
                 signal.signal(signal.SIGTERM, signal.SIG_DFL)
                 work()

@@ -11,6 +11,8 @@ import time
 from collections.abc import Sequence
 from typing import IO
 
+from sioms.tools.children import ends_with_us
+
 PATIENCE_S = 300.0
 """Longest wait for anything in the demo [s]: under twenty busy loops a second takes a minute at times."""
 
@@ -29,7 +31,9 @@ class Process:
 
     def __init__(self, arguments: Sequence[str], ready: str, errors: bool = False) -> None:
         pipe: dict[str, int] = {"stderr" if errors else "stdout": subprocess.PIPE}
-        self._process = subprocess.Popen([sys.executable, "-m", *arguments], text=True, **pipe)  # type: ignore[call-overload]
+        self._process = subprocess.Popen(  # type: ignore[call-overload]
+            [sys.executable, "-P", "-m", *arguments], text=True, preexec_fn=ends_with_us(), **pipe
+        )
         stream: IO[str] = self._process.stderr if errors else self._process.stdout
         self.said: list[str] = []
         found = threading.Event()
@@ -94,6 +98,7 @@ def tool(name: str, *arguments: str, input_text: str | None = None) -> str:
     done = subprocess.run(
         [beside if os.path.exists(beside) else name, *arguments],
         input=input_text, text=True, capture_output=True, timeout=4 * PATIENCE_S, check=False,
+        preexec_fn=ends_with_us(),
     )  # fmt: skip
     if done.returncode:
         raise RuntimeError(f"{name} {' '.join(arguments)}: {done.stderr.strip()}")
