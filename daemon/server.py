@@ -194,8 +194,7 @@ class Server:
     def reset_workcell(self, who: str) -> None:
         """Clear the latch and give devices in fault another try; nothing moves by itself."""
         self._note(workcell_entry(who, stop=False))  # first: a stop that comes next is noted after it
-        self._request_seen = self.shared.request.mark
-        self.shared.latch.reset(self._request_seen)
+        self.shared.latch.reset(self._request_seen)  # what has been asked for since then has not been heard
         self.log("info", "reset", by=who)
         for device in self.devices.values():
             device.trouble = ""
@@ -208,11 +207,13 @@ class Server:
         """Stop a node and keep that; one whose driver is not there starts stopped.
 
         Raises:
-            OSError: EIO, its driver takes no messages.
+            OSError: EIO, its driver takes no messages: it will be stopped when it is started again.
         """
-        self._order(node, DriverVerb.NODE_STOP, source)
-        self._note(self._node_entry(node, source, stop=True))
-        self.log("warning", "emergency stop", node=node.name, source=source)
+        try:
+            self._order(node, DriverVerb.NODE_STOP, source)
+        finally:
+            self._note(self._node_entry(node, source, stop=True))
+            self.log("warning", "emergency stop", node=node.name, source=source)
 
     def reset_node(self, node: Node, who: str) -> None:
         """Clear the stop and the faults of a node.
@@ -225,9 +226,9 @@ class Server:
         self.log("info", "reset", node=node.name, by=who)
 
     def _order(self, node: Node, verb: DriverVerb, text: str) -> None:
-        device = self.devices.get(node.device)
+        device = self.devices.get(node.device) or self._leaving.get(node.device)
         if device is not None and device.is_there:
-            device.send(verb, node.block, node.channels, node.bit, text)
+            device.send(verb, node.block, node.channels, node.bit, text, self.shared.latch.resets)
             self.shared.latch.ordered()
 
     def _node_entry(self, node: Node, source: str, *, stop: bool) -> dict[str, Any]:

@@ -78,8 +78,8 @@ TO_DRIVER: Mapping[int, tuple[Kind, ...]] = {
     DriverVerb.STOP_CHANGED: (),
     DriverVerb.SHUTDOWN: (),
     DriverVerb.INPUT: (TEXT, LIST, INTEGER),
-    DriverVerb.NODE_STOP: (INTEGER, LIST, INTEGER, TEXT),
-    DriverVerb.NODE_RESET: (INTEGER, LIST, INTEGER, TEXT),
+    DriverVerb.NODE_STOP: (INTEGER, LIST, INTEGER, TEXT, INTEGER),
+    DriverVerb.NODE_RESET: (INTEGER, LIST, INTEGER, TEXT, INTEGER),
 }
 FROM_DRIVER: Mapping[int, tuple[Kind, ...]] = {
     DriverVerb.READY: (INTEGER,),

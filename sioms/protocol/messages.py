@@ -113,7 +113,8 @@ class DriverVerb(IntEnum):
     INPUT = 5
     """D: [name, channels, bit]; descriptor: the page of a node that the driver reads."""
     NODE_STOP = 6
-    """D: [block, channels, bit, source]: emergency stop of some channels, or of one bit of them (-1: all). NODE_RESET likewise."""
+    """D: [block, channels, bit, source, resets]: emergency stop of some channels, or of one bit of them (-1: all), after so many
+    resets of the workcell; void when the driver has seen a later one. NODE_RESET likewise."""
     NODE_RESET = 7
     READY = 20
     """[blocks]; descriptors: one page a block, writable until the daemon seals it."""

@@ -152,8 +152,11 @@ class Attachments:
             return
         if number == 0 or number in handle.waits:
             raise MalformedMessage(f"message number {number} is zero or in use")
-        # Nothing is taken after a stop, or refused after its reset, because no tick has come in between.
-        self._runtime.stops.heed()
+        # Nothing is taken after a stop, or refused after its reset, because no tick has come in between; and no order that
+        # was acknowledged before undoes what is acknowledged now.
+        self._runtime.heed()
+        if handle.number not in self.handles:
+            return  # that was the order
         try:
             match verb:
                 case HandleVerb.WRITE:

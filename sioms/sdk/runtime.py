@@ -258,25 +258,29 @@ class Runtime:
         refused = become_realtime(priority, self._gave_up_realtime)
         if refused:
             self.log("debug", "runs without " + ", ".join(refused))
+        status = 0
+        try:
+            self.start()
+            self._loop()
+        except Exception as error:  # any failure of a driver: stop first, report second
+            status = 1
+            self._fail(error)
+        return status
+
+    def start(self) -> None:
+        """Be stopped as the process before this one was, tick for the first time, and tell the daemon."""
         self.watch(self._control.fileno(), self._control_readable)
         self.watch(self._timer.fd, self._on_timer)
         self.watch(self._line_timer.fd, self._on_line_timer)
         phase_ns = int(self._phase * self.period_ns)
         self._scheduled_ns = time.monotonic_ns() // self.period_ns * self.period_ns + phase_ns
         self._timer.set(self._scheduled_ns + 2 * self.period_ns - self._lead_ns, self.period_ns)
-        status = 0
-        try:
-            self.looked_ns = time.monotonic_ns()
-            self.stops.restore(self._stopped)
-            self.stops.look()
-            self._tick_and_publish(self._scheduled_ns)  # who opens a node at once finds readings
-            self._scheduled_ns += self.period_ns
-            self._tell_ready()
-            self._loop()
-        except Exception as error:  # any failure of a driver: stop first, report second
-            status = 1
-            self._fail(error)
-        return status
+        self.looked_ns = time.monotonic_ns()
+        self.stops.restore(self._stopped)
+        self.stops.look()
+        self._tick_and_publish(self._scheduled_ns)  # who opens a node at once finds readings
+        self._scheduled_ns += self.period_ns
+        self._tell_ready()
 
     def _watch_requests(self) -> None:
         """Wake up when somebody asks for a stop; a tick would see it, too, but later."""
@@ -365,16 +369,16 @@ class Runtime:
             self.statistics.record_slack(slack_ns)
 
     def _look_around(self, began_ns: int) -> None:
-        """Heed what the daemon and the latch ask for; what was asked for before ``began_ns`` is done with this tick."""
-        if self.stops.heed_orders():
-            self._hear_orders()
+        """Heed what is asked for; what was asked for before ``began_ns`` is done with this tick."""
+        self.heed()
         self.looked_ns = began_ns
-        self.stops.heed()
 
-    def _hear_orders(self) -> None:
-        """Obey all that the daemon has sent."""
-        while self.running and self._take_order():
-            pass
+    def heed(self) -> None:
+        """Heed the daemon's orders, then the latch and the stop-request file; cheap when there is nothing new."""
+        if self.stops.heed_orders():
+            while self.running and self._take_order():
+                pass
+        self.stops.heed()
 
     def _tick_and_publish(self, scheduled_ns: int) -> int:
         """Return when the tick itself was done."""
@@ -545,11 +549,14 @@ class Runtime:
             case DriverVerb.INPUT:
                 name, channels, bit = arguments
                 self.inputs[name].attach(fds[0], channels, bit)
-            case DriverVerb.NODE_STOP:
-                block, channels, bit, source = arguments
-                self.stops.stop_node(self.blocks[block], channels, bit, source)
-            case DriverVerb.NODE_RESET:
-                block, channels, bit, _ = arguments
+            case DriverVerb.NODE_STOP | DriverVerb.NODE_RESET:
+                block, channels, bit, text, resets = arguments
+                self.stops.heed()  # a reset that came before it must not come after it
+                if resets != self.latch.resets:
+                    return  # the workcell has been reset since then: of all that, nothing is left
+                if verb is DriverVerb.NODE_STOP:
+                    self.stops.stop_node(self.blocks[block], channels, bit, text)
+                    return
                 try:
                     self.stops.reset_node(self.blocks[block], channels, bit, "reset")
                 except (OSError, CommandError) as error:

@@ -195,7 +195,7 @@ def _axis_acts(
             state, "emergency stop", latch=latched, motion=halting, queue=lambda s: s.buffered[0] == 0
         )
         if by_daemon:
-            world.order(DriverVerb.NODE_STOP, 0, [number], -1, "somebody")
+            world.order(DriverVerb.NODE_STOP, 0, [number], -1, "somebody", world.latch.resets)
             done(None)
         else:
             owner.ioctl(Request.EMERGENCY_STOP, None, done)
@@ -206,7 +206,7 @@ def _axis_acts(
         if not by_daemon:
             owner.ioctl(Request.RESET, None, done)
         elif not world.latch.stopped_ns:
-            world.order(DriverVerb.NODE_RESET, 0, [number], -1, "somebody")
+            world.order(DriverVerb.NODE_RESET, 0, [number], -1, "somebody", world.latch.resets)
             done(None)
 
     def stop_all() -> None:
@@ -294,7 +294,7 @@ def test_outputs_that_the_next_tick_sets(make_world: Any) -> None:
                 Request.EMERGENCY_STOP, None, promises.make(state, "stop", data=lambda s: s.data[0] == 0)
             )
         else:
-            world.order(DriverVerb.NODE_STOP, 0, [0], -1, "somebody")
+            world.order(DriverVerb.NODE_STOP, 0, [0], -1, "somebody", world.latch.resets)
             promises.make(state, "stop by the daemon", data=lambda s: s.data[0] == 0)(None)
 
     def reset() -> None:

@@ -1,0 +1,421 @@
+"""Goes through all states of ``ownership_model`` up to a depth, and takes every step between them on the real objects.
+
+python tests/ownership_explorer.py --depth 6 --limit-s 600     # as far as that goes
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from ownership_cell import Cell, cells
+from ownership_model import (
+    CLIENTS,
+    GUEST,
+    IN,
+    OPEN,
+    UP,
+    Action,
+    Broken,
+    Device,
+    Driver,
+    Held,
+    State,
+    actions,
+    follow,
+    promise,
+)
+
+BEGINNINGS: dict[str, list[Action]] = {
+    "nobody owns anything": [],
+    "two own, one waits": [("open", 0, 0), ("open", 1, 1), ("open", 2, 0)],
+    "all moves": [("open", 0, 0), ("open", 2, 1), ("hear", 0), ("hear", 1), ("move", 0, 0), ("move", 2, 1)],
+    "all is stopped": [("open", 0, 0), ("open", 1, 1), ("stop_node", 2, 1), ("stop", 2)],
+}
+"""Where exploring begins: steps after a start at which all have connected and come to rest."""
+
+
+SYSTEM = frozenset(
+    ["notice", "listen", "bury", "start", "beat", "hear", "tick", "see_death", "leave", "boot"]
+)  # fmt: skip
+"""What happens by itself, if nobody asks for anything."""
+
+
+def check_rest(s: State) -> None:
+    """See that nothing is left of who has gone, when all has come to rest.
+
+    Raises:
+        Broken: something is.
+    """
+    for d, device in enumerate(s.devices):
+        promise(device.phase == UP, "a device comes back")
+        (driver,) = device.driver
+        promise(not device.claim or device.claim[1] == OPEN, "nothing is left of a handle that ends")
+        promise(not device.claim or s.clients[device.claim[0]][0] == IN, "nothing is left of the dead")
+        promise(driver.handle[:1] == device.claim[:1], "daemon and driver agree on who owns an output")
+        promise((driver.stopped, driver.node_stop or s.stopped) == (s.stopped, s.node_stops[d] or s.stopped),
+                 "daemon and driver agree on what is stopped")  # fmt: skip
+
+
+MOST_STEPS_TO_REST = 100
+
+
+class Explored(NamedTuple):
+    """How far it went: states, steps between them, depth to which they are complete, steps that the real objects took."""
+
+    states: int
+    steps: int
+    depth: int
+    taken: int
+
+
+def begin(name: str) -> list[Action]:
+    """Return the steps from nothing to a beginning."""
+    state, way = State(), []
+
+    def take(action: Action) -> None:
+        nonlocal state
+        state, _ = follow(state, action)
+        way.append(action)
+
+    take(("boot",))
+    more = settle(state)[1]
+    for action in [*more, *[("connect", c) for c in range(CLIENTS)], *BEGINNINGS[name]]:
+        take(action)
+    return way
+
+
+def settle(state: State) -> tuple[State, list[Action]]:
+    """Let all happen that happens by itself; return the rest state, and the way there."""
+    way: list[Action] = []
+    while step := next((a for a in actions(state) if a[0] in SYSTEM), None):
+        state, _ = follow(state, step)
+        way.append(step)
+    return state, way
+
+
+Graph = dict[State, list[tuple[Action, State, str]]]
+
+
+def explore(
+    way: Iterable[Action], depth: int, goes_on: Callable[[], bool] = lambda: True
+) -> tuple[Graph, State, int]:
+    """Return all states up to a depth (each for those that differ by names) with the steps that leave them, and where it began.
+
+    Raises:
+        Broken: a promise does not hold; with the steps that lead there.
+    """
+    state = State()
+    for action in way:
+        state, _ = follow(state, action)
+    first = typical(state)
+    graph: Graph = {}
+    came: dict[State, tuple[State, Action] | None] = {first: None}
+    rests: set[State] = set()
+    front, reached = [first], 0
+    while front and reached < depth and goes_on():
+        new: list[State] = []
+        for state in front:
+            steps = graph[state] = []
+            for action in actions(state):
+                try:
+                    after, answer = follow(state, action)
+                except Broken as error:
+                    raise Broken(f"{error}, after {trace(came, state)} and then {action}") from None
+                steps.append((action, after, answer))
+                alike = typical(after)
+                if alike not in came:
+                    _see_rest(alike, rests)
+                    came[alike] = (state, action)
+                    new.append(alike)
+        front, reached = new, reached + 1
+    return graph, first, reached
+
+
+def _see_rest(state: State, rests: set[State]) -> None:
+    """See that nothing is left of who has gone when all comes to rest; ``rests``: states of which that is known."""
+    passed = []
+    while state not in rests and (step := next((a for a in actions(state) if a[0] in SYSTEM), None)):
+        passed.append(state)
+        if len(passed) > MOST_STEPS_TO_REST:
+            raise Broken("all comes to rest")
+        state, _ = follow(state, step)
+    if state not in rests:
+        check_rest(state)
+    rests.update(passed, [state])
+
+
+def trace(came: dict[State, tuple[State, Action] | None], state: State) -> list[Action]:
+    """Return the steps that lead to a state, up to names."""
+    steps: list[Action] = []
+    while (before := came[state]) is not None:
+        state = before[0]
+        steps.append(before[1])
+    return steps[::-1]
+
+
+def follow_all(
+    make: Callable[[], Cell], way: list[Action], graph: Graph, goes_on: Callable[[], bool] = lambda: True
+) -> int:
+    """Take every step of a graph on the real objects, in walks as long as possible; return how many that was.
+
+    Raises:
+        AssertionError: the real objects went elsewhere than the model.
+    """
+    left = {state: list(range(len(steps))) for state, steps in graph.items()}
+    walk: Walk | None = None
+    taken = 0
+    while goes_on():
+        if walk is None:
+            walk = Walk(make(), way)
+        route = _route(graph, left, typical(walk.state))
+        if route is None:
+            more = _way_back(graph, walk.state)
+            if more:
+                for action in more:
+                    walk.take(action)
+                continue
+            taken += walk.length
+            if walk.length == len(way):
+                return taken
+            walk = None
+            continue
+        for state, index in route:
+            if index in left[state]:
+                left[state].remove(index)
+            walk.go(graph[state][index][0], state)
+    return taken + (walk.length if walk else 0)
+
+
+def _route(graph: Graph, left: dict[State, list[int]], start: State) -> list[tuple[State, int]] | None:
+    """Return the shortest way to, and along, a step that has not been taken; None when there is none."""
+    if start not in graph:
+        return None
+    came: dict[State, tuple[State, int] | None] = {start: None}
+    queue = deque([start])
+    while queue:
+        state = queue.popleft()
+        if left[state]:
+            route = [(state, left[state][0])]
+            while (before := came[state]) is not None:
+                route.append(before)
+                state = before[0]
+            return route[::-1]
+        for index, (_, after, _) in enumerate(graph[state]):
+            alike = typical(after)
+            if alike in graph and alike not in came:
+                came[alike] = (state, index)
+                queue.append(alike)
+    return None
+
+
+def _way_back(graph: Graph, state: State) -> list[Action]:
+    """Return steps that happen by themselves and lead from outside of a graph into it; none when there are none."""
+    steps: list[Action] = []
+    while typical(state) not in graph:
+        step = next((a for a in actions(state) if a[0] in SYSTEM), None)
+        if step is None:
+            return []
+        steps.append(step)
+        state, _ = follow(state, step)
+    return steps
+
+
+class Walk:
+    """A walk of model and real objects together."""
+
+    def __init__(self, cell: Cell, way: Iterable[Action]) -> None:
+        self.cell, self.state, self.length = cell, State(), 0
+        self.steps: list[Action] = []
+        for action in way:
+            self.take(action)
+
+    def go(self, action: Action, alike: State) -> None:
+        """Take the step that an action is in a state that differs from the present one by names only."""
+        for clients, devices in ALIKE:
+            if renamed(alike, clients, devices) == self.state:
+                self.take(_named(action, clients, devices))
+                return
+        raise AssertionError("not alike")
+
+    def take(self, action: Action) -> None:
+        """Take a step on both sides and compare."""
+        after, answer = follow(self.state, action)
+        self.steps.append(action)
+        self.length += 1
+        try:
+            told = self.cell.take(action)
+            assert told == answer, f"answered {told!r}; want {answer!r}"
+            seen = self.cell.view(after)
+            assert seen == after, _difference(seen, after)
+        except Exception as error:
+            raise AssertionError(f"{error!r}; at the end of {self.steps[-40:]}") from error
+        self.state = after
+
+
+def wander(make: Callable[[], Cell], steps: int, seed: int) -> int:
+    """Take steps at random, from where nothing has happened yet; what happens by itself is favoured, so that all goes on.
+
+    Returns:
+        How many different steps that were, names apart.
+
+    Raises:
+        AssertionError: the real objects went elsewhere than the model, or a promise does not hold.
+    """
+    chance, walk, seen = random.Random(seed), Walk(make(), begin("nobody owns anything")), set()
+    for _ in range(steps):
+        choice = list(actions(walk.state))
+        by_itself = [action for action in choice if action[0] in SYSTEM]
+        kinds = sorted(
+            {action[0] for action in (by_itself if by_itself and chance.random() < 0.5 else choice)}, key=str
+        )
+        kind = chance.choice(kinds)
+        if kind == "crash" and chance.random() < 0.8:
+            continue
+        action = chance.choice([action for action in choice if action[0] == kind])
+        seen.add((typical(walk.state), kind))
+        walk.take(action)
+    return len(seen)
+
+
+CLIENT_FIRST = frozenset(
+    [
+        "connect",
+        "open",
+        "give_up",
+        "close",
+        "stop",
+        "reset",
+        "stop_node",
+        "reset_node",
+        "request_stop",
+        "suspend",
+        "die",
+        "move",
+        "stop_by_handle",
+        "reset_by_handle",
+        "expire",
+        "notice",
+    ]
+)
+DEVICE_SECOND = frozenset(
+    [
+        "open",
+        "give_up",
+        "close",
+        "stop_node",
+        "reset_node",
+        "move",
+        "stop_by_handle",
+        "reset_by_handle",
+        "expire",
+    ]
+)
+DEVICE_FIRST = frozenset(["hear", "tick", "see_death", "kill", "leave", "listen", "bury", "start", "replace"])
+
+
+def _named(action: Action, clients: tuple[int, ...], devices: tuple[int, ...]) -> Action:
+    name, *rest = action
+    if name in CLIENT_FIRST:
+        rest[0] = clients[int(rest[0])]
+    if name in DEVICE_SECOND:
+        rest[1] = devices[int(rest[1])]
+    if name in DEVICE_FIRST:
+        rest[0] = devices[int(rest[0])]
+    if name == "die" and rest[1] in (1, 2):
+        rest[1] = 1 + devices[int(rest[1]) - 1]
+    return (name, *rest)
+
+
+def _difference(seen: State, wanted: State) -> str:
+    return "; ".join(
+        f"{n} is {a}; want {b}" for n, a, b in zip(State._fields, seen, wanted, strict=True) if a != b
+    )
+
+
+def run(name: str, depth: int, goes_on: Callable[[], bool] = lambda: True) -> Explored:
+    """Explore from a beginning to a depth, and take all steps on the real objects."""
+    way = begin(name)
+    graph, _, reached = explore(way, depth, goes_on)
+    with cells() as make:
+        taken = follow_all(make, way, graph, goes_on)
+    return Explored(len(graph), sum(map(len, graph.values())), reached, taken)
+
+
+# --- what is alike --------------------------------------------------------------------------------
+
+
+def renamed(s: State, clients: tuple[int, ...], devices: tuple[int, ...]) -> State:
+    """Return a state with clients and devices under other numbers."""
+
+    def held(who: Held) -> Held:
+        return (clients[who[0]], who[1]) if who else who
+
+    def driver(of: Driver) -> Driver:
+        inbox = tuple((v, clients[n] if n >= 0 else n, m) for v, n, m in of.inbox)
+        return of._replace(inbox=inbox, handle=held(of.handle))
+
+    new_clients, new_devices, stops = list(s.clients), list(s.devices), list(s.node_stops)
+    for c, client in enumerate(s.clients):
+        words = client[1]
+        if words.startswith("open"):
+            words = f"open {devices[int(words[-1])]}"
+        new_clients[clients[c]] = (client[0], words)
+    for d, device in enumerate(s.devices):
+        stops[devices[d]] = s.node_stops[d]
+        new_devices[devices[d]] = Device(device.phase, held(device.claim), tuple(map(driver, device.driver)))
+    waiting = tuple((clients[c], devices[d]) for c, d in s.waiting)
+    return s._replace(
+        node_stops=tuple(stops), clients=tuple(new_clients), waiting=waiting, devices=tuple(new_devices)
+    )
+
+
+ALIKE = [((*clients, GUEST), devices) for clients in ((0, 1), (1, 0)) for devices in ((0, 1), (1, 0))]
+
+
+def typical(s: State) -> State:
+    """Return the one that stands for all states that differ from this one by names only."""
+    return min(renamed(s, *names) for names in ALIKE)
+
+
+def main(arguments: list[str]) -> int:
+    """Explore, walk, and tell how far it went."""
+    parser = argparse.ArgumentParser(
+        description="Explore the protocol of ownership and stops on the real objects."
+    )
+    parser.add_argument(
+        "--model-depth", type=int, default=0, help="steps from each beginning, in the model only"
+    )
+    parser.add_argument(
+        "--depth", type=int, default=0, help="steps from each beginning, taken by the real objects"
+    )
+    parser.add_argument("--walks", type=int, default=0, help="random walks of 400 steps")
+    parser.add_argument("--seed", type=int, default=0, help="of the first walk")
+    options = parser.parse_args(arguments)
+    for name in BEGINNINGS:
+        if options.model_depth:
+            graph, _, reached = explore(begin(name), options.model_depth)
+            steps = sum(map(len, graph.values()))
+            print(
+                f"model, {name}: depth {reached}: {len(graph)} states, {steps} steps between them", flush=True
+            )
+        if options.depth:
+            found = run(name, options.depth)
+            print(
+                f"real, {name}: depth {found.depth}: {found.states} states, {found.steps} steps between them; "
+                f"{found.taken} taken",
+                flush=True,
+            )
+    with cells() as make:
+        seeds = range(options.seed, options.seed + options.walks)
+        different = sum(wander(make, 400, seed) for seed in seeds)
+    print(f"real, at random: {400 * options.walks} steps, {different} different ones")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
