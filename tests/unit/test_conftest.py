@@ -1,8 +1,10 @@
 """The helpers that other tests lean on."""
 
 import signal
+import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from daemon_rig import has_ended
@@ -56,3 +58,14 @@ def test_names_are_free_and_fit_a_socket_address(free_name):
     names = {free_name("daemon.sock") for _ in range(3)}
     assert len(names) == 3
     assert all(len(str(name)) < 100 and not name.exists() and name.parent.is_dir() for name in names)
+
+
+def test_a_suite_that_is_started_with_interrupts_ignored_has_children_that_obey_them(tmp_path):
+    """As in the background of a shell that is not interactive."""
+    tests = Path(__file__).parents[1]
+    inner = f"import sys; sys.path.insert(0, {str(tests)!r}); import conftest, signal; print(signal.getsignal(signal.SIGINT))"
+    outer = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); os.execv(sys.executable, sys.argv[1:])"
+    done = subprocess.run(
+        [sys.executable, "-c", outer, sys.executable, "-c", inner], capture_output=True, text=True, check=True
+    )
+    assert "default_int_handler" in done.stdout
