@@ -526,6 +526,8 @@ class Runtime:
             packet, fds, _, _ = socket.recv_fds(self._control, MAX_PACKET, 8)
         except BlockingIOError:
             return False
+        except ConnectionResetError:
+            return self._take_order()  # it is reported once, ahead of what is still there to read
         except OSError:
             packet, fds = b"", []
         if not packet:
