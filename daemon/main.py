@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import sys
 
+from sioms.safe_path import leave_working_directory
+
 from .nursery_process import start_nursery
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the daemon, or check a configuration; return the exit status."""
+    leave_working_directory()
     nursery = start_nursery()  # it imports numpy and the motion core while we import; it ends when we do
     import argparse
     import signal

@@ -7,6 +7,8 @@ import socket
 import sys
 from typing import NamedTuple
 
+from sioms.safe_path import safe_environment
+
 _SIGINT = 2
 """Of Linux; importing ``signal`` would delay the nursery by the import of ``enum``."""
 
@@ -33,8 +35,13 @@ def start_nursery() -> NurseryProcess:
     ours.setblocking(False)  # a nursery that is stuck in a driver's import must not hold up the daemon
     with theirs:
         theirs.set_inheritable(True)
-        environment = dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", PYTHONFAULTHANDLER="1")
-        arguments = [sys.executable, "-m", "sioms.sdk.nursery", str(theirs.fileno())]
+        environment = dict(
+            safe_environment(os.environ),
+            OPENBLAS_NUM_THREADS="1",
+            OMP_NUM_THREADS="1",
+            PYTHONFAULTHANDLER="1",
+        )
+        arguments = [sys.executable, "-P", "-m", "sioms.sdk.nursery", str(theirs.fileno())]
         # A terminal's Ctrl-C is for the daemon, whose end ends the nursery.
         pid = os.posix_spawn(sys.executable, arguments, environment, setsigmask=[_SIGINT])
         return NurseryProcess(ours, pid)

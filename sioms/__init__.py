@@ -10,6 +10,13 @@
 Names are loaded when they are first used, so that a program pays only for what it needs.
 """
 
+import sys as _sys
+
+if getattr(_sys, "argv", [])[:1] == ["-m"] and any(word.split(".")[0] == "sioms" for word in _sys.orig_argv):
+    from .safe_path import leave_working_directory
+
+    leave_working_directory()  # a module of ours is being run by its name
+
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from .client.command import command as command

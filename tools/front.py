@@ -17,6 +17,8 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
+from sioms.safe_path import leave_working_directory
+
 
 @dataclass(frozen=True, slots=True)
 class Command:
@@ -51,6 +53,7 @@ def main(words: Sequence[str] | None = None) -> int:
     """Run a command; return its exit status."""
     if as_program := words is None:
         words = sys.argv[1:]
+        leave_working_directory()
         _begin()
     parser = argparse.ArgumentParser(prog="sioms", description=DESCRIPTION)
     parser.add_argument("--version", action="store_true", help="print the version and exit")

@@ -33,7 +33,7 @@ def probe(name: str, folder: Path | None = None, table: Mapping[str, Any] | None
     Raises:
         ProbeFailed: there is no such driver, or its file does not load.
     """
-    command = [sys.executable, "-m", "sioms.sdk.probe", name, str(folder or Path.cwd())]
+    command = [sys.executable, "-P", "-m", "sioms.sdk.probe", name, str(folder or Path.cwd())]
     command += [json.dumps(table)] if table is not None else []
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     if done.returncode:

@@ -173,7 +173,7 @@ class Station:
     def _connect(self, paced: bool, wired: bool) -> None:
         rig = self.rig
         name, *options = rig.counterpart
-        program = ["-m", name if "." in name else f"sioms.tools.counterparts.{name}"]
+        program = ["-P", "-m", name if "." in name else f"sioms.tools.counterparts.{name}"]
         if name.endswith(".py"):
             program = [str((self._base / name).resolve())]
         link = [] if rig.tcp else ["--link", str(self._folder / "device")]
@@ -186,7 +186,7 @@ class Station:
             ["--baud", str(self.baud), "--bits", str(rig.bits_per_character)] if paced and self.baud else []
         )
         for kind in (rig.line, "pushed") if rig.pushes else (rig.line,):
-            command = [sys.executable, "-m", "sioms.tools.author.wire", "--kind", kind, *speed]
+            command = [sys.executable, "-P", "-m", "sioms.tools.author.wire", "--kind", kind, *speed]
             command += ["--device", self.counterpart.port, "--link", str(self._folder / "port")]
             self.wires.append(Peer(command, "wire"))
         self.port = self.wires[0].port
@@ -437,7 +437,7 @@ class Client:
 
     def __init__(self, script: str, *words: str) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-c", PROLOGUE + script, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            [sys.executable, "-P", "-c", PROLOGUE + script, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             text=True, preexec_fn=ends_with_us(),
         )  # fmt: skip
         line = self._process.stdout.readline() if self._process.stdout else ""

@@ -78,7 +78,15 @@ def run_replay(args: argparse.Namespace) -> int:
         print(f"sioms driver replay: {error}", file=sys.stderr)
         return 2
     with tempfile.TemporaryDirectory(prefix="sioms-replay-") as folder:
-        command = [sys.executable, "-m", "sioms.tools.author.replaying", str(args.trace), "--kind", kind]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "sioms.tools.author.replaying",
+            str(args.trace),
+            "--kind",
+            kind,
+        ]
         command += ["--link", str(Path(folder) / "port"), "--ignore", args.ignore]
         peer = Peer(command, "replaying peer")
         try:

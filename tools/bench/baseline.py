@@ -115,4 +115,4 @@ def run_ns(command: list[str], environment: dict[str, str] | None = None) -> int
 
 def interpreter_ns() -> int:
     """Return how long a bare interpreter takes: ``python -c pass`` [ns]."""
-    return run_ns([sys.executable, "-c", "pass"])
+    return run_ns([sys.executable, "-P", "-c", "pass"])
