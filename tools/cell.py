@@ -227,9 +227,13 @@ def troubles(status: dict[str, Any], device: str = "", node: str = "") -> list[s
         if device not in ("", each["name"]):
             continue
         if each["state"] == "fault":
-            lines.append(f"{each['name']}: device in fault: {each['reason']}; `sioms reset` tries it again")
+            lines.append(
+                f"{each['name']}: device in fault: {each['reason'].removeprefix(each['name'] + ': ')}; `sioms reset` tries it again"
+            )
         elif each["trouble"]:
-            lines.append(f"{each['name']}: {each['trouble']}; `sioms reset {node or each['name']}` clears it")
+            lines.append(
+                f"{each['name']}: {each['trouble'].removeprefix(each['name'] + ': ')}; `sioms reset {node or each['name']}` clears it"
+            )
     return ["", *lines] if lines else []
 
 

@@ -88,6 +88,11 @@ def run(args: argparse.Namespace) -> int:
             errno.EPERM,
             f"{args.action} the service: it writes to /etc; run it as root, or with --dry-run to see what",
         )
+    if not args.root.is_dir():
+        raise OSError(
+            errno.ENOENT,
+            f"{args.action} the service: --root {args.root}: no such folder; make it, or name another",
+        )
     if args.action == "install":
         _refuse_unseen(args.root)
         return _install(items, args.root, args.dry_run, args.force)

@@ -341,7 +341,7 @@ class NodeCore:
         if self._map is None:
             return OSError(errno.EBADF, f"read {self.name}: it is closed")
         if isinstance(error, NotReadable):
-            why = error.reason or "no reason given"
+            why = error.reason.removeprefix(f"{self.info.device}: ") or "no reason given"
             state = {
                 PageState.STALE: "its driver is gone or hung",
                 PageState.STARTING: "its device is starting",

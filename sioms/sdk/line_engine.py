@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -173,8 +174,7 @@ class LineEngine(Connected):
 
     def _told(self, unit: LineUnit, error: Exception) -> str:
         """Return what failed of which unit, and what to look at unless the driver has said so."""
-        text, line = str(error), self._driver.line
-        text = text if unit.name in text else f"{unit.name}: {text}"
+        text, line = _named(unit, error), self._driver.line
         if not isinstance(error, LinkError) or "look at" in text:
             return text
         if line.serial is None:
@@ -219,7 +219,7 @@ class LineEngine(Connected):
         if error is None:
             bank.action_done(action, now_ns)
         else:
-            bank.action_failed(action, f"{state.unit.name}: {error}", now_ns)
+            bank.action_failed(action, _named(state.unit, error), now_ns)
             self._take_actions(state, block, now_ns)
             if self._closed and action.is_stop and self.line is not None:  # no poll has it sent again
                 steps, done = _later(state.unit.act(action)), partial(self._acted, state, block, bank, action)
@@ -368,3 +368,9 @@ def _later(steps: Steps) -> Steps:
     """Carry out steps after a pause in which the line serves nobody else for long."""
     yield Pause(RETRY_S)
     yield from steps
+
+
+def _named(unit: LineUnit, error: Exception) -> str:
+    """Return an error with the name of the unit that it is about, once."""
+    text = str(error)
+    return text if re.search(rf"(?<!\w){re.escape(unit.name)}(?!\w)", text) else f"{unit.name}: {text}"

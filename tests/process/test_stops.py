@@ -142,7 +142,7 @@ def test_a_fresh_stop_while_the_daemon_hangs_stays_latched(
             [sys.executable, "-c", f"import sys; from sioms.tools.{module} import main; sys.exit(main({words}))"],
             env={**os.environ, "SIOMS_SOCKET": daemon.socket}, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
-        wait_for(lambda: axis.read().status[0] & AxisStatus.EMERGENCY_STOP, "latched", 5.0)
+        wait_for(lambda: axis.read().status[0] & AxisStatus.EMERGENCY_STOP, "latched", 20.0)
         latched_s = time.monotonic() - began
         at_rest(axis, 1.0)
         _, said = tool.communicate(timeout=20.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from sioms.protocol.records import numpy_dtype
 from sioms.sdk.connection import Connection
 from sioms.sdk.exchange import Exchange, LinkError, Steps
 from sioms.sdk.line import BABBLE_NS, Counters, Line, Priority
+from sioms.sdk.line_engine import _named
 from sioms.sdk.settings import LineSettings
 
 MS = 1_000_000
@@ -121,3 +123,16 @@ def test_no_verb_lets_the_set_point_run_on_before_a_late_tick(verb: str, gap_ms:
     assert bank.fields[7][0] == pytest.approx(position[0], abs=1e-4), (
         "it brakes from where it was last put out"
     )
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        ("nothing for 0.5 s", "io: nothing for 0.5 s"),
+        ("let go of io x: it is in state 8 yet", "let go of io x: it is in state 8 yet"),
+        ("an action was refused", "io: an action was refused"),
+    ],
+)
+def test_an_error_names_its_unit_once(error: str, told: str) -> None:
+    unit: Any = SimpleNamespace(name="io")
+    assert _named(unit, OSError(error)) == told

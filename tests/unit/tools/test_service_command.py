@@ -77,3 +77,10 @@ def test_only_root_may(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     assert main(["service", "install"]) == 1
     assert "run it as root, or with --dry-run" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("action", ["install", "remove"])
+def test_a_mistyped_root_is_not_made(tmp_path: Path, capsys: pytest.CaptureFixture[str], action: str) -> None:
+    assert main(["service", action, "--root", str(tmp_path / "imgae")]) == 1
+    assert "imgae: no such folder; make it, or name another" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
