@@ -257,6 +257,10 @@ class Walk:
         self.state = after
 
 
+OFTEN = {"move": 8.0, "open": 2.0, "connect": 4.0, "crash": 0.2, "suspend": 0.5, "give_up": 0.5}
+"""How likely some steps of a random walk are, against 1 for the others: so that something moves when others happen."""
+
+
 def wander(make: Callable[[], Cell], steps: int, seed: int) -> int:
     """Take steps at random, from where nothing has happened yet; what happens by itself is favoured, so that all goes on.
 
@@ -270,12 +274,8 @@ def wander(make: Callable[[], Cell], steps: int, seed: int) -> int:
     for _ in range(steps):
         choice = list(actions(walk.state))
         by_itself = [action for action in choice if action[0] in SYSTEM]
-        kinds = sorted(
-            {action[0] for action in (by_itself if by_itself and chance.random() < 0.5 else choice)}, key=str
-        )
-        kind = chance.choice(kinds)
-        if kind == "crash" and chance.random() < 0.8:
-            continue
+        kinds = sorted({str(a[0]) for a in (by_itself if by_itself and chance.random() < 0.5 else choice)})
+        kind = chance.choices(kinds, [OFTEN.get(kind, 1.0) for kind in kinds])[0]
         action = chance.choice([action for action in choice if action[0] == kind])
         seen.add((typical(walk.state), kind))
         walk.take(action)

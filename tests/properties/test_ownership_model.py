@@ -8,13 +8,39 @@ from typing import Any
 
 import pytest
 from ownership_cell import cells
-from ownership_explorer import BEGINNINGS, begin, explore, run, wander
+from ownership_explorer import (
+    BEGINNINGS,
+    Walk,
+    begin,
+    check_rest,
+    explore,
+    run,
+    settle,
+    wander,
+)
 
 from sioms.protocol.messages import ClientVerb
 
 DEPTH = int(os.environ.get("SIOMS_EXPLORE_DEPTH", "1"))
 """Steps from each beginning; a deeper exploration takes hours, see tests/ownership_explorer.py."""
 WALKS = 12
+SCHEDULES = [
+    "open 0 0, hear 0, stop_node 1 0, move 0 0, reset_node 1 0, move 0 0",
+    "open 0 0, hear 0, stop_node 1 0, hear 0, reset_node 1 0, stop_by_handle 0 0, hear 0, move 0 0",
+    "open 0 0, hear 0, stop_node 1 0, reset_by_handle 0 0, hear 0, kill 0, bury 0 process, start 0",
+    "open 0 0, hear 0, move 0 0, replace 0, stop_node 1 0, move 0 0",
+    "kill 0, stop_node 1 0, bury 0 socket, start 0, listen 0, open 0 0, hear 0, move 0 0",
+    "stop 0, tick 1, stop_node 0 1, reset 0, tick 1, open 1 1, hear 1, move 1 1",
+    "replace 0, hear 0, reset 0, stop_node 0 0, hear 0",
+    "open 0 0, open 2 0, regrant, close 0 0, hear 0, listen 0",
+    "stop_node 1 1, replace 1, crash, hear 1",
+    "open 0 0, hear 0, move 0 0, die 0 0, see_death 0 socket",
+    "open 0 1, hear 1, move 0 1, stop 1, tick 1",
+    "request_stop 0, tick 0, reset 1, tick 1, request_stop 0, reset 1",
+    "request_stop 0, beat, reset 1, crash, hear 0, leave 0, hear 1, leave 1, boot",
+    "stop_node 0 0, stop 1, crash, kill 0, kill 1, boot, listen 0, connect 0, open 0 0, hear 0, move 0 0",
+]
+"""Each has broken a promise once, or would with a slip of the pen."""
 
 
 @pytest.mark.parametrize("name", BEGINNINGS)
@@ -28,6 +54,18 @@ def test_no_promise_is_broken_in_any_state_of_the_model(name: str) -> None:
 def test_the_real_objects_go_where_the_model_goes(name: str) -> None:
     found = run(name, DEPTH)
     assert found.depth == DEPTH and found.taken > found.steps > 30
+
+
+@pytest.mark.parametrize("schedule", SCHEDULES)
+def test_what_once_broke_a_promise(schedule: str) -> None:
+    with cells() as make:
+        walk = Walk(make(), begin("nobody owns anything"))
+        for step in schedule.split(", "):
+            name, *arguments = step.split()
+            walk.take((name, *(int(a) if a.isdigit() else a for a in arguments)))
+        for action in settle(walk.state)[1]:
+            walk.take(action)
+        check_rest(walk.state)
 
 
 def test_a_stop_that_is_asked_for_in_the_middle_of_a_reset_is_heard() -> None:
@@ -48,6 +86,18 @@ def test_a_stop_that_is_asked_for_in_the_middle_of_a_reset_is_heard() -> None:
         server.shared.record.note = note  # type: ignore[method-assign]
         cell.take(("tick", 0))
         assert server.shared.latch.stopped_ns, "by a driver that looks"
+
+
+def test_the_last_words_of_a_driver_are_heard(capsys: pytest.CaptureFixture[str]) -> None:
+    with cells() as make:
+        cell = make()
+        for action in begin("nobody owns anything"):
+            cell.take(action)
+        for number in range(3):
+            cell._process(1).runtime.log("error", f"the reason, part {number}")
+        cell.take(("kill", 1))
+        cell.take(("bury", 1, "process"))
+        assert "part 2" in capsys.readouterr().err
 
 
 def test_nothing_of_a_dead_client_is_left() -> None:
