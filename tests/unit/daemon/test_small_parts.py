@@ -20,7 +20,7 @@ from sioms.daemon.rights import Peer, Rights
 from sioms.daemon.sessions import peer_of, pidfd_of
 from sioms.daemon.users import Users
 from sioms.protocol.flags import Right
-from sioms.protocol.markers import MARKERS, TABLE_SIZE, MarkerTable, split_token
+from sioms.protocol.markers import MARKERS, TABLE_SIZE, MarkerTable, split_token, token_of
 
 S = 1_000_000_000
 EVA = Peer(10, 1000, "eva", frozenset({20, 1000}))
@@ -171,6 +171,12 @@ class TestMarkerOwners:
         assert new.number == old.number
         owners.signal(old, 5)
         assert not owners.is_signalled(new) and not owners.is_signalled(owners.find(new.number, ""))
+
+    def test_a_token_of_an_earlier_reservation_finds_nothing(self, owners: MarkerOwners) -> None:
+        number, key = split_token(owners.reserve("eva"))
+        with pytest.raises(MarkerError, match="not reserved") as refused:
+            owners.find(token_of(number, key ^ 1), "wait for")
+        assert refused.value.errno == errno.EINVAL
 
     def test_owned_by(self, owners: MarkerOwners) -> None:
         mine, persisting = owners.reserve("eva"), owners.reserve(None)

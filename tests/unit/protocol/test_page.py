@@ -155,6 +155,19 @@ def test_a_writer_killed_half_way_leaves_the_snapshot_before() -> None:
     assert slot_header(reader.latest(1002))[0] == 3
 
 
+def test_a_publication_that_never_came_to_its_end_leaves_no_history_in_its_place() -> None:
+    """The writer itself is cut off in the middle: after the stamp, before the values."""
+    page = Page()
+    reader = page.good()
+    for value in range(2, 6):
+        page.publish(value)
+    assert reader.numbered(2) is not None
+    with pytest.raises(ValueError):
+        page.writer.publish(memoryview(b"too short"), 9999, 9999, 9999)
+    assert reader.numbered(2) is None
+    assert slot_header(reader.latest(1005))[0] == 5
+
+
 class Lapping:
     """A buffer whose writer goes on while it is copied."""
 
