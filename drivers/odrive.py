@@ -267,18 +267,28 @@ class OdriveUnit(AxesUnit):
         """Stop an axis that may run, check its speed limit, set its watchdog, close its loop unless a stop is latched."""
         table = self._settings.axis[axis]
         number, path = table.number, f"axis{table.number}"
-        limit_at = f"{path}.controller.config.vel_limit"
-        (state,), (limit,) = yield odrive.read([f"{path}.current_state", limit_at], self._timeout_s)
-        wanted = self.bank.settings[axis].velocity_max / abs(self._travel[axis])
-        if wanted > limit * 1.001:
-            text = f"velocity_max is {wanted:g} turns/s, but {limit_at} is {limit:g}"
-            raise DeviceError(errno.ERANGE, f"open {self.name} {table.name}: {text}; want at most that")
+        limit_at, torque_at = f"{path}.controller.config.vel_limit", f"{path}.motor.config.torque_lim"
+        (state,), (limit,), (torque,) = yield odrive.read(
+            [f"{path}.current_state", limit_at, torque_at], self._timeout_s
+        )
+        settings = self.bank.settings[axis]
+        wanted = settings.velocity_max / abs(self._travel[axis])
+        most = settings.force_max * abs(self._travel[axis]) / (2 * math.pi)
+        for what, mine, unit, at, boards in (
+            ("velocity_max", wanted, "turns/s", limit_at, limit),
+            ("force_max", most, "N m", torque_at, torque),  # a greater torque would be cut without a word
+        ):
+            if mine > boards * 1.001:
+                text = f"{what} is {mine:g} {unit}, but {at} is {boards:g}; want at most that"
+                raise DeviceError(errno.ERANGE, f"open {self.name} {table.name}: {text}")
         if state == CLOSED_LOOP:
             yield from self.halt(axis, fastest=self.bank.is_latched(axis))
         elif state != IDLE:  # the homing or calibration of somebody else
             yield from self._let_go(axis)
         yield from self._arm(axis, path)
         self._fixed[axis][limit_at] = limit
+        if math.isfinite(torque):
+            self._fixed[axis][torque_at] = torque
         # the last host's watchdog may have run out since the state was read
         (bits,), (state,) = yield odrive.read([f"{path}.error", f"{path}.current_state"], self._timeout_s)
         if int(bits) == odrive.WATCHDOG_EXPIRED:  # what the last host left behind when it died

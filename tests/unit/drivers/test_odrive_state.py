@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -297,6 +298,7 @@ def test_a_restart_is_noticed_by_the_next_poll_and_everything_is_set_again(off_s
         (b"w axis0.config.enable_watchdog 0\n", "enable_watchdog reads 0, but 1 was set"),
         (b"w axis0.config.watchdog_timeout 9\n", "watchdog_timeout reads 9, but 0.5 was set"),
         (b"w axis0.controller.config.vel_limit 90\n", "vel_limit reads 90, but 20 was set"),
+        (b"w axis0.motor.config.torque_lim 90\n", "torque_lim reads 90, but 10 was set"),
         (b"v 0 0.5\n", "control_mode reads 2, but 3 was set|input_vel reads 0.5"),
         (b"c 0 0.01\n", "control_mode reads 1, but 3 was set|input_torque reads 0.01"),
         (b"w axis0.controller.config.input_mode 2\n", "input_mode reads 2, but 1 was set"),
@@ -307,6 +309,19 @@ def test_what_somebody_else_sets_is_seen(line: bytes, told: str) -> None:
     poll(rig, 10)
     rig.device.take(line)
     poll_until(rig, told, 10)
+
+
+def test_a_force_that_the_board_would_cut_is_refused() -> None:
+    rig = board()
+    rig.device.axes[0].p["motor.config.torque_lim"] = 0.5
+    with pytest.raises(
+        DeviceError,
+        match=r"force_max is 0.6366\d N m, but axis0.motor.config.torque_lim is 0.5; want at most",
+    ):
+        rig.do(rig.unit.open())
+    rig.device.axes[0].p["motor.config.torque_lim"] = math.inf  # as it ships
+    rig.do(rig.unit.open())
+    poll(rig, 20)
 
 
 def test_an_axis_that_somebody_else_switches_on_is_seen() -> None:
