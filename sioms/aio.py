@@ -27,7 +27,9 @@ from sioms.protocol.messages import ClientVerb, HandleVerb
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.socketpath import socket_path
 from sioms.protocol.stopfile import StopRequest
+from sioms.protocol.text import printable
 
+from .client.arguments import seconds
 from .client.channel import Answer, Call, Channel
 from .client.channel import connect as connect_socket
 from .client.command import command
@@ -36,8 +38,6 @@ from .client.shown import acknowledged_by_daemon
 from .client.workcell import STARTING_S, node_parts, open_call, request_stop
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from .client.node_core import Records
     from .client.overdue import Overdue
 
@@ -243,6 +243,7 @@ class AsyncNode(NodeCore):
 
     async def wait_event(self, mask: int = -1, last: Any = None, timeout: float | None = None) -> Event:
         """Wait until a masked bit differs from the last state seen; see ``BinaryNode.wait_event``."""
+        timeout = seconds(f"wait for an event on {self.name}", timeout)
         if last is None:
             await self.fresh()
         edges = Edges(self, mask, last)
@@ -332,9 +333,10 @@ class AsyncWorkcell:
 
     async def emergency_stop(self, node: str = "", why: str = "") -> None:
         """Stop the workcell or a node, latched until reset; the workcell also while the daemon hangs."""
-        taken = request_stop(None if node else self._page, why)
+        call = Call("emergency stop", ClientVerb.EMERGENCY_STOP, node, printable(str(why)))
+        taken = call.enough = request_stop(None if node else self._page, call.arguments[1])
         try:
-            await self._call("emergency stop", ClientVerb.EMERGENCY_STOP, node, why, enough=taken)
+            await self._requests.call(call)
         except OSError:
             if taken is None or not taken():
                 raise  # else the drivers have latched it without the daemon
@@ -352,10 +354,8 @@ class AsyncWorkcell:
             if error.errno not in (errno.EIO, errno.EBADF):
                 raise
 
-    async def _call(
-        self, what: str, verb: ClientVerb, *arguments: object, enough: Callable[[], bool] | None = None
-    ) -> Any:
-        return (await self._requests.call(Call(what, verb, *arguments, enough=enough))).value
+    async def _call(self, what: str, verb: ClientVerb, *arguments: object) -> Any:
+        return (await self._requests.call(Call(what, verb, *arguments))).value
 
 
 async def connect(path: str | None = None, name: str = "") -> AsyncWorkcell:

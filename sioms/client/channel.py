@@ -37,6 +37,7 @@ from sioms.protocol.messages import (
 )
 from sioms.protocol.socketpath import may_serve
 
+from .arguments import of_verb, seconds
 from .shown import acknowledged_by_daemon
 
 TYPE_CHECKING = False
@@ -69,6 +70,9 @@ class Call:
         ahead: records that are sent ahead of it, in parts.
         limit_s: the time-out that the other side has been given [s], None = it may take for ever.
         enough: tells of an overdue answer whether it is not needed any more.
+
+    Raises:
+        TypeError, ValueError: an argument is none that the verb takes; the other side would take it for a broken client.
     """
 
     __slots__ = ("ahead", "arguments", "enough", "limit_s", "verb", "what")
@@ -82,14 +86,11 @@ class Call:
         limit_s: float | None = 0.0,
         enough: Callable[[], bool] | None = None,
     ) -> None:
-        if limit_s is not None and not (isinstance(limit_s, int | float) and limit_s == limit_s):
-            # Here it costs the caller an error; the other side would take it for a broken client.
-            raise TypeError(f"{what}: time-out {limit_s!r}; want seconds as a number, or None for ever")
         self.what = what
         self.verb = verb
-        self.arguments = arguments
+        self.arguments = of_verb(what, verb, arguments)
         self.ahead = ahead
-        self.limit_s = limit_s
+        self.limit_s = seconds(what, limit_s)
         self.enough = enough
 
     @property

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from struct import error as struct_error
+
 from sioms.protocol.flags import ControlMode
 from sioms.protocol.records import AXIS_WRITE, AXIS_WRITE_FIELDS
+
+from .arguments import integer, number
 
 _DEFAULT = {name: 0 if code in "iIq" else 0.0 for name, code in AXIS_WRITE_FIELDS}
 _QUANTITY = {
@@ -54,6 +58,7 @@ def command(
         The packed record; records are joined with ``+`` or given to ``write`` as a list.
 
     Raises:
+        TypeError: a word that is no number.
         ValueError: an unknown word, nothing commanded, or words of a group missing.
 
     Example:
@@ -68,7 +73,7 @@ def command(
             raise ValueError(
                 f"make command: unknown word {name}; there are: {', '.join([*_QUANTITY, *_WITH])}"
             )
-        fields[name] = float(value)
+        fields[name] = number(f"make command: {name}", value)
         mode |= flag
     for group in _TOGETHER:
         missing = [name for name in group if name not in values]
@@ -76,16 +81,20 @@ def command(
             raise ValueError(f"make command: {', '.join(missing)} missing; {', '.join(group)} go together")
     if not mode & 0x3F:
         raise ValueError(f"make command: nothing commanded; give one of {', '.join(_QUANTITY)}")
-    fields["axis"] = axis
+    fields["axis"] = integer("make command: axis", axis, "the index of an axis")
     if wait is not None:
         mode |= ControlMode.SPECIFIED_WAIT_MARKER
-        fields["wait_marker_number"] = int(wait)  # type: ignore[call-overload]
+        fields["wait_marker_number"] = integer("make command: wait", wait, "a marker or its number")
     if signal is not None:
         mode |= ControlMode.SPECIFIED_SIGNAL_MARKER
-        fields["signal_marker_number"] = int(signal)  # type: ignore[call-overload]
+        fields["signal_marker_number"] = integer("make command: signal", signal, "a marker or its token")
     if synch:
         mode |= ControlMode.WAIT_FOR_EXTERNAL_SYNCH
     if relative:
         mode |= ControlMode.RELATIVE
     fields["control_mode"] = int(mode)
-    return AXIS_WRITE.pack(*fields.values())
+    try:
+        return AXIS_WRITE.pack(*fields.values())
+    except struct_error as error:
+        whole = {name: fields[name] for name in ("axis", "wait_marker_number", "signal_marker_number")}
+        raise ValueError(f"make command: {whole}: {error}") from None

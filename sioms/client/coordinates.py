@@ -8,6 +8,8 @@ Concurrency: as the node that it looks at.
 
 from __future__ import annotations
 
+from .arguments import integer, number
+
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
@@ -37,9 +39,10 @@ class UserAxis:
     __slots__ = ("axis", "direction", "node", "offset")
 
     def __init__(self, node: AxisNode, axis: int = 0, offset: float = 0.0, direction: int = 1) -> None:
-        if direction not in (1, -1):
+        if integer("make user coordinates: direction", direction, "1 or -1") not in (1, -1):
             raise ValueError(f"make user coordinates: direction {direction!r}; want 1 or -1")
-        self.node, self.axis, self.offset, self.direction = node, axis, offset, direction
+        self.node, self.axis, self.direction = node, axis, direction
+        self.offset = number("make user coordinates: offset", offset)
 
     def __repr__(self) -> str:
         channel = self.node.info.channels[self.axis]
@@ -56,11 +59,11 @@ class UserAxis:
 
     def to_node(self, user: float) -> float:
         """Return the node's position of a user position."""
-        return (user - self.offset) * self.direction
+        return (number("turn a user position", user) - self.offset) * self.direction
 
     def to_user(self, position: float) -> float:
         """Return the user position of one of the node's."""
-        return self.direction * position + self.offset
+        return self._turn(position) + self.offset
 
     @property
     def position(self) -> float:
@@ -75,7 +78,10 @@ class UserAxis:
 
     def call_here(self, user: float) -> None:
         """Let the present place have this user coordinate; nothing moves, and no other client sees it."""
-        self.offset = user - self.direction * self.node.read().position[self.axis]
+        self.offset = (
+            number("call a place by a user coordinate", user)
+            - self.direction * self.node.read().position[self.axis]
+        )
 
     def limits(self) -> tuple[float | None, float | None]:
         """Return the lowest and highest user position, None where there is no soft limit."""
@@ -88,16 +94,19 @@ class UserAxis:
         self, position: float, *, replace: bool = False, timeout: float | None = 0.0, **words: Any
     ) -> int:
         """Append a command to a user position; the words of ``sioms.command`` in user coordinates."""
-        place = self.direction * position if words.get("relative") else self.to_node(position)
+        place = self._turn(position) if words.get("relative") else self.to_node(position)
         return self.node.move(place, self.axis, replace=replace, timeout=timeout, **self._turned(words))
 
     def tweak(self, step: float, **words: Any) -> int:
         """Append a step from where the preceding command ends."""
-        return self.node.tweak(self.direction * step, self.axis, **self._turned(words))
+        return self.node.tweak(self._turn(step), self.axis, **self._turned(words))
 
     def jog(self, velocity: float, *, acceleration: float | None = None) -> int:
         """Go over to a velocity; see ``AxisNode.jog``."""
-        return self.node.jog(self.direction * velocity, self.axis, acceleration=acceleration)
+        return self.node.jog(self._turn(velocity), self.axis, acceleration=acceleration)
+
+    def _turn(self, value: float) -> float:
+        return self.direction * number("turn user coordinates", value)
 
     def _turned(self, words: dict[str, Any]) -> dict[str, Any]:
-        return {name: self.direction * word if name in _SIGNED else word for name, word in words.items()}
+        return {name: self._turn(word) if name in _SIGNED else word for name, word in words.items()}

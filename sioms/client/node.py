@@ -14,6 +14,7 @@ from sioms.protocol.flags import NodeClass, Request
 from sioms.protocol.messages import HandleVerb
 from sioms.protocol.page import NotReadable
 
+from .arguments import integer, numbers, seconds
 from .channel import Call
 from .command import command
 from .node_core import Edges, Event, NodeCore
@@ -116,7 +117,8 @@ class Node(NodeCore):
         """
         if not self._subscribed:
             self.subscribe(1)
-        deadline = None if timeout is None else monotonic() + timeout
+        after = integer(f"wait for new data of {self.name}", after, "the number of a snapshot")
+        deadline = _deadline(f"wait for new data of {self.name}", timeout)
         while True:
             snapshot = self.read()
             if snapshot.number > after:
@@ -268,7 +270,7 @@ class AxisNode(Node):
 
     def calibrate(self, *positions: float) -> None:
         """Give the present position of each axis a new value, without motion."""
-        self.ioctl(Request.CALIBRATE_DEVICE, [float(p) for p in positions])
+        self.ioctl(Request.CALIBRATE_DEVICE, numbers(f"calibrate {self.name}", positions))
 
     def limits(self) -> dict[str, list[float | None]]:
         """Return the limits in force by name, one value an axis, None where there is none."""
@@ -285,7 +287,8 @@ class AxisNode(Node):
         Raises:
             TimeoutError: they did not.
         """
-        deadline = None if timeout is None else monotonic() + timeout
+        commands = integer(f"wait for room on {self.name}", commands, "a number of commands")
+        deadline = _deadline(f"wait for room on {self.name}", timeout)
         if not self._subscribed:
             self.subscribe(1)
         while self.room() < commands:
@@ -318,12 +321,14 @@ class AnalogNode(Node):
                 or blind; the offset is then as before.
             TimeoutError: too few readings came in time.
         """
-        value: list[float] = self.ioctl(Request.ZERO_DEVICE, samples, timeout)
+        value: list[float] = self.ioctl(
+            Request.ZERO_DEVICE, integer(f"zero {self.name}: samples", samples), timeout
+        )
         return value
 
     def set_gains(self, gains: Sequence[float]) -> None:
         """Set the gain matrix: n*n numbers in rows, or the n of its diagonal."""
-        self.ioctl(Request.SET_GAINS, [float(g) for g in gains])
+        self.ioctl(Request.SET_GAINS, numbers(f"set gains of {self.name}", gains))
 
     def gains(self) -> list[float]:
         """Return the gain matrix, n*n numbers in rows."""
@@ -358,10 +363,10 @@ class BinaryNode(Node):
             EdgesLost: more edges came since ``last`` than can be told; its ``lost`` says how many, its ``event`` is
                 where to go on from.
         """
+        deadline = _deadline(f"wait for an event on {self.name}", timeout)
         edges = Edges(self, mask, last)
         if self._subscribed == 0:
             self.subscribe(-1)
-        deadline = None if timeout is None else monotonic() + timeout
         while True:
             event = edges.look()
             if event is not None:
@@ -374,6 +379,12 @@ NODE: dict[NodeClass, type[Node]] = {
     NodeClass.ANALOG: AnalogNode,
     NodeClass.BINARY: BinaryNode,
 }
+
+
+def _deadline(what: str, timeout: float | None) -> float | None:
+    """Return when a time-out that begins now ends [s, time.monotonic], None = never; raises TypeError or ValueError."""
+    limit_s = seconds(what, timeout)
+    return None if limit_s is None else monotonic() + limit_s
 
 
 def select(
@@ -390,7 +401,7 @@ def select(
         The nodes with new data, and those with room; both empty when the time is over.
     """
     readable, room = list(readable), list(room)
-    deadline = None if timeout is None else monotonic() + timeout
+    deadline = _deadline("select", timeout)
     poller = poll()
     for node in {*readable, *room}:
         poller.register(node.fileno(), POLLIN)

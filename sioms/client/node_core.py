@@ -10,6 +10,7 @@ import os
 from mmap import PROT_READ, mmap
 from time import monotonic_ns, sleep
 
+from sioms.protocol import text
 from sioms.protocol.flags import NodeClass, PageState, Request, WriteFlag
 from sioms.protocol.messages import MAX_INLINE, MAX_WRITE, HandleVerb
 from sioms.protocol.nodeinfo import NodeInfo
@@ -17,6 +18,7 @@ from sioms.protocol.page import NotReadable, PageReader, as_of_ns
 from sioms.protocol.records import ANALOG_WRITE, BINARY_WRITE
 
 from . import shown
+from .arguments import integer, number, numbers
 from .channel import Call, Channel
 from .snapshot import SNAPSHOT, BinarySnapshot, Layout
 
@@ -92,7 +94,11 @@ class Edges:
                 errno.EINVAL, f"wait for an event on {node.name}: want a node of one binary channel"
             )
         self._node = node
-        self._mask = mask
+        self._mask = integer(f"wait for an event on {node.name}: mask", mask)
+        if not (last is None or isinstance(last, Event | BinarySnapshot)):
+            raise TypeError(
+                f"wait for an event on {node.name}: last {text.shown(last)}; want an event or a snapshot of the node"
+            )
         if isinstance(last, Event):
             self._state, self._number, self._edges = last.final, last.number, last.edges
         else:
@@ -238,8 +244,10 @@ class NodeCore:
     def kept(self, after: int, last: int) -> Iterator[Any]:
         """Yield the snapshots after a number, up to a last one, that the page still holds, as they are looked at."""
         page = self._page
-        for number in range(max(after + 1, page.head - page.slots + 2, 1), last + 1):
-            raw = page.numbered(number)  # one by one: who is far behind pays for one edge at a time
+        what = f"get the history of {self.name}"
+        first = integer(what, after, "the number of a snapshot") + 1
+        for at in range(max(first, page.head - page.slots + 2, 1), integer(what, last) + 1):
+            raw = page.numbered(at)  # one by one: who is far behind pays for one edge at a time
             if raw is not None:
                 yield self._snapshot(raw, self._layout)
 
@@ -283,8 +291,12 @@ class NodeCore:
         if isinstance(which, str):
             if which in names:
                 return names.index(which)
-        elif -len(names) <= which < len(names):
-            return which % len(names)
+        elif (
+            -len(names)
+            <= (number := integer(f"choose channel of {self.name}", which, "its index or name"))
+            < len(names)
+        ):
+            return number % len(names)
         raise OSError(
             errno.EINVAL,
             f"choose channel {which!r} of {self.name}: it has {', '.join(names)} (0 to {len(names) - 1})",
@@ -292,7 +304,9 @@ class NodeCore:
 
     def index_of(self, axis: int | str) -> int:
         """Return the index of an axis that is named; one that is numbered is the driver's to judge."""
-        return self.channel(axis) if isinstance(axis, str) else axis
+        if isinstance(axis, str):
+            return self.channel(axis)
+        return integer(f"choose axis of {self.name}", axis, "its index or name")
 
     def __repr__(self) -> str:
         what = f"<{type(self).__name__} {self.name}"
@@ -307,11 +321,15 @@ class NodeCore:
     # --- requests as values ----------------------------------------------------------------------
 
     def _ioctl(self, request: Request, argument: object = None, timeout: float | None = 0.0) -> Call:
+        if not isinstance(request, Request):
+            raise TypeError(
+                f"ioctl on {self.name}: {text.shown(request)} is no request; want one of sioms.Request"
+            )
         what = f"{request.name} on {self.name}"
         return Call(what, HandleVerb.IOCTL, int(request), argument, timeout, limit_s=timeout)
 
     def _write(self, records: Records, timeout: float | None, replace: bool) -> Call:
-        data = records if isinstance(records, bytes) else _join(records)
+        data = records if isinstance(records, bytes) else _join(records, self.name)
         flags = WriteFlag.REPLACE if replace else WriteFlag.APPEND
         what = f"write {self.name}"
         if len(data) <= MAX_INLINE:
@@ -319,7 +337,7 @@ class NodeCore:
         if len(data) > MAX_WRITE:
             raise OSError(errno.EMSGSIZE, f"{what}: {len(data)} bytes of records; at most {MAX_WRITE}")
         parts = [data[i : i + MAX_INLINE] for i in range(0, len(data), MAX_INLINE)]
-        limit_s = None if timeout is None else timeout + _JUDGED_S * len(parts)
+        limit_s = None if timeout is None else number(what, timeout, "seconds") + _JUDGED_S * len(parts)
         ahead = tuple(parts[:-1])
         return Call(what, HandleVerb.WRITE, int(flags), timeout, parts[-1], ahead=ahead, limit_s=limit_s)
 
@@ -328,8 +346,14 @@ class NodeCore:
         if len(values) != count:
             raise OSError(errno.EINVAL, f"write {self.name}: {len(values)} values; want {count}")
         if self.info.node_class is NodeClass.BINARY:
-            return b"".join([BINARY_WRITE.pack(i, 0, int(value), 0) for i, value in enumerate(values)])
-        return b"".join([ANALOG_WRITE.pack(i, 0, value) for i, value in enumerate(values)])
+            what, words = f"write {self.name}", "an integer of at most 63 bits"
+            data = [integer(what, value, words, flags=True) for value in values]
+            if any(value >= 1 << 63 for value in data):
+                raise ValueError(f"{what}: {data}; want {words}")
+            return b"".join([BINARY_WRITE.pack(i, 0, value, 0) for i, value in enumerate(data)])
+        return b"".join(
+            [ANALOG_WRITE.pack(i, 0, v) for i, v in enumerate(numbers(f"write {self.name}", values))]
+        )
 
     def _drain(self) -> None:
         try:
@@ -364,7 +388,12 @@ class NodeCore:
         os.close(self._event)
 
 
-def _join(records: Any) -> bytes:
+def _join(records: Any, name: str) -> bytes:
     if hasattr(records, "tobytes"):
         return bytes(records.tobytes())
-    return bytes(records) if isinstance(records, bytearray) else b"".join(records)
+    try:
+        return bytes(records) if isinstance(records, bytearray) else b"".join(records)
+    except TypeError as error:
+        raise TypeError(
+            f"write {name}: {text.shown(records)}: {error}; want packed records, see sioms.command, or an array of them"
+        ) from None

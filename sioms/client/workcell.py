@@ -13,7 +13,9 @@ from sioms.protocol.messages import ClientVerb
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.socketpath import socket_path
 from sioms.protocol.stopfile import StopRequest
+from sioms.protocol.text import printable, shown
 
+from .arguments import number as as_number
 from .channel import CONNECT_S, ENOUGH_LOOK_S, Answer, Call, Channel, connect
 from .node import NODE, SYNCH_LEAD_S, AxisNode, Node
 from .shown import acknowledged_by_daemon
@@ -86,10 +88,10 @@ class Marker:
 
 def open_call(name: str, mode: str, timeout: float | None, lease: float) -> Call:
     """Make the request that opens a node."""
-    access = _ACCESS.get(mode)
+    access = _ACCESS.get(mode) if isinstance(mode, str) else None
     if access is None:
-        raise OSError(errno.EINVAL, f"open {name}: mode {mode!r}; want 'r', 'w' or 'rw'")
-    return Call(f"open {name}", ClientVerb.OPEN, name, int(access), timeout, float(lease), limit_s=timeout)
+        raise OSError(errno.EINVAL, f"open {name}: mode {shown(mode)}; want 'r', 'w' or 'rw'")
+    return Call(f"open {name}", ClientVerb.OPEN, name, int(access), timeout, lease, limit_s=timeout)
 
 
 def node_parts(value: Any, fds: list[int]) -> tuple[Any, ...]:
@@ -238,6 +240,8 @@ class Workcell:
             OSError: ENOENT no such node; EBUSY held, by whom; EACCES no right; EIO device lost;
                 ETIMEDOUT not free in time; EINVAL not of that kind.
         """
+        if kind is not None and not (isinstance(kind, type) and issubclass(kind, Node)):
+            raise TypeError(f"open {name}: kind {shown(kind)}; want AxisNode, AnalogNode or BinaryNode")
         answer = self._channel.call(open_call(name, mode, timeout, lease))
         core = node_parts(answer.value, answer.fds)
         node = NODE[core[0].node_class](core, self, lease)
@@ -287,7 +291,7 @@ class Workcell:
         Raises:
             OSError: ETIME, a driver heard of it too late; the nodes that had started are stopped.
         """
-        start_ns = monotonic_ns() + int(lead * 1e9)
+        start_ns = monotonic_ns() + int(as_number("synch: lead", lead, "seconds") * 1e9)
         told: list[AxisNode] = []
         try:
             for node in nodes:
@@ -317,17 +321,15 @@ class Workcell:
 
     def free_marker(self, token: int) -> None:
         """Free a marker; needs its token."""
-        self._call("free marker", ClientVerb.FREE_MARKER, int(token))
+        self._call("free marker", ClientVerb.FREE_MARKER, token)
 
     def signal_marker(self, token: int) -> None:
         """Signal a marker; needs its token."""
-        self._call("signal marker", ClientVerb.SIGNAL_MARKER, int(token))
+        self._call("signal marker", ClientVerb.SIGNAL_MARKER, token)
 
     def wait_marker(self, number: int, timeout: float | None = None) -> int:
         """Wait until a marker is signalled; return when that was [ns, CLOCK_MONOTONIC]."""
-        return int(
-            self._call("wait for marker", ClientVerb.WAIT_MARKER, int(number), timeout, limit_s=timeout)
-        )
+        return int(self._call("wait for marker", ClientVerb.WAIT_MARKER, number, timeout, limit_s=timeout))
 
     # --- stops -----------------------------------------------------------------------------------
 
@@ -341,9 +343,10 @@ class Workcell:
             node: a node, '' for the whole workcell.
             why: for the log and for who asks why nothing moves.
         """
-        taken = request_stop(None if node else self._request, why)
+        call = Call("emergency stop", ClientVerb.EMERGENCY_STOP, node, printable(str(why)))
+        taken = call.enough = request_stop(None if node else self._request, call.arguments[1])
         try:
-            self._channel.call(Call("emergency stop", ClientVerb.EMERGENCY_STOP, node, why, enough=taken))
+            self._channel.call(call)
         except OSError:
             if taken is None or not taken():
                 raise  # else the drivers have latched it without the daemon

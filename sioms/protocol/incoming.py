@@ -7,10 +7,6 @@ What a value means (a channel that is none, a limit out of range) is judged, and
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import NoneType
-from typing import Any, NamedTuple
-
 from .messages import (
     MAX_PACKET,
     MAX_VALUES,
@@ -22,8 +18,13 @@ from .messages import (
     decode,
 )
 
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from typing import Any
 
-class Kind(NamedTuple):
+
+class Kind:
     """A kind of argument.
 
     Attributes:
@@ -32,14 +33,15 @@ class Kind(NamedTuple):
         most: characters or bytes that it may have, 0 = as many as a packet holds.
     """
 
-    types: tuple[type, ...]
-    words: str
-    most: int = 0
+    __slots__ = ("most", "types", "words")
+
+    def __init__(self, types: tuple[type, ...], words: str, most: int = 0) -> None:
+        self.types, self.words, self.most = types, words, most
 
 
 INTEGER = Kind((int,), "an integer")
 NUMBER = Kind((float, int), "a number")
-SECONDS = Kind((float, int, NoneType), "a number of seconds or nil")
+SECONDS = Kind((float, int, type(None)), "seconds as a number, or none for ever")
 FLAG = Kind((bool,), "true or false")
 NAME = Kind((str,), "a name", 255)
 TEXT = Kind((str,), "text")

@@ -1,0 +1,150 @@
+"""Checks of what a program hands to the client library, before anything is sent.
+
+A wrong kind of value costs the caller a TypeError, and one that no message holds a ValueError, with a sentence that says what
+was attempted; the node goes on. What a good kind of value means is for the daemon or the driver to judge, and to
+refuse by an OSError: only they know ranges, limits and states.
+
+Numbers of numpy are numbers; booleans and text are none.
+"""
+
+from __future__ import annotations
+
+from _operator import index
+
+from sioms.protocol.incoming import ANYTHING, FLAG, FROM_CLIENT, INTEGER, NUMBER, ON_HANDLE, SECONDS
+from sioms.protocol.messages import ClientVerb
+from sioms.protocol.text import shown
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from typing import Any
+
+_DEPTH = 8
+_LEAST, _MOST = -(1 << 63), 1 << 64
+
+
+def _wrong(what: str, value: object, want: str) -> TypeError:
+    return TypeError(f"{what}: {shown(value)} is {type(value).__name__}; want {want}")
+
+
+def _is_array(value: Any) -> bool:
+    return getattr(value, "shape", ()) != ()
+
+
+def number(what: str, value: Any, want: str = "a number") -> float:
+    """Return a number as a float.
+
+    Args:
+        what: what was attempted, for the message.
+        value: given by the caller.
+        want: what would be right.
+
+    Raises:
+        TypeError: it is none.
+    """
+    if type(value) is float or type(value) is int:
+        return _as_float(what, value)
+    if isinstance(value, bool | str) or not hasattr(value, "__float__") or _is_array(value):
+        raise _wrong(what, value, want)
+    return _as_float(what, value)
+
+
+def _as_float(what: str, value: Any) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        raise ValueError(f"{what}: {shown(value)} is beyond what a floating-point number holds") from None
+
+
+def numbers(what: str, values: Any, want: str = "numbers") -> list[float]:
+    """Return an iterable of numbers as floats; raises TypeError when it is something else."""
+    if isinstance(values, str | bytes | dict) or not hasattr(values, "__iter__"):
+        raise _wrong(what, values, want)
+    return [number(what, value, want) for value in values]
+
+
+def integer(what: str, value: Any, want: str = "an integer", *, flags: bool = False) -> int:
+    """Return an integer of at most 64 bits.
+
+    Args:
+        what: what was attempted, for the message.
+        value: given by the caller: an integer, or what stands for one, as a marker does.
+        want: what would be right.
+        flags: whether True and False count as 1 and 0.
+
+    Raises:
+        TypeError: it is none.
+        ValueError: it has more bits.
+    """
+    if hasattr(value, "__index__") and (flags or not isinstance(value, bool)) and not _is_array(value):
+        found = index(value)
+    elif hasattr(value, "__int__") and not hasattr(value, "__float__"):
+        found = int(value)
+    else:
+        raise _wrong(what, value, want)
+    if not _LEAST <= found < _MOST:
+        raise ValueError(f"{what}: {shown(found)} does not fit into 64 bits; want {want}")
+    return found
+
+
+def seconds(what: str, value: Any) -> float | None:
+    """Return a time-out [s], None = for ever; raises TypeError or ValueError when it is none."""
+    if value is None:
+        return None
+    found = number(f"{what}: time-out", value, SECONDS.words)
+    if found != found:
+        raise ValueError(f"{what}: time-out {found}; want {SECONDS.words}")
+    return found
+
+
+def plain(what: str, value: Any, depth: int = _DEPTH) -> Any:
+    """Return a value as messages hold it: arrays and tuples as lists, numbers of numpy as plain ones.
+
+    Raises:
+        TypeError: messages hold no such thing.
+        ValueError: it is nested too deep, or an integer of more than 64 bits.
+    """
+    if value is None or type(value) in (bool, float, str, bytes):
+        return value
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if depth == 0:
+        raise ValueError(f"{what}: the argument is nested more than {_DEPTH} deep")
+    if isinstance(value, list | tuple):
+        return [plain(what, each, depth - 1) for each in value]
+    if isinstance(value, dict):
+        if not all(type(key) is str for key in value):
+            raise _wrong(what, value, "names as keys")
+        return {key: plain(what, each, depth - 1) for key, each in value.items()}
+    if isinstance(value, bool | float | str | bytes):
+        return value
+    return integer(what, value, "numbers, text, lists or maps of them, or none")
+
+
+def of_verb(what: str, verb: int, arguments: Iterable[Any]) -> list[Any]:
+    """Return the arguments of a request as its verb takes them (``protocol.incoming``).
+
+    Raises:
+        TypeError: one is of another kind.
+        ValueError: no message holds it.
+    """
+    kinds = (FROM_CLIENT if isinstance(verb, ClientVerb) else ON_HANDLE)[verb]
+    taken = []
+    for value, kind in zip(arguments, kinds, strict=True):
+        if kind is INTEGER:
+            value = value if type(value) is int and 0 <= value < _MOST else integer(what, value)
+        elif kind is SECONDS:
+            value = seconds(what, value)
+        elif kind is NUMBER:
+            value = number(what, value)
+        elif kind is ANYTHING:
+            value = plain(what, value)
+        elif kind is FLAG:
+            value = bool(value)
+        elif type(value) not in kind.types:
+            raise _wrong(what, value, kind.words)
+        if kind.most and len(value) > kind.most:
+            raise ValueError(f"{what}: {len(value)} characters; want {kind.words} of at most {kind.most}")
+        taken.append(value)
+    return taken
