@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import Meta
 
+from sioms.documents import DEEPEST
 from sioms.wording import choices, did_you_mean, every_error, explain, field_names
 
 Table = TypeVar("Table", bound=msgspec.Struct)
@@ -119,8 +120,6 @@ class Config(msgspec.Struct, frozen=True):
         return os.path.join(self.folder, named) if named else ""
 
 
-DEEPEST = 16
-"""Arrays and tables in one another that a device may have."""
 _SECTIONS = ("workcell", "device", "node", "grant", "emergency_stop", "alarm")
 _COMMON = tuple(field.name for field in msgspec.structs.fields(DeviceTable))
 

@@ -19,6 +19,7 @@ from functools import partial
 from typing import Any
 
 from sioms.protocol.messages import MalformedMessage, unpack_compressed
+from sioms.protocol.text import printable
 
 from .config import Config, parse
 from .lines import with_lines
@@ -87,7 +88,7 @@ class Loader:
         self._count = 0
         self._loop = loop
         self._path = path
-        self._done = done
+        self._done = partial(_tell, done)
         self._died = nursery_died
         self._process = process
         self._text = ""
@@ -281,3 +282,8 @@ def _unknown_users(config: Config) -> list[str]:
                 f"[device.{name}]: user = {device.common.user}: no such user; create it or name another"
             )
     return errors
+
+
+def _tell(done: Callable[[Plan | None, list[str]], None], plan: Plan | None, errors: list[str]) -> None:
+    """Tell the errors, whatever characters the configuration has put into them."""
+    done(plan, [error if error.isprintable() else printable(error, 2000) for error in errors])

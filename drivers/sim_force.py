@@ -15,7 +15,6 @@ the sensor is the twin of the one that the model was found for.
 
 from __future__ import annotations
 
-import tomllib
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,6 +23,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
+from sioms.documents import read_bytes, toml_of
 from sioms.plant.force_sensor import COMPONENTS, Contact, Flaws, ForceSensor, Six
 from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
@@ -155,7 +155,7 @@ def _flaws(path: str) -> Flaws | None:
     if not path:
         return None
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        table = toml_of(read_bytes(Path(path)))
         return from_table(Flaws, msgspec.convert(table, table_type(Flaws)))
     except (OSError, ValueError, msgspec.ValidationError) as error:
         raise ValueError(f"flaws_file {path}: {error}") from None
@@ -165,7 +165,7 @@ def _twin(path: str) -> ForceTwin:
     from sioms.reconcile.force.model_file import from_table as model_from  # heavy, and for twins only
     from sioms.reconcile.force.twin import ForceTwin
 
-    model, names = model_from(tomllib.loads(Path(path).read_text(encoding="utf-8")), path)
+    model, names = model_from(toml_of(read_bytes(Path(path))), path)
     if names != COMPONENTS:
         raise ValueError(f"model_file {path}: of {', '.join(names)}; the sensor has {', '.join(COMPONENTS)}")
     return ForceTwin(model)

@@ -19,7 +19,6 @@ a changed file.
 from __future__ import annotations
 
 import math
-import tomllib
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from sioms.documents import read_bytes, toml_of
 from sioms.drivers import tactile_nodes
 from sioms.plant.finger import FingerShape, TactileArray
 from sioms.protocol.flags import AnalogStatus, NodeClass, Request
@@ -168,7 +168,7 @@ def _model(path: str) -> SensorModel:
     from sioms.reconcile.finger.model_file import from_table as model_from  # heavy, and for twins only
 
     try:
-        return model_from(tomllib.loads(Path(path).read_text(encoding="utf-8")), path)[0]
+        return model_from(toml_of(read_bytes(Path(path))), path)[0]
     except OSError as error:
         raise ValueError(f"model_file {path}: {error.strerror}; sioms reconcile tactile writes one") from None
     except ValueError as error:

@@ -27,6 +27,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.documents import read_text
 from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, BlockSpec
@@ -190,7 +191,7 @@ class TactileNodes:
 
     def _load_finger(self, text: Any) -> str:
         if text is None or text == []:
-            text = Path(self._settings.finger_file).read_text(encoding="utf-8")
+            text = read_text(Path(self._settings.finger_file))
         if not isinstance(text, str):
             raise Refusal(errno.EINVAL, f"{type(text).__name__} given; want the text of a finger's file")
         from sioms.tactile.finger import from_toml
@@ -248,7 +249,7 @@ def _finger(settings: ShapeSettings, elements: int) -> Finger:
 
     path = Path(settings.finger_file)
     try:
-        finger = from_toml(path.read_text(encoding="utf-8"))
+        finger = from_toml(read_text(path))
     except OSError as error:
         raise ValueError(
             f"shape: finger_file {path}: {error.strerror}; sioms tactile calibrate writes one"

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import json
 import time
-import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sioms.documents import read_bytes, read_text, toml_of
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.finger.belief import Belief
 from sioms.reconcile.finger.model_file import belief_of, check, corrected, from_table, to_toml
@@ -90,8 +90,8 @@ def read_model(path: Path, data: Path) -> tuple[Belief, str, bool]:
         if path.is_dir() or path.suffix == ".json":
             finger = read_nominal(path if path.is_dir() else path.parent)
             return _checked(belief_of(finger), str(path)), data.name, False
-        text = path.read_text(encoding="utf-8")
-        table = tomllib.loads(text)
+        text = read_text(path)
+        table = toml_of(text)
         if "finger" in table:
             m, stated = from_table(table, str(path))
             return m.belief(), m.name, stated
@@ -136,7 +136,7 @@ def read_experiments(data: Path) -> list[Experiment]:
 def _columns(path: Path) -> Mapping[str, Mapping[str, Any]]:
     if not path.exists():
         return {}
-    table = parsed(path.read_bytes(), f"read {path}")
+    table = parsed(read_bytes(path), f"read {path}")
     only(table, ("columns",), f"read {path}")
     return columns_in(table, "columns", ARRAYS, f"read {path}", keys=("name", "unit"), named=False)
 
@@ -214,8 +214,8 @@ def write_models(verdict: SensorVerdict, model: Path | None, out: Path) -> None:
     (out / "model.toml").write_text(to_toml(verdict.model))
     nominal: Finger | None = None
     if model is not None and model.is_file() and model.suffix == ".toml":
-        text = model.read_text(encoding="utf-8")
-        if "finger" not in tomllib.loads(text):
+        text = read_text(model)
+        if "finger" not in toml_of(text):
             nominal = from_toml(text)
     dead = tuple(int(p.value) for e in verdict.effects if e.name == "dead_element" for p in e.parameters)
     (out / "finger.toml").write_text(finger_to_toml(corrected(_named_only(verdict.model), nominal, dead)))

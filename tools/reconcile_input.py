@@ -24,7 +24,6 @@ has them.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -33,6 +32,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.documents import json_of, read_bytes, read_text
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.given import columns_in, number, only, parsed, table_in, truth, words
 from sioms.reconcile.model import AxisModel
@@ -113,7 +113,7 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
             f"read {data}: no column description (or give --columns): {_draft(files, description)}"
         )
     where = f"read {description}"
-    table = parsed(description.read_bytes(), where)
+    table = parsed(read_bytes(description), where)
     only(table, ("sample_time_s", "loop_time_s", "files", "continuous", "final", "columns"), where)
     columns_of = columns_in(table, "columns", QUANTITIES, where)
     given = number(table, "sample_time_s", where, model.sample_time_s)
@@ -276,11 +276,11 @@ def read_model(path: Path) -> AxisModel:
     if not path.exists():
         raise BadInputError(f"read model {path}: no such file")
     if path.suffix != ".json":
-        return parse_model(path.read_text(errors="replace"), str(path))
+        return parse_model(read_text(path), str(path))
     where = f"read model {path}"
     try:
-        given = json.loads(path.read_text())
-    except (ValueError, RecursionError) as e:
+        given = json_of(read_bytes(path))
+    except ValueError as e:
         raise BadInputError(f"{where}: {e}") from e
     if not isinstance(given, Mapping):
         raise BadInputError(f"{where}: it holds {given!r:.40}; needs an object")

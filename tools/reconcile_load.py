@@ -20,7 +20,6 @@ The workflow sees what any client sees. It knows nothing of what the sensor hide
 from __future__ import annotations
 
 import time
-import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -32,6 +31,7 @@ import msgspec
 import numpy as np
 
 import sioms
+from sioms.documents import read_bytes, toml_of
 from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.reconcile.errors import BadInputError
@@ -148,7 +148,7 @@ def read_stand(path: Path, count: int) -> Stand:
         BadInputError: it is missing or makes no sense.
     """
     try:
-        stand = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), Stand)
+        stand = msgspec.convert(toml_of(read_bytes(path)), Stand)
     except (OSError, ValueError, msgspec.ValidationError) as error:
         raise BadInputError(f"read stand {path}: {getattr(error, 'strerror', None) or error}") from None
     items = [(p.name, p.wrench, p.most) for p in stand.push]

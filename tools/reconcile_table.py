@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.documents import read_bytes
 from sioms.reconcile.errors import BadInputError
-from sioms.tools.arrays import UnreadableError, read_mat, read_npz
+from sioms.tools.arrays import MOST_BYTES, UnreadableError, read_mat, read_npz
 
 Array = NDArray[np.float64]
 SUFFIXES = (".csv", ".npz", ".mat", ".txt")
@@ -140,7 +141,10 @@ def _table(columns: dict[str, Array]) -> Table:
 
 
 def _text(path: Path) -> Table:
-    raw = path.read_bytes()
+    try:
+        raw = read_bytes(path, MOST_BYTES)
+    except ValueError as error:
+        raise BadInputError(f"read {path}: {error}") from None
     try:
         lines = raw.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:

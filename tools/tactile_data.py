@@ -8,7 +8,6 @@ or nominal.json with radii and angles.
 
 from __future__ import annotations
 
-import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +17,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.documents import json_of, read_bytes, read_text
 from sioms.tactile.cylinder import Cylinder
 from sioms.tactile.finger import Elements, Finger, from_toml, nominal_finger
 from sioms.tactile.touches import Recording, Touches, average
+from sioms.tools.arrays import read_npz
 
 Floats = NDArray[np.float64]
 
@@ -48,10 +49,10 @@ def read_folder(folder: Path) -> Data:
     recordings, touches = {}, {}
     for path in sorted(folder.glob("*.npz")):
         try:
-            with _opened(path) as file:
-                recordings[path.stem] = recording = _recording(file)
-                if "cmd_theta" in file:
-                    touches[path.stem] = average(recording, *_commanded(file), nominal.signal.scale)
+            file = _opened(path)
+            recordings[path.stem] = recording = _recording(file)
+            if "cmd_theta" in file:
+                touches[path.stem] = average(recording, *_commanded(file), nominal.signal.scale)
         except _UNREADABLE as error:
             raise ValueError(f"read {path}: {_words(error)}") from error
     if not touches:
@@ -69,17 +70,16 @@ def read_recording(path: Path) -> Recording:
         OSError: the file cannot be read.
     """
     try:
-        with _opened(path) as file:
-            return _recording(file)
+        return _recording(_opened(path))
     except _UNREADABLE as error:
         raise ValueError(f"read {path}: {_words(error)}") from error
 
 
-def _opened(path: Path) -> Any:
+def _opened(path: Path) -> dict[str, Any]:
     path.stat()
     if not zipfile.is_zipfile(path):
         raise ValueError("this is no npz archive; want arrays raw and time, as numpy.savez writes them")
-    return np.load(path)
+    return read_npz(path)
 
 
 def _words(error: BaseException) -> str:
@@ -142,14 +142,14 @@ def read_nominal(folder: Path) -> Finger:
     """Read the finger as built from nominal.toml or nominal.json."""
     text = folder / "nominal.toml"
     if text.exists():
-        return from_toml(text.read_text(encoding="utf-8"))
+        return from_toml(read_text(text))
     path = folder / "nominal.json"
     if not path.exists():
         raise ValueError(
             f"read {folder}: neither nominal.toml nor nominal.json; describe the finger as built"
         )
     try:
-        return _built(json.loads(path.read_text(encoding="utf-8")), folder.name)
+        return _built(json_of(read_bytes(path)), folder.name)
     except KeyError as error:
         raise ValueError(f"read {path}: key {error} is missing") from error
     except (ValueError, TypeError, IndexError) as error:

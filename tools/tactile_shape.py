@@ -15,6 +15,7 @@ from typing import TextIO
 
 import numpy as np
 
+from sioms.documents import read_text
 from sioms.tactile.chain import StrainFrame
 from sioms.tactile.estimator import Load, Quality
 from sioms.tactile.finger import Finger, from_toml
@@ -70,7 +71,7 @@ def shape(args: argparse.Namespace) -> int:
     if args.settle < 1 or jobs < 1:
         raise ValueError(f"fit frames: --settle {args.settle}, --jobs {jobs}; want 1 or more")
     compiled = False if args.plain else None
-    finger = from_toml(args.finger.read_text(encoding="utf-8"))
+    finger = from_toml(read_text(args.finger))
     setting = Setting(finger, compiled, args.load_deviation, args.settle)
     setting.sensor()  # refuses nonsense before anything is written
     recordings = {path: _read(path, setting) for path in _paths(args.data)}

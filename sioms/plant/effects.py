@@ -19,13 +19,14 @@ Units: "force" is N or N m, "position" m or rad, as the axis has it.
 
 import difflib
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sioms.documents import toml_of
 
 Array = NDArray[np.float64]
 
@@ -250,8 +251,8 @@ def parse_effects(text: str, axes: Sequence[str], source: str = "effects") -> tu
         EffectsError: no TOML, or unknown or wrong entries, all of them at once.
     """
     try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        table = toml_of(text)
+    except ValueError as error:
         raise EffectsError(f"read effects of {source}: {error}; want a TOML table per axis") from error
     return build_effects(table, axes, source)
 

@@ -6,10 +6,10 @@ Pure: text and tables in. ``where`` begins every message: "read model nominal.to
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from sioms.documents import toml_of
 from sioms.reconcile.errors import BadInputError
 
 COLUMN_KEYS = ("name", "unit", "scale", "offset")
@@ -22,8 +22,8 @@ def parsed(text: bytes, where: str) -> dict[str, Any]:
         BadInputError: it is none.
     """
     try:
-        return tomllib.loads(text.decode("utf-8"))
-    except (ValueError, RecursionError) as e:  # of tomllib, of the decoder, of an integer of too many digits
+        return toml_of(text)
+    except ValueError as e:
         raise BadInputError(f"{where}: {e}") from e
 
 

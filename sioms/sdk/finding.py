@@ -14,6 +14,8 @@ from typing import Any
 import msgspec
 
 from sioms.protocol.flags import NodeClass
+from sioms.protocol.page import page_size
+from sioms.protocol.text import shown
 from sioms.wording import choices, did_you_mean, every_error, explain, field_names
 
 from .driver import Driver, LineDriver, StreamDriver, TickDriver
@@ -144,6 +146,14 @@ def describe(driver: type[Driver], name: str, settings: Any) -> tuple[list[objec
     return [blocks, description.tick_hz, list(description.inputs), description.lease_s], errors
 
 
+MOST_HISTORY = 1 << 20
+"""Snapshots that a page keeps at most."""
+MOST_PAGE = 1 << 28
+"""Bytes of a page at most."""
+MOST_COMMANDS = 1 << 20
+"""Commands that an axis buffers at most."""
+
+
 def _block_errors(blocks: Any) -> list[str]:
     errors = []
     names = [block.name for block in blocks]
@@ -151,8 +161,20 @@ def _block_errors(blocks: Any) -> list[str]:
         channels = [channel.name for channel in block.channels]
         if not channels:
             errors.append(f": block {block.name!r} has no channel; want at least one")
-        for name in [c for c in channels if not c or any(letter.isspace() or letter == "/" for letter in c)]:
-            errors.append(f": a channel is named {name!r}; want a name without blanks and without /")
+        for name in [
+            c for c in channels if not 0 < len(c) < 256 or not c.isprintable() or any(x in c for x in " /")
+        ]:
+            errors.append(f": a channel is named {shown(name)}; want a name without blanks and without /")
+        for channel in [c for c in block.channels if not c.unit.isprintable() or len(c.unit) > 32]:
+            errors.append(f": the unit of {channel.name} is {shown(channel.unit)}; want up to 32 characters")
+        if not 4 <= block.history <= MOST_HISTORY or block.history & (block.history - 1):
+            errors.append(f": history = {block.history}; want a power of two, 4 to {MOST_HISTORY}")
+        elif (size := page_size(block.node_class, len(channels), block.history)) > MOST_PAGE:
+            errors.append(
+                f": history = {block.history} of {len(channels)} channels takes {size >> 20} MiB; want at most {MOST_PAGE >> 20}"
+            )
+        if not 0 <= block.capacity <= MOST_COMMANDS:
+            errors.append(f": capacity = {block.capacity}; want 1 to {MOST_COMMANDS}")
         if block.node_class is NodeClass.AXIS:
             for channel in [c for c in block.channels if c.unit not in ("m", "rad")]:
                 errors.append(

@@ -10,13 +10,13 @@ explains every key by example; the structs below are the schema.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
 
+from sioms.documents import read_bytes, toml_of
 from sioms.wording import did_you_mean
 
 from . import regmap_check
@@ -352,10 +352,10 @@ def load_map(path: Path, overrides: Mapping[str, Any] | None = None) -> Register
         RegisterMapError: unreadable or wrong.
     """
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = toml_of(read_bytes(path))
     except OSError as error:
         raise RegisterMapError(str(path), [(error.strerror or str(error)).lower()]) from None
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except ValueError as error:
         raise RegisterMapError(str(path), [f"no TOML: {error}"]) from None
     return parse_map(_merged(document, overrides or {}), str(path))
 

@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.documents import toml_of
 from sioms.tactile.cylinder import DEFAULT_SHEAR_MODULUS_PA, Cylinder
 from sioms.tactile.emap import MOST_EXTENT, e_map, highest_needed
 from sioms.tactile.model import Spectra, StrainTable, adhering, bounded, elliptic, strain_table
@@ -290,8 +291,8 @@ def from_toml(text: str) -> Finger:
         ValueError: not TOML, an unknown or missing key, or a value that makes no sense; the message names it.
     """
     try:
-        return msgspec.toml.decode(text, type=Finger)
-    except msgspec.DecodeError as error:
+        return msgspec.convert(toml_of(text), Finger)
+    except (msgspec.ValidationError, ValueError) as error:
         raise ValueError(f"load finger: {error}") from error
 
 

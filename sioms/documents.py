@@ -1,0 +1,101 @@
+"""TOML and JSON files that anybody may have written: whatever the bytes are, tables or one sentence.
+
+A file is read up to a size, and what it holds is bounded in depth before anybody walks through it. Dates, which none of our
+files hold, and integers beyond 64 bits, which nothing that they are handed to takes, are refused here.
+
+Without input or output but for ``read_bytes``.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+MOST_BYTES = 1 << 22
+"""Bytes of a document: ten thousand devices, or as many touches."""
+DEEPEST = 10
+"""Arrays and tables within each other at most."""
+_LONGEST = 200
+
+
+def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
+    """Read a file of at most so many bytes.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is larger, or no file that ends.
+    """
+    with path.open("rb") as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise ValueError(f"it is larger than {most / 2**20:g} MiB")
+    return data
+
+
+def read_text(path: Path, most: int = MOST_BYTES) -> str:
+    """Read a text in UTF-8; see ``read_bytes``."""
+    return _text(read_bytes(path, most))
+
+
+def toml_of(text: str | bytes) -> dict[str, Any]:
+    """Parse TOML.
+
+    Raises:
+        ValueError: it is none, or holds what no file of ours does; the message says what, and where.
+    """
+    plain = _text(text)
+    try:
+        table = tomllib.loads(plain)
+    except RecursionError:
+        raise ValueError(f"arrays or tables nested too deep; at most {DEEPEST} deep is right") from None
+    _check(table, "", 0)
+    return table
+
+
+def json_of(text: str | bytes) -> Any:
+    """Parse JSON; see ``toml_of``."""
+    plain = _text(text)
+    try:
+        value = json.loads(plain)
+    except RecursionError:
+        raise ValueError(f"arrays or objects nested too deep; at most {DEEPEST} deep is right") from None
+    _check(value, "", 0)
+    return value
+
+
+def _text(text: str | bytes) -> str:
+    if isinstance(text, str):
+        plain = text
+    else:
+        try:
+            plain = text.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise ValueError(
+                f"it is no text in UTF-8 (byte {error.start} is {text[error.start]:#04x})"
+            ) from None
+    if len(plain) > 4 * MOST_BYTES:
+        raise ValueError(f"it is larger than {4 * MOST_BYTES / 2**20:g} MiB")
+    return plain
+
+
+def _check(value: object, where: str, depth: int) -> None:
+    if isinstance(value, dict | list):
+        if depth > DEEPEST:
+            raise ValueError(f"{where[:_LONGEST]}: nested deeper than {DEEPEST}")
+        for key, each in value.items() if isinstance(value, dict) else enumerate(value):
+            _check(
+                each,
+                f"{where}.{key}".lstrip(".") if isinstance(value, dict) else f"{where}[{key}]",
+                depth + 1,
+            )
+    elif isinstance(value, int):
+        if not -(2**63) <= value < 2**63:
+            raise ValueError(f"{where[:_LONGEST]}: an integer of more than 64 bits")
+    elif not isinstance(value, str | float | None):
+        raise ValueError(
+            f"{where[:_LONGEST]} = {value}: a {type(value).__name__}; want text, a number, an array or a table"
+        )
