@@ -206,6 +206,8 @@ class NodeVerbs:
         handle = session.handles.get(handle_number)
         if handle is None:
             raise Refused(errno.EBADF, f"close: this session has no handle {handle_number}")
+        if handle.closing:
+            raise Refused(errno.EBADF, f"close {handle.node.name}: it is being closed already")
         if handle.claims and self.detach(handle):
             handle.closing = number
             session.waits[number] = Wait(number, session, None, f"close {handle.node.name}")

@@ -42,6 +42,7 @@ from ownership_model import (
 from ownership_stand_ins import (
     CLOCK,
     CONFIG,
+    DAEMON_LEASE_S,
     DRIVERS,
     FIRST_UID,
     LEASE_S,
@@ -314,6 +315,16 @@ class Cell:
             self.server.shared.latch.daemon_alive(CLOCK())
         else:
             process.runtime.latch.daemon_alive(CLOCK())
+        process.tick(1)
+
+    def lapse(self, d: int) -> None:
+        process = self._process(d)
+        CLOCK.now_ns += 2 * int(DAEMON_LEASE_S * 1e9)
+        for other in PROCESSES.values():
+            for handle in other.runtime.clients.handles.values():
+                handle.heard_ns = CLOCK()
+        process.tick(1)
+        self._server.shared.latch.daemon_alive(CLOCK())
         process.tick(1)
 
     def kill(self, d: int) -> None:

@@ -339,6 +339,12 @@ class Step:
         if self.devices[d].driver[0].handle == (c, ""):
             self._let_go(d)
 
+    def lapse(self, d: int) -> None:
+        """See that the daemon has been silent for longer than its lease."""
+        self.tick(d)
+        if self.devices[d].driver[0].handle:
+            self._let_go(d)
+
     def leave(self, d: int) -> None:
         self.tick(d)  # until its axes rest
         self.kill(d)
@@ -543,6 +549,8 @@ def _of_driver(s: State, d: int, device: Device) -> Iterator[Action]:
         if driver.handle[1:] == ("dead",):
             yield ("see_death", d, "socket")
             yield ("see_death", d, "process")
+        if s.daemon and driver.handle and not driver.ending:
+            yield ("lapse", d)
         if driver.ending:
             yield ("leave", d)
     if device.phase == PAUSING:

@@ -27,6 +27,7 @@ NAMES = ("axis", "port")
 CONFIG = """
 [workcell]
 name = "model"
+daemon_lease_s = 0.5
 [[grant]]
 users = ["client0", "client1"{guest}]
 rights = ["read", "write", "stop"]
@@ -43,7 +44,7 @@ variant = {0}
 driver = "port"
 variant = {1}
 """
-LEASE_S, TICK_HZ = 1.0, 500.0
+LEASE_S, DAEMON_LEASE_S, TICK_HZ = 1.0, 0.5, 500.0
 FIRST_UID = 70_000
 
 

@@ -36,6 +36,7 @@ SCHEDULES = [
     "stop_node 1 1, replace 1, crash, hear 1",
     "open 0 0, hear 0, move 0 0, die 0 0, see_death 0 socket",
     "open 0 1, hear 1, move 0 1, stop 1, tick 1",
+    "open 0 0, hear 0, move 0 0, lapse 0",
     "request_stop 0, tick 0, reset 1, tick 1, request_stop 0, reset 1",
     "request_stop 0, beat, reset 1, crash, hear 0, leave 0, hear 1, leave 1, boot",
     "stop_node 0 0, stop 1, crash, kill 0, kill 1, boot, listen 0, connect 0, open 0 0, hear 0, move 0 0",
@@ -86,6 +87,19 @@ def test_a_stop_that_is_asked_for_in_the_middle_of_a_reset_is_heard() -> None:
         server.shared.record.note = note  # type: ignore[method-assign]
         cell.take(("tick", 0))
         assert server.shared.latch.stopped_ns, "by a driver that looks"
+
+
+def test_a_handle_is_closed_once_and_each_close_is_answered() -> None:
+    with cells() as make:
+        cell = make()
+        for action in [*begin("nobody owns anything"), ("open", 0, 0), ("hear", 0)]:
+            cell.take(action)
+        assert cell.close(0, 0) == "", "later"
+        assert cell.close(0, 0) == "refused"
+        cell.hear(0)
+        cell.listen(0)
+        assert list(cell.clients[0].take().values()) == ["done"]
+        assert not cell._session(0).waits
 
 
 def test_the_last_words_of_a_driver_are_heard(capsys: pytest.CaptureFixture[str]) -> None:
