@@ -286,9 +286,8 @@ class OdriveUnit(AxesUnit):
         elif state != IDLE:  # the homing or calibration of somebody else
             yield from self._let_go(axis)
         yield from self._arm(axis, path)
-        self._fixed[axis][limit_at] = limit
-        if math.isfinite(torque):
-            self._fixed[axis][torque_at] = torque
+        limits = {limit_at: limit, torque_at: torque}  # the board ships without a limit of the torque
+        self._fixed[axis] |= {at: value for at, value in limits.items() if math.isfinite(value)}
         # the last host's watchdog may have run out since the state was read
         (bits,), (state,) = yield odrive.read([f"{path}.error", f"{path}.current_state"], self._timeout_s)
         if int(bits) == odrive.WATCHDOG_EXPIRED:  # what the last host left behind when it died

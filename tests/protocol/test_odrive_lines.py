@@ -1,5 +1,7 @@
 """ODrive's lines: the documented checksums, replies among refusals, and what is damaged."""
 
+import math
+
 import pytest
 
 from sioms.sdk.codec import odrive
@@ -76,7 +78,12 @@ def test_sets_and_what_is_read_behind_them(step: int) -> None:
     for bad in (b"1.25*1\r\n", b"\xff*3\r\n"):
         with pytest.raises(LinkError, match="checksum"):
             feed(move, bad + reply("0 0"), step)
-    for text in ("nan", "word"):
+    limit = odrive.read(["axis0.motor.config.torque_lim", "x"], 0.1)
+    assert feed(limit, reply("inf", "1", "0 0"), step) == [[math.inf], [1.0]]
+    for text in ("nan", "-inf"):
+        with pytest.raises(LinkError, match="no number"):
+            feed(limit, reply(text, "1", "0 0"), step)
+    for text in ("nan", "word", "inf"):
         with pytest.raises(LinkError, match="no number"):
             feed(move, reply(text, "0 0"), step)
     with pytest.raises(LinkError, match="incomplete"):

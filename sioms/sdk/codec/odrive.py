@@ -11,6 +11,7 @@ import errno
 import math
 import re
 from collections.abc import Callable, Sequence
+from itertools import chain, repeat
 
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError
 
@@ -62,13 +63,13 @@ def unwrap(raw: bytes, what: str) -> str:
     return body.decode("ascii", "replace")
 
 
-def number(text: str, what: str) -> float:
-    """Return a finite number; raises LinkError otherwise."""
+def number(text: str, what: str, *, is_limit: bool = False) -> float:
+    """Return a finite number, or inf of a limit that is none; raises LinkError otherwise."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
+    if not math.isfinite(value) and not (is_limit and value > 0):
         raise LinkError(f"{what}: {text[:60]!r} is no number")
     return value
 
@@ -112,7 +113,11 @@ def exchange(
         for text in texts:
             if _REFUSAL.match(text.encode("ascii", "replace")):
                 raise DeviceError(errno.EINVAL, f"{what}: refused, {text}")
-        values = [[number(word, what) for word in text.split()] for text in texts]
+        limits = chain((text.endswith(("_lim", "_limit")) for text in asked), repeat(False))
+        values = [
+            [number(word, what, is_limit=limit) for word in text.split()]
+            for text, limit in zip(texts, limits, strict=False)
+        ]
         if [len(each) for each in values] != widths:
             raise LinkError(
                 f"{what}: replies of {[len(each) for each in values]} numbers; {widths} are right"
