@@ -69,7 +69,8 @@ def test_what_once_broke_a_promise(schedule: str) -> None:
         check_rest(walk.state)
 
 
-def test_a_stop_that_is_asked_for_in_the_middle_of_a_reset_is_heard() -> None:
+@pytest.mark.parametrize("by", ["client", "driver"])
+def test_a_stop_that_is_asked_for_in_the_middle_of_a_reset_is_heard(by: str) -> None:
     with cells() as make:
         cell = make()
         for action in begin("nobody owns anything"):
@@ -80,7 +81,10 @@ def test_a_stop_that_is_asked_for_in_the_middle_of_a_reset_is_heard() -> None:
 
         def interrupted(entry: Mapping[str, Any]) -> None:
             note(entry)
-            cell.request_stop(1)
+            if by == "client":
+                cell.request_stop(1)
+            else:
+                cell._process(1).runtime.stops.stop_workcell("an input")
 
         server.shared.record.note = interrupted  # type: ignore[method-assign]
         assert cell.take(("reset", 0)) == "done"
