@@ -19,10 +19,11 @@ from sioms.tactile.calibration import Calibration, Options
 from sioms.tactile.calibration import calibrate as fit
 from sioms.tactile.characterize import creep_of, noise_of, proximity_of, relaxation_of, thermal_of
 from sioms.tactile.closedform import equivalent_radius, indenter_radius
-from sioms.tactile.estimator import Estimator, Load, ShapeEstimate
+from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import Finger, from_toml, to_toml
 from sioms.tactile.identify import series_of
 from sioms.tactile.linearity import linearise
+from sioms.tactile.quality import Load, ShapeEstimate
 from sioms.tactile.touches import Recording, Touches, join, ramps_of
 from sioms.tools.report_page import Page
 from sioms.tools.tactile import Progress

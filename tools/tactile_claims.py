@@ -22,9 +22,10 @@ from sioms.tactile.design import (
     exact_equivalent_wedge,
     spacing_needed,
 )
-from sioms.tactile.estimator import Estimator, Load
+from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import ContactModel, Finger, nominal_finger
 from sioms.tactile.indenter import FLAT, Round
+from sioms.tactile.quality import Load
 from sioms.tactile.width import hertz_table, rigid_core_table
 
 Floats = NDArray[np.float64]

@@ -17,8 +17,8 @@ import numpy as np
 
 from sioms.documents import read_text
 from sioms.tactile.chain import StrainFrame
-from sioms.tactile.estimator import Load, Quality
 from sioms.tactile.finger import Finger, from_toml
+from sioms.tactile.quality import Load, Quality
 from sioms.tactile.sensing import CHANNELS, LoadTare, Sensed, ShapeSensor, numbers
 from sioms.tactile.touches import BASELINE, Recording
 from sioms.tools.tactile import Progress

@@ -17,10 +17,11 @@ from sioms.tactile.calibration import calibrate as fit
 from sioms.tactile.closedform import equivalent_radius, indenter_radius
 from sioms.tactile.cylinder import Cylinder
 from sioms.tactile.emap import e_map
-from sioms.tactile.estimator import Estimator, Load
+from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import ContactModel, Finger, IdentifiedMap
 from sioms.tactile.identify import series_of, truncated
 from sioms.tactile.linearity import linearise
+from sioms.tactile.quality import Load
 from sioms.tactile.together import Common, fit_together
 from sioms.tactile.touches import LOADED, Touches, TouchLoads, join, ramps_of, touch_loads
 from sioms.tactile.width import hertz_table

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.tactile import held_out
 from sioms.tactile.calibrate import (
     DEEP,
     FEWEST,
@@ -30,11 +31,10 @@ from sioms.tactile.calibrate import (
 from sioms.tactile.contact import width_for_load
 from sioms.tactile.cylinder import Cylinder, respond
 from sioms.tactile.emap import MOST_EXTENT, e_map, felt, highest_needed
-from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import ContactKind, ContactModel, Elements, Finger, Geometry, IdentifiedMap
 from sioms.tactile.identify import Identified, corrected, series_of, truncated
 from sioms.tactile.indenter import Wedge
-from sioms.tactile.linearity import Quadratic, linearise
+from sioms.tactile.linearity import Quadratic
 from sioms.tactile.preparation import Faults, Fits, begin_at, clean_outputs
 from sioms.tactile.proximity import LONGEST, SHORTEST
 from sioms.tactile.together import Common, fit_together
@@ -62,8 +62,6 @@ _CLOSE = 0.005  # of a range, to its end
 _MOST_QUADRATIC = 15.0  # 1/output
 _FAR_CELL = 2.0
 _MOST_BENT = 0.9  # 4 q A, at 1 of which a pull A is the lowest output of a quadratic q
-_FOUND, _FOUND_LOAD = 80, 100.0  # touches looked for again, from so many N/m on
-_FOUND_DOUBTFUL, _FOUND_DEG, _FOUND_PERCENT = 0.4, 1.0, 8.0
 _FAR_GAIN = 5.0  # from nominal, either way: rather a wrong unit than scatter
 
 
@@ -194,7 +192,19 @@ def calibrate(
             residuals[name][known] = found.left_out / peak
     finger = _finger(nominal, body, best, kind, adhesion, widths, faults, touches, residuals, direct, peak)
     doubts = _doubts(nominal, finger, best, sought, faults, touches.force / touches.load)
-    doubts += _found_again(finger, recorded)
+    halves = [
+        _half(finger, body, best, touches, loads, adhesion, np.arange(len(touches)) % 2 == parity)
+        for parity in (0, 1)
+    ]
+    tick("estimates of left-out touches")
+    worth = held_out.joined(
+        [
+            held_out.estimates(half, recorded.pick(~train), faults.recorded.load[~train])
+            for half, train in halves
+        ]
+    )
+    finger = msgspec.structs.replace(finger, systematic=held_out.systematic(worth))
+    doubts += held_out.doubts(worth, finger.systematic)
     return Calibration(
         finger,
         touches,
@@ -270,43 +280,6 @@ def _doubts(
         doubts.append(
             f"the load cell reads {float(np.median(cell)):.2f} times the commanded load: strains and loads contradict each other in scale"
         )
-    return doubts
-
-
-def _found_again(finger: Finger, touches: Touches) -> list[str]:
-    """Return why the finger is not to be believed that does not find the touches that it was made from."""
-    angles = np.array(finger.angles_rad)[np.array(finger.elements.used)]
-    inside = (touches.angle_rad > angles.min()) & (touches.angle_rad < angles.max())
-    chosen = np.flatnonzero(inside & (touches.load >= _FOUND_LOAD))
-    if chosen.size == 0:
-        return []
-    chosen = chosen[:: max(1, chosen.size // _FOUND)]
-    estimator = Estimator(finger, averaged=max(touches.averaged, 1.0))
-    strains = -np.array(finger.elements.gain) * linearise(
-        touches.output[chosen], np.array(finger.elements.quadratic)
-    )
-    shapes = list(estimator.batch(strains))
-    doubtful = float(np.mean([shape.doubtful for shape in shapes]))
-    off = np.array(
-        [
-            (shape.angle_rad - touches.angle_rad[n], shape.load_n_per_m / touches.load[n] - 1.0)
-            for shape, n in zip(shapes, chosen, strict=True)
-            if shape.usable
-        ]
-    ).reshape(-1, 2)
-    doubts = []
-    if doubtful > _FOUND_DOUBTFUL:
-        doubts.append(
-            f"{100.0 * doubtful:.0f} % of the touches that it was made from are doubtful when it estimates them; of a sound finger "
-            f"less than {100.0 * _FOUND_DOUBTFUL:.0f} % are"
-        )
-    if off.size:
-        place, load = np.degrees(np.median(np.abs(off[:, 0]))), 100.0 * float(np.median(off[:, 1]))
-        if place > _FOUND_DEG or abs(load) > _FOUND_PERCENT:
-            doubts.append(
-                f"it finds the touches that it was made from {place:.2f} degrees beside their places and {load:+.1f} % off their loads, "
-                f"in the median; want less than {_FOUND_DEG:g} degrees and {_FOUND_PERCENT:g} %"
-            )
     return doubts
 
 
@@ -496,6 +469,35 @@ def _left_out(
             square[element] += float(miss @ miss)
             count[element] += miss.size
     return np.asarray(np.sqrt(square / np.where(count > 0, count, np.nan)) / peak)
+
+
+def _half(
+    finger: Finger, body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, adhesion: float, train: NDArray[np.bool_]
+) -> tuple[Finger, NDArray[np.bool_]]:  # fmt: skip
+    """Return the finger with elements and map from some of the touches alone, and which."""
+    part, tractions = touches.pick(train), TouchLoads(loads.normal[train], loads.shear[train])
+    depth = finger.notes["map"] != "uniform"
+    own = fit_elements(body, fits, part, tractions, adhesion, Freedom(depth, False))
+    rows = None
+    if finger.identified is not None:
+        direct = _identify(body, own, part, tractions, adhesion, Options(), [])[1]
+        if direct is not None:
+            rows = np.array(finger.identified.rows)
+            rows[[e for e, fit in enumerate(own) if fit is not None]] = direct.rows
+    return msgspec.structs.replace(
+        finger,
+        elements=msgspec.structs.replace(
+            finger.elements,
+            **{
+                name: tuple(
+                    kept if fit is None else float(getattr(fit, name))
+                    for kept, fit in zip(getattr(finger.elements, name), own, strict=True)
+                )
+                for name in ("angle_rad", "radius_m", "gain")
+            },
+        ),
+        identified=None if rows is None else IdentifiedMap(tuple(map(tuple, rows.tolist()))),
+    ), train
 
 
 def _identify(

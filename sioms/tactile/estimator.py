@@ -18,7 +18,6 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from enum import Enum, Flag, auto
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,39 +28,11 @@ from sioms.tactile.linearity import linearise
 from sioms.tactile.model import StrainTable
 from sioms.tactile.posterior import DEVIATIONS, Averager
 from sioms.tactile.proximity import Proximity
+from sioms.tactile.quality import BLANK, Load, Quality, ShapeEstimate, nothing
 
 Floats = NDArray[np.float64]
 Covariance = tuple[tuple[float, float, float], ...]
 Found = tuple[int, float, float, Products, int, float]  # status, t, b, products there, steps, sum of weights
-
-
-class Quality(Flag):
-    """Say what is wrong with an estimate."""
-
-    GOOD = 0
-    NO_CONTACT = auto()  # the strains do not rise above the noise: nothing is estimated
-    BAD_ELEMENTS = auto()  # some elements are dead, saturated or not finite and were left out
-    TOO_FEW_ELEMENTS = auto()  # fewer than four usable elements near the touch: nothing is estimated
-    POOR_FIT = (
-        auto()
-    )  # one round contact does not explain the strains: two contacts, a strange shape, a drifted finger
-    OUT_OF_ARC = auto()  # beyond the outermost elements
-    OVERLOAD = auto()  # wider or heavier than the model covers
-    SHARP = auto()  # the width is at its lower bound: an edge, or a load too small to tell
-    FLAT_OR_HOLLOW = auto()  # R is not below rb: no convex indenter does that
-    NOT_CONVERGED = auto()
-    WRONG_SIGN = auto()  # the strains are those of a pull
-    IMPRECISE = (
-        auto()
-    )  # four standard deviations of the best fit's place are over 2 degrees: means are given instead
-    NO_BASELINE = auto()  # the readings without touch are not known yet: nothing is estimated
-    WITHOUT_LOAD = (
-        auto()
-    )  # the force sensor's load was not there, too old, or did not press: fitted without it
-    BLIND = auto()  # whether anything touches is not known: the elements that are left cannot say
-    SUSPECT = (
-        auto()
-    )  # one touch explains the strains only without one element, or without a shift of all: fitted so
 
 
 _HUGE = 1e30  # variance of an element that must not count
@@ -73,33 +44,9 @@ _RATHER_ROUND = (
     9.0  # chi square by which a hollow touch beside the last elements must be more likely than a round one
 )
 _HOLLOW = 1.2  # R in units of rb, beyond which noise alone does not make a flat
-_UNKNOWN = Quality.TOO_FEW_ELEMENTS | Quality.NO_BASELINE | Quality.BLIND
-_NOTHING = Quality.NO_CONTACT | Quality.WRONG_SIGN | _UNKNOWN
-_DOUBT = (
-    Quality.POOR_FIT | Quality.OUT_OF_ARC | Quality.OVERLOAD | Quality.NOT_CONVERGED | Quality.IMPRECISE
-    | Quality.SUSPECT | Quality.WRONG_SIGN
-)  # fmt: skip
 _TRIED = 3  # elements without which a poor fit is tried again
 _SHIFTS = 4  # rounds in which a shift of all elements is found
 _ALIKE = 0.05  # of a shift of all elements, by which one may differ from it
-
-
-class State(Enum):
-    """Say what is known of a touch; the flags of `Quality` say why."""
-
-    BLIND = "blind"  # whether anything touches is not known
-    UNTOUCHED = "untouched"
-    TOUCHED = "touched"
-    DOUBTFUL = "doubtful"  # something is there, but not one touch that presses and is told well
-
-
-def state_of(quality: Quality) -> State:
-    """Return the state that the flags say."""
-    if quality & _UNKNOWN:
-        return State.BLIND
-    if quality & Quality.NO_CONTACT:
-        return State.UNTOUCHED
-    return State.DOUBTFUL if quality & _DOUBT else State.TOUCHED
 
 
 @dataclass(slots=True)
@@ -112,75 +59,6 @@ class _Frame:
     load: float
     load_weight: float
     count: int
-
-
-@dataclass(frozen=True, slots=True)
-class Load:
-    """A measured load P [N/m] and its standard deviation [N/m]; zero deviation means exact."""
-
-    value: float
-    deviation: float
-
-
-@dataclass(frozen=True, slots=True)
-class ShapeEstimate:
-    """Hold what one frame says about the touch; immutable.  All numbers are nan when nothing was estimated.
-
-    Args:
-        angle_rad: place t_c.
-        load_n_per_m: P, compression positive.
-        equivalent_radius_m: R, 1/R = 1/rb + 1/rc.
-        equivalent_curvature_per_m: 1/R, which behaves for flats (1/rb) and is infinite for an edge.
-        radius_m: rc, infinite for a flat or hollow indenter.
-        width_rad: theta_w = 2a.
-        residual: root mean square of strain less model, over the usable elements.
-        misfit: chi square per degree of freedom, about 1 when the model fits.
-        covariance: of (angle [rad], load [N/m], R [m]), rows in this order.
-        quality: flags.
-        steps: steps of the search.
-    """
-
-    angle_rad: float
-    load_n_per_m: float
-    equivalent_radius_m: float
-    equivalent_curvature_per_m: float
-    radius_m: float
-    width_rad: float
-    residual: float
-    misfit: float
-    covariance: tuple[tuple[float, float, float], ...]
-    quality: Quality
-    steps: int
-
-    @property
-    def deviations(self) -> tuple[float, float, float]:
-        """Return the standard deviations of angle [rad], load [N/m] and R [m]."""
-        c = self.covariance
-        return math.sqrt(c[0][0]), math.sqrt(c[1][1]), math.sqrt(c[2][2])
-
-    @property
-    def usable(self) -> bool:
-        """Return whether anything was estimated."""
-        return not self.quality & _NOTHING
-
-    @property
-    def state(self) -> State:
-        """Return blind, untouched, touched or doubtful."""
-        return state_of(self.quality)
-
-    @property
-    def doubtful(self) -> bool:
-        """Return whether a flag says not to rely on the numbers; an edge or a flat is no doubt."""
-        return bool(self.quality & (_NOTHING | _DOUBT))
-
-
-_BLANK = ((math.nan,) * 3,) * 3
-
-
-def nothing(quality: Quality) -> ShapeEstimate:
-    """Return an estimate that says why there is none."""
-    n = math.nan
-    return ShapeEstimate(n, n, n, n, n, n, n, n, _BLANK, quality, 0)
 
 
 class Estimator:
@@ -229,6 +107,7 @@ class Estimator:
         pitch = self._pitch = float(np.ptp(angles)) / max(angles.size - 1, 1)
         self._arc = float(angles.min()) - 0.5 * pitch, float(angles.max()) + 0.5 * pitch
         self._radius, self._circles = finger.cylinder.outer_m, finger.contact.circles
+        self._systematic = finger.systematic
         self._largest = most_hollow * self._radius
         table = self._table
         self._widest = float(table.half_widths[-1]) ** 2
@@ -535,18 +414,22 @@ class Estimator:
         return dataclasses.replace(
             shape, angle_rad=mean.angle, load_n_per_m=mean.load, equivalent_radius_m=mean.radius,
             equivalent_curvature_per_m=bend, radius_m=rc, width_rad=2.0 * math.sqrt(mean.square),
-            covariance=self._rounded(mean.covariance, mean.radius, mean.square),
+            covariance=self._widened(mean.covariance, mean.load, mean.radius, mean.square),
             quality=shape.quality & (Quality.BAD_ELEMENTS | Quality.SUSPECT) | judged | Quality.IMPRECISE,
         )  # fmt: skip
 
-    def _rounded(self, covariance: Covariance, radius: float, b: float) -> Covariance:
-        """Add to the variance of R what circles taken for parabolas do to it: so much less is R of `sioms.plant.rubber`."""
-        if not self._circles or not radius > 0.0:
-            return covariance
-        bend = max(self._radius / radius - 1.0, 0.0)  # rb/rc
-        off = self._circles * radius * b * (0.36 + 0.7 * bend + 0.28 * bend**2)
+    def _widened(self, covariance: Covariance, load: float, radius: float, b: float) -> Covariance:
+        """Add the finger's systematic errors, and to the variance of R what circles taken for parabolas do to it.
+
+        So much less is R of `sioms.plant.rubber`.
+        """
+        own, round_ = self._systematic, 0.0
+        if self._circles and radius > 0.0:
+            bend = max(self._radius / radius - 1.0, 0.0)  # rb/rc
+            round_ = self._circles * radius * b * (0.36 + 0.7 * bend + 0.28 * bend**2)
         (aa, ap, ar), (pa, pp, pr), (ra, rp, rr) = covariance
-        return (aa, ap, ar), (pa, pp, pr), (ra, rp, rr + off * off)
+        aa, pp = aa + own.place_rad**2, pp + (own.load * load) ** 2
+        return (aa, ap, ar), (pa, pp, pr), (ra, rp, rr + (own.radius * radius) ** 2 + round_**2)
 
     def _bent(self, radius: float) -> tuple[float, float]:
         """Return 1/R [1/m] and rc [m]."""
@@ -569,7 +452,7 @@ class Estimator:
         bend, rc = self._bent(radius)
         return ShapeEstimate(
             t, p, radius, bend, rc, 2.0 * math.sqrt(b),
-            math.sqrt(chi / total), misfit, self._rounded(covariance, radius, b), quality, steps,
+            math.sqrt(chi / total), misfit, self._widened(covariance, p, radius, b), quality, steps,
         )  # fmt: skip
 
     def _judge(self, t: float, b: float, load: float, radius: float, misfit: float, steps: int) -> Quality:
@@ -622,7 +505,7 @@ def _covariance(
     m00, m01, m02 = d * f - e * e, c * e - b * f, b * e - c * d
     det = a * m00 + b * m01 + c * m02
     if not det > 0.0:
-        return _BLANK
+        return BLANK
     m11, m12, m22 = a * f - c * c, b * c - a * e, a * d - b * b
     by_load = -radius / load
     tr = (m01 * by_load + m02 * slope) / det

@@ -118,6 +118,14 @@ class IdentifiedMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rows: tuple[tuple[float, ...], ...]
 
 
+class Systematic(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Standard deviations of the finger's own errors, beside those of noise and residuals: of the place [rad], and of load and R, relative."""
+
+    place_rad: float = 0.0
+    load: float = 0.0
+    radius: float = 0.0
+
+
 class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A calibrated finger; immutable, safe to share."""
 
@@ -129,6 +137,7 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     contact: ContactModel = ContactModel()
     identified: IdentifiedMap | None = None
     strips: Strips | None = None
+    systematic: Systematic = Systematic()
     notes: dict[str, str] = {}
 
     def __post_init__(self) -> None:
@@ -147,6 +156,11 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             )
         if len(self.contact.half_width_rad) != len(self.contact.ratio):
             raise ValueError(f"{what}: contact table has unequal columns; give as many ratios as half widths")
+        for name in self.systematic.__struct_fields__:
+            if not 0.0 <= getattr(self.systematic, name) < math.inf:
+                raise ValueError(
+                    f"{what}: systematic {name} is {getattr(self.systematic, name)}; need 0 or more, finite"
+                )
         if not self.signal.lowest < self.signal.highest:
             raise ValueError(
                 f"{what}: lowest reading {self.signal.lowest} is not below {self.signal.highest}"

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sioms.tactile.chain import SETTLE_FRAMES, Held, SignalChain, StrainFrame
-from sioms.tactile.estimator import Estimator, Load, Quality, ShapeEstimate, State, nothing, state_of
+from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import Finger
+from sioms.tactile.quality import Load, Quality, ShapeEstimate, State, nothing, state_of
 from sioms.tactile.rest import Rebase
 from sioms.tactile.witness import FEWEST
 

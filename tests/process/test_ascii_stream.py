@@ -15,7 +15,7 @@ from wire_rig import Wire
 from sioms.protocol.flags import AnalogStatus
 from sioms.tactile.cylinder import FINGER_B
 from sioms.tactile.emap import e_map
-from sioms.tactile.estimator import Quality
+from sioms.tactile.quality import Quality
 from sioms.tactile.sensing import CHANNELS
 from sioms.tactile.series import line_load
 

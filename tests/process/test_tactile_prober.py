@@ -11,8 +11,8 @@ from daemon_rig import wait_for
 import sioms
 from sioms.protocol.flags import Request
 from sioms.tactile.cylinder import FINGER_B
-from sioms.tactile.estimator import Quality
 from sioms.tactile.finger import nominal_finger, to_toml
+from sioms.tactile.quality import Quality
 from sioms.tools.tactile_data import read_folder
 from sioms.tools.tactile_prober import LENGTH_M, Prober, Rig, Touch, write_nominal
 from sioms.tools.tactile_simulated import simulated

@@ -17,7 +17,7 @@ from sioms.protocol.flags import AnalogStatus, Request
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError
 from sioms.tactile.cylinder import FINGER_B
 from sioms.tactile.emap import e_map
-from sioms.tactile.estimator import Quality
+from sioms.tactile.quality import Quality
 from sioms.tactile.series import line_load
 from sioms.tools.counterparts import ascii_stream as counterpart
 

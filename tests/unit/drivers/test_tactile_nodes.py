@@ -15,7 +15,7 @@ from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, BlockSpec, Description
 from sioms.sdk.driver import Refusal, TickDriver
-from sioms.tactile.estimator import Quality
+from sioms.tactile.quality import Quality
 from sioms.tactile.sensing import CHANNELS
 
 FINGER = str(Path(__file__).parents[3] / "etc" / "finger.toml")

@@ -10,12 +10,13 @@ import pytest
 
 from sioms.tactile.calibration import Calibration, Options, calibrate
 from sioms.tactile.closedform import equivalent_radius
-from sioms.tactile.estimator import Estimator, Quality
+from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import Finger, from_toml, to_toml
 from sioms.tactile.identify import corrected, truncated
 from sioms.tactile.linearity import Quadratic, find_quadratic, linearise, with_ramps
 from sioms.tactile.preparation import _cell_share
 from sioms.tactile.proximity import Proximity
+from sioms.tactile.quality import Quality
 from sioms.tactile.touches import Recording, Touches, average, join, touch_loads
 
 

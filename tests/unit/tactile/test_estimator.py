@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from sioms.tactile import emap, series
 from sioms.tactile.closedform import equivalent_radius
 from sioms.tactile.cylinder import FINGER_B
-from sioms.tactile.estimator import Estimator, Load, Quality
+from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import Finger, nominal_finger
 from sioms.tactile.linearity import linearise
 from sioms.tactile.model import pressed
+from sioms.tactile.quality import Load, Quality
 
 ANGLES = np.radians(143.0 - 9.22 * np.arange(16))
 MATRIX = emap.e_map(FINGER_B, ANGLES, 10.3e-3, 100)[:, :201]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sioms.tactile.estimator import Load, Quality
 from sioms.tactile.finger import Finger
+from sioms.tactile.quality import Load, Quality
 from sioms.tactile.sensing import CHANNELS, LoadTare, ShapeSensor, numbers
 
 MS = 1_000_000

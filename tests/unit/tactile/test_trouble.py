@@ -23,8 +23,9 @@ from sioms.sdk.codec import sample_stream as stream
 from sioms.sdk.codec.cobs import frame
 from sioms.tactile import sensing
 from sioms.tactile.chain import RECOVER_S
-from sioms.tactile.estimator import Estimator, Quality, State, state_of
+from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import Finger as CalibratedFinger
+from sioms.tactile.quality import Quality, State, state_of
 from sioms.tactile.sensing import CHANNELS
 
 FINGER = str(Path(__file__).parents[3] / "etc" / "finger.toml")
