@@ -60,6 +60,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--soak", type=int, metavar="N", help="opens and closes of the sub-bench open")
     parser.add_argument("--frames", type=int, metavar="N", help="frames of the sub-bench protocol")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of random frames")
+    parser.add_argument(
+        "--picture",
+        metavar="FILE",
+        default="",
+        help="draw what the sub-bench tactile finds (png, pdf or svg)",
+    )
     parser.add_argument("--json", metavar="FILE", help="write all figures to a file")
     parser.add_argument("--tables", metavar="FILE", help="write them as Markdown tables")
 
@@ -76,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     # However we are ended, our daemons end with us.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    options = Options(args.quick, args.trials, args.soak, args.frames, args.seed)
+    options = Options(args.quick, args.trials, args.soak, args.frames, args.seed, args.picture)
     report, failed = Report(), []
     try:
         for name in args.names or BENCHES:

@@ -13,6 +13,7 @@ class Options:
         quick: seconds instead of minutes.
         trials, soak, frames: counts that were asked for, None for the usual.
         seed: of random numbers.
+        picture: file that a sub-bench which draws writes its picture to, empty for none.
     """
 
     quick: bool = False
@@ -20,6 +21,7 @@ class Options:
     soak: int | None = None
     frames: int | None = None
     seed: int = 1
+    picture: str = ""
 
     def count(self, quick: int, full: int) -> int:
         """Return how many samples to take."""

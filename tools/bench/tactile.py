@@ -13,14 +13,16 @@ from numpy.typing import NDArray
 
 from sioms.tactile.closedform import equivalent_radius
 from sioms.tactile.cylinder import FINGER_B
-from sioms.tactile.estimator import Estimator, Load
+from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import Finger, nominal_finger
 from sioms.tactile.model import pressed
+from sioms.tactile.quality import Load
 from sioms.tactile.sensing import ShapeSensor
 from sioms.tactile.series import spread
 
 from .figures import Bar, Report
 from .options import Options
+from .touches import bench_touches
 
 Floats = NDArray[np.float64]
 
@@ -76,6 +78,7 @@ def bench_tactile(options: Options, report: Report) -> None:
     _frames(report, finger_of(16), count)
     _many_elements(report, finger_of(48), count)
     _worth(report, finger_of(16), options.count(400, 10_000))
+    bench_touches(options, report)
 
 
 def _kinds() -> list[tuple[str, bool, float]]:
