@@ -372,7 +372,7 @@ class Step:
         self.clients[c] = (OUT, "")
         self.waiting = [wait for wait in self.waiting if wait[0] != c]
         for d in range(DEVICES):
-            if self.devices[d].claim[:1] == (c,):
+            if _owns(self.devices[d], c):
                 if self.devices[d].phase == UP:
                     self._send(d, DETACH)
                     self._set(d, claim=(c, ORPHAN))
@@ -456,6 +456,11 @@ class Step:
             self.start(d)
 
 
+def _owns(device: Device, c: int) -> bool:
+    """Tell whether a client has a device open, and not only one that had its name before."""
+    return device.claim[:1] == (c,) and device.claim[1] != ORPHAN
+
+
 def follow(state: State, action: Action) -> tuple[State, str]:
     """Take a step; return the state after it, and what who acted was answered.
 
@@ -496,9 +501,8 @@ def _of_client(s: State, c: int, connected: bool) -> Iterator[Action]:
     holds = [d for d in range(DEVICES) if s.devices[d].driver and s.devices[d].driver[0].handle == (c, "")]
     if connected:
         for words in range(len(LAST_WORDS)):
-            if not words or (
-                (c, words - 1) not in s.waiting and s.devices[(words - 1) % DEVICES].claim[:1] != (c,)
-            ):
+            d = (words - 1) % DEVICES
+            if words in (0, 3) or ((c, d) not in s.waiting and not _owns(s.devices[d], c)):
                 yield ("die", c, words)
         if any(device.claim == (c, OPEN) and device.phase == UP for device in s.devices):
             yield ("suspend", c)
@@ -511,7 +515,7 @@ def _of_client(s: State, c: int, connected: bool) -> Iterator[Action]:
         yield ("request_stop", c)
     for d, device in enumerate(s.devices):
         if connected:
-            mine = device.claim[:1] == (c,)
+            mine = _owns(device, c)
             if (c, d) in s.waiting:
                 yield ("give_up", c, d)
             elif not mine:
