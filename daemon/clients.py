@@ -12,15 +12,18 @@ import os
 import socket
 import time
 import traceback
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from sioms.protocol.flags import Right
 from sioms.protocol.incoming import FROM_CLIENT, take
 from sioms.protocol.messages import MAX_PACKET, ClientVerb, MalformedMessage, refusal, reply
 
-from .config import WorkcellTable
+from .config import QuotaTable, WorkcellTable
 from .marker_owners import MarkerError
 from .marker_verbs import MarkerVerbs
 from .node_verbs import NodeVerbs
+from .quotas import Quotas, why_full
 from .rights import Peer, Rights
 from .sessions import LATER, Refused, Session, Wait, peer_of, pidfd_of
 from .users import Users
@@ -29,6 +32,9 @@ from .workcell_verbs import WorkcellVerbs
 if TYPE_CHECKING:
     from .server import Server
 
+STATUS_NS = 20_000_000
+"""How old what STATUS tells may be while nobody asks for anything else."""
+_QUERIES = frozenset({ClientVerb.HELLO, ClientVerb.LIST, ClientVerb.INFO, ClientVerb.STATUS})
 LONGEST_WAIT_S = 7 * 24 * 3600.0
 _SHOWN = frozenset(
     {
@@ -63,6 +69,7 @@ class Clients:
         self._server = server
         self._listener = listener
         self.sessions: set[Session] = set()
+        self._status: tuple[int, dict[str, object]] | None = None
         self.nodes = NodeVerbs(server, self)
         self.markers = MarkerVerbs(server.shared.markers, self)
         self._workcell = WorkcellVerbs(server, self)
@@ -73,11 +80,16 @@ class Clients:
         """The bounds of the configuration."""
         return self._server.config.workcell if self._server.config else WorkcellTable()
 
+    @property
+    def quotas(self) -> Quotas:
+        """The quotas of the configuration."""
+        return Quotas(self._server.config.quota if self._server.config else QuotaTable())
+
     # --- connections -----------------------------------------------------------------------------
 
     def welcome(self) -> None:
         """Begin to accept clients; while the first configuration is loading they hear that, and nothing else."""
-        self._server.loop.watch(self._listener.fileno(), self._accept)
+        self._server.loop.turns.add(self._listener.fileno(), "door", 0, self._accept)
 
     def _accept(self) -> None:
         try:
@@ -86,57 +98,92 @@ class Clients:
             if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOMEM):
                 # The listener stays readable: look away for a while instead of spinning.
                 self._server.log("error", "session refused", why=error.strerror)
-                self._server.loop.unwatch(self._listener.fileno())
+                self._server.loop.turns.remove(self._listener.fileno())
                 self._server.loop.after(0.2, self.welcome)
             return
         sock.setblocking(False)
         peer = peer_of(sock, self.users)
-        if len(self.sessions) >= self.bounds.max_sessions:
-            self._refuse(sock, peer)
+        if why := self._why_not(peer):
+            self._refuse(sock, peer, why)
             return
         session = Session(sock, peer, pidfd_of(sock, peer.pid))
         self.sessions.add(session)
-        self._server.loop.watch(sock.fileno(), lambda: self._receive(session))
+        self._changed()
+        self._server.loop.turns.add(sock.fileno(), peer.uid, 0, lambda: self._receive(session))
+        session.greeting = self._server.loop.after(self.quotas.greeting_s, lambda: self._was_silent(session))
         if session.pidfd >= 0:
             # A child that it forked may hold the socket open after its death.
             self._server.loop.watch(session.pidfd, lambda: self._end_session(session, ""))
 
-    def _refuse(self, sock: socket.socket, peer: Peer) -> None:
+    def _why_not(self, peer: Peer) -> str:
+        """Return why a client is not taken, empty when it is."""
+        own = [session for session in self.sessions if session.peer.uid == peer.uid]
+        silent = sum(session.greeting is not None for session in own)
+        may_stop = bool(self.rights.on_workcell(peer) & Right.STOP)
+        return (
+            self.quotas.over(peer, "silent", silent, "connections that have not said a word")
+            or self.quotas.over(peer, "sessions", len(own), "sessions")
+            or why_full(len(self.sessions), len(own), self.bounds.max_sessions, may_stop)
+        )
+
+    def _refuse(self, sock: socket.socket, peer: Peer, why: str) -> None:
         """Tell one client too many why it is not taken."""
-        most = self.bounds.max_sessions
-        self._server.log("warning", "session refused", peer=peer, why=f"max_sessions = {most} are open")
-        text = f"connect: {most} sessions are open, as many as max_sessions of [workcell] allows; close one, or allow more"
+        self._server.log("warning", "session refused", peer=peer, why=why)
         with contextlib.suppress(OSError):
-            sock.send(refusal(0, errno.EUSERS, text))
+            sock.send(refusal(0, errno.EUSERS, f"connect: {why}"))
         sock.close()
 
+    def _was_silent(self, session: Session) -> None:
+        """End a connection on which nothing has been said: it takes the place of others."""
+        if session in self.sessions:
+            why = (
+                f"nothing was said within {self.quotas.greeting_s:g} s of connecting (greeting_s of [quota])"
+            )
+            self.send(session, refusal(0, errno.ETIMEDOUT, f"connect: {why}"))
+            if session in self.sessions:
+                self._end_session(session, why)
+
+    def _has(self, peer: Peer, what: Callable[[Session], int]) -> int:
+        """Return how much of something a user has over all his sessions."""
+        return sum(what(session) for session in self.sessions if session.peer.uid == peer.uid)
+
+    def handles_of(self, peer: Peer) -> int:
+        """Return how many handles a user has open."""
+        return self._has(peer, lambda session: len(session.handles))
+
+    def _changed(self) -> None:
+        """What STATUS tells has changed."""
+        self._status = None
+
     def _receive(self, session: Session) -> None:
-        for _ in range(16):  # a chatty client gets its turn, not the loop
-            if session not in self.sessions:
-                return
-            try:
-                packet = session.sock.recv(MAX_PACKET + 1)
-            except BlockingIOError:
-                return
-            except OSError:
-                packet = b""
-            if not packet:
-                self._end_session(session, "")
-                return
-            try:
-                self._dispatch(session, *take(packet, FROM_CLIENT))
-            except MalformedMessage as error:
-                self._end_session(session, str(error))
-                return
-            except Exception as error:  # our own mistake costs one session, not the workcell
-                trace = "".join(traceback.format_exception(error)[-3:])
-                self._server.log("error", "internal error", peer=session, trace=trace)
-                if session in self.sessions:
-                    self._end_session(session, f"internal error: {error!r}")
-                return
+        if session not in self.sessions:
+            return
+        try:
+            packet = session.sock.recv(MAX_PACKET + 1)
+        except BlockingIOError:
+            return
+        except OSError:
+            packet = b""
+        if not packet:
+            self._end_session(session, "")
+            return
+        try:
+            self._dispatch(session, *take(packet, FROM_CLIENT))
+        except MalformedMessage as error:
+            self._end_session(session, str(error))
+        except Exception as error:  # our own mistake costs one session, not the workcell
+            trace = "".join(traceback.format_exception(error)[-3:])
+            self._server.log("error", "internal error", peer=session, trace=trace)
+            if session in self.sessions:
+                self._end_session(session, f"internal error: {error!r}")
 
     def _dispatch(self, session: Session, of_client: int, number: int, arguments: list[Any]) -> None:
         verb = ClientVerb(of_client)
+        if session.greeting is not None:
+            session.greeting.cancel()
+            session.greeting = None
+        if verb not in _QUERIES:
+            self._changed()
         if starting := self._server.starting:
             text = f"connect: the daemon is starting: {starting}; `sioms wait` waits until it is ready"
             self.send(session, refusal(number, errno.EAGAIN, text))
@@ -168,7 +215,7 @@ class Clients:
             case ClientVerb.INFO:
                 return self._server.names.pack(self.nodes.find(session, "get information", *arguments))
             case ClientVerb.STATUS:
-                return self._workcell.status()
+                return self._status_now()
             case ClientVerb.RESERVE_MARKER:
                 return self.markers.reserve(session, *arguments)
             case ClientVerb.FREE_MARKER:
@@ -186,6 +233,13 @@ class Clients:
             case ClientVerb.CANCEL:
                 return self._cancel(session, *arguments)
 
+    def _status_now(self) -> dict[str, object]:
+        """Return what STATUS tells: worked out anew when something has been asked for, else once in a while."""
+        now_ns = time.monotonic_ns()
+        if self._status is None or now_ns - self._status[0] > STATUS_NS:
+            self._status = (now_ns, self._workcell.status())
+        return self._status[1]
+
     def send(self, session: Session, packet: bytes, fds: list[int] | None = None) -> None:
         """Send an answer."""
         try:
@@ -200,9 +254,12 @@ class Clients:
 
     def _end_session(self, session: Session, why: str) -> None:
         self.sessions.discard(session)
+        self._changed()
+        if session.greeting is not None:
+            session.greeting.cancel()
         if why:
             self._server.log("warning", "session ended", peer=session, why=why)
-        self._server.loop.unwatch(session.sock.fileno())
+        self._server.loop.turns.remove(session.sock.fileno())
         session.sock.close()
         for wait in list(session.waits.values()):
             self.drop(wait)
@@ -226,11 +283,9 @@ class Clients:
 
     def wait(self, session: Session, number: int, timeout_s: float | None, what: str) -> Wait:
         """Keep a request to be answered later, or refused when its time is over [s; None = never]."""
-        if len(session.waits) >= self.bounds.max_waits:
-            raise Refused(
-                errno.EAGAIN,
-                f"{what}: {len(session.waits)} requests are waiting already; at most {self.bounds.max_waits}",
-            )
+        waiting = self._has(session.peer, lambda other: len(other.waits))
+        if why := self.quotas.over(session.peer, "waits", waiting, "requests that wait"):
+            raise Refused(errno.EAGAIN, f"{what}: {why}")
         wait = Wait(number, session, None, what)
         if timeout_s is not None:
             limit = min(max(float(timeout_s), 0.0), LONGEST_WAIT_S)
@@ -240,6 +295,7 @@ class Clients:
 
     def answer(self, wait: Wait, packet: bytes, fds: list[int] | None = None) -> None:
         """Answer a request that was kept, unless it has ended in another way."""
+        self._changed()
         if self.drop(wait):
             self.send(wait.session, packet, fds)
 

@@ -33,10 +33,19 @@ class WorkcellTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     start_stopped: bool = False
     daemon_lease_s: Seconds = 0.5
     max_sessions: Count = 256
-    max_handles: Count = 256
-    max_markers: Annotated[int, Meta(ge=0, le=1023)] = 128
-    max_waits: Count = 64
     state_folder: str = ""
+
+
+class QuotaTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[quota]``: how much one user may have at a time; root and the daemon's own user four times as much."""
+
+    sessions: Count = 48
+    silent: Count = 16
+    greeting_s: Seconds = 5.0
+    handles: Count = 256
+    markers: Annotated[int, Meta(ge=1, le=1023)] = 128
+    waits: Count = 256
+    subscriptions: Count = 128
 
 
 class GrantTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -107,6 +116,7 @@ class Config(msgspec.Struct, frozen=True):
     """A configuration without errors of its own (names are checked with the descriptions)."""
 
     workcell: WorkcellTable
+    quota: QuotaTable
     devices: dict[str, Device]
     nodes: dict[str, NodeTable]
     grants: list[GrantTable]
@@ -120,7 +130,7 @@ class Config(msgspec.Struct, frozen=True):
         return os.path.join(self.folder, named) if named else ""
 
 
-_SECTIONS = ("workcell", "device", "node", "grant", "emergency_stop", "alarm")
+_SECTIONS = ("workcell", "quota", "device", "node", "grant", "emergency_stop", "alarm")
 _COMMON = tuple(field.name for field in msgspec.structs.fields(DeviceTable))
 
 
@@ -151,6 +161,7 @@ def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
         f"[{key}]: unknown section{did_you_mean(key, _SECTIONS)}" for key in root if key not in _SECTIONS
     ]
     workcell = _convert(root.get("workcell", {}), WorkcellTable, "[workcell]", errors) or WorkcellTable()
+    quota = _convert(root.get("quota", {}), QuotaTable, "[quota]", errors) or QuotaTable()
     devices: dict[str, Device] = {}
     for name, table in _tables(root, "device", errors):
         device = _device(name, table, errors)
@@ -168,7 +179,7 @@ def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
     if not devices and not errors:
         errors.append("read configuration: no [device.NAME] in it; want at least one")
     alarms = _list(root, "alarm", AlarmTable, errors)
-    return Config(workcell, devices, nodes, grants, sources, alarms, folder), errors
+    return Config(workcell, quota, devices, nodes, grants, sources, alarms, folder), errors
 
 
 def _tables(root: Mapping[str, Any], section: str, errors: list[str]) -> list[tuple[str, dict[str, Any]]]:

@@ -7,11 +7,15 @@ from __future__ import annotations
 
 import heapq
 import itertools
-import selectors
+import select
 import time
 from collections.abc import Callable
 from typing import Any
 
+from sioms.turns import Turns
+
+SHARE = 0.7
+"""Of its time, what the daemon spends at most on requests."""
 TIDY = 1024
 """Pending calls from which on cancelled ones are looked for."""
 RESTLESS_NS, REST_NS, PAUSE_S = 20_000_000, 100_000, 0.005
@@ -35,11 +39,16 @@ class Timer:
 class Loop:
     """Runs callbacks when descriptors become readable and when times are reached.
 
+    Attributes:
+        turns: serves clients, one packet after all else that there is to do.
+
     Concurrency: one thread.
     """
 
     def __init__(self) -> None:
-        self._selector = selectors.DefaultSelector()
+        self._epoll = select.epoll()
+        self._callbacks: dict[int, Callback] = {}
+        self.turns = Turns(self._epoll, (SHARE,))
         self._timers: list[tuple[int, int, Timer]] = []
         self._order = itertools.count()
         self._tidy_at = TIDY
@@ -48,11 +57,13 @@ class Loop:
 
     def watch(self, fd: int, callback: Callback) -> None:
         """Call back whenever the descriptor is readable or hung up."""
-        self._selector.register(fd, selectors.EVENT_READ, callback)
+        self._epoll.register(fd, select.EPOLLIN)
+        self._callbacks[fd] = callback
 
     def unwatch(self, fd: int) -> None:
         """Stop watching a descriptor; call before closing it."""
-        self._selector.unregister(fd)
+        self._epoll.unregister(fd)
+        del self._callbacks[fd]
 
     def at(self, when_ns: int, callback: Callback) -> Timer:
         """Call back once at a time [ns, CLOCK_MONOTONIC]."""
@@ -78,17 +89,25 @@ class Loop:
         """Wait for the next event or timer and serve it."""
         while self._timers and self._timers[0][2].callback is None:
             heapq.heappop(self._timers)
-        timeout = max(0.0, (self._timers[0][0] - time.monotonic_ns()) / 1e9) if self._timers else None
+        pause_s = self.turns.pause_s
+        timeout = -1.0 if pause_s is None else pause_s
+        if self._timers:
+            due_s = max(0.0, (self._timers[0][0] - time.monotonic_ns()) / 1e9)
+            timeout = due_s if pause_s is None else min(pause_s, due_s)
         began_ns = time.monotonic_ns()
-        events = self._selector.select(timeout)
+        events = self._epoll.poll(timeout)
         rested_ns = time.monotonic_ns()
         if rested_ns - began_ns > REST_NS:
             self._restless_ns = rested_ns
-        for key, _ in events:
+        for fd, _ in events:
             # An earlier callback of this round may have closed this descriptor.
-            if self._selector.get_map().get(key.fd) is key:
-                key.data()
+            callback = self._callbacks.get(fd)
+            if callback is not None:
+                callback()
+            else:
+                self.turns.mark(fd)
             self._serve_timers()  # a crowd at the door must not delay the stamp that drivers look at
+        self.turns.serve()
         self._serve_timers()
         if time.monotonic_ns() - self._restless_ns > RESTLESS_NS:
             time.sleep(
@@ -104,5 +123,5 @@ class Loop:
                 callback()
 
     def close(self) -> None:
-        """Release the selector."""
-        self._selector.close()
+        """Release the descriptor."""
+        self._epoll.close()

@@ -103,6 +103,10 @@ class MarkerOwners:
         """Return the reservations of a session."""
         return [r for r in self._reserved.values() if r.owner == owner]
 
+    def count_where(self, condition: Callable[[object | None], bool]) -> int:
+        """Return how many reservations have an owner for whom a condition holds."""
+        return sum(condition(r.owner) for r in self._reserved.values())
+
     def is_signalled(self, reservation: Reservation) -> bool:
         """Tell whether a reserved marker has been signalled."""
         return self._table.is_signalled(reservation.number, reservation.generation)

@@ -10,7 +10,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from sioms.protocol.markers import MarkerTable
+from sioms.protocol.markers import MARKERS, MarkerTable
 from sioms.protocol.messages import refusal, reply
 
 from .marker_owners import MarkerError, MarkerOwners, Reservation
@@ -29,6 +29,12 @@ class Persisting:
 
     def __str__(self) -> str:
         return f"{self.user} (markers that persist)"
+
+
+def _uid_of(owner: object) -> int:
+    return (
+        owner.peer.uid if isinstance(owner, Session) else owner.uid if isinstance(owner, Persisting) else -1
+    )
 
 
 class MarkerVerbs:
@@ -51,14 +57,13 @@ class MarkerVerbs:
 
     def reserve(self, session: Session, count: int, persist: bool) -> list[int]:
         """Reserve markers, all or none; return their tokens."""
-        count, most = int(count), self._clients.bounds.max_markers
-        if not 1 <= count <= most:
-            raise Refused(errno.EINVAL, f"reserve markers: {count} asked for; want 1 to {most}")
-        owner = Persisting(session.peer.uid, session.peer.user) if persist else session
-        has = self.count(owner)
-        if has + count > most:
-            who = owner if persist else "this session"
-            raise Refused(errno.EBUSY, f"reserve markers: {who} has {has}; at most {most}, free some")
+        count, peer = int(count), session.peer
+        if not 1 <= count < MARKERS:
+            raise Refused(errno.EINVAL, f"reserve markers: {count} asked for; want 1 to {MARKERS - 1}")
+        has = self._owners.count_where(lambda owner: _uid_of(owner) == peer.uid)
+        if why := self._clients.quotas.over(peer, "markers", has, "markers", count):
+            raise Refused(errno.EBUSY, f"reserve markers: {why}; free some")
+        owner = Persisting(peer.uid, peer.user) if persist else session
         tokens: list[int] = []
         try:
             for _ in range(count):

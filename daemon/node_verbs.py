@@ -86,10 +86,9 @@ class NodeVerbs:
             )
         if not 0 <= float(lease_s) <= 3600:
             raise Refused(errno.EINVAL, f"open {name}: lease {lease_s} s; want 0 (none) to 3600")
-        if len(session.handles) >= self._clients.bounds.max_handles:
-            raise Refused(
-                errno.EMFILE, f"open {name}: this session has {len(session.handles)} open handles; close some"
-            )
+        open_ones = self._clients.handles_of(session.peer)
+        if why := self._clients.quotas.over(session.peer, "handles", open_ones, "nodes open"):
+            raise Refused(errno.EMFILE, f"open {name}: {why}; close some")
         obstacle = self._obstacle(node)
         if obstacle is None:
             self._grant(session, number, node, access, float(lease_s))
@@ -179,7 +178,8 @@ class NodeVerbs:
             try:
                 device.send(
                     DriverVerb.ATTACH, handle.number, node.block, node.channels, node.bit, int(access), exclusive,
-                    int(rights), int(lease_s * 1e9), str(session), node.name, fds=fds,
+                    int(rights), int(lease_s * 1e9), str(session), session.peer.uid,
+                    self._clients.quotas.of_device(session.peer.uid), node.name, fds=fds,
                 )  # fmt: skip
             except OSError as error:
                 raise Refused(errno.EIO, f"open {node.name}: {error.strerror}") from None

@@ -195,7 +195,7 @@ class Server:
         """Clear the latch and give devices in fault another try; nothing moves by itself."""
         self._note(workcell_entry(who, stop=False))  # first: a stop that comes next is noted after it
         self.shared.latch.reset(self._request_seen)  # what has been asked for since then has not been heard
-        self.log("info", "reset", by=who)
+        self.log("warning", "reset", by=who)
         for device in self.devices.values():
             device.trouble = ""
             device.tell(DriverVerb.STOP_CHANGED)
@@ -223,7 +223,7 @@ class Server:
         """
         self._order(node, DriverVerb.NODE_RESET, who)
         self._note(self._node_entry(node, who, stop=False))
-        self.log("info", "reset", node=node.name, by=who)
+        self.log("warning", "reset", node=node.name, by=who)
 
     def _order(self, node: Node, verb: DriverVerb, text: str) -> None:
         device = self.devices.get(node.device) or self._leaving.get(node.device)
@@ -442,6 +442,7 @@ class Server:
         self.loop.after(ALIVE_S, self._alive)
 
     def _look_at_budget(self) -> None:
+        self.log.tell_suppressed()
         use = realtime_use({device.name: device.pid for device in self.devices.values()})
         if greedy := self._budget.look(time.monotonic(), use):
             make_ordinary(greedy[1])

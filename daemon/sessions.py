@@ -93,6 +93,7 @@ class Session:
         name: what it calls itself.
         handles: by number.
         waits: unanswered requests by message number.
+        greeting: ends it if it says nothing; None once it has.
     """
 
     sock: socket.socket
@@ -101,6 +102,12 @@ class Session:
     name: str = ""
     handles: dict[int, Handle] = field(default_factory=dict)
     waits: dict[int, Wait] = field(default_factory=dict)
+    greeting: Timer | None = None
+
+    @property
+    def user(self) -> str:
+        """Whose it is."""
+        return self.peer.user
 
     def __str__(self) -> str:
         return f"{self.peer}" + (f" {self.name}" if self.name else "")

@@ -137,7 +137,9 @@ class World:
                 return
         raise AssertionError("the driver does not come up")
 
-    def open(self, block: int, channels: Sequence[int], *, exclusive: bool, bit: int = -1) -> Client:
+    def open(
+        self, block: int, channels: Sequence[int], *, exclusive: bool, bit: int = -1, uid: int = 1000
+    ) -> Client:
         """Open a node as the daemon does."""
         number = len(self.clients) + 1
         shown_block = self.runtime.blocks[block]
@@ -146,7 +148,7 @@ class World:
         access = Access.READ | Access.WRITE if exclusive else Access.READ
         self.runtime.clients.attach(
             [theirs.detach(), wake], number, block, list(channels), bit, int(access), exclusive, int(Right.ALL), 0,
-            "tester", f"node{number}",
+            "tester", uid, [256, 128], f"node{number}",
         )  # fmt: skip
         spec = shown_block.spec
         info = NodeInfo(

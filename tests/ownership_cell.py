@@ -77,6 +77,11 @@ from sioms.protocol.messages import MAX_PACKET, ClientVerb, HandleVerb, decode, 
 from sioms.protocol.records import BINARY_WRITE
 from sioms.protocol.stopfile import open_stop_request
 from sioms.sdk.blocks import AxisBlock
+from sioms.turns import Turns
+
+
+def _of_clients(turns: Turns) -> dict[int, Callable[[], object]]:
+    return {fd: source.callbacks[fd] for fd, (_, source) in turns._of.items()}
 
 
 def _serve(fds: dict[int, Callable[[], None]], fd: int) -> None:
@@ -187,8 +192,8 @@ class Cell:
 
     @property
     def _watched(self) -> dict[int, Callable[[], None]]:
-        found = self._server.loop._selector.get_map()
-        return {fd: key.data for fd, key in found.items()}  # type: ignore[misc]
+        loop = self._server.loop
+        return {**loop._callbacks, **_of_clients(loop.turns)}
 
     def _session(self, c: int) -> Any:
         pid = self.clients[c].pid if c not in self.dead else self.dead[c].pid
@@ -303,7 +308,10 @@ class Cell:
     def see_death(self, d: int, how: str) -> None:
         process = self._process(d)
         (handle,) = process.runtime.clients.handles.values()
-        _serve(process.runtime._callbacks, handle.sock.fileno() if how == "socket" else handle.pidfd)
+        _serve(
+            {**process.runtime._callbacks, **_of_clients(process.runtime.turns)},
+            handle.sock.fileno() if how == "socket" else handle.pidfd,
+        )
 
     def expire(self, c: int, d: int) -> None:
         process = self._process(d)

@@ -75,7 +75,20 @@ ON_HANDLE: Mapping[int, tuple[Kind, ...]] = {
     HandleVerb.PART: (INTEGER, RECORDS),
 }
 TO_DRIVER: Mapping[int, tuple[Kind, ...]] = {
-    DriverVerb.ATTACH: (INTEGER, INTEGER, LIST, INTEGER, INTEGER, FLAG, INTEGER, INTEGER, TEXT, TEXT),
+    DriverVerb.ATTACH: (
+        INTEGER,
+        INTEGER,
+        LIST,
+        INTEGER,
+        INTEGER,
+        FLAG,
+        INTEGER,
+        INTEGER,
+        TEXT,
+        INTEGER,
+        LIST,
+        TEXT,
+    ),
     DriverVerb.DETACH: (INTEGER, INTEGER, TEXT),
     DriverVerb.STOP_CHANGED: (),
     DriverVerb.SHUTDOWN: (),

@@ -29,12 +29,17 @@ from sioms.protocol.text import shown
 
 from .blocks import AxisBlock
 from .exchange import HookError
-from .handles import LATER, Handle
+from .handles import LATER, Handle, Quota
 from .requests import LOOKS, ioctl
 from .writing import write
 
 if TYPE_CHECKING:
     from .runtime import Runtime
+
+
+OWNERS, READERS = 0, 1
+SHARES = (0.5, 0.125)
+"""Of its time, what a driver spends at most on the requests of who owns outputs, and on those of all others."""
 
 
 class Attachments:
@@ -90,7 +95,8 @@ class Attachments:
 
     def attach(
         self, fds: list[int], number: int, block: int, channels: list[int], bit: int, access: int,
-        exclusive: bool, rights: int, lease_ns: int, who: str, node: str,
+        exclusive: bool, rights: int, lease_ns: int, who: str, uid: int,
+        quota: list[int], node: str,
     ) -> None:  # fmt: skip
         """Take a handle from the daemon: descriptors of socket, wake pipe and, if known, the client's process."""
         if len(fds) < 2:  # the kernel drops what goes beyond the limit of open descriptors
@@ -102,14 +108,15 @@ class Attachments:
         sock = socket.socket(fileno=fds[0])
         sock.setblocking(False)
         handle = Handle(
-            number, node, who, sock, fds[1], fds[2] if len(fds) > 2 else -1, self._runtime.blocks[block],
+            number, node, who, uid, sock, fds[1], fds[2] if len(fds) > 2 else -1, self._runtime.blocks[block],
             np.array(channels, dtype=np.intp), bit, Access(access), exclusive, Right(rights), lease_ns,
-            time.monotonic_ns(), self._runtime.effects,
+            time.monotonic_ns(), self._runtime.effects, Quota(*quota),
         )  # fmt: skip
         self.handles[number] = handle
         if lease_ns:
             self._leased.append(handle)
-        self._runtime.watch(sock.fileno(), lambda: self._readable(handle))
+        kind = OWNERS if exclusive else READERS
+        self._runtime.turns.add(sock.fileno(), uid, kind, lambda: self._readable(handle))
         if exclusive and handle.pidfd >= 0:
             # A child of the client may hold the socket open after the client's death.
             self._runtime.watch(handle.pidfd, lambda: self.drop(handle))
@@ -190,6 +197,16 @@ class Attachments:
         subscribers = self._runtime.pages.subscribers(handle.block)
         if handle in subscribers:
             subscribers.remove(handle)
+        elif (
+            every
+            and (most := sum(h.every != 0 for h in self.handles.values() if h.uid == handle.uid))
+            >= handle.quota.subscriptions
+        ):
+            raise OSError(
+                errno.EAGAIN,
+                f"subscribe to {handle.node}: user {handle.uid} has {most} subscriptions to this device, as many as "
+                "subscriptions of [quota] allows",
+            )
         handle.every, handle.countdown = every, 0
         if every:
             subscribers.append(handle)
@@ -203,7 +220,7 @@ class Attachments:
         """End a handle: halt what it owns, then tell the daemon that the channels are free."""
         if self.handles.pop(handle.number, None) is None:
             return
-        self._runtime.unwatch(handle.sock.fileno())
+        self._runtime.turns.remove(handle.sock.fileno())
         if handle.pidfd >= 0:
             self._runtime.unwatch(handle.pidfd)
         if handle in self._leased:

@@ -13,7 +13,8 @@ import os
 import socket
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from itertools import islice
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +28,17 @@ from .effects import Effects
 if TYPE_CHECKING:
     from .writing import AxesWrite
 
-MAX_WAITS = 64
+LOOKS_A_MS = 16
+"""Waits of each user that are looked at, for every millisecond of a tick's period: some 20 us, 100 where all are answered."""
 LATER = object()
 """Returned instead of a value when the answer comes later."""
+
+
+class Quota(NamedTuple):
+    """What one user may have of a device at a time, over all his handles: requests that wait, and subscriptions."""
+
+    waits: int
+    subscriptions: int
 
 
 @dataclass(slots=True, eq=False)
@@ -39,7 +48,7 @@ class Handle:
     Attributes:
         number: the daemon's number of it.
         node: name it was opened by.
-        who: whose it is, for messages.
+        who: whose it is, for messages; uid: his number.
         sock: socket to the client, non-blocking.
         wakes: writing end of the pipe that wakes the client, non-blocking.
         pidfd: the client's process, -1 when unknown.
@@ -47,6 +56,7 @@ class Handle:
         access: what it may do by its mode; ``exclusive`` says that it owns its channels.
         rights: what its user may do.
         effects: the instant that its answers carry.
+        quota: what its user may have.
         lease_ns: longest silence allowed to the client, 0 = any.
         every: the client is woken by every n-th publication; 0 = not; -1 = when a binary edge came.
         writing: writes of axis records that are not in the buffers yet, the oldest first.
@@ -60,6 +70,7 @@ class Handle:
     number: int
     node: str
     who: str
+    uid: int
     sock: socket.socket
     wakes: int
     pidfd: int
@@ -72,6 +83,7 @@ class Handle:
     lease_ns: int
     heard_ns: int
     effects: Effects
+    quota: Quota
     every: int = 0
     countdown: int = 0
     writes_under_way: int = 0
@@ -134,6 +146,7 @@ class Wait:
         channels: axes it depends on: dropped buffers end it.
         cancelled: undoes what the wait has begun.
         looks: it changes nothing, it only waits for what readings show.
+        refusal: with what it has ended, until its client is told: errno and sentence.
     """
 
     handle: Handle
@@ -144,68 +157,107 @@ class Wait:
     channels: frozenset[int] = frozenset()
     cancelled: Callable[[], None] | None = None
     looks: bool = False
+    refusal: tuple[int, str] | None = None
 
 
 class Waits:
-    """All waits of a driver process.
+    """All waits of a driver process, looked at in turn: so many of each user a time.
 
     Args:
         effects: where the effects of what has waited are noted.
+        a_look: how many of each user are looked at after a publication.
     """
 
-    def __init__(self, effects: Effects) -> None:
+    def __init__(self, effects: Effects, a_look: int = LOOKS_A_MS) -> None:
+        self.a_look = a_look
         self._effects = effects
-        self._waits: list[Wait] = []
+        self._of: dict[int, dict[Wait, None]] = {}
+        self._idle: dict[tuple[int, frozenset[int]], bool] = {}
 
     def add(self, wait: Wait) -> None:
         """Keep a wait until it is ready, late, cancelled or its handle is gone.
 
         Raises:
-            OSError: EAGAIN, the handle has too many.
+            OSError: EAGAIN, its user has too many.
         """
-        if len(wait.handle.waits) >= MAX_WAITS:
-            raise OSError(errno.EAGAIN, f"{wait.what}: {MAX_WAITS} requests of this handle wait already")
-        wait.handle.waits[wait.number] = wait
-        self._waits.append(wait)
+        handle = wait.handle
+        waiting = self._of.setdefault(handle.uid, {})
+        if len(waiting) >= handle.quota.waits:
+            raise OSError(
+                errno.EAGAIN,
+                f"{wait.what}: {len(waiting)} requests of user {handle.uid} wait at this device already, as many as "
+                "waits of [quota] allows",
+            )
+        handle.waits[wait.number] = wait
+        waiting[wait] = None
 
     def check(self, now_ns: int, shown: Sequence[AnyBlock]) -> None:
-        """Answer what is ready or late; cheap when nothing waits.
+        """Answer what is ready or late, as far as it is looked at; cheap when nothing waits.
 
         Args:
             now_ns: the time [ns].
             shown: blocks that have just been published, as they are now.
         """
-        if not self._waits:
+        if not self._of:
             return
-        for wait in list(self._waits):
-            if wait.handle.waits.get(wait.number) is not wait:
-                continue  # ended by what another has just brought about
-            try:
-                done = wait.ready()
-            except OSError as error:
-                self.end(wait, error.errno or errno.EIO, error.strerror or str(error))
-                continue
-            if done is not None:
-                self._remove(wait)
-                if not (wait.looks and any(wait.handle.block is block for block in shown)):
-                    self._effects.note()
-                wait.handle.answer(wait.number, done[0])
-            elif wait.deadline_ns is not None and now_ns >= wait.deadline_ns:
-                self.end(wait, errno.ETIMEDOUT, f"{wait.what}: not within its time-out")
+        self._idle.clear()
+        for uid, waiting in list(self._of.items()):
+            is_more = len(waiting) > self.a_look
+            for wait in list(islice(waiting, self.a_look)):
+                if wait not in waiting:
+                    continue  # ended by what another has just brought about
+                if is_more:
+                    del waiting[wait]
+                    waiting[wait] = None  # behind the others
+                self._look(wait, now_ns, shown)
+            if not waiting:
+                self._of.pop(uid, None)
+
+    def _look(self, wait: Wait, now_ns: int, shown: Sequence[AnyBlock]) -> None:
+        try:
+            done = wait.ready() if wait.refusal is None else None
+        except OSError as error:
+            self._refuse(wait, error.errno or errno.EIO, error.strerror or str(error))
+            return
+        if wait.refusal is not None:
+            self._refuse(wait, *wait.refusal)
+        elif done is not None:
+            self._remove(wait)
+            if not (wait.looks and any(wait.handle.block is block for block in shown)):
+                self._effects.note()
+            wait.handle.answer(wait.number, done[0])
+        elif wait.deadline_ns is not None and now_ns >= wait.deadline_ns:
+            self._refuse(wait, errno.ETIMEDOUT, f"{wait.what}: not within its time-out")
+
+    def is_idle(self, block: AnyBlock, axes: frozenset[int]) -> bool:
+        """Whether axes are idle, found out once for all who wait for it."""
+        key = (id(block), axes)
+        found = self._idle.get(key)
+        if found is None:
+            found = self._idle[key] = block.bank.is_idle(sorted(axes))  # type: ignore[union-attr]
+        return found
 
     def end(self, wait: Wait, errno_: int, text: str) -> None:
         """End a wait with a refusal."""
-        if self._remove(wait):
-            if wait.cancelled is not None:
-                wait.cancelled()
-            wait.handle.refuse(wait.number, errno_, text)
+        if wait in self._of.get(wait.handle.uid, ()) and wait.refusal is None:
+            self._refuse(wait, errno_, text)
 
     def end_where(self, condition: Callable[[Wait], bool], errno_: int, text: str) -> int:
-        """End all waits that a condition holds for; return how many."""
-        ended = [wait for wait in self._waits if condition(wait)]
-        for wait in ended:
-            self.end(wait, errno_, f"{wait.what}: {text}")
-        return len(ended)
+        """End all waits that a condition holds for; return how many.
+
+        Nothing of them happens any more; beyond a few of each user, they are told so after the next publications.
+        """
+        ended = 0
+        for waiting in list(self._of.values()):
+            mine = [wait for wait in waiting if wait.refusal is None and condition(wait)]
+            ended += len(mine)
+            for wait in mine[: self.a_look]:
+                self._refuse(wait, errno_, f"{wait.what}: {text}")
+            for wait in mine[self.a_look :]:
+                wait.refusal = (errno_, f"{wait.what}: {text}")
+                if wait.cancelled is not None:
+                    wait.cancelled()
+        return ended
 
     def forget(self, handle: Handle) -> None:
         """Drop the waits of a handle that is gone."""
@@ -214,8 +266,17 @@ class Waits:
             if wait.cancelled is not None:
                 wait.cancelled()
 
+    def _refuse(self, wait: Wait, errno_: int, text: str) -> None:
+        if self._remove(wait):
+            if wait.cancelled is not None:
+                wait.cancelled()
+            wait.handle.refuse(wait.number, errno_, text)
+
     def _remove(self, wait: Wait) -> bool:
         if wait.handle.waits.pop(wait.number, None) is None:
             return False
-        self._waits.remove(wait)
+        waiting = self._of[wait.handle.uid]
+        del waiting[wait]
+        if not waiting:
+            del self._of[wait.handle.uid]
         return True

@@ -99,7 +99,7 @@ def ioctl(
         case Request.GET_STATISTICS:
             if argument is not None and (type(argument) is not int or argument < 1):
                 raise _refuse(errno.EINVAL, f"{what}: {shown(argument)} ticks; want a number from 1, or none")
-            return runtime.statistics_report(argument or FEW_TICKS)
+            return _statistics(runtime, handle, number, argument or FEW_TICKS, what)
         case Request.WAIT_UNTIL_EVENT:
             raise _refuse(errno.ENOTTY, f"{what}: is answered by the client library, out of the page")
         case Request.ZERO_DEVICE if _corrected_here(handle):
@@ -127,6 +127,20 @@ def ioctl(
     return runtime.engine.carry_out(handle, number, answer, what)
 
 
+def _statistics(runtime: Runtime, handle: Handle, number: int, last: int, what: str) -> Any:
+    """Tell the statistics: what was worked out just now, else when a tick is done and leaves time."""
+
+    def report(fresh: bool) -> tuple[Any] | None:
+        found = runtime.statistics_report(handle.uid, last, fresh=fresh)
+        return None if found is None else (found,)
+
+    known = report(False)
+    if known is not None:
+        return known[0]
+    runtime.waits.add(Wait(handle, number, what, None, lambda: report(True), looks=True))
+    return LATER
+
+
 def _corrected_here(handle: Handle) -> bool:
     return isinstance(handle.block, AnalogBlock) and not handle.block.corrected_by_driver
 
@@ -146,11 +160,11 @@ def _axis_request(
                 if not runtime.engine.publishes:  # it may have learned so since the last publication
                     runtime.effects.note()
                 return None
-            channels = frozenset(int(a) for a in axes)
+            block, channels = handle.block, frozenset(handle.axes)
             runtime.waits.add(
                 Wait(
                     handle, number, what, runtime.deadline(timeout_s),
-                    lambda: (None,) if bank.is_idle(axes) else None, channels, looks=True,
+                    lambda: (None,) if runtime.waits.is_idle(block, channels) else None, channels, looks=True,
                 )
             )  # fmt: skip
             return LATER

@@ -36,14 +36,15 @@ from sioms.protocol.messages import (
 from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.stopjournal import StopJournal
 from sioms.protocol.text import printable
+from sioms.turns import Turns
 
-from .attachments import Attachments
+from .attachments import SHARES, Attachments
 from .blocks import AnyBlock, AxisBlock, set_alarms
 from .driver import Driver, LineDriver, StreamDriver, TickDriver
 from .effects import Effects
 from .engine import Engine
 from .exchange import HookError
-from .handles import Waits
+from .handles import LOOKS_A_MS, Waits
 from .inputs import Input
 from .keeping import keep_positions
 from .line_engine import LineEngine
@@ -62,7 +63,8 @@ SETTLE_NS = 20_000_000
 """An axis whose loop is closed here follows its command by so much; only then is the loop given up."""
 FAIL_GRACE_NS = 500_000_000
 """How long a failed driver's line may take to send the stops."""
-PACKETS_A_TURN = 8
+REPORT_NS = 20_000_000
+"""How old statistics may be that are told: to sort them takes longer than anything else a reader can ask for."""
 
 
 def run(
@@ -120,9 +122,12 @@ class Runtime:
         self._description = description
         self._epoll = select.epoll()
         self._callbacks: dict[int, Callable[[], None]] = {}
+        self.turns = Turns(self._epoll, SHARES)
         self._timer = TimerFd()
         self._line_timer = TimerFd()
         self._line_due_ns: int | None = None
+        self._reports: dict[int, tuple[int, dict[str, object]]] = {}
+        self._reported_ns: dict[int, int] = {}
         self.stops = Stops(self, self.latch, request, StopJournal(fds[5]), options["stop_sources"])
         self._stopped = options["stopped"]
         self._phase = float(options["phase"])
@@ -141,6 +146,7 @@ class Runtime:
         self.clients = Attachments(self)
         self.engine = self._make_engine()
         self.period_ns = int(1e9 / self.engine.tick_hz)
+        self.waits.a_look = max(LOOKS_A_MS, LOOKS_A_MS * self.period_ns // 1_000_000)
         self._lead_ns = self.engine.lead_ns if isinstance(self.engine, TickEngine) else 0
         self._spare_until_ns = 0
 
@@ -236,8 +242,26 @@ class Runtime:
             errno_, text,
         )  # fmt: skip
 
-    def statistics_report(self, last: int) -> dict[str, object]:
-        """Return what GET_STATISTICS tells: times of the last ticks, link counters, handles."""
+    def statistics_report(self, uid: int, last: int, *, fresh: bool) -> dict[str, object] | None:
+        """Return what GET_STATISTICS tells: times of the last ticks, link counters, handles.
+
+        Args:
+            uid: who asks; it is worked out once in REPORT_NS for each user.
+            last: over so many ticks.
+            fresh: whether it may be worked out now; None is returned when it is not, or he has had his turn.
+        """
+        now_ns = time.monotonic_ns()
+        self._reports = {n: kept for n, kept in self._reports.items() if now_ns - kept[0] < REPORT_NS}
+        if last in self._reports:
+            return self._reports[last][1]
+        if not fresh or now_ns - self._reported_ns.get(uid, -REPORT_NS) < REPORT_NS:
+            return None
+        self._reported_ns[uid] = now_ns
+        report = self._report(last)
+        self._reports[last] = (now_ns, report)
+        return report
+
+    def _report(self, last: int) -> dict[str, object]:
         report = self.statistics.summary(last)
         report["tick_hz"] = self.engine.tick_hz
         report["handles"] = len(self.clients.handles)
@@ -304,12 +328,15 @@ class Runtime:
         )
 
     def _loop(self) -> None:
-        poll, callbacks = self._epoll.poll, self._callbacks
+        poll, callbacks, turns = self._epoll.poll, self._callbacks, self.turns
         while self.running:
-            for fd, _ in poll():
+            for fd, _ in poll(turns.pause_s):
                 callback = callbacks.get(fd)
                 if callback is not None:
                     callback()
+                else:
+                    turns.mark(fd)
+            turns.serve()  # one request, after all that is due
 
     def tick_early(self) -> None:
         """Have a tick as soon as there can be one: what has been stopped shall not wait for its turn.
@@ -425,11 +452,7 @@ class Runtime:
 
     def _run_line(self, until_ns: int) -> None:
         """Let the line send what is left to send; nothing else runs any more."""
-        others = {
-            self._control.fileno(),
-            self._timer.fd,
-            *(h.sock.fileno() for h in self.clients.handles.values()),
-        }
+        others = {self._control.fileno(), self._timer.fd}
         while not self.engine.is_quiet() and time.monotonic_ns() < until_ns:
             for fd, _ in self._epoll.poll(0.005):
                 callback = self._callbacks.get(fd)
@@ -516,9 +539,7 @@ class Runtime:
             os.close(fd)
 
     def _control_readable(self) -> None:
-        for _ in range(PACKETS_A_TURN):
-            if not self._take_order():
-                return
+        self._take_order()  # one; the tick has its turn before the next
 
     def _take_order(self) -> bool:
         """Obey one message of the daemon; return whether there was one."""

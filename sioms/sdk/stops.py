@@ -198,6 +198,8 @@ class Stops:
         parts = [
             part for c in handle.channels.tolist() for part in parts_of(c, handle.bit, spec.channels[c].width)
         ]
+        what = f"emergency stop of {handle.node}" if stop else f"reset of {handle.node}"
+        self._runtime.log("warning", f"{what} by {handle.who}")
         self._note(node_entry(handle.node, self._runtime.device, spec.name, parts, source, stop=stop))
 
     def restore(self, stopped: Iterable[tuple[str, list[list[int]], str, str]]) -> None:

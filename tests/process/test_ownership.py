@@ -6,6 +6,7 @@ import asyncio
 import errno
 import json
 import os
+import socket
 import sys
 import threading
 import time
@@ -183,36 +184,41 @@ def test_use_after_close_is_ebadf(cell: sioms.Workcell) -> None:
             call()
 
 
-def test_bounds_of_a_session(start_daemon: Callable[..., Daemon]) -> None:
-    bounds = "max_sessions = 4\nmax_handles = 3\nmax_markers = 5\nmax_waits = 2\n"
-    daemon = start_daemon(WORKCELL.replace('name = "test"', 'name = "test"\n' + bounds))
+def test_bounds_and_quotas(start_daemon: Callable[..., Daemon]) -> None:
+    """The daemon's own user may have four times as much as the quotas say."""
+    quotas = "[quota]\nhandles = 1\nmarkers = 2\nwaits = 1\nsilent = 1\ngreeting_s = 0.5\n"
+    text = WORKCELL.replace('name = "test"', 'name = "test"\nmax_sessions = 6\n' + quotas)
+    daemon = start_daemon(text)
     with daemon.cell() as cell:
-        nodes = [cell.open("mod0.readonly") for _ in range(3)]
-        with raises(errno.EMFILE, "3 open handles"):
+        nodes = [cell.open("mod0.readonly") for _ in range(4)]
+        with raises(errno.EMFILE, "has 4 nodes open, and at most 4 are allowed (handles of [quota], 4 times"):
             cell.open("mod1.readonly")
         nodes.pop().close()
         cell.open("mod1.readonly").close()
-        with raises(errno.EINVAL, "want 1 to 5"):
-            cell.reserve_markers(6)
-        markers = cell.reserve_markers(4)
-        with raises(errno.EBUSY, "this session has 4"):
-            cell.reserve_markers(2)
+        with raises(errno.EINVAL, "want 1 to 1023"):
+            cell.reserve_markers(1024)
+        markers = cell.reserve_markers(6)
+        with (
+            daemon.cell() as second,
+            raises(errno.EBUSY, "has 6 markers, and at most 8 are allowed (markers of [quota]"),
+        ):
+            second.reserve_markers(3)
         waiters = [
             threading.Thread(target=lambda: _quiet(lambda: markers[0].wait(20.0)), daemon=True)
-            for _ in range(2)
+            for _ in range(4)
         ]
         for waiter in waiters:
             waiter.start()
-        wait_for(lambda: cell.status()["sessions"][0][2] == 2, "two wait")
-        with raises(errno.EAGAIN, "at most 2"):
+        wait_for(lambda: cell.status()["sessions"][0][2] == 4, "four wait")
+        with raises(errno.EAGAIN, "has 4 requests that wait, and at most 4 are allowed (waits of [quota]"):
             markers[1].wait(1.0)
         markers[0].signal()
-        others = [daemon.cell() for _ in range(3)]
-        with raises(errno.EUSERS, "4 sessions are open, as many as max_sessions"):
+        others = [daemon.cell() for _ in range(5)]
+        with raises(errno.EUSERS, "6 sessions are open; max_sessions of [workcell] allows 6"):
             daemon.cell()
-        daemon.said('event="session refused".*max_sessions = 4 are open')
+        daemon.said('event="session refused".*6 sessions are open')
         others.pop().close()
-        wait_for(lambda: len(cell.status()["sessions"]) == 3, "a session less")
+        wait_for(lambda: len(cell.status()["sessions"]) == 5, "a session less")
         daemon.cell().close()
         for node in (*nodes, *others):
             node.close()
@@ -220,12 +226,31 @@ def test_bounds_of_a_session(start_daemon: Callable[..., Daemon]) -> None:
             waiter.join(5.0)
 
 
-def test_too_many_waits_on_a_handle(cell: sioms.Workcell) -> None:
-    with cell.open("mod0.xaxis", "rw") as axis:
+def test_silent_connections_are_few_and_end(start_daemon: Callable[..., Daemon]) -> None:
+    text = WORKCELL.replace('name = "test"', 'name = "test"\n[quota]\nsilent = 1\ngreeting_s = 0.5\n')
+    daemon = start_daemon(text)
+    silent = [socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(5)]
+    with daemon.cell() as cell:
+        for sock in silent:
+            sock.connect(str(daemon.socket))
+            sock.settimeout(5.0)
+        assert b"4 connections that have not said a word" in silent[4].recv(1000)
+        assert b"nothing was said within 0.5 s" in silent[0].recv(1000)
+        assert silent[0].recv(1000) == b""
+        wait_for(
+            lambda: len(cell.status()["sessions"]) == 1, "the silent ones are gone, who has spoken is not"
+        )
+        for sock in silent:
+            sock.close()
+
+
+def test_too_many_waits_at_a_device(start_daemon: Callable[..., Daemon]) -> None:
+    daemon = start_daemon(WORKCELL.replace('name = "test"', 'name = "test"\n[quota]\nwaits = 16\n'))
+    with daemon.cell() as cell, cell.open("mod0.xaxis", "rw") as axis:
         axis.command(velocity=0.01)
         calls = [axis._ioctl(Request.WAIT_UNTIL_IDLE, None, 30.0) for _ in range(65)]
         numbers = [axis._channel.send(call) for call in calls]
-        with raises(errno.EAGAIN, "64 requests of this handle wait already"):
+        with raises(errno.EAGAIN, "wait at this device already, as many as waits of [quota] allows"):
             axis._channel.wait(numbers[-1], calls[-1])
         axis.stop()
         for number, call in zip(numbers[:-1], calls[:-1], strict=True):

@@ -18,7 +18,7 @@ from daemon_rig import FORCE, IO, WORKCELL, Daemon, axes, raises, wait_for
 
 BAD = """
 [workcell]
-max_handle = 3
+max_session = 3
 [workcel]
 name = "x"
 [device.mod0]
@@ -62,7 +62,7 @@ def test_all_errors_of_all_devices_come_at_once(tmp_path: Path) -> None:
     status, said = check(tmp_path / "bad.toml", BAD)
     assert status == 2
     for pattern in (
-        r"^\[workcell\]: unknown key max_handle; did you mean max_handles\?",
+        r"^\[workcell\]: unknown key max_session; did you mean max_sessions\?",
         r"^\[workcel\]: unknown section; did you mean workcell\?",
         r"^\[device.mod0\]: driver = sim-axis: no such driver; did you mean sim-axes\?",
         r"^\[device.mod1\]: unknown key tick_hx; did you mean tick_hz\?",

@@ -127,7 +127,7 @@ def test_nothing_of_a_dead_client_is_left() -> None:
         assert server is not None
         client.ask(ClientVerb.RESERVE_MARKER, 3, False)
         session = next(s for s in server.clients.sessions if s.peer.pid == client.pid)
-        server.loop._selector.get_map()[session.sock.fileno()].data()
+        cell._watched[session.sock.fileno()]()
         assert server.clients.markers.count(session) == 3
         for action in (
             ("die", 0, 0),

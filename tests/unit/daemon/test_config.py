@@ -77,7 +77,8 @@ def test_all_errors_at_once_in_the_order_of_the_sections() -> None:
         ("[workcell]\ndaemon_lease_s = nan", "daemon_lease_s"),
         ("[workcell]\nsocket_mode = '777 '", "socket_mode"),
         ("[workcell]\nsocket_mode = 432", "socket_mode"),
-        ("[workcell]\nmax_markers = 1024", "max_markers"),
+        ("[quota]\nmarkers = 1024", "[quota]"),
+        ("[quota]\nsilent = 0", "silent"),
         ("[[emergency_stop]]\nnode = 'x'\nactive = 2", "active"),
         ("x = [", "read configuration: "),
         ("", "want at least one"),
@@ -89,7 +90,7 @@ def test_errors(text: str, words: str) -> None:
 
 
 def test_values_at_their_ends_are_taken() -> None:
-    text = "[workcell]\nmax_markers = 1023\nmax_sessions = 1\nsocket_mode = '660'\n[device.a-b_1]\ndriver = 'd'\nrealtime_priority = 0\n"
+    text = "[quota]\nmarkers = 1023\n[workcell]\nmax_sessions = 1\nsocket_mode = '660'\n[device.a-b_1]\ndriver = 'd'\nrealtime_priority = 0\n"
     assert errors(text) == []
 
 

@@ -7,7 +7,7 @@ import pytest
 from own_writes_rig import CLOCK, World, own_time
 
 from sioms.drivers.sim_axes import SimAxes
-from sioms.protocol.flags import ControlMode
+from sioms.protocol.flags import ControlMode, Request
 from sioms.protocol.records import AXIS_WRITE, AXIS_WRITE_FIELDS
 
 
@@ -41,3 +41,44 @@ def test_all_leases_that_have_run_out_end_in_one_tick(world: World) -> None:
     CLOCK.now_ns += 100_000_000
     world.tick()
     assert not world.runtime.clients.handles
+
+
+def test_waits_of_one_user_are_answered_a_few_a_tick_and_anothers_at_once(world: World) -> None:
+    flood = [world.open(0, list(range(8)), exclusive=False, uid=1) for _ in range(8)]
+    owner = world.open(0, [0], exclusive=True, uid=2)
+    other = world.open(0, [0], exclusive=False, uid=3)
+    owner.write(jog(), replace=True)
+    world.tick()
+    answers: list[tuple[int, object]] = []
+    for i in range(320):
+        flood[i % 8].ioctl(Request.WAIT_UNTIL_IDLE, done=lambda value: answers.append((1, value)))
+    assert len(answers) == 64 and "waits of [quota]" in str(answers[0][1])
+    other.ioctl(Request.WAIT_UNTIL_IDLE, done=lambda value: answers.append((3, value)))
+    answers.clear()
+    owner.ioctl(Request.STOP)
+    ticks = []
+    for _ in range(400):
+        world.tick()
+        for client in (*flood, other):
+            client.take()
+        ticks.append(len(answers))
+        if len(answers) == 257:
+            break
+    assert ticks[0] <= 2 * 16 + 1, "of each user a few"
+    assert 3 in [uid for uid, _ in answers[: 2 * 16 + 1]]
+    assert len(answers) == 257 and len(ticks) >= 8
+
+
+def test_statistics_are_worked_out_seldom_and_after_a_tick(world: World) -> None:
+    client = world.open(0, [0], exclusive=False)
+    told: list[object] = []
+    done = []
+    work = world.runtime._report
+    world.runtime._report = lambda last: done.append(world.runtime._is_ticking) or work(last)  # type: ignore[method-assign, func-returns-value]
+    for last in range(1, 41):
+        client.ioctl(Request.GET_STATISTICS, last, told.append)
+    assert not told and not done
+    for _ in range(30):
+        world.tick()
+    assert 1 <= len(done) <= 3 and all(done)
+    client.ioctl(Request.GET_STATISTICS, None, told.append)
