@@ -24,7 +24,7 @@ from sioms.protocol.text import printable
 from .config import Config, parse
 from .lines import with_lines
 from .loop import Loop, Timer
-from .names import DeviceInfo, NameTable
+from .names import DeviceInfo, NameTable, shared_claims
 from .nursery import DIED, Nursery
 from .nursery_process import NurseryProcess
 from .patience import Patience
@@ -209,7 +209,7 @@ class Loader:
         names = NameTable(
             {n: self._infos[n] for n in self._config.devices if n in self._infos}, self._config.nodes
         )
-        self._errors += _unknown_users(self._config)
+        self._errors += _unknown_users(self._config) + shared_claims(names.devices.values())
         sources, alarms = self._stop_sources(names), self._alarms(names)
         if not self._errors:
             self._errors += names.errors

@@ -6,7 +6,7 @@ names of one thing exclude each other without any rule of their own.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from sioms.protocol.flags import PROTOCOL_VERSION, NodeClass
@@ -40,6 +40,7 @@ class DeviceInfo:
     tick_hz: float
     inputs: tuple[str, ...]
     lease_s: float
+    claims: tuple[str, ...] = ()
 
     def facts(self) -> list[object]:
         """Return all it tells as plain values, to be compared."""
@@ -59,7 +60,7 @@ class DeviceInfo:
     @classmethod
     def unpack(cls, name: str, driver: str, packed: list) -> DeviceInfo:  # type: ignore[type-arg]
         """Make it from the nursery's reply."""
-        blocks, tick_hz, inputs, lease_s = packed
+        blocks, tick_hz, inputs, lease_s, claims = packed
         return cls(
             name,
             driver,
@@ -70,7 +71,29 @@ class DeviceInfo:
             tick_hz,
             tuple(inputs),
             lease_s,
+            tuple(claims),
         )
+
+
+def shared_claims(devices: Iterable[DeviceInfo]) -> list[str]:
+    """Return a sentence for each device that wants what one before it has already: a port, a unit, a line."""
+    errors, owners = [], dict[str, str]()
+    for device in devices:
+        for claim in device.claims:
+            # A whole network address is in the way of its units.
+            there = [
+                claim,
+                claim.partition(" unit ")[0],
+                *(c for c in owners if c.startswith(f"{claim} unit ")),
+            ]
+            owner = next((owners[each] for each in there if each in owners), None)
+            if owner is not None:
+                errors.append(
+                    f"[device.{device.name}]: {claim} is that of device {owner} already; want one of its own"
+                )
+                break
+        owners |= dict.fromkeys(device.claims, device.name)
+    return errors
 
 
 Claim = tuple[str, int, int, int]

@@ -20,6 +20,7 @@ the process dies: what level they then have is the board's matter, so a line tha
 from __future__ import annotations
 
 import errno
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from datetime import timedelta
@@ -124,6 +125,13 @@ class Gpio(TickDriver):
             own = "in" if settings.output else ""
             ports.append(BlockSpec(own, NodeClass.BINARY, (channel,), history=settings.history))
         return Description(tuple(ports), settings.tick_hz, lease_s=max(0.1, 5 / settings.tick_hz))
+
+    @classmethod
+    def claims(cls, settings: GpioSettings) -> Sequence[str]:
+        """Return the lines; the kernel gives each to one only."""
+        chip = os.path.realpath(settings.chip)
+        lines = [table.line for table in settings.output] + [table.line for table in settings.input]
+        return [f"line {line} of {chip}" for line in lines]
 
     def __init__(self, name: str, settings: GpioSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)

@@ -99,6 +99,11 @@ class Iio(StreamDriver):
         return _describe(settings)
 
     @classmethod
+    def claims(cls, settings: IioSettings) -> Sequence[str]:
+        """Return the buffer, which the kernel gives to one only; single values may be read by many."""
+        return [f"buffer of IIO device {settings.device}"] if settings.mode == "buffer" else []
+
+    @classmethod
     def golden(cls, settings: Any) -> Sequence[Golden]:
         """Return a scan of the kernel's dummy device; scans carry no checksum."""
         types = ("le:u13/16>>0", "le:s12/16>>0", "le:s11/16>>0", "le:s16/16>>0", "le:s64/64>>0")

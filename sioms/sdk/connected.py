@@ -14,6 +14,7 @@ from .driver import LineDriver, StreamDriver
 from .exchange import DeviceError, Steps
 from .handles import LATER, Handle
 from .line import Counters, Line, Priority
+from .locks import NameLocks
 from .side_connection import SideConnection
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ class Connected:
         self._gap_s = gap_s
         self._recovery_s = recovery_s
         self._connecting: Connection | None = None
+        self._locks = NameLocks(driver.claims(driver.settings), partial(runtime.log, "warning"))
         self._retry_ns = 0
         self._pause_ns = FIRST_PAUSE_NS
         runtime.line_due = self._line_due
@@ -51,6 +53,7 @@ class Connected:
             if self._connecting is None:
                 if now_ns < self._retry_ns:
                     return False
+                self._locks.take()
                 self._connecting = open_connection(self._base.line, self._count_stranger)
                 self._limit_ns = now_ns + int(self._base.line.connect_timeout_s * 1e9)
             if not self._connecting.is_connected():

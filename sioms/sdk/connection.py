@@ -14,6 +14,7 @@ from pathlib import Path
 import serial
 
 from .datagram import Datagrams, split_address
+from .locks import PortLock
 from .settings import LineSettings
 
 MOST_PORTS = 4
@@ -38,6 +39,7 @@ class Connection:
         self._sock: socket.socket | None = None
         self._datagrams: Datagrams | None = None
         self._file: FileIO | None = None
+        self._lock: PortLock | None = None
         if settings.serial is not None:
             self._open_serial(settings)
         elif settings.udp is not None:
@@ -95,6 +97,8 @@ class Connection:
 
     def close(self) -> None:
         """Release the line."""
+        if self._lock is not None:
+            self._lock.release()
         if self._serial is not None:
             self._serial.close()
         if self._sock is not None:
@@ -117,6 +121,14 @@ class Connection:
         self._file = FileIO(fd)
 
     def _open_serial(self, settings: LineSettings) -> None:
+        self._lock = PortLock(settings.serial or "")
+        try:
+            self._open_port(settings, self._lock)
+        except OSError:
+            self._lock.release()
+            raise
+
+    def _open_port(self, settings: LineSettings, lock: PortLock) -> None:
         try:
             self._serial = serial.Serial(
                 settings.serial, settings.baud, parity=settings.parity, stopbits=settings.stop_bits,
@@ -136,6 +148,7 @@ class Connection:
         except (ValueError, termios.error) as error:
             raise OSError(errno.EINVAL, f"open {settings.serial} at {settings.baud} baud: {error}") from None
         fd = self._serial.fileno()
+        lock.exclude(fd)
         os.set_blocking(fd, False)
         # VMIN 1: without data a read says EAGAIN, so that an empty read can only mean a hang-up.
         attributes = termios.tcgetattr(fd)

@@ -31,6 +31,7 @@ from sioms.protocol.flags import Request
 from .blocks import AnyBlock, BlockSpec, Description
 from .exchange import Steps
 from .golden import Golden
+from .locks import claims_of
 from .settings import LineSettings
 
 if TYPE_CHECKING:
@@ -142,6 +143,11 @@ class Driver(ABC):
     @abstractmethod
     def describe(cls, name: str, settings: Any) -> Description:
         """Tell the blocks, rate and inputs; pure; raises ValueError with a sentence for bad settings."""
+
+    @classmethod
+    def claims(cls, settings: Any) -> Sequence[str]:
+        """Return what no other device may use, in words that are equal for the same: here the key ``line``."""
+        return claims_of(settings)
 
     @classmethod
     def golden(cls, settings: Any) -> Sequence[Golden]:

@@ -143,7 +143,8 @@ def describe(driver: type[Driver], name: str, settings: Any) -> tuple[list[objec
         ]
         for b in description.blocks
     ]  # fmt: skip
-    return [blocks, description.tick_hz, list(description.inputs), description.lease_s], errors
+    claims = list(driver.variant(settings).claims(settings))
+    return [blocks, description.tick_hz, list(description.inputs), description.lease_s, claims], errors
 
 
 MOST_HISTORY = 1 << 20

@@ -37,6 +37,16 @@ name = "x"
 motor = { mas = 1.0 }
 [device.io0]
 driver = "sim-io"
+[device.scale0]
+driver = "ascii-stream"
+line = { serial = "/dev/ttyNONE7" }
+columns = ["a"]
+rate_hz = 100.0
+[device.scale1]
+driver = "ascii-stream"
+line = { serial = "/dev/../dev/ttyNONE7" }
+columns = ["a"]
+rate_hz = 100.0
 [device."5x"]
 driver = "sim-io"
 [[grant]]
@@ -68,6 +78,7 @@ def test_all_errors_of_all_devices_come_at_once(tmp_path: Path) -> None:
         r"^\[device.mod1\]: unknown key tick_hx; did you mean tick_hz\?",
         r"^\[device.mod2\].*unknown key mas; did you mean mass\?",
         r"^\[device.io0\]: outputs and inputs are both 0",
+        r"^\[device.scale1\]: serial port /dev/ttyNONE7 is that of device scale0 already; want one of its own",
         r"^\[device.5x\]: a device name is letters",
         r"^\[\[grant\]\] number 1.*reed",
         r"^\[\[emergency_stop\]\] number 1: unknown key nod",
