@@ -71,15 +71,15 @@ def test_a_moved_environment_is_mended(dev, tmp_path, monkeypatch, places):
 
 
 def test_a_step_ends_when_it_is_silent_and_not_when_it_is_slow(dev, monkeypatch, capfd):
-    monkeypatch.setattr(dev, "QUIET_S", 2.0)
+    monkeypatch.setattr(dev, "QUIET_S", 1.5)  # silence is looked at once a second: it ends after 2 s
     monkeypatch.setattr(dev.os, "getloadavg", lambda: (0.0, 0.0, 0.0))
-    slow = "import time\nfor _ in range(3): print('.', flush=True); time.sleep(1.5)"
+    slow = "import time\nfor _ in range(2): print('.', flush=True); time.sleep(1.2)"
     assert dev.run_step("slow", [sys.executable, "-c", slow]) == 0
     hangs = "import time; time.sleep(60)"
     assert dev.run_step("hangs", [sys.executable, "-c", hangs]) == -1
     assert "hangs: killed; it has printed nothing" in capfd.readouterr().err
     monkeypatch.setattr(dev.os, "getloadavg", lambda: (100.0 * dev.os.cpu_count(), 0.0, 0.0))
-    assert dev.run_step("starved", [sys.executable, "-c", "import time; time.sleep(4)"]) == 0
+    assert dev.run_step("starved", [sys.executable, "-c", "import time; time.sleep(2.3)"]) == 0
 
 
 def test_what_failed_is_run_once_more_and_a_second_failure_counts(dev, monkeypatch, capsys):
