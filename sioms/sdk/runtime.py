@@ -126,8 +126,8 @@ class Runtime:
         self._timer = TimerFd()
         self._line_timer = TimerFd()
         self._line_due_ns: int | None = None
-        self._reports: dict[int, tuple[int, dict[str, object]]] = {}
-        self._reported_ns: dict[int, int] = {}
+        self._summaries: dict[int, tuple[int, dict[str, object]]] = {}
+        self._summed_ns: dict[int, int] = {}
         self.stops = Stops(self, self.latch, request, StopJournal(fds[5]), options["stop_sources"])
         self._stopped = options["stopped"]
         self._phase = float(options["phase"])
@@ -246,23 +246,18 @@ class Runtime:
         """Return what GET_STATISTICS tells: times of the last ticks, link counters, handles.
 
         Args:
-            uid: who asks; it is worked out once in REPORT_NS for each user.
+            uid: who asks; times are sorted once in REPORT_NS for each user.
             last: over so many ticks.
-            fresh: whether it may be worked out now; None is returned when it is not, or he has had his turn.
+            fresh: whether they may be sorted now; None is returned when it is not, or he has had his turn.
         """
         now_ns = time.monotonic_ns()
-        self._reports = {n: kept for n, kept in self._reports.items() if now_ns - kept[0] < REPORT_NS}
-        if last in self._reports:
-            return self._reports[last][1]
-        if not fresh or now_ns - self._reported_ns.get(uid, -REPORT_NS) < REPORT_NS:
-            return None
-        self._reported_ns[uid] = now_ns
-        report = self._report(last)
-        self._reports[last] = (now_ns, report)
-        return report
-
-    def _report(self, last: int) -> dict[str, object]:
-        report = self.statistics.summary(last)
+        self._summaries = {n: kept for n, kept in self._summaries.items() if now_ns - kept[0] < REPORT_NS}
+        if last not in self._summaries:
+            if not fresh or now_ns - self._summed_ns.get(uid, -REPORT_NS) < REPORT_NS:
+                return None
+            self._summed_ns[uid] = now_ns
+            self._summaries[last] = (now_ns, self.statistics.summary(last))
+        report = dict(self._summaries[last][1])
         report["tick_hz"] = self.engine.tick_hz
         report["handles"] = len(self.clients.handles)
         counters = getattr(self.engine, "counters", None)

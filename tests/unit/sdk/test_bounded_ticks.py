@@ -73,8 +73,8 @@ def test_statistics_are_worked_out_seldom_and_after_a_tick(world: World) -> None
     client = world.open(0, [0], exclusive=False)
     told: list[object] = []
     done = []
-    work = world.runtime._report
-    world.runtime._report = lambda last: done.append(world.runtime._is_ticking) or work(last)  # type: ignore[method-assign, func-returns-value]
+    work = world.runtime.statistics.summary
+    world.runtime.statistics.summary = lambda last: done.append(world.runtime._is_ticking) or work(last)  # type: ignore[method-assign, func-returns-value]
     for last in range(1, 41):
         client.ioctl(Request.GET_STATISTICS, last, told.append)
     assert not told and not done
