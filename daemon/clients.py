@@ -68,6 +68,7 @@ class Clients:
         self.address = address
         self._server = server
         self._listener = listener
+        self._spare = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
         self.sessions: set[Session] = set()
         self._status: tuple[int, dict[str, object]] | None = None
         self.nodes = NodeVerbs(server, self)
@@ -96,10 +97,7 @@ class Clients:
             sock, _ = self._listener.accept()
         except OSError as error:
             if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOMEM):
-                # The listener stays readable: look away for a while instead of spinning.
-                self._server.log("error", "session refused", why=error.strerror)
-                self._server.loop.turns.remove(self._listener.fileno())
-                self._server.loop.after(0.2, self.welcome)
+                self._cannot_accept(error)
             return
         sock.setblocking(False)
         peer = peer_of(sock, self.users)
@@ -114,6 +112,23 @@ class Clients:
         if session.pidfd >= 0:
             # A child that it forked may hold the socket open after its death.
             self._server.loop.watch(session.pidfd, lambda: self._end_session(session, ""))
+
+    def _cannot_accept(self, error: OSError) -> None:
+        """Tell a client that the daemon has no descriptor for it, by way of one that is kept for that."""
+        if self._spare >= 0:
+            os.close(self._spare)
+            self._spare = -1
+            with contextlib.suppress(OSError):
+                sock, _ = self._listener.accept()
+                why = f"{(error.strerror or '').lower()} in the daemon; raise LimitNOFILE of its service, or ulimit -n"
+                self._refuse(sock, peer_of(sock, self.users), why)
+        else:
+            self._server.log("error", "session refused", why=error.strerror)
+        with contextlib.suppress(OSError):
+            self._spare = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+        if self._spare < 0:  # the listener stays readable: no spinning
+            self._server.loop.turns.remove(self._listener.fileno())
+            self._server.loop.after(0.2, self.welcome)
 
     def _why_not(self, peer: Peer) -> str:
         """Return why a client is not taken, empty when it is."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import signal
 import socket
 import sys
@@ -24,6 +25,8 @@ from .stop_record import StopRecord
 
 PRIORITY = 50
 """SCHED_FIFO priority of the daemon: that of a driver, so that it gets its turn whenever a tick is done."""
+MOST_FILES = 65536
+"""Descriptors that the daemon asks for, as far as it may: some three for each session and handle."""
 
 
 def serve(config_path: str, given_path: str | None, level: str, process: NurseryProcess) -> int:
@@ -55,6 +58,8 @@ def serve(config_path: str, given_path: str | None, level: str, process: Nursery
         )
         return 1
     _become_prompt(log)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, MOST_FILES)), hard))
     try:
         server = Server(loop, listening, config_path, log, record, process)
     except OSError as error:

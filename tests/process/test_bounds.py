@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -42,6 +43,32 @@ def test_reset_of_a_node_says_so_when_the_workcell_is_stopped(daemon: Daemon, ce
             cell.reset("mod0")
     finally:
         cell.reset()
+
+
+def test_a_client_for_whom_there_is_no_descriptor_is_told_so_and_others_can_stop(
+    daemon: Daemon, cell: sioms.Workcell
+) -> None:
+    axis = cell.open("mod0", "rw")
+    axis.command(velocity=0.01)
+    most = resource.prlimit(daemon.pid, resource.RLIMIT_NOFILE)
+    now = len(os.listdir(f"/proc/{daemon.pid}/fd"))
+    resource.prlimit(daemon.pid, resource.RLIMIT_NOFILE, (now + 6, most[1]))
+    cells: list[sioms.Workcell] = []
+    try:
+        for _ in range(2):  # also when it has been told once
+            with raises(errno.EUSERS, "too many open files in the daemon; raise LimitNOFILE"):
+                for _ in range(8):
+                    cells.append(sioms.Workcell(daemon.socket))
+        assert axis.read()[0].in_motion
+        cell.emergency_stop(why="no descriptors")
+    finally:
+        resource.prlimit(daemon.pid, resource.RLIMIT_NOFILE, most)
+        for other in cells:
+            other.close()
+    wait_for(lambda: not axis.read()[0].in_motion, "rest")
+    cell.reset()
+    sioms.Workcell(daemon.socket).close()
+    axis.close()
 
 
 def test_persisting_markers_are_bounded(daemon: Daemon, cell: sioms.Workcell) -> None:
