@@ -349,8 +349,10 @@ class Cell:
 
     def notice(self, c: int, how: str) -> None:
         session = self._session(c)
-        _serve(self._watched, session.sock.fileno() if how == "socket" else session.pidfd)
-        del self.dead[c]
+        fd = session.sock.fileno() if how == "socket" else session.pidfd
+        while session in self._server.clients.sessions:  # its last words, then its end
+            _serve(self._watched, fd)
+        self.dead.pop(c, None)
 
     def listen(self, d: int) -> None:
         device = self._device(d)
