@@ -35,6 +35,10 @@ BENCHES: dict[str, tuple[str, str]] = {
         "drivers: cycle against the line's speed, streams without loss, stop on a busy line",
     ),
     "tactile": ("tactile", "shape from strain: time of a frame, errors against theory, convergence"),
+    "attack": (
+        "attack",
+        "floods by one user beside victims of another; deaths at random points (--trials 10000)",
+    ),
     "protocol": ("fuzzing", "malformed frames on the sockets of daemon and drivers"),
 }
 """Name of a sub-bench: the module that holds it, as a function of its name, and what it measures."""
