@@ -1,12 +1,16 @@
-"""A driver process that cannot be started because the nursery has just died."""
+"""A driver process that cannot be started: the nursery has just died, no descriptor is left, or the one before lives."""
 
 from __future__ import annotations
 
 import os
 import signal
+import socket
+import subprocess
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
+import pytest
 
 from sioms.daemon.config import Device, DeviceTable
 from sioms.daemon.devices import DriverProcess, State
@@ -31,17 +35,49 @@ class _Owner:
         raise AssertionError(f"{name} is not to be called")
 
 
+def _device(loop: Loop, nursery: Any, owner: Any) -> DriverProcess:
+    common = msgspec.convert({"driver": "sim-io"}, DeviceTable)
+    info = DeviceInfo("io0", "sim-io", (), 100.0, (), 0.1)
+    return DriverProcess(
+        loop, lambda: nursery, Device("io0", common, {}), info, [], owner, lambda *_args, **_fields: None, {}
+    )
+
+
 def test_a_start_that_is_refused_at_once_is_a_death_like_any_other() -> None:
     loop = Loop()
     owner: Any = _Owner()
     nursery = Nursery(loop, lambda _: None)
     os.kill(nursery.pid, signal.SIGKILL)
     os.waitpid(nursery.pid, 0)
-    common = msgspec.convert({"driver": "sim-io"}, DeviceTable)
-    info = DeviceInfo("io0", "sim-io", (), 100.0, (), 0.1)
-    device = DriverProcess(
-        loop, lambda: nursery, Device("io0", common, {}), info, [], owner, lambda *_args, **_fields: None, {}
-    )
+    device = _device(loop, nursery, owner)
     device.start()
     assert device.state is State.RESTARTING and "nursery" in owner.gone[0]
+    loop.close()
+
+
+def test_a_start_without_descriptors_is_a_death_like_any_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop, owner = Loop(), _Owner()
+
+    def none_left(*_: object) -> None:
+        raise OSError(24, "Too many open files")
+
+    device = _device(loop, None, owner)
+    monkeypatch.setattr(socket, "socketpair", none_left)
+    device.start()
+    assert device.state is State.RESTARTING and "Too many open files" in owner.gone[0]
+    loop.close()
+
+
+def test_the_next_process_is_forked_when_the_last_one_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until then it may hold the device."""
+    loop, forked = Loop(), []
+    device = _device(loop, SimpleNamespace(spawn=lambda *_: forked.append(True)), _Owner())
+    monkeypatch.setattr(signal, "pidfd_send_signal", lambda *_: None)  # one that takes long to die
+    with subprocess.Popen(["sleep", "100"]) as last:
+        device._bury(os.pidfd_open(last.pid))
+        device.start()
+        assert not forked
+        last.kill()
+        loop.step()
+        assert forked
     loop.close()
