@@ -52,6 +52,7 @@ from ownership_stand_ins import (
     Flusher,
     Listener,
     Nursery,
+    Patience,
     Process,
     Timer,
     Users,
@@ -551,6 +552,7 @@ def cells() -> Iterator[Callable[[], Cell]]:
         patch.setattr(sioms.daemon.loading, "Nursery", Nursery)
         patch.setattr(sioms.daemon.server, "Nursery", Nursery)
         patch.setattr(sioms.daemon.stop_record, "_Flusher", Flusher)
+        patch.setattr(sioms.daemon.devices, "Patience", Patience)
         patch.setattr(sioms.daemon.suspended, "is_stopped", SUSPENDED.__contains__)
         patch.setattr(sioms.sdk.nursery, "find_driver", lambda name, folder: DRIVERS[name])
         patch.setattr(signal, "pidfd_send_signal", _send_signal)

@@ -223,6 +223,20 @@ class Flusher:
         """Nothing."""
 
 
+class Patience:
+    """Endless: time passes here as the schedule wants."""
+
+    def __init__(self, pid: int, limit_s: float = 0.0) -> None:
+        pass
+
+    def renew(self, now_s: float) -> None:
+        """Nothing."""
+
+    def stuck(self, now_s: float) -> str:
+        """Return that it may go on."""
+        return ""
+
+
 class Listener:
     """A listening socket at which clients wait whom the schedule lets in."""
 
