@@ -1,0 +1,32 @@
+"""Each decoder takes its seeds, what was once found, and random changes of both, without anything but what it may raise."""
+
+from __future__ import annotations
+
+import random
+import time
+
+import pytest
+from fuzz.run import changed
+from fuzz.targets import TARGETS, feed
+
+FOUND: dict[str, list[bytes]] = {
+    "message": [b"\x91" * 30_000, b"\xdd\xff\xff\xff\xff", b"\xc7\x00\x05", b"\x93\x01\x01\xa3\xed\xa0\x80", b"\x92\x01" + b"\x91" * 1015],
+    "toml": [b"x = " + b"[" * 2000, b"x = " + b"9" * 5000, b"\xff"],
+    "json": [b"[" * 100_000, b'{"a":' * 2000],
+    "config": [b"[device.a]\ndriver = 'b'\nx = " + b"[" * 2000 + b"]" * 2000, b"device = 1979-05-27\n", b"[device]\n[[node]]\n"],
+}  # fmt: skip
+"""What broke a decoder, or would have."""
+SPAN_S, MOST = 0.3, 500
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_decoder(name: str) -> None:
+    target, chance = TARGETS[name], random.Random(name)
+    begin = [*target.seeds, *FOUND.get(name, [])]
+    taken = [feed(target, data) for data in begin]
+    assert any(taken), "at least one seed is good"
+    until = time.monotonic() + SPAN_S
+    for _ in range(MOST):
+        feed(target, changed(chance, chance.choice(begin)))
+        if time.monotonic() > until:
+            break
