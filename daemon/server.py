@@ -326,6 +326,16 @@ class Server:
         rights = Rights(plan.config.grants, os.getuid(), self.clients.users)
         for name in rights.unknown:
             self.log("warning", "grant to nobody", who=name, why="not known on this machine, or no answer")
+        if self.config is not None:
+            then, now = self.config.workcell, plan.config.workcell
+            for key in ("socket", "socket_mode", "socket_group"):
+                if getattr(then, key) != getattr(now, key):
+                    self.log(
+                        "warning",
+                        "not taken up",
+                        key=key,
+                        why="it holds from the next start of the daemon on",
+                    )
         names, old = self.names, self._nursery
         self.config, self.names, self._nursery = plan.config, plan.names, plan.nursery
         self._watched_inputs = plan.watched_inputs

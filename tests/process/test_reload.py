@@ -136,3 +136,10 @@ def test_nothing_is_left_of_reloads(daemon: Daemon) -> None:
         wait_for(
             lambda: len(os.listdir(f"/proc/{daemon.pid}/fd")) <= descriptors, "as many descriptors as before"
         )
+
+
+def test_what_holds_from_the_next_start_on_is_told(daemon: Daemon) -> None:
+    daemon.configure(TEXT.replace('name = "test"', 'name = "test"\nsocket_mode = "0600"'))
+    with daemon.cell() as cell:
+        cell.reload()
+    daemon.said('event="not taken up" key=socket_mode')
