@@ -296,8 +296,8 @@ def _trial(
         ].emergency_stop()
         os.kill(pids["mod1"], signal.SIGKILL)
     if kind == "fork server":
-        with contextlib.suppress(OSError, IndexError):
-            os.kill(_fork_server(daemon, set(pids.values())), signal.SIGKILL)
+        for pid in _fork_servers(daemon, {*pids.values()}):
+            os.kill(pid, signal.SIGKILL)
     killed = ["mod0", "mod1"] if kind == "two clients" else ["mod0"]
     begins = {}
     for name in killed:
@@ -324,6 +324,8 @@ def _trial(
 def _is_back(daemon: Daemon, before: int) -> bool:
     with daemon.cell() as cell:
         (device,) = [d for d in cell.status()["devices"] if d["name"] == "mod1"]
+        if device["state"] == "fault":  # it has died too often in short time
+            cell.reset("mod1")
     return device["state"] == "up" and device["pid"] not in (0, before)
 
 
@@ -348,9 +350,10 @@ def _daemon_trial(chance: random.Random) -> int:
         return int("bench" not in kept)
 
 
-def _fork_server(daemon: Daemon, drivers: set[int]) -> int:
+def _fork_servers(daemon: Daemon, drivers: set[int]) -> list[int]:
+    """Return the fork server, if there is one: after its death one is started when it is needed."""
     children = Path(f"/proc/{daemon.pid}/task/{daemon.pid}/children").read_text().split()
-    return next(int(pid) for pid in children if int(pid) not in drivers)
+    return [int(pid) for pid in children if int(pid) not in drivers]
 
 
 def _weight(daemon: Daemon) -> dict[str, int]:
