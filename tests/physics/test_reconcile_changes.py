@@ -119,10 +119,13 @@ def test_a_sagging_supply_beside_friction_is_said_and_not_named() -> None:
     assert next(g for g in verdict.gaps if g.channel == "force, closed loop").closed > 0.9
 
 
-def test_a_change_that_the_axis_does_not_keep_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_change_is_believed_where_the_axis_keeps_it_and_the_loop_is_no_faster(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     quick = Options(pictures=False)
     s = _explained(prepare(drive(picked), AXIS, quick), quick)
     assert _changed(s) is not None
+    assert _changed(replace(s, ready=replace(s.ready, points=True))) is None
 
     def promised(*given: object) -> Course:
         course = settled(*given)  # type: ignore[arg-type]
@@ -130,9 +133,3 @@ def test_a_change_that_the_axis_does_not_keep_is_not_believed(monkeypatch: pytes
 
     monkeypatch.setattr(axis, "settled", promised)
     assert _changed(s) is None
-
-
-def test_between_points_of_a_faster_loop_no_change_is_looked_for() -> None:
-    quick = Options(pictures=False)
-    s = _explained(prepare(drive(picked), AXIS, quick), quick)
-    assert _changed(replace(s, ready=replace(s.ready, points=True))) is None
