@@ -21,10 +21,21 @@ def _group(item: pytest.Item) -> int | None:
     return next((number for number in found if number is not None), 0)
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Let files be handed out in the order of their first tests below, not by how many tests they have."""
+    config.option.loadscopereorder = False
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the tests of one workcell together; those that need none come last."""
-    order = {item: _group(item) for item in items}
-    items.sort(key=lambda item: len(GROUPS) if order[item] is None else order[item])
+    """Begin with the drivers' check, which takes longer than all else and mostly waits; put the tests of one workcell together."""
+
+    def place(item: pytest.Item) -> int:
+        if "shipped" in getattr(item, "fixturenames", ()):
+            return -1
+        group = _group(item)
+        return len(GROUPS) if group is None else group
+
+    items.sort(key=place)
 
 
 class Workcells:

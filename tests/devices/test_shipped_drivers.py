@@ -1,0 +1,54 @@
+"""Every shipped driver passes ``sioms driver check``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from check_rig import run
+from device_rigs import RIGS
+
+from sioms.tools.counterparts.rigs import MAP_RIGS
+
+pytestmark = pytest.mark.timeout(1000)
+
+WIRED = [rig.title for rig in RIGS if rig.line]
+BY_MAP = {rig.driver for rig in MAP_RIGS}
+SHIPPED = [name for name in WIRED if name not in BY_MAP] + [rig.title for rig in MAP_RIGS]
+"""Every driver with a wire; those of register maps by their maps."""
+
+
+@pytest.fixture(scope="module")
+def shipped(request: pytest.FixtureRequest) -> tuple[dict[str, dict[str, Any]], str]:
+    """The drivers that the chosen tests are about, checked side by side: all, or those that failed before."""
+    names = [
+        item.callspec.params["name"]
+        for item in request.session.items
+        if "shipped" in getattr(item, "fixturenames", ())
+    ]
+    _, reports, said = run(*names, "-j", "4")
+    return {report["driver"]: report for report in reports}, said
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_driver_passes(name: str, shipped: tuple[dict[str, dict[str, Any]], str]) -> None:
+    reports, said = shipped
+    assert name in reports, said
+    trials = reports[name]["trials"]
+    failed = [
+        f"{t['name']}: expected {t['expected']}; saw {t['seen']}" for t in trials if t["verdict"] == "FAILED"
+    ]
+    assert not failed, "\n".join(failed)
+    passed = {t["name"] for t in trials if t["verdict"] == "passed"}
+    assert {"random", "kill driver", "kill daemon"} <= passed
+    assert {"missing", "mute", "unplugged"} <= passed
+
+
+@pytest.mark.parametrize("name", ["iio"])
+def test_a_driver_without_a_line_passes(name: str, shipped: tuple[dict[str, dict[str, Any]], str]) -> None:
+    reports, said = shipped
+    verdicts = {t["name"]: t["verdict"] for t in reports[name]["trials"]}
+    assert "FAILED" not in verdicts.values(), said
+    assert {verdicts[name] for name in ("golden", "timing", "unplugged", "kill driver", "kill daemon")} == {
+        "passed"
+    }
