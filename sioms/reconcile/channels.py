@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
+from scipy.signal import lfilter
 
 from sioms.reconcile.effect import Array
 from sioms.reconcile.errors import BadInputError
@@ -151,12 +152,10 @@ def drive_output(force: Array, delay: float, lag: float, limit: float, dt: float
     held = np.concatenate([np.zeros(k + 1), force])
     u = (1.0 - part) * held[1 : len(force) + 1] + part * held[: len(force)]
     if lag > 0.0:
-        decay, out, state = np.exp(-dt / lag), np.empty_like(u), 0.0
+        decay = float(np.exp(-dt / lag))
         share = (1.0 - decay) * lag / dt
-        for i, goal in enumerate(u):
-            out[i] = goal + (state - goal) * share
-            state = goal + (state - goal) * decay
-        u = out
+        state: Array = np.asarray(lfilter([0.0, 1.0 - decay], [1.0, -decay], u))  # at each sample's start
+        u = u + (state - u) * share
     limited: Array = np.clip(u, -limit, limit)
     return limited
 
