@@ -146,13 +146,14 @@ def _guarded(name: str, module: Any, args: argparse.Namespace) -> int:
         )
         return 1
     except OSError as error:
-        if error.errno == errno.EBADF and not error.filename:
+        if error.errno in (errno.EBADF, errno.ENOSPC) and not error.filename:
             error.strerror = f"write standard output: {(error.strerror or '').lower()}"
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
             sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # nothing is flushed at exit
         text = error.strerror or str(error)
-        where = f": {error.filename}" if error.filename else ""
-        print(f"sioms {name}: {text}{where}", file=sys.stderr)
+        if error.filename:  # what the system has refused
+            text = f"{error.filename}: {text.lower()}"
+        print(f"sioms {name}: {text}", file=sys.stderr)
         return 1
 
 

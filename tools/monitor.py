@@ -1,7 +1,7 @@
 """``sioms monitor``: a live view of all nodes in a terminal, with the emergency stop on a key.
 
 A thread of its own asks the daemon, so that a daemon that hangs delays neither the picture nor the
-stop. Values come out of the shared pages. When standard output is no terminal, one picture is printed.
+stop. Values come out of the shared pages. When standard output is no terminal, or a dumb one, one picture is printed.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
         watch.ask()
         if watch.cell is not None and (unknown := watch.unknown()):
             raise OSError(errno.ENOENT, f"no such node: {', '.join(unknown)}; `sioms list -v` lists all")
-    if not sys.stdout.isatty() or not sys.stdin.isatty():
+    if not _can_paint():
         watch.ask()
         if watch.cell is None:
             raise OSError(watch.lost)
@@ -70,6 +70,11 @@ def run(args: argparse.Namespace) -> int:
         Monitor(watch).go_on()
     watch.ended.set()
     return 0
+
+
+def _can_paint() -> bool:
+    """Tell whether there is a terminal with keys and a cursor that can be placed."""
+    return sys.stdout.isatty() and sys.stdin.isatty() and os.environ.get("TERM") != "dumb"
 
 
 class Watch:

@@ -23,6 +23,7 @@ from _socket import (
     socket,
 )
 from _thread import allocate_lock
+from stat import S_ISSOCK
 from struct import pack, unpack
 from time import monotonic
 
@@ -128,12 +129,16 @@ def connect(path: str, timeout_s: float = CONNECT_S) -> socket:
         ) from None
     except OSError as error:
         sock.close()
+        number = error.errno or errno.ENAMETOOLONG  # Python itself refuses a path that no address holds
         hint = {
             errno.ENOENT: "no daemon listens there; start one with `siomsd --config FILE`, or name its socket in SIOMS_SOCKET",
             errno.ECONNREFUSED: "the daemon that made this socket is gone; start one with `siomsd --config FILE`",
             errno.EACCES: "no permission; ask to be put into the group of the socket",
-        }.get(error.errno or 0, os.strerror(error.errno or errno.EIO).lower())
-        raise OSError(error.errno, f"connect to {path}: {hint}") from None
+            errno.ENAMETOOLONG: "the path of a socket has at most 107 bytes",
+        }.get(number, os.strerror(number).lower())
+        if number == errno.ECONNREFUSED and not _is_socket(path):
+            hint = "that is no socket; name the daemon's in SIOMS_SOCKET"
+        raise OSError(number, f"connect to {path}: {hint}") from None
     uid = unpack("3i", sock.getsockopt(SOL_SOCKET, SO_PEERCRED, 12))[1]
     if not may_serve(uid, path):
         sock.close()
@@ -143,6 +148,13 @@ def connect(path: str, timeout_s: float = CONNECT_S) -> socket:
             "daemon for others has its socket in a folder of its own user, as /run/sioms",
         )
     return sock
+
+
+def _is_socket(path: str) -> bool:
+    try:
+        return S_ISSOCK(os.stat(path).st_mode)
+    except OSError:
+        return True  # it has just gone
 
 
 def _fds_of(ancillary: list[tuple[int, int, bytes]]) -> list[int]:

@@ -179,6 +179,23 @@ def test_a_daemon_that_lets_nobody_in_is_not_waited_for_long(short_folder: Path)
             sock.close()
 
 
+@pytest.mark.parametrize(
+    ("name", "number", "told"),
+    [
+        ("x" * 120, errno.ENAMETOOLONG, "at most 107 bytes"), ("no socket", errno.ECONNREFUSED, "that is no socket"),
+        ("nothing", errno.ENOENT, "no daemon listens there"),
+    ],
+)  # fmt: skip
+def test_what_is_no_daemons_socket_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, number: int, told: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("no socket").write_text("")
+    with pytest.raises(OSError, match=told) as refused:
+        connect(name)
+    assert refused.value.errno == number
+
+
 def test_take_does_not_wait(peer: Peer) -> None:
     assert peer.channel.take() is None
     number = peer.channel.send(Call("ask", HandleVerb.SUBSCRIBE, 1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from tool_rig import AXES, node_info, snapshot
 
 from sioms.protocol.flags import AnalogStatus, AxisStatus, NodeClass
+from sioms.tools import monitor
 from sioms.tools.monitor_events import History
 from sioms.tools.monitor_view import JOG_KEYS, KEYS, NodeView, Style, View, body, head, page, screen
 
@@ -179,3 +181,11 @@ def test_history_tells_what_came_and_what_went_but_not_of_what_cannot_be_seen():
         f"4 mod0.{AXES[3]}: good again",
     }
     assert len(history.lines) == 6
+
+
+@pytest.mark.parametrize(("term", "paints"), [("xterm", True), ("dumb", False)])
+def test_a_dumb_terminal_is_not_painted(monkeypatch: pytest.MonkeyPatch, term: str, paints: bool) -> None:
+    terminal = SimpleNamespace(isatty=lambda: True)
+    monkeypatch.setattr("sioms.tools.monitor.sys", SimpleNamespace(stdout=terminal, stdin=terminal))
+    monkeypatch.setenv("TERM", term)
+    assert monitor._can_paint() is paints
