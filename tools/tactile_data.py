@@ -84,7 +84,7 @@ def _opened(path: Path) -> dict[str, Any]:
 
 def _words(error: BaseException) -> str:
     if isinstance(error, KeyError):
-        return f"{error.args[0]}; want at least raw and time, with touches also cmd_theta, cmd_P and cmd_rc"
+        return f"{error.args[0]} is missing; want at least raw and time, with touches also cmd_theta, cmd_P and cmd_rc"
     return str(error)
 
 

@@ -152,6 +152,7 @@ def test_an_installed_wheel_finds_the_files_of_its_service(built, tmp_path):
     shutil.move(libraries / "sioms-0.1.0.data" / "data" / "share", tmp_path / "venv" / "share")
     (libraries / "others.pth").write_text("\n".join(p for p in sys.path if p.endswith("site-packages")))
     root = tmp_path / "root"
+    root.mkdir()
     code = f"from sioms.tools.front import main; raise SystemExit(main(['service', 'install', '--root', {str(root)!r}]))"
     done = subprocess.run(
         [tmp_path / "venv" / "bin" / "python3", "-P", "-c", code], cwd="/", capture_output=True, text=True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -25,9 +26,8 @@ def test_the_examples_of_all_drivers_are_a_good_configuration() -> None:
     text = Path(init.__file__).with_name("starter_simulated.toml").read_text()
     for i, driver in enumerate(DRIVERS):
         assert f'driver = "{driver}"' in init.example(driver)
-        text += (
-            "\n" + stanza(init.example(driver), None, f"d{i}").replace('"mod0.plant.', '"arm0.plant.') + "\n"
-        )
+        lines = stanza(init.example(driver), None, f"d{i}").replace('"mod0.plant.', '"arm0.plant.')
+        text += "\n" + re.sub(r"/dev/tty(USB|ACM)0", rf"/dev/tty\g<1>{i}", lines) + "\n"  # a port each
     Path("all.toml").write_text(text)
     assert init.check(Path("all.toml")) == 0
 

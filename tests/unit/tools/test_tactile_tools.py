@@ -191,7 +191,7 @@ def test_calibrate_names_what_is_wrong(
     assert f"read {empty / 'bad.npz'}: this is no npz archive" in capsys.readouterr().err
     np.savez(empty / "bad.npz", output=np.zeros((3, 16)), time=np.zeros(3))
     assert command("calibrate", str(empty)) == 1
-    assert "raw is not a file in the archive; want at least raw and time" in capsys.readouterr().err
+    assert "raw is missing; want at least raw and time" in capsys.readouterr().err
     (empty / "nominal.json").write_text('{"ra_mm": "9.6"}')
     assert command("calibrate", str(empty)) == 1
     assert "nominal.json: " in capsys.readouterr().err
