@@ -71,15 +71,20 @@ def integer(what: str, value: Any, want: str = "an integer", *, flags: bool = Fa
         what: what was attempted, for the message.
         value: given by the caller: an integer, or what stands for one, as a marker does.
         want: what would be right.
-        flags: whether True and False count as 1 and 0.
+        flags: whether True and False count as 1 and 0, and a floating-point number as the whole number that it is.
 
     Raises:
         TypeError: it is none.
         ValueError: it has more bits.
     """
+    real = hasattr(value, "__float__") and not _is_array(value)
     if hasattr(value, "__index__") and (flags or not isinstance(value, bool)) and not _is_array(value):
         found = index(value)
-    elif hasattr(value, "__int__") and not hasattr(value, "__float__"):
+    elif (
+        float(value).is_integer()
+        if flags and real
+        else hasattr(value, "__int__") and not hasattr(value, "__float__")
+    ):
         found = int(value)
     else:
         raise _wrong(what, value, want)
