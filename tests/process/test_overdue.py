@@ -69,7 +69,7 @@ def test_blocking(peer: tuple[str, Channel, socket.socket], threads: int) -> Non
     def ask() -> None:
         began = time.monotonic()
         try:
-            outcome: object = channel.call(Call("ask", 1)).value
+            outcome: object = channel.call(Call("ask", HandleVerb.KEEPALIVE)).value
         except OSError as error:
             outcome = error
         outcomes.append((outcome, time.monotonic() - began))
@@ -92,7 +92,7 @@ def test_asyncio(peer: tuple[str, Channel, socket.socket]) -> None:
         requests = _Requests(channel, HandleVerb.CANCEL)
         began = time.monotonic()
         try:
-            outcome: object = (await requests.call(Call("ask", 1))).value
+            outcome: object = (await requests.call(Call("ask", HandleVerb.KEEPALIVE))).value
         except OSError as error:
             outcome = error
         took_s = time.monotonic() - began
