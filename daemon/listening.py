@@ -12,6 +12,8 @@ import stat
 from contextlib import suppress
 from pathlib import Path
 
+from sioms.protocol.socketpath import own_path
+
 
 class Listening:
     """A socket that clients can connect to, and the lock that keeps other daemons away from it.
@@ -25,7 +27,8 @@ class Listening:
         group: whose it is, '' for the daemon's own.
 
     Raises:
-        OSError: another daemon serves there, or the socket cannot be made, with a sentence.
+        OSError: another daemon serves there, or the socket cannot be made, with a sentence; of a path that somebody has
+            chosen the folder must be there.
 
     Attributes:
         sock: the socket, listening.
@@ -35,7 +38,12 @@ class Listening:
     def __init__(self, path: str, mode: int, group: str) -> None:
         self.path = path
         folder = os.path.dirname(path) or "."
-        os.makedirs(folder, mode=0o755, exist_ok=True)
+        if path == own_path():
+            os.makedirs(folder, mode=0o755, exist_ok=True)
+        elif not os.path.isdir(folder):
+            raise OSError(
+                errno.ENOENT, f"{path}: there is no folder {folder}; make it or choose another path"
+            )
         _check_folder(folder)
         self._lock = _lock(path + ".lock", path)
         try:

@@ -16,6 +16,7 @@ import pytest
 
 from sioms.client.channel import connect
 from sioms.daemon.listening import Listening
+from sioms.protocol.socketpath import own_path
 from sioms.protocol.stopfile import open_stop_request
 
 NOBODY = 65534
@@ -55,6 +56,21 @@ def test_who_comes_second_is_refused_and_told_who_is_first(path: str) -> None:
     refused(path, errno.EADDRINUSE, "another daemon")
     first.close()
     Listening(path, 0o660, "").close()
+
+
+def test_a_folder_that_somebody_has_mistyped_is_not_made(
+    short_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    missing = short_folder / "missing"
+    with pytest.raises(
+        OSError, match=f"there is no folder {missing}; make it or choose another path"
+    ) as caught:
+        Listening(f"{missing}/d.sock", 0o660, "")
+    assert caught.value.errno == errno.ENOENT and not missing.exists()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(missing))
+    listening = Listening(own_path(), 0o660, "")
+    assert os.listdir(missing) == ["sioms"]
+    listening.close()
 
 
 def test_what_a_dead_daemon_has_left_is_taken_over(path: str) -> None:
