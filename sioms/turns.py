@@ -7,6 +7,7 @@ Concurrency: one thread, that of the process that serves.
 
 from __future__ import annotations
 
+import os
 import select
 import time
 from collections.abc import Callable, Hashable
@@ -21,15 +22,17 @@ class _Source:
     """The connections of one source.
 
     Attributes:
-        waiting: epoll of its connections; the kernel passes them round.
+        fd: what the loop waits for: its one connection, or ``waiting``.
+        waiting: epoll of several connections; the kernel passes them round.
         used_ns: virtual time up to which it has been served.
     """
 
-    __slots__ = ("callbacks", "kind", "used_ns", "waiting")
+    __slots__ = ("callbacks", "fd", "kind", "used_ns", "waiting")
 
     def __init__(self, kind: int) -> None:
         self.kind = kind
-        self.waiting = select.epoll()
+        self.fd = -1
+        self.waiting: select.epoll | None = None
         self.callbacks: dict[int, Callback] = {}
         self.used_ns = 0
 
@@ -40,9 +43,13 @@ class Turns:
     Args:
         epoll: that of the loop; an event of it that ``mark`` knows is a source with packets.
         shares: of every window, by the kind of source, in the order in which kinds come first.
+
+    Attributes:
+        gives_way: whether processes of the same real-time priority may run after every packet.
     """
 
     def __init__(self, epoll: select.epoll, shares: tuple[float, ...]) -> None:
+        self.gives_way = False
         self._epoll = epoll
         self._budgets_ns = [int(share * WINDOW_NS) for share in shares]
         self._left_ns = list(self._budgets_ns)
@@ -68,25 +75,44 @@ class Turns:
         found = self._sources.get(key)
         if found is None:
             found = self._sources[key] = _Source(kind)
-            self._by_fd[found.waiting.fileno()] = found
-            self._epoll.register(found.waiting.fileno(), select.EPOLLIN)
-        found.waiting.register(fd, select.EPOLLIN)
         found.callbacks[fd] = callback
         self._of[fd] = (key, found)
+        if found.waiting is not None:
+            found.waiting.register(fd, select.EPOLLIN)
+            return
+        if found.fd < 0:
+            self._wait_for(found, fd)
+            return
+        found.waiting = select.epoll()
+        for each in found.callbacks:
+            found.waiting.register(each, select.EPOLLIN)
+        self._wait_no_more(found)
+        self._wait_for(found, found.waiting.fileno())
+
+    def _wait_for(self, source: _Source, fd: int) -> None:
+        source.fd = fd
+        self._by_fd[fd] = source
+        self._epoll.register(fd, 0 if source in self._paused else select.EPOLLIN)
+
+    def _wait_no_more(self, source: _Source) -> None:
+        self._epoll.unregister(source.fd)
+        del self._by_fd[source.fd]
 
     def remove(self, fd: int) -> bool:
         """Serve a connection no more; call before closing it. Returns whether it was served."""
         key, source = self._of.pop(fd, (None, None))
         if source is None:
             return False
-        source.waiting.unregister(fd)
         del source.callbacks[fd]
+        if source.waiting is not None:
+            source.waiting.unregister(fd)
         if not source.callbacks:
-            self._epoll.unregister(source.waiting.fileno())
-            del self._sources[key], self._by_fd[source.waiting.fileno()]
+            self._wait_no_more(source)
+            del self._sources[key]
             self._ready = [other for other in self._ready if other is not source]
             self._paused = [other for other in self._paused if other is not source]
-            source.waiting.close()
+            if source.waiting is not None:
+                source.waiting.close()
         return True
 
     def mark(self, fd: int) -> None:
@@ -115,21 +141,26 @@ class Turns:
         source = ready[0] if len(ready) == 1 else min(ready, key=lambda s: (s.kind, s.used_ns))
         ready.clear()
         self._now_ns = max(source.used_ns, self._now_ns)
-        spent_ns = time.thread_time_ns()  # what others of this processor took meanwhile is not the source's
-        for fd, _ in source.waiting.poll(0, 1):
-            source.callbacks[fd]()
-        took_ns = time.thread_time_ns() - spent_ns
+        if source.waiting is None:
+            source.callbacks[source.fd]()
+        else:
+            for fd, _ in source.waiting.poll(0, 1):
+                source.callbacks[fd]()
+        # Beyond a window, others of this processor have had it meanwhile.
+        took_ns = min(time.monotonic_ns() - began_ns, WINDOW_NS)
         source.used_ns = self._now_ns + took_ns
         self._left_ns[source.kind] -= took_ns
         if self._left_ns[source.kind] <= 0:
             for other in self._sources.values():
                 if other.kind == source.kind and other not in self._paused:
                     self._paused.append(other)
-                    self._epoll.modify(other.waiting.fileno(), 0)
+                    self._epoll.modify(other.fd, 0)
+        if self.gives_way:
+            os.sched_yield()
 
     def _open_window(self, now_ns: int) -> None:
         self._window_ns = now_ns
         self._left_ns[:] = self._budgets_ns
         for source in self._paused:
-            self._epoll.modify(source.waiting.fileno(), select.EPOLLIN)
+            self._epoll.modify(source.fd, select.EPOLLIN)
         self._paused.clear()

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 OWNERS, READERS = 0, 1
-SHARES = (0.5, 0.125)
+SHARES = (0.85, 0.125)
 """Of its time, what a driver spends at most on the requests of who owns outputs, and on those of all others."""
 
 

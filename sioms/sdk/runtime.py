@@ -277,6 +277,7 @@ class Runtime:
         refused = become_realtime(priority, self._gave_up_realtime)
         if refused:
             self.log("debug", "runs without " + ", ".join(refused))
+        self.turns.gives_way = os.sched_getscheduler(0) == os.SCHED_FIFO
         status = 0
         try:
             self.start()

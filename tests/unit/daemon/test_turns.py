@@ -14,8 +14,7 @@ class Server:
 
     def __init__(self, monkeypatch, shares=(0.5, 0.125)):
         self.now_ns, self.cost_ns = 10**9, 20_000
-        for clock in ("monotonic_ns", "thread_time_ns"):
-            monkeypatch.setattr(turns.time, clock, lambda: self.now_ns)
+        monkeypatch.setattr(turns.time, "monotonic_ns", lambda: self.now_ns)
         self.epoll = select.epoll()
         self.turns = Turns(self.epoll, shares)
         self.served = []
