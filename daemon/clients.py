@@ -15,9 +15,9 @@ import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from sioms.protocol import verbs
 from sioms.protocol.flags import Right
-from sioms.protocol.incoming import FROM_CLIENT, take
-from sioms.protocol.messages import MAX_PACKET, ClientVerb, MalformedMessage, refusal, reply
+from sioms.protocol.messages import MAX_PACKET, MalformedMessage, refusal, reply
 
 from .config import QuotaTable, WorkcellTable
 from .marker_owners import MarkerError
@@ -34,23 +34,7 @@ if TYPE_CHECKING:
 
 STATUS_NS = 20_000_000
 """How old what STATUS tells may be while nobody asks for anything else."""
-_QUERIES = frozenset({ClientVerb.HELLO, ClientVerb.LIST, ClientVerb.INFO, ClientVerb.STATUS})
 LONGEST_WAIT_S = 7 * 24 * 3600.0
-_SHOWN = frozenset(
-    {
-        ClientVerb.EMERGENCY_STOP, ClientVerb.RESET, ClientVerb.SIGNAL_MARKER, ClientVerb.FREE_MARKER,
-        ClientVerb.WAIT_MARKER, ClientVerb.CLOSE,
-    }
-)  # fmt: skip
-"""What readings of nodes show: who has the answer shall read nothing older."""
-
-
-_NEEDS_ANY_RIGHT = {
-    ClientVerb.RESERVE_MARKER: "reserve markers",
-    ClientVerb.SIGNAL_MARKER: "signal a marker",
-    ClientVerb.WAIT_MARKER: "wait for a marker",
-}
-"""Requests on what belongs to no node: of anybody who may do something here."""
 
 
 class Clients:
@@ -183,7 +167,7 @@ class Clients:
             self._end_session(session, "")
             return
         try:
-            self._dispatch(session, *take(packet, FROM_CLIENT))
+            self._dispatch(session, *verbs.take(packet, verbs.FROM_CLIENT, pending=session.waits))
         except MalformedMessage as error:
             self._end_session(session, str(error))
         except Exception as error:  # our own mistake costs one session, not the workcell
@@ -192,61 +176,60 @@ class Clients:
             if session in self.sessions:
                 self._end_session(session, f"internal error: {error!r}")
 
-    def _dispatch(self, session: Session, of_client: int, number: int, arguments: list[Any]) -> None:
-        verb = ClientVerb(of_client)
+    def _dispatch(self, session: Session, number: int, message: verbs.Message) -> None:
         if session.greeting is not None:
             session.greeting.cancel()
             session.greeting = None
-        if verb not in _QUERIES:
+        if not message.query:
             self._changed()
         if starting := self._server.starting:
             text = f"connect: the daemon is starting: {starting}; `sioms wait` waits until it is ready"
             self.send(session, refusal(number, errno.EAGAIN, text))
             return
-        if number == 0 or number in session.waits:
-            raise MalformedMessage(f"message number {number} is zero or in use")
         try:
-            value = self._verb(session, verb, number, arguments)
+            value = self._serve(session, number, message)
         except (Refused, MarkerError) as error:
             # Also then: who closes a handle that its driver has ended already shall see the axes halted.
-            self.send(session, refusal(number, error.errno, str(error), _as_of_ns(verb)))
+            self.send(session, refusal(number, error.errno, str(error), _as_of_ns(message)))
         else:
             if value is not LATER:
-                self.send(session, reply(number, value, _as_of_ns(verb)))
+                self.send(session, reply(number, value, _as_of_ns(message)))
 
-    def _verb(self, session: Session, verb: ClientVerb, number: int, arguments: list[Any]) -> Any:
-        if verb in _NEEDS_ANY_RIGHT and not self.rights.anywhere(session.peer):
-            what = f"{_NEEDS_ANY_RIGHT[verb]}: {session.peer.user}"
+    def _serve(self, session: Session, number: int, message: verbs.Message) -> Any:
+        if message.somewhere and not self.rights.anywhere(session.peer):
+            what = f"{message.somewhere}: {session.peer.user}"
             raise Refused(errno.EPERM, f"{what} has no right on any node; ask for a [[grant]]")
-        match verb:
-            case ClientVerb.HELLO:
-                return self._workcell.hello(session, number, *arguments)
-            case ClientVerb.OPEN:
-                return self.nodes.open(session, number, *arguments)
-            case ClientVerb.CLOSE:
-                return self.nodes.close(session, number, *arguments)
-            case ClientVerb.LIST:
+        match message:
+            case verbs.Hello():
+                return self._workcell.hello(session, number, message)
+            case verbs.Open():
+                return self.nodes.open(session, number, message)
+            case verbs.Close(handle):
+                return self.nodes.close(session, number, handle)
+            case verbs.List():
                 return self.nodes.listing(session)
-            case ClientVerb.INFO:
-                return self._server.names.pack(self.nodes.find(session, "get information", *arguments))
-            case ClientVerb.STATUS:
+            case verbs.Info(node, right=right):
+                return self._server.names.pack(self.nodes.find(session, "get information", node, right))
+            case verbs.Status():
                 return self._status_now()
-            case ClientVerb.RESERVE_MARKER:
-                return self.markers.reserve(session, *arguments)
-            case ClientVerb.FREE_MARKER:
-                return self.markers.free(*arguments)
-            case ClientVerb.SIGNAL_MARKER:
-                return self.markers.signal(*arguments)
-            case ClientVerb.WAIT_MARKER:
-                return self.markers.wait(session, number, *arguments)
-            case ClientVerb.EMERGENCY_STOP:
-                return self._workcell.emergency_stop(session, *arguments)
-            case ClientVerb.RESET:
-                return self._workcell.reset(session, *arguments)
-            case ClientVerb.RELOAD:
-                return self._workcell.reload(session, number)
-            case ClientVerb.CANCEL:
-                return self._cancel(session, *arguments)
+            case verbs.ReserveMarker(how_many, persist):
+                return self.markers.reserve(session, how_many, persist)
+            case verbs.FreeMarker(token):
+                return self.markers.free(token)
+            case verbs.SignalMarker(token):
+                return self.markers.signal(token)
+            case verbs.WaitMarker(marker, timeout_s):
+                return self.markers.wait(session, number, marker, timeout_s)
+            case verbs.EmergencyStop():
+                return self._workcell.emergency_stop(session, message)
+            case verbs.Reset():
+                return self._workcell.reset(session, message)
+            case verbs.Reload():
+                return self._workcell.reload(session, number, message)
+            case verbs.Cancel(waiting):
+                return self._cancel(session, waiting)
+            case _:
+                raise NotImplementedError(f"{type(message).__name__} is not served")
 
     def _status_now(self) -> dict[str, object]:
         """Return what STATUS tells: worked out anew when something has been asked for, else once in a while."""
@@ -329,13 +312,13 @@ class Clients:
         )
 
     def _cancel(self, session: Session, number: int) -> bool:
-        wait = session.waits.get(int(number))
+        wait = session.waits.get(number)
         if wait is None:
             return False
         self.answer(wait, refusal(wait.number, errno.ECANCELED, f"{wait.what}: cancelled"))
         return True
 
 
-def _as_of_ns(verb: ClientVerb) -> int:
+def _as_of_ns(message: verbs.Message) -> int:
     """Return the instant at which a request had its effect on what readings show: now, or never."""
-    return time.monotonic_ns() if verb in _SHOWN else 0
+    return time.monotonic_ns() if message.shown else 0

@@ -15,10 +15,11 @@ from enum import Enum
 from functools import partial
 from typing import Any, Protocol
 
+from sioms.protocol.driver_verbs import FROM_DRIVER, LinkChanged, Ready, Shutdown
 from sioms.protocol.flags import PageState
-from sioms.protocol.incoming import FROM_DRIVER, take
-from sioms.protocol.messages import MAX_PACKET, DriverVerb, MalformedMessage, encode
+from sioms.protocol.messages import MAX_PACKET, MalformedMessage
 from sioms.protocol.page import NotReadable, PageReader, set_daemon_state
+from sioms.protocol.verbs import Message, take
 
 from .config import Device
 from .loop import Loop, Timer
@@ -59,7 +60,7 @@ class Owner(Protocol):
     def stopped_of(self, device: str) -> list[list[Any]]:
         """Return what of a device is stopped and must be so from its driver's start."""
 
-    def device_message(self, device: DriverProcess, verb: DriverVerb, arguments: list[Any]) -> None:
+    def device_message(self, device: DriverProcess, message: Message) -> None:
         """The driver tells something."""
 
 
@@ -192,7 +193,7 @@ class DriverProcess:
             self._then = None
             then()
 
-    def send(self, verb: DriverVerb, *arguments: object, fds: Sequence[int] = ()) -> None:
+    def send(self, message: Message, fds: Sequence[int] = ()) -> None:
         """Send a notice to the driver.
 
         Raises:
@@ -201,18 +202,20 @@ class DriverProcess:
         if self._sock is None:
             raise OSError(errno.EIO, f"device {self.name} is {self.state.value}: {self.reason}")
         try:
-            socket.send_fds(self._sock, [encode(verb, 0, *arguments)], list(fds))
+            socket.send_fds(self._sock, [message.packed()], list(fds))
         except OSError as error:
             raise OSError(
                 errno.EIO, f"driver of {self.name} does not take messages: {error.strerror}"
             ) from None
 
-    def tell(self, verb: DriverVerb, *arguments: object) -> None:
+    def tell(self, message: Message) -> None:
         """Send a notice; a driver that cannot take it will be found dead or hung anyway."""
         try:
-            self.send(verb, *arguments)
+            self.send(message)
         except OSError as error:
-            self._log("warning", "notice lost", device=self.name, verb=verb.name, why=error.strerror)
+            self._log(
+                "warning", "notice lost", device=self.name, verb=type(message).__name__, why=error.strerror
+            )
 
     def why_unreadable(self, block: int) -> str:
         """Return why readers of a block are refused, empty when they are not."""
@@ -259,7 +262,7 @@ class DriverProcess:
             self._when_gone(done)
             return
         self.state = State.ENDING
-        self.tell(DriverVerb.SHUTDOWN)
+        self.tell(Shutdown())
         self._timer = self._loop.after(_SHUTDOWN_S, lambda: self.kill("it did not end when asked to"))
 
     def _receive(self) -> None:
@@ -281,21 +284,20 @@ class DriverProcess:
         if not packet:
             return False
         try:
-            of_driver, _, arguments = take(packet, FROM_DRIVER)
-            verb = DriverVerb(of_driver)
+            _, message = take(packet, FROM_DRIVER, state=self.state.value)
         except MalformedMessage as error:
             for fd in fds:
                 os.close(fd)
             self.kill(f"its driver sent a malformed message: {error}")
             return None
-        if verb is DriverVerb.READY:
+        if isinstance(message, Ready):
             self._ready(fds)
             return True
         for fd in fds:
             os.close(fd)
-        if verb is DriverVerb.LINK:
-            self.link = (PageState(arguments[0]), arguments[1])
-        self._owner.device_message(self, verb, arguments)
+        if isinstance(message, LinkChanged):
+            self.link = (PageState(message.state), message.reason)
+        self._owner.device_message(self, message)
         return True
 
     def _ready(self, fds: list[int]) -> None:

@@ -13,8 +13,9 @@ import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
+from sioms.protocol.driver_verbs import Attach, Detach
 from sioms.protocol.flags import Access, Right
-from sioms.protocol.messages import DriverVerb, refusal, reply
+from sioms.protocol.messages import refusal, reply
 from sioms.wording import did_you_mean
 
 from .claims import Claims
@@ -25,6 +26,8 @@ from .sessions import LATER, Handle, Refused, Session, Wait
 from .suspended import Suspended
 
 if TYPE_CHECKING:
+    from sioms.protocol.verbs import Open
+
     from .clients import Clients
     from .server import Server
 
@@ -72,10 +75,9 @@ class NodeVerbs:
             )
         return node
 
-    def open(
-        self, session: Session, number: int, name: str, mode: int, timeout_s: float | None, lease_s: float
-    ) -> Any:
+    def open(self, session: Session, number: int, message: Open) -> Any:
         """Open a node, at once or when it becomes free."""
+        name, mode, timeout_s, lease_s = message
         node = self._openable(session, name)
         if not 1 <= mode <= 3:
             raise Refused(errno.EINVAL, f"open {name}: mode {mode}; want read (1), write (2) or both (3)")
@@ -177,9 +179,12 @@ class NodeVerbs:
             exclusive = not node.read_only
             try:
                 device.send(
-                    DriverVerb.ATTACH, handle.number, node.block, node.channels, node.bit, int(access), exclusive,
-                    int(rights), int(lease_s * 1e9), str(session), session.peer.uid,
-                    self._clients.quotas.of_device(session.peer.uid), node.name, fds=fds,
+                    Attach(
+                        handle.number, node.block, node.channels, node.bit, int(access), exclusive,
+                        int(rights), int(lease_s * 1e9), str(session), session.peer.uid,
+                        self._clients.quotas.of_device(session.peer.uid), node.name,
+                    ),
+                    fds,
                 )  # fmt: skip
             except OSError as error:
                 raise Refused(errno.EIO, f"open {node.name}: {error.strerror}") from None
@@ -268,7 +273,7 @@ class NodeVerbs:
 
     def _order_end(self, device: DriverProcess, handle: Handle, errno_: int, text: str) -> None:
         try:
-            device.send(DriverVerb.DETACH, handle.number, errno_, text)
+            device.send(Detach(handle.number, errno_, text))
         except OSError:
             if device.is_there and device.generation == handle.generation:
                 self._server.loop.after(_AGAIN_S, lambda: self._order_end(device, handle, errno_, text))

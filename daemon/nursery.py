@@ -13,7 +13,9 @@ import socket
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sioms.protocol.messages import MAX_PACKET, MalformedMessage, NurseryVerb, decode_reply, encode
+from sioms.protocol.driver_verbs import Describe, Spawn
+from sioms.protocol.messages import MAX_PACKET, MalformedMessage, decode_reply
+from sioms.protocol.verbs import Message
 
 from .loop import Loop
 from .nursery_process import NurseryProcess, start_nursery
@@ -53,14 +55,14 @@ class Nursery:
         self, device: str, driver: str, settings: dict[str, Any], folder: str, answer: Answer
     ) -> None:
         """Validate a device's settings and describe its blocks."""
-        self._request(answer, [], NurseryVerb.DESCRIBE, device, driver, settings, folder)
+        self._request(answer, [], Describe(device, driver, settings, folder))
 
     def spawn(
         self, device: str, driver: str, settings: dict[str, Any], generation: int, options: dict[str, Any],
         fds: Sequence[int], answer: Answer,
     ) -> None:  # fmt: skip
         """Fork a driver process; answers with its pid and a descriptor of it."""
-        self._request(answer, fds, NurseryVerb.SPAWN, device, driver, settings, generation, options)
+        self._request(answer, fds, Spawn(device, driver, settings, generation, options))
 
     def close(self) -> None:
         """End the nursery, also one that is stuck; the drivers it forked live on."""
@@ -80,9 +82,9 @@ class Nursery:
         if self._sock.fileno() >= 0:
             self._end()
 
-    def _request(self, answer: Answer, fds: Sequence[int], verb: NurseryVerb, *arguments: object) -> None:
+    def _request(self, answer: Answer, fds: Sequence[int], message: Message) -> None:
         self._number += 1
-        packet = encode(verb, self._number, *arguments)
+        packet = message.packed(self._number)
         if len(packet) > MAX_PACKET:
             answer(None, 7, f"settings of {len(packet)} bytes; want at most {MAX_PACKET}", [])
             return

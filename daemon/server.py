@@ -13,9 +13,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from sioms.protocol import driver_verbs
 from sioms.protocol.flags import PageState
-from sioms.protocol.messages import DriverVerb
 from sioms.protocol.stopjournal import node_entry, parts_of, workcell_entry
+from sioms.protocol.verbs import Message
 
 from . import suspended
 from .clients import Clients
@@ -172,7 +173,7 @@ class Server:
             self.log("warning", "emergency stop", source=source)
             latch.name_source(source)  # drivers see the request page before the message that says who
         for device in self.devices.values():
-            device.tell(DriverVerb.STOP_CHANGED)
+            device.tell(driver_verbs.StopChanged())
         self.shared.record.look()
         if not known or not self.shared.record.state.workcell:
             self._note(workcell_entry(source, stop=True, named=True))
@@ -198,7 +199,7 @@ class Server:
         self.log("warning", "reset", by=who)
         for device in self.devices.values():
             device.trouble = ""
-            device.tell(DriverVerb.STOP_CHANGED)
+            device.tell(driver_verbs.StopChanged())
             device.reset()
         for device in self.devices.values():
             self._look_at_stop_inputs(device)  # as one that is still pressed, it stops the workcell again
@@ -210,7 +211,7 @@ class Server:
             OSError: EIO, its driver takes no messages: it will be stopped when it is started again.
         """
         try:
-            self._order(node, DriverVerb.NODE_STOP, source)
+            self._order(node, driver_verbs.NodeStop, source)
         finally:
             self._note(self._node_entry(node, source, stop=True))
             self.log("warning", "emergency stop", node=node.name, source=source)
@@ -221,14 +222,16 @@ class Server:
         Raises:
             OSError: EIO, its driver takes no messages.
         """
-        self._order(node, DriverVerb.NODE_RESET, who)
+        self._order(node, driver_verbs.NodeReset, who)
         self._note(self._node_entry(node, who, stop=False))
         self.log("warning", "reset", node=node.name, by=who)
 
-    def _order(self, node: Node, verb: DriverVerb, text: str) -> None:
+    def _order(
+        self, node: Node, order: type[driver_verbs.NodeStop | driver_verbs.NodeReset], source: str
+    ) -> None:
         device = self.devices.get(node.device) or self._leaving.get(node.device)
         if device is not None and device.is_there:
-            device.send(verb, node.block, node.channels, node.bit, text, self.shared.latch.resets)
+            device.send(order(node.block, node.channels, node.bit, source, self.shared.latch.resets))
             self.shared.latch.ordered()
 
     def _node_entry(self, node: Node, source: str, *, stop: bool) -> dict[str, Any]:
@@ -284,37 +287,37 @@ class Server:
                 self.stop_workcell(f"input {node} stops the workcell, and it cannot be read: {why}")
                 return
 
-    def device_message(self, device: DriverProcess, verb: DriverVerb, arguments: list[Any]) -> None:
+    def device_message(self, device: DriverProcess, message: Message) -> None:
         """Take a notice of a driver."""
-        match verb:
-            case DriverVerb.DETACHED:
-                self.clients.nodes.detached(device, arguments[0])
-            case DriverVerb.MARKER_SIGNALLED:
+        match message:
+            case driver_verbs.Detached(handle):
+                self.clients.nodes.detached(device, handle)
+            case driver_verbs.MarkerSignalled():
                 self.clients.markers.signalled()
-            case DriverVerb.STOPPED:
-                self.log("warning", "emergency stop", source=arguments[0], device=device.name)
+            case driver_verbs.Stopped(source):
+                self.log("warning", "emergency stop", source=source, device=device.name)
                 for other in self.devices.values():
-                    other.tell(DriverVerb.STOP_CHANGED)
-            case DriverVerb.LINK:
-                state = PageState(arguments[0])
+                    other.tell(driver_verbs.StopChanged())
+            case driver_verbs.LinkChanged(number, reason):
+                state = PageState(number)
                 good = state in (PageState.GOOD, PageState.STARTING)
                 self.log(
                     "info" if good else "error",
                     "link",
                     device=device.name,
                     state=state.name.lower(),
-                    reason=arguments[1],
+                    reason=reason,
                 )
                 if not good and device.device.common.on_loss == "stop":
-                    self.stop_workcell(f"device {device.name}: {arguments[1]}")
+                    self.stop_workcell(f"device {device.name}: {reason}")
                 if not good:
                     self._look_at_stop_inputs(device)
-            case DriverVerb.LOG:
-                if str(arguments[1]).startswith("fault of "):
-                    device.trouble = str(arguments[1])
-                self.log(str(arguments[0]), "driver", device=device.name, text=arguments[1])
+            case driver_verbs.LogLine(level, text):
+                if text.startswith("fault of "):
+                    device.trouble = text
+                self.log(level, "driver", device=device.name, text=text)
             case _:
-                device.kill(f"its driver sent {verb.name}, which is not for a driver to send")
+                raise NotImplementedError(f"{type(message).__name__} is not served")
 
     # --- inside ----------------------------------------------------------------------------------
 
@@ -416,7 +419,7 @@ class Server:
         if source is None or reader.state is not State.UP or source.state is not State.UP:
             return
         try:
-            reader.send(DriverVerb.INPUT, name, node.channels, node.bit, fds=[source.page_fds[node.block]])
+            reader.send(driver_verbs.Input(name, node.channels, node.bit), [source.page_fds[node.block]])
         except OSError as error:
             self.log("warning", "input lost", device=reader.name, node=name, why=error.strerror)
 

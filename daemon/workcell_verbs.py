@@ -18,6 +18,8 @@ from .devices import State
 from .sessions import LATER, Refused, Session
 
 if TYPE_CHECKING:
+    from sioms.protocol.verbs import EmergencyStop, Hello, Reload, Reset
+
     from .clients import Clients
     from .server import Server
 
@@ -34,8 +36,9 @@ class WorkcellVerbs:
         self._server = server
         self._clients = clients
 
-    def hello(self, session: Session, number: int, version: int, name: str) -> Any:
+    def hello(self, session: Session, number: int, message: Hello) -> Any:
         """Answer a client that says who it is."""
+        version, name = message
         if version != PROTOCOL_VERSION:
             raise Refused(
                 errno.EPROTO, f"hello: protocol version {version}; this daemon speaks {PROTOCOL_VERSION}"
@@ -72,11 +75,12 @@ class WorkcellVerbs:
             "holders": [[h.node.name, str(h.session), (now - h.since_ns) / 1e9] for h in self._clients.nodes.holders()],
         }  # fmt: skip
 
-    def emergency_stop(self, session: Session, name: str, why: str) -> None:
+    def emergency_stop(self, session: Session, message: EmergencyStop) -> None:
         """Stop the workcell, or a node."""
+        name, why = message
         source = f"{session}" + (f": {printable(why, 80)}" if why else "")
         if not name:
-            if not self._clients.rights.on_workcell(session.peer) & Right.STOP:
+            if not self._clients.rights.on_workcell(session.peer) & message.right:
                 raise Refused(
                     errno.EPERM,
                     f"emergency stop: {session.peer.user} has no right to stop; ask for a [[grant]]",
@@ -84,16 +88,17 @@ class WorkcellVerbs:
             self._server.hear_request()
             self._server.stop_workcell(source)
             return
-        node = self._clients.nodes.find(session, "emergency stop", name, Right.STOP)
+        node = self._clients.nodes.find(session, "emergency stop", name, message.right)
         try:
             self._server.stop_node(node, source)
         except OSError as error:
             raise Refused(errno.EIO, f"emergency stop of {name}: {error.strerror}") from None
 
-    def reset(self, session: Session, name: str) -> None:
+    def reset(self, session: Session, message: Reset) -> None:
         """Reset the workcell, or a node, or the fault of its device."""
+        (name,) = message
         if not name:
-            if not self._clients.rights.on_workcell(session.peer) & (Right.ADMINISTER | Right.WRITE):
+            if not self._clients.rights.on_workcell(session.peer) & message.right:
                 raise Refused(
                     errno.EPERM, f"reset: {session.peer.user} has no right to write or administer every node"
                 )
@@ -103,7 +108,7 @@ class WorkcellVerbs:
                 )
             self._server.reset_workcell(str(session))
             return
-        node = self._clients.nodes.find(session, "reset", name, Right.WRITE | Right.ADMINISTER)
+        node = self._clients.nodes.find(session, "reset", name, message.right)
         device = self._server.devices.get(node.device)
         if device is not None and device.state is State.FAULT:
             device.reset()
@@ -121,11 +126,11 @@ class WorkcellVerbs:
         if device is not None:
             device.trouble = ""
 
-    def reload(self, session: Session, number: int) -> Any:
+    def reload(self, session: Session, number: int, message: Reload) -> Any:
         """Take up the configuration anew, when it has its turn; answered with all errors."""
 
         def check() -> None:
-            if not self._clients.rights.on_workcell(session.peer) & Right.ADMINISTER:
+            if not self._clients.rights.on_workcell(session.peer) & message.right:
                 text = f"reload: {session.peer.user} has no right to administer every node"
                 raise Refused(errno.EPERM, text)
 

@@ -22,8 +22,8 @@ from contextlib import suppress
 from time import monotonic, monotonic_ns
 from typing import TYPE_CHECKING, Any, Self
 
+from sioms.protocol import verbs
 from sioms.protocol.flags import PROTOCOL_VERSION, Request
-from sioms.protocol.messages import ClientVerb, HandleVerb
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.socketpath import socket_path
 from sioms.protocol.stopfile import StopRequest
@@ -45,9 +45,9 @@ if TYPE_CHECKING:
 class _Requests:
     """Requests in flight on a channel, answered by the event loop."""
 
-    def __init__(self, channel: Channel, cancel_verb: int) -> None:
+    def __init__(self, channel: Channel, cancel: type[verbs.Cancel | verbs.CancelOnHandle]) -> None:
         self._channel = channel
-        self._cancel_verb = cancel_verb
+        self._cancel_message = cancel
         self._futures: dict[int, asyncio.Future[Answer]] = {}
         self._abandoned: dict[int, Call] = {}
         self._looks: dict[int, asyncio.TimerHandle] = {}
@@ -93,7 +93,7 @@ class _Requests:
         if self._futures.pop(number, None) is not None:
             self._abandoned[number] = call
             with suppress(OSError):  # the other side has gone, and the request with it
-                self._channel.send(Call("cancel", self._cancel_verb, number))
+                self._channel.send(Call("cancel", self._cancel_message(number)))
 
     @property
     def closed(self) -> bool:
@@ -116,9 +116,9 @@ class _Requests:
                     for fd in fds:
                         os.close(fd)
                     call = self._abandoned.pop(message[1], None)
-                    if call is not None and call.verb == ClientVerb.OPEN and fds:
+                    if call is not None and isinstance(call.message, verbs.Open) and fds:
                         # Opened just before the cancel arrived: nobody will close it but us.
-                        self._channel.send(Call("close", ClientVerb.CLOSE, message[3][0]))
+                        self._channel.send(Call("close", verbs.Close(message[3][0])))
                     continue
                 try:
                     future.set_result(self._channel.result(packet))
@@ -142,7 +142,7 @@ class AsyncNode(NodeCore):
     def __init__(self, core: tuple[Any, ...], cell: AsyncWorkcell) -> None:
         super().__init__(*core)
         self._cell = cell
-        self._requests = _Requests(self._channel, HandleVerb.CANCEL)
+        self._requests = _Requests(self._channel, verbs.CancelOnHandle)
 
     async def __aenter__(self) -> Self:
         return self
@@ -227,7 +227,7 @@ class AsyncNode(NodeCore):
     async def subscribed(self, every: int) -> None:
         """Have the node's descriptor become readable with every n-th publication, -1: with edges only."""
         if every != self._subscribed:
-            await self._requests.call(Call(f"subscribe to {self.name}", HandleVerb.SUBSCRIBE, every))
+            await self._requests.call(Call(f"subscribe to {self.name}", verbs.Subscribe(every)))
             self._subscribed = every
 
     async def snapshots(self, every: int = 1) -> AsyncIterator[Any]:
@@ -310,31 +310,31 @@ class AsyncWorkcell:
 
     async def info(self, name: str) -> NodeInfo:
         """Return what a node is, without opening it."""
-        return NodeInfo(await self._call(f"get information of {name}", ClientVerb.INFO, name))
+        return NodeInfo(await self._call(f"get information of {name}", verbs.Info(name)))
 
     async def status(self) -> dict[str, Any]:
         """Return devices, sessions, holders and the state of the emergency stop."""
-        value: dict[str, Any] = await self._call("get status", ClientVerb.STATUS)
+        value: dict[str, Any] = await self._call("get status", verbs.Status())
         return value
 
     async def reserve_marker(self) -> int:
         """Reserve a marker; return its token."""
-        tokens: list[int] = await self._call("reserve marker", ClientVerb.RESERVE_MARKER, 1, False)
+        tokens: list[int] = await self._call("reserve marker", verbs.ReserveMarker(1, False))
         return tokens[0]
 
     async def signal_marker(self, token: int) -> None:
         """Signal a marker."""
-        await self._call("signal marker", ClientVerb.SIGNAL_MARKER, token)
+        await self._call("signal marker", verbs.SignalMarker(token))
 
     async def wait_marker(self, number: int, timeout: float | None = None) -> int:
         """Wait until a marker is signalled; return when that was [ns, CLOCK_MONOTONIC]."""
-        stamp_ns: int = await self._call("wait for marker", ClientVerb.WAIT_MARKER, number, timeout)
+        stamp_ns: int = await self._call("wait for marker", verbs.WaitMarker(number, timeout))
         return stamp_ns
 
     async def emergency_stop(self, node: str = "", why: str = "") -> None:
         """Stop the workcell or a node, latched until reset; the workcell also while the daemon hangs."""
-        call = Call("emergency stop", ClientVerb.EMERGENCY_STOP, node, printable(str(why)))
-        taken = call.enough = request_stop(None if node else self._page, call.arguments[1])
+        call = Call("emergency stop", verbs.EmergencyStop(node, printable(str(why))))
+        taken = call.enough = request_stop(None if node else self._page, printable(str(why)))
         try:
             await self._requests.call(call)
         except OSError:
@@ -344,18 +344,18 @@ class AsyncWorkcell:
 
     async def reset(self, node: str = "") -> None:
         """Clear the latched stop of the workcell or of a node."""
-        await self._call("reset", ClientVerb.RESET, node)
+        await self._call("reset", verbs.Reset(node))
 
     async def forget(self, handle: int) -> None:
         """Tell the daemon that a node was closed."""
         try:
-            await self._call("close", ClientVerb.CLOSE, handle)
+            await self._call("close", verbs.Close(handle))
         except OSError as error:
             if error.errno not in (errno.EIO, errno.EBADF):
                 raise
 
-    async def _call(self, what: str, verb: ClientVerb, *arguments: object) -> Any:
-        return (await self._requests.call(Call(what, verb, *arguments))).value
+    async def _call(self, what: str, message: verbs.Message) -> Any:
+        return (await self._requests.call(Call(what, message))).value
 
 
 async def connect(path: str | None = None, name: str = "") -> AsyncWorkcell:
@@ -366,7 +366,7 @@ async def connect(path: str | None = None, name: str = "") -> AsyncWorkcell:
         name: what this client calls itself.
     """
     channel = Channel(connect_socket(path or socket_path()), "the daemon")
-    requests = _Requests(channel, ClientVerb.CANCEL)
+    requests = _Requests(channel, verbs.Cancel)
     answer = await _hello(requests, name)
     return AsyncWorkcell(requests, StopRequest(*answer.fds) if answer.fds else None, answer.value[1])
 
@@ -376,7 +376,7 @@ async def _hello(requests: _Requests, name: str) -> Answer:
     deadline = monotonic() + STARTING_S
     while True:
         try:
-            return await requests.call(Call("hello", ClientVerb.HELLO, PROTOCOL_VERSION, name))
+            return await requests.call(Call("hello", verbs.Hello(PROTOCOL_VERSION, name)))
         except OSError as error:
             if error.errno != errno.EAGAIN or monotonic() > deadline:
                 requests.close()

@@ -25,10 +25,11 @@ from sioms.client import shown
 from sioms.client.channel import Call, Channel
 from sioms.client.node_core import NodeCore
 from sioms.motion import AxisSettings, DriveAction
+from sioms.protocol.driver_verbs import Attach, DriverVerb
 from sioms.protocol.flags import Access, ControlMode, NodeClass, Request, Right
 from sioms.protocol.latch import LATCH_SIZE, Latch
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
-from sioms.protocol.messages import DriverVerb, encode
+from sioms.protocol.messages import encode
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BinaryBlock, BlockSpec, Description
 from sioms.sdk.drive_axes import AxesUnit
@@ -147,8 +148,11 @@ class World:
         readable, wake = os.pipe2(os.O_NONBLOCK)
         access = Access.READ | Access.WRITE if exclusive else Access.READ
         self.runtime.clients.attach(
-            [theirs.detach(), wake], number, block, list(channels), bit, int(access), exclusive, int(Right.ALL), 0,
-            "tester", uid, [256, 128], f"node{number}",
+            [theirs.detach(), wake],
+            Attach(
+                number, block, list(channels), bit, int(access), exclusive, int(Right.ALL), 0, "tester", uid, [256, 128],
+                f"node{number}",
+            ),
         )  # fmt: skip
         spec = shown_block.spec
         info = NodeInfo(

@@ -1,9 +1,9 @@
-"""Write what is generated: manual pages (docs/man) and shell completions (etc/completion).
+"""Write what is generated: manual pages (docs/man), shell completions (etc/completion) and docs/protocol.md.
 
     python -m sioms.tools.generate           write the files that differ
     python -m sioms.tools.generate --check   write nothing; exit 1 and name the files that differ
 
-Everything comes out of the tables of options, manuals and commands, so that none of them can lie.
+Everything comes out of the tables of options, manuals, commands and verbs, so that none of them can lie.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from . import driver
 from .front import COMMANDS, DESCRIPTION
 from .manual import DAEMON_OPTIONS, MANUALS, STATUS, VARIABLES, option_groups, shape
 from .options import TOOLS, Option
+from .verb_table import protocol_page
 
 TREE = Path(__file__).resolve().parent.parent
 _NODE_COMMANDS = ("info", "monitor", "reset", "stop")
@@ -45,6 +46,7 @@ def files() -> dict[str, str]:
     made["docs/man/sioms.1"] = front_page()
     made["docs/man/sioms-driver.1"] = driver_page()
     made["docs/man/siomsd.8"] = daemon_page()
+    made["docs/protocol.md"] = protocol_page()
     made["etc/completion/sioms.bash"] = bash()
     made["etc/completion/_sioms"] = zsh()
     made["etc/completion/sioms.fish"] = fish()

@@ -11,14 +11,16 @@ from __future__ import annotations
 
 from _operator import index
 
-from sioms.protocol.incoming import ANYTHING, FLAG, FROM_CLIENT, INTEGER, NUMBER, ON_HANDLE, SECONDS
-from sioms.protocol.messages import ClientVerb
 from sioms.protocol.text import shown
+from sioms.protocol.verbs import ANYTHING, FLAG, INTEGER, NUMBER, SECONDS
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from typing import Any
+    from typing import Any, TypeVar
+
+    from sioms.protocol.verbs import Message
+
+    M = TypeVar("M", bound=Message)
 
 _DEPTH = 8
 _LEAST, _MOST = -(1 << 63), 1 << 64
@@ -127,16 +129,15 @@ def plain(what: str, value: Any, depth: int = _DEPTH) -> Any:
     return integer(what, value, "numbers, text, lists or maps of them, or none")
 
 
-def of_verb(what: str, verb: int, arguments: Iterable[Any]) -> list[Any]:
-    """Return the arguments of a request as its verb takes them (``protocol.incoming``).
+def checked(what: str, message: M) -> M:
+    """Return a message of what a program has handed over with its arguments as the verb takes them (``protocol.verbs``).
 
     Raises:
         TypeError: one is of another kind.
         ValueError: no message holds it.
     """
-    kinds = (FROM_CLIENT if isinstance(verb, ClientVerb) else ON_HANDLE)[verb]
-    taken = []
-    for value, kind in zip(arguments, kinds, strict=True):
+    taken: list[Any] = []
+    for value, kind in zip(message, message.fields.values(), strict=True):
         if kind is INTEGER:
             value = value if type(value) is int and 0 <= value < _MOST else integer(what, value)
         elif kind is SECONDS:
@@ -152,4 +153,4 @@ def of_verb(what: str, verb: int, arguments: Iterable[Any]) -> list[Any]:
         if kind.most and len(value) > kind.most:
             raise ValueError(f"{what}: {len(value)} characters; want {kind.words} of at most {kind.most}")
         taken.append(value)
-    return taken
+    return message.of(taken)

@@ -27,18 +27,11 @@ from stat import S_ISSOCK
 from struct import pack, unpack
 from time import monotonic
 
-from sioms.protocol.messages import (
-    MAX_PACKET,
-    ClientVerb,
-    HandleVerb,
-    MalformedMessage,
-    decode_reply,
-    encode,
-    value_of,
-)
+from sioms.protocol.messages import MAX_PACKET, MalformedMessage, decode_reply, value_of
 from sioms.protocol.socketpath import may_serve
+from sioms.protocol.verbs import Cancel, CancelOnHandle, Keepalive, Part
 
-from .arguments import of_verb, seconds
+from .arguments import checked, seconds
 from .shown import acknowledged_by_daemon
 
 TYPE_CHECKING = False
@@ -46,13 +39,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from typing import Any
 
+    from sioms.protocol.verbs import Message
+
     from .overdue import Overdue
 
 _CMSG_CLOEXEC = 0x40000000
 _DONTWAIT = 0x40
 _ANCILLARY = CMSG_SPACE(8 * 4)
 _FOREVER = pack("ll", 0, 0)
-KEEPALIVE = encode(HandleVerb.KEEPALIVE, 0)
+KEEPALIVE = Keepalive().packed()
 INTERRUPTIBLE_S = 1.0
 """A signal that comes just before the interpreter goes to sleep is seen when that wakes: it sleeps this long [s]."""
 FIRST_LOOK_S = 1.0
@@ -64,10 +59,11 @@ CONNECT_S = 2.0
 
 
 class Call:
-    """A request to be sent: verb, arguments, and how long its answer may take.
+    """A request to be sent: a message, and how long its answer may take.
 
     Attributes:
         what: the request in words, for messages.
+        message: its arguments as its verb takes them.
         ahead: records that are sent ahead of it, in parts.
         limit_s: the time-out that the other side has been given [s], None = it may take for ever.
         enough: tells of an overdue answer whether it is not needed any more.
@@ -76,20 +72,19 @@ class Call:
         TypeError, ValueError: an argument is none that the verb takes; the other side would take it for a broken client.
     """
 
-    __slots__ = ("ahead", "arguments", "enough", "limit_s", "verb", "what")
+    __slots__ = ("ahead", "enough", "limit_s", "message", "what")
 
     def __init__(
         self,
         what: str,
-        verb: int,
-        *arguments: object,
+        message: Message,
+        *,
         ahead: tuple[bytes, ...] = (),
         limit_s: float | None = 0.0,
         enough: Callable[[], bool] | None = None,
     ) -> None:
         self.what = what
-        self.verb = verb
-        self.arguments = of_verb(what, verb, arguments)
+        self.message = checked(what, message)
         self.ahead = ahead
         self.limit_s = seconds(what, limit_s)
         self.enough = enough
@@ -235,9 +230,9 @@ class Channel:
 
     def _abandon(self, number: int) -> None:
         """Nobody waits for this answer any more: cancel the request, and let go of what it may bring."""
-        verb = ClientVerb.CANCEL if self._passed else HandleVerb.CANCEL
+        cancel = Cancel(number) if self._passed else CancelOnHandle(number)
         try:
-            cancelled = self.send(Call("cancel", verb, number))
+            cancelled = self.send(Call("cancel", cancel))
         except OSError:
             return  # the other side has gone, and the request with it
         with self._mutex:
@@ -253,14 +248,14 @@ class Channel:
                 raise OSError(*self._ended)
             self._number += 1
             number = self._number
-            packet = encode(call.verb, number, *call.arguments)
+            packet = call.message.packed(number)
             if len(packet) > MAX_PACKET:
                 raise OSError(
                     errno.EMSGSIZE, f"{call.what}: {len(packet)} bytes in one message; at most {MAX_PACKET}"
                 )
             try:
                 for part in call.ahead:
-                    self._sock.send(encode(HandleVerb.PART, 0, number, part))
+                    self._sock.send(Part(number, part).packed())
                 self._sock.send(packet)
             except OSError as error:
                 raise self._gone(error, call.what) from None

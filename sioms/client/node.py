@@ -11,8 +11,8 @@ from select import POLLIN, poll
 from time import monotonic, monotonic_ns
 
 from sioms.protocol.flags import NodeClass, Request
-from sioms.protocol.messages import HandleVerb
 from sioms.protocol.page import NotReadable
+from sioms.protocol.verbs import Subscribe
 
 from .arguments import integer, numbers, seconds
 from .channel import Call
@@ -56,7 +56,7 @@ class Node(NodeCore):
     def subscribe(self, every: int) -> None:
         """Have ``fileno`` become readable with every n-th publication, -1: with edges only, 0: not at all."""
         if every != self._subscribed:
-            self._channel.call(Call(f"subscribe to {self.name}", HandleVerb.SUBSCRIBE, every))
+            self._channel.call(Call(f"subscribe to {self.name}", Subscribe(every)))
             self._subscribed = every
 
     def ioctl(self, request: Request, argument: object = None, timeout: float | None = 0.0) -> Any:

@@ -12,10 +12,11 @@ from time import monotonic_ns, sleep
 
 from sioms.protocol import text
 from sioms.protocol.flags import NodeClass, PageState, Request, WriteFlag
-from sioms.protocol.messages import MAX_INLINE, MAX_WRITE, HandleVerb
+from sioms.protocol.messages import MAX_INLINE, MAX_WRITE
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.page import NotReadable, PageReader, as_of_ns
 from sioms.protocol.records import ANALOG_WRITE, BINARY_WRITE
+from sioms.protocol.verbs import Ioctl, Write
 
 from . import shown
 from .arguments import integer, number, numbers
@@ -326,20 +327,20 @@ class NodeCore:
                 f"ioctl on {self.name}: {text.shown(request)} is no request; want one of sioms.Request"
             )
         what = f"{request.name} on {self.name}"
-        return Call(what, HandleVerb.IOCTL, int(request), argument, timeout, limit_s=timeout)
+        return Call(what, Ioctl(int(request), argument, timeout), limit_s=timeout)
 
     def _write(self, records: Records, timeout: float | None, replace: bool) -> Call:
         data = records if isinstance(records, bytes) else _join(records, self.name)
         flags = WriteFlag.REPLACE if replace else WriteFlag.APPEND
         what = f"write {self.name}"
         if len(data) <= MAX_INLINE:
-            return Call(what, HandleVerb.WRITE, int(flags), timeout, data, limit_s=timeout)
+            return Call(what, Write(int(flags), timeout, data), limit_s=timeout)
         if len(data) > MAX_WRITE:
             raise OSError(errno.EMSGSIZE, f"{what}: {len(data)} bytes of records; at most {MAX_WRITE}")
         parts = [data[i : i + MAX_INLINE] for i in range(0, len(data), MAX_INLINE)]
         limit_s = None if timeout is None else number(what, timeout, "seconds") + _JUDGED_S * len(parts)
         ahead = tuple(parts[:-1])
-        return Call(what, HandleVerb.WRITE, int(flags), timeout, parts[-1], ahead=ahead, limit_s=limit_s)
+        return Call(what, Write(int(flags), timeout, parts[-1]), ahead=ahead, limit_s=limit_s)
 
     def _outputs(self, values: Sequence[float]) -> bytes:
         count = len(self.info.channels)

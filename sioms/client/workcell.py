@@ -8,8 +8,8 @@ import sys
 from _socket import socket
 from time import monotonic, monotonic_ns, sleep
 
+from sioms.protocol import verbs
 from sioms.protocol.flags import PROTOCOL_VERSION, Access, NodeClass
-from sioms.protocol.messages import ClientVerb
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.socketpath import socket_path
 from sioms.protocol.stopfile import StopRequest
@@ -91,7 +91,7 @@ def open_call(name: str, mode: str, timeout: float | None, lease: float) -> Call
     access = _ACCESS.get(mode) if isinstance(mode, str) else None
     if access is None:
         raise OSError(errno.EINVAL, f"open {name}: mode {shown(mode)}; want 'r', 'w' or 'rw'")
-    return Call(f"open {name}", ClientVerb.OPEN, name, int(access), timeout, lease, limit_s=timeout)
+    return Call(f"open {name}", verbs.Open(name, int(access), timeout, lease), limit_s=timeout)
 
 
 def node_parts(value: Any, fds: list[int]) -> tuple[Any, ...]:
@@ -145,7 +145,7 @@ class Workcell:
             connect(self._path, CONNECT_S if enough is None else ENOUGH_LOOK_S), "the daemon"
         )
         title = os.path.basename(sys.argv[0]) if name is None and sys.argv and sys.argv[0] else name or ""
-        answer = self._hello(Call("hello", ClientVerb.HELLO, PROTOCOL_VERSION, title, enough=enough))
+        answer = self._hello(Call("hello", verbs.Hello(PROTOCOL_VERSION, title), enough=enough))
         _, self.name, self.rights = answer.value
         self._request: StopRequest | None = None
         self._nodes: dict[int, Node] = {}
@@ -257,7 +257,7 @@ class Workcell:
         """Tell the daemon that a node was closed, and wait until its channels are free (nodes call this)."""
         self._nodes.pop(handle, None)
         try:
-            self._channel.call(Call("close", ClientVerb.CLOSE, handle))
+            self._channel.call(Call("close", verbs.Close(handle)))
         except OSError as error:
             # The daemon has gone, or knows no such handle any more: the driver has halted the axes
             # at the end of file of the node's own socket either way.
@@ -266,16 +266,16 @@ class Workcell:
 
     def nodes(self) -> list[NodeEntry]:
         """Return all nodes that this user may read."""
-        value = self._call("list nodes", ClientVerb.LIST)
+        value = self._call("list nodes", verbs.List())
         return [NodeEntry(packed) for packed in value]
 
     def info(self, name: str) -> NodeInfo:
         """Return what a node is, without opening it."""
-        return NodeInfo(self._call(f"get information of {name}", ClientVerb.INFO, name))
+        return NodeInfo(self._call(f"get information of {name}", verbs.Info(name)))
 
     def status(self) -> dict[str, Any]:
         """Return devices, sessions, holders and the state of the emergency stop."""
-        value: dict[str, Any] = self._call("get status", ClientVerb.STATUS)
+        value: dict[str, Any] = self._call("get status", verbs.Status())
         return value
 
     def synch(self, *nodes: AxisNode, lead: float = SYNCH_LEAD_S) -> int:
@@ -316,20 +316,20 @@ class Workcell:
             count: how many.
             persist: keep them beyond the end of the session.
         """
-        tokens = self._call(f"reserve {count} markers", ClientVerb.RESERVE_MARKER, count, persist)
+        tokens = self._call(f"reserve {count} markers", verbs.ReserveMarker(count, persist))
         return [Marker(self, token) for token in tokens]
 
     def free_marker(self, token: int) -> None:
         """Free a marker; needs its token."""
-        self._call("free marker", ClientVerb.FREE_MARKER, token)
+        self._call("free marker", verbs.FreeMarker(token))
 
     def signal_marker(self, token: int) -> None:
         """Signal a marker; needs its token."""
-        self._call("signal marker", ClientVerb.SIGNAL_MARKER, token)
+        self._call("signal marker", verbs.SignalMarker(token))
 
     def wait_marker(self, number: int, timeout: float | None = None) -> int:
         """Wait until a marker is signalled; return when that was [ns, CLOCK_MONOTONIC]."""
-        return int(self._call("wait for marker", ClientVerb.WAIT_MARKER, number, timeout, limit_s=timeout))
+        return int(self._call("wait for marker", verbs.WaitMarker(number, timeout), limit_s=timeout))
 
     # --- stops -----------------------------------------------------------------------------------
 
@@ -343,8 +343,8 @@ class Workcell:
             node: a node, '' for the whole workcell.
             why: for the log and for who asks why nothing moves.
         """
-        call = Call("emergency stop", ClientVerb.EMERGENCY_STOP, node, printable(str(why)))
-        taken = call.enough = request_stop(None if node else self._request, call.arguments[1])
+        call = Call("emergency stop", verbs.EmergencyStop(node, printable(str(why))))
+        taken = call.enough = request_stop(None if node else self._request, printable(str(why)))
         try:
             self._channel.call(call)
         except OSError:
@@ -354,7 +354,7 @@ class Workcell:
 
     def reset(self, node: str = "") -> None:
         """Clear the latched stop of the workcell or of a node. Nothing resumes by itself."""
-        self._call("reset", ClientVerb.RESET, node)
+        self._call("reset", verbs.Reset(node))
 
     def reload(self) -> None:
         """Let the daemon take up its configuration anew.
@@ -362,9 +362,9 @@ class Workcell:
         Raises:
             OSError: EINVAL with all errors; nothing was taken up.
         """
-        errors: list[str] = self._call("reload", ClientVerb.RELOAD, limit_s=60.0)
+        errors: list[str] = self._call("reload", verbs.Reload(), limit_s=60.0)
         if errors:
             raise OSError(errno.EINVAL, "reload: nothing taken up: " + "; ".join(errors))
 
-    def _call(self, what: str, verb: ClientVerb, *arguments: object, limit_s: float | None = 0.0) -> Any:
-        return self._channel.call(Call(what, verb, *arguments, limit_s=limit_s)).value
+    def _call(self, what: str, message: verbs.Message, limit_s: float | None = 0.0) -> Any:
+        return self._channel.call(Call(what, message, limit_s=limit_s)).value

@@ -15,7 +15,7 @@ that carry its number. No client passes a descriptor to anybody: closing what a 
 Whoever receives something else ends that connection, and nothing else.
 
 Everything that a process receives goes through ``decode``, which knows bounds of size, nesting and kinds of values
-before it builds any; ``incoming`` adds what each verb takes.
+before it builds any; ``verbs`` adds what each verb takes.
 """
 
 from __future__ import annotations
@@ -95,49 +95,6 @@ class HandleVerb(IntEnum):
     KEEPALIVE = 4
     CANCEL = 5
     PART = 6
-    """[number, records]: the beginning of the records of a write that is to follow; a notice."""
-
-
-class DriverVerb(IntEnum):
-    """Between the daemon and a driver, on its control socket (D: sent by the daemon)."""
-
-    ATTACH = 1
-    """D: [handle, block, channels, bit, access, exclusive, rights, lease_ns, who, node]; descriptors: socket,
-    writing end of the wake pipe, pidfd if any."""
-    DETACH = 2
-    """D: [handle, errno, reason]: end it, as if its socket had closed, and say why; no reason: its client has closed it."""
-    STOP_CHANGED = 3
-    """D: []: the latch has changed, look at once."""
-    SHUTDOWN = 4
-    """D: stop, make outputs safe, exit."""
-    INPUT = 5
-    """D: [name, channels, bit]; descriptor: the page of a node that the driver reads."""
-    NODE_STOP = 6
-    """D: [block, channels, bit, source, resets]: emergency stop of some channels, or of one bit of them (-1: all), after so many
-    resets of the workcell; void when the driver has seen a later one. NODE_RESET likewise."""
-    NODE_RESET = 7
-    READY = 20
-    """[blocks]; descriptors: one page a block, writable until the daemon seals it."""
-    DETACHED = 21
-    """[handle]: its axes are being halted, the channels are free."""
-    MARKER_SIGNALLED = 22
-    """[number]."""
-    STOPPED = 23
-    """[source]: the driver has latched the emergency stop of the workcell."""
-    LINK = 24
-    """[state, reason]: PageState of the device behind the driver."""
-    LOG = 25
-    """[level, text]."""
-
-
-class NurseryVerb(IntEnum):
-    """Between the daemon and the nursery, the process that forks the drivers."""
-
-    DESCRIBE = 1
-    """[device, driver, table, folder] -> [errors, description], packed and compressed by zlib."""
-    SPAWN = 2
-    """[device, driver, table, generation, options] -> pid; descriptors: control socket, latch, request page,
-    markers -> pidfd."""
 
 
 class MalformedMessage(Exception):

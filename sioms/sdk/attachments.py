@@ -15,22 +15,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sioms.protocol.flags import Access, Right
-from sioms.protocol.incoming import ON_HANDLE, take
-from sioms.protocol.messages import (
-    MAX_INLINE,
-    MAX_PACKET,
-    MAX_WRITE,
-    DriverVerb,
-    HandleVerb,
-    MalformedMessage,
-)
+from sioms.protocol import verbs
+from sioms.protocol.driver_verbs import Attach, Detached
+from sioms.protocol.flags import REQUESTS, Access, Right
+from sioms.protocol.messages import MAX_INLINE, MAX_PACKET, MAX_WRITE, MalformedMessage
 from sioms.protocol.text import shown
 
 from .blocks import AxisBlock
 from .exchange import HookError
 from .handles import LATER, Handle, Quota
-from .requests import LOOKS, ioctl
+from .requests import ioctl
 from .writing import write
 
 if TYPE_CHECKING:
@@ -87,23 +81,20 @@ class Attachments:
         """End a handle because the daemon says so, and tell its client why; one that has ended already is confirmed again."""
         handle = self.handles.get(number)
         if handle is None:
-            self._runtime.tell(DriverVerb.DETACHED, number)
+            self._runtime.tell(Detached(number))
         elif reason:
             self.end(handle, errno_, reason)
         else:
             self.drop(handle)
 
-    def attach(
-        self, fds: list[int], number: int, block: int, channels: list[int], bit: int, access: int,
-        exclusive: bool, rights: int, lease_ns: int, who: str, uid: int,
-        quota: list[int], node: str,
-    ) -> None:  # fmt: skip
+    def attach(self, fds: list[int], message: Attach) -> None:
         """Take a handle from the daemon: descriptors of socket, wake pipe and, if known, the client's process."""
+        number, block, channels, bit, access, exclusive, rights, lease_ns, who, uid, quota, node = message
         if len(fds) < 2:  # the kernel drops what goes beyond the limit of open descriptors
             for fd in fds:
                 os.close(fd)
             self._runtime.log("error", f"{node}: {who} could not be served: too many open descriptors")
-            self._runtime.tell(DriverVerb.DETACHED, number)
+            self._runtime.tell(Detached(number))
             return
         sock = socket.socket(fileno=fds[0])
         sock.setblocking(False)
@@ -137,7 +128,7 @@ class Attachments:
             if not packet:
                 self.drop(handle)
                 return
-            self._serve(handle, *take(packet, ON_HANDLE))
+            self._serve(handle, *verbs.take(packet, verbs.ON_HANDLE, pending=handle.waits))
         except MalformedMessage as error:
             self._runtime.log(
                 "warning", f"{handle.node}: connection of {handle.who} ended: malformed message: {error}"
@@ -150,46 +141,46 @@ class Attachments:
             self._runtime.log("error", f"{handle.node}: the driver failed to serve {handle.who}: {trace}")
             self.end(handle, errno.EIO, f"{handle.node}: the driver failed: {shown(error)}")
 
-    def _serve(self, handle: Handle, of_client: int, number: int, arguments: list[Any]) -> None:
-        verb = HandleVerb(of_client)
-        if verb is HandleVerb.KEEPALIVE:
+    def _serve(self, handle: Handle, number: int, message: verbs.Message) -> None:
+        if isinstance(message, verbs.Keepalive):
             return
-        if verb is HandleVerb.PART:
-            _keep_part(handle, *arguments)
+        if isinstance(message, verbs.Part):
+            _keep_part(handle, message)
             return
-        if number == 0 or number in handle.waits:
-            raise MalformedMessage(f"message number {number} is zero or in use")
         # Nothing is taken after a stop, or refused after its reset, because no tick has come in between; and no order that
         # was acknowledged before undoes what is acknowledged now.
         self._runtime.heed()
         if handle.number not in self.handles:
             return  # that was the order
         try:
-            match verb:
-                case HandleVerb.WRITE:
-                    flags, timeout_s, data = arguments
-                    self._runtime.effects.note()
-                    if handle.ahead[1]:
-                        data = _whole(handle, number, data)
-                    value = write(self._runtime, handle, number, flags, timeout_s, data)
-                case HandleVerb.IOCTL:
-                    request, argument, timeout_s = arguments
-                    if request not in LOOKS:
-                        self._runtime.effects.note()
-                    value = ioctl(self._runtime, handle, number, request, argument, timeout_s)
-                case HandleVerb.SUBSCRIBE:
-                    self._subscribe(handle, arguments[0])
-                    value = None
-                case HandleVerb.CANCEL:
-                    wait = handle.waits.get(arguments[0])
-                    value = wait is not None
-                    if wait is not None:
-                        self._runtime.waits.end(wait, errno.ECANCELED, f"{wait.what}: cancelled")
+            value = self._value(handle, number, message)
         except OSError as error:
             handle.refuse(number, error.errno or errno.EIO, error.strerror or str(error))
         else:
             if value is not LATER:
                 handle.answer(number, value)
+
+    def _value(self, handle: Handle, number: int, message: verbs.Message) -> Any:
+        match message:
+            case verbs.Write(flags, timeout_s, records):
+                self._runtime.effects.note()
+                if handle.ahead[1]:
+                    records = _whole(handle, number, records)
+                return write(self._runtime, handle, number, flags, timeout_s, records)
+            case verbs.Ioctl(request, argument, timeout_s):
+                if (rule := REQUESTS.get(request)) is None or not rule.looks:
+                    self._runtime.effects.note()
+                return ioctl(self._runtime, handle, number, request, argument, timeout_s)
+            case verbs.Subscribe(every):
+                self._subscribe(handle, every)
+                return None
+            case verbs.CancelOnHandle(waiting):
+                wait = handle.waits.get(waiting)
+                if wait is not None:
+                    self._runtime.waits.end(wait, errno.ECANCELED, f"{wait.what}: cancelled")
+                return wait is not None
+            case _:
+                raise NotImplementedError(f"{type(message).__name__} is not served")
 
     def _subscribe(self, handle: Handle, every: int) -> None:
         if not -1 <= every <= 1_000_000:
@@ -234,15 +225,16 @@ class Attachments:
             elif not handle.halted:
                 self._halt_all([handle])
         handle.close()
-        self._runtime.tell(DriverVerb.DETACHED, handle.number)
+        self._runtime.tell(Detached(handle.number))
 
     def _make_safe(self, handle: Handle) -> None:
         """Give the outputs of a handle their safe values; of a bit only that bit."""
         self._runtime.stops.make_safe(handle.block, handle.channels, handle.bit)
 
 
-def _keep_part(handle: Handle, number: int, records: bytes) -> None:
+def _keep_part(handle: Handle, message: verbs.Part) -> None:
     """Keep records that come ahead of their write; those of a write that never came are dropped."""
+    number, records = message
     if len(records) > MAX_INLINE:
         raise MalformedMessage(f"a part of a write of {len(records)} bytes; want up to {MAX_INLINE}")
     if not handle.writes:

@@ -17,8 +17,9 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
-from sioms.protocol.incoming import TO_NURSERY, take
-from sioms.protocol.messages import MAX_UNPACKED, NurseryVerb, encode, pack_compressed, refusal, reply
+from sioms.protocol.driver_verbs import TO_NURSERY, Describe, Spawn
+from sioms.protocol.messages import MAX_UNPACKED, encode, pack_compressed, refusal, reply
+from sioms.protocol.verbs import take
 
 from .finding import DriverNotFound, describe, find_driver, read_settings
 
@@ -39,15 +40,15 @@ def main(fd: int) -> None:
         packet, fds, _, _ = socket.recv_fds(sock, 1 << 20, 8)
         if not packet:
             return
-        verb, number, arguments = take(packet, TO_NURSERY, values=MAX_UNPACKED)
+        number, message = take(packet, TO_NURSERY, values=MAX_UNPACKED)
         try:
-            match NurseryVerb(verb):
-                case NurseryVerb.DESCRIBE:
+            match message:
+                case Describe():
                     # Thousands of alike channels would not fit into a packet.
-                    described = pack_compressed(_describe(*arguments), 1)
+                    described = pack_compressed(_describe(*message), 1)
                     _tell(sock, encode(0, number, 0, described))
-                case NurseryVerb.SPAWN:
-                    _spawn(sock, number, fds, *arguments)
+                case Spawn():
+                    _spawn(sock, number, fds, *message)
         except Exception as error:  # a driver's describe may raise anything; the daemon must hear of it
             traceback.print_exc()
             _tell(sock, refusal(number, 5, f"{type(error).__name__}: {error}"))

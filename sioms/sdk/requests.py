@@ -16,7 +16,7 @@ import numpy as np
 
 from sioms.motion import CommandError
 from sioms.motion.queue import LIMIT_NAMES
-from sioms.protocol.flags import Request, Right
+from sioms.protocol.flags import REQUESTS, Request
 from sioms.protocol.text import shown
 
 from .blocks import AnalogBlock, AxisBlock
@@ -33,27 +33,6 @@ FEW_TICKS = 1000
 
 def _refuse(errno_: int, text: str) -> OSError:
     return OSError(errno_, text)
-
-
-LOOKS = frozenset(
-    {
-        Request.WAIT_UNTIL_IDLE, Request.GET_LIMITS, Request.GET_GAINS, Request.GET_STATISTICS, Request.GET_PARTICULARS,
-    }
-)  # fmt: skip
-"""Requests that change nothing that readings show; of all others a reading after the answer shows the effect."""
-_NEEDS_OWNER = {
-    Request.CALIBRATE_DEVICE, Request.HOME, Request.SET_LIMITS, Request.FLUSH, Request.ZERO_DEVICE, Request.SET_GAINS,
-}  # fmt: skip
-_NEEDS_RIGHT = {
-    **dict.fromkeys(Request, Right.WRITE),
-    **dict.fromkeys(LOOKS, Right.READ),
-    Request.WAIT_UNTIL_EVENT: Right.READ,
-    Request.EMERGENCY_STOP: Right.STOP,
-    Request.STOP: Right.STOP | Right.WRITE,
-    Request.RESET: Right.WRITE | Right.ADMINISTER,
-    Request.CANCEL_WAITS: Right.WRITE | Right.ADMINISTER,
-}
-"""Any of these will do."""
 
 
 def ioctl(
@@ -73,9 +52,10 @@ def ioctl(
         raise _refuse(errno.ENOTTY, f"ioctl {request_number} on {handle.node}: no such request") from None
     what = f"{request.name} on {handle.node}"
     owns = handle.exclusive or not _writable(handle)
-    if request in _NEEDS_OWNER and not owns:
+    rule = REQUESTS[request]
+    if rule.owner and not owns:
         raise _refuse(errno.EBADF, f"{what}: needs the output node itself, not its read-only companion")
-    if not handle.rights & _NEEDS_RIGHT[request]:
+    if not handle.rights & rule.right:
         raise _refuse(errno.EPERM, f"{what}: the user has no right to do that; ask for a [[grant]]")
     match request:
         case Request.EMERGENCY_STOP:

@@ -23,19 +23,15 @@ from typing import Any
 import numpy as np
 
 from sioms.motion import CommandError, EventKind
+from sioms.protocol import driver_verbs
 from sioms.protocol.flags import PageState
-from sioms.protocol.incoming import TO_DRIVER, take
 from sioms.protocol.latch import LATCH_SIZE, Latch
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
-from sioms.protocol.messages import (
-    MAX_PACKET,
-    MAX_UNPACKED,
-    DriverVerb,
-    encode,
-)
+from sioms.protocol.messages import MAX_PACKET, MAX_UNPACKED
 from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.stopjournal import StopJournal
 from sioms.protocol.text import printable
+from sioms.protocol.verbs import Message, take
 from sioms.turns import Turns
 
 from .attachments import SHARES, Attachments
@@ -116,7 +112,7 @@ class Runtime:
         self.latch = Latch(memoryview(mmap.mmap(fds[1], LATCH_SIZE)))
         request, self._request_fd = StopRequest(fds[2], fds[3]), fds[2]
         table = MarkerTable(memoryview(mmap.mmap(fds[4], TABLE_SIZE)))
-        self.markers = Markers(table, lambda number: self.tell(DriverVerb.MARKER_SIGNALLED, number))
+        self.markers = Markers(table, lambda number: self.tell(driver_verbs.MarkerSignalled(number)))
         description = driver.describe(device, settings)
         self.inputs: dict[str, Input] = {name: Input(name) for name in description.inputs}
         self._description = description
@@ -154,7 +150,7 @@ class Runtime:
 
     def log(self, level: str, text: str) -> None:
         """Write a line to the daemon's log."""
-        self.tell(DriverVerb.LOG, level, printable(text.replace("\n", " "), 1000))
+        self.tell(driver_verbs.LogLine(level, printable(text.replace("\n", " "), 1000)))
 
     def emergency_stop(self, source: str) -> None:
         """Stop the whole workcell."""
@@ -205,7 +201,7 @@ class Runtime:
     def set_link(self, blocks: Sequence[AnyBlock], state: PageState, reason: str) -> None:
         """Say how the device behind some blocks is: in their pages, and to the daemon once a change."""
         if self.pages.set_link(blocks, state, reason):
-            self.tell(DriverVerb.LINK, int(state), printable(reason))
+            self.tell(driver_verbs.LinkChanged(int(state), printable(reason)))
 
     def is_good(self, blocks: Sequence[AnyBlock]) -> bool:
         """Whether all these blocks have a good link."""
@@ -523,14 +519,14 @@ class Runtime:
 
     # --- the daemon ------------------------------------------------------------------------------
 
-    def tell(self, verb: DriverVerb, *arguments: object) -> None:
+    def tell(self, message: Message) -> None:
         try:
-            self._control.send(encode(verb, 0, *arguments))
+            self._control.send(message.packed())
         except OSError:
             return  # a daemon that is gone is noticed by its end of file, a hung one by its lease
 
     def _tell_ready(self) -> None:
-        socket.send_fds(self._control, [encode(DriverVerb.READY, 0, len(self.blocks))], self.pages.fds)
+        socket.send_fds(self._control, [driver_verbs.Ready(len(self.blocks)).packed()], self.pages.fds)
         for fd in self.pages.fds:
             os.close(fd)
 
@@ -551,29 +547,28 @@ class Runtime:
             self.unwatch(self._control.fileno())
             self.end("the daemon has gone")
             return False
-        verb, _, arguments = take(packet, TO_DRIVER, values=MAX_UNPACKED)
-        self._obey(DriverVerb(verb), arguments, fds)
+        _, message = take(packet, driver_verbs.TO_DRIVER, values=MAX_UNPACKED)
+        self._obey(message, fds)
         return True
 
-    def _obey(self, verb: DriverVerb, arguments: list[Any], fds: list[int]) -> None:
-        match verb:
-            case DriverVerb.ATTACH:
-                self.clients.attach(fds, *arguments)
-            case DriverVerb.DETACH:
-                self.clients.detach(*arguments)
-            case DriverVerb.STOP_CHANGED:
+    def _obey(self, message: Message, fds: list[int]) -> None:
+        match message:
+            case driver_verbs.Attach():
+                self.clients.attach(fds, message)
+            case driver_verbs.Detach(handle, errno_, reason):
+                self.clients.detach(handle, errno_, reason)
+            case driver_verbs.StopChanged():
                 self.stops.look()
-            case DriverVerb.SHUTDOWN:
+            case driver_verbs.Shutdown():
                 self.end("the device was taken out of service")
-            case DriverVerb.INPUT:
-                name, channels, bit = arguments
+            case driver_verbs.Input(name, channels, bit):
                 self.inputs[name].attach(fds[0], channels, bit)
-            case DriverVerb.NODE_STOP | DriverVerb.NODE_RESET:
-                block, channels, bit, text, resets = arguments
+            case driver_verbs.NodeStop() | driver_verbs.NodeReset():
+                block, channels, bit, text, resets = message
                 self.stops.heed()  # a reset that came before it must not come after it
                 if resets != self.latch.resets:
                     return  # the workcell has been reset since then: of all that, nothing is left
-                if verb is DriverVerb.NODE_STOP:
+                if isinstance(message, driver_verbs.NodeStop):
                     self.stops.stop_node(self.blocks[block], channels, bit, text)
                     return
                 try:
@@ -581,7 +576,7 @@ class Runtime:
                 except (OSError, CommandError) as error:
                     self.log("warning", str(error))
             case _:
-                self.log("error", f"daemon sent {verb.name}, which is not for it to send")
+                raise NotImplementedError(f"{type(message).__name__} is not served")
 
 
 def _become_user(user: str) -> None:

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sioms.protocol.driver_verbs import Stopped
 from sioms.protocol.flags import PageState
 from sioms.protocol.latch import Latch
-from sioms.protocol.messages import DriverVerb
 from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.stopjournal import StopJournal, channels_and_bits, node_entry, parts_of, workcell_entry
 
@@ -77,7 +77,7 @@ class Stops:
         if fresh:
             self._note(workcell_entry(source, stop=True))
             self._request.request(time.monotonic_ns(), os.getpid(), source)  # wakes the other drivers
-            self._runtime.tell(DriverVerb.STOPPED, source)
+            self._runtime.tell(Stopped(source))
 
     @property
     def is_up_to_date(self) -> bool:
@@ -110,7 +110,7 @@ class Stops:
             source = self._request.source
             # A reset may have answered it since: a stop that is over must not be latched again.
             if mark != latch.answered_request and latch.stop(time.monotonic_ns(), source):
-                self._runtime.tell(DriverVerb.STOPPED, latch.source)
+                self._runtime.tell(Stopped(latch.source))
         stopped_ns, resets = latch.stopped_ns, latch.resets
         self._seen = (stopped_ns, resets, mark)
         if (stopped_ns and stopped_ns != seen_stop) or resets != seen_resets:

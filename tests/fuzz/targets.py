@@ -20,14 +20,12 @@ from sioms.daemon.config import parse as parse_config
 from sioms.documents import json_of, toml_of
 from sioms.plant.effects import EffectsError, parse_effects
 from sioms.protocol import wire
-from sioms.protocol.incoming import FROM_CLIENT, FROM_DRIVER, ON_HANDLE, TO_DRIVER, TO_NURSERY, take
+from sioms.protocol.driver_verbs import FROM_DRIVER, TO_DRIVER, TO_NURSERY, DriverVerb, NurseryVerb
 from sioms.protocol.messages import (
     MAX_PACKET,
     ClientVerb,
-    DriverVerb,
     HandleVerb,
     MalformedMessage,
-    NurseryVerb,
     decode,
     decode_reply,
     encode,
@@ -36,6 +34,7 @@ from sioms.protocol.messages import (
     value_of,
 )
 from sioms.protocol.text import printable, shown
+from sioms.protocol.verbs import FROM_CLIENT, ON_HANDLE, take
 from sioms.reconcile.errors import BadInputError
 from sioms.sdk.codec.ascii_line import LineReceiver
 from sioms.sdk.codec.ati_rdt import parse as parse_rdt
@@ -84,11 +83,11 @@ def _message(data: bytes) -> None:
     assert repr(decode(encode(*message))) == repr(message)
     for verbs in (FROM_CLIENT, ON_HANDLE, TO_DRIVER, FROM_DRIVER, TO_NURSERY):
         try:
-            _, _, arguments = take(data, verbs)
+            _, taken = take(data, verbs)
         except MalformedMessage as error:
             assert str(error).isprintable()
         else:
-            assert len(arguments) == len(verbs[message[0]])
+            assert len(taken) == len(verbs[message[0]].fields)
 
 
 def _reply(data: bytes) -> None:

@@ -20,7 +20,8 @@ import pytest
 from sioms.aio import _Requests
 from sioms.client.channel import Call, Channel
 from sioms.client.overdue import GRACE_S, MOST_S
-from sioms.protocol.messages import HandleVerb, decode, reply
+from sioms.protocol.messages import decode, reply
+from sioms.protocol.verbs import CancelOnHandle, Keepalive
 
 ANSWERED_S = 2.0 * GRACE_S
 """When the one that is starved answers in the end [s]."""
@@ -69,7 +70,7 @@ def test_blocking(peer: tuple[str, Channel, socket.socket], threads: int) -> Non
     def ask() -> None:
         began = time.monotonic()
         try:
-            outcome: object = channel.call(Call("ask", HandleVerb.KEEPALIVE)).value
+            outcome: object = channel.call(Call("ask", Keepalive())).value
         except OSError as error:
             outcome = error
         outcomes.append((outcome, time.monotonic() - began))
@@ -89,10 +90,10 @@ def test_asyncio(peer: tuple[str, Channel, socket.socket]) -> None:
     does, channel, sock = peer
 
     async def ask() -> tuple[object, float]:
-        requests = _Requests(channel, HandleVerb.CANCEL)
+        requests = _Requests(channel, CancelOnHandle)
         began = time.monotonic()
         try:
-            outcome: object = (await requests.call(Call("ask", HandleVerb.KEEPALIVE))).value
+            outcome: object = (await requests.call(Call("ask", Keepalive()))).value
         except OSError as error:
             outcome = error
         took_s = time.monotonic() - began

@@ -21,13 +21,13 @@ from wire_rig import SLIDE, Wire
 import sioms
 from sioms.client.channel import Call, Channel, connect
 from sioms.protocol.flags import PROTOCOL_VERSION
-from sioms.protocol.messages import ClientVerb, HandleVerb
 from sioms.protocol.records import BINARY_WRITE
+from sioms.protocol.verbs import Hello, Write
 
 
 def test_the_stop_request_file_cannot_be_taken_away(daemon: Daemon, cell: sioms.Workcell) -> None:
     channel = Channel(connect(daemon.socket), "the daemon")
-    fd, taken = channel.call(Call("hello", ClientVerb.HELLO, PROTOCOL_VERSION, "rogue")).fds
+    fd, taken = channel.call(Call("hello", Hello(PROTOCOL_VERSION, "rogue"))).fds
     try:
         with pytest.raises(OSError):
             os.pwrite(taken, bytes(8), 0)  # what drivers say is theirs to say
@@ -152,7 +152,7 @@ def port(start_daemon: Callable[..., Daemon]) -> Iterator[tuple[Daemon, Device]]
 
 def _send(node: sioms.BinaryNode, value: int) -> None:
     """Send a write and do not wait for its answer."""
-    node._channel.send(Call("write", HandleVerb.WRITE, 0, 0.0, BINARY_WRITE.pack(0, 0, value, 0)))
+    node._channel.send(Call("write", Write(0, 0.0, BINARY_WRITE.pack(0, 0, value, 0))))
 
 
 def test_writes_on_their_way_do_not_come_after_the_safe_value(port: tuple[Daemon, Device]) -> None:

@@ -23,9 +23,9 @@ from sioms.client.node_core import NodeCore
 from sioms.drivers.sim_axes import SimAxes
 from sioms.drivers.sim_force import SimForce
 from sioms.drivers.sim_io import SimIo
+from sioms.protocol.driver_verbs import DriverVerb
 from sioms.protocol.flags import AxisStatus, Request
 from sioms.protocol.markers import token_of
-from sioms.protocol.messages import DriverVerb
 from sioms.protocol.records import BINARY_WRITE
 
 STEPS = int(os.environ.get("SIOMS_INTERLEAVINGS", "6000")) // 4

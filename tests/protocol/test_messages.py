@@ -10,6 +10,28 @@ import zlib
 import msgpack
 import pytest
 
+from sioms.protocol.driver_verbs import (
+    FROM_DRIVER,
+    TO_DRIVER,
+    TO_NURSERY,
+    Attach,
+    Describe,
+    Detach,
+    Detached,
+    DriverVerb,
+    Input,
+    LinkChanged,
+    LogLine,
+    MarkerSignalled,
+    NodeReset,
+    NodeStop,
+    NurseryVerb,
+    Ready,
+    Shutdown,
+    Spawn,
+    StopChanged,
+    Stopped,
+)  # fmt: skip
 from sioms.protocol.flags import (
     Access,
     AnalogStatus,
@@ -21,16 +43,13 @@ from sioms.protocol.flags import (
     Right,
     WriteFlag,
 )  # fmt: skip
-from sioms.protocol.incoming import FROM_CLIENT, FROM_DRIVER, ON_HANDLE, TO_DRIVER, TO_NURSERY, take
 from sioms.protocol.messages import (
     MAX_PACKET,
     MAX_UNPACKED,
     MAX_VALUES,
     ClientVerb,
-    DriverVerb,
     HandleVerb,
     MalformedMessage,
-    NurseryVerb,
     decode,
     decode_reply,
     encode,
@@ -40,6 +59,32 @@ from sioms.protocol.messages import (
 )  # fmt: skip
 from sioms.protocol.records import ANALOG_WRITE, AXIS_WRITE, BINARY_WRITE
 from sioms.protocol.text import MAX_TEXT
+from sioms.protocol.verbs import (
+    FROM_CLIENT,
+    ON_HANDLE,
+    Cancel,
+    CancelOnHandle,
+    Close,
+    EmergencyStop,
+    FreeMarker,
+    Hello,
+    Info,
+    Ioctl,
+    Keepalive,
+    List,
+    Message,
+    Open,
+    Part,
+    Reload,
+    ReserveMarker,
+    Reset,
+    SignalMarker,
+    Status,
+    Subscribe,
+    WaitMarker,
+    Write,
+    take,
+)  # fmt: skip
 from sioms.protocol.wire import MAX_DEPTH
 
 GOLDEN = [
@@ -63,6 +108,78 @@ GOLDEN = [
     (reply(9, None, 1 << 40), "96000900c0c2cf0000010000000000"),
     (refusal(9, 16, "held", 1 << 40), "96000910a468656c64c2cf0000010000000000"),
 ]  # fmt: skip
+
+SOCKETS = (FROM_CLIENT, ON_HANDLE, TO_DRIVER, FROM_DRIVER, TO_NURSERY)
+RECORDED: list[tuple[Message, str]] = [
+    (Hello(2, "eva"), "94010502a3657661"),
+    (Open("mod0", 3, None, 0.25), "960205a46d6f643003c0cb3fd0000000000000"),
+    (Close(300), "930305cd012c"),
+    (List(), "920405"),
+    (Info("mod0.xaxis"), "930505aa6d6f64302e7861786973"),
+    (Status(), "920605"),
+    (ReserveMarker(2, True), "940a0502c3"),
+    (FreeMarker(562949953421312), "930b05cf0002000000000000"),
+    (SignalMarker(7), "930c0507"),
+    (WaitMarker(7, 1.5), "940d0507cb3ff8000000000000"),
+    (EmergencyStop("", "why"), "941405a0a3776879"),
+    (Reset("mod0"), "931505a46d6f6430"),
+    (Reload(), "921605"),
+    (Cancel(5), "931e0505"),
+    (Write(1, 0.5, b"\x01\x02"), "95010501cb3fe0000000000000c4020102"),
+    (Ioctl(23, {"position_max": [0.2, None]}, 0.0), "9502051781ac706f736974696f6e5f6d617892cb3fc999999999999ac0cb0000000000000000"),
+    (Subscribe(-1), "930305ff"),
+    (Keepalive(), "920405"),
+    (CancelOnHandle(5), "93050505"),
+    (Part(9, b"\x03"), "94060509c40103"),
+    (Attach(7, 0, [0, 1], -1, 3, True, 15, 250000000, "eva (pid 5)", 1001, [64, 16], "mod0"), "9e01050700920001ff03c30fce0ee6b280ab6576612028706964203529cd03e9924010a46d6f6430"),
+    (Detach(7, 110, "late"), "950205076ea46c617465"),
+    (StopChanged(), "920305"),
+    (Shutdown(), "920405"),
+    (Input("io0", [0], 3), "950505a3696f30910003"),
+    (NodeStop(0, [0, 1], -1, "eva", 2), "97060500920001ffa365766102"),
+    (NodeReset(0, [1], 4, "eva", 2), "97070500910104a365766102"),
+    (Ready(2), "93140502"),
+    (Detached(7), "93150507"),
+    (MarkerSignalled(9), "93160509"),
+    (Stopped("io0.bit3"), "931705a8696f302e62697433"),
+    (LinkChanged(2, "unplugged"), "94180502a9756e706c7567676564"),
+    (LogLine("error", "no"), "941905a56572726f72a26e6f"),
+    (Describe("mod0", "sim-axis", {"a": [1, True]}, "/etc"), "960105a46d6f6430a873696d2d6178697381a1619201c3a42f657463"),
+    (Spawn("mod0", "sim-axis", {}, 3, {"user": "eva"}), "970205a46d6f6430a873696d2d61786973800381a475736572a3657661"),
+]  # fmt: skip
+"""Every verb with number 5, as it was sent before there was a table of verbs."""
+
+
+@pytest.mark.parametrize(("message", "packet"), RECORDED, ids=[type(m).__name__ for m, _ in RECORDED])
+def test_every_verb_is_on_the_wire_as_ever(message: Message, packet: str) -> None:
+    assert message.packed(5).hex() == packet
+    (socket,) = (socket for socket in SOCKETS if type(message) in socket.values())
+    number, taken = take(bytes.fromhex(packet), socket)
+    assert (number, type(taken)) == (5, type(message))
+    assert list(taken) == list(message)
+
+
+def test_no_verb_is_left_out() -> None:
+    kinds = [kind for socket in SOCKETS for kind in socket.values()]
+    assert {type(message) for message, _ in RECORDED} == {*kinds}
+    for verbs, sockets in (
+        (ClientVerb, [FROM_CLIENT]), (HandleVerb, [ON_HANDLE]), (DriverVerb, [TO_DRIVER, FROM_DRIVER]), (NurseryVerb, [TO_NURSERY]),
+    ):  # fmt: skip
+        assert sorted(verb for socket in sockets for verb in socket) == sorted(verbs)
+
+
+def test_a_message_is_taken_in_its_states_only() -> None:
+    ready = Ready(1).packed()
+    assert take(ready, FROM_DRIVER, state="starting") == (0, Ready(1))
+    with pytest.raises(MalformedMessage, match="Ready while up; want it while starting or ending"):
+        take(ready, FROM_DRIVER, state="up")
+
+
+@pytest.mark.parametrize("number", [0, 3])
+def test_a_request_has_a_number_of_its_own(number: int) -> None:
+    with pytest.raises(MalformedMessage, match=f"message number {number} is zero or in use"):
+        take(Status().packed(number), FROM_CLIENT, pending={3})
+    assert take(Keepalive().packed(number), ON_HANDLE, pending={3}) == (number, Keepalive())
 
 
 @pytest.mark.parametrize(("packet", "golden"), GOLDEN, ids=[g for _, g in GOLDEN])
@@ -207,10 +324,11 @@ def test_what_is_no_reply(message: list[object]) -> None:
 
 
 def test_every_verb_takes_certain_kinds_and_nothing_else() -> None:
-    for verbs in (FROM_CLIENT, ON_HANDLE, TO_DRIVER, FROM_DRIVER, TO_NURSERY):
-        for verb, kinds in verbs.items():
+    for verbs in SOCKETS:
+        for verb, kind_of in verbs.items():
+            kinds = [*kind_of.fields.values()]
             good = [kind.types[0]() if kind.types else None for kind in kinds]
-            assert take(encode(verb, 1, *good), verbs) == (verb, 1, good)
+            assert take(encode(verb, 1, *good), verbs) == (1, kind_of.of(good))
             with pytest.raises(MalformedMessage, match="arguments"):
                 take(encode(verb, 1, *good, None), verbs)
             for place, kind in enumerate(kinds):

@@ -15,7 +15,8 @@ import pytest
 
 from sioms.client.channel import Call, Channel, connect
 from sioms.client.overdue import GRACE_S
-from sioms.protocol.messages import ClientVerb, HandleVerb, decode, encode, refusal, reply
+from sioms.protocol.messages import ClientVerb, decode, encode, refusal, reply
+from sioms.protocol.verbs import Ioctl, Subscribe
 
 
 class Peer:
@@ -34,7 +35,7 @@ class Peer:
         def run() -> None:
             try:
                 self.results[word] = self.channel.call(
-                    Call("ask", HandleVerb.IOCTL, 1, word, None, limit_s=limit_s)
+                    Call("ask", Ioctl(1, word, None), limit_s=limit_s)
                 ).value
             except OSError as error:
                 self.results[word] = error
@@ -115,12 +116,12 @@ def test_the_reason_of_the_end_is_told_to_who_sends_next(peer: Peer) -> None:
     peer.sock.close()
     for _ in range(2):
         with pytest.raises(OSError, match="stopped by eva") as refused:
-            peer.channel.call(Call("ask", HandleVerb.SUBSCRIBE, 1))
+            peer.channel.call(Call("ask", Subscribe(1)))
         assert refused.value.errno == errno.ECANCELED
 
 
 def test_answers_before_the_end_are_kept(peer: Peer) -> None:
-    call = Call("ask", HandleVerb.SUBSCRIBE, 1)
+    call = Call("ask", Subscribe(1))
     first, second = peer.channel.send(call), peer.channel.send(call)
     peer.sock.send(reply(first, "taken"))
     peer.sock.send(refusal(second, errno.EAGAIN, "no room"))
@@ -134,7 +135,7 @@ def test_answers_before_the_end_are_kept(peer: Peer) -> None:
 
 def test_a_message_too_long_is_refused_before_it_is_sent(peer: Peer) -> None:
     with pytest.raises(OSError, match="at most 65536") as refused:
-        peer.channel.call(Call("ask", HandleVerb.IOCTL, 1, b"x" * 70000, None))
+        peer.channel.call(Call("ask", Ioctl(1, b"x" * 70000, None)))
     assert refused.value.errno == errno.EMSGSIZE
     number = peer.ask("still works")
     peer.sock.send(reply(number, 1))
@@ -198,7 +199,7 @@ def test_what_is_no_daemons_socket_is_told(
 
 def test_take_does_not_wait(peer: Peer) -> None:
     assert peer.channel.take() is None
-    number = peer.channel.send(Call("ask", HandleVerb.SUBSCRIBE, 1))
+    number = peer.channel.send(Call("ask", Subscribe(1)))
     peer.sock.send(reply(number, 5))
     packet = peer.channel.take()
     assert packet is not None and peer.channel.result(packet).value == 5

@@ -21,10 +21,12 @@ from sioms.daemon.names import BlockInfo, DeviceInfo, NameTable
 from sioms.daemon.rights import RIGHTS, Peer, Rights
 from sioms.daemon.sessions import Session
 from sioms.daemon.users import Users
+from sioms.protocol.driver_verbs import Detach
 from sioms.protocol.flags import PROTOCOL_VERSION, Access, NodeClass, Right
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
-from sioms.protocol.messages import ClientVerb, DriverVerb, decode
+from sioms.protocol.messages import ClientVerb, decode
 from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.protocol.verbs import FROM_CLIENT, Message
 
 PORT = BlockInfo("", NodeClass.BINARY, (ChannelInfo("do", width=2),), True, 64, 0)
 INFOS = {"io0": DeviceInfo("io0", "sim-io", (PORT,), 100.0, (), 0.1)}
@@ -40,19 +42,19 @@ class Device:
         self.page_fds = [os.memfd_create("page")]
         self.restarts = SimpleNamespace(deaths_ns=[])
         self.link, self.started_ns = (SimpleNamespace(name="GOOD"), ""), 0
-        self.orders: list[tuple[DriverVerb, tuple[Any, ...]]] = []
+        self.orders: list[Message] = []
 
     @property
     def is_there(self) -> bool:
         return True
 
-    def send(self, verb: DriverVerb, *arguments: Any, fds: Any = ()) -> None:
+    def send(self, message: Message, fds: Any = ()) -> None:
         if not self.takes:
             raise OSError(errno.EIO, "takes no messages")
-        self.orders.append((verb, arguments))
+        self.orders.append(message)
 
-    def ended(self) -> list[tuple[Any, ...]]:
-        return [arguments for verb, arguments in self.orders if verb is DriverVerb.DETACH]
+    def ended(self) -> list[Detach]:
+        return [order for order in self.orders if isinstance(order, Detach)]
 
 
 class Workcell:
@@ -106,7 +108,7 @@ class Workcell:
     def ask(self, who: str, verb: ClientVerb, *arguments: object) -> int | None:
         """Ask for something; return the errno of the answer, None when there is none yet."""
         self._number += 1
-        self.clients._dispatch(self.sessions[who], int(verb), self._number, list(arguments))
+        self.clients._dispatch(self.sessions[who], self._number, FROM_CLIENT[int(verb)].of([*arguments]))
         return self.answer(who)
 
     def answer(self, who: str) -> int | None:

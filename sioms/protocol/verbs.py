@@ -1,0 +1,344 @@
+"""The verb table: every message of every socket, with its arguments, who may send it, in which state, and by which right.
+
+A class is a message, its fields are the arguments in the order of the wire, and an instance is one that is sent or has been
+received. ``take`` decodes a packet of a peer and checks number and kinds of the arguments, the message number and the state, so
+that a TypeError of whoever serves it is its own mistake and not the peer's. What a value means (a channel that is none, a
+limit out of range) is judged, and refused, by who serves it. Messages between daemon, drivers and fork server: ``driver_verbs``.
+
+docs/protocol.md is generated from this table.
+"""
+
+from __future__ import annotations
+
+from _operator import itemgetter
+
+from .flags import Right
+from .messages import MAX_PACKET, MAX_VALUES, ClientVerb, HandleVerb, MalformedMessage, decode, encode
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Container, Sequence
+    from typing import Any, ClassVar, Self, TypeAlias, dataclass_transform
+
+    Integer: TypeAlias = int
+    Number: TypeAlias = float
+    Seconds: TypeAlias = float | None
+    Flag: TypeAlias = bool
+    Name: TypeAlias = str
+    Text: TypeAlias = str
+    Records: TypeAlias = bytes
+    Array: TypeAlias = Sequence[Any]
+    Table: TypeAlias = dict[str, Any]
+    Anything: TypeAlias = Any
+else:
+
+    def dataclass_transform(**_):
+        return lambda cls: cls
+
+
+class Kind:
+    """A kind of argument.
+
+    Attributes:
+        types: what it may be, exactly.
+        words: the same for messages.
+        most: characters or bytes that it may have, 0 = as many as a packet holds.
+    """
+
+    __slots__ = ("most", "types", "words")
+
+    def __init__(self, types: tuple[type, ...], words: str, most: int = 0) -> None:
+        self.types, self.words, self.most = types, words, most
+
+
+INTEGER = Kind((int,), "an integer")
+NUMBER = Kind((float, int), "a number")
+SECONDS = Kind((float, int, type(None)), "seconds as a number, or none for ever")
+FLAG = Kind((bool,), "true or false")
+ANYTHING = Kind((), "anything")
+KINDS = {
+    "Integer": INTEGER,
+    "Number": NUMBER,
+    "Seconds": SECONDS,
+    "Flag": FLAG,
+    "Name": Kind((str,), "a name", 255),
+    "Text": Kind((str,), "text"),
+    "Records": Kind((bytes,), "bytes"),
+    "Array": Kind((list,), "an array"),
+    "Table": Kind((dict,), "a map"),
+    "Anything": ANYTHING,
+}
+"""Kinds by the annotations of fields."""
+
+
+_NO_RIGHT = Right(0)
+
+
+class Socket(dict[int, "type[Message]"]):
+    """The messages that one side of a socket may send, by verb.
+
+    Attributes:
+        sender, receiver: the two ends, in words.
+        states: of the connection, as the receiver sees it, in the order in which they are gone through.
+    """
+
+    def __init__(self, sender: str, receiver: str, states: tuple[str, ...]) -> None:
+        super().__init__()
+        self.sender, self.receiver, self.states = sender, receiver, states
+
+
+@dataclass_transform(frozen_default=True)
+class Message(tuple):  # type: ignore[type-arg]
+    """A message: the tuple of its arguments.
+
+    Attributes:
+        verb: its number on the wire.
+        fields: names and kinds of its arguments.
+        notice: it draws no reply, and its message number says nothing.
+        states: in which the receiver takes it; elsewhere it is malformed.
+        then: the state after it, unless that has been passed; '' = the same.
+        right: any of these is asked for, on the node that it names, else on every node; 0: none is.
+        somewhere: in words what is done, where a right on any node will do.
+        shown: readings show its effect: who has the answer shall read nothing older.
+        query: nothing changes by it.
+    """
+
+    verb: ClassVar[int]
+    fields: ClassVar[dict[str, Kind]]
+    notice: ClassVar[bool]
+    states: ClassVar[tuple[str, ...]]
+    then: ClassVar[str]
+    right: ClassVar[Right]
+    somewhere: ClassVar[str]
+    shown: ClassVar[bool]
+    query: ClassVar[bool]
+
+    if not TYPE_CHECKING:
+
+        def __new__(cls, *arguments):
+            return tuple.__new__(cls, arguments)
+
+    def __init_subclass__(
+        cls, on: Socket, verb: int, notice: bool = False, states: tuple[str, ...] = (), then: str = "",
+        right: Right = _NO_RIGHT, somewhere: str = "", shown: bool = False, query: bool = False,
+    ) -> None:  # fmt: skip
+        cls.verb, cls.notice, cls.states, cls.then = verb, notice, states or on.states, then
+        cls.right, cls.somewhere, cls.shown, cls.query = right, somewhere, shown, query
+        names = cls.__dict__.get("__annotations__", {})  # noqa: RUF063  # as light as it is
+        cls.fields = {name: KINDS[kind] for name, kind in names.items()}
+        cls.__match_args__ = tuple(names)  # type: ignore[attr-defined, misc]
+        for at, name in enumerate(names):
+            setattr(cls, name, property(itemgetter(at)))
+        on[int(verb)] = cls
+
+    @classmethod
+    def of(cls, arguments: list[Any]) -> Self:
+        """Make a message of arguments that have been checked."""
+        return tuple.__new__(cls, arguments)
+
+    def packed(self, number: int = 0) -> bytes:
+        """Return the packet, with its message number."""
+        return encode(self.verb, number, *self)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}{tuple(self)!r}"
+
+
+def take(
+    packet: bytes,
+    socket: Socket,
+    most: int = MAX_PACKET,
+    values: int = MAX_VALUES,
+    *,
+    pending: Container[int] = (),
+    state: str = "",
+) -> tuple[int, Message]:
+    """Decode a message of a peer.
+
+    Args:
+        packet: as it was received.
+        socket: what may come on that socket.
+        most: bytes that a packet may have.
+        values: values that its arrays and maps may hold.
+        pending: numbers of requests that are not answered yet.
+        state: of the connection; '' where every message is taken in every state.
+
+    Returns:
+        Message number, and the message: each argument is of its kind, and none that must be seconds or a number is NaN.
+
+    Raises:
+        MalformedMessage: anything else.
+    """
+    parts = decode(packet, most, values)
+    number, arguments = parts[1], parts[2:]
+    kind_of = socket.get(parts[0])
+    if kind_of is None:
+        raise MalformedMessage(f"verb {parts[0]} is none")
+    fields = kind_of.fields
+    if len(arguments) != len(fields):
+        raise MalformedMessage(f"verb {parts[0]} with {len(arguments)} arguments; want {len(fields)}")
+    for value, kind in zip(arguments, fields.values(), strict=True):
+        if type(value) not in kind.types and kind.types:
+            raise MalformedMessage(
+                f"verb {parts[0]} with {type(value).__name__} as an argument; want {kind.words}"
+            )
+        if value != value and kind.types:
+            raise MalformedMessage(f"verb {parts[0]} with NaN as an argument; want {kind.words}")
+        if kind.most and len(value) > kind.most:
+            raise MalformedMessage(
+                f"verb {parts[0]} with {len(value)} characters; want {kind.words} of at most {kind.most}"
+            )
+    if state and state not in kind_of.states:
+        raise MalformedMessage(
+            f"{kind_of.__name__} while {state}; want it while {' or '.join(kind_of.states)}"
+        )
+    if not kind_of.notice and (number == 0 or number in pending):
+        raise MalformedMessage(f"message number {number} is zero or in use")
+    return number, kind_of.of(arguments)
+
+
+# --- from a client to the daemon -----------------------------------------------------------------
+
+FROM_CLIENT = Socket("client", "daemon", ("starting", "serving"))
+"""While the daemon is starting, every request is refused with EAGAIN."""
+
+
+class Hello(Message, on=FROM_CLIENT, verb=ClientVerb.HELLO, query=True):
+    """Say who one is. Answer: [protocol version, workcell, rights]; descriptors of the stop-request file if it may stop."""
+
+    version: Integer
+    name: Text
+
+
+class Open(Message, on=FROM_CLIENT, verb=ClientVerb.OPEN, right=Right.READ):
+    """Open a node, which takes the right to write, too, if the node can be written.
+
+    Answer: [handle, node, channels, bit, [process that made the socket, process behind it]]; descriptors of page, wake pipe
+    and the handle's socket.
+    """
+
+    node: Name
+    access: Integer
+    timeout_s: Seconds
+    lease_s: Number
+
+
+class Close(Message, on=FROM_CLIENT, verb=ClientVerb.CLOSE, shown=True):
+    """Close a handle; answered when what it owned is being halted, and free."""
+
+    handle: Integer
+
+
+class List(Message, on=FROM_CLIENT, verb=ClientVerb.LIST, query=True):
+    """Tell the nodes that the user may read."""
+
+
+class Info(Message, on=FROM_CLIENT, verb=ClientVerb.INFO, right=Right.READ, query=True):
+    """Tell what a node is."""
+
+    node: Name
+
+
+class Status(Message, on=FROM_CLIENT, verb=ClientVerb.STATUS, query=True):
+    """Tell devices, sessions, holders and stops."""
+
+
+class ReserveMarker(Message, on=FROM_CLIENT, verb=ClientVerb.RESERVE_MARKER, somewhere="reserve markers"):
+    """Reserve markers, all or none, for the session or to persist. Answer: their tokens."""
+
+    how_many: Integer
+    persist: Flag
+
+
+class FreeMarker(Message, on=FROM_CLIENT, verb=ClientVerb.FREE_MARKER, shown=True):
+    """Free a marker; who waits for it gets EPIPE."""
+
+    token: Integer
+
+
+class SignalMarker(
+    Message, on=FROM_CLIENT, verb=ClientVerb.SIGNAL_MARKER, somewhere="signal a marker", shown=True
+):
+    """Signal a marker."""
+
+    token: Integer
+
+
+class WaitMarker(
+    Message, on=FROM_CLIENT, verb=ClientVerb.WAIT_MARKER, somewhere="wait for a marker", shown=True
+):
+    """Wait until a marker, by number or token, is signalled. Answer: when that was [ns]."""
+
+    marker: Integer
+    timeout_s: Seconds
+
+
+class EmergencyStop(
+    Message, on=FROM_CLIENT, verb=ClientVerb.EMERGENCY_STOP, right=Right.STOP, shown=True
+):  # fmt: skip
+    """Stop a node, '' = the workcell, until it is reset. The right on any node will do for the workcell."""
+
+    node: Name
+    why: Text
+
+
+class Reset(
+    Message, on=FROM_CLIENT, verb=ClientVerb.RESET, right=Right.WRITE | Right.ADMINISTER, shown=True
+):  # fmt: skip
+    """Clear the stop of a node, '' = of the workcell, and faults."""
+
+    node: Name
+
+
+class Reload(Message, on=FROM_CLIENT, verb=ClientVerb.RELOAD, right=Right.ADMINISTER):
+    """Take up the configuration anew. Answer: all errors; with any, nothing was taken up."""
+
+
+class Cancel(Message, on=FROM_CLIENT, verb=ClientVerb.CANCEL):
+    """End a request of this session that waits. Answer: whether there was one."""
+
+    number: Integer
+
+
+# --- from a client to a driver, on the socket of a handle ----------------------------------------
+
+ON_HANDLE = Socket("client", "driver", ("open",))
+
+
+class Write(Message, on=ON_HANDLE, verb=HandleVerb.WRITE, right=Right.WRITE, shown=True):
+    """Write records, those sent ahead in parts first, all or none; needs a handle that is open for writing. Answer: the tick."""
+
+    flags: Integer
+    timeout_s: Seconds
+    records: Records
+
+
+class Ioctl(Message, on=ON_HANDLE, verb=HandleVerb.IOCTL, shown=True):
+    """Carry out a request; what it takes and needs is in the table of requests."""
+
+    request: Integer
+    argument: Anything
+    timeout_s: Seconds
+
+
+class Subscribe(Message, on=ON_HANDLE, verb=HandleVerb.SUBSCRIBE, query=True):
+    """Wake the client by its pipe with every n-th publication; -1: with edges only; 0: not."""
+
+    every: Integer
+
+
+class Keepalive(Message, on=ON_HANDLE, verb=HandleVerb.KEEPALIVE, notice=True, query=True):
+    """Renew the lease, as every message does."""
+
+
+class CancelOnHandle(Message, on=ON_HANDLE, verb=HandleVerb.CANCEL, query=True):
+    """End a request of this handle that waits. Answer: whether there was one."""
+
+    number: Integer
+
+
+class Part(Message, on=ON_HANDLE, verb=HandleVerb.PART, notice=True):
+    """The beginning of the records of the write of this message number, which is to follow."""
+
+    write: Integer
+    records: Records
