@@ -127,7 +127,7 @@ class SimForce(TickDriver):
         for index, contact in enumerate(self.settings.contact):
             reading = self.kit.inputs[contact.node].read(now_ns)
             missing |= reading is None
-            self._forces[index] = 0.0 if reading is None else reading[0, 0]
+            self._forces[index] = 0.0 if reading is None else reading["value"][0]
         data, sensor, time_s = self._block.data, self._sensor, now_ns * 1e-9
         if self._twin is None:
             sensor.read(self._forces, data, time_s)

@@ -218,7 +218,7 @@ class SimIo(TickDriver):
         news: dict[int, dict[int, float]] = {}
         for index, node in enumerate(self._nodes):
             for stamp_ns, reading in self.kit.inputs[node].fresh(now_ns):
-                news.setdefault(stamp_ns, {})[index] = float(reading[0, 0])
+                news.setdefault(stamp_ns, {})[index] = float(reading["value"][0])
         edges = []
         for stamp_ns in sorted(news):
             self._positions.update(news[stamp_ns])

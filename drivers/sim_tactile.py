@@ -142,7 +142,7 @@ class SimTactile(TickDriver):
         if not node:
             return 0.0
         reading = self.kit.inputs[node].read(now_ns)
-        return None if reading is None else float(reading[0, 0])
+        return None if reading is None else float(reading["value"][0])
 
 
 def _check(settings: SimTactileSettings) -> int:

@@ -216,9 +216,10 @@ class TactileNodes:
         reading = node.read(now_ns)
         if reading is None or stamp_ns - node.stamp_ns > self._settings.load_age_s * 1e9:
             return None
-        if int(reading.view(np.int64)[1, 0]) & int(AnalogStatus.INVALID | AnalogStatus.SATURATED):
+        flags = reading.get("flags", (0,))
+        if int(flags[0]) & int(AnalogStatus.INVALID | AnalogStatus.SATURATED):
             return None
-        return float(reading[0, 0])
+        return float(reading["value"][0])
 
     def _make(self, finger: Finger) -> ShapeSensor:
         from sioms.tactile.sensing import ShapeSensor

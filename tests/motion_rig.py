@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from sioms.motion import ActionKind, AxisBank, AxisSettings, CommandError, DriveBank, Event, EventKind, Keeper
-from sioms.motion.bank import ROW
 from sioms.motion.commands import WIRE_DTYPE
-from sioms.protocol.flags import ControlMode
+from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable, split_token, token_of
+from sioms.protocol.records import read_rows
 
 TICK_NS = 1_000_000
 MODE = ControlMode
@@ -98,7 +98,7 @@ class Rig:
         self.plant = plant
         self.switches: Callable[[np.ndarray], np.ndarray] | None = None
         self.events: list[Event] = []
-        self.history: list[np.ndarray] = []
+        self.history: list[dict[str, np.ndarray]] = []
         self.tick()
 
     def tick(self, ticks: int = 1, *, plan: bool = True) -> None:
@@ -110,10 +110,10 @@ class Rig:
             if self.plant is not None:
                 self.raw = self.plant(output, self.tick_ns * 1e-9)
             else:
-                self.raw = self.raw + self.bank.fields[ROW["following_error"]]
+                self.raw = self.raw + self.bank.rows["following_error"]
             if plan:
                 self.bank.plan_ahead()
-            self.history.append(self.bank.fields.copy())
+            self.history.append(read_rows(NodeClass.AXIS, self.bank.fields.copy()))
             self.events += self.bank.take_events()
 
     def run(self, most: int = 20_000) -> float:
@@ -130,14 +130,12 @@ class Rig:
 
     def field(self, name: str, i: int = 0) -> float:
         """Return a published field of axis i."""
-        row = self.bank.fields[ROW[name]]
-        if name in ("in_motion", "status", "buffered"):
-            return int(row.view(np.int64)[i])
-        return float(row[i])
+        value: float = self.bank.rows[name][i].item()
+        return value
 
     def trace(self, name: str, i: int = 0) -> np.ndarray:
         """Return a field of axis i over all ticks."""
-        return np.array([h[ROW[name], i] for h in self.history])
+        return np.array([h[name][i] for h in self.history])
 
     def kinds(self) -> list[EventKind]:
         """Return the kinds of all events so far."""
@@ -237,4 +235,4 @@ class Cell:
         self.send()
 
     def status(self, i=0):
-        return int(self.bank.fields[11].view(np.int64)[i])
+        return int(self.bank.rows["status"][i])

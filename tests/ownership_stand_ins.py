@@ -93,7 +93,7 @@ class Axis(TickDriver):
         return (self._block,)
 
     def tick(self, now_ns: int) -> None:
-        self.bank.tick(now_ns, self.bank.fields[0].copy())
+        self.bank.tick(now_ns, self.bank.rows["position"].copy())
 
     def moves(self) -> bool:
         """Tell whether it does so for more than the moment that a halt takes."""

@@ -9,7 +9,7 @@ from typing import Any
 from sioms.client.snapshot import SNAPSHOT, Layout
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
-from sioms.protocol.records import READ_FIELDS
+from sioms.protocol.records import READ
 
 AXES = ("xaxis", "yaxis", "zaxis", "taxis")
 
@@ -25,6 +25,6 @@ def node_info(
 def snapshot(node_class: NodeClass, count: int, **fields: Sequence[float]) -> Any:
     """Return a snapshot of all channels; fields that are not given are 0."""
     raw = struct.pack("<QQQQ", 7, 1_000_000_000, 42, 0)
-    for name, code in READ_FIELDS[node_class]:
-        raw += struct.pack(f"<{count}{code}", *fields.get(name, [0] * count))
+    for name, column in READ[node_class].items():
+        raw += struct.pack(f"<{count}{column.code}", *fields.get(name, [0] * count))
     return SNAPSHOT[node_class](raw, Layout(node_class, count, list(range(count)), -1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sioms.protocol.flags import ControlMode, NodeClass
-from sioms.protocol.records import ANALOG_WRITE, AXIS_WRITE, AXIS_WRITE_FIELDS, BINARY_WRITE
+from sioms.protocol.records import ANALOG_WRITE, AXIS_WRITE, BINARY_WRITE, WRITE
 
 from .options import Target, UsageError
 
@@ -15,20 +15,19 @@ if TYPE_CHECKING:
 
 # The numbers of an axis, always in this order whatever the order of the letters (section F.4.2).
 ORDER = (
-    ("p", "position", ControlMode.POSITION),
-    ("v", "velocity", ControlMode.VELOCITY),
-    ("a", "acceleration", ControlMode.ACCELERATION),
-    ("j", "jerk", ControlMode.JERK),
-    ("f", "force", ControlMode.FORCE),
-    ("F", "force_velocity", ControlMode.FORCE_VELOCITY),
-    ("o", "force_offset", ControlMode.SPECIFIED_FORCE_OFFSET),
-    ("t", "time", ControlMode.SPECIFIED_TIME),
-    ("m", "wait_marker_number", ControlMode.SPECIFIED_WAIT_MARKER),
-    ("s", "signal_marker_number", ControlMode.SPECIFIED_SIGNAL_MARKER),
+    ("p", "position"),
+    ("v", "velocity"),
+    ("a", "acceleration"),
+    ("j", "jerk"),
+    ("f", "force"),
+    ("F", "force_velocity"),
+    ("o", "force_offset"),
+    ("t", "time"),
+    ("m", "wait_marker_number"),
+    ("s", "signal_marker_number"),
 )
 _QUANTITIES = "pvajfF"
-_FIELD = {name: place for place, (name, _) in enumerate(AXIS_WRITE_FIELDS)}
-_INTEGERS = ("wait_marker_number", "signal_marker_number")
+_COLUMNS = WRITE[NodeClass.AXIS]
 
 
 class Columns:
@@ -59,14 +58,13 @@ class Columns:
         self._names = ["data"]
         self.replace = self.has_end = False
         self.is_axis = info.node_class is NodeClass.AXIS
-        letters = [letter for letter, _, _ in ORDER if letter in flags]
+        letters = [letter for letter, _ in ORDER if letter in flags]
         if self.is_axis:
             if not any(letter in _QUANTITIES for letter in letters):
                 letters.insert(0, "p")
-            chosen = [entry for entry in ORDER if entry[0] in letters]
-            self._names = [name for _, name, _ in chosen]
-            for _, _, mode in chosen:
-                self._mode |= mode
+            self._names = [name for letter, name in ORDER if letter in letters]
+            for name in self._names:
+                self._mode |= _COLUMNS[name].flag
             queued = any(letter in "tms" for letter in letters)
             self.replace = not queued
             self.has_end = "t" in letters or "p" in letters
@@ -111,11 +109,11 @@ class Columns:
         return any(numbers[i * width + at] < 0 for i in range(len(self._channels)))
 
     def _axis(self, channel: int, numbers: Sequence[float]) -> bytes:
-        fields: list[float] = [0.0] * len(_FIELD)
-        fields[0], fields[1], fields[2], fields[3] = channel, int(self._mode), 0, 0
+        fields: dict[str, float] = dict.fromkeys(_COLUMNS, 0)
+        fields["axis"], fields["control_mode"] = channel, int(self._mode)
         for name, value in zip(self._names, numbers, strict=True):
-            fields[_FIELD[name]] = _whole(value, name.replace("_", " ")) if name in _INTEGERS else value
-        return AXIS_WRITE.pack(*fields)
+            fields[name] = value if _COLUMNS[name].code == "d" else _whole(value, name.replace("_", " "))
+        return AXIS_WRITE.pack(*fields.values())
 
 
 def _whole(value: float, what: str) -> int:

@@ -1,9 +1,9 @@
-"""Write what is generated: manual pages (docs/man), shell completions (etc/completion) and docs/protocol.md.
+"""Write what is generated: manual pages (docs/man), shell completions (etc/completion), docs/protocol.md and docs/records.md.
 
     python -m sioms.tools.generate           write the files that differ
     python -m sioms.tools.generate --check   write nothing; exit 1 and name the files that differ
 
-Everything comes out of the tables of options, manuals, commands and verbs, so that none of them can lie.
+Everything comes out of the tables of options, manuals, commands, verbs and columns, so that none of them can lie.
 """
 
 from __future__ import annotations
@@ -11,6 +11,9 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+
+from sioms.protocol.flags import ControlMode, NodeClass
+from sioms.protocol.records import READ, WRITE, Column
 
 from . import driver
 from .front import COMMANDS, DESCRIPTION
@@ -47,10 +50,46 @@ def files() -> dict[str, str]:
     made["docs/man/sioms-driver.1"] = driver_page()
     made["docs/man/siomsd.8"] = daemon_page()
     made["docs/protocol.md"] = protocol_page()
+    made["docs/records.md"] = records_page()
     made["etc/completion/sioms.bash"] = bash()
     made["etc/completion/_sioms"] = zsh()
     made["etc/completion/sioms.fish"] = fish()
     return made
+
+
+# --- records -------------------------------------------------------------------------------------
+
+RECORDS = """# Records
+
+What is written to a node and read from it: one record per channel, little-endian. Generated from
+`sioms/protocol/records.py` by `python -m sioms.tools.generate`.
+
+A write is any number of write records, one after the other, without gaps. A read is an array per column, in this order: 8 bytes
+per channel and column, in the node's page in shared memory. Units are declared per channel; u is m or rad, f is N or N*m.
+`i` and `I` are integers of 4 bytes, `q` of 8 bytes, `d` is a double. A column with a flag counts only where `control_mode` has that flag.
+"""
+
+
+def records_page() -> str:
+    """Return the page of the records' columns."""
+    parts = [RECORDS]
+    for verb, tables in (("Write", WRITE), ("Read", READ)):
+        for node_class in (NodeClass.AXIS, NodeClass.ANALOG, NodeClass.BINARY):
+            rows = [_column_row(column, flagged=verb == "Write") for column in tables[node_class].values()]
+            head = (
+                "| column | type | unit | flag | meaning |"
+                if verb == "Write"
+                else "| column | type | unit | meaning |"
+            )
+            rule = "| --- " * (head.count("|") - 1) + "|"
+            parts.append("\n".join([f"## {verb} {node_class.name.lower()}", "", head, rule, *rows]) + "\n")
+    return "\n".join(parts)
+
+
+def _column_row(column: Column, *, flagged: bool) -> str:
+    flag = [str(ControlMode(column.flag).name) if column.flag else ""] if flagged else []
+    cells = [f"`{column.name}`", f"`{column.code}`", column.unit.format(u="u", f="f"), *flag, column.text]
+    return f"| {' | '.join(cells)} |"
 
 
 # --- manual pages --------------------------------------------------------------------------------

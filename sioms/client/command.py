@@ -4,32 +4,21 @@ from __future__ import annotations
 
 from struct import error as struct_error
 
-from sioms.protocol.flags import ControlMode
-from sioms.protocol.records import AXIS_WRITE, AXIS_WRITE_FIELDS
+from sioms.protocol.flags import QUANTITIES, ControlMode, NodeClass
+from sioms.protocol.records import AXIS_WRITE, WRITE
 
 from .arguments import integer, number
 
-_DEFAULT = {name: 0 if code in "iIq" else 0.0 for name, code in AXIS_WRITE_FIELDS}
-_QUANTITY = {
-    "position": ControlMode.POSITION,
-    "velocity": ControlMode.VELOCITY,
-    "acceleration": ControlMode.ACCELERATION,
-    "jerk": ControlMode.JERK,
-    "force": ControlMode.FORCE,
-    "force_velocity": ControlMode.FORCE_VELOCITY,
-}
-_WITH = {
-    "max_velocity": ControlMode.SPECIFIED_MAX_VEL_ACC,
-    "max_acceleration": ControlMode.SPECIFIED_MAX_VEL_ACC,
-    "time": ControlMode.SPECIFIED_TIME,
-    "k": ControlMode.SPECIFIED_GAINS,
-    "kz": ControlMode.SPECIFIED_GAINS,
-    "kp": ControlMode.SPECIFIED_GAINS,
-    "kb": ControlMode.SPECIFIED_GAINS,
-    "force_offset": ControlMode.SPECIFIED_FORCE_OFFSET,
-    "max_force": ControlMode.SPECIFIED_MAX_FORCE,
-}
-_TOGETHER = (("max_velocity", "max_acceleration"), ("k", "kz", "kp", "kb"))
+_COLUMNS = WRITE[NodeClass.AXIS]
+_DEFAULT = {name: 0.0 if column.code == "d" else 0 for name, column in _COLUMNS.items()}
+_FLAGS = {name: ControlMode(column.flag) for name, column in _COLUMNS.items() if column.code == "d"}
+_QUANTITY = {name: flag for name, flag in _FLAGS.items() if flag & QUANTITIES}
+_WITH = {name: flag for name, flag in _FLAGS.items() if not flag & QUANTITIES}
+_TOGETHER = [
+    group
+    for flag in dict.fromkeys(_WITH.values())
+    if len(group := [name for name, theirs in _WITH.items() if theirs == flag]) > 1
+]
 
 
 def command(
@@ -68,7 +57,7 @@ def command(
     fields = dict(_DEFAULT)
     mode = ControlMode(0)
     for name, value in values.items():
-        flag = _QUANTITY.get(name) or _WITH.get(name)
+        flag = _FLAGS.get(name)
         if flag is None:
             raise ValueError(
                 f"make command: unknown word {name}; there are: {', '.join([*_QUANTITY, *_WITH])}"
@@ -79,7 +68,7 @@ def command(
         missing = [name for name in group if name not in values]
         if missing and len(missing) < len(group):
             raise ValueError(f"make command: {', '.join(missing)} missing; {', '.join(group)} go together")
-    if not mode & 0x3F:
+    if not mode & QUANTITIES:
         raise ValueError(f"make command: nothing commanded; give one of {', '.join(_QUANTITY)}")
     fields["axis"] = integer("make command: axis", axis, "the index of an axis")
     if wait is not None:

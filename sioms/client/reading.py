@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
-from collections import namedtuple
-
+from sioms.protocol import records
 from sioms.protocol.flags import NodeClass
-from sioms.protocol.records import READ_FIELDS
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Any
 
-AxisReading = namedtuple("AxisReading", [name for name, _ in READ_FIELDS[NodeClass.AXIS]])  # type: ignore[misc]
-"""One axis: the fields of table F.3 and beyond it; units of the channel."""
-AnalogReading = namedtuple("AnalogReading", ["data", "flags"])
-BinaryReading = namedtuple("BinaryReading", ["data", "changed_ns", "edges"])
+
+class AxisReading(records.tuple_of("AxisReading", records.READ[NodeClass.AXIS]), records.AxisRead):  # type: ignore[misc]
+    """One axis; units of the channel."""
+
+    __slots__ = ()
+
+
+class AnalogReading(records.tuple_of("AnalogReading", records.READ[NodeClass.ANALOG]), records.AnalogRead):  # type: ignore[misc]
+    """One analog channel."""
+
+    __slots__ = ()
+
+
+class BinaryReading(records.tuple_of("BinaryReading", records.READ[NodeClass.BINARY]), records.BinaryRead):  # type: ignore[misc]
+    """One binary port, or one bit of it."""
+
+    __slots__ = ()
+
+
 READING: dict[NodeClass, Callable[..., Any]] = {
     NodeClass.AXIS: AxisReading,
     NodeClass.ANALOG: AnalogReading,

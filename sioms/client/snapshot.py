@@ -10,7 +10,7 @@ from struct import Struct, unpack_from
 
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.page import SLOT_HEADER
-from sioms.protocol.records import READ_FIELDS
+from sioms.protocol.records import READ
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
     import numpy as np
     from numpy.typing import NDArray
+
+    from sioms.protocol.records import Column
 
 
 class Layout:
@@ -32,7 +34,7 @@ class Layout:
         names: of the channels that the node shows.
     """
 
-    __slots__ = ("bit", "block_channels", "channels", "count", "fields", "names", "node_class", "rows")
+    __slots__ = ("bit", "block_channels", "channels", "columns", "count", "names", "node_class", "rows")
 
     def __init__(
         self,
@@ -48,19 +50,19 @@ class Layout:
         self.channels = channels
         self.bit = bit
         self.count = len(channels)
-        self.fields = READ_FIELDS[node_class]
+        self.columns = READ[node_class]
         contiguous = channels == list(range(channels[0], channels[0] + len(channels)))
-        self.rows: list[tuple[Callable[..., tuple[Any, ...]], int, list[int] | None]] = []
-        for row, (_, code) in enumerate(self.fields):
-            start = SLOT_HEADER + 8 * block_channels * row
+        self.rows: dict[str, tuple[Callable[..., tuple[Any, ...]], int, list[int] | None]] = {}
+        for row, (name, column) in enumerate(self.columns.items()):
+            start, code = SLOT_HEADER + 8 * block_channels * row, column.code
             if contiguous:
-                self.rows.append((Struct(f"<{self.count}{code}").unpack_from, start + 8 * channels[0], None))
+                self.rows[name] = (Struct(f"<{self.count}{code}").unpack_from, start + 8 * channels[0], None)
             else:
-                self.rows.append((Struct(f"<{block_channels}{code}").unpack_from, start, channels))
+                self.rows[name] = (Struct(f"<{block_channels}{code}").unpack_from, start, channels)
 
-    def row(self, raw: bytes, row: int) -> tuple[Any, ...]:
-        """Return one field of all channels."""
-        unpack, offset, pick = self.rows[row]
+    def row(self, raw: bytes, name: str) -> tuple[Any, ...]:
+        """Return one column of all channels."""
+        unpack, offset, pick = self.rows[name]
         values = unpack(raw, offset)
         return values if pick is None else tuple([values[i] for i in pick])
 
@@ -107,9 +109,7 @@ class Snapshot:
         # Loaded when first used: named tuples are a tenth of the start time of a shell tool.
         from .reading import READING
 
-        return READING[self._layout.node_class](
-            *[self._row(row)[channel] for row in range(len(self._layout.fields))]
-        )
+        return READING[self._layout.node_class](*[self._row(name)[channel] for name in self._layout.columns])
 
     def __iter__(self) -> Iterator[Any]:
         return iter([self[i] for i in range(len(self))])
@@ -128,47 +128,44 @@ class Snapshot:
         """
         import numpy as np
 
-        names = [name for name, _ in self._layout.fields]
-        if field not in names:
+        if field not in self._layout.columns:
             raise KeyError(
-                f"no field {field} in {self._layout.node_class.name.lower()} readings; there are: {', '.join(names)}"
+                f"no field {field} in {self._layout.node_class.name.lower()} readings; "
+                f"there are: {', '.join(self._layout.columns)}"
             )
-        return np.array(self._row(names.index(field)))
+        return np.array(self._row(field))
 
-    def _row(self, row: int) -> tuple[Any, ...]:
-        return self._layout.row(self._raw, row)
+    def _row(self, name: str) -> tuple[Any, ...]:
+        return self._layout.row(self._raw, name)
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> tuple[Any, ...]:
+            """Stand for the columns, which are made below."""
 
 
-def _field(row: int, text: str) -> property:
+def _column(column: Column) -> property:
+    name = column.name
+
     def get(self: Snapshot) -> tuple[Any, ...]:
-        unpack, offset, pick = self._layout.rows[row]
+        unpack, offset, pick = self._layout.rows[name]
         values = unpack(self._raw, offset)
         return values if pick is None else tuple([values[i] for i in pick])
 
-    return property(get, doc=text)
+    unit = column.unit.format(u="unit of the channel", f="N or N*m")
+    return property(get, doc=f"Of each channel: {column.text}{unit and f' [{unit}]'}.")
 
 
 class AxisSnapshot(Snapshot):
     """Axes: lengths in the channel's unit (m or rad), forces in N or N*m."""
 
     __slots__ = ()
-    position = _field(0, "Measured position.")
-    velocity = _field(1, "Filtered measured velocity.")
-    force = _field(2, "Force or torque applied by the actuator.")
-    commanded_position = _field(7, "Position that the profile asks for now.")
-    commanded_velocity = _field(8, "Velocity that the profile asks for now.")
-    following_error = _field(9, "Commanded minus measured position.")
-    in_motion = _field(10, "1 while a command is being carried out.")
-    status = _field(11, "AxisStatus flags.")
-    buffered = _field(12, "Commands that wait in the buffer; the running one has left it.")
 
 
 class AnalogSnapshot(Snapshot):
     """Analog channels in their declared units."""
 
     __slots__ = ()
-    data = _field(0, "Values.")
-    flags = _field(1, "AnalogStatus flags, 0 = good.")
 
 
 class BinarySnapshot(Snapshot):
@@ -179,15 +176,12 @@ class BinarySnapshot(Snapshot):
     @property
     def data(self) -> tuple[int, ...]:
         """Bits of each port; of a bit node 0 or 1."""
-        values = self._layout.row(self._raw, 0)
+        values = self._layout.row(self._raw, "data")
         bit = self._layout.bit
         return values if bit < 0 else (values[0] >> bit & 1,)
 
-    changed_ns = _field(1, "Time of the port's last edge [ns, CLOCK_MONOTONIC].")
-    edges = _field(2, "Edges of the port since the driver started.")
-
-    def _row(self, row: int) -> tuple[Any, ...]:
-        return self.data if row == 0 else self._layout.row(self._raw, row)
+    def _row(self, name: str) -> tuple[Any, ...]:
+        return self.data if name == "data" else self._layout.row(self._raw, name)
 
 
 SNAPSHOT: dict[NodeClass, type[Snapshot]] = {
@@ -195,3 +189,7 @@ SNAPSHOT: dict[NodeClass, type[Snapshot]] = {
     NodeClass.ANALOG: AnalogSnapshot,
     NodeClass.BINARY: BinarySnapshot,
 }
+for _class, _columns in READ.items():
+    for _name in _columns:
+        if not hasattr(SNAPSHOT[_class], _name):
+            setattr(SNAPSHOT[_class], _name, _column(_columns[_name]))

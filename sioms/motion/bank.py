@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.protocol.flags import AxisStatus
-from sioms.protocol.records import AXIS_READ_FIELDS
+from sioms.protocol.flags import AxisStatus, NodeClass
+from sioms.protocol.records import READ, read_rows
 
 from .commands import WIRE_DTYPE
 from .guard import LimitGuard
@@ -29,7 +29,6 @@ from .settings import SWITCH_MINUS, SWITCH_PLUS, AxisSettings
 from .types import CommandError, Event, EventKind, Keeper, MarkerPort
 
 Axes = NDArray[np.int64]
-ROW = {name: i for i, (name, _) in enumerate(AXIS_READ_FIELDS)}
 EMERGENCY_STOP, HOMING, HOMED = int(AxisStatus.EMERGENCY_STOP), int(AxisStatus.HOMING), int(AxisStatus.HOMED)
 FOLLOWING_ERROR = int(AxisStatus.FOLLOWING_ERROR)
 
@@ -44,8 +43,7 @@ class AxisBank:
         capacity: commands that each axis' buffer holds.
         late_max_s: a tick that comes later than this after its predecessor stops all motion [s].
 
-    ``fields`` is (13, n) float64 in the order of AXIS_READ_FIELDS, contiguous; integer rows are the
-    same memory seen as int64. ``stepper`` (n,) tells which entries of tick()'s answer are raw output
+    ``fields`` is (columns of AxisRead, n) float64, contiguous; ``rows`` are its rows by name, whole numbers as int64. ``stepper`` (n,) tells which entries of tick()'s answer are raw output
     positions; the others are forces or torques. ``keeper`` may be set before the first tick.
 
     Concurrency: one thread.
@@ -62,19 +60,20 @@ class AxisBank:
     ) -> None:
         n = self.n = len(settings)
         self.settings = tuple(settings)
-        self.fields = np.zeros((len(AXIS_READ_FIELDS), n))
-        integers = self.fields.view(np.int64)
-        self._position, self._velocity = self.fields[ROW["position"]], self.fields[ROW["velocity"]]
-        self._force = self.fields[ROW["force"]]
-        self._desired = self.fields[ROW["commanded_position"]]
-        self._desired_velocity = self.fields[ROW["commanded_velocity"]]
-        self._following = self.fields[ROW["following_error"]]
-        self._status, self._buffered = integers[ROW["status"]], integers[ROW["buffered"]]
+        self.fields = np.zeros((len(READ[NodeClass.AXIS]), n))
+        rows = self.rows = read_rows(NodeClass.AXIS, self.fields)
+        self._position, self._velocity, self._force = rows["position"], rows["velocity"], rows["force"]
+        self._desired, self._desired_velocity = rows["commanded_position"], rows["commanded_velocity"]
+        self._following, self._status, self._buffered = (
+            rows["following_error"],
+            rows["status"],
+            rows["buffered"],
+        )
         self._queue = CommandQueue(settings, markers, capacity)
-        self._law = ControlLaw(settings, tick_s, self.fields[ROW["k"] : ROW["kb"] + 1])
+        self._law = ControlLaw(settings, tick_s, [rows[name] for name in ("k", "kz", "kp", "kb")])
         self.stepper = self._law.stepper
         self._sequencer = Sequencer(
-            settings, self._queue, self._law, self._position, self._velocity, integers[ROW["in_motion"]],
+            settings, self._queue, self._law, self._position, self._velocity, rows["in_motion"],
             tick_s,
         )  # fmt: skip
         self._guard = LimitGuard(self._queue, self._sequencer)

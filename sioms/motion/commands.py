@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.protocol.flags import QUANTITIES, ControlMode, NodeClass
-from sioms.protocol.records import numpy_dtype
+from sioms.protocol.records import WRITE, AxisWrite, numpy_dtype, tuple_of
 
 from .settings import AxisKind, AxisSettings
 from .types import CommandError, MarkerPort, RecordError
@@ -45,28 +45,10 @@ _IS_COMBINATION = np.zeros(QUANTITIES + 1, dtype=bool)
 _IS_COMBINATION[[int(c) for c in COMBINATIONS]] = True
 
 
-class Command(NamedTuple):
+class Command(tuple_of("Command", COMMAND_DTYPE.names or ()), AxisWrite):  # type: ignore[misc]
     """One buffered record as Python numbers, in the order of COMMAND_DTYPE."""
 
-    axis: int
-    control_mode: int
-    signal_marker_number: int
-    wait_marker_number: int
-    position: float
-    velocity: float
-    acceleration: float
-    jerk: float
-    max_velocity: float
-    max_acceleration: float
-    time: float
-    k: float
-    kz: float
-    kp: float
-    kb: float
-    force_offset: float
-    force: float
-    force_velocity: float
-    max_force: float
+    __slots__ = ()
     signal_generation: int
     wait_generation: int
 
@@ -114,9 +96,9 @@ class Limits:
 
 
 class Rule(NamedTuple):
-    """A field that holds when a flag is set, with its bound and unit."""
+    """What bounds a column of a command where its flag is set."""
 
-    flag: ControlMode
+    flag: int
     field: str
     bound: str
     """Name of the array in Limits: |value| at most that; "" when only finiteness is asked."""
@@ -124,24 +106,29 @@ class Rule(NamedTuple):
     unit: str
 
 
+def _rule(field: str, bound: str = "", *, positive: bool = False) -> Rule:
+    column = WRITE[NodeClass.AXIS][field]
+    return Rule(column.flag, field, bound, positive, column.unit)
+
+
 RULES = (
-    Rule(M.VELOCITY, "velocity", "velocity", False, "{u}/s"),
-    Rule(M.ACCELERATION, "acceleration", "acceleration", False, "{u}/s^2"),
-    Rule(M.JERK, "jerk", "jerk", False, "{u}/s^3"),
-    Rule(M.FORCE, "force", "force", False, "{f}"),
-    Rule(M.FORCE_VELOCITY, "force_velocity", "", False, "{f}/s"),
-    Rule(M.SPECIFIED_TIME, "time", "", False, "s"),
-    Rule(M.SPECIFIED_GAINS, "k", "", False, ""),
-    Rule(M.SPECIFIED_GAINS, "kz", "", False, ""),
-    Rule(M.SPECIFIED_GAINS, "kp", "", False, ""),
-    Rule(M.SPECIFIED_GAINS, "kb", "", False, ""),
-    Rule(M.SPECIFIED_FORCE_OFFSET, "force_offset", "force", False, "{f}"),
-    Rule(M.SPECIFIED_MAX_VEL_ACC, "max_velocity", "velocity", True, "{u}/s"),
-    Rule(M.SPECIFIED_MAX_VEL_ACC, "max_acceleration", "acceleration", True, "{u}/s^2"),
-    Rule(M.SPECIFIED_MAX_FORCE, "max_force", "force", True, "{f}"),
+    _rule("velocity", "velocity"),
+    _rule("acceleration", "acceleration"),
+    _rule("jerk", "jerk"),
+    _rule("force", "force"),
+    _rule("force_velocity"),
+    _rule("time"),
+    _rule("k"),
+    _rule("kz"),
+    _rule("kp"),
+    _rule("kb"),
+    _rule("force_offset", "force"),
+    _rule("max_velocity", "velocity", positive=True),
+    _rule("max_acceleration", "acceleration", positive=True),
+    _rule("max_force", "force", positive=True),
 )
 
-TOWARDS = Rule(M.ACCELERATION, "acceleration", "acceleration", True, "{u}/s^2")
+TOWARDS = _rule("acceleration", "acceleration", positive=True)
 """With a velocity to go over to, the acceleration is a size."""
 
 
@@ -256,7 +243,7 @@ class Validator:
         for rule in RULES:
             if not present & rule.flag:
                 continue
-            held = (mode & int(rule.flag)) != 0
+            held = (mode & rule.flag) != 0
             value = commands[rule.field]
             bad = held & ~np.isfinite(value)
             if bad.any():

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.protocol.flags import AxisStatus
-from sioms.protocol.records import AXIS_READ_FIELDS
+from sioms.protocol.flags import AxisStatus, NodeClass
+from sioms.protocol.records import READ, read_rows
 
 from . import modes
 from .actions import ActionKind, DriveAction
@@ -50,7 +50,7 @@ class DriveBank:
         settle_s: how long after its start a command may take to be reported as moving [s]; until
             then 'done' reports are not believed.
 
-    ``fields`` and ``keeper`` as in AxisBank. Concurrency: one thread.
+    ``fields``, ``rows`` and ``keeper`` as in AxisBank. Concurrency: one thread.
     """
 
     def __init__(
@@ -63,15 +63,12 @@ class DriveBank:
     ) -> None:
         n = self.n = len(settings)
         self.settings = tuple(settings)
-        self.fields = np.zeros((len(AXIS_READ_FIELDS), n))
-        integers = self.fields.view(np.int64)
-        self._position, self._velocity = self.fields[0], self.fields[1]
-        self._desired, self._desired_velocity, self._following = (
-            self.fields[7],
-            self.fields[8],
-            self.fields[9],
-        )
-        self._in_motion, self._status_word, self._buffered = integers[10], integers[11], integers[12]
+        self.fields = np.zeros((len(READ[NodeClass.AXIS]), n))
+        rows = self.rows = read_rows(NodeClass.AXIS, self.fields)
+        self._position, self._velocity, self._force = rows["position"], rows["velocity"], rows["force"]
+        self._desired, self._desired_velocity = rows["commanded_position"], rows["commanded_velocity"]
+        self._following, self._in_motion = rows["following_error"], rows["in_motion"]
+        self._status_word, self._buffered = rows["status"], rows["buffered"]
         self._queue = CommandQueue(settings, markers, capacity, passing=False)
         self._limits = self._queue.limits
         self._velocity_limit, self._acceleration_limit = self._queue.in_force
@@ -478,7 +475,7 @@ class DriveBank:
         np.add(self._raw, self._offset, out=self._position)
         np.copyto(self._velocity, velocity, where=good)
         if force is not None:
-            self.fields[2] = force
+            self._force[:] = force
         if not good.all():
             self._fault_fresh(np.flatnonzero(~good), "the reported position is not a finite number", now_ns)
         for axis, text in enumerate(fault or ()):

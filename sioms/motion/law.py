@@ -33,9 +33,7 @@ class ControlLaw:
         gains: arrays k, kz, kp, kb (n,) to use, rows of the published fields.
     """
 
-    def __init__(
-        self, settings: Sequence[AxisSettings], tick_s: float, gains: Sequence[Vector] | Vector
-    ) -> None:
+    def __init__(self, settings: Sequence[AxisSettings], tick_s: float, gains: Sequence[Vector]) -> None:
         n = len(settings)
         self.stepper = np.array([s.kind is AxisKind.STEPPER for s in settings], dtype=bool)
         self.k: Vector = gains[0]

@@ -25,6 +25,9 @@ _QUANTITIES = (
 )  # fmt: skip
 _BESIDE = (modes.MAX_VEL_ACC, modes.MAX_FORCE, modes.FORCE_OFFSET, modes.SYNCH)
 _COLUMN = {name: i for i, name in enumerate(WIRE_DTYPE.names or ())}
+AXIS = _COLUMN["axis"]
+_MODE, _POSITION = _COLUMN["control_mode"], _COLUMN["position"]
+_SIGNAL, _WAIT = _COLUMN["signal_marker_number"], _COLUMN["wait_marker_number"]
 
 Check = tuple[int, NDArray[np.float64] | None, bool]
 """Column of a value, the array (n,) of its bound or None, and whether it must be above zero."""
@@ -54,7 +57,7 @@ class PlainCheck:
 
     def command(self, record: tuple[Any, ...], axis: int) -> Command | None:
         """Return a record of the wire as a command of a bank axis; None when it is not plain, or bad."""
-        mode = record[1]
+        mode = record[_MODE]
         checks = self._checks.get(mode)
         if checks is None or mode & ~self._offered[axis]:
             return None
@@ -68,6 +71,9 @@ class PlainCheck:
                 self._minimum.item(axis) + self._below[axis],
                 self._maximum.item(axis) - self._above[axis],
             )
-            if not low <= record[4] <= high:
+            if not low <= record[_POSITION] <= high:
                 return None
-        return Command._make((axis, mode, 0, 0, *record[4:], 0, 0))
+        fields = [*record, 0, 0]
+        fields[AXIS], fields[_SIGNAL], fields[_WAIT] = axis, 0, 0
+        command: Command = Command._make(fields)
+        return command

@@ -20,7 +20,7 @@ from . import modes
 from .buffers import Chunk, CommandBuffers, cut
 from .commands import WIRE_DTYPE, Command, Limits, Validator
 from .feasibility import Feasibility, Tail
-from .plain import MOST, PlainCheck
+from .plain import AXIS, MOST, PlainCheck
 from .settings import AxisSettings
 from .types import CommandError, Event, EventKind, MarkerPort, RecordError
 
@@ -192,9 +192,10 @@ class CommandQueue:
             return None
         most, known, commands = self.capacity - 1 - waiting - count, len(axes), []
         for record in records:
-            if not 0 <= record[0] < known:
+            local = record[AXIS]
+            if not 0 <= local < known:
                 return None
-            axis = int(axes[record[0]])
+            axis = int(axes[local])
             full = not replace and self._buffers.count.item(axis) > most
             command = None if full or self.is_barred(axis) else self._plain.command(record, axis)
             if command is None:

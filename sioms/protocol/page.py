@@ -32,7 +32,7 @@ import os
 from struct import Struct, pack_into, unpack_from
 
 from .flags import NodeClass, PageState
-from .records import READ_FIELDS
+from .records import READ, READ_SIZE
 from .text import printable
 
 MAGIC = b"SIOMSpg1"
@@ -86,7 +86,7 @@ class NotReadable(Exception):
 
 def slot_size(node_class: NodeClass, channels: int) -> int:
     """Return the bytes of one snapshot."""
-    return SLOT_HEADER + 8 * len(READ_FIELDS[node_class]) * channels
+    return SLOT_HEADER + READ_SIZE[node_class] * channels
 
 
 def page_size(node_class: NodeClass, channels: int, slots: int) -> int:
@@ -124,7 +124,7 @@ class PageWriter:
     ) -> None:
         if slots < 4 or slots & (slots - 1):
             raise PageError(f"lay out page: {slots} slots; must be a power of two of at least 4")
-        fields = len(READ_FIELDS[node_class])
+        fields = len(READ[node_class])
         size = slot_size(node_class, channels)
         _HEADER.pack_into(
             buffer, 0, MAGIC, VERSION, node_class, channels, fields, slots, size, HEADER_SIZE, lease_ns,

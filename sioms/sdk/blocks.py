@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
-from sioms.protocol.records import READ_FIELDS
+from sioms.protocol.records import READ, read_rows
 
 from .alarms import Alarms
 
@@ -73,9 +73,8 @@ class Block:
     Attributes:
         spec: what it is.
         n: number of channels.
-        fields: shape (fields, n) float64, one row a field in the order of READ_FIELDS; integer
-            fields are the same memory seen through ``words``.
-        words: shape (fields, n) int64, the same memory.
+        fields: shape (columns, n) float64, one row a column of the record.
+        rows: its rows by the name of their column, whole numbers as int64: the same memory.
         stamp_ns: time the readings hold for [ns, CLOCK_MONOTONIC]; set by the driver when it knows
             better than "now", e.g. for samples that travelled.
     """
@@ -83,13 +82,13 @@ class Block:
     def __init__(self, spec: BlockSpec, fields: NDArray[np.float64] | None = None) -> None:
         self.spec = spec
         self.n = len(spec.channels)
-        shape = (len(READ_FIELDS[spec.node_class]), self.n)
+        shape = (len(READ[spec.node_class]), self.n)
         self.fields = np.zeros(shape) if fields is None else fields
         if self.fields.shape != shape or not self.fields.flags.c_contiguous:
             raise ValueError(
                 f"make block {spec.name!r}: fields of shape {self.fields.shape}; want {shape}, contiguous"
             )
-        self.words: NDArray[np.int64] = self.fields.view(np.int64)
+        self.rows = read_rows(spec.node_class, self.fields)
         self.stamp_ns = 0
 
     def payload(self) -> memoryview:
@@ -121,13 +120,14 @@ class AnalogBlock(Block):
     def __init__(self, spec: BlockSpec) -> None:
         super().__init__(spec)
         self.corrected_by_driver = False
-        self.data: NDArray[np.float64] = self.fields[0]
-        self.flags: NDArray[np.int64] = self.words[1]
+        self.data: NDArray[np.float64] = self.rows["data"]
+        self.flags: NDArray[np.int64] = self.rows["flags"]
         self.offset: NDArray[np.float64] = np.zeros(self.n)
         self.gains: NDArray[np.float64] | None = None
         self.alarms: Alarms | None = None
         self._shown = np.zeros_like(self.fields)
-        self._shown_flags = self._shown.view(np.int64)[1]
+        rows = read_rows(spec.node_class, self._shown)
+        self._shown_data, self._shown_flags = rows["data"], rows["flags"]
         self._bytes = self._shown.data.cast("B")
 
     def unfit(self) -> NDArray[np.bool_]:
@@ -140,7 +140,7 @@ class AnalogBlock(Block):
 
     def payload(self) -> memoryview:
         """Return the readings, corrected, as bytes in page order."""
-        shown = self._shown[0]
+        shown = self._shown_data
         np.subtract(self.data, self.offset, out=shown)
         if self.gains is not None:
             shown[:] = self.gains @ shown
@@ -151,13 +151,13 @@ class AnalogBlock(Block):
 
 
 class BinaryBlock(Block):
-    """Binary ports: ``data`` (n,) int64, one port of up to 62 bits a channel."""
+    """Binary ports: ``data`` (n,) int64, one port of up to 62 bits a channel, and ``edges`` (n,) of each."""
 
     def __init__(self, spec: BlockSpec) -> None:
         super().__init__(spec)
-        self.data: NDArray[np.int64] = self.words[0]
-        self._changed_ns = self.words[1]
-        self._edges = self.words[2]
+        self.data: NDArray[np.int64] = self.rows["data"]
+        self.edges: NDArray[np.int64] = self.rows["edges"]
+        self._changed_ns = self.rows["changed_ns"]
 
     def set(self, port: int, value: int, stamp_ns: int) -> bool:
         """Set a port; count and stamp the edge if it is one.
@@ -174,12 +174,12 @@ class BinaryBlock(Block):
             return False
         self.data[port] = value
         self._changed_ns[port] = stamp_ns
-        self._edges[port] += 1
+        self.edges[port] += 1
         return True
 
     def count_lost(self, port: int, edges: int) -> None:
         """Count edges that happened and that nobody can tell any more: who compares ``edges`` sees that he missed them."""
-        self._edges[port] += edges
+        self.edges[port] += edges
 
 
 @dataclass(slots=True)

@@ -321,7 +321,7 @@ class AxesUnit(LineUnit):
                 self._stood_ns[axis] = now_ns
             elif now_ns - self._stood_ns[axis] > SHORT_NS:
                 self._goes[axis] = False
-                text = f"{self.name}: came to rest at {self.bank.fields[0, axis]:g} before its target; look at its limit switches"
+                text = f"{self.name}: came to rest at {self.bank.rows['position'][axis]:g} before its target; look at its limit switches"
                 self.bank.fault([axis], text, now_ns)
 
     def _guard(self, now_ns: int) -> None:
@@ -348,7 +348,7 @@ def end_at_soft_limit(
     """
     settings, limits = bank.settings[axis], bank.get_limits([axis])
     low, high = limits["position_min"][0], limits["position_max"][0]
-    position, velocity = float(bank.fields[0, axis]), float(bank.fields[1, axis])
+    position, velocity = float(bank.rows["position"][axis]), float(bank.rows["velocity"][axis])
     # up to two polls and the stop's way over the line pass before the drive brakes
     ahead = velocity * (2 * between_s + LATENCY_S) + velocity * abs(velocity) / (
         2 * settings.acceleration_max

@@ -35,7 +35,6 @@ from .locks import claims_of
 from .settings import LineSettings
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from sioms.motion import DriveAction, MarkerPort
@@ -44,13 +43,13 @@ if TYPE_CHECKING:
 class InputNode(Protocol):
     """A node of another device that this driver reads (``Description.inputs``)."""
 
-    def read(self, now_ns: int) -> NDArray[np.float64] | None:
-        """Return the readings, shape (fields, channels) in READ_FIELDS order; None while it is not there.
+    def read(self, now_ns: int) -> Mapping[str, NDArray[Any]] | None:
+        """Return the readings, shape (channels,) each, by name; None while it is not there.
 
-        Integer fields (status, binary data) are int64 in the same memory: ``.view(np.int64)``.
+        ``value`` is the position of axes and the data of all others; the columns of its record are there, too.
         """
 
-    def fresh(self, now_ns: int) -> list[tuple[int, NDArray[np.float64]]]:
+    def fresh(self, now_ns: int) -> list[tuple[int, Mapping[str, NDArray[Any]]]]:
         """Return all snapshots since the last look, oldest first, as (stamp_ns, readings)."""
 
     @property

@@ -464,7 +464,7 @@ class GrblUnit(AxesUnit):
         busy = self._chain.blocks(self._raw * self._per_unit) + int(self._moves.bound.sum())
         if 0 <= report.free_blocks < 2 or busy >= CHAIN_BLOCKS:
             return
-        offset = self.bank.fields[0] - self._raw
+        offset = self.bank.rows["position"] - self._raw
         low, high = self._soft_limits()
         found = self._chain.next(
             self.clock(), (low - offset) * self._per_unit, (high - offset) * self._per_unit

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import mmap
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sioms.protocol.page import SLOT_HEADER, NotReadable, PageReader, slot_header
-from sioms.protocol.records import READ_FIELDS
+from sioms.protocol.records import VALUE, read_rows
 
 
 class Input:
@@ -33,7 +34,6 @@ class Input:
         self._map = mmap.mmap(fd, size, prot=mmap.PROT_READ)
         os.close(fd)
         self._reader = PageReader(self._map)
-        self._fields = len(READ_FIELDS[self._reader.node_class])
         self._channels = np.array(channels, dtype=np.intp)
         self._all = list(channels) == list(range(self._reader.channels))
         self._bit = bit
@@ -46,18 +46,22 @@ class Input:
             self._map.close()
         self._reader, self._map = None, None
 
-    def read(self, now_ns: int) -> NDArray[np.float64] | None:
-        """Return the readings, shape (fields, channels); None while the device is not there."""
-        if self._reader is None:
+    def read(self, now_ns: int) -> Mapping[str, NDArray[Any]] | None:
+        """Return the readings, shape (channels,) each, by name; None while the device is not there.
+
+        ``value`` is the position of axes and the data of all others; the columns of the record are there, too.
+        """
+        reader = self._reader
+        if reader is None:
             return None
         try:
-            raw = self._reader.latest(now_ns)
+            raw = reader.latest(now_ns)
         except NotReadable:
             return None
         self._number, self.stamp_ns, _ = slot_header(raw)
-        return self._values(raw)
+        return self._readings(reader, raw)
 
-    def fresh(self, now_ns: int) -> list[tuple[int, NDArray[np.float64]]]:
+    def fresh(self, now_ns: int) -> list[tuple[int, Mapping[str, NDArray[Any]]]]:
         """Return all snapshots since the last look, oldest first, as (stamp_ns, readings as of ``read``).
 
         None is lost as long as the looks are no further apart than what the page keeps; nothing comes
@@ -76,15 +80,15 @@ class Input:
             raw = reader.numbered(number)
             if raw is not None:
                 self._number, self.stamp_ns, _ = slot_header(raw)
-                found.append((self.stamp_ns, self._values(raw)))
+                found.append((self.stamp_ns, self._readings(reader, raw)))
         return found
 
-    def _values(self, raw: bytes) -> NDArray[np.float64]:
-        values = np.frombuffer(raw, np.float64, offset=SLOT_HEADER).reshape(self._fields, -1)
+    def _readings(self, reader: PageReader, raw: bytes) -> Mapping[str, NDArray[Any]]:
+        fields = np.frombuffer(raw, np.float64, offset=SLOT_HEADER).reshape(-1, reader.channels)
         if not self._all:
-            values = values[:, self._channels]
+            fields = fields[:, self._channels]
+        readings = read_rows(reader.node_class, fields)
         if self._bit >= 0:
-            values = values.copy()
-            words = values.view(np.int64)
-            words[0] = words[0] >> self._bit & 1
-        return values
+            readings["data"] = readings["data"] >> self._bit & 1
+        readings["value"] = readings[VALUE[reader.node_class]]
+        return readings

@@ -16,7 +16,6 @@ import numpy as np
 
 from sioms.motion import ActionKind, AxisSettings, Command, DriveAction, DriveBank
 from sioms.protocol.flags import AxisStatus, ControlMode
-from sioms.protocol.records import AXIS_READ_FIELDS
 
 from .blocks import AnyBlock, AxisBlock, BlockSpec
 from .drive_axes import end_at_soft_limit
@@ -26,7 +25,6 @@ from .mapped import MappedUnit, Values
 from .mapped_guard import Guard
 
 SELDOM_NS = 1_000_000_000
-STATUS = [name for name, _ in AXIS_READ_FIELDS].index("status")
 REST_S = 5.0
 """Longest time that a drive may take to come to rest when it is opened [s]."""
 LOOKS_AT_REST = 10
@@ -135,7 +133,7 @@ class DriveUnit(LineUnit):
             asked_ns=self._block.asked_ns,
         )
         self._end_before_soft_limit(now_ns)
-        lost = bool(int(self.bank.fields.view(np.int64)[STATUS, 0]) & AxisStatus.POSITION_LOST)
+        lost = bool(int(self.bank.rows["status"][0]) & AxisStatus.POSITION_LOST)
         if lost and not self._lost:  # one fault for one cause: look at once whether it was a restart
             self._guard.look_soon()
         self._lost = lost

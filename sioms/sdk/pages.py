@@ -104,7 +104,7 @@ class Pages:
     def _wake(self, block: AnyBlock, subscribers: list[Handle]) -> None:
         edge = False
         if isinstance(block, BinaryBlock):
-            edges = int(block.words[2].sum())
+            edges = int(block.edges.sum())
             edge = edges != self._edges.get(id(block))
             self._edges[id(block)] = edges
         for handle in subscribers:

@@ -103,7 +103,7 @@ class TickEngine:
 
     def _write(self, block: AnyBlock, changes: Mapping[int, Change]) -> None:
         channels, values = self._runtime.outputs.merged(block, changes)
-        edges = block.words[2].copy() if isinstance(block, BinaryBlock) else None
+        edges = block.edges.copy() if isinstance(block, BinaryBlock) else None
         try:
             self._driver.write_outputs(block.spec, channels, values)
         except Refusal as error:
@@ -113,7 +113,7 @@ class TickEngine:
         except Exception as error:
             raise HookError(f"{type(self._driver).__name__}.write_outputs") from error
         self._runtime.outputs.acknowledge(block, channels, values)
-        if edges is not None and (edges != block.words[2]).any():  # type: ignore[union-attr]
+        if edges is not None and (edges != block.edges).any():  # type: ignore[union-attr]
             self._runtime.publish(
                 block, time.monotonic_ns()
             )  # an edge of its own, though the tick sees only the last

@@ -84,7 +84,7 @@ def run(n: int, tick_s: float, ticks: int, moves: int) -> None:
         ticks_ns.append(timed(bank.tick, now, position))
         slack_ns.append(timed(bank.plan_ahead, 32))
         np.copyto(page, bank.fields)
-        np.copyto(position, bank.fields[7])
+        np.copyto(position, bank.rows["commanded_position"])
     report(f"tick, {n} axes at {1 / tick_s:.0f} Hz, random moves", ticks_ns)
     report("  plan_ahead(32) after it", slack_ns)
 

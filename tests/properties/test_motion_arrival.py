@@ -41,7 +41,7 @@ class Loose(Rig):
         super().__init__([given], plant=self.follow, tick_ns=TICK_NS, **changes)
 
     def follow(self, _output, _dt):
-        motor = self.raw + self.bank.fields[9]
+        motor = self.raw + self.bank.rows["following_error"]
         self.load = float(np.clip(self.load, motor[0] - PLAY / 2, motor[0] + PLAY / 2))
         return motor
 

@@ -97,7 +97,7 @@ def test_nobody_elses_motion_is_another_for_it():
             if flooded:
                 rig.bank.is_idle([1])
             rig.tick()
-        return np.array(rig.history)[:, :, [0, 2]]
+        return np.array([[row[[0, 2]] for row in h.values()] for h in rig.history])
 
     assert np.array_equal(run(False), run(True))
 

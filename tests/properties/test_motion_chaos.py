@@ -6,7 +6,6 @@ from hypothesis import strategies as st
 from motion_rig import MODE, Rig, axis, records
 
 from sioms.motion import SWITCH_HOME, SWITCH_MINUS, SWITCH_PLUS, AxisKind, CommandError, EventKind, Homing
-from sioms.motion.bank import ROW
 from sioms.protocol.flags import AxisStatus as S
 
 QUANTITY = st.sampled_from(
@@ -99,7 +98,7 @@ class Chaos(Rig):
         elif name == "nan":
             self.raw[given] = np.nan
             bank.tick(now, self.raw)
-            self.raw[given] = self.bank.fields[ROW["position"], given]
+            self.raw[given] = self.bank.rows["position"][given]
         elif name in ("reset", "flush", "zero"):
             getattr(bank, name)([given])
         elif name == "fault":
@@ -128,12 +127,12 @@ def test_any_verbs_in_any_order(steps):
     assert not any(
         cell.field("status", i) & (S.MOVING | S.WAITING_MARKER | S.WAITING_SYNCH) for i in cell.axes
     )
-    still = cell.bank.fields[ROW["commanded_velocity"]].copy()
+    still = cell.bank.rows["commanded_velocity"].copy()
     held = [i for i in cell.axes if not cell.field("status", i) & S.FAULT]
     assert np.abs(still[2]) == 0.0 or 2 not in held
     cell.events.clear()
     cell.bank.reset(cell.axes)
-    before = cell.bank.fields[ROW["commanded_position"]].copy()
+    before = cell.bank.rows["commanded_position"].copy()
     cell.tick(20)
     assert EventKind.STARTED not in cell.kinds()
-    assert np.array_equal(before[2:], cell.bank.fields[ROW["commanded_position"]][2:])
+    assert np.array_equal(before[2:], cell.bank.rows["commanded_position"][2:])

@@ -136,7 +136,7 @@ def test_a_fingers_zero_is_answered_when_it_is_in_force(make_world: Callable[...
         stamp_ns = 0
 
         def read(self, now_ns: int) -> Any:
-            return np.array([[force[0]]])
+            return {"value": np.array([force[0]])}
 
     world.runtime.inputs["hand.force"] = Hand()  # type: ignore[index]
     client = world.open(2, range(16), exclusive=False)

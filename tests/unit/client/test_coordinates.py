@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 
 from sioms.client.command import command
 from sioms.client.coordinates import UserAxis
-from sioms.protocol.records import AXIS_WRITE, AXIS_WRITE_FIELDS
+from sioms.protocol.flags import NodeClass
+from sioms.protocol.records import AXIS_WRITE, WRITE
 
-NAMES = [name for name, _ in AXIS_WRITE_FIELDS]
+NAMES = list(WRITE[NodeClass.AXIS])
 number = st.floats(-10, 10)
 direction = st.sampled_from([1, -1])
 

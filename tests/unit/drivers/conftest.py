@@ -34,7 +34,7 @@ class Bench:
         raise AssertionError(source)
 
     def publish(self, block, stamp_ns):
-        self.published.append((int(block.data[0]), int(block.words[1, 0])))
+        self.published.append((int(block.data[0]), int(block.rows["changed_ns"][0])))
         self._publish(block, stamp_ns)
 
     def make(self, driver, name, table):

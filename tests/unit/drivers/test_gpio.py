@@ -42,7 +42,7 @@ class Rig:
         self.driver = chip.GpioOnStandIn("io0", msgspec.convert(table, Gpio.Settings), self)
 
     def publish(self, block: Any, stamp_ns: int) -> None:
-        self.published.append((int(block.data[0]), int(block.words[1, 0]), int(block.words[2, 0])))
+        self.published.append((int(block.data[0]), int(block.rows["changed_ns"][0]), int(block.edges[0])))
 
     def log(self, level: str, text: str) -> None:
         self.said.append(text)

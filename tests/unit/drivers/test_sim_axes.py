@@ -19,7 +19,7 @@ STEPPER = {
 
 
 def status(driver, axis=0):
-    return AxisStatus(int(driver.bank.fields.view(np.int64)[11, axis]))
+    return AxisStatus(int(driver.bank.rows["status"][axis]))
 
 
 def test_servo_moves_to_its_goal_and_rests_within_friction(bench):
@@ -29,9 +29,9 @@ def test_servo_moves_to_its_goal_and_rests_within_friction(bench):
     bench.run(2.0, until=lambda: mod.bank.is_idle([0]))
     bench.run(0.3)
     stiffness = 2.0 * (2 * np.pi * 30) ** 2
-    assert mod.bank.fields[0, 0] == pytest.approx(0.2, abs=3.0 / stiffness + 2e-6)
+    assert mod.bank.rows["position"][0] == pytest.approx(0.2, abs=3.0 / stiffness + 2e-6)
     true = mod.blocks[1].data[0]
-    assert 0 <= true - mod.bank.fields[0, 0] < 1e-6 + 1e-9
+    assert 0 <= true - mod.bank.rows["position"][0] < 1e-6 + 1e-9
 
 
 def test_tracking_error_without_friction_is_that_of_the_acceleration(bench):
@@ -42,7 +42,7 @@ def test_tracking_error_without_friction_is_that_of_the_acceleration(bench):
     worst = 0.0
     for _ in range(600):
         bench.run(0.001)
-        worst = max(worst, abs(mod.bank.fields[9, 0]))
+        worst = max(worst, abs(mod.bank.rows["following_error"][0]))
     # a/w^2 in steady acceleration; the step in acceleration of an unlimited jerk stays below twice that.
     assert 0.5 * 5.0 / (2 * np.pi * 30) ** 2 < worst < 2 * 5.0 / (2 * np.pi * 30) ** 2
 
@@ -66,7 +66,7 @@ def test_stepper_that_loses_steps_does_not_notice_but_the_world_does(bench):
     bench.write(mod, control_mode=ControlMode.POSITION, position=0.3)
     bench.run(2.0, until=lambda: mod.bank.is_idle([0]))
     bench.run(0.3)
-    assert mod.bank.fields[0, 0] == pytest.approx(0.3, abs=2e-5)
+    assert mod.bank.rows["position"][0] == pytest.approx(0.3, abs=2e-5)
     assert mod.blocks[1].data[0] < 0.29
 
 
@@ -84,7 +84,7 @@ def test_stepper_with_an_encoder_finds_its_lost_steps_again(bench):
     tried = mod.bank.particulars([0])["retries"][0]
     assert 0 < tried < 10 and not status(mod) & AxisStatus.MISSED_TARGET
     assert mod.blocks[1].data[0] == pytest.approx(0.03, abs=1e-4 + 1e-6), "the load is there"
-    assert mod.bank.fields[0, 0] == pytest.approx(0.03, abs=1e-4)
+    assert mod.bank.rows["position"][0] == pytest.approx(0.03, abs=1e-4)
 
 
 def test_stepper_that_slips_every_time_says_so(bench):
@@ -99,8 +99,8 @@ def test_stepper_that_slips_every_time_says_so(bench):
     assert mod.bank.particulars([0])["retries"] == [3] and mod.bank.particulars([0])["misses"] == [1]
     assert status(mod) & AxisStatus.MISSED_TARGET
     assert (
-        mod.blocks[1].data[0] == pytest.approx(mod.bank.fields[0, 0], abs=1e-5)
-        and mod.bank.fields[0, 0] < 0.04
+        mod.blocks[1].data[0] == pytest.approx(mod.bank.rows["position"][0], abs=1e-5)
+        and mod.bank.rows["position"][0] < 0.04
     )
 
 
@@ -117,7 +117,7 @@ def test_homing_finds_the_switch_edge(bench):
     bench.run(5.0, until=lambda: bool(status(mod) & AxisStatus.HOMED))
     bench.run(0.5)
     # The new coordinate counts from the edge of the switch.
-    assert mod.bank.fields[0, 0] - (mod.blocks[1].data[0] + 0.05) == pytest.approx(0.0, abs=5e-5)
+    assert mod.bank.rows["position"][0] - (mod.blocks[1].data[0] + 0.05) == pytest.approx(0.0, abs=5e-5)
 
 
 def test_force_mode_presses_on_the_wall(bench):
@@ -177,10 +177,10 @@ def test_own_beams_show_the_crossing_in_the_tick_in_which_it_happens(bench):
     bench.run(0.01)
     bench.write(mod, control_mode=ControlMode.POSITION, position=0.2)
     bench.run(1.0, until=lambda: port.data[0] == 0b10)
-    assert 0 <= bench.clock_ns - port.words[1, 0] < 1_000_000
+    assert 0 <= bench.clock_ns - port.rows["changed_ns"][0] < 1_000_000
     bench.run(1.0, until=lambda: port.data[0] == 0)
     # 10 mm at 0.5 m/s at most, in the acceleration of 5 m/s^2 from 0.05 m on.
-    assert port.words[2, 0] == 2 and mod.blocks[1].data[0] > 0.06
+    assert port.edges[0] == 2 and mod.blocks[1].data[0] > 0.06
 
 
 def test_hidden_effects_file(bench, tmp_path):
@@ -282,7 +282,7 @@ def test_a_starved_machine_moves_as_a_free_one(bench, bandwidth_hz):
     for _ in range(60):
         now_ns += int(random.integers(10, 80)) * 1_000_000
         mod.tick(now_ns)
-        worst = max(worst, abs(mod.bank.fields[9, 0]))
+        worst = max(worst, abs(mod.bank.rows["following_error"][0]))
     assert not status(mod) & AxisStatus.FAULT and mod.bank.is_idle([0])
-    assert mod.bank.fields[0, 0] == pytest.approx(0.3, abs=2e-4)
+    assert mod.bank.rows["position"][0] == pytest.approx(0.3, abs=2e-4)
     assert worst < 2 * 6.0 / (2 * np.pi * bandwidth_hz) ** 2 + 0.002

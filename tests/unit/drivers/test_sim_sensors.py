@@ -30,13 +30,13 @@ def test_beam_edges_carry_the_instant_of_the_crossing(bench):
     for _ in range(300):
         bench.run(0.001)
         log.append((bench.clock_ns, mod.blocks[1].data[0]))
-        seen.add((int(port.data[0]), int(port.words[1, 0])))
-    assert port.data[0] == 0 and port.words[2, 0] == 2
+        seen.add((int(port.data[0]), int(port.rows["changed_ns"][0])))
+    assert port.data[0] == 0 and port.edges[0] == 2
     # Found by interpolating the record of the positions; the object is passed in 1 ms.
     stamps, positions = np.array(log).T
     leave = np.interp(0.0505, positions, stamps)
     enter = np.interp(0.05, positions, stamps)
-    assert port.words[1, 0] == pytest.approx(leave, abs=1000)
+    assert port.rows["changed_ns"][0] == pytest.approx(leave, abs=1000)
     seen.update(bench.published)
     assert any(data == 2 and abs(stamp - enter) < 1000 for data, stamp in seen)
 
@@ -54,10 +54,10 @@ def test_triggered_wave_counts_its_periods_and_ends_with_its_trigger(bench):
     io = bench.make(SimIo, "io0", {"outputs": 1, "inputs": 1, "wave": [wave]})
     bench.run(0.01)
     port = io.blocks[1]
-    assert port.words[2, 0] == 0
+    assert port.edges[0] == 0
     io.write_outputs(io.blocks[0].spec, [0], [1.0])
     bench.run(0.05)
-    assert port.words[2, 0] == 6 and port.data[0] == 0
+    assert port.edges[0] == 6 and port.data[0] == 0
     io.write_outputs(io.blocks[0].spec, [0], [0.0])
     bench.run(0.01)
     io.write_outputs(io.blocks[0].spec, [0], [1.0])
@@ -65,7 +65,7 @@ def test_triggered_wave_counts_its_periods_and_ends_with_its_trigger(bench):
     assert port.data[0] == 1
     io.write_outputs(io.blocks[0].spec, [0], [0.0])
     bench.run(0.01)
-    assert port.data[0] == 0 and port.words[2, 0] == 8
+    assert port.data[0] == 0 and port.edges[0] == 8
 
 
 def test_gripper_and_loop(bench):
@@ -83,7 +83,7 @@ def test_gripper_and_loop(bench):
     began = bench.clock_ns
     assert outputs.data[0] == 0b1000_0100 and inputs.data[0] == 0b110
     bench.run(0.3, until=lambda: inputs.data[0] == 0b101)
-    assert inputs.words[1, 0] == began + 120_000_000
+    assert inputs.rows["changed_ns"][0] == began + 120_000_000
 
 
 @pytest.mark.parametrize(

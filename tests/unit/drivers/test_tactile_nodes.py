@@ -183,7 +183,7 @@ def test_readings_from_before_the_request_make_no_baseline(bench, hand):
 def test_a_blind_finger_is_not_zeroed(bench):
     """The node that it feels is not there: its readings are INVALID."""
     finger = bench.make(SimTactile, "tactile0", table())
-    bench.inputs["hand.force"].read = lambda now_ns: np.zeros((1, 1))
+    bench.inputs["hand.force"].read = lambda now_ns: {"value": np.zeros(1)}
     bench.run(0.15)
     still = ask_zero(finger)
     bench.inputs["hand.force"].read = lambda now_ns: None

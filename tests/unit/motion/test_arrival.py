@@ -261,7 +261,7 @@ def test_many_axes_settle_and_try_again_each_for_itself():
     rig.tick(2)
     rig.write(mode=[MODE.POSITION] * n, axis=list(range(n)), position=np.linspace(-1, 1, n))
     rig.run()
-    assert np.abs(rig.bank.fields[0] - np.linspace(-1, 1, n)).max() < TOLERANCE
+    assert np.abs(rig.bank.rows["position"] - np.linspace(-1, 1, n)).max() < TOLERANCE
     assert rig.bank.particulars(range(n))["retries"] == [int(i % missing == 0) for i in range(n)]
 
 
@@ -309,7 +309,7 @@ def test_a_stepper_takes_its_start_velocity_at_once_and_no_more():
     assert (np.minimum(np.abs(v[1:]), np.abs(v[:-1]))[steps > 0.02] <= jump + 0.02).all(), (
         "jumps only from or to slow"
     )
-    assert not any(int(h[11].view(np.int64)[0]) & S.SATURATED for h in quick.history)
+    assert not any(int(h["status"][0]) & S.SATURATED for h in quick.history)
 
 
 def test_a_stepper_jogs_below_its_start_velocity_without_a_ramp():

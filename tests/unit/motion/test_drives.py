@@ -190,12 +190,12 @@ def test_a_soft_limit_that_ends_a_run_or_a_force_is_told():
         for action in bank.take_actions():
             bank.action_done(action, now)
         bank.poll(now + 10_000_000, np.array([0.005]), moves, yes, no)
-        status = int(bank.fields.view(np.int64)[11, 0])
+        status = int(bank.rows["status"][0])
         assert bool(status & S.FORCE_MODE) == (mode is MODE.FORCE)
         bank.stop_at_limit([0], S.LIMIT_PLUS, "the soft limit is near", now + 11_000_000)
         assert [a.is_stop for a in bank.take_actions()] == [True]
         bank.poll(now + 20_000_000, np.array([0.006]), still, no, yes)
-        status = S(int(bank.fields.view(np.int64)[11, 0]))
+        status = S(int(bank.rows["status"][0]))
         assert status & S.LIMIT_PLUS and status.severity == 1
         assert status & S.FORCE_ENDED == bits and not status & S.FORCE_MODE
         told = [e for e in bank.take_events() if e.kind is EventKind.DROPPED]

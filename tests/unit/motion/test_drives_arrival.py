@@ -188,7 +188,7 @@ def test_a_keeper_hears_of_a_motion_before_the_drive_does():
     cell = Watched(restore=Restore("matching"))
     cell.bank.keeper, cell.bank._seen = keeper, False
     cell.poll()
-    assert cell.bank.fields[0, 0] == 0.5 and cell.status() & S.HOMED
+    assert cell.bank.rows["position"][0] == 0.5 and cell.status() & S.HOMED
     assert keeper.notes[-1] == (True, True, 0.0, 0.5)
     seen = []
     take = cell.drives[0].take

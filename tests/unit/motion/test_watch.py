@@ -283,7 +283,7 @@ def test_reset_alone_gives_no_positions_to_an_axis_that_lost_its_place():
     cell.write(mode=MODE.POSITION, position=0.3)
     cell.poll(50)
     assert not cell.status() & (S.FAULT | S.POSITION_LOST)
-    assert cell.bank.fields[0, 0] == pytest.approx(0.3)
+    assert cell.bank.rows["position"][0] == pytest.approx(0.3)
 
 
 def test_homing_finds_the_place_again_and_sets_its_counter_as_it_likes():

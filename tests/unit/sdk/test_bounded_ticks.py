@@ -7,8 +7,8 @@ import pytest
 from own_writes_rig import CLOCK, World, own_time
 
 from sioms.drivers.sim_axes import SimAxes
-from sioms.protocol.flags import ControlMode, Request
-from sioms.protocol.records import AXIS_WRITE, AXIS_WRITE_FIELDS
+from sioms.protocol.flags import ControlMode, NodeClass, Request
+from sioms.protocol.records import AXIS_WRITE, WRITE
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def world() -> Iterator[World]:
 def jog() -> bytes:
     """Return the record of a velocity."""
     given = {"control_mode": int(ControlMode.VELOCITY), "velocity": 0.1}
-    return AXIS_WRITE.pack(*(given.get(name, 0) for name, _ in AXIS_WRITE_FIELDS))
+    return AXIS_WRITE.pack(*(given.get(name, 0) for name in WRITE[NodeClass.AXIS]))
 
 
 def test_all_leases_that_have_run_out_end_in_one_tick(world: World) -> None:

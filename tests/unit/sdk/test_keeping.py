@@ -155,7 +155,7 @@ def test_an_axis_without_a_rule_keeps_to_its_device_and_others_are_found_by_name
     rig.tick(102)
     settings = settings[::-1]
     rig = Rig(settings, keeper=PositionFile(str(tmp_path / "x"), settings, BOOT, lambda *_: None))
-    assert rig.bank.fields[0].tolist() == [pytest.approx(3.0 - 1e-3), 0.0, 1.0]
+    assert rig.bank.rows["position"].tolist() == [pytest.approx(3.0 - 1e-3), 0.0, 1.0]
 
 
 @pytest.mark.parametrize(

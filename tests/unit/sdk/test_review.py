@@ -114,13 +114,13 @@ def test_no_verb_lets_the_set_point_run_on_before_a_late_tick(verb: str, gap_ms:
     for _ in range(100):
         now += MS
         bank.tick(now, position)
-        position = bank.fields[7].copy()
-    velocity = bank.fields[8][0]
+        position = bank.rows["commanded_position"].copy()
+    velocity = bank.rows["commanded_velocity"][0]
     assert 0.04 < position[0] < 0.06 and velocity > 0.5
     now += gap_ms * MS
     VERBS[verb](bank, now)
     bank.tick(now + 1000, position)
-    assert bank.fields[7][0] == pytest.approx(position[0], abs=1e-4), (
+    assert bank.rows["commanded_position"][0] == pytest.approx(position[0], abs=1e-4), (
         "it brakes from where it was last put out"
     )
 

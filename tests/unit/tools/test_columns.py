@@ -6,11 +6,11 @@ import pytest
 from tool_rig import AXES, node_info
 
 from sioms.protocol.flags import ControlMode, NodeClass
-from sioms.protocol.records import ANALOG_WRITE, AXIS_WRITE, AXIS_WRITE_FIELDS, BINARY_WRITE
+from sioms.protocol.records import ANALOG_WRITE, AXIS_WRITE, BINARY_WRITE, WRITE
 from sioms.tools.columns import Columns
 from sioms.tools.options import UsageError, fold
 
-NAMES = [name for name, _ in AXIS_WRITE_FIELDS]
+NAMES = list(WRITE[NodeClass.AXIS])
 
 
 def columns(line: str, node_class=NodeClass.AXIS, names=AXES) -> Columns:
