@@ -10,12 +10,11 @@ from collections.abc import Iterable, Sequence
 from time import monotonic, monotonic_ns, sleep
 from typing import Any
 
+from sioms.arguments import positive
 from sioms.client.stopping import emergency_stop
 from sioms.client.workcell import NodeEntry, Workcell
 from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
-
-from .arguments import positive
 
 READONLY = ".readonly"
 

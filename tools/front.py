@@ -22,29 +22,29 @@ from sioms.safe_path import leave_working_directory
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command: the module of sioms.tools that has it, and one line for the overview."""
+    """A command: the module that has it, and one line for the overview."""
 
     module: str
     text: str
 
 
 COMMANDS: dict[str, Command] = {
-    "demo": Command("demo", "show the simulated workcell at work"),
-    "init": Command("init", "write a starter configuration, with what is plugged in"),
-    "list": Command("cell", "list the nodes of the workcell"),
-    "info": Command("cell", "tell what a node is: channels, units, limits"),
-    "status": Command("cell", "tell how devices, sessions and the emergency stop stand"),
-    "wait": Command("cell", "wait until the daemon is ready"),
-    "monitor": Command("monitor", "watch all nodes live, with the emergency stop on a key"),
-    "stop": Command("cell", "emergency stop of a node or of the whole workcell"),
-    "reset": Command("cell", "clear a latched stop or fault"),
-    "reload": Command("cell", "have the daemon take up its configuration anew"),
-    "check": Command("cell", "check a configuration"),
-    "service": Command("service", "install the daemon as a service of this machine"),
-    "driver": Command("driver", "list, check, trace and replay drivers"),
-    "bench": Command("bench", "measure latencies and throughput on this machine"),
-    "tactile": Command("tactile", "design, calibrate and measure elastic fingers"),
-    "reconcile": Command("reconcile", "find where simulation and measurement disagree"),
+    "demo": Command("sioms.tools.demo", "show the simulated workcell at work"),
+    "init": Command("sioms.tools.init", "write a starter configuration, with what is plugged in"),
+    "list": Command("sioms.tools.cell", "list the nodes of the workcell"),
+    "info": Command("sioms.tools.cell", "tell what a node is: channels, units, limits"),
+    "status": Command("sioms.tools.cell", "tell how devices, sessions and the emergency stop stand"),
+    "wait": Command("sioms.tools.cell", "wait until the daemon is ready"),
+    "monitor": Command("sioms.tools.monitor", "watch all nodes live, with the emergency stop on a key"),
+    "stop": Command("sioms.tools.cell", "emergency stop of a node or of the whole workcell"),
+    "reset": Command("sioms.tools.cell", "clear a latched stop or fault"),
+    "reload": Command("sioms.tools.cell", "have the daemon take up its configuration anew"),
+    "check": Command("sioms.tools.cell", "check a configuration"),
+    "service": Command("sioms.tools.service", "install the daemon as a service of this machine"),
+    "driver": Command("sioms.tools.driver", "list, check, trace and replay drivers"),
+    "bench": Command("sioms.tools.bench", "measure latencies and throughput on this machine"),
+    "tactile": Command("sioms.tactile.command", "design, calibrate and measure elastic fingers"),
+    "reconcile": Command("sioms.reconcile.command", "find where simulation and measurement disagree"),
 }
 DESCRIPTION = "The devices of a workcell behind one small interface. `sioms COMMAND --help` tells more."
 
@@ -62,7 +62,7 @@ def main(words: Sequence[str] | None = None) -> int:
     wanted = next((word for word in words if not word.startswith("-")), "")
     module: Any = None
     if wanted in there:
-        module = import_module(f"sioms.tools.{there[wanted].module}")
+        module = import_module(there[wanted].module)
         module.add_parser(subparsers)
     else:
         for name, command in there.items():
@@ -116,7 +116,7 @@ def installed() -> dict[str, Command]:
     found = {}
     for name, command in COMMANDS.items():
         try:
-            there = find_spec(f"sioms.tools.{command.module}") is not None
+            there = find_spec(command.module) is not None
         except ModuleNotFoundError:  # of a package that is not there
             there = False
         if there:

@@ -18,6 +18,7 @@ import numpy as np
 
 from sioms.daemon.config import parse as parse_config
 from sioms.documents import json_of, toml_of
+from sioms.lab.arrays import UnreadableError, read_mat, read_npz
 from sioms.plant.effects import EffectsError, parse_effects
 from sioms.protocol import wire
 from sioms.protocol.driver_verbs import FROM_DRIVER, TO_DRIVER, TO_NURSERY, DriverVerb, NurseryVerb
@@ -36,6 +37,8 @@ from sioms.protocol.messages import (
 from sioms.protocol.text import printable, shown
 from sioms.protocol.verbs import FROM_CLIENT, ON_HANDLE, take
 from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.files.axis import read_model
+from sioms.reconcile.files.table import load_table
 from sioms.sdk.codec.ascii_line import LineReceiver
 from sioms.sdk.codec.ati_rdt import parse as parse_rdt
 from sioms.sdk.codec.cobs import FrameReceiver
@@ -47,9 +50,6 @@ from sioms.sdk.golden import Golden, Incomplete, _read
 from sioms.sdk.regmap import RegisterMapError, parse_map
 from sioms.tactile.cylinder import Cylinder
 from sioms.tactile.finger import from_toml, nominal_finger, to_toml
-from sioms.tools.arrays import UnreadableError, read_mat, read_npz
-from sioms.tools.reconcile_input import read_model
-from sioms.tools.reconcile_table import load_table
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from sioms.reconcile.axis import analyse
+from sioms.reconcile.files.axis import read_data, read_model
 from sioms.reconcile.prepare import Options
 from sioms.reconcile.verdict import Outcome
-from sioms.tools.reconcile_input import read_data, read_model
 
 TRUE = {"weight": 14.0, "fc": 6.0, "fs": 9.0, "vs": 0.12, "stiffness": 3e4, "viscous": 9.0, "inertia": 2.1}
 MODEL = """[axis]

@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sioms.reconcile import command as reconcile
 from sioms.reconcile.axis import analyse
+from sioms.reconcile.command.blind import solve
+from sioms.reconcile.command.selftest import generate, record, write_public
+from sioms.reconcile.files.axis import read_data, read_model
 from sioms.reconcile.prepare import Options
 from sioms.reconcile.records import Session
 from sioms.reconcile_selftest.draw import draw_axis
 from sioms.reconcile_selftest.score import score
-from sioms.tools import reconcile
-from sioms.tools.reconcile_blind import solve
-from sioms.tools.reconcile_input import read_data, read_model
-from sioms.tools.reconcile_selftest import generate, record, write_public
 
 AXES = Path(__file__).parent / "reconcile_axes"
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sioms.reconcile import command as reconcile
+from sioms.reconcile.command.selftest_sensors import selftest, write_public
 from sioms.reconcile_selftest.finger_draw import HiddenFinger, draw_finger
 from sioms.reconcile_selftest.force_world import HiddenSensor, draw_sensor
 from sioms.reconcile_selftest.sensors import score_sensor
-from sioms.tools import reconcile
-from sioms.tools.reconcile_selftest_sensors import selftest, write_public
 
 
 def solve(hidden: HiddenFinger | HiddenSensor, folder: Path) -> tuple[int, dict[str, object]]:

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sioms.reconcile.command.selftest import record
 from sioms.reconcile.effects import library
 from sioms.reconcile_selftest.axis import Axis, Servo
 from sioms.reconcile_selftest.draw import NAMED, SATURATED, draw_axis
 from sioms.reconcile_selftest.score import PRIMARY
 from sioms.reconcile_selftest.world import Recording, World
-from sioms.tools.reconcile_selftest import record
 
 #: An axis of 2 kg without friction, on a soft spring of a controller.
 BARE = Axis(

@@ -95,7 +95,7 @@ def workflow(
     """Start the workflow as a user does."""
     file = folder / "nominal.toml"
     file.write_text(model)
-    command = [sys.executable, "-m", "sioms.tools.reconcile", "axis", node, "--model", str(file),
+    command = [sys.executable, "-m", "sioms.reconcile", "axis", node, "--model", str(file),
                "--socket", daemon.socket, "--out", str(folder / "report"), *options]  # fmt: skip
     return Running(command, {"OPENBLAS_NUM_THREADS": "1"}, None)
 
@@ -214,7 +214,7 @@ def test_nothing_moves_without_consent_and_a_node_of_another_kind_is_refused(
     with daemon.cell() as session:
         assert session.open("mod0.xaxis.readonly").read().position[0] == 0.0
     (tmp_path / "nominal.toml").write_text(MODEL.replace("linear", "rotary"))
-    wrong = Running([sys.executable, "-m", "sioms.tools.reconcile", "axis", "mod0.xaxis", "--model", str(tmp_path / "nominal.toml"),
+    wrong = Running([sys.executable, "-m", "sioms.reconcile", "axis", "mod0.xaxis", "--model", str(tmp_path / "nominal.toml"),
                      "--socket", daemon.socket, "--yes"], {}, None)  # fmt: skip
     assert wrong.wait_exit(120.0) == 2
     assert "it is in m, the model in rad" in said(wrong)

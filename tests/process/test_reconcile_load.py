@@ -88,7 +88,7 @@ def workflow(daemon: Daemon, folder: Path, *options: str, stand: str = STAND) ->
     """Start the workflow as a user does."""
     for name, text in (("nominal.toml", MODEL), ("stand.toml", stand)):
         (folder / name).write_text(text)
-    command = [sys.executable, "-m", "sioms.tools.reconcile", "force", "force0", "--model", str(folder / "nominal.toml"),
+    command = [sys.executable, "-m", "sioms.reconcile", "force", "force0", "--model", str(folder / "nominal.toml"),
                "--stand", str(folder / "stand.toml"), "--socket", daemon.socket, "--out", str(folder / "report"), *options]  # fmt: skip
     return Running(command, {"OPENBLAS_NUM_THREADS": "1"}, None)
 

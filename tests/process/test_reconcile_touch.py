@@ -22,8 +22,8 @@ from sioms.plant.finger import scattered
 from sioms.protocol.flags import Request
 from sioms.tactile.cylinder import FINGER_B
 from sioms.tactile.finger import from_toml, nominal_finger, to_toml
+from sioms.tactile.live.simulated import simulated
 from sioms.tools.counterparts.finger import shape_of
-from sioms.tools.tactile_simulated import simulated
 
 CONFIG = Path(__file__).parents[2] / "etc" / "prober.toml"
 ELEMENTS = 6  # a short finger: half a minute of touches
@@ -69,7 +69,7 @@ def workflow(cell: Path, folder: Path, *options: str) -> Running:
     """Start the workflow as a user does."""
     model = folder / "nominal.toml"
     model.write_text(MODEL)
-    command = [sys.executable, "-m", "sioms.tools.reconcile", "tactile", "tactile0", "--model", str(model),
+    command = [sys.executable, "-m", "sioms.reconcile", "tactile", "tactile0", "--model", str(model),
                "--socket", str(cell / "prober.sock"), "--out", str(folder / "report"), *options]  # fmt: skip
     return Running(command, {"OPENBLAS_NUM_THREADS": "1"}, None)
 

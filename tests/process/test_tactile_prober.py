@@ -11,11 +11,11 @@ from daemon_rig import wait_for
 import sioms
 from sioms.protocol.flags import Request
 from sioms.tactile.cylinder import FINGER_B
+from sioms.tactile.files import read_folder
 from sioms.tactile.finger import nominal_finger, to_toml
+from sioms.tactile.live.prober import LENGTH_M, Prober, Rig, Touch, write_nominal
+from sioms.tactile.live.simulated import simulated
 from sioms.tactile.quality import Quality
-from sioms.tools.tactile_data import read_folder
-from sioms.tools.tactile_prober import LENGTH_M, Prober, Rig, Touch, write_nominal
-from sioms.tools.tactile_simulated import simulated
 
 CONFIG = Path(__file__).parents[2] / "etc" / "prober.toml"
 ANGLES = np.radians(143.0 - 9.22 * np.arange(16))

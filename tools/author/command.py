@@ -14,9 +14,9 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+from sioms.children import ends_with_us
 from sioms.wording import did_you_mean
 
-from ..children import ends_with_us
 from ..counterparts.rigs import MAP_RIGS, RIGS, Rig, find_rig, rig_of
 from .check import Subject, check, trial_names
 from .golden import ProbeFailed, probe

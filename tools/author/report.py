@@ -7,7 +7,8 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any
 
-from ..report_page import Page
+from sioms.report_page import Page
+
 from .trial import Result, Verdict
 
 WIDTH = 110

@@ -22,12 +22,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
+from sioms.children import ends_with_us
 from sioms.client.workcell import Workcell
 from sioms.protocol.flags import AxisStatus, ControlMode, NodeClass
 
 from ..bench.rig import Daemon
 from ..cell import READONLY, is_part
-from ..children import ends_with_us
 from ..counterparts.rigs import Axis, Output, Rig
 
 ANSWER_S = 5.0

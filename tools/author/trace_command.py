@@ -15,8 +15,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from sioms.children import ends_with_us
+
 from ..bench.rig import Daemon
-from ..children import ends_with_us
 from ..counterparts.rigs import LINES
 from .station import Peer, wait_for
 from .traces import BadTrace, Trace, read_trace

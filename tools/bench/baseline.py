@@ -9,7 +9,7 @@ import sys
 import time
 from typing import Self
 
-from ..children import ends_with_us
+from sioms.children import ends_with_us
 
 _ECHO = """
 import socket, sys

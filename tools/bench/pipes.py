@@ -11,7 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from ..children import ends_with_us
+from sioms.children import ends_with_us
+
 from .baseline import interpreter_ns, run_ns
 from .figures import Bar, Report
 from .options import Options

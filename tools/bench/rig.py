@@ -21,9 +21,8 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
+from sioms.children import ends_with_us
 from sioms.client.workcell import Workcell
-
-from ..children import ends_with_us
 
 READY_S = 30.0
 

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import sioms
+from sioms.children import PATIENCE_S, Process
 from sioms.protocol.flags import AxisStatus
-
-from .rig import PATIENCE_S, Process
 
 MIDDLE = 0.24
 """Of the range of each axis that is moved [m]: from here the way to either limit is the same."""

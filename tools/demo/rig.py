@@ -1,95 +1,17 @@
-"""Processes of the demo: daemons and helpers, started with their ready line awaited, ended for sure."""
+"""What the demo prints and runs: headings, and pipe tools with what they print."""
 
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
-import threading
-import time
-from collections.abc import Sequence
-from typing import IO
 
-from sioms.tools.children import ends_with_us
-
-PATIENCE_S = 300.0
-"""Longest wait for anything in the demo [s]: under twenty busy loops a second takes a minute at times."""
-
-
-class Process:
-    """A child process whose ready line has been seen.
-
-    Args:
-        arguments: of a Python module: ``["sioms.daemon.main", "--config", ...]``.
-        ready: text that the ready line contains.
-        errors: whether it comes on stderr instead of stdout.
-
-    Raises:
-        RuntimeError: it ended or stayed mute; with what it said.
-    """
-
-    def __init__(self, arguments: Sequence[str], ready: str, errors: bool = False) -> None:
-        pipe: dict[str, int] = {"stderr" if errors else "stdout": subprocess.PIPE}
-        self._process = subprocess.Popen(  # type: ignore[call-overload]
-            [sys.executable, "-P", "-m", *arguments], text=True, preexec_fn=ends_with_us(), **pipe
-        )
-        stream: IO[str] = self._process.stderr if errors else self._process.stdout
-        self.said: list[str] = []
-        found = threading.Event()
-
-        def listen() -> None:
-            for line in stream:
-                self.said.append(line.rstrip())
-                if ready in line:
-                    found.set()
-            found.set()
-
-        threading.Thread(target=listen, daemon=True).start()
-        if not found.wait(PATIENCE_S) or not any(ready in line for line in self.said):
-            self.kill()
-            raise RuntimeError(
-                f"start {arguments[0]}: it did not say {ready!r}; it said: {' | '.join(self.said[-5:])}"
-            )
-
-    @property
-    def pid(self) -> int:
-        """Its process number."""
-        return int(self._process.pid)
-
-    @property
-    def ready_line(self) -> str:
-        """The last line it said until now."""
-        return self.said[-1]
-
-    def kill(self) -> int:
-        """Kill it at once (SIGKILL); return when [ns, CLOCK_MONOTONIC]."""
-        now_ns = time.monotonic_ns()
-        self._process.kill()
-        self._process.wait()
-        return now_ns
-
-    def end(self) -> None:
-        """Ask it to end, and see that it does."""
-        if self._process.poll() is None:
-            self._process.send_signal(signal.SIGTERM)
-            try:
-                self._process.wait(PATIENCE_S)
-            except subprocess.TimeoutExpired:
-                self.kill()
+from sioms.children import PATIENCE_S, ends_with_us
 
 
 def bold(text: str) -> str:
     """Return a heading: bold on a terminal, plain elsewhere."""
     return f"\033[1m{text}\033[0m" if sys.stdout.isatty() else text
-
-
-def daemon(config: str, socket_path: str) -> Process:
-    """Start a daemon; clients of this process and its children will find it."""
-    os.environ["SIOMS_SOCKET"] = socket_path
-    return Process(
-        ["sioms.daemon.main", "--config", config, "--socket", socket_path], "event=ready", errors=True
-    )
 
 
 def tool(name: str, *arguments: str, input_text: str | None = None) -> str:

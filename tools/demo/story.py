@@ -11,12 +11,13 @@ import time
 from importlib.resources import files
 
 import sioms
+from sioms.children import PATIENCE_S, Process, daemon
 from sioms.client.command import command
 
 from . import measure
 from .pace import RATES, paced, rate_for, share
 from .recorder import Recorder
-from .rig import PATIENCE_S, Process, bold, daemon, tool
+from .rig import bold, tool
 
 
 def tell(out: str, quick: bool, wire: bool) -> int:

@@ -7,8 +7,9 @@ from contextlib import ExitStack
 from importlib.resources import files
 
 import sioms
+from sioms.children import PATIENCE_S, Process, daemon
 
-from .rig import PATIENCE_S, Process, bold, daemon
+from .rig import bold
 
 PORTS = {"/dev/ttyUSB0": "drives", "/dev/ttyACM0": "finger", "192.168.127.254:502": "io"}
 """Port names of the configuration, and the counterpart that takes the place of each."""

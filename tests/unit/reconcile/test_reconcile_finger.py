@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 from sioms.plant.finger import FingerShape, TactileArray
+from sioms.reconcile import command as reconcile
 from sioms.reconcile.descent import descend, within
 from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.files.finger import read_experiments, read_model
 from sioms.reconcile.finger.belief import Belief, late, outputs, scene_of
 from sioms.reconcile.finger.data import CELL, COURSE, STRENGTH, TOUCH, behind
 from sioms.reconcile.finger.effects import library
@@ -34,8 +36,6 @@ from sioms.tactile.contact import frictionless
 from sioms.tactile.cylinder import FINGER_B
 from sioms.tactile.indenter import FLAT, Round, Wedge
 from sioms.tactile.touches import Recording
-from sioms.tools import reconcile
-from sioms.tools.reconcile_finger import read_experiments, read_model
 
 ANGLES = np.radians(143.0 - 9.22 * np.arange(16))
 

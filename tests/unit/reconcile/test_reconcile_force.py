@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from sioms.plant.force_sensor import Contact, Flaws, ForceSensor
+from sioms.reconcile import command as reconcile
+from sioms.reconcile.command.selftest_sensors import COLUMNS
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.force.belief import Loads, lagged, late, readings
 from sioms.reconcile.force.model_file import from_table, to_toml
@@ -21,8 +23,6 @@ from sioms.reconcile.sensors.analyse import Options, analyse
 from sioms.reconcile.sensors.search import Saving, Searcher
 from sioms.reconcile.sensors.steady import changes
 from sioms.reconcile_selftest.force_world import COMPONENTS, draw_sensor, record
-from sioms.tools import reconcile
-from sioms.tools.reconcile_selftest_sensors import COLUMNS
 
 SENSOR = {"sensor": {"name": "s", "components": ["fx", "tz"], "full_range": [100.0, 5.0]}}
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.files.finger import read_experiments
+from sioms.reconcile.files.force import read_loads
 from sioms.reconcile.finger.model_file import from_table as finger_from
 from sioms.reconcile.force.model_file import from_table as sensor_from
 from sioms.reconcile.given import parsed
-from sioms.tools.reconcile_finger import read_experiments
-from sioms.tools.reconcile_force import read_loads
 
 SENSOR = {"name": "w", "components": ["fz"], "full_range": [200.0]}
 FINGER = {

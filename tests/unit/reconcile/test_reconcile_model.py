@@ -12,6 +12,7 @@ import pytest
 
 from sioms.reconcile.effect import Slot
 from sioms.reconcile.effects import known, library
+from sioms.reconcile.files.axis import read_data, read_model
 from sioms.reconcile.jit import compiled
 from sioms.reconcile.kernel import summed
 from sioms.reconcile.model import AxisModel, Controller
@@ -20,7 +21,6 @@ from sioms.reconcile.records import Record, Session
 from sioms.reconcile.screen import shapes
 from sioms.reconcile.simulate import pack, simulate
 from sioms.reconcile.verdict import BadInputError
-from sioms.tools.reconcile_input import read_data, read_model
 
 AXIS = AxisModel(
     True, 1e-3, 2e-3, 1e-3, 1e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)

@@ -13,13 +13,13 @@ from scipy.signal import lfilter
 from sioms.reconcile.axis import _explained, _upright, analyse
 from sioms.reconcile.checks import runs_the_loop
 from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.files.axis import read_data, read_model
 from sioms.reconcile.fit import Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import observer
 from sioms.reconcile.prepare import Options, prepare
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.sampling import Sampling, read_as, trusted
-from sioms.tools.reconcile_input import read_data, read_model
 
 AXES = Path(__file__).parents[2] / "physics" / "reconcile_axes"
 QUICK = Options(pictures=False)

@@ -15,11 +15,11 @@ from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import observer
 from sioms.reconcile.plausible import physical, small
 from sioms.reconcile.records import Record, Session
+from sioms.reconcile.report.page import span
 from sioms.reconcile.simulate import simulate
 from sioms.reconcile.switches import Switches
 from sioms.reconcile.verdict import Estimate, Gap
 from sioms.reconcile.windows import NUMBERS, Seen
-from sioms.tools.reconcile_page import span
 
 AXIS = AxisModel(
     True, 1e-3, 2e-3, 1e-3, 2e-5, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)

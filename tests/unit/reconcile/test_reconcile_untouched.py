@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from sioms.reconcile.axis import analyse
+from sioms.reconcile.files.axis import read_data, read_model
 from sioms.reconcile.gaps import lap, lap_floor
 from sioms.reconcile.prepare import UNTOUCHED, Options, prepare
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.timed import Timed
 from sioms.reconcile.verdict import Gap, NamedEffect
-from sioms.tools.reconcile_input import read_data, read_model
 
 AXES = Path(__file__).parents[2] / "physics" / "reconcile_axes"
 QUICK = Options(pictures=False)

@@ -1,0 +1,105 @@
+"""Processes that end with the program that starts them, however that ends.
+
+A program that is told to end (SIGTERM, SIGHUP, Ctrl-C) ends what it has started by itself; for one that is killed the kernel
+does so: each child asks it for a SIGTERM on the death of its parent. A daemon that gets it stops its drivers.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import IO
+
+PATIENCE_S = 300.0
+"""Longest wait for a child [s]: under twenty busy loops a second takes a minute at times."""
+
+_PR_SET_PDEATHSIG = 1
+_libc = ctypes.CDLL(None)
+
+
+def ends_with_us() -> Callable[[], None]:
+    """Return the ``preexec_fn`` of a child that gets SIGTERM when the thread that starts it ends, by prctl(2)."""
+    parent = os.getpid()
+
+    def tie() -> None:
+        _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+        if os.getppid() != parent:  # it has died meanwhile
+            os._exit(128 + signal.SIGTERM)
+
+    return tie
+
+
+class Process:
+    """A child process whose ready line has been seen.
+
+    Args:
+        arguments: of a Python module: ``["sioms.daemon.main", "--config", ...]``.
+        ready: text that the ready line contains.
+        errors: whether it comes on stderr instead of stdout.
+
+    Raises:
+        RuntimeError: it ended or stayed mute; with what it said.
+    """
+
+    def __init__(self, arguments: Sequence[str], ready: str, errors: bool = False) -> None:
+        pipe: dict[str, int] = {"stderr" if errors else "stdout": subprocess.PIPE}
+        self._process = subprocess.Popen(  # type: ignore[call-overload]
+            [sys.executable, "-P", "-m", *arguments], text=True, preexec_fn=ends_with_us(), **pipe
+        )
+        stream: IO[str] = self._process.stderr if errors else self._process.stdout
+        self.said: list[str] = []
+        found = threading.Event()
+
+        def listen() -> None:
+            for line in stream:
+                self.said.append(line.rstrip())
+                if ready in line:
+                    found.set()
+            found.set()
+
+        threading.Thread(target=listen, daemon=True).start()
+        if not found.wait(PATIENCE_S) or not any(ready in line for line in self.said):
+            self.kill()
+            raise RuntimeError(
+                f"start {arguments[0]}: it did not say {ready!r}; it said: {' | '.join(self.said[-5:])}"
+            )
+
+    @property
+    def pid(self) -> int:
+        """Its process number."""
+        return int(self._process.pid)
+
+    @property
+    def ready_line(self) -> str:
+        """The last line it said until now."""
+        return self.said[-1]
+
+    def kill(self) -> int:
+        """Kill it at once (SIGKILL); return when [ns, CLOCK_MONOTONIC]."""
+        now_ns = time.monotonic_ns()
+        self._process.kill()
+        self._process.wait()
+        return now_ns
+
+    def end(self) -> None:
+        """Ask it to end, and see that it does."""
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGTERM)
+            try:
+                self._process.wait(PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                self.kill()
+
+
+def daemon(config: str, socket_path: str) -> Process:
+    """Start a daemon; clients of this process and its children will find it."""
+    os.environ["SIOMS_SOCKET"] = socket_path
+    return Process(
+        ["sioms.daemon.main", "--config", config, "--socket", socket_path], "event=ready", errors=True
+    )

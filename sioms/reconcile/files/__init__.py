@@ -1,0 +1,1 @@
+"""What people have, read: tables with a short TOML, folders of recordings, model files."""

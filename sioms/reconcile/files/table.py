@@ -1,0 +1,229 @@
+"""Read tables as instruments and spreadsheets write them: CSV of any dialect, NPZ, MAT.
+
+A CSV may part its columns by comma, semicolon, tab or blanks, write 1,5 for 1.5, carry lines of remarks before its head, a
+unit in each name (``pos [deg]``, ``pos (deg)``, ``pos/deg``, ``pos_deg``) or a line of units below the head. A time of day,
+with or without a date before it (``2024-02-01 12:30:00.125``), is read as seconds since midnight.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.documents import read_bytes
+from sioms.lab.arrays import MOST_BYTES, UnreadableError, read_mat, read_npz
+from sioms.reconcile.errors import BadInputError
+
+Array = NDArray[np.float64]
+SUFFIXES = (".csv", ".npz", ".mat", ".txt")
+#: Factors to SI, by what they measure.
+UNITS = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
+    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9},
+    "angle": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180.0, "turn": 2.0 * np.pi},
+    "force": {"N": 1.0, "mN": 1e-3, "kN": 1e3},
+    "torque": {"N m": 1.0, "mN m": 1e-3, "kN m": 1e3, "N mm": 1e-3, "N cm": 1e-2},
+    "electric": {"V": 1.0, "mV": 1e-3, "A": 1.0, "mA": 1e-3, "%": 1.0},
+    "number": {"1": 1.0},
+    "speed": dict.fromkeys(("m/s", "mm/s", "rad/s", "deg/s", "rpm", "1/min"), 1.0),
+}
+#: Other spellings of the same units.
+SPELLINGS = {
+    "°": "deg",
+    "degree": "deg",
+    "degrees": "deg",
+    "rev": "turn",
+    "revs": "turn",
+    "turns": "turn",
+    "sec": "s",
+    "msec": "ms",
+    "µs": "us",
+    "μs": "us",
+    "µm": "um",
+    "μm": "um",
+    "Nm": "N m",
+    "N*m": "N m",
+    "N·m": "N m",
+    "Nmm": "N mm",
+    "Ncm": "N cm",
+    "mNm": "mN m",
+    "kNm": "kN m",
+    "counts": "count",
+    "cts": "count",
+    "inc": "count",
+    "ticks": "count",
+    "U/min": "rpm",
+    "-": "1",
+    "": "1",
+}
+#: Kinds of arrays that are columns.
+NUMBERS = "fiub"
+#: Lines that may stand before the head.
+REMARKS = 60
+_IN_BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]$")
+_AFTER_SLASH = re.compile(r"^(.*?)\s*/\s*([^/]+)$")
+_CLOCK = re.compile(r"^(?:\S+[ T])?(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)Z?$")
+_AFTER_BAR = re.compile(r"^(.+)_([^_\W]+)$")
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Columns of one file, shape (n,) each, by their heads; and the units that the heads state, if any."""
+
+    columns: dict[str, Array]
+    units: dict[str, str]
+
+    def find(self, name: str) -> str | None:
+        """Return the head of the column that is meant: as given, or the only one that is so but for its unit."""
+        if name in self.columns:
+            return name
+        alike = [head for head in self.columns if named(head)[0] == name]
+        return alike[0] if len(alike) == 1 else None
+
+
+def unit_of(text: str) -> str | None:
+    """Return the usual spelling of a unit; None where it is not known."""
+    text = text.strip()
+    text = SPELLINGS.get(text, text)
+    return text if text == "count" or any(text in group for group in UNITS.values()) else None
+
+
+def measures(unit: str) -> str:
+    """Say what a known unit measures: time, length, angle, force ..."""
+    return next((kind for kind, group in UNITS.items() if unit in group), "count")
+
+
+def named(head: str) -> tuple[str, str | None]:
+    """Part the head of a column into its name and the unit that it states."""
+    head = head.strip().strip('"').strip()
+    for pattern in (_IN_BRACKETS, _AFTER_SLASH):
+        if (m := pattern.match(head)) and m[1] and (unit := unit_of(m[2])):
+            return m[1].strip(), unit
+    m = _AFTER_BAR.match(head)
+    return head, unit_of(m[2]) if m else None
+
+
+def load_table(path: Path) -> Table:
+    """Read the columns of one file.
+
+    Raises:
+        BadInputError: there is no such file, or it is no table.
+    """
+    if not path.exists():
+        raise BadInputError(f"read {path}: no such file")
+    if path.suffix in (".npz", ".mat"):
+        try:
+            raw = read_npz(path) if path.suffix == ".npz" else read_mat(path)
+        except UnreadableError as error:
+            raise BadInputError(str(error)) from None
+        return _table(
+            {
+                k: np.asarray(v, dtype=np.float64)
+                for k, v in raw.items()
+                if np.ndim(v) == 1 and np.asarray(v).dtype.kind in NUMBERS
+            }
+        )
+    return _text(path)
+
+
+def load_columns(path: Path) -> dict[str, Array]:
+    """Read the columns of one file, without their units."""
+    return load_table(path).columns
+
+
+def _table(columns: dict[str, Array]) -> Table:
+    return Table(columns, {head: unit for head in columns if (unit := named(head)[1]) is not None})
+
+
+def _text(path: Path) -> Table:
+    try:
+        raw = read_bytes(path, MOST_BYTES)
+    except ValueError as error:
+        raise BadInputError(f"read {path}: {error}") from None
+    try:
+        lines = raw.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        lines = raw.decode("latin-1").splitlines()
+    lines = [line for line in lines if line.strip(" \t,;")]
+    first = next(
+        (
+            i
+            for i in range(min(len(lines), REMARKS))
+            if _numbers(lines[i : i + 1]) is not None and _numbers(lines[i : i + 3]) is not None
+        ),
+        None,
+    )
+    if first is None:
+        raise BadInputError(
+            f"read {path}: no numbers in the first {REMARKS} lines; needs one head line of names and numbers below"
+        )
+    if first == 0:
+        raise BadInputError(
+            f"read {path}: the first line has numbers, no names; needs one head line of names"
+        )
+    rows = _numbers(lines[first:])
+    if rows is None:
+        bad = next(
+            i
+            for i in range(first, len(lines))
+            if _numbers([lines[i]]) is None or _numbers([lines[first], lines[i]]) is None
+        )
+        raise BadInputError(
+            f"read {path}: line {bad + 1} is no row of numbers like line {first + 1}: {lines[bad][:60]!r}"
+        )
+    head, units = _head(lines[:first], rows.shape[1])
+    if any(_numbers([cell]) is not None for cell in head):
+        raise BadInputError(
+            f"read {path}: line {first} is neither names nor {rows.shape[1]} numbers: {lines[first - 1][:60]!r}"
+        )
+    if not head:
+        raise BadInputError(f"read {path}: no line of {rows.shape[1]} names over {rows.shape[1]} columns")
+    table = _table({n: np.ascontiguousarray(rows[:, i]) for i, n in enumerate(head)})
+    return Table(table.columns, {**table.units, **{n: u for n, u in zip(head, units, strict=False) if u}})
+
+
+def _cells(line: str, sign: str | None) -> list[str]:
+    cells = [c.strip().strip('"').strip() for c in line.strip().split(sign)]
+    return cells[:-1] if len(cells) > 1 and not cells[-1] else cells
+
+
+def _sign(line: str) -> str | None:
+    """What parts the columns; None: blanks."""
+    return next((s for s in ";\t," if s in line), None)
+
+
+def _numbers(lines: Sequence[str]) -> Array | None:
+    """Read rows of numbers, all alike; None where they are none. A comma is a decimal point where it does not part the columns."""
+    sign = _sign(lines[0])
+    text = [line.replace(",", ".") for line in lines] if sign != "," else lines
+    try:
+        rows = [[_value(c) for c in _cells(line, sign)] for line in text]
+    except ValueError:
+        return None
+    return np.array(rows) if len({len(r) for r in rows}) == 1 else None
+
+
+def _value(cell: str) -> float:
+    """Read a number or a time of day; nan for an empty cell."""
+    try:
+        return float(cell) if cell else np.nan
+    except ValueError:
+        if (m := _CLOCK.match(cell)) is None:
+            raise
+        return 3600.0 * int(m[1]) + 60.0 * int(m[2]) + float(m[3])
+
+
+def _head(above: Sequence[str], count: int) -> tuple[list[str], list[str | None]]:
+    """Find the names, and a line of units below them, in the lines above the numbers."""
+    wide = [c for line in above if len(c := _cells(line.lstrip("#%"), _sign(line))) == count]
+    if not wide:
+        return [], []
+    units = [unit_of(re.sub(r"[\[\]()]", "", c)) for c in wide[-1]]
+    if len(wide) > 1 and all(u is not None for u in units):
+        return wide[-2], [None if u == "1" else u for u in units]
+    return wide[-1], []

@@ -1,0 +1,1 @@
+"""Experiments through the daemon: designed, asked for, run, recorded and decided."""

@@ -1,0 +1,71 @@
+"""The page of the libraries of sensor effects, made from the effects themselves (``sioms reconcile effects sensors``).
+
+With ``--out docs`` page and pictures are written there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from sioms.reconcile.effect import TERM_PREFIX
+from sioms.reconcile.finger.effects import library as of_fingers
+from sioms.reconcile.force.effects import library as of_force_sensors
+from sioms.reconcile.sensors.effect import SensorEffect
+
+HEAD = """# The libraries of sensor effects
+
+Made by `sioms reconcile effects sensors --out docs`. A number marked "each" stands for every element or component. Outputs of a finger
+are fractions of the untouched output, compression positive, strains and angles SI; loads and readings of a force sensor
+are shares of each component's full range. Outside its bounds it is not that effect.
+
+A picture shows what an effect of typical size changes: on a finger in all outputs, that of the element under the edge dark; on a force
+sensor in two components, fx dark.
+"""
+PICTURES = "pictures/effects"
+
+
+def page() -> str:
+    """Write both libraries as Markdown."""
+    force = (e for e in of_force_sensors(("fx", "fy")).values() if not e.name.startswith(TERM_PREFIX))
+    return "\n".join(
+        [
+            HEAD,
+            *_part("Tactile finger", "finger", of_fingers().values()),
+            *_part("Force/torque sensor", "force", force),
+        ]
+    )
+
+
+def write(folder: Path) -> None:
+    """Write the page and the pictures."""
+    from sioms.reconcile.report.signatures import pictures
+
+    (folder / PICTURES).mkdir(parents=True, exist_ok=True)
+    (folder / "reconcile-effects-sensors.md").write_text(page())
+    for stem, figure in pictures().items():
+        figure.savefig(folder / PICTURES / f"{stem}.png", dpi=60, metadata={"Software": None})
+
+
+def _part(title: str, kind: str, effects: Iterable[SensorEffect]) -> list[str]:
+    return [f"## {title}\n", *(section(e, kind) for e in effects)]
+
+
+def section(effect: SensorEffect, kind: str) -> str:
+    """Write one effect of a finger or of a force sensor."""
+    lines = [f"### {effect.name}: {effect.title}", "", f"`{effect.equation}` ({effect.channel.value})", "",
+             "| parameter | unit | bounds | typical | meaning |", "| --- | --- | --- | --- | --- |"]  # fmt: skip
+    for q in effect.parameters:
+        bounds = "any" if q.phase else f"{q.lower:g} to {q.upper:g}"
+        lines.append(
+            f"| {q.symbol}{' (each)' if q.each else ''} | {q.unit} | {bounds} | {q.size:g} | {q.text} |"
+        )
+    lines += ["", f"![change by {effect.title}]({PICTURES}/{kind}_{effect.name}.png)", ""]
+    lines.append(f"Where its residual is: {effect.signature}.")
+    if effect.lookalikes:
+        lines.append(f"Confused with: {', '.join(effect.lookalikes)}. Told apart by: {effect.separate}.")
+    if effect.session:
+        lines.append(f"Belongs to the session: {', '.join(effect.session)}.")
+    if not effect.rankable:
+        lines.append("Decided by a channel of its own, before the search.")
+    return "\n".join(lines) + "\n"

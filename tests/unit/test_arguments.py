@@ -1,0 +1,48 @@
+"""Numbers on a command line."""
+
+from __future__ import annotations
+
+import argparse
+
+import pytest
+
+from sioms.arguments import positive, whole
+from sioms.reconcile.command import main
+
+
+def test_numbers_that_make_sense_are_read() -> None:
+    assert whole()("0") == 0
+    assert whole(1)("20") == 20
+    assert positive("2.5e-3") == 2.5e-3
+
+
+@pytest.mark.parametrize("text", ["-3", "0.5", "abc", ""])
+def test_what_is_no_count_is_refused(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="from 0 on"):
+        whole()(text)
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "abc"])
+def test_what_is_no_size_is_refused(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="above 0"):
+        positive(text)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("axis", "run", "--jobs", "-3"),
+        ("axis", "run", "--seed", "-1"),
+        ("axis", "mod0.xaxis", "--lap", "0"),
+        ("selftest", "--axes", "0"),
+        ("tactile", "tactile0", "--model", "m.toml", "--step", "0"),
+        ("force", "force0", "--model", "m.toml", "--rest", "-5"),
+    ],
+)
+def test_a_number_that_makes_no_sense_is_an_error_of_use(
+    command: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(list(command))
+    assert stopped.value.code == 2
+    assert command[-2] in capsys.readouterr().err

@@ -1,0 +1,61 @@
+"""What a program starts ends with it: told to end, or killed."""
+
+from __future__ import annotations
+
+import ast
+import os
+import select
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TREE = Path(__file__).resolve().parents[2]
+PARENT = """
+import subprocess, sys, time
+from sioms.children import ends_with_us
+child = subprocess.Popen([sys.executable, "-IS", "-c", "import time; time.sleep(60)"], preexec_fn=ends_with_us())
+print(child.pid, flush=True)
+time.sleep(60)
+"""
+COMMAND = """
+import sys, time
+from sioms.tools import front
+front._begin()
+try:
+    print("ready", flush=True)
+    time.sleep(60)
+finally:
+    print("in order", flush=True)
+"""
+
+
+def test_a_child_ends_with_a_parent_that_is_killed() -> None:
+    with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        child = os.pidfd_open(int(parent.stdout.readline()))
+        parent.kill()
+        parent.wait()
+        assert select.select([child], [], [], 30.0)[0], "the child lives on"
+    os.close(child)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_command_that_is_told_to_end_puts_things_in_order(number: signal.Signals) -> None:
+    with subprocess.Popen([sys.executable, "-c", COMMAND], stdout=subprocess.PIPE, text=True) as command:
+        assert command.stdout is not None and command.stdout.readline() == "ready\n"
+        command.send_signal(number)
+        assert (command.stdout.read(), command.wait(30.0)) == ("in order\n", 128 + number)
+
+
+def test_everything_that_a_tool_starts_ends_with_it() -> None:
+    loose = []
+    for path in (path for folder in ("sioms", "tools") for path in (TREE / folder).rglob("*.py")):
+        text = path.read_text()
+        for node in ast.walk(ast.parse(text if "subprocess.Popen" in text else "")):
+            starts = isinstance(node, ast.Call) and ast.unparse(node.func) == "subprocess.Popen"
+            if starts and "preexec_fn" not in [keyword.arg for keyword in node.keywords]:
+                loose.append(f"{path.name}:{node.lineno}")
+    assert not loose, "started without ends_with_us()"
