@@ -15,8 +15,8 @@ from pathlib import Path
 from conftest import Running
 from daemon_rig import Daemon, daemons
 
-from sioms.tools.counterparts.rigs import RIGS as SHIPPED
-from sioms.tools.counterparts.rigs import Axis, Output, Rig
+from sioms.check.rigs import RIGS as SHIPPED
+from sioms.check.rigs import Axis, Output, Rig
 
 __all__ = ["GROUPS", "RIGS", "Axis", "Output", "Rig", "at_work", "group_of"]
 
@@ -24,7 +24,7 @@ LIMITS = "position_min = -1.0\nposition_max = 1.0\n"
 
 GPIO = Path(__file__).with_name("gpio_stand_in.py")
 
-# Rigs of the shipped drivers stand in sioms.tools.counterparts.rigs; that of the GPIO lines on a kernel without simulated ones here.
+# Rigs of the shipped drivers stand in sioms.check.rigs; that of the GPIO lines on a kernel without simulated ones here.
 RIGS = (
     *SHIPPED,
     Rig(
@@ -56,20 +56,20 @@ def at_work(rigs: Sequence[Rig]) -> Iterator[Daemon]:
     """Run some rigs in one workcell, each driver up and its link good."""
     with ExitStack() as stack:
         start = stack.enter_context(daemons())
-        counterparts: dict[str, Running] = {}
+        simulators: dict[str, Running] = {}
         folder = Path(stack.enter_context(_folder()))
         for rig in rigs:  # all start at the same time
-            if rig.counterpart:
-                name, *options = rig.counterpart
+            if rig.simulator:
+                name, *options = rig.simulator
                 link = [] if rig.tcp else ["--link", str(folder / rig.device)]
-                command = [sys.executable, "-m", f"sioms.tools.counterparts.{name}", *link, *options]
-                counterparts[rig.device] = Running(command, {}, None)
-                stack.callback(counterparts[rig.device].end)
+                command = [sys.executable, "-m", name, *link, *options]
+                simulators[rig.device] = Running(command, {}, None)
+                stack.callback(simulators[rig.device].end)
         text = '[workcell]\nname = "all"\n'
         for rig in rigs:
             port = ""
-            if rig.counterpart:
-                port = counterparts[rig.device].wait_line(r"^ready (\S+)$").group(1)
+            if rig.simulator:
+                port = simulators[rig.device].wait_line(r"^ready (\S+)$").group(1)
             text += rig.configured(port, port)
         daemon = start(text)
         for rig in rigs:

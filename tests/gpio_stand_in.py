@@ -16,7 +16,7 @@ from typing import Any
 import gpiod
 from gpiod.line import Direction, Edge, Value
 
-from sioms.drivers.gpio import Gpio
+from sioms.drivers.gpio.driver import Gpio
 
 LINES = [f"OUT{i}" for i in range(8)] + [f"IN{i}" for i in range(8)]
 levels = [0] * 16

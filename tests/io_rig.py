@@ -9,10 +9,10 @@ import msgspec
 import numpy as np
 from steps_rig import carry_out
 
-from sioms.drivers.modbus_io import IoUnit, ModbusIo
+from sioms.drivers.modbus.io import IoUnit, ModbusIo
+from sioms.drivers.modbus.simulated import moxa, wago
 from sioms.sdk.codec.modbus import frame_tcp
 from sioms.sdk.exchange import Exchange, Pause, Step, Steps
-from sioms.tools.counterparts import moxa, wago
 
 EXCHANGE_S = 0.002
 

@@ -51,7 +51,7 @@ class Misfit:
 
     Attributes:
         words: of the sentence that says why.
-        options: of the counterpart.
+        options: of the simulator.
         change: a command to it before the daemon starts.
         axis: that is in fault with these words, in a device that is up otherwise.
     """
@@ -70,16 +70,16 @@ def check_misfits(
     Args:
         start: starts processes that end with the test.
         folder: a short path.
-        name: of the counterpart's module.
-        config: table of the device, whatever its name; ``{port}`` is the counterpart's port.
+        name: of the simulator's module.
+        config: table of the device, whatever its name; ``{port}`` is the simulator's port.
         misfits: to be tried, in parallel.
-        given: options of all counterparts.
+        given: options of all simulators.
     """
     commands = [
         (
             sys.executable,
             "-m",
-            f"sioms.tools.counterparts.{name}",
+            f"sioms.drivers.{name}",
             "--link",
             str(folder / f"p{i}"),
             *given,
@@ -121,25 +121,25 @@ def _check_misfit(cell: sioms.Workcell, i: int, misfit: Misfit) -> None:
 
 
 class Wire:
-    """A counterpart behind a link in a folder, and what a test does with it.
+    """A simulator behind a link in a folder, and what a test does with it.
 
     Args:
         start: starts processes that end with the test.
         folder: a short path.
-        name: of the counterpart's module.
-        options: of the counterpart; without ``--tcp`` or ``--port`` it serves the link ``folder/port``.
+        name: of the simulator's module.
+        options: of the simulator; without ``--tcp`` or ``--port`` it serves the link ``folder/port``.
     """
 
     def __init__(self, start: Callable[..., Any], folder: Path, name: str, *options: object) -> None:
         self._start, self.folder = start, folder
         port = () if {"--tcp", "--port"}.intersection(options) else ("--link", folder / "port")
-        command = [sys.executable, "-m", f"sioms.tools.counterparts.{name}", *port, *options]
+        command = [sys.executable, "-m", f"sioms.drivers.{name}", *port, *options]
         self.device = start([str(part) for part in command])
         self.port: str = self.device.wait_line(r"^ready (\S+)$").group(1)
         self.socket = str(folder / "s")
 
     def tell(self, line: str) -> Any:
-        """Send a command to the counterpart and return its answer's value."""
+        """Send a command to the simulator and return its answer's value."""
         before = len(self.device.lines)
         self.device.process.stdin.write(line + "\n")
         self.device.process.stdin.flush()
@@ -153,7 +153,7 @@ class Wire:
         return self.tell(f"state {axis}".rstrip())[key]
 
     def serve(self, config: str) -> sioms.Workcell:
-        """Start the daemon with the tables of devices; ``{port}`` is the counterpart's port."""
+        """Start the daemon with the tables of devices; ``{port}`` is the simulator's port."""
         path = self.folder / "cell.toml"
         path.write_text('[workcell]\nname = "wire"\n' + config.replace("{port}", self.port))
         command = [sys.executable, "-m", "sioms.daemon.main", "--config", path, "--socket", self.socket]

@@ -36,7 +36,7 @@ def add_parser(subparsers: Any) -> None:
         "--only", metavar="TRIAL,...", default="", help="these trials alone; a name that is none lists all"
     )
     one.add_argument(
-        "--counterpart", metavar="COMMAND", default="", help="module or file of the device, and options"
+        "--simulator", metavar="COMMAND", default="", help="module or file of the device, and options"
     )
     one.add_argument(
         "--config", metavar="FILE", type=Path, help="TOML of the device; {port} stands for its port"
@@ -74,15 +74,15 @@ def run(args: argparse.Namespace) -> int:
                 print("\n".join(table(head, rows)))
             return 0
         case "check":
-            from .author.command import run_check
+            from sioms.check.command import run_check
 
             return run_check(args)
         case "trace":
-            from .author.trace_command import run_trace
+            from sioms.check.trace_command import run_trace
 
             return run_trace(args)
         case "replay":
-            from .author.trace_command import run_replay
+            from sioms.check.trace_command import run_replay
 
             return run_replay(args)
     raise ValueError(f"sioms driver: no action {args.action}")

@@ -42,7 +42,7 @@ COMMANDS: dict[str, Command] = {
     "check": Command("sioms.tools.cell", "check a configuration"),
     "service": Command("sioms.tools.service", "install the daemon as a service of this machine"),
     "driver": Command("sioms.tools.driver", "list, check, trace and replay drivers"),
-    "bench": Command("sioms.tools.bench", "measure latencies and throughput on this machine"),
+    "bench": Command("sioms.bench", "measure latencies and throughput on this machine"),
     "tactile": Command("sioms.tactile.command", "design, calibrate and measure elastic fingers"),
     "reconcile": Command("sioms.reconcile.command", "find where simulation and measurement disagree"),
 }

@@ -99,7 +99,9 @@ def example(driver: str) -> str:
     text = page_of(driver)
     start = re.search(r"^( *)\[device\.[\w-]+\]$", text, re.MULTILINE)
     if start is None:
-        raise OSError(errno.EINVAL, f"the driver {driver} shows no example; see its page in docs/drivers")
+        raise OSError(
+            errno.EINVAL, f"the driver {driver} shows no example; see its page in drivers/README.md"
+        )
     indent, lines = start[1], []
     for line in text[start.start() :].splitlines():
         if not line.strip() or not line.startswith(indent):

@@ -155,7 +155,7 @@ class BenchSupply(LineDriver):
     # for `sioms driver check`: how to run it against its simulated device
     rig = {  # noqa: RUF012
         "tables": '[device.supply]\ndriver = "./bench_supply.py"\nline = { serial = "{port}" }\npoll_hz = 50.0\n',
-        "counterpart": ["bench_supply_device.py"],
+        "simulator": ["bench_supply_device.py"],
         "analogs": ["supply.meas"],
         "outputs": [{"node": "supply", "width": 0, "safe": 0.0, "other": 5.0}],
         "checked": False,

@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable
 
-from sioms.tools.counterparts import wire
+from sioms.simulation import wire
 
 HIGHEST_V, LIMIT_A = 30.0, 2.0
 RISE_S = 0.05

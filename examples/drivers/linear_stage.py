@@ -174,7 +174,7 @@ class StageDriver(LineDriver):
     rig = {  # noqa: RUF012
         "tables": '[device.stage]\ndriver = "./linear_stage.py"\nline = { serial = "{port}", baud = 115200 }\nsteps_per_m = 1e6\n'
         '[[device.stage.axis]]\nname = "x"\nvelocity_max = 0.1\nacceleration_max = 1.0\n',
-        "counterpart": ["linear_stage_device.py"],
+        "simulator": ["linear_stage_device.py"],
     }
 
     @classmethod

@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable
 
-from sioms.tools.counterparts import wire
+from sioms.simulation import wire
 
 SWITCHES = (-300_000.0, 300_000.0)
 FASTEST = 200_000.0

@@ -14,9 +14,9 @@ from collections.abc import Callable
 from pymodbus.constants import ExcCodes
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from sioms.tools.counterparts.control import serve
-from sioms.tools.counterparts.faults import Faults
-from sioms.tools.counterparts.modbus import RtuLine, serial_parser
+from sioms.drivers.modbus.simulated.lines import RtuLine, serial_parser
+from sioms.simulation.control import serve
+from sioms.simulation.faults import Faults
 
 ROOM_C, HEATER_C, TIME_S = 20.0, 250.0, 2.0
 """Temperature of the room, what a heater would reach, and the time constant of a zone (a quick oven)."""

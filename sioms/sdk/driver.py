@@ -118,7 +118,7 @@ class Driver(ABC):
         inputs_ns: a driver that sets it in each tick to the time at which its readings were there
             [ns, CLOCK_MONOTONIC] splits the tick's time in two in the statistics.
         rig: what ``sioms driver check`` runs a driver with that is not shipped: a mapping with the keys of ``Rig``
-            of ``sioms.tools.counterparts.rigs``.
+            of ``sioms.check.rigs``.
         realtime_priority: SCHED_FIFO priority of its process unless the configuration says otherwise; 0: an ordinary
             process. For drivers of hardware; a simulation has no business before other people's work.
     """

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from sioms.tools.bench.figures import Bar, Report, Summary
+from sioms.bench.figures import Bar, Report, Summary
 
 NAMES = ("p50", "p90", "p99", "p99.9", "max")
 
@@ -18,7 +18,7 @@ NAMES = ("p50", "p90", "p99", "p99.9", "max")
 def bench(folder: Path, *words: str) -> list[dict[str, Any]]:
     """Run the bench as a user does and return its figures."""
     out = folder / "figures.json"
-    command = [sys.executable, "-m", "sioms.tools.bench", *words, "--quick", "--json", str(out)]
+    command = [sys.executable, "-m", "sioms.bench", *words, "--quick", "--json", str(out)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stdout + done.stderr
     figures: list[dict[str, Any]] = json.loads(out.read_text())["figures"]
@@ -56,7 +56,7 @@ def test_two_writers_never_both_win(tmp_path: Path) -> None:
 
 def test_an_unknown_name_is_refused_with_those_that_there_are() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "sioms.tools.bench", "raed"], capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "sioms.bench", "raed"], capture_output=True, text=True, timeout=60
     )
     assert done.returncode == 2
     assert "raed" in done.stderr and "read" in done.stderr

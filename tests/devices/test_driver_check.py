@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from check_rig import run
 
+from sioms.check import motion_trials
+from sioms.check.rigs import MAP_RIGS
+from sioms.check.station import Station, wait_for
+from sioms.check.trial import Trial, Verdict, attempt
 from sioms.protocol.flags import AxisStatus
-from sioms.tools.author import motion_trials
-from sioms.tools.author.station import Station, wait_for
-from sioms.tools.author.trial import Trial, Verdict, attempt
-from sioms.tools.counterparts.rigs import MAP_RIGS
 
 pytestmark = pytest.mark.timeout(1000)
 
@@ -47,7 +47,7 @@ def broken() -> dict[str, tuple[int, dict[str, dict[str, Any]], str]]:
         return dict(zip(trials_of, pool.map(one, trials_of), strict=True))
 
 
-def test_a_file_with_its_own_counterpart_passes() -> None:
+def test_a_file_with_its_own_simulator_passes() -> None:
     status, trials, said = broken()["scale"]
     assert status == 0, said
     assert {t["verdict"] for t in trials.values()} == {"passed"} and len(trials) == 5
@@ -95,8 +95,8 @@ def test_a_trial_whose_device_faults_by_itself_is_tried_again_and_says_so(
         with station.cell.open(axis.node, "rw", timeout=5.0) as node:
             motion_trials.run(station, node, axis)
             motion_trials.wait_moving(station, node.read, axis)
-            if next(alarms, None) is not None and station.counterpart is not None:
-                station.counterpart.tell("alarm 133")  # its communication time-out, as of a host held up
+            if next(alarms, None) is not None and station.simulator is not None:
+                station.simulator.tell("alarm 133")  # its communication time-out, as of a host held up
                 assert wait_for(lambda: node.read().status[0] & AxisStatus.FAULT, 3.0)
             return f"speed {motion_trials.wait_moving(station, node.read, axis):g}"
 

@@ -8,7 +8,7 @@ import pytest
 from check_rig import run
 from device_rigs import RIGS
 
-from sioms.tools.counterparts.rigs import MAP_RIGS
+from sioms.check.rigs import MAP_RIGS
 
 pytestmark = pytest.mark.timeout(1000)
 

@@ -18,6 +18,13 @@ import numpy as np
 
 from sioms.daemon.config import parse as parse_config
 from sioms.documents import json_of, toml_of
+from sioms.drivers.ascii_stream.codec import LineReceiver
+from sioms.drivers.ati_rdt.codec import parse as parse_rdt
+from sioms.drivers.framed_adc.cobs import FrameReceiver
+from sioms.drivers.framed_adc.codec import parse_samples
+from sioms.drivers.ft300.codec import RecordReceiver
+from sioms.drivers.modbus.regmap import RegisterMapError, parse_map
+from sioms.drivers.schunk_ft.codec import parse as parse_schunk
 from sioms.lab.arrays import UnreadableError, read_mat, read_npz
 from sioms.plant.effects import EffectsError, parse_effects
 from sioms.protocol import wire
@@ -39,15 +46,8 @@ from sioms.protocol.verbs import FROM_CLIENT, ON_HANDLE, take
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.files.axis import read_model
 from sioms.reconcile.files.table import load_table
-from sioms.sdk.codec.ascii_line import LineReceiver
-from sioms.sdk.codec.ati_rdt import parse as parse_rdt
-from sioms.sdk.codec.cobs import FrameReceiver
-from sioms.sdk.codec.ft300 import RecordReceiver
-from sioms.sdk.codec.sample_stream import parse_samples
-from sioms.sdk.codec.schunk_ifb import parse as parse_schunk
 from sioms.sdk.exchange import DeviceError, LinkError
 from sioms.sdk.golden import Golden, Incomplete, _read
-from sioms.sdk.regmap import RegisterMapError, parse_map
 from sioms.tactile.cylinder import Cylinder
 from sioms.tactile.finger import from_toml, nominal_finger, to_toml
 
@@ -156,7 +156,7 @@ def _finger() -> bytes:
     ).encode()
 
 
-MAP = (files("sioms.drivers") / "maps" / "leadshine.toml").read_bytes()
+MAP = (files("sioms.drivers") / "modbus" / "maps" / "leadshine.toml").read_bytes()
 NOMINAL = Path(__file__).parents[1] / "physics" / "reconcile_axes" / "s18" / "nominal.json"
 CONFIG = (
     b'[workcell]\nname = "a"\n[device.io0]\ndriver = "sim-io"\noutputs = 8\n[[grant]]\nrights = ["read"]\n'

@@ -21,7 +21,7 @@ import pytest
 from daemon_rig import Daemon, daemons, raises, wait_for
 from gpiod.line import Direction, Drive
 
-from sioms.tools.counterparts.gpio_sim import CONFIGFS, SimulatedChip
+from sioms.drivers.gpio.simulator import CONFIGFS, SimulatedChip
 
 if not CONFIGFS.is_dir() or os.geteuid() != 0:
     pytest.skip(

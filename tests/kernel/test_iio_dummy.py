@@ -21,10 +21,10 @@ import numpy as np
 import pytest
 from daemon_rig import Daemon, daemons, wait_for
 
+from sioms.drivers.iio.codec import Element, Layout, parse_type
+from sioms.drivers.iio.device import IioDevice, find_device
+from sioms.drivers.iio.kernel_dummy import CONFIGFS, NAME, TRIGGER, DummyDevice
 from sioms.protocol.flags import AnalogStatus
-from sioms.sdk.codec.iio_scan import Element, Layout, parse_type
-from sioms.sdk.iio_device import IioDevice, find_device
-from sioms.tools.counterparts.iio_dummy import CONFIGFS, NAME, TRIGGER, DummyDevice
 
 if not CONFIGFS.is_dir() or os.geteuid() != 0:
     pytest.skip(

@@ -40,7 +40,7 @@ OPTIONS = ("--rate", "200", "--time", "us", "--checksum", "--wait-for", "RUN", "
 
 
 def test_samples_losses_and_unplugging(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "ascii_stream", *OPTIONS)
+    wire = Wire(start, short_folder, "ascii_stream.simulator", *OPTIONS)
     cell = wire.serve(CONFIG)
     wire.wait_up("scale0")
     with cell.open("scale0") as node:
@@ -74,7 +74,7 @@ def test_samples_losses_and_unplugging(start: Callable[..., Any], short_folder: 
 
 
 def test_another_device_is_refused(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "ascii_stream", "--columns", "3", "--rate", "100")
+    wire = Wire(start, short_folder, "ascii_stream.simulator", "--columns", "3", "--rate", "100")
     wire.serve(
         '[device.scale0]\ndriver = "ascii-stream"\nline = { serial = "{port}" }\ncolumns = ["a"]\nrate_hz = 100.0\n'
     )

@@ -23,11 +23,11 @@ CONFIG = Path(__file__).parents[2] / "etc/bench-modbus.toml"
 PULSES_PER_M = 10000 / 0.010
 
 
-class Counterpart:
+class Simulator:
     """A simulated device as a process, with its control channel."""
 
     def __init__(self, module: str, *options: object) -> None:
-        command = [sys.executable, "-m", f"sioms.tools.counterparts.{module}", *map(str, options)]
+        command = [sys.executable, "-m", f"sioms.drivers.{module}", *map(str, options)]
         self.running = Running(command, {}, None)
 
     def port(self) -> str:
@@ -49,9 +49,11 @@ class Bench:
     """The daemon with the shipped file, its port names put in."""
 
     def __init__(self, start: Callable[..., Daemon], folder: Path) -> None:
-        self.drive = Counterpart("leadshine", "--link", folder / "drive", "--units", "1")
-        self.finger = Counterpart("adc", "--link", folder / "finger", "--channels", "16")
-        self.block = Counterpart("moxa", "--model", "E1212", "--port", "0", "--watchdog-s", "0.6")
+        self.drive = Simulator("modbus.simulated.leadshine", "--link", folder / "drive", "--units", "1")
+        self.finger = Simulator("framed_adc.simulator", "--link", folder / "finger", "--channels", "16")
+        self.block = Simulator(
+            "modbus.simulated.moxa", "--model", "E1212", "--port", "0", "--watchdog-s", "0.6"
+        )
         text = CONFIG.read_text()
         for name, device in (
             ("/dev/ttyUSB0", self.drive), ("/dev/ttyACM0", self.finger), ("192.168.127.254:502", self.block),

@@ -54,7 +54,7 @@ acceleration_max = 20.0
 
 
 def test_modes_stops_and_shutdown(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "dynamixel", "--ids", "1,2,3")
+    wire = Wire(start, short_folder, "dynamixel.simulator", "--ids", "1,2,3")
     cell = wire.serve(CONFIG + OTHER)
     wire.wait_up("arm0.a")
     wire.wait_up("arm0.b")
@@ -99,7 +99,7 @@ def test_modes_stops_and_shutdown(start: Callable[..., Any], short_folder: Path)
 
 
 def test_watchdog_and_deaths(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "dynamixel", "--ids", "1,2")
+    wire = Wire(start, short_folder, "dynamixel.simulator", "--ids", "1,2")
     cell = wire.serve(CONFIG)
     wire.wait_up("arm0.b")
     with cell.open("arm0.b", "rw") as b:
@@ -117,7 +117,7 @@ def test_watchdog_and_deaths(start: Callable[..., Any], short_folder: Path) -> N
 
 
 def test_stray_bytes_restarts_and_other_masters(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "dynamixel", "--ids", "1,2")
+    wire = Wire(start, short_folder, "dynamixel.simulator", "--ids", "1,2")
     cell = wire.serve(CONFIG)
     wire.wait_up("arm0.a")
     wire.wait_up("arm0.b")
@@ -168,11 +168,9 @@ def test_stray_bytes_restarts_and_other_masters(start: Callable[..., Any], short
         wait_for(lambda: wire.state("mode", 1) == 4, "the mode", 3.0)
 
 
-def test_the_vendors_client_agrees_with_the_counterpart(
-    start: Callable[..., Any], short_folder: Path
-) -> None:
+def test_the_vendors_client_agrees_with_the_simulator(start: Callable[..., Any], short_folder: Path) -> None:
     sdk = pytest.importorskip("dynamixel_sdk")
-    wire = Wire(start, short_folder, "dynamixel", "--ids", "1,2")
+    wire = Wire(start, short_folder, "dynamixel.simulator", "--ids", "1,2")
     port, packets = sdk.PortHandler(wire.port), sdk.PacketHandler(2.0)
     assert port.openPort() and port.setBaudRate(57600)
     assert packets.ping(port, 1) == (1020, 0, 0)

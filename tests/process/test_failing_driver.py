@@ -11,7 +11,7 @@ from wire_rig import SLIDE, Wire
 
 DRIVER = '''
 import os
-from sioms.drivers.modbus_axis import ModbusAxis
+from sioms.drivers.modbus.axis import ModbusAxis
 from sioms.sdk.exchange import LinkError
 
 
@@ -43,7 +43,7 @@ DRIVER = Failing
 
 
 def test_a_driver_that_raises_sends_the_stop_first(start: Any, short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "leadshine")
+    wire = Wire(start, short_folder, "modbus.simulated.leadshine")
     (short_folder / "failing.py").write_text(DRIVER.replace("{folder}", str(short_folder)))
     wire.serve(SLIDE.replace('"modbus-axis"', '"./failing.py"'))
     wire.wait_up("slide0")
@@ -59,7 +59,7 @@ def test_a_driver_that_raises_sends_the_stop_first(start: Any, short_folder: Pat
 
 
 WRITER = '''
-from sioms.drivers.sim_io import SimIo
+from sioms.drivers.sim.io import SimIo
 
 
 class Careless(SimIo):
@@ -79,7 +79,7 @@ def test_an_exception_in_a_write_is_told_as_the_drivers_with_its_place(
     start: Any, short_folder: Path
 ) -> None:
     (short_folder / "careless.py").write_text(WRITER)
-    wire = Wire(start, short_folder, "leadshine")
+    wire = Wire(start, short_folder, "modbus.simulated.leadshine")
     wire.serve('[device.io0]\ndriver = "./careless.py"\noutputs = 4\nsafe = 0\n')
     wire.wait_up("io0")
     node, pid = wire.client.open("io0", "rw"), wire.pid("io0")

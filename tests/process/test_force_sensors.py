@@ -88,7 +88,7 @@ def lost_and_back(wire: Sensor, cause: str, words: str, cure: str = "clear") -> 
 
 
 def test_ft300_streams_through_damage_loss_and_deaths(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Sensor(start, short_folder, "ft300", "--baud", "19200")
+    wire = Sensor(start, short_folder, "ft300.simulator", "--baud", "19200")
     wire.tell("register 410 0")
     cell = wire.serve("[device.f0]\n" + FT300)
     wire.wait_up("f0")
@@ -129,7 +129,7 @@ def test_ft300_streams_through_damage_loss_and_deaths(start: Callable[..., Any],
 def test_an_outside_master_agrees_on_the_ft300_and_the_driver_polls(
     start: Callable[..., Any], short_folder: Path
 ) -> None:
-    wire = Sensor(start, short_folder, "ft300", "--baud", "19200")
+    wire = Sensor(start, short_folder, "ft300.simulator", "--baud", "19200")
     wire.tell(PUT)
     master = minimalmodbus.Instrument(wire.port, 9)
     master.serial.baudrate, master.serial.timeout = 19200, 0.3
@@ -161,12 +161,12 @@ def test_an_outside_master_agrees_on_the_ft300_and_the_driver_polls(
 
 def test_ft300_configured_wrongly(start: Callable[..., Any], short_folder: Path) -> None:
     """Each device is refused for a reason of its own, in one workcell; none shows data."""
-    wire = Sensor(start, short_folder, "ft300", "--baud", "19200")
+    wire = Sensor(start, short_folder, "ft300.simulator", "--baud", "19200")
     drive = start(
         [
             sys.executable,
             "-m",
-            "sioms.tools.counterparts.leadshine",
+            "sioms.drivers.modbus.simulated.leadshine",
             "--link",
             short_folder / "drive",
             "--units",
@@ -193,7 +193,7 @@ def test_ft300_configured_wrongly(start: Callable[..., Any], short_folder: Path)
 
 
 def test_ati_through_a_bad_network_stalls_and_deaths(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Sensor(start, short_folder, "ati_rdt", "--port", "0")
+    wire = Sensor(start, short_folder, "ati_rdt.simulator", "--port", "0")
     cell = wire.serve(ATI)
     wire.wait_up("f0")
     wire.tell(PUT)
@@ -286,7 +286,7 @@ def apart(wire: Sensor, tables: Mapping[str, str]) -> str:
 
 
 def test_ati_wrong_host_port_identity_and_page(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Sensor(start, short_folder, "ati_rdt", "--port", "0", "--model", "axia")
+    wire = Sensor(start, short_folder, "ati_rdt.simulator", "--port", "0", "--model", "axia")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         closed = f"127.0.0.1:{probe.getsockname()[1]}"
@@ -354,7 +354,7 @@ def servers(replies: Iterable[bytes]) -> Iterator[list[tuple[str, list[bytes]]]]
 
 
 def test_ati_with_a_page_that_is_none(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Sensor(start, short_folder, "ati_rdt", "--port", "0", "--rate", "1000")
+    wire = Sensor(start, short_folder, "ati_rdt.simulator", "--port", "0", "--rate", "1000")
     with servers(reply for reply, _ in BAD_PAGES.values()) as places:
         table = ATI.partition("]\n")[2].replace('page = "{port}"', 'page = "PLACE"')
         pairs = zip(BAD_PAGES, places, strict=True)
@@ -370,7 +370,7 @@ def test_ati_with_a_page_that_is_none(start: Callable[..., Any], short_folder: P
 def test_schunk_through_a_bad_network_stalls_and_deaths(
     start: Callable[..., Any], short_folder: Path
 ) -> None:
-    wire = Sensor(start, short_folder, "schunk_ifb", "--port", "0", "--data-port", "0")
+    wire = Sensor(start, short_folder, "schunk_ft.simulator", "--port", "0", "--data-port", "0")
     cell = wire.serve(SCHUNK + "tool = 1\nnoise_filter = 2\n")
     wire.wait_up("f0")
     wire.tell(PUT)
@@ -423,12 +423,12 @@ STOP = 'on_loss = "stop"\n'
 @pytest.mark.parametrize(
     ("name", "options", "table", "words"),
     [
-        ("schunk_ifb", ("--port", "0", "--data-port", "0"), SCHUNK, "their number stands still at .*: the sensor is frozen"),
-        ("ati_rdt", ("--port", "0"), ATI, "their number stands still at .*: the sensor is frozen"),
-        ("ft300", ("--baud", "19200"), "[device.f0]\n" + FT300, "the last [0-9]+ records were all the same"),
-        ("adc", ("--channels", "4"), "[device.f0]\n" + ADC, "their number stands still at .*: the device is frozen"),
-        ("ascii_stream", ("--rate", "200", "--time", "ms"), "[device.f0]\n" + LINES, "their time stands still at .* ms: the device is frozen"),
-        ("iio", (), "[device.f0]\n" + IIO, "the time at which they were taken stands still"),
+        ("schunk_ft.simulator", ("--port", "0", "--data-port", "0"), SCHUNK, "their number stands still at .*: the sensor is frozen"),
+        ("ati_rdt.simulator", ("--port", "0"), ATI, "their number stands still at .*: the sensor is frozen"),
+        ("ft300.simulator", ("--baud", "19200"), "[device.f0]\n" + FT300, "the last [0-9]+ records were all the same"),
+        ("framed_adc.simulator", ("--channels", "4"), "[device.f0]\n" + ADC, "their number stands still at .*: the device is frozen"),
+        ("ascii_stream.simulator", ("--rate", "200", "--time", "ms"), "[device.f0]\n" + LINES, "their time stands still at .* ms: the device is frozen"),
+        ("iio.simulator", (), "[device.f0]\n" + IIO, "the time at which they were taken stands still"),
     ],
 )  # fmt: skip
 def test_a_frozen_stream_is_a_lost_link_and_stops_the_workcell(
@@ -459,7 +459,7 @@ def test_a_frozen_stream_is_a_lost_link_and_stops_the_workcell(
 
 def test_schunk_connection_lost_and_box_restarted(start: Callable[..., Any], short_folder: Path) -> None:
     """Replies are numbered from 1 on each connection; a supply that is off for 0.3 s leaves the host's connection dead, without a word."""
-    wire = Sensor(start, short_folder, "schunk_ifb", "--port", "0", "--data-port", "0")
+    wire = Sensor(start, short_folder, "schunk_ft.simulator", "--port", "0", "--data-port", "0")
     cell = wire.serve(SCHUNK + "noise_filter = 3\n")
     wire.wait_up("f0")
     with cell.open("f0") as node:
@@ -486,7 +486,7 @@ def test_schunk_connection_lost_and_box_restarted(start: Callable[..., Any], sho
 
 def test_schunk_as_the_vendors_simulator(start: Callable[..., Any], short_folder: Path) -> None:
     """Streams before it is asked, answers every parameter alike: taken, every record read, none of 5 s lost."""
-    wire = Sensor(start, short_folder, "schunk_ifb", "--port", "0", "--data-port", "0", "--vendor")
+    wire = Sensor(start, short_folder, "schunk_ft.simulator", "--port", "0", "--data-port", "0", "--vendor")
     cell = wire.serve(SCHUNK)
     wire.wait_up("f0")
     with cell.open("f0") as node:
@@ -500,7 +500,7 @@ def test_schunk_as_the_vendors_simulator(start: Callable[..., Any], short_folder
 
 
 def test_schunk_wrong_host_identity_and_a_taken_port(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Sensor(start, short_folder, "schunk_ifb", "--port", "0", "--data-port", "0")
+    wire = Sensor(start, short_folder, "schunk_ft.simulator", "--port", "0", "--data-port", "0")
     base = SCHUNK.replace("[device.f0]\n", "")
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder,

@@ -48,7 +48,7 @@ def unlock(node: Any) -> None:
 
 
 def test_moves_stops_homes_and_alarms(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "grbl")
+    wire = Wire(start, short_folder, "grbl.simulator")
     cell = wire.serve(CONFIG)
     wire.wait_up("mod0.x")
     with cell.open("mod0", "rw") as both:
@@ -156,7 +156,7 @@ def test_moves_stops_homes_and_alarms(start: Callable[..., Any], short_folder: P
 
 
 def test_line_faults_and_deaths_on_tcp(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "grbl", "--tcp", "0", "--no-homing", "--hal")
+    wire = Wire(start, short_folder, "grbl.simulator", "--tcp", "0", "--no-homing", "--hal")
     cell = wire.serve(CONFIG.replace('serial = "{port}"', 'tcp = "{port}"').replace("homing = true", ""))
     wire.wait_up("mod0.x")
     with cell.open("mod0.x", "rw") as x:
@@ -226,4 +226,4 @@ def test_limits_that_differ(start: Callable[..., Any], short_folder: Path) -> No
         Misfit("velocity_max = 0.1, but $110 of the controller is 0.05", change="set 110 3000"),
         Misfit("acceleration_max = 0.5, but $122 of the controller is 0.1", change="set 122 100"),
     )
-    check_misfits(start, short_folder, "grbl", CONFIG, misfits)
+    check_misfits(start, short_folder, "grbl.simulator", CONFIG, misfits)

@@ -33,7 +33,7 @@ RAW = BUFFER.replace('"buffer"', '"raw"').replace("250.0", "100.0").replace('tri
 
 
 def test_scans_of_a_buffer(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "iio")
+    wire = Wire(start, short_folder, "iio.simulator")
     cell = wire.serve(BUFFER)
     wire.wait_up("adc0")
     set_up = wire.tell("state")
@@ -89,7 +89,7 @@ def test_scans_of_a_buffer(start: Callable[..., Any], short_folder: Path) -> Non
 
 
 def test_single_readings(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "iio", "--number", "3")
+    wire = Wire(start, short_folder, "iio.simulator", "--number", "3")
     cell = wire.serve(RAW)
     wire.wait_up("adc0")
     with cell.open("adc0") as node:
@@ -120,7 +120,7 @@ def test_single_readings(start: Callable[..., Any], short_folder: Path) -> None:
 def test_devices_that_do_not_fit(
     start: Callable[..., Any], short_folder: Path, change: tuple[str, str], words: str
 ) -> None:
-    wire = Wire(start, short_folder, "iio")
+    wire = Wire(start, short_folder, "iio.simulator")
     wire.serve(BUFFER.replace(*change))
     wait_for(lambda: words in wire.reason("adc0"), f"the sentence; {wire.reason('adc0')}")
     assert not wire.reads("adc0")

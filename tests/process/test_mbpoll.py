@@ -37,7 +37,7 @@ def ask(where: list[str], table: str, address: int, count: int = 1, *values: int
 
 
 def test_the_leadshine(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "leadshine", "--units", "7")
+    wire = Wire(start, short_folder, "modbus.simulated.leadshine", "--units", "7")
     where = ["-m", "rtu", "-a", "7", "-b", "115200", "-P", "none", "-B", wire.port]
     assert ask(where, "4", 0x0001) == [10000]
     ask(where, "4", 0x6200, 1, 1, 0, 5000, 300, 20, 20, 0, 0x10)
@@ -48,7 +48,7 @@ def test_the_leadshine(start: Callable[..., Any], short_folder: Path) -> None:
 
 
 def test_the_oriental(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "oriental_az")
+    wire = Wire(start, short_folder, "modbus.simulated.oriental_az")
     where = ["-m", "rtu", "-a", "1", "-b", "115200", "-P", "even", "-B", wire.port]
     ask(where, "4", 0x0058, 1, 0, 0, 0, 1, 0, 2000, 0, 8000, 0, 60000, 0, 60000, 0, 1000, 0, 1)
     wait_for(lambda: ask(where, "4:int", 0x00CC) == [2000], "the position")
@@ -56,7 +56,7 @@ def test_the_oriental(start: Callable[..., Any], short_folder: Path) -> None:
 
 
 def test_the_moxa(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "moxa", "--model", "E1212", "--port", "0")
+    wire = Wire(start, short_folder, "modbus.simulated.moxa", "--model", "E1212", "--port", "0")
     host, _, port = wire.port.partition(":")
     where = ["-m", "tcp", "-a", "1", "-p", port, host]
     wire.tell("loop on")

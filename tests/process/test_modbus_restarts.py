@@ -53,7 +53,7 @@ def test_a_cut_cable_drops_the_outputs_behind_each_opening(
     start: Callable[..., Any], short_folder: Path
 ) -> None:
     """The coupler's watchdog starts when its trigger is modified: the first opening of its life proves nothing for the others."""
-    wire = Wire(start, short_folder, "wago", "--port", "0")
+    wire = Wire(start, short_folder, "modbus.simulated.wago", "--port", "0")
     cell = wire.serve(WAGO)
     for opening in range(4):
         wire.wait_up("io0")
@@ -74,7 +74,7 @@ def test_a_cut_cable_drops_the_outputs_behind_each_opening(
 def test_a_coupler_that_restarts_is_armed_again_and_a_silent_one_is_lost(
     start: Callable[..., Any], short_folder: Path
 ) -> None:
-    wire = Wire(start, short_folder, "wago", "--port", "0")
+    wire = Wire(start, short_folder, "modbus.simulated.wago", "--port", "0")
     cell = wire.serve(WAGO)
     wire.wait_up("io0")
     for off_s in (0.02, 1.0):
@@ -99,7 +99,7 @@ def test_a_drive_that_was_off_goes_nowhere_until_it_knows_where_it_is(
     start: Callable[..., Any], short_folder: Path, off_s: float
 ) -> None:
     """Position 0 of the drive is 0.05 m of the machine then: 0.29 m would end at 0.34 m, beyond the limit."""
-    wire = Wire(start, short_folder, "leadshine", "--units", "1")
+    wire = Wire(start, short_folder, "modbus.simulated.leadshine", "--units", "1")
     cell = wire.serve(LEADSHINE)
     wire.wait_up("slide0")
     with cell.open("slide0", "rw", timeout=5.0) as axis:

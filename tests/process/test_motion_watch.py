@@ -60,7 +60,7 @@ def clear(axis: Any) -> None:
 def test_motion_that_nobody_commanded_is_stopped_and_told(
     start: Callable[..., Any], short_folder: Path
 ) -> None:
-    wire = Wire(start, short_folder, "tmcl", "--motors", "1", "--baud", "115200")
+    wire = Wire(start, short_folder, "tmcl.simulator", "--motors", "1", "--baud", "115200")
     cell = wire.serve(MODULE)
     wire.wait_up("mod0")
     with cell.open("mod0", "rw") as axis:
@@ -99,7 +99,7 @@ def test_motion_that_nobody_commanded_is_stopped_and_told(
 def test_a_place_that_is_lost_takes_no_positions_until_it_is_found(
     start: Callable[..., Any], short_folder: Path
 ) -> None:
-    wire = Wire(start, short_folder, "leadshine", "--units", "1")
+    wire = Wire(start, short_folder, "modbus.simulated.leadshine", "--units", "1")
     cell = wire.serve(SLIDE)
     wire.wait_up("slide0")
     with cell.open("slide0", "rw") as axis:

@@ -39,7 +39,7 @@ force_max = 2.0
 
 
 def test_moves_torques_homes_and_faults(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "odrive", "--baud", "115200")
+    wire = Wire(start, short_folder, "odrive.simulator", "--baud", "115200")
     cell = wire.serve(CONFIG)
     wire.wait_up("mod0.x")
     wait_for(lambda: wire.state("state", 0) == 8, "closed loop")
@@ -102,7 +102,7 @@ def test_moves_torques_homes_and_faults(start: Callable[..., Any], short_folder:
 
 
 def test_line_faults_watchdog_and_deaths(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "odrive")
+    wire = Wire(start, short_folder, "odrive.simulator")
     cell = wire.serve(CONFIG)
     wire.wait_up("mod0.x")
     with cell.open("mod0.x", "rw") as x:
@@ -136,13 +136,13 @@ def test_boards_that_do_not_fit(start: Callable[..., Any], short_folder: Path) -
         Misfit("vel_limit is 2", change="set axis1.controller.config.vel_limit 2"),
         Misfit("encoder failed", change="error 0x100 1", axis="j"),
     )
-    check_misfits(start, short_folder, "odrive", CONFIG, misfits)
+    check_misfits(start, short_folder, "odrive.simulator", CONFIG, misfits)
 
 
 def test_nothing_left_in_the_board_moves_it_and_a_restart_is_told(
     start: Callable[..., Any], short_folder: Path
 ) -> None:
-    wire = Wire(start, short_folder, "odrive", "--baud", "115200", "--friction", "0.5")
+    wire = Wire(start, short_folder, "odrive.simulator", "--baud", "115200", "--friction", "0.5")
     cell = wire.serve(CONFIG)
     wire.wait_up("mod0.x")
 
@@ -190,7 +190,7 @@ def test_nothing_left_in_the_board_moves_it_and_a_restart_is_told(
 
 
 def test_a_workcell_that_starts_stopped_closes_no_loop(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "odrive")
+    wire = Wire(start, short_folder, "odrive.simulator")
     cell = wire.serve("start_stopped = true\n" + CONFIG)
     wire.wait_up("mod0.x")
     until = time.monotonic() + 1.0

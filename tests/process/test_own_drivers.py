@@ -47,7 +47,7 @@ watchdog_s = 1.0
 
 
 class OwnWire(Wire):
-    """A counterpart out of a file."""
+    """A simulator out of a file."""
 
     def __init__(self, start: Callable[..., Any], folder: Path, name: str, *options: str) -> None:
         for path in FOLDER.iterdir():

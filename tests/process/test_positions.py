@@ -69,7 +69,7 @@ def port(tmp_path: Path) -> Iterator[str]:
     """A drive that lives on when its driver dies."""
     link = ["--link", str(tmp_path / "port")]
     drive = Running(
-        [sys.executable, "-m", "sioms.tools.counterparts.leadshine", *link, "--units", "1"], {}, None
+        [sys.executable, "-m", "sioms.drivers.modbus.simulated.leadshine", *link, "--units", "1"], {}, None
     )
     try:
         yield drive.wait_line(r"^ready (\S+)$").group(1)

@@ -18,12 +18,12 @@ from conftest import Running
 from daemon_rig import at_rest, wait_for
 
 import sioms
+from sioms.drivers.framed_adc.simulated.finger import shape_of
 from sioms.plant.finger import scattered
 from sioms.protocol.flags import Request
 from sioms.tactile.cylinder import FINGER_B
 from sioms.tactile.finger import from_toml, nominal_finger, to_toml
 from sioms.tactile.live.simulated import simulated
-from sioms.tools.counterparts.finger import shape_of
 
 CONFIG = Path(__file__).parents[2] / "etc" / "prober.toml"
 ELEMENTS = 6  # a short finger: half a minute of touches

@@ -14,7 +14,7 @@ from daemon_rig import IO, Daemon, Waiting, axes, daemons, wait_for
 
 SLOW = """
 import os, time
-from sioms.drivers.sim_io import SimIo
+from sioms.drivers.sim.io import SimIo
 class DRIVER(SimIo):
     @classmethod
     def describe(cls, name, settings):

@@ -218,7 +218,7 @@ def test_two_writers_of_one_port_keep_each_others_bits(port: tuple[Daemon, Devic
 
 
 def test_nothing_that_is_asked_of_a_lost_drive_begins_when_it_is_back(start: Any, short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "leadshine")
+    wire = Wire(start, short_folder, "modbus.simulated.leadshine")
     cell = wire.serve(SLIDE)
     wire.wait_up("slide0")
     with cell.open("slide0", "rw") as node:

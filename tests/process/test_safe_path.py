@@ -67,7 +67,7 @@ def test_commands_import_nothing_from_where_they_are_started(trap: Path, command
     [
         (":/nowhere", ["sioms.daemon.main", "--check", "--config", "cell.toml"]),
         (".", ["sioms.tools.front", "driver", "list"]),
-        (None, ["sioms.tools.counterparts.wago", "--help"]),
+        (None, ["sioms.drivers.modbus.simulated.wago", "--help"]),
         (None, ["sioms.sdk.probe", "sim-io", "."]),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",

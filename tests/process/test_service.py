@@ -340,7 +340,7 @@ def test_a_driver_that_fails_to_start_does_not_hold_up_the_others(
 ) -> None:
     driver = tmp_path / "broken.py"
     driver.write_text(
-        "from sioms.drivers.sim_io import SimIo\n"
+        "from sioms.drivers.sim.io import SimIo\n"
         "class Broken(SimIo):\n"
         "    def tick(self, now_ns):\n"
         "        raise RuntimeError('bad day')\n"
@@ -357,7 +357,7 @@ def test_a_driver_that_fails_to_start_does_not_hold_up_the_others(
 
 
 def test_a_driver_file_is_found_beside_the_configuration_and_its_faults_are_said(tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_text("from sioms.drivers.sim_io import SimIo\nDRIVER = SimIo\n")
+    (tmp_path / "mine.py").write_text("from sioms.drivers.sim.io import SimIo\nDRIVER = SimIo\n")
     (tmp_path / "syntax.py").write_text("def\n")
     (tmp_path / "none.py").write_text("X = 1\n")
     head = '\n[device.{0}]\ndriver = "./{0}.py"\ninputs = 1\n'

@@ -41,7 +41,7 @@ PER_M = 51200 / 0.01
 
 
 def test_moves_homes_and_faults(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "tmcl", "--motors", "2", "--baud", "115200")
+    wire = Wire(start, short_folder, "tmcl.simulator", "--motors", "2", "--baud", "115200")
     cell = wire.serve(CONFIG)
     wire.wait_up("mod0.x")
     assert wire.state("heartbeat_ms") == 200
@@ -97,7 +97,7 @@ def counted(node: Any, counter: str, before: int) -> bool:
 
 
 def test_line_faults_and_deaths(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "tmcl", "--motors", "2")
+    wire = Wire(start, short_folder, "tmcl.simulator", "--motors", "2")
     cell = wire.serve(CONFIG)
     wire.wait_up("mod0.x")
     with cell.open("mod0.x", "rw") as x:
@@ -136,7 +136,7 @@ def test_line_faults_and_deaths(start: Callable[..., Any], short_folder: Path) -
 
 
 def test_stray_bytes_restarts_and_other_masters(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "tmcl", "--motors", "2", "--baud", "115200")
+    wire = Wire(start, short_folder, "tmcl.simulator", "--motors", "2", "--baud", "115200")
     cell = wire.serve(CONFIG)
     wire.wait_up("mod0.x")
     with cell.open("mod0.x", "rw") as x:
@@ -202,14 +202,12 @@ def test_wrong_devices(start: Callable[..., Any], short_folder: Path) -> None:
             change="noise 1000",
         ),
     )
-    check_misfits(start, short_folder, "tmcl", CONFIG, misfits, "--motors", "2")
+    check_misfits(start, short_folder, "tmcl.simulator", CONFIG, misfits, "--motors", "2")
 
 
-def test_the_vendors_client_agrees_with_the_counterpart(
-    start: Callable[..., Any], short_folder: Path
-) -> None:
+def test_the_vendors_client_agrees_with_the_simulator(start: Callable[..., Any], short_folder: Path) -> None:
     pytrinamic = pytest.importorskip("pytrinamic.connections")
-    wire = Wire(start, short_folder, "tmcl", "--motors", "2")
+    wire = Wire(start, short_folder, "tmcl.simulator", "--motors", "2")
     manager = pytrinamic.ConnectionManager(f"--interface serial_tmcl --port {wire.port} --data-rate 115200")
     with manager.connect() as master:
         master.move_to(0, 20000, 1)

@@ -511,7 +511,7 @@ def test_sioms_tells_about_the_workcell(shell: Shell) -> None:
     assert "mod0.xaxis.readonly" in good(shell("sioms list -v"))
     assert re.search(r"xaxis +m +-1 +1 +velocity 1", good(shell("sioms info mod0")))
     assert re.search(r"^mod0 +sim-axes +up +good", good(shell("sioms status")), re.M)
-    assert re.search(r"^sim-axes +sioms.drivers.sim_axes +\S", good(shell("sioms driver list")), re.M)
+    assert re.search(r"^sim-axes +sioms.drivers.sim.axes +\S", good(shell("sioms driver list")), re.M)
     assert good(shell("sioms list | head -1")).startswith("node")
     assert "gripper0.bit3" in good(shell("sioms list --names")).split()
 

@@ -60,13 +60,15 @@ safe = {{ do = 0 }}
 
 
 class Cell:
-    """Counterparts, a daemon, and a client."""
+    """Simulators, a daemon, and a client."""
 
     def __init__(self, start: Callable[..., Any], folder: Path) -> None:
         self._start = start
-        self.drives = self._counterpart("leadshine", "--link", folder / "drives", "--units", "1")
-        self.finger = self._counterpart("adc", "--link", folder / "finger")
-        self.io = self._counterpart("moxa", "--model", "E1212")
+        self.drives = self._simulator(
+            "modbus.simulated.leadshine", "--link", folder / "drives", "--units", "1"
+        )
+        self.finger = self._simulator("framed_adc.simulator", "--link", folder / "finger")
+        self.io = self._simulator("modbus.simulated.moxa", "--model", "E1212")
         config = folder / "wire.toml"
         port = self.io.wait_line(r"^ready (\S+)$").group(1)
         config.write_text(CONFIG.format(folder=folder, io=port))
@@ -76,13 +78,13 @@ class Cell:
         self.daemon.wait_line("event=ready")
         self.client = sioms.Workcell(self.socket)
 
-    def _counterpart(self, name: str, *options: object) -> Any:
-        process = self._start([sys.executable, "-m", f"sioms.tools.counterparts.{name}", *map(str, options)])
+    def _simulator(self, name: str, *options: object) -> Any:
+        process = self._start([sys.executable, "-m", f"sioms.drivers.{name}", *map(str, options)])
         process.wait_line("^ready ")
         return process
 
     def tell(self, process: Any, line: str) -> Any:
-        """Send a command to a counterpart and return its answer's value."""
+        """Send a command to a simulator and return its answer's value."""
         before = len(process.lines)
         process.process.stdin.write(line + "\n")
         process.process.stdin.flush()
@@ -254,7 +256,7 @@ def test_the_driver_watches_over_moves_for_which_the_drive_has_no_dead_man(
 
     The line has polls on it back to back, which must not keep the driver from ending.
     """
-    wire = Wire(start, short_folder, "leadshine", "--units", "1")
+    wire = Wire(start, short_folder, "modbus.simulated.leadshine", "--units", "1")
     wire.serve(SLIDE.replace("[[", "poll_hz = 1000.0\n[["))
     wire.wait_up("slide0")
 

@@ -7,9 +7,17 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from sioms.sdk.codec import modbus_pdu, sample_stream
-from sioms.sdk.codec.ascii_line import MAX_LINE_BYTES, LineReceiver
-from sioms.sdk.codec.cobs import MAX_PAYLOAD_BYTES, MAX_WIRE_BYTES, FrameReceiver, frame, stuff, unstuff
+from sioms.drivers.ascii_stream.codec import MAX_LINE_BYTES, LineReceiver
+from sioms.drivers.framed_adc import codec as sample_stream
+from sioms.drivers.framed_adc.cobs import (
+    MAX_PAYLOAD_BYTES,
+    MAX_WIRE_BYTES,
+    FrameReceiver,
+    frame,
+    stuff,
+    unstuff,
+)
+from sioms.sdk.codec import modbus_pdu
 from sioms.sdk.codec.modbus import RtuUnit, SerialLine, TcpUnit, frame_rtu, frame_tcp
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError
 

@@ -9,7 +9,7 @@ import pytest
 from own_writes_rig import World, own_time
 
 from sioms.client.node_core import Edges, EdgesLost
-from sioms.drivers.sim_io import SimIo
+from sioms.drivers.sim.io import SimIo
 from sioms.protocol.records import BINARY_WRITE
 
 

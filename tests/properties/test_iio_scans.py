@@ -7,7 +7,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sioms.sdk.codec.iio_scan import Element, ElementType, Layout, ScanReceiver
+from sioms.drivers.iio.codec import Element, ElementType, Layout, ScanReceiver
 
 
 @st.composite

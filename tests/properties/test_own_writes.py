@@ -20,9 +20,9 @@ from own_writes_rig import DEVICE, Client, Device, OnLine, Pushing, World, world
 from sioms.client import shown
 from sioms.client.command import command
 from sioms.client.node_core import NodeCore
-from sioms.drivers.sim_axes import SimAxes
-from sioms.drivers.sim_force import SimForce
-from sioms.drivers.sim_io import SimIo
+from sioms.drivers.sim.axes import SimAxes
+from sioms.drivers.sim.force import SimForce
+from sioms.drivers.sim.io import SimIo
 from sioms.protocol.driver_verbs import DriverVerb
 from sioms.protocol.flags import AxisStatus, Request
 from sioms.protocol.markers import token_of

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from own_writes_rig import DEVICE, Client, Device, LineTable, Pushing, World, worlds
 
-from sioms.drivers.sim_tactile import SimTactile
+from sioms.drivers.sim.tactile import SimTactile
 from sioms.protocol.flags import AnalogStatus, Request
 from sioms.sdk.blocks import AnyBlock, Description
 from sioms.sdk.driver import Kit, TickDriver

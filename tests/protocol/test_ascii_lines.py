@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sioms.sdk.codec.ascii_line import LineReceiver
+from sioms.drivers.ascii_stream.codec import LineReceiver
 
 GOLDEN = [
     (b"1.5,-2,3e2\n", (1.5, -2.0, 300.0)),

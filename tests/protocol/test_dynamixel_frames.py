@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from sioms.sdk.codec import dynamixel as dxl
-from sioms.sdk.codec.dynamixel import Bus, Status
+from sioms.drivers.dynamixel import codec as dxl
+from sioms.drivers.dynamixel import simulator
+from sioms.drivers.dynamixel.codec import Bus, Status
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError
-from sioms.tools.counterparts import dynamixel as counterpart
 
 GOLDEN = [
     line.split("|")[2]
@@ -96,7 +96,7 @@ def test_alert_and_stuffing() -> None:
 
 def test_the_simulated_servo_answers_as_the_manual_says() -> None:
     now = 1.0
-    bus = counterpart.Bus([1], 1030, lambda: now)
+    bus = simulator.Bus([1], 1030, lambda: now)
     bus.servos[1].put(6, 38, 1)
     assert bus.take(bytes.fromhex(GOLDEN[0]))[0].hex(" ") == GOLDEN[1]
     bus.servos[1].mover.position = 166.0

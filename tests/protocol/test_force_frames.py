@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from sioms.sdk.codec import ati_rdt as rdt
-from sioms.sdk.codec import ft300, http_get
-from sioms.sdk.codec import schunk_ifb as ifb
+from sioms.drivers.ati_rdt import codec as rdt
+from sioms.drivers.ati_rdt import http_get
+from sioms.drivers.ft300 import codec as ft300
+from sioms.drivers.schunk_ft import codec as ifb
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError
 
 GOLDEN = [

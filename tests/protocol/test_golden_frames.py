@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from sioms.sdk.codec import sample_stream as stream
+from sioms.drivers.framed_adc import codec as stream
+from sioms.drivers.framed_adc.cobs import FrameReceiver, frame, unstuff
 from sioms.sdk.codec.checksum import crc16_ccitt_false, crc16_modbus, crc16_umts
-from sioms.sdk.codec.cobs import FrameReceiver, frame, unstuff
 from sioms.sdk.codec.modbus import RtuUnit, SerialLine, TcpUnit
 from sioms.sdk.codec.modbus_pdu import read_write_registers
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError

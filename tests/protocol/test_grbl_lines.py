@@ -2,9 +2,9 @@
 
 import pytest
 
-from sioms.sdk.codec import grbl
+from sioms.drivers.grbl import codec as grbl
+from sioms.drivers.grbl import simulator
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError, StateLost
-from sioms.tools.counterparts import grbl as counterpart
 
 
 def feed(exchange: Exchange, data: bytes, step: int) -> object:
@@ -99,7 +99,7 @@ def test_lines_that_cannot_be_sent() -> None:
 
 def test_the_simulated_controller_answers_as_the_documents_say() -> None:
     now = 1.0
-    device = counterpart.Controller(homing=False, clock=lambda: now)
+    device = simulator.Controller(homing=False, clock=lambda: now)
 
     def say(data: bytes) -> str:
         return b"".join(device.take(data)).decode()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sioms.sdk.codec.iio_scan import Element, Layout, ScanReceiver, parse_type
+from sioms.drivers.iio.codec import Element, Layout, ScanReceiver, parse_type
 
 
 def layout(*types: str, reverse: bool = False) -> Layout:

@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from sioms.sdk.codec import odrive
+from sioms.drivers.odrive import codec as odrive
+from sioms.drivers.odrive import simulator
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError
-from sioms.tools.counterparts import odrive as counterpart
 
 
 def feed(exchange: Exchange, data: bytes, step: int) -> object:
@@ -38,7 +38,7 @@ def test_the_documented_reply() -> None:
     data = b"24.087744*32\r\n" + reply("0.0 0.0")
     for step in (1, 4, 100):
         assert feed(odrive.read(["vbus_voltage"], 0.1), data + b"1*49\r\n", step) == [[24.087744]]
-    board = counterpart.Board()
+    board = simulator.Board()
     assert board.take(b"r vbus_voltage *93\n") == [b"24.087744*32\r\n"]
     assert board.take(b"r vbus_voltage*125\r") == [b"24.087744*32\r\n"]
     assert board.take(b"r vbus_voltage *94\n") == []

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from sioms.sdk.codec.tmcl import (
+from sioms.drivers.tmcl import simulator
+from sioms.drivers.tmcl.codec import (
     Axis,
     Module,
     Op,
@@ -16,7 +17,6 @@ from sioms.sdk.codec.tmcl import (
     separator,
 )
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError
-from sioms.tools.counterparts import tmcl as counterpart
 
 GOLDEN = [
     line.split("|")[2]
@@ -143,7 +143,7 @@ def test_no_cut_of_a_search_is_a_telegram() -> None:
 
 def test_the_simulated_module_answers_as_the_manual_says() -> None:
     now = 5.0
-    module = counterpart.Module(clock=lambda: now)
+    module = simulator.Module(clock=lambda: now)
     module.motors[0].mover.position = 10000.0
     assert (
         module.take(bytes.fromhex("01 06 01 00 00 00 00 00 08"))[0].hex(" ") == "02 01 64 06 00 00 27 10 a4"

@@ -22,7 +22,7 @@ def test_the_core_imports_little() -> None:
     done = python(
         WITHOUT
         + "import os, sioms, sioms.aio, sioms.daemon.main, sioms.daemon.server, sioms.sdk, sioms.sdk.nursery\n"
-        "import sioms.sdk.runtime, sioms.drivers.sim_axes, sioms.drivers.sim_io, sioms.drivers.tmcl\n"
+        "import sioms.sdk.runtime, sioms.drivers.sim.axes, sioms.drivers.sim.io, sioms.drivers.tmcl.driver\n"
         "roots = {name.partition('.')[0] for name, m in sys.modules.items() if 'site-packages' in str(getattr(m, '__file__', ''))}\n"
         "print(*sorted(roots))"
     )

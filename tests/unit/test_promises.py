@@ -30,7 +30,7 @@ def test_each_promise_names_a_test() -> None:
 
 
 def test_benches_that_are_named_exist() -> None:
-    commands = (TREE / "tools" / "bench" / "command.py").read_text(encoding="utf-8")
+    commands = (TREE / "sioms" / "bench" / "command.py").read_text(encoding="utf-8")
     for name in re.findall(r"`sioms bench (\w+)`", PAGE):
         assert f'"{name}": (' in commands, name
 

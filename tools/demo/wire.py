@@ -12,21 +12,25 @@ from sioms.children import PATIENCE_S, Process, daemon
 from .rig import bold
 
 PORTS = {"/dev/ttyUSB0": "drives", "/dev/ttyACM0": "finger", "192.168.127.254:502": "io"}
-"""Port names of the configuration, and the counterpart that takes the place of each."""
+"""Port names of the configuration, and the simulator that takes the place of each."""
 
 
 def bench(folder: str, stack: ExitStack) -> str:
-    """Start the counterparts; return the path of the configuration with their port names in it."""
+    """Start the simulators; return the path of the configuration with their port names in it."""
     drives, finger = f"{folder}/ttyUSB0", f"{folder}/ttyACM0"
-    base = "sioms.tools.counterparts"
-    io = Process([f"{base}.moxa", "--model", "E1212", "--port", "0"], "ready")
+    base = "sioms.drivers"
+    io = Process([f"{base}.modbus.simulated.moxa", "--model", "E1212", "--port", "0"], "ready")
     stack.callback(io.end)
-    stack.callback(Process([f"{base}.leadshine", "--link", drives, "--units", "1"], "ready").end)
-    stack.callback(Process([f"{base}.adc", "--link", finger, "--channels", "16"], "ready").end)
+    stack.callback(
+        Process([f"{base}.modbus.simulated.leadshine", "--link", drives, "--units", "1"], "ready").end
+    )
+    stack.callback(
+        Process([f"{base}.framed_adc.simulator", "--link", finger, "--channels", "16"], "ready").end
+    )
     text = files("sioms.tools.demo").joinpath("bench-modbus.toml").read_text()
     names = {"drives": drives, "finger": finger, "io": io.ready_line.split()[-1]}
-    for port, counterpart in PORTS.items():
-        text = text.replace(port, names[counterpart])
+    for port, simulator in PORTS.items():
+        text = text.replace(port, names[simulator])
     path = f"{folder}/bench-modbus.toml"
     with open(path, "w", encoding="utf-8") as file:
         file.write(text)

@@ -22,7 +22,7 @@ FINGER = (
 """The finger that is probed if none is described: faults of the sizes that the dissertation reports."""
 
 
-class Counterpart:
+class Simulator:
     """A simulated finger as a process; commands go to its standard input."""
 
     def __init__(self, words: Sequence[str]) -> None:
@@ -81,10 +81,10 @@ def simulated(
     """
     port, socket = folder / "finger", folder / "prober.sock"
     with ExitStack() as stack:
-        module = "sioms.tools.counterparts.finger"
+        module = "sioms.drivers.framed_adc.simulated.finger"
         words = ["--link", str(port), "--socket", str(socket), "--finger", finger]
         words += [] if hidden is None else ["--finger-file", str(hidden)]
-        device = Counterpart([module, *words, "--mount", *(str(radius) for radius in radii_m)])
+        device = Simulator([module, *words, "--mount", *(str(radius) for radius in radii_m)])
         stack.callback(device.end)
         config = folder / "prober.toml"
         source = text or files("sioms.tactile.live").joinpath("prober.toml").read_text(encoding="utf-8")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from sioms.drivers.tmcl import Tmcl, TmclUnit
+from sioms.drivers.tmcl.driver import Tmcl, TmclUnit
 from sioms.sdk.driver import Kit
 from sioms.sdk.exchange import Steps
 
@@ -34,7 +34,7 @@ class HastyUnit(TmclUnit):
 
 
 class Hasty(Tmcl):
-    rig: ClassVar = {"counterpart": ["tmcl"], "tables": TABLES}
+    rig: ClassVar = {"simulator": ["sioms.drivers.tmcl.simulator"], "tables": TABLES}
 
     def __init__(self, name: str, settings: Any, kit: Kit) -> None:
         super().__init__(name, settings, kit)

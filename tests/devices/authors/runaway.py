@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from sioms.drivers.tmcl import Tmcl, TmclUnit
+from sioms.drivers.tmcl.driver import Tmcl, TmclUnit
 from sioms.sdk.driver import Kit
 from sioms.sdk.exchange import Steps
 
@@ -16,7 +16,7 @@ class RunawayUnit(TmclUnit):
 
 class Runaway(Tmcl):
     rig: ClassVar = {
-        "counterpart": ["tmcl"],
+        "simulator": ["sioms.drivers.tmcl.simulator"],
         "tables": (
             '[device.runaway]\ndriver = "{driver}"\nmodule = 1140\npoll_hz = 50.0\n'
             'line = { serial = "{port}", baud = 115200 }\n[[device.runaway.axis]]\nname = "x"\nmotor = 0\n'

@@ -68,7 +68,7 @@ class ScaleUnit(LineUnit):
 class Scale(LineDriver):
     Settings = Settings
     rig: ClassVar = {
-        "counterpart": ["scale_device.py"],
+        "simulator": ["scale_device.py"],
         "tables": '[device.scale]\ndriver = "{driver}"\nline = { serial = "{port}", baud = 9600 }\n',
         "analogs": ["scale"],
     }

@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sioms.drivers.ascii_stream import AsciiStream, Inspection
+from sioms.drivers.ascii_stream import simulator
+from sioms.drivers.ascii_stream.driver import AsciiStream, Inspection
 from sioms.protocol.flags import AnalogStatus, Request
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError
 from sioms.tactile.cylinder import FINGER_B
 from sioms.tactile.emap import e_map
 from sioms.tactile.quality import Quality
 from sioms.tactile.series import line_load
-from sioms.tools.counterparts import ascii_stream as counterpart
 
 
 class Rig:
@@ -27,7 +27,7 @@ class Rig:
 
     def __init__(self, *options: str, **table: Any) -> None:
         self.now_s = 50.0
-        self.device = counterpart.Board(counterpart.options_parser().parse_args(options), lambda: self.now_s)
+        self.device = simulator.Board(simulator.options_parser().parse_args(options), lambda: self.now_s)
         settings = {"line": {"serial": "/x"}, "columns": ["a", "b"], "rate_hz": 80.0, **table}
         self.driver = AsciiStream("t0", msgspec.convert(settings, AsciiStream.Settings), self)
         self.published: list[tuple[int, np.ndarray, int]] = []

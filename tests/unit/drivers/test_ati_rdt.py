@@ -12,12 +12,12 @@ from force_rig import INVALID, LOAD, OVERRUN, SATURATED, Rig, check_refused, ste
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sioms.drivers import ati_rdt as ati_driver
-from sioms.drivers.ati_rdt import AtiRdt
+from sioms.drivers.ati_rdt import driver as ati_driver
+from sioms.drivers.ati_rdt import simulator as ati_rdt
+from sioms.drivers.ati_rdt.driver import AtiRdt
 from sioms.protocol.flags import Request
 from sioms.sdk.driver import Refusal
 from sioms.sdk.exchange import DeviceError, LinkError
-from sioms.tools.counterparts import ati_rdt
 
 HOST = ("127.0.0.1", 4711)
 UDP = {"udp": "192.168.1.1:49152"}

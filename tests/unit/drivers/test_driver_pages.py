@@ -1,4 +1,4 @@
-"""The pages under docs/drivers: every configuration in them is read by the driver that it names, and every driver has a page."""
+"""The pages of drivers: every configuration in them is read by the driver that it names, and every driver has a page."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from sioms.sdk import finding
 
-PAGES = Path(__file__).parents[3] / "docs" / "drivers"
+PAGES = Path(__file__).parents[3] / "drivers"
 
 
 def examples(path: Path) -> list[str]:
@@ -21,7 +21,9 @@ def examples(path: Path) -> list[str]:
     return [textwrap.dedent(block) for block in blocks if "[device." in block]
 
 
-TEXTS = [(path.name, text) for path in sorted(PAGES.glob("*.md")) for text in examples(path)]
+TEXTS = [
+    (str(path.relative_to(PAGES)), text) for path in sorted(PAGES.glob("*/*.md")) for text in examples(path)
+]
 
 
 @pytest.mark.parametrize(("page", "text"), TEXTS, ids=[page for page, _ in TEXTS])
@@ -39,12 +41,12 @@ def test_every_driver_and_every_register_map_has_a_page_with_an_example() -> Non
     registered = {point.name for point in entry_points(group="sioms.drivers")}
     simulated = {name for name in registered if name.startswith("sim-")}
     assert {table["driver"] for table in devices} >= registered - simulated
-    maps = {path.stem for path in (PAGES.parents[1] / "drivers" / "maps").glob("*.toml")}
+    maps = {path.stem for path in (PAGES / "modbus" / "maps").glob("*.toml")}
     assert {table["map"] for table in devices if "map" in table} == maps
 
 
 def test_the_table_of_families_leads_to_a_page_of_every_driver_and_map() -> None:
-    linked = set(re.findall(r"\]\(([\w-]+\.md)[)#]", (PAGES / "README.md").read_text()))
+    linked = set(re.findall(r"\]\(([\w/-]+\.md)[)#]", (PAGES / "README.md").read_text()))
     assert all((PAGES / name).exists() for name in linked)
     pages: dict[str, set[str]] = {}
     for page, text in TEXTS:

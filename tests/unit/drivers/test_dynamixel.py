@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 from drive_rig import LIMITS, Joined
 
-from sioms.drivers.dynamixel import Dynamixel
+from sioms.drivers.dynamixel import codec
+from sioms.drivers.dynamixel import simulator as dynamixel
+from sioms.drivers.dynamixel.driver import Dynamixel
 from sioms.motion import ActionKind, Command, DriveAction
 from sioms.protocol.flags import ControlMode
-from sioms.sdk.codec import dynamixel as codec
 from sioms.sdk.exchange import DeviceError, LinkError, StateLost
-from sioms.tools.counterparts import dynamixel
 
 ACTION = DriveAction(ActionKind.START, 0, None, 0.07, 1.0)
 STEPS_PER_M = 4096 / 0.05

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import msgspec
 
-from sioms.drivers.ati_rdt import AtiRdt
-from sioms.drivers.ft300 import Ft300
-from sioms.drivers.schunk_ft import SchunkFt
+from sioms.drivers.ati_rdt.driver import AtiRdt
+from sioms.drivers.ft300.driver import Ft300
+from sioms.drivers.schunk_ft.driver import SchunkFt
 
 UDP = {"udp": "192.168.1.1:49152"}
 

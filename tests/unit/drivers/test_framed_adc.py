@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sioms.drivers.framed_adc import FramedAdc
+from sioms.drivers.framed_adc import simulator as adc
+from sioms.drivers.framed_adc.driver import FramedAdc
 from sioms.protocol.flags import AnalogStatus
 from sioms.sdk.exchange import DeviceError, LinkError, Steps
-from sioms.tools.counterparts import adc
 
 
 class Rig:

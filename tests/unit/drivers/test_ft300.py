@@ -11,10 +11,10 @@ from force_rig import LOAD, OVERRUN, SATURATED, Rig, check_refused, steps_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sioms.drivers.ft300 import Ft300
+from sioms.drivers.ft300 import simulator as ft300
+from sioms.drivers.ft300.driver import Ft300
 from sioms.sdk.driver import LineDriver, StreamDriver
 from sioms.sdk.exchange import DeviceError, LinkError, Pause, Send, Steps
-from sioms.tools.counterparts import ft300
 
 RECORD_S = 16 * 10 / 19200
 

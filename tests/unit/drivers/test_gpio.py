@@ -19,8 +19,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sioms.drivers.gpio import Gpio
-from sioms.sdk.codec.gpio_edges import Edge, EdgePort
+from sioms.drivers.gpio.driver import Gpio
+from sioms.drivers.gpio.edges import Edge, EdgePort
 from sioms.sdk.driver import Refusal
 from sioms.sdk.exchange import LinkError
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from drive_rig import Joined
 
-from sioms.drivers.grbl import Grbl
+from sioms.drivers.grbl import simulator as grbl
+from sioms.drivers.grbl.driver import Grbl
 from sioms.motion import ActionKind, DriveAction
 from sioms.motion.watch import Order
 from sioms.protocol.flags import AxisStatus
 from sioms.sdk.exchange import DeviceError, LinkError, StateLost
-from sioms.tools.counterparts import grbl
 
 AXIS = {"name": "x", "letter": "X", "velocity_max": 0.1, "acceleration_max": 0.5}
 
@@ -331,7 +331,7 @@ def test_a_quick_stop_that_is_not_obeyed_is_sent_again() -> None:
 
 
 def test_the_example_of_its_page_fits_a_controller_as_it_ships() -> None:
-    page = (Path(__file__).parents[3] / "docs/drivers/grbl.md").read_text()
+    page = (Path(__file__).parents[3] / "drivers/grbl/README.md").read_text()
     text = "\n".join(line[4:] for line in page.splitlines() if line.startswith("    "))
     table = tomllib.loads(text)["device"]["mod0"]
     table.pop("driver"), table.pop("line")

@@ -11,12 +11,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from sioms.drivers.iio import Iio, IioRaw
+from sioms.drivers.iio.device import IioDevice, find_device
+from sioms.drivers.iio.driver import Iio, IioRaw
+from sioms.drivers.iio.simulator import Dummy
 from sioms.plant.finger import FingerShape, TactileArray
 from sioms.sdk.exchange import LinkError
-from sioms.sdk.iio_device import IioDevice, find_device
 from sioms.tactile.sensing import CHANNELS
-from sioms.tools.counterparts.iio import Dummy
 
 
 @pytest.fixture

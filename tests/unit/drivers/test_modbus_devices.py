@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from steps_rig import carry_out
 
-from sioms.drivers.modbus_axis import MAPS, ModbusAxis
-from sioms.drivers.modbus_io import ModbusIo
+from sioms.drivers.modbus.axis import MAPS, ModbusAxis
+from sioms.drivers.modbus.io import ModbusIo
+from sioms.drivers.modbus.regmap import named_map
+from sioms.drivers.modbus.simulated import leadshine, moxa, oriental_az
 from sioms.motion import CommandError, DriveAction
 from sioms.protocol.flags import AxisStatus, ControlMode
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
@@ -20,8 +22,6 @@ from sioms.protocol.records import NodeClass, numpy_dtype
 from sioms.sdk.codec.modbus import frame_rtu, frame_tcp
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Pause, StateLost, Step, Steps
 from sioms.sdk.markers import Markers
-from sioms.sdk.regmap import named_map
-from sioms.tools.counterparts import leadshine, moxa, oriental_az
 
 EXCHANGE_S = 0.003
 

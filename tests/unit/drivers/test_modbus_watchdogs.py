@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from io_rig import Joined
 
+from sioms.drivers.modbus.simulated import moxa, wago
 from sioms.sdk.exchange import DeviceError, StateLost
-from sioms.tools.counterparts import moxa, wago
 
 WAGO = {
     "map": "wago_750",

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from drive_rig import LIMITS, Joined
 
-from sioms.drivers.odrive import Odrive
+from sioms.drivers.odrive import simulator as odrive
+from sioms.drivers.odrive.driver import Odrive
+from sioms.drivers.odrive.simulator import CLOSED_LOOP, IDLE
 from sioms.motion import ActionKind, DriveAction
 from sioms.protocol.flags import AxisStatus
 from sioms.sdk.exchange import DeviceError, LinkError, StateLost
-from sioms.tools.counterparts import odrive
-from sioms.tools.counterparts.odrive import CLOSED_LOOP, IDLE
 
 ACTION = DriveAction(ActionKind.START, 0, None, 0.1, 0.5)
 TURN = 0.01

@@ -17,7 +17,7 @@ def sent(steps: Any) -> list[bytes]:
 def make() -> Any:
     import msgspec
 
-    from sioms.drivers.tmcl import Tmcl
+    from sioms.drivers.tmcl.driver import Tmcl
 
     class Kit:
         markers = Markers(MarkerTable(memoryview(bytearray(TABLE_SIZE))), lambda number: None)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from force_rig import INVALID, LOAD, SATURATED, Rig, check_refused, steps_of
 
-from sioms.drivers.schunk_ft import SchunkFt
+from sioms.drivers.schunk_ft import simulator as schunk_ifb
+from sioms.drivers.schunk_ft.driver import SchunkFt
 from sioms.protocol.flags import Request
 from sioms.sdk.driver import Refusal
 from sioms.sdk.exchange import DeviceError, LinkError
-from sioms.tools.counterparts import schunk_ifb
 
 
 class SchunkRig(Rig):

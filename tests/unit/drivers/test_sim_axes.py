@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from sioms.drivers.sim_axes import SimAxes
+from sioms.drivers.sim.axes import SimAxes
 from sioms.protocol.flags import AxisStatus, ControlMode
 
 SERVO = {

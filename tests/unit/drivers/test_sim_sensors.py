@@ -4,10 +4,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from sioms.drivers.sim_axes import SimAxes
-from sioms.drivers.sim_force import SimForce
-from sioms.drivers.sim_io import SimIo
-from sioms.drivers.sim_tactile import SimTactile
+from sioms.drivers.sim.axes import SimAxes
+from sioms.drivers.sim.force import SimForce
+from sioms.drivers.sim.io import SimIo
+from sioms.drivers.sim.tactile import SimTactile
 from sioms.plant.finger import FingerShape, TactileArray
 from sioms.protocol.flags import AnalogStatus, ControlMode
 

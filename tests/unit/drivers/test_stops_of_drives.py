@@ -7,13 +7,16 @@ from typing import Any
 import pytest
 from drive_rig import LIMITS, Joined
 
-from sioms.drivers.dynamixel import Dynamixel
-from sioms.drivers.grbl import Grbl
-from sioms.drivers.odrive import Odrive
-from sioms.drivers.tmcl import Tmcl
+from sioms.drivers.dynamixel import simulator as dynamixel
+from sioms.drivers.dynamixel.driver import Dynamixel
+from sioms.drivers.grbl import simulator as grbl
+from sioms.drivers.grbl.driver import Grbl
+from sioms.drivers.odrive import simulator as odrive
+from sioms.drivers.odrive.driver import Odrive
+from sioms.drivers.tmcl import simulator as tmcl
+from sioms.drivers.tmcl.driver import Tmcl
 from sioms.motion import ActionKind, DriveAction
 from sioms.sdk.exchange import DeviceError
-from sioms.tools.counterparts import dynamixel, grbl, odrive, tmcl
 
 ACTION = DriveAction(ActionKind.START, 0, None, 0.1, 1.0)
 

@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from sioms.drivers.framed_adc import FramedAdc
-from sioms.drivers.sim_tactile import SimTactile
+from sioms.drivers.framed_adc.driver import FramedAdc
+from sioms.drivers.sim.tactile import SimTactile
 from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, BlockSpec, Description

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 from drive_rig import CHARACTER_S, LIMITS, Joined
 
-from sioms.drivers.tmcl import Tmcl
+from sioms.drivers.tmcl import simulator as tmcl
+from sioms.drivers.tmcl.codec import Op
+from sioms.drivers.tmcl.driver import Tmcl
 from sioms.motion import ActionKind, DriveAction
-from sioms.sdk.codec.tmcl import Op
 from sioms.sdk.exchange import DeviceError, LinkError, StateLost
-from sioms.tools.counterparts import tmcl
 
 AXIS = {"name": "x", "motor": 0, "travel_per_turn": 0.01, "microsteps_per_turn": 51200, **LIMITS}
 ACTION = DriveAction(ActionKind.START, 0, None, 0.1, 1.0)

@@ -1,6 +1,6 @@
 """Lines that are dropped, each counted under its reason."""
 
-from sioms.sdk.codec.ascii_line import LineReceiver
+from sioms.drivers.ascii_stream.codec import LineReceiver
 
 
 def test_each_fault_has_its_counter() -> None:

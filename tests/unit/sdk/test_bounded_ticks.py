@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 from own_writes_rig import CLOCK, World, own_time
 
-from sioms.drivers.sim_axes import SimAxes
+from sioms.drivers.sim.axes import SimAxes
 from sioms.protocol.flags import ControlMode, NodeClass, Request
 from sioms.protocol.records import AXIS_WRITE, WRITE
 

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sioms.sdk.codec.grbl import parse_report
-from sioms.sdk.codec.grbl_jog import JogChain, straight_jog
-from sioms.sdk.codec.grbl_machine import MachinePosition, compare_limits
+from sioms.drivers.grbl.codec import parse_report
+from sioms.drivers.grbl.jog import JogChain, straight_jog
+from sioms.drivers.grbl.machine import MachinePosition, compare_limits
 from sioms.sdk.exchange import DeviceError
 
 MOVES = st.dictionaries(

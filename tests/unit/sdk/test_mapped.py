@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 
 import sioms.drivers
+from sioms.drivers.modbus.registers import Gearing
+from sioms.drivers.modbus.regmap import load_map
+from sioms.drivers.modbus.unit import MappedUnit
 from sioms.sdk.codec.modbus import RtuUnit, SerialLine, TcpUnit, frame_rtu, frame_tcp
 from sioms.sdk.exchange import DeviceError, Exchange, Pause, Steps
-from sioms.sdk.mapped import MappedUnit
-from sioms.sdk.registers import Gearing
-from sioms.sdk.regmap import load_map
 
-MAPS = Path(sioms.drivers.__file__).parent / "maps"
+MAPS = Path(sioms.drivers.__file__).parent / "modbus" / "maps"
 LINE = SerialLine(115200)
 
 

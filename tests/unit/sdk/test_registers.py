@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sioms.sdk.registers import UNITS, Gearing, rounded, to_raw, to_words
+from sioms.drivers.modbus.registers import UNITS, Gearing, rounded, to_raw, to_words
 
 
 @pytest.mark.parametrize(

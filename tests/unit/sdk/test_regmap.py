@@ -8,11 +8,11 @@ import msgspec
 import pytest
 
 import sioms.drivers
-from sioms.drivers.modbus_axis import ModbusAxis
+from sioms.drivers.modbus.axis import ModbusAxis
+from sioms.drivers.modbus.regmap import RegisterMapError, load_map, parse_map
 from sioms.protocol.flags import ControlMode
-from sioms.sdk.regmap import RegisterMapError, load_map, parse_map
 
-MAPS = Path(sioms.drivers.__file__).parent / "maps"
+MAPS = Path(sioms.drivers.__file__).parent / "modbus" / "maps"
 
 
 @pytest.mark.parametrize("path", sorted(MAPS.glob("*.toml")), ids=lambda path: path.stem)

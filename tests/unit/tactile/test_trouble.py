@@ -16,11 +16,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from sioms.drivers.framed_adc import FramedAdc
+from sioms.drivers.framed_adc import codec as stream
+from sioms.drivers.framed_adc.cobs import frame
+from sioms.drivers.framed_adc.driver import FramedAdc
 from sioms.plant.finger import FingerShape, TactileArray
 from sioms.protocol.flags import AnalogStatus
-from sioms.sdk.codec import sample_stream as stream
-from sioms.sdk.codec.cobs import frame
 from sioms.tactile import sensing
 from sioms.tactile.chain import RECOVER_S
 from sioms.tactile.estimator import Estimator

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sioms.tools.author.station import _crash
+from sioms.check.station import _crash
 
 LOG = r"""time=1 level=info event="device up" device=stage pid=7
 time=2 level=error event=driver device=stage text="driver failed: KeyError(8):   File \"a.py\", line 1, in poll     x = y[8]     ~^^^ KeyError: 8 "

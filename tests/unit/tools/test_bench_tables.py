@@ -1,7 +1,7 @@
 """Figures become Markdown tables that say what was met."""
 
-from sioms.tools.bench.figures import Bar, Report
-from sioms.tools.bench.tables import markdown
+from sioms.bench.figures import Bar, Report
+from sioms.bench.tables import markdown
 
 
 def test_each_sub_bench_is_a_table_with_its_verdicts(capsys: object) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sioms.tools.author.bending import STRAY, Bender, Faults
+from sioms.check.bending import STRAY, Bender, Faults
 
 REQUEST = bytes(range(1, 10))
 

@@ -8,7 +8,7 @@ from importlib.resources import files
 import msgspec
 import pytest
 
-from sioms.drivers.sim_axes import SimAxes
+from sioms.drivers.sim.axes import SimAxes
 from sioms.tools.demo.pace import RATES, paced, rate_for
 
 CONFIG = files("sioms.tools.demo").joinpath("demo.toml").read_text()

@@ -6,13 +6,13 @@ import tomllib
 
 import pytest
 
-from sioms.tools.bench.drivers import CASES, STREAMS, Case, faster
-from sioms.tools.counterparts.rigs import MAP_RIGS, RIGS, Axis, Rig, find_rig, rig_of
+from sioms.bench.drivers import CASES, STREAMS, Case, faster
+from sioms.check.rigs import MAP_RIGS, RIGS, Axis, Rig, find_rig, rig_of
 
 KEYS = {
     "driver": "scale.py",
     "tables": '[device.scale]\ndriver = "{driver}"\nline = { serial = "{port}", baud = 9600, parity = "E", stop_bits = 2 }\n',
-    "counterpart": ["scale_device.py", "--fast"],
+    "simulator": ["scale_device.py", "--fast"],
     "axes": [{"node": "scale.x", "reach": 0.5}],
 }
 
@@ -25,14 +25,14 @@ def test_a_driver_names_its_rig() -> None:
         9600,
         12,
     )
-    assert rig.axes == (Axis("scale.x", 0.5),) and tuple(rig.counterpart) == ("scale_device.py", "--fast")
+    assert rig.axes == (Axis("scale.x", 0.5),) and tuple(rig.simulator) == ("scale_device.py", "--fast")
     assert rig.table["line"] == {"serial": "/dev/null", "baud": 9600, "parity": "E", "stop_bits": 2}
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"counterparts": []}, "unknown key counterparts; one of driver, tables"),
+        ({"simulators": []}, "unknown key simulators; one of driver, tables"),
         ({"tcp": "yes"}, "tcp"),
         ({"axes": [{}]}, "node"),
     ],
@@ -48,7 +48,7 @@ def test_every_rig_is_whole(rig: Rig) -> None:
     assert next(iter(tables["device"])) == rig.device and tables["device"][rig.device]["driver"] == rig.driver
     assert find_rig(rig.title) is rig
     if rig.line:
-        assert rig.counterpart
+        assert rig.simulator
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.rig} {case.baud}")

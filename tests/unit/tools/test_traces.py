@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from sioms.tools.author.trace_command import configuration
-from sioms.tools.author.traces import BadTrace, Message, Replay, Trace, read_trace
+from sioms.check.trace_command import configuration
+from sioms.check.traces import BadTrace, Message, Replay, Trace, read_trace
 
 HEADER = {
     "sioms_trace": 1, "device": "mod0", "driver": "tmcl",

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from sioms.tools.author.bending import Bender, Faults, Piece, Way
-from sioms.tools.author.ends import make_ends
+from sioms.check.bending import Bender, Faults, Piece, Way
+from sioms.check.ends import make_ends
 
 MESSAGE = bytes(range(20))
 

@@ -1,5 +1,0 @@
-"""The author's tools: ``sioms driver check``, ``trace`` and ``replay``.
-
-A station puts a driver to work under the real daemon, against its counterpart, over a wire that can be disturbed; driver
-and counterpart know nothing of it. Trials disturb, stop and kill, and say what they saw.
-"""
