@@ -66,7 +66,7 @@ FORCE_MODES = (
 
 AxisTable: Any = table_type(
     AxisSettings,
-    without=("kind", "modes", "watch"),
+    without=("kind", "modes"),
     extra={
         "description": (str, ""),
         "bandwidth_hz": (float, 30.0),

@@ -20,6 +20,7 @@ from sioms.protocol.records import READ, read_rows
 from .commands import WIRE_DTYPE
 from .guard import LimitGuard
 from .homing import HomingRuns
+from .host_watch import HostWatch
 from .inbox import Inbox
 from .law import ControlLaw
 from .plain import MOST
@@ -31,6 +32,7 @@ from .types import CommandError, Event, EventKind, Keeper, MarkerPort
 Axes = NDArray[np.int64]
 EMERGENCY_STOP, HOMING, HOMED = int(AxisStatus.EMERGENCY_STOP), int(AxisStatus.HOMING), int(AxisStatus.HOMED)
 FOLLOWING_ERROR = int(AxisStatus.FOLLOWING_ERROR)
+FAULT, POSITION_LOST = int(AxisStatus.FAULT), int(AxisStatus.POSITION_LOST)
 
 
 class AxisBank:
@@ -78,6 +80,7 @@ class AxisBank:
         )  # fmt: skip
         self._guard = LimitGuard(self._queue, self._sequencer)
         self._homing = HomingRuns(settings, self._queue, self)
+        self._motion_watch = HostWatch(settings, tick_s, self._law.velocity_limit)
         self._limp = np.zeros(n, dtype=bool)
         self._any_limp = False
         self._offset = np.zeros(n)
@@ -434,11 +437,27 @@ class AxisBank:
         if not self._seen:
             self._first_measurement(told, now_ns)
         np.subtract(raw, self._last_raw, out=scratch)
+        if self._motion_watch.is_due(now_ns, scratch):
+            self._look(now_ns)
         scratch /= dt
         scratch -= velocity
         scratch *= dt / (self._filter + dt)
         velocity += scratch
         self._last_raw[:] = raw
+
+    def _look(self, now_ns: int) -> None:
+        """Put axes in fault that move as nobody has told them."""
+        found = self._motion_watch.look(
+            now_ns,
+            self._raw,
+            self._last_raw,
+            self._desired_velocity,
+            self._sequencer.kind == HOLD,
+            self._limp,
+        )
+        for finding in found:
+            if not self._queue.latched[finding.axis] & (POSITION_LOST if finding.lost else FAULT):
+                (self.lose_place if finding.lost else self.fault)([finding.axis], finding.text, now_ns)
 
     def _first_measurement(self, told: NDArray[np.float64], now_ns: int) -> None:
         self._seen = True

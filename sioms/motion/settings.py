@@ -153,7 +153,7 @@ class Restore:
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """What motion of an axis is a fault (see watch.py).
+    """What motion of an axis is a fault (see watch.py, and host_watch.py for loops that the host closes).
 
     Args:
         uncommanded: motion that nobody commanded is one; false for an axis that is guided by hand or moved by others.
@@ -204,7 +204,7 @@ class AxisSettings:
         deadband: a point move of an axis at rest that is shorter than this is not carried out [unit].
         start_velocity: speed that is taken up and given up at once [unit/s]; steppers only.
         restore: when the position is taken over from the process before, None: never.
-        watch: what motion of a drive that closes its own loop is a fault.
+        watch: what motion is a fault.
         modes: control-mode flags that a drive offers (drives that close their own loop).
     """
 

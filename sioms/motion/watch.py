@@ -234,8 +234,7 @@ class MotionWatch:
         state.reference, state.since_ns = place, now_ns
 
     def _tolerance(self, axis: int) -> float:
-        given = self._settings[axis].watch.tolerance
-        return JITTER_S * self._settings[axis].velocity_max if given is None else given
+        return tolerance_of(self._settings[axis])
 
     def _fastest(self, axis: int) -> float:
         return (1 + self._settings[axis].watch.speed_margin) * float(self._velocity[axis])
@@ -283,7 +282,7 @@ class MotionWatch:
         first, second = abs(state.doubted - state.place), abs(place - state.doubted)
         between_s = (now_ns - state.doubted_ns) / 1e9
         gap = state.doubted_ns - state.stamp_ns > GAP_NS
-        before, name, unit = state.place, self._settings[axis].name, self._settings[axis].unit
+        before, reference = state.place, state.reference
         held = state.order is Order.HOLD and watched
         if held:
             first_s = (state.doubted_ns - state.stamp_ns) / 1e9
@@ -291,20 +290,14 @@ class MotionWatch:
             jumped = gap or (first > self._tolerance(axis) and stands)
         else:
             jumped = gap or second <= self._fastest(axis) * (between_s + max(LATE_S, state.doubted_late_s))
-        tolerance, reference = self._tolerance(axis), state.reference
         self._rest_at(state, now_ns, place, velocity)
         state.late_s = late_s
         if jumped:
-            within_s = (now_ns - state.doubted_ns) / 1e9 if not gap else 0.0
-            text = f"position lost: axis {name} read {before:.6g} {unit} and reads {place:.6g} {unit}"
-            how = "after a gap in its readings" if gap else f"within {within_s:.3g} s"
-            return Finding(axis, f"{text} {how}, where it cannot have gone by itself", lost=True)
+            within_s = (now_ns - state.doubted_ns) / 1e9 if not gap else None
+            return Finding(axis, lost_text(self._settings[axis], before, place, within_s), lost=True)
         if held:
-            text = (
-                f"axis {name} moves though nothing was commanded: from {reference:.6g} to {place:.6g} {unit}"
-            )
             return Finding(
-                axis, f"{text} at {velocity:.3g} {unit}/s; at most {tolerance:.3g} {unit} is right", False
+                axis, uncommanded_text(self._settings[axis], reference, place, velocity), lost=False
             )
         return Finding(axis, self._fast_text(axis, velocity), lost=False)
 
@@ -342,11 +335,45 @@ class MotionWatch:
         return state.aways > 1
 
     def _fast_text(self, axis: int, velocity: float) -> str:
-        name, unit, most = self._settings[axis].name, self._settings[axis].unit, float(self._velocity[axis])
-        return f"axis {name} moves at {velocity:.4g} {unit}/s; velocity_max is {most:.4g} {unit}/s"
+        return fast_text(self._settings[axis], velocity, float(self._velocity[axis]))
 
     def _away_text(self, axis: int, state: _State, velocity: float) -> str:
+        if state.order is not Order.POINT:
+            return away_text(self._settings[axis], velocity, state.goal)
         name, unit = self._settings[axis].name, self._settings[axis].unit
-        if state.order is Order.POINT:
-            return f"axis {name} moves away from its target {state.goal:.6g} {unit}: at {state.place:.6g} {unit}, {velocity:.3g} {unit}/s"
-        return f"axis {name} runs at {velocity:.3g} {unit}/s; {state.goal:.3g} {unit}/s were commanded"
+        return f"axis {name} moves away from its target {state.goal:.6g} {unit}: at {state.place:.6g} {unit}, {velocity:.3g} {unit}/s"
+
+
+# --- what is the same for axes whose loop the host closes --------------------------------------------
+
+
+def tolerance_of(axis: AxisSettings) -> float:
+    """Return how far an axis that is to hold may be pushed [unit]."""
+    given = axis.watch.tolerance
+    return JITTER_S * axis.velocity_max if given is None else given
+
+
+def fast_text(axis: AxisSettings, velocity: float, most: float) -> str:
+    """Say that an axis is too fast; velocities in unit/s."""
+    return f"axis {axis.name} moves at {velocity:.4g} {axis.unit}/s; velocity_max is {most:.4g} {axis.unit}/s"
+
+
+def away_text(axis: AxisSettings, velocity: float, commanded: float) -> str:
+    """Say that an axis runs the other way; velocities in unit/s."""
+    return (
+        f"axis {axis.name} runs at {velocity:.3g} {axis.unit}/s; {commanded:.3g} {axis.unit}/s were commanded"
+    )
+
+
+def uncommanded_text(axis: AxisSettings, reference: float, place: float, velocity: float) -> str:
+    """Say that an axis does not hold; places in unit, velocity in unit/s."""
+    unit, most = axis.unit, tolerance_of(axis)
+    text = f"axis {axis.name} moves though nothing was commanded: from {reference:.6g} to {place:.6g} {unit}"
+    return f"{text} at {velocity:.3g} {unit}/s; at most {most:.3g} {unit} is right"
+
+
+def lost_text(axis: AxisSettings, before: float, place: float, within_s: float | None) -> str:
+    """Say that an axis is where it cannot be; places in unit, the time None after a gap in the readings [s]."""
+    text = f"position lost: axis {axis.name} read {before:.6g} {axis.unit} and reads {place:.6g} {axis.unit}"
+    how = "after a gap in its readings" if within_s is None else f"within {within_s:.3g} s"
+    return f"{text} {how}, where it cannot have gone by itself"

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
+
+TREE = Path(__file__).resolve().parents[2]
 
 CORE = {"msgpack", "msgspec", "numpy", "ruckig", "serial"}
 WITHOUT = "import sys\nfor name in ('gpiod', 'matplotlib', 'numba'): sys.modules[name] = None\n"
@@ -53,3 +58,13 @@ def test_what_is_missing_is_named(
     assert done.returncode == 1
     assert f"is not installed; run: pip install 'sioms[{extra}]'" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_every_extra_that_is_named_is_one() -> None:
+    with open(TREE / "pyproject.toml", "rb") as file:
+        extras = set(tomllib.load(file)["project"]["optional-dependencies"])
+    for folder in ("sioms", "drivers", "daemon", "tools", "docs"):
+        for path in sorted((TREE / folder).rglob("*")):
+            if path.suffix in (".py", ".md") and not path.is_symlink():
+                named = set(re.findall(r"sioms\[(\w+)\]", path.read_text(encoding="utf-8")))
+                assert named <= extras, path

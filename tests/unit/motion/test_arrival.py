@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from motion_rig import MODE, Rig, axis
 
-from sioms.motion import Arrival, AxisKind, Backlash, CommandError, EventKind, Restore
+from sioms.motion import Arrival, AxisKind, Backlash, CommandError, EventKind, Restore, Watch
 from sioms.protocol.flags import AxisStatus as S
 
 D = 0.1
@@ -15,7 +15,8 @@ TOLERANCE = 1e-3
 
 
 def stepper(**changes):
-    return axis(**{"kind": AxisKind.STEPPER, "k": None, **changes})
+    loose = Watch(tolerance=1.0)  # what slips here does so at once
+    return axis(**{"kind": AxisKind.STEPPER, "k": None, "watch": loose, **changes})
 
 
 def slipping(*losses):

@@ -48,7 +48,7 @@ def test_timed_velocity_that_nothing_follows_stops_at_maximum_deceleration():
 
 
 def test_timed_force_ends_in_holding_where_the_axis_is():
-    rig = Rig([axis()], plant=lambda output, dt: np.array([0.25]))
+    rig = Rig([axis()], start=[0.25], plant=lambda output, dt: np.array([0.25]))
     rig.tick(5)
     rig.write(mode=MODE.FORCE | MODE.SPECIFIED_TIME, force=3.0, time=0.1)
     rig.tick(50)
