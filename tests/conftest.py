@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import itertools
+import json
 import os
 import re
 import shutil
@@ -49,6 +50,21 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_runtest_setup(item: pytest.Item) -> None:
     if item.get_closest_marker("root") and os.geteuid() != 0:
         pytest.skip("needs the rights of root")
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Add how long each file took to the file in SIOMS_TEST_DURATIONS (see quick.py)."""
+    target = os.environ.get("SIOMS_TEST_DURATIONS")
+    if not target:
+        return
+    taken: dict[str, float] = {}
+    for report in terminalreporter.getreports(""):
+        if isinstance(report, pytest.TestReport):
+            path = report.nodeid.partition("::")[0]
+            taken[path] = taken.get(path, 0.0) + report.duration
+    known = json.loads(Path(target).read_text()) if Path(target).exists() else {}
+    known.update({path: round(seconds, 1) for path, seconds in taken.items()})
+    Path(target).write_text(json.dumps(known, indent=0, sort_keys=True) + "\n")
 
 
 _libc = ctypes.CDLL(None)
