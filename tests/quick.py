@@ -127,7 +127,7 @@ def test_files(known: Iterable[str]) -> dict[str, set[str]]:
     found: dict[str, set[str]] = {}
     for name, path in paths.items():
         text = path.read_text(encoding="utf-8")
-        named = {word for word in re.findall(r"\bsioms(?:\.\w+)+", text)}
+        named = set(re.findall(r"\bsioms(?:\.\w+)+", text))
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.ImportFrom) and node.module:
                 named.add(node.module)
