@@ -171,6 +171,15 @@ class TestMoxa:
         joined.poll(1.0)
         assert joined.unit.blocks[1].data[0] == 0b11, "what it has on, it reads"
 
+    def test_a_restart_while_the_link_was_lost_is_seen_by_the_next_opening(self) -> None:
+        joined = block()
+        assert joined.run(joined.unit._guard.open()) is False
+        joined.now_s += 3.0
+        assert joined.run(joined.unit._guard.open()) is False, "the cable alone"
+        joined.device.power_off()
+        joined.device.power_on()
+        assert joined.run(joined.unit._guard.open()) is True
+
     def test_a_block_without_these_registers_is_taken(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Older firmware has neither flag nor uptime: they prove nothing, and that is told."""
         joined = block()

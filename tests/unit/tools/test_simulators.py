@@ -9,7 +9,7 @@ import pytest
 
 from sioms.drivers.ati_rdt import simulator as ati_rdt
 from sioms.drivers.framed_adc import simulator as adc
-from sioms.drivers.modbus.simulated import leadshine, oriental_az
+from sioms.drivers.modbus.simulated import leadshine, oriental_az, wago
 from sioms.drivers.modbus.simulated.moxa import Block
 from sioms.drivers.schunk_ft import simulator as schunk_ifb
 from sioms.simulation.control import obey
@@ -208,6 +208,17 @@ class TestOrientalAz:
         drive.raise_alarm(0x41)
         drive.write(16, 0x180, [0, 1])
         assert drive.state()["alarm"] == 0x41  # needs a power cycle
+
+
+def test_the_watchdog_of_the_coupler_starts_only_when_its_trigger_is_modified() -> None:
+    """The manual's words: of two openings of its life that write the same value, the second starts nothing."""
+    clock = Clock()
+    coupler = wago.Coupler(8, 8, 2, clock)
+    for value, runs in ((1, True), (1, False), (2, True), (0, False)):
+        coupler.write(wago.SIMPLE_STOP, [0xAA55])
+        coupler.write(wago.TIME, [10])
+        coupler.write(wago.TRIGGER, [value])
+        assert coupler.state()["armed"] is runs, value
 
 
 def test_the_block_counts_and_drops_its_outputs() -> None:
