@@ -16,7 +16,6 @@ from sioms.reconcile.bounces import rattles
 from sioms.reconcile.changes import change, settled
 from sioms.reconcile.channels import with_resolution
 from sioms.reconcile.conclude import LARGE, LEAST_ODD, UNEXPLAINED, Searched, conclude
-from sioms.reconcile.effect import Slot
 from sioms.reconcile.effects import known
 from sioms.reconcile.effects.terms import TERMS
 from sioms.reconcile.excitation import Gate, gate
@@ -36,7 +35,6 @@ from sioms.reconcile.verdict import Verdict
 #: A change in time leaves at most this share of what else would be left above the noise; of several that leave about the same, or no more than
 #: noise, the one with the fewest numbers in all is taken.
 HALVED, ROUGHLY, ABOUT = 0.5, 2.0, 1.25
-WARM = (Slot.THERMAL, Slot.WARMING)
 #: Above this multiple, and with this share of the disagreement left, nothing is named at all.
 HOPELESS, HALF = 5.0, 0.33
 #: Above this multiple a nameless term is looked for, though no smoother explains anything (a bend in force is no function of motion).
@@ -174,7 +172,7 @@ def _changed(s: Searched) -> Timed | None:
 
 def warm(model: AxisModel) -> bool:
     """Say whether a number changes by what the axis did before."""
-    return any(known()[n].slot in WARM for n in model.effects)
+    return any(known()[n].mechanism.warms for n in model.effects)
 
 
 def _terms(model: AxisModel) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sioms.reconcile.effect import Array, Slot
+from sioms.reconcile.effect import Array
 from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Fit, Free, Problem, descended, free_parameters, get, put, refit, shifted
 from sioms.reconcile.model import AxisModel
@@ -30,7 +30,7 @@ STEPS, TOLERANCE = 4, 1e-3
 
 def rattles(model: AxisModel) -> bool:
     """Say whether there is a gap, whose bounces leave more than noise does."""
-    return any(known()[n].slot is Slot.BACKLASH for n in model.effects)
+    return any(known()[n].mechanism.bounces for n in model.effects)
 
 
 def polish(
@@ -45,7 +45,7 @@ def polish(
     Args:
         bent: the same problem, as it is fitted after the search.
     """
-    name = next(n for n in model.effects if known()[n].slot is Slot.BACKLASH)
+    name = next(n for n in model.effects if known()[n].mechanism.bounces)
     first = problem.residual(model)
     scale = spread(first)
     best, cost = model, rough(first, scale)

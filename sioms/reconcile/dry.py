@@ -20,12 +20,12 @@ def dry_friction(model: AxisModel, x: Array, v: Array, u: Array, temperature: Ar
     total, share = np.zeros_like(x), np.ones_like(x)
     laws = [(known()[n], known()[n].values(given)) for n, given in model.effects.items()]
     for effect, p in laws:
-        if effect.slot is Slot.VARIATION:
+        if effect.mechanism.varies:
             share *= 1.0 + p[0] * np.sin(p[2] * 2.0 * np.pi / model.pitch * x + p[1])
     for effect, p in laws:
-        if effect.slot in (Slot.FRICTION, Slot.WARMING):
+        if effect.slot is Slot.FRICTION:
             total -= share * way * effect.evaluate(x, v, u, temperature, effect.row(p, model.pitch))
-        elif effect.slot is Slot.HYSTERESIS:
+        elif effect.mechanism.builds_up:
             rest, drop = (p[2], np.exp(-((v / p[3]) ** 2))) if len(p) > 2 else (p[0], 0.0 * v)
             total -= built_up(x, share * (p[0] + (rest - p[0]) * drop), rest / p[1])
     return total

@@ -1,6 +1,6 @@
 """What an effect is: one small object that says everything the workflow, a plant and a reader need.
 
-An effect enters the simulation through exactly one slot. State functions have the signature
+An effect enters the simulation as a state function, or through a mechanism of its own. State functions have the signature
 ``f(x, v, u, temperature, p)`` with x position [m | rad], v velocity, u actuator force after the
 drive [N | N m], temperature the dimensionless heat state and p the parameters in the order of
 ``Effect.parameters`` and 2 pi / pitch in ``p[TURN]``; written without branches, the plain form takes arrays of axes, and
@@ -9,7 +9,7 @@ drive [N | N m], temperature the dimensionless heat state and p the parameters i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -38,28 +38,77 @@ class Channel(Enum):
 
 
 class Slot(Enum):
-    """How an effect enters the time step."""
+    """What the state function of an effect returns."""
 
     FORCE = "force"  # added generalised force f(x, v, u, T, p) [force]
     FRICTION = "friction"  # level >= 0 of dry friction, opposing motion, holding at rest [force]
     GAIN = "gain"  # factor on the actuator force [1]
-    INERTIA = "inertia"  # p[0] added to the inertia
-    DELAY = "delay"  # p[0] transport delay of the command [s]
-    LAG = "lag"  # p[0] time constant of the drive [s]
-    LIMIT = "limit"  # p[0] largest actuator force [force]
-    THERMAL = "thermal"  # gain 1 - p[0] T, T' = ((u / rated)^2 - T) / p[1]
-    # friction p[0] that builds up over the displacement p[1] after reversal; at rest of level p[2], dropping over the speed p[3]
-    HYSTERESIS = "hysteresis"
-    ELASTIC = "elastic"  # two masses: resonance p[0] [Hz], load fraction p[1], damping ratio p[2]
-    BACKLASH = "backlash"  # two masses: gap p[0], load fraction p[1]
-    SCALE = "scale"  # measured = p[0] * true
-    ECCENTRICITY = "eccentricity"  # measured = true + p[0] sin(theta + p[1])
-    MODULATION = "modulation"  # inertia J + p[0] sin(p[2] theta + p[1])
-    VARIATION = (
-        "variation"  # dry friction, of levels and hysteresis alike, times 1 + p[0] sin(p[2] theta + p[1])
-    )
-    WARMING = "warming"  # friction level p[0] T beside the others, T' = (|v| - T) / p[1]
-    LATTICE = "lattice"  # counts come in multiples of p[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Mechanism:
+    """A part of an effect that is no function of the state: numbers that the time step reads from the plant row.
+
+    Attributes:
+        enter: (row, p) writes the numbers p into the row, by the names of ``kernel``'s places in lower case.
+        twin: (p, pitch) returns the effects of ``sioms.plant.effects`` that mean the same; None where no plant can carry it out.
+        last: enters after all others, as it needs the whole inertia.
+        substeps: steps in a millisecond that it needs.
+        bounces: impacts whose timing shifts with any number: the cost of a fit is rough.
+        warms: what it does depends on what the axis did before.
+        builds_up: friction p[0] over the displacement p[1] after a reversal; at rest of level p[2], dropping over the speed p[3].
+        varies: dry friction, of levels and of what builds up alike, times 1 + p[0] sin(p[2] theta + p[1]).
+        column: (motion, wave number, phase, dry friction) returns the force per unit of the first parameter, for the screening.
+    """
+
+    enter: Callable[[Any, Array], None] = lambda row, p: None
+    twin: Callable[[Array, float], Mapping[str, Mapping[str, float]]] | None = None
+    last: bool = False
+    substeps: int = 2
+    bounces: bool = False
+    warms: bool = False
+    builds_up: bool = False
+    varies: bool = False
+    column: Callable[[Any, float, float, Array], Array] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What first guesses of an effect go by.
+
+    Attributes:
+        scales: natural size of each of its parameters on this axis.
+        pitch, max_speed: of the axis.
+        force: largest force in the records; travel: range of motion of the longest.
+        bounces: whether something in the model does.
+    """
+
+    scales: Mapping[str, float]
+    pitch: float
+    max_speed: float
+    force: float
+    travel: float
+    bounces: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Trials:
+    """How an effect that is not linear in the state is screened: tried in the simulation on a small grid.
+
+    Attributes:
+        guesses: values that differ from the parameters' starts.
+        further: other values that the best ``FEW`` are tried with.
+        kept: so many of them are fitted.
+        stretched: its size is a guess, and is stretched to what the records show.
+    """
+
+    guesses: Callable[[Seen], Iterable[Mapping[str, float]]]
+    further: tuple[Mapping[str, float], ...] = ()
+    kept: int = 1
+    stretched: bool = True
+
+
+NONE = Mechanism()
 
 
 class Ref(Enum):
@@ -86,6 +135,9 @@ class Parameter:
     ``phase`` marks an angle: free, wrapped, without bounds that mean anything.
     ``shape`` marks a force in which the effect is not linear.
     ``least`` is the smallest size (of a factor: distance from one), either way, that is named; what is smaller may belong to something else.
+    ``soft`` marks one that may lie at its bound: a contact harder than what is seen is as good as hard.
+    ``vanishes`` marks one that at its lower bound makes another effect of this, as every time constant does.
+    ``steps``: what is within so many steps of the encoder is not seen.
     """
 
     symbol: str
@@ -99,6 +151,9 @@ class Parameter:
     phase: bool = False
     least: float = 0.0
     shape: bool = False
+    soft: bool = False
+    vanishes: bool = False
+    steps: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,12 +161,17 @@ class Effect:
     """One physical effect. Immutable; share it freely between threads.
 
     Attributes:
-        function: state function of the FORCE, FRICTION and GAIN slots, else None.
+        function: state function, if it has one, and slot: what that returns.
+        mechanism: what it is beside, or instead of, that.
+        trials: how it is screened; None for one that is linear in a function of the state.
+        neutral: value of the first parameter at which nothing changes.
+        sized: the first parameter says how large the effect is.
         rotary, linear: kinds of axis on which it makes sense.
         rankable: False where moving data can never tell it from its look-alike.
         replaces: effects that this one contains or excludes; switching it on switches them off.
         joins: effects of which this one is both at once: it is tried where one of them is in the model already.
         beside: effects one of which must be in the model for this one to be tried; none: it may stand alone.
+        takes: (symbol, symbol): in the place of a look-alike that has the second number, the first is that.
         ratios: (symbol, symbol, most): the first number is at most so many times the second.
         session: parameters that belong to the session and not to the axis.
     """
@@ -119,13 +179,17 @@ class Effect:
     name: str
     title: str
     channel: Channel
-    slot: Slot
     equation: str
     parameters: tuple[Parameter, ...]
     signature: str
     lookalikes: tuple[str, ...]
     separate: str
+    slot: Slot | None = None
     function: StateFunction | None = None
+    mechanism: Mechanism = NONE
+    trials: Trials | None = None
+    neutral: float = 0.0
+    sized: bool = True
     rotary: bool = True
     linear: bool = True
     rankable: bool = True
@@ -134,11 +198,17 @@ class Effect:
     joins: tuple[str, ...] = ()
     beside: tuple[str, ...] = ()
     ratios: tuple[tuple[str, str, float], ...] = ()
+    takes: tuple[tuple[str, str], ...] = ()
 
     @property
     def primary(self) -> Parameter:
         """The first parameter says how large the effect is."""
         return self.parameters[0]
+
+    @property
+    def is_friction(self) -> bool:
+        """Whether it is dry friction, whose level follows the run-in of the axis."""
+        return self.mechanism.builds_up or (self.slot is Slot.FRICTION and not self.mechanism.warms)
 
     def values(self, given: Mapping[str, float]) -> Array:
         """Order named values.
@@ -178,11 +248,20 @@ class Effect:
             Force, friction level or gain, shape (n,), by the slot.
 
         Raises:
-            TypeError: the slot has no state function.
+            TypeError: the effect has no state function.
         """
         if self.function is None:
-            raise TypeError(
-                f"evaluate effect {self.name}: slot {self.slot.value} is no function of the state"
-            )
+            raise TypeError(f"evaluate effect {self.name}: it is no function of the state")
         out = self.function(x, v, u, temperature, p)
         return np.broadcast_to(np.asarray(out, dtype=np.float64), np.shape(x)).copy()
+
+    def force(self, x: Array, v: Array, u: Array, temperature: Array, way: Array, p: Array) -> Array:
+        """Return the force on the axis of the state function on a motion, shape (n,); ``way``: direction, -1 to 1."""
+        value = self.evaluate(x, v, u, temperature, p)
+        match self.slot:
+            case Slot.FRICTION:
+                return -value * way
+            case Slot.GAIN:
+                return u * (value - 1.0)
+            case _:
+                return value

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sioms.reconcile.effect import Array, Effect, Slot
+from sioms.reconcile.effect import Array, Effect
 from sioms.reconcile.effects import library
 from sioms.reconcile.fit import Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.screen import (
-    STATE_SLOTS,
     dead_band,
     range_of,
     shapes,
@@ -70,11 +69,11 @@ def common(a: Array, b: Array) -> float:
 
 
 def _trace(problem: Problem, model: AxisModel, effect: Effect) -> Array | None:
-    """Trace of the effect at its typical size, one column per amplitude and phase; None for a lattice, or beside nothing."""
-    if effect.slot is Slot.LATTICE or not accompanied(model, effect.name):
+    """Trace of the effect at its typical size, one column per amplitude and phase; None where it leaves none."""
+    if not accompanied(model, effect.name):
         return None
     size = effect.primary.start * model.scale(effect.primary)
-    if effect.slot in STATE_SLOTS:
+    if effect.trials is None:
         motions, dead = smoothed_motion(problem, model), dead_band(problem, model)
         shape = next(shapes(effect, model, range_of(motions)), None)
         if shape is None:  # the range holds no period of any order

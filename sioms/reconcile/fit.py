@@ -298,7 +298,7 @@ def refit(
         return Fit(model, free, r, np.empty((len(r), 0)))
 
     fit = descended(problem, model, free, iterations, tolerance)
-    smooth = tuple(f for f in free if f.effect == BASE or known()[f.effect].slot is not Slot.BACKLASH)
+    smooth = tuple(f for f in free if f.effect == BASE or not known()[f.effect].mechanism.bounces)
     if 0 < len(smooth) < len(free):  # whose steps fail wherever a gap is to take part in them
         model = descended(problem, fit.model, smooth, 2 * iterations, 0.1 * tolerance).model
         r = problem.residual(model)

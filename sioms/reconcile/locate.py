@@ -77,12 +77,9 @@ def _known_force(model: AxisModel, m: Motion, dead: float) -> Array:
     total = dry_friction(model, m.x, m.v, m.u, m.temperature, direction(m.v, dead))
     for name, given in model.effects.items():
         effect = known()[name]
-        if effect.function is None or effect.slot in (Slot.FRICTION, Slot.WARMING):
-            continue
-        f = effect.evaluate(m.x, m.v, m.u, m.temperature, effect.row(effect.values(given), model.pitch))
-        if effect.slot is Slot.GAIN:
-            f = m.u * (f - 1.0)
-        total += f
+        if effect.slot in (Slot.FORCE, Slot.GAIN):
+            row = effect.row(effect.values(given), model.pitch)
+            total += effect.force(m.x, m.v, m.u, m.temperature, m.v, row)
     return total
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -111,6 +112,26 @@ class AxisModel:
     def applicable(self, effect: Effect) -> bool:
         """Say whether the effect makes sense on this kind of axis."""
         return effect.rotary if self.rotary else effect.linear
+
+
+def plant_row(model: AxisModel) -> SimpleNamespace:
+    """Lay a model out as the time step reads it: numbers by the names of ``kernel``'s places, in lower case; what is absent is 0."""
+    row = SimpleNamespace(
+        inertia=model.inertia,
+        viscous=model.viscous,
+        dt=model.sample_time_s,
+        quantum=model.resolution,
+        gain_y=1.0,
+        turn_x=2.0 * np.pi / model.pitch,
+        limit=np.inf,
+        rated=model.rated_force,
+        tau_t=1.0,
+        hyst_x=1.0,
+    )
+    entering = [(known()[name], given) for name, given in model.effects.items()]
+    for effect, given in sorted(entering, key=lambda e: e[0].mechanism.last):
+        effect.mechanism.enter(row, effect.values(given))
+    return row
 
 
 def controller_row(model: AxisModel) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sioms.reconcile.blocks import better
-from sioms.reconcile.effect import Array, Ref, Slot
+from sioms.reconcile.effect import Array, Ref
 from sioms.reconcile.effects import known, library
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.model import AxisModel
@@ -14,8 +14,6 @@ from sioms.reconcile.variation import named
 
 #: A refitted candidate: fit, held-out losses, share saved, standard errors.
 Tried = tuple[Fit, Array, float, float]
-#: Of a displacement within so many steps of the encoder nothing is seen.
-UNSEEN_STEPS = 2.0
 AND = " and "
 
 
@@ -28,8 +26,7 @@ def swapped(model: AxisModel, name: str, other: str) -> AxisModel:
     """Put another effect in the place of one, keeping the values of parameters that both have."""
     plain = {p.symbol: p.start * model.scale(p) for p in known()[other].parameters}
     shared = {k: v for k, v in model.effects[name].items() if k in plain}
-    if known()[name].slot is Slot.BACKLASH and known()[other].slot is Slot.ELASTIC:
-        shared["f_res"] = model.effects[name]["f_contact"]  # a contact that is never left
+    shared |= {k: model.effects[name][o] for k, o in known()[other].takes if o in model.effects[name]}
     return named(model.without_effect(name).with_effect(other, {**plain, **shared}))
 
 
@@ -95,15 +92,14 @@ def leans(model: AxisModel, name: str) -> bool:
     if any(given[a] > most * given[b] for a, b, most in effect.ratios):
         return True
     free = [q for q in effect.parameters if not q.phase and not q.fixed]
-    least = (Ref.TIME, Ref.SPEED, Ref.PITCH) if effect.slot is Slot.HYSTERESIS else (Ref.TIME,)
-    if any(q.ref in least and 0.0 < given[q.symbol] < 1.02 * q.lower * model.scale(q) for q in free):
+    least = [q for q in free if q.vanishes or q.ref is Ref.TIME]
+    if any(0.0 < given[q.symbol] < 1.02 * q.lower * model.scale(q) for q in least):
         return True
-    paths = [q for q in free if q.ref is Ref.PITCH and effect.slot is Slot.HYSTERESIS]
-    if any(0.0 < given[q.symbol] < UNSEEN_STEPS * model.resolution for q in paths):
+    if any(0.0 < given[q.symbol] < q.steps * model.resolution for q in free if q is not effect.primary):
         return True
-    for q in [effect.primary] if effect.slot in (Slot.BACKLASH, Slot.THERMAL) else free:
+    for q in [q for q in free if not q.soft]:
         low, high = (bound * model.scale(q) for bound in (q.lower, q.upper))
-        signed = q.lower < 0.0 or effect.slot is Slot.SCALE
+        signed = q.lower < 0.0 or effect.neutral != 0.0
         if given[q.symbol] > 0.98 * high or (signed and given[q.symbol] < low + 0.02 * abs(low)):
             return True
     return False
@@ -112,12 +108,10 @@ def leans(model: AxisModel, name: str) -> bool:
 def small(model: AxisModel, name: str) -> bool:
     """Say whether an effect has become smaller than it may be to be named."""
     effect = known()[name]
-    if effect.slot in (Slot.LIMIT, Slot.ELASTIC):
+    if not effect.sized:
         return False
     p = effect.primary
-    if effect.slot is Slot.SCALE:
-        return abs(model.effects[name][p.symbol] - p.start) <= p.least
-    least = max(p.lower, p.least, 1e-4 * p.start) * model.scale(p)
-    if effect.slot is Slot.BACKLASH:  # within a step of the sensor nothing is seen of a gap
-        least = max(least, model.resolution)
+    if effect.neutral:
+        return abs(model.effects[name][p.symbol] - effect.neutral) <= p.least
+    least = max(max(p.lower, p.least, 1e-4 * p.start) * model.scale(p), p.steps * model.resolution)
     return abs(model.effects[name][p.symbol]) <= 1.01 * least

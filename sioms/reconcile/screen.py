@@ -17,37 +17,21 @@ from scipy.signal import butter, sosfiltfilt
 
 from sioms.reconcile.bounces import rattles
 from sioms.reconcile.dry import dry_friction
-from sioms.reconcile.effect import Array, Effect, Parameter, Ref, Slot
+from sioms.reconcile.effect import Array, Effect, Parameter, Ref, Seen, Slot, Trials
 from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.simulate import replay
 from sioms.reconcile.variation import room_for
 
-#: Trial values, as multiples of a parameter's scale, of effects that are not forces of the state.
-GRID_DELAY = (0.5e-3, 2e-3, 5e-3)
-GRID_RESONANCE = (7.0, 11.0, 16.0, 24.0, 36.0, 55.0)
-GRID_GAP = tuple(float(g) for g in np.geomspace(3e-4, 0.18, 24))
-#: A contact that bounces makes a cost of many minima; started with one that does not, it would not find all that do. The best
-#: few gaps of the first contact are tried with the others.
-CONTACTS = tuple(
-    {"load_fraction": f, "zeta": z} for f, z in ((0.4, 0.3), (0.6, 0.3), (0.4, 0.05), (0.6, 0.05))
-)
-FEW = 4
-GRID_LIMIT = (0.95, 0.85, 0.7, 0.5, 0.3)
-GRID_TAU = (3.0, 10.0, 40.0)
-STEP_LENGTH = 3.5  # from one trial of a length to the next
-GRID_DROP = (0.003, 0.01, 0.03, 0.1)  # speeds of a drop, of the largest
+FEW = 4  # trials that further values are tried with
 #: First guesses of the level at speed and of the breakaway level, of a level that stood for both.
 DROPS = ((1.0, 1.4), (0.85, 1.05))
-GRID_PHASE = np.linspace(-np.pi, np.pi, 9)[1:]
-SIZES = (1.0, 0.7, 0.4)  # where bounces fall out otherwise with each
 SPEED_STEPS, PLACES = 7, 15
 #: Below this the measured motion stands for one without noise; a command is followed up to COMMAND_HZ, if to this share.
 SLOW_HZ, COMMAND_HZ, FOLLOWED = 5.0, 30.0, 0.2
 #: A regression on more rows than this leaves some out.
 MOST_ROWS = 40_000
-STATE_SLOTS = (Slot.FORCE, Slot.FRICTION, Slot.GAIN, Slot.MODULATION, Slot.VARIATION)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,36 +91,20 @@ def state_columns(
     """Forces per unit of each amplitude of a state effect (two columns where it has a phase), shape (n, k)."""
     columns = []
     m, way = motion, direction(motion.v, dead)
-    dry = dry_friction(model, m.x, m.v, m.u, m.temperature, way) if effect.slot is Slot.VARIATION else way
+    own = effect.mechanism.column
+    dry = dry_friction(model, m.x, m.v, m.u, m.temperature, way) if effect.mechanism.varies else way
     for amplitude, phase in amplitudes(effect):
         for turn in (0.0, np.pi / 2) if phase is not None else (0.0,):
+            if own is not None:
+                columns.append(own(m, shape["n"] * 2.0 * np.pi / model.pitch, turn, dry))
+                continue
             values = {p.symbol: shape.get(p.symbol, 0.0) for p in effect.parameters}
             values[amplitude.symbol] = 1.0
             if phase is not None:
                 values[phase.symbol] = turn
             row = effect.row(effect.values(values), model.pitch)
-            if effect.slot is Slot.MODULATION:
-                columns.append(_modulation(model, m, shape, turn))
-                continue
-            if effect.slot is Slot.VARIATION:
-                columns.append(dry * np.sin(shape["n"] * 2.0 * np.pi / model.pitch * m.x + turn))
-                continue
-            f = effect.evaluate(m.x, m.v, m.u, m.temperature, row)
-            if effect.slot is Slot.FRICTION:
-                f = -f * way
-            elif effect.slot is Slot.GAIN:
-                f = m.u * (f - 1.0)
-            columns.append(f)
+            columns.append(effect.force(m.x, m.v, m.u, m.temperature, way, row))
     return np.stack(columns, axis=1)
-
-
-def _modulation(model: AxisModel, motion: Motion, shape: dict[str, float], phase: float) -> Array:
-    """Force of a unit inertia that varies over the turn: -(s a + s' v^2 / 2)."""
-    w = shape["n"] * 2.0 * np.pi / model.pitch
-    f: Array = -(
-        np.sin(w * motion.x + phase) * motion.a + 0.5 * motion.v**2 * w * np.cos(w * motion.x + phase)
-    )
-    return f
 
 
 def amplitudes(effect: Effect) -> list[tuple[Parameter, Parameter | None]]:
@@ -208,7 +176,7 @@ def screen(
     out = []
     for name in names:
         effect = lib[name]
-        if effect.slot in STATE_SLOTS:
+        if effect.trials is None:
             out.append(_screen_state(problem, fit, effect, motions, q, rest, dead, travel, levels or {}))
         else:
             out.extend(_screen_trials(problem, fit, effect, q, rest, levels or {}))
@@ -367,55 +335,32 @@ def _values(
 def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator[dict[str, float]]:
     """Yield trial values of an effect that is no force of the state."""
     start = {p.symbol: p.start * model.scale(p) for p in effect.parameters}
-    first = effect.parameters[0].symbol
-    peak = max(float(np.max(np.abs(r.force))) for r in problem.session.records)
-    match effect.slot:
-        case Slot.DELAY | Slot.LAG:
-            grid: tuple[dict[str, float], ...] = tuple({first: g} for g in GRID_DELAY)
-        case Slot.ELASTIC:
-            grid = tuple({first: g, "load_fraction": f} for g in GRID_RESONANCE for f in (0.3, 0.6))
-        case Slot.BACKLASH:
-            grid = tuple({first: g * model.pitch, **CONTACTS[0]} for g in GRID_GAP)
-        case Slot.LIMIT:
-            grid = tuple({first: g * peak} for g in GRID_LIMIT)
-        case Slot.WARMING:
-            grid = tuple({"tau": g} for g in GRID_TAU)
-        case Slot.THERMAL:
-            grid = tuple({"tau": g, "loss": 0.1} for g in GRID_TAU)
-        case Slot.HYSTERESIS:
-            reach = 0.5 * max(float(np.ptp(r.position)) for r in problem.session.records)
-            low = 10.0 * effect.parameters[1].lower * model.pitch
-            high = max(min(0.8 * effect.parameters[1].upper * model.pitch, reach), low)
-            steps = 1 + int(np.ceil(np.log(high / low) / np.log(STEP_LENGTH)))
-            lengths = tuple({"xs": float(g)} for g in np.geomspace(low, high, steps))
-            speeds = [{"vs": g * model.max_speed} for g in GRID_DROP] if "vs" in start else [{}]
-            grid = tuple({**length, **speed} for length in lengths for speed in speeds)
-        case Slot.SCALE:
-            grid = ({first: 1.01},)
-        case Slot.ECCENTRICITY:
-            sizes = SIZES if rattles(model) else SIZES[:1]
-            grid = tuple(
-                {first: share * start[first], "phase": float(g)} for share in sizes for g in GRID_PHASE
-            )
-        case _:
-            grid = ({},)
-    for g in grid:
-        yield {**start, **g}
+    records = problem.session.records
+    seen = Seen(
+        {p.symbol: model.scale(p) for p in effect.parameters},
+        model.pitch,
+        model.max_speed,
+        max(float(np.max(np.abs(r.force))) for r in records),
+        max(float(np.ptp(r.position)) for r in records),
+        rattles(model),
+    )
+    for guess in effect.trials.guesses(seen) if effect.trials is not None else ():
+        yield {**start, **guess}
 
 
 def _screen_trials(
     problem: Problem, fit: Fit, effect: Effect, q: Array, rest: Array, levels: Mapping[str, float]
 ) -> list[Start]:
     """Try an effect on a grid in the simulation; the change it makes may be stretched, and turned round where its size has a sign."""
-    model = room_for(fit.model, effect.name)
+    model, way = room_for(fit.model, effect.name), effect.trials or Trials(lambda seen: ())
     trials = [{**t, **levels} for t in trial_values(effect, model, problem)]
     if effect.joins:
         trials = _beside(trials, fit.model, effect)
     best = _scored(problem, fit, model, effect, trials, q, rest, stretched=not levels)
-    if effect.slot is Slot.BACKLASH:
-        others = [{**s.values, **contact} for s in best[:FEW] for contact in CONTACTS[1:]]
+    if way.further:
+        others = [{**s.values, **further} for s in best[:FEW] for further in way.further]
         best = sorted(best + _scored(problem, fit, model, effect, others, q, rest), key=lambda s: -s.gain)
-    return best[: 2 if effect.slot in (Slot.ELASTIC, Slot.BACKLASH) else 1]
+    return best[: way.kept]
 
 
 def _scored(
@@ -434,7 +379,7 @@ def _scored(
         stretched: their sizes are only typical, and are stretched to what is seen; else they are those of what they replace.
     """
     best: list[Start] = []
-    least = -9.0 if effect.slot is Slot.SCALE or effect.primary.lower < 0.0 else 0.0
+    least = -9.0 if effect.neutral or effect.primary.lower < 0.0 else 0.0
     for values, tried in zip(
         trials,
         problem.mapper(lambda v: problem.residual(model.with_effect(effect.name, v)), trials),
@@ -468,10 +413,9 @@ def _stretched(
 ) -> dict[str, float]:
     """Scale the amplitude where the effect is linear in it."""
     p = effect.parameters[0]
-    neutral = {Slot.SCALE: 1.0}.get(effect.slot, 0.0)
-    if effect.joins or effect.slot in (Slot.ELASTIC, Slot.BACKLASH, Slot.LIMIT):
+    if effect.joins or effect.trials is None or not effect.trials.stretched:
         return values
     s = model.scale(p)
-    amplitude = neutral + (values[p.symbol] - neutral) * stretch
+    amplitude = effect.neutral + (values[p.symbol] - effect.neutral) * stretch
     low = max(p.lower * s, 1e-3 * p.start * s) if p.lower >= 0.0 else p.lower * s
     return {**values, p.symbol: float(np.clip(amplitude, low, p.upper * s))}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sioms.reconcile import ladder
 from sioms.reconcile.blocks import better, block_ids, heldout
 from sioms.reconcile.bounces import POLISHED, UNPOLISHED, bent, polish, rattles, rough, spread
-from sioms.reconcile.effect import Array, Slot
+from sioms.reconcile.effect import Array
 from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Fit, Problem, closed_errors, refit, shifted
 from sioms.reconcile.model import AxisModel
@@ -111,7 +111,7 @@ class Searcher:
         return sorted((s for n in names for s in self._starts[key, n]), key=lambda s: -s.gain)
 
     def _fit(self, model: AxisModel, iterations: int, best: float) -> Fit:
-        gap = next((n for n in model.effects if known()[n].slot is Slot.BACKLASH), None)
+        gap = next((n for n in model.effects if known()[n].mechanism.bounces), None)
         if gap is None or iterations <= 4:
             return refit(self.problem, model, self.frozen, iterations)
         new = tuple(model.effects[gap].values()) not in self._polished
@@ -266,7 +266,7 @@ class Searcher:
         """
         tried: dict[str, Tried] = {}
         chosen = self._candidates(fit)
-        for s in sorted(chosen, key=lambda s: known()[s.effect].slot is Slot.BACKLASH):
+        for s in sorted(chosen, key=lambda s: known()[s.effect].mechanism.bounces):
             best = min((t[0].cost for t in tried.values()), default=np.inf)
             self._try(tried, s.effect, self._with(fit, s, 8 if s is chosen[0] else 5, best), losses)
         for effect, new in self._enriched(tried):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sioms.reconcile.effect import Array, Channel, Slot
+from sioms.reconcile.effect import Array, Channel
 from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Problem
 from sioms.reconcile.model import AxisModel
@@ -21,7 +21,6 @@ from sioms.reconcile.simulate import track
 
 STEPS = 4
 OFFSET = "offset"
-FRICTION_SLOTS = (Slot.FRICTION, Slot.HYSTERESIS)
 VISCOUS = ("viscous", "viscous_direction")
 
 
@@ -60,13 +59,13 @@ def knobs(model: AxisModel) -> tuple[str, ...]:
 def _knobs(model: AxisModel) -> list[_Knob]:
     effects = [known()[n] for n in model.effects]
     out = [_Knob("offset", 0.03 * model.rated_force)]
-    if any(e.slot in FRICTION_SLOTS for e in effects):
+    if any(e.is_friction for e in effects):
         out.append(_Knob("dry", 0.1, 0.0))
     if model.viscous > 0.0 or any(e.name in VISCOUS for e in effects):
         out.append(_Knob("viscous", 0.2, 0.0))
     if any(p.phase for e in effects for p in e.parameters if e.channel is not Channel.SENSOR):
         out.append(_Knob("zero", 0.1 * model.pitch))
-    if any(e.slot is Slot.THERMAL for e in effects):
+    if any(e.mechanism.warms and e.channel is Channel.ACTUATOR for e in effects):
         out.append(_Knob("heat", 1.0, 0.0))
     return out
 
@@ -79,7 +78,7 @@ def applied(model: AxisModel, record: Record, state: State) -> tuple[AxisModel, 
         for p in effect.parameters:
             if effect.name in VISCOUS:
                 values[p.symbol] *= state.viscous
-            elif effect.slot in FRICTION_SLOTS and "{F}" in p.unit:
+            elif effect.is_friction and "{F}" in p.unit:
                 values[p.symbol] *= state.dry
     if state.offset:
         held = effects.setdefault(OFFSET, {"off": 0.0})

@@ -1,7 +1,6 @@
 """Run an axis model over records: closed loop or tracking.
 
-The model's effects are packed into the rows that the kernel reads; nothing here depends on which effects
-exist, only on their slots.
+The model's effects are packed into the rows that the kernel reads; nothing here depends on which effects exist.
 """
 
 from __future__ import annotations
@@ -17,14 +16,12 @@ from sioms.reconcile import kernel as k
 from sioms.reconcile.effect import ROW, Array, Slot
 from sioms.reconcile.effects import known
 from sioms.reconcile.jit import addresses
-from sioms.reconcile.model import AxisModel, controller_row
+from sioms.reconcile.model import AxisModel, controller_row, plant_row
 from sioms.reconcile.noise import Noise, Pair, corrections
 from sioms.reconcile.records import Record
 
 #: Corrections of an observer that follows nothing.
 IDLE = (0.0,) * 8
-#: Steps in a millisecond without a transmission, with one, and with contact in one.
-STEPS = {None: 2, Slot.ELASTIC: 4, Slot.BACKLASH: 6}
 #: A record begins in motion that at first makes more way than this share of the largest speed would. Its start is fitted
 #: over so many periods of an elastic transmission, and samples.
 MOVING, PERIODS, FEWEST = 0.01, 4.0, 40
@@ -72,38 +69,23 @@ def pack(model: AxisModel, substeps: int = 0) -> Packed:
     """Pack a model for the kernel.
 
     Args:
-        substeps: steps in a sample; 0 chooses by ``STEPS``.
+        substeps: steps in a sample; 0 chooses by what the effects need.
     """
-    lib = known()
     plant = np.zeros(k.PLANT_SIZE)
-    plant[k.INERTIA], plant[k.VISCOUS] = model.inertia, model.viscous
-    plant[k.DT], plant[k.QUANTUM], plant[k.GAIN_Y] = model.sample_time_s, model.resolution, 1.0
-    plant[k.TURN_X], plant[k.LIMIT] = 2.0 * np.pi / model.pitch, np.inf
-    plant[k.RATED], plant[k.TAU_T], plant[k.HYST_X] = model.rated_force, 1.0, 1.0
-    functions: dict[Slot, list[Any]] = {Slot.FORCE: [], Slot.FRICTION: [], Slot.GAIN: []}
-    rows: dict[Slot, list[Array]] = {s: [] for s in functions}
-    transmission: tuple[Slot, Array] | None = None
-    for name, given in model.effects.items():
-        effect = lib[name]
-        p = effect.values(given)
-        if effect.slot is Slot.WARMING:
-            plant[k.WARMING], plant[k.TAU_T] = 1.0, p[1]
-        slot = Slot.FRICTION if effect.slot is Slot.WARMING else effect.slot
-        if slot in functions:
-            rows[slot].append(effect.row(p, model.pitch))
-            functions[slot].append(effect.function)
-        elif effect.slot in (Slot.ELASTIC, Slot.BACKLASH):
-            transmission = (effect.slot, p)
-        else:
-            _place(plant, effect.slot, p)
-    if transmission is not None:
-        _couple(plant, *transmission)
-    steps = substeps or _steps(transmission, model.sample_time_s)
+    for place, value in vars(plant_row(model)).items():
+        plant[getattr(k, place.upper())] = value
+    effects = [(known()[name], given) for name, given in model.effects.items()]
+    functions: dict[Slot, list[Any]] = {slot: [] for slot in Slot}
+    rows: dict[Slot, list[Array]] = {slot: [] for slot in Slot}
+    for effect, given in effects:
+        if effect.slot is not None:
+            rows[effect.slot].append(effect.row(effect.values(given), model.pitch))
+            functions[effect.slot].append(effect.function)
     return Packed(
         plant,
         {s: addresses(f) for s, f in functions.items()},
         {s: np.array(r).reshape(-1, ROW) for s, r in rows.items()},
-        steps,
+        substeps or _steps(max((e.mechanism.substeps for e, _ in effects), default=2), model.sample_time_s),
     )
 
 
@@ -120,49 +102,9 @@ def linked(packed: Packed) -> Pair | None:
     return Pair(*(float(row[i]) for i in (k.INERTIA, k.LOAD, k.STIFF, k.DAMP, k.VISCOUS)))
 
 
-def _steps(transmission: tuple[Slot, Array] | None, sample_time_s: float) -> int:
-    """Steps in a sample: as many as the fastest motion needs, at slow rates no more than at 1 kHz."""
-    most = STEPS[transmission[0] if transmission else None]
+def _steps(most: int, sample_time_s: float) -> int:
+    """Steps in a sample: as many as the fastest motion needs in a millisecond, at slow rates no more than at 1 kHz."""
     return min(most, math.ceil(most * sample_time_s / 1e-3 - 1e-9))
-
-
-def _place(plant: Array, slot: Slot, p: Array) -> None:
-    """Write the parameters of a slot that has its own place in the plant row."""
-    match slot:
-        case Slot.INERTIA:
-            plant[k.INERTIA] += p[0]
-        case Slot.DELAY:
-            plant[k.DELAY] += p[0]
-        case Slot.LAG:
-            plant[k.LAG] = p[0]
-        case Slot.LIMIT:
-            plant[k.LIMIT] = p[0]
-        case Slot.THERMAL:
-            plant[k.LOSS], plant[k.TAU_T] = p
-        case Slot.HYSTERESIS:
-            plant[k.HYST_F : k.HYST_F + len(p)] = p
-        case Slot.SCALE:
-            plant[k.GAIN_Y] = p[0]
-        case Slot.ECCENTRICITY:
-            plant[k.ECC_AMP], plant[k.ECC_PHASE] = p
-        case Slot.MODULATION:
-            plant[k.MOD_A], plant[k.MOD_PHASE], plant[k.MOD_N] = p
-        case Slot.VARIATION:
-            plant[k.VARY_A], plant[k.VARY_PHASE], plant[k.VARY_N] = p
-        case Slot.LATTICE:
-            plant[k.QUANTUM] *= p[0]
-        case _:
-            raise ValueError(f"pack slot {slot.value}: it has no place in the plant row")
-
-
-def _couple(plant: Array, slot: Slot, p: Array) -> None:
-    """Write stiffness and damping of the transmission."""
-    r = p[1]
-    reduced = plant[k.INERTIA] * r * (1.0 - r)
-    hz, zeta, gap = (p[0], p[2], 0.0) if slot is Slot.ELASTIC else (p[2], p[3], p[0])
-    stiff = (2.0 * np.pi * hz) ** 2 * reduced
-    plant[k.LOAD], plant[k.STIFF], plant[k.GAP] = r, stiff, gap
-    plant[k.DAMP] = 2.0 * zeta * np.sqrt(stiff * reduced)
 
 
 def _march(

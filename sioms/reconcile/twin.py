@@ -1,7 +1,7 @@
 """The simulated twin of an axis: a model with its effects, as a plant that a simulated device steps.
 
 The equations are those of the library, evaluated on arrays of axes; nothing is written twice. Effects with a state
-function act as they stand, a user's own among them; those that are a slot of the time step (delay, two masses,
+function act as they stand, a user's own among them; those with a mechanism of their own (delay, two masses,
 sensor errors) become the plant's effect of the same meaning. The plant has its own integration and its own servo,
 so a twin that agrees with a recording says more than the simulation that was fitted to it.
 """
@@ -18,9 +18,10 @@ from sioms.plant.effects import build_effects
 from sioms.plant.forces import Motion
 from sioms.plant.foreign import Laws
 from sioms.plant.parameters import Motor
-from sioms.reconcile.effect import Array, Effect, Slot
+from sioms.reconcile.effect import NONE, Array, Effect, Slot
 from sioms.reconcile.effects import known
-from sioms.reconcile.model import AxisModel
+from sioms.reconcile.model import AxisModel, plant_row
+from sioms.reconcile.model_file import parse_model
 
 #: A hot drive keeps at least this share of its force constant, as in the time step of the workflow.
 LEAST_GAIN = 0.05
@@ -63,13 +64,10 @@ class Acting:
         at, heat = self._axes, self._heat
         state = motion.position[at], motion.velocity[at], heat.before[at], heat.temperature[at]
         value = self._effect.evaluate(*state, self._rows)
-        match self._effect.slot:
-            case Slot.GAIN:
-                value = motion.drive[at] * (value - 1.0)
-            case Slot.FRICTION:
-                value = np.maximum(value, 0.0)
-            case _:
-                pass
+        if self._effect.slot is Slot.GAIN:
+            value = motion.drive[at] * (value - 1.0)
+        elif self._effect.slot is Slot.FRICTION:
+            value = np.maximum(value, 0.0)
         total[at] += value
 
 
@@ -95,10 +93,17 @@ def twins(
     for i, model in models.items():
         for name, values in model.effects.items():
             effect = known()[name]
-            if effect.function is not None and effect.slot is not Slot.WARMING:
+            if effect.mechanism is not NONE:
+                if effect.mechanism.twin is None:
+                    raise ValueError(
+                        f"simulate {name} of {model.name}: a plant cannot carry it out; "
+                        "switch the effect off in the model file"
+                    )
+                table.setdefault(names[i], {}).update(
+                    effect.mechanism.twin(effect.values(values), model.pitch)
+                )
+            if effect.slot is not None:
                 acting.setdefault(name, []).append((i, effect.row(effect.values(values), model.pitch)))
-            elif effect.slot not in (Slot.THERMAL, Slot.INERTIA):
-                table.setdefault(names[i], {}).update(_slot(effect, values, model))
     heat = _heat(models, len(motors), tick_s)
     forces = {n: Acting(known()[n], [i for i, _ in a], [r for _, r in a], heat) for n, a in acting.items()}
     levels = tuple(f for n, f in forces.items() if known()[n].slot is Slot.FRICTION)
@@ -108,10 +113,9 @@ def twins(
 
 def _motor(model: AxisModel, motor: Motor) -> Motor:
     """Give a motor the body of the model; its friction is the model's effects and nothing else."""
-    added = sum(known()[n].values(v)[0] for n, v in model.effects.items() if known()[n].slot is Slot.INERTIA)
     return replace(
         motor,
-        mass=model.inertia + added,
+        mass=plant_row(model).inertia,
         viscous=model.viscous,
         coulomb=0.0,
         stiction=None,
@@ -124,41 +128,22 @@ def _motor(model: AxisModel, motor: Motor) -> Motor:
 def _heat(models: Mapping[int, AxisModel], count: int, tick_s: float) -> Heat:
     loss, tau, rated = np.zeros(count), np.ones(count), np.ones(count)
     for i, model in models.items():
-        for name, values in model.effects.items():
-            if known()[name].slot is Slot.THERMAL:
-                loss[i], tau[i] = known()[name].values(values)
-        rated[i] = model.rated_force
+        row = plant_row(model)
+        loss[i], tau[i], rated[i] = getattr(row, "loss", 0.0), row.tau_t, row.rated
     return Heat(loss, tau, rated, tick_s)
 
 
-def _slot(effect: Effect, values: Mapping[str, float], model: AxisModel) -> dict[str, dict[str, float]]:
-    """Say an effect that fills a slot of the time step in the words of the plant."""
-    p = effect.values(values)
-    match effect.slot:
-        case Slot.DELAY:
-            return {"delay": {"delay_s": p[0]}}
-        case Slot.LAG:
-            return {"lag": {"tau_s": p[0]}}
-        case Slot.LIMIT:
-            return {"saturation": {"limit": p[0]}}
-        case Slot.HYSTERESIS:
-            rise, speed = (p[2] - p[0], p[3]) if len(p) > 2 else (0.0, 1.0)
-            stiffness = (p[0] + rise) / p[1]
-            return {"presliding": {"level": p[0], "stiffness": stiffness, "rise": rise, "velocity": speed}}
-        case Slot.ELASTIC:
-            return {"elastic": {"frequency_hz": p[0], "load_fraction": p[1], "damping": p[2]}}
-        case Slot.BACKLASH:
-            return {"backlash": {"gap": p[0], "load_fraction": p[1], "frequency_hz": p[2], "damping": p[3]}}
-        case Slot.SCALE:
-            return {"encoder_scale": {"gain": p[0]}}
-        case Slot.ECCENTRICITY:
-            return {"encoder_eccentricity": {"amplitude": p[0], "pitch": model.pitch, "phase": p[1]}}
-        case Slot.VARIATION:
-            return {"friction_variation": {"depth": p[0], "pitch": model.pitch / p[2], "phase": p[1]}}
-        case Slot.LATTICE:
-            return {"encoder_quantisation": {"factor": p[0]}}
-        case _:
-            raise ValueError(
-                f"simulate {effect.name} of {model.name}: a plant cannot carry out slot {effect.slot.value}; "
-                "switch the effect off in the model file"
-            )
+def from_files(
+    files: Mapping[int, tuple[str, str]],
+    motors: Sequence[Motor],
+    axes: Sequence[tuple[str, str]],
+    tick_s: float,
+) -> tuple[list[Motor], tuple[PlantEffect, ...], Laws]:
+    """Turn model files into what the plant is built of: see ``sioms.plant.foreign.TwinAxes``."""
+    models = {i: parse_model(text, path) for i, (path, text) in files.items()}
+    for i, model in models.items():
+        name, unit = axes[i]
+        if model.rotary != (unit == "rad"):
+            kind = "rotary" if model.rotary else "linear"
+            raise ValueError(f"model_file {files[i][0]}: of a {kind} axis; {name} is in {unit}")
+    return twins(models, motors, [name for name, _ in axes], tick_s)

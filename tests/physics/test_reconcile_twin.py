@@ -71,7 +71,7 @@ def test_the_twin_moves_as_the_simulation(name: str, beside: str) -> None:
 
 def test_all_effects_that_a_plant_can_carry_out_have_a_case() -> None:
     sensor = {n for n, e in library().items() if e.channel is Channel.SENSOR}
-    assert {n for n, e in library().items() if e.slot is not Slot.BACKLASH} == set(CASES) | sensor
+    assert {n for n, e in library().items() if not e.mechanism.bounces} == set(CASES) | sensor
 
 
 def test_backlash_plays_and_hits_as_in_the_simulation() -> None:

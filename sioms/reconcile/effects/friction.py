@@ -9,9 +9,24 @@ K. J. Astrom, P. Lischinsky, "A new model for control of systems with friction",
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 
-from sioms.reconcile.effect import TURN, Array, Channel, Effect, Number, Parameter, Ref, Slot
+from sioms.reconcile.effect import (
+    TURN,
+    Array,
+    Channel,
+    Effect,
+    Mechanism,
+    Number,
+    Parameter,
+    Ref,
+    Seen,
+    Slot,
+    Trials,
+)
 from sioms.reconcile.jit import state_function
 
 
@@ -55,6 +70,54 @@ def stribeck_level(x: Number, v: Number, u: Number, temperature: Number, p: Arra
 def load_level(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """mu |u|."""
     return p[0] * np.abs(u)
+
+
+#: Steps from one trial of a length to the next; speeds of a drop, of the largest. Within so many steps of the encoder no path is seen.
+STEP_LENGTH = 3.5
+GRID_DROP = (0.003, 0.01, 0.03, 0.1)
+UNSEEN_STEPS = 2.0
+
+
+def lengths(seen: Seen, lower: float, upper: float) -> list[float]:
+    """List first guesses of the path over which friction builds up, bounds over the pitch: up to half of what was travelled."""
+    low = 10.0 * lower * seen.pitch
+    high = max(min(0.8 * upper * seen.pitch, 0.5 * seen.travel), low)
+    return [
+        float(g) for g in np.geomspace(low, high, 1 + int(np.ceil(np.log(high / low) / np.log(STEP_LENGTH))))
+    ]
+
+
+def _lugre(seen: Seen) -> Iterator[dict[str, float]]:
+    for xs in lengths(seen, 1e-5, 2e-2):
+        for drop in GRID_DROP:
+            yield {"xs": xs, "vs": drop * seen.max_speed}
+
+
+def _building_up(row: Any, p: Array) -> None:
+    for place, value in zip(("hyst_f", "hyst_x", "hyst_s", "hyst_v"), p, strict=False):
+        setattr(row, place, value)
+
+
+def _building_up_twin(p: Array, pitch: float) -> dict[str, dict[str, float]]:
+    rise, speed = (p[2] - p[0], p[3]) if len(p) > 2 else (0.0, 1.0)
+    stiffness = (p[0] + rise) / p[1]
+    return {"presliding": {"level": p[0], "stiffness": stiffness, "rise": rise, "velocity": speed}}
+
+
+def _varying(row: Any, p: Array) -> None:
+    row.vary_a, row.vary_phase, row.vary_n = p
+
+
+def _varying_twin(p: Array, pitch: float) -> dict[str, dict[str, float]]:
+    return {"friction_variation": {"depth": p[0], "pitch": pitch / p[2], "phase": p[1]}}
+
+
+def _varying_column(motion: Any, wave: float, phase: float, dry: Array) -> Array:
+    out: Array = dry * np.sin(wave * motion.x + phase)
+    return out
+
+
+BUILDING_UP = Mechanism(_building_up, _building_up_twin, builds_up=True)
 
 
 VISCOUS = Effect(
@@ -156,11 +219,22 @@ PRESLIDING = Effect(
     name="presliding",
     title="Coulomb friction with presliding (Dahl)",
     channel=Channel.MECHANICS,
-    slot=Slot.HYSTERESIS,
+    mechanism=BUILDING_UP,
+    trials=Trials(lambda seen: ({"xs": xs} for xs in lengths(seen, 1e-5, 5e-3))),
     equation="dF/dx = (Fc sign(v) - F) / xs, force -F",
     parameters=(
         Parameter("Fc", "{F}", Ref.FORCE, 0.0, 1.5, 0.05, "level after sliding"),
-        Parameter("xs", "{x}", Ref.PITCH, 1e-5, 5e-3, 1e-3, "presliding displacement"),
+        Parameter(
+            "xs",
+            "{x}",
+            Ref.PITCH,
+            1e-5,
+            5e-3,
+            1e-3,
+            "presliding displacement",
+            vanishes=True,
+            steps=UNSEEN_STEPS,
+        ),
     ),
     signature="friction force builds up over a displacement after every reversal",
     lookalikes=("coulomb", "stribeck", "backlash"),
@@ -172,13 +246,26 @@ LUGRE = Effect(
     name="lugre",
     title="friction with presliding and low-speed drop (LuGre)",
     channel=Channel.MECHANICS,
-    slot=Slot.HYSTERESIS,
+    mechanism=BUILDING_UP,
+    trials=Trials(_lugre),
     equation="dF/dx = (g sign(v) - F) Fs/(xs g), force -F, g = Fc + (Fs - Fc) exp(-(v/vs)^2)",
     parameters=(
         Parameter("Fc", "{F}", Ref.FORCE, 0.0, 1.5, 0.05, "level at speed"),
-        Parameter("xs", "{x}", Ref.PITCH, 1e-5, 2e-2, 1e-3, "presliding displacement"),
+        Parameter(
+            "xs",
+            "{x}",
+            Ref.PITCH,
+            1e-5,
+            2e-2,
+            1e-3,
+            "presliding displacement",
+            vanishes=True,
+            steps=UNSEEN_STEPS,
+        ),
         Parameter("Fs", "{F}", Ref.FORCE, 0.0, 3.0, 0.08, "breakaway level"),
-        Parameter("vs", "{x}/s", Ref.SPEED, 2e-4, 0.5, 0.02, "speed over which the level drops"),
+        Parameter(
+            "vs", "{x}/s", Ref.SPEED, 2e-4, 0.5, 0.02, "speed over which the level drops", vanishes=True
+        ),
     ),
     signature="friction force builds up over a displacement after every reversal and drops with the speed",
     lookalikes=("stribeck", "presliding", "coulomb", "backlash"),
@@ -192,7 +279,7 @@ FRICTION_VARIATION = Effect(
     name="friction_variation",
     title="dry friction that varies over the turn",
     channel=Channel.MECHANICS,
-    slot=Slot.VARIATION,
+    mechanism=Mechanism(_varying, _varying_twin, varies=True, column=_varying_column),
     equation="dry friction with a low-speed drop or presliding, its level times 1 + depth sin(n theta + phase)",
     parameters=(
         Parameter("depth", "1", Ref.ONE, 0.0, 0.95, 0.1, "relative variation of the level", least=0.02),

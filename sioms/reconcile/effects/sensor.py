@@ -2,15 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 
-from sioms.reconcile.effect import Channel, Effect, Parameter, Ref, Slot
+from sioms.reconcile.effect import Array, Channel, Effect, Mechanism, Parameter, Ref, Seen, Trials
+
+
+def _scaled(row: Any, p: Array) -> None:
+    row.gain_y = p[0]
+
+
+def _eccentric(row: Any, p: Array) -> None:
+    row.ecc_amp, row.ecc_phase = p
+
+
+def _coarse(row: Any, p: Array) -> None:
+    row.quantum *= p[0]
+
+
+#: First guesses of the eccentricity: phases, and sizes where impacts come to fall differently with each.
+GRID_PHASE = np.linspace(-np.pi, np.pi, 9)[1:]
+SIZES = (1.0, 0.7, 0.4)
+
+
+def _runouts(seen: Seen) -> Iterator[dict[str, float]]:
+    for share in SIZES if seen.bounces else SIZES[:1]:
+        for phase in GRID_PHASE:
+            yield {"amp": share * 1e-3 * seen.scales["amp"], "phase": float(phase)}
+
 
 ENCODER_SCALE = Effect(
     name="encoder_scale",
     title="encoder scale",
     channel=Channel.SENSOR,
-    slot=Slot.SCALE,
+    mechanism=Mechanism(_scaled, lambda p, pitch: {"encoder_scale": {"gain": p[0]}}),
+    trials=Trials(lambda seen: ({"gain": 1.01},)),
+    neutral=1.0,
     equation="measured = gain * true",
     parameters=(
         Parameter(
@@ -32,7 +61,11 @@ ECCENTRICITY = Effect(
     name="eccentricity",
     title="encoder eccentricity",
     channel=Channel.SENSOR,
-    slot=Slot.ECCENTRICITY,
+    mechanism=Mechanism(
+        _eccentric,
+        lambda p, pitch: {"encoder_eccentricity": {"amplitude": p[0], "pitch": pitch, "phase": p[1]}},
+    ),
+    trials=Trials(_runouts),
     equation="measured = true + amp sin(theta + phase)",
     parameters=(
         Parameter("amp", "{x}", Ref.PITCH, 0.0, 0.02, 1e-3, "amplitude of the reading error"),
@@ -46,7 +79,8 @@ ENCODER_QUANTISATION = Effect(
     name="encoder_quantisation",
     title="coarser encoder than stated",
     channel=Channel.SENSOR,
-    slot=Slot.LATTICE,
+    mechanism=Mechanism(_coarse, lambda p, pitch: {"encoder_quantisation": {"factor": p[0]}}),
+    trials=Trials(lambda seen: ({},)),
     equation="counts come in multiples of factor",
     parameters=(
         Parameter("factor", "1", Ref.ONE, 1.0, 4096.0, 1.0, "true over stated resolution", fixed=True),

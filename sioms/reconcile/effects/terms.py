@@ -5,20 +5,27 @@ A term describes the residual in symbols; it claims no cause and is kept out of 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from sioms.reconcile.effect import (
+    NONE,
     TERM_PREFIX,
     TURN,
     Array,
     Channel,
     Effect,
+    Mechanism,
     Number,
     Parameter,
     Ref,
     Slot,
     StateFunction,
+    Trials,
 )
+from sioms.reconcile.effects.drive import GRID_TAU
+from sioms.reconcile.effects.friction import BUILDING_UP, UNSEEN_STEPS, lengths
 from sioms.reconcile.jit import state_function
 
 
@@ -112,6 +119,21 @@ def dull_force(x: Number, v: Number, u: Number, temperature: Number, p: Array) -
     return -p[0] * np.tanh(u / p[1])
 
 
+def _warming(row: Any, p: Array) -> None:
+    row.warming, row.tau_t = 1.0, p[1]
+
+
+def _turning(row: Any, p: Array) -> None:
+    row.mod_a, row.mod_phase, row.mod_n = p
+
+
+def _turning_column(motion: Any, wave: float, phase: float, dry: Array) -> Array:
+    """Force of a unit inertia that varies over the turn: -(s a + s' v^2 / 2)."""
+    at = wave * motion.x + phase
+    f: Array = -(np.sin(at) * motion.a + 0.5 * motion.v**2 * wave * np.cos(at))
+    return f
+
+
 PHASE = Parameter("phase", "rad", Ref.ANGLE, -np.pi, np.pi, 0.0, "phase at position zero", phase=True)
 ORDER = Parameter("n", "1/pitch", Ref.ONE, 1.0, 12.0, 1.0, "periods in a pitch", fixed=True)
 PLACE = Parameter("x0", "{x}", Ref.PITCH, -1e6, 1e6, 0.01, "place of the bend")
@@ -127,7 +149,9 @@ def _term(
     equation: str,
     function: StateFunction | None,
     *parameters: Parameter,
-    slot: Slot = Slot.FORCE,
+    slot: Slot | None = Slot.FORCE,
+    mechanism: Mechanism = NONE,
+    trials: Trials | None = None,
     replaces: tuple[str, ...] = (),
     lookalikes: tuple[str, ...] = (),
 ) -> Effect:
@@ -137,6 +161,8 @@ def _term(
         channel=Channel.MECHANICS,
         slot=slot,
         function=function,
+        mechanism=mechanism,
+        trials=trials,
         equation=equation,
         parameters=parameters,
         signature="",
@@ -220,7 +246,9 @@ TERMS = (
         warm_level,
         _size("g", "{F} s/{x}", Ref.DAMPING, "what friction gains where the axis has moved of late"),
         Parameter("tau", "s", Ref.TIME, 0.5, 1e4, 10.0, "time over which it does"),
-        slot=Slot.WARMING,
+        slot=Slot.FRICTION,
+        mechanism=Mechanism(_warming, warms=True),
+        trials=Trials(lambda seen: ({"tau": g} for g in GRID_TAU)),
         replaces=("thermal_gain",),
     ),
     _term("load_square", "F = -g u |u|", load_square, _size("g", "1/({F})", Ref.ONE)),
@@ -237,8 +265,20 @@ TERMS = (
         "dF/dx = (f sign(v) - F)/length, force -F",
         None,
         Parameter("f", "{F}", Ref.FORCE, 0.0, 1.5, 0.05, "level long after a reversal"),
-        Parameter("xs", "{x}", Ref.PITCH, 5e-3, 100.0, 0.05, "displacement over which it builds up"),
-        slot=Slot.HYSTERESIS,
+        Parameter(
+            "xs",
+            "{x}",
+            Ref.PITCH,
+            5e-3,
+            100.0,
+            0.05,
+            "displacement over which it builds up",
+            vanishes=True,
+            steps=UNSEEN_STEPS,
+        ),
+        slot=None,
+        mechanism=BUILDING_UP,
+        trials=Trials(lambda seen: ({"xs": xs} for xs in lengths(seen, 5e-3, 100.0))),
         replaces=("presliding", "lugre", "coulomb", "stribeck", "coulomb_position"),
         lookalikes=("coulomb",),
     ),
@@ -249,6 +289,7 @@ TERMS = (
         Parameter("dJ", "{F} s^2/{x}", Ref.INERTIA, 0.0, 0.9, 0.1, "amplitude of the inertia"),
         PHASE,
         ORDER,
-        slot=Slot.MODULATION,
+        slot=None,
+        mechanism=Mechanism(_turning, column=_turning_column),
     ),
 )

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sioms.reconcile.effect import Slot
+from sioms.reconcile.effect import NONE, Mechanism, Slot
 from sioms.reconcile.effects import known, library
 from sioms.reconcile.files.axis import read_data, read_model
 from sioms.reconcile.jit import compiled
@@ -99,6 +99,33 @@ def test_a_state_function_that_cannot_be_compiled_says_what_it_may_do() -> None:
 
     with pytest.raises(TypeError, match=r"compile state function summed .* single p\[i\]"):
         compiled(summed)
+
+
+def test_every_effect_is_screened_fitted_and_carried_out_by_what_it_says_itself() -> None:
+    for name, effect in known().items():
+        assert effect.slot is not None or effect.mechanism is not NONE, name
+        assert (effect.slot is None) == (effect.function is None), name
+        assert effect.slot is not None or effect.trials is not None or effect.mechanism.column is not None, (
+            name
+        )
+        assert effect.neutral == 0.0 or effect.primary.lower < effect.neutral < effect.primary.upper, name
+
+
+def test_a_users_own_mechanism_is_packed_by_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    def enter(row, p):  # type: ignore[no-untyped-def]
+        row.delay, row.lag = p
+
+    own = replace(
+        library()["delay"],
+        name="slow_drive",
+        mechanism=Mechanism(enter, substeps=4),
+        parameters=tuple(replace(library()["delay"].primary, symbol=s) for s in ("delay", "tau")),
+    )
+    monkeypatch.setitem(known(), own.name, own)
+    slow = pack(AXIS.with_effect(own.name, {"delay": 2e-3, "tau": 3e-3}))
+    both = pack(AXIS.with_effect("delay", {"delay": 2e-3}).with_effect("lag", {"tau": 3e-3}))
+    assert (slow.plant == both.plant).all()
+    assert (slow.substeps, both.substeps) == (4, 2)
 
 
 def test_unknown_parameters_are_refused() -> None:
