@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from sioms.motion import SWITCH_HOME, SWITCH_MINUS, SWITCH_PLUS, AxisBank, AxisKind, AxisSettings
 from sioms.plant.binary import Beam, Box, port_values
 from sioms.plant.effects import Effect, build_effects, parse_effects
-from sioms.plant.foreign import Laws
+from sioms.plant.foreign import Laws, TwinAxes, twin
 from sioms.plant.motor import MotorBank
 from sioms.plant.parameters import Motor
 from sioms.plant.stepper import Stepper, StepperBank
@@ -349,18 +349,9 @@ def _twins(
     files = {i: axis.model_file for i, axis in enumerate(servos) if axis.model_file}
     if not files:
         return motors, (), Laws()
-    # The library of effects is loaded only by who has a twin.
-    from sioms.reconcile.model_file import parse_model
-    from sioms.reconcile.twin import twins
-
-    models = {i: parse_model(_text("model_file", path), path) for i, path in files.items()}
-    for i, model in models.items():
-        if model.rotary != (servos[i].unit == "rad"):
-            kind = "rotary" if model.rotary else "linear"
-            raise ValueError(
-                f"model_file {files[i]}: of a {kind} axis; {servos[i].name} is in {servos[i].unit}"
-            )
-    return twins(models, motors, [axis.name for axis in servos], tick_s)
+    twins: TwinAxes = twin("axes")
+    texts = {i: (path, _text("model_file", path)) for i, path in files.items()}
+    return twins(texts, motors, [(axis.name, axis.unit) for axis in servos], tick_s)
 
 
 def _model_sum(axis: Any) -> str:

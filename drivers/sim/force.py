@@ -18,21 +18,18 @@ from __future__ import annotations
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
 
 from sioms.documents import read_bytes, toml_of
 from sioms.plant.force_sensor import COMPONENTS, Contact, Flaws, ForceSensor, Six
+from sioms.plant.foreign import TwinForce, twin
 from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
 from sioms.sdk.driver import Kit, TickDriver
 from sioms.sdk.tables import from_table, table_type
-
-if TYPE_CHECKING:
-    from sioms.reconcile.force.twin import ForceTwin
 
 Vector = tuple[float, float, float]
 
@@ -161,14 +158,9 @@ def _flaws(path: str) -> Flaws | None:
         raise ValueError(f"flaws_file {path}: {error}") from None
 
 
-def _twin(path: str) -> ForceTwin:
-    from sioms.reconcile.force.model_file import from_table as model_from  # heavy, and for twins only
-    from sioms.reconcile.force.twin import ForceTwin
-
-    model, names = model_from(toml_of(read_bytes(Path(path))), path)
-    if names != COMPONENTS:
-        raise ValueError(f"model_file {path}: of {', '.join(names)}; the sensor has {', '.join(COMPONENTS)}")
-    return ForceTwin(model)
+def _twin(path: str) -> TwinForce:
+    made: TwinForce = twin("force")(toml_of(read_bytes(Path(path))), path, COMPONENTS)
+    return made
 
 
 DRIVER = SimForce

@@ -22,22 +22,19 @@ import math
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
 from sioms.documents import read_bytes, toml_of
 from sioms.drivers import tactile_nodes
 from sioms.plant.finger import FingerShape, TactileArray
+from sioms.plant.foreign import TwinFinger, twin
 from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
 from sioms.sdk.driver import Kit, TickDriver
 from sioms.sdk.tables import from_table, table_type
-
-if TYPE_CHECKING:
-    from sioms.reconcile.finger.twin import FingerTwin
-    from sioms.reconcile.sensors.effect import SensorModel
 
 FingerTable: Any = table_type(FingerShape)
 
@@ -152,7 +149,7 @@ def _check(settings: SimTactileSettings) -> int:
         ValueError: numbers of another length than the elements, a radius that is no radius, or a model that cannot be read.
     """
     shape = from_table(FingerShape, settings.finger)
-    elements = _model(settings.model_file).count if settings.model_file else len(shape.angles_rad)
+    elements = _twin(settings).count if settings.model_file else len(shape.angles_rad)
     for key, values in (("gain", settings.gain), ("offset", settings.offset)):
         if len(values) not in (0, elements):
             raise ValueError(f"{key}: {len(values)} numbers; want {elements}, one for each element")
@@ -164,23 +161,16 @@ def _check(settings: SimTactileSettings) -> int:
     return elements
 
 
-def _model(path: str) -> SensorModel:
-    from sioms.reconcile.finger.model_file import from_table as model_from  # heavy, and for twins only
-
+def _twin(settings: SimTactileSettings) -> TwinFinger:
+    path, length_m = settings.model_file, from_table(FingerShape, settings.finger).length_m
+    noise = (settings.noise, settings.resolution, settings.seed)
     try:
-        return model_from(toml_of(read_bytes(Path(path))), path)[0]
+        made: TwinFinger = twin("finger")(toml_of(read_bytes(Path(path))), path, length_m, *noise)
+        return made
     except OSError as error:
         raise ValueError(f"model_file {path}: {error.strerror}; sioms reconcile tactile writes one") from None
     except ValueError as error:
         raise ValueError(f"model_file {path}: {error}") from None
-
-
-def _twin(settings: SimTactileSettings) -> FingerTwin:
-    from sioms.reconcile.finger.twin import FingerTwin
-
-    length_m = from_table(FingerShape, settings.finger).length_m
-    noise = (settings.noise, settings.resolution, settings.seed)
-    return FingerTwin(_model(settings.model_file), length_m, *noise)
 
 
 def _array(settings: SimTactileSettings) -> TactileArray:

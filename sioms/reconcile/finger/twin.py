@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from sioms.reconcile.finger.belief import Belief, outputs, scene_of
+from sioms.reconcile.finger.model_file import from_table
 from sioms.reconcile.finger.pressures import Floats
 from sioms.reconcile.sensors.effect import SensorModel
 
@@ -34,6 +37,11 @@ class FingerTwin:
         self._random = np.random.default_rng(seed)
         self._late = np.zeros(len(self._belief.angle))
         self._time_s: float | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of elements."""
+        return len(self._late)
 
     def mount(self, indenter_radius_m: float) -> None:
         """Tabulate an indenter, so that the first touch with it need not."""
@@ -75,3 +83,14 @@ class FingerTwin:
         self._time_s = time_s
         self._late += -math.expm1(-elapsed_s / b.creep_time) * (steady - self._late)
         return steady + b.creep * (self._late - steady)
+
+
+def twin(
+    table: Mapping[str, Any], path: str, length_m: float, noise: float, resolution: float, seed: int
+) -> FingerTwin:
+    """Return the twin of the finger in a model file (the entry point ``finger`` of ``sioms.twins``); see ``FingerTwin``.
+
+    Raises:
+        ValueError: the file makes no sense.
+    """
+    return FingerTwin(from_table(table, path)[0], length_m, noise, resolution, seed)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from sioms.reconcile.force.belief import Floats, ForceBelief, Loads, Loops
 from sioms.reconcile.force.effects import lagging
+from sioms.reconcile.force.model_file import from_table
 from sioms.reconcile.sensors.effect import SensorModel
 
 _ONE = np.zeros(1, dtype=np.int64)
@@ -45,3 +49,15 @@ class ForceTwin:
                 else response(out, row, p)
             )
         return np.asarray(out[0] * b.full)
+
+
+def twin(table: Mapping[str, Any], path: str, components: tuple[str, ...]) -> ForceTwin:
+    """Return the twin of the sensor in a model file (the entry point ``force`` of ``sioms.twins``).
+
+    Raises:
+        ValueError: the file makes no sense, or is of a sensor with other components.
+    """
+    model, names = from_table(table, path)
+    if names != components:
+        raise ValueError(f"model_file {path}: of {', '.join(names)}; the sensor has {', '.join(components)}")
+    return ForceTwin(model)
