@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from sioms.reconcile.ambiguity import settle
+from sioms.reconcile.axis_verdict import AxisVerdict
 from sioms.reconcile.blocks import better
 from sioms.reconcile.bounces import rattles
 from sioms.reconcile.changes import change, settled
@@ -30,7 +31,6 @@ from sioms.reconcile.search import Found, Searcher, Step
 from sioms.reconcile.timed import Timed, known_beside
 from sioms.reconcile.tones import as_timed, hum
 from sioms.reconcile.variation import named as varied
-from sioms.reconcile.verdict import Verdict
 
 #: A change in time leaves at most this share of what else would be left above the noise; of several that leave about the same, or no more than
 #: noise, the one with the fewest numbers in all is taken.
@@ -43,7 +43,7 @@ LOUD = 1.4
 FELL, AGAIN = 0.7, 2
 
 
-def analyse(session: Session, nominal: AxisModel, options: Options | None = None) -> Verdict:
+def analyse(session: Session, nominal: AxisModel, options: Options | None = None) -> AxisVerdict:
     """Find what the nominal model lacks.
 
     Args:

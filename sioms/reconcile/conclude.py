@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import binom
 
 from sioms.reconcile.ambiguity import Rival
+from sioms.reconcile.axis_verdict import AxisVerdict, Trace
 from sioms.reconcile.bounces import deepest, rattles
 from sioms.reconcile.effect import Array
 from sioms.reconcile.evidence import describe, spans_of
@@ -16,7 +17,7 @@ from sioms.reconcile.excitation import Gate
 from sioms.reconcile.experiment import Envelope, Experiment, separate
 from sioms.reconcile.fit import Fit, Problem, refit
 from sioms.reconcile.gaps import measure, rungs, session_states
-from sioms.reconcile.locate import Place, Spectrum, locate, spectra
+from sioms.reconcile.locate import Spectrum, locate, spectra
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import effective_samples
 from sioms.reconcile.plausible import leans
@@ -27,7 +28,7 @@ from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.session import State
 from sioms.reconcile.simulate import replay
 from sioms.reconcile.timed import as_recorded
-from sioms.reconcile.verdict import Gap, Outcome, Trace, Verdict
+from sioms.reconcile.verdict import Gap, Outcome, Place
 
 #: A generic smoother explaining this share more than the named model: something is missing.
 UNEXPLAINED = 0.2
@@ -67,7 +68,7 @@ class Searched:
     rejected: tuple[str, ...]
 
 
-def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> Verdict:
+def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> AxisVerdict:
     """Conclude.
 
     Args:
@@ -104,7 +105,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         notes += _of_loops(gaps, ratio)
     open_now = open_rivals if outcome is Outcome.AMBIGUOUS else []
     places, spectrum, traces = _pictures(ready, nominal, found.fit.model, o, rng)
-    return Verdict(
+    return AxisVerdict(
         outcome=outcome,
         nominal=nominal,
         model=fit.model,
@@ -115,10 +116,11 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         ladder=found.ladder,
         rungs=rungs(ready.final, [step.model for step in found.ladder]),
         findings=ready.findings,
-        gate=s.excited,
+        missing=s.excited.missing,
+        pairs=s.excited.pairs,
         places=places,
         spectra=spectrum,
-        experiment=_plan(ready, o, fit.model, open_now) if open_now else None,
+        decisive=_plan(ready, o, fit.model, open_now) if open_now else None,
         ratio=ratio,
         smoother_share=s.share,
         burst_share=burst,

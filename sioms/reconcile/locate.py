@@ -19,26 +19,9 @@ from sioms.reconcile.fit import Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.refuse import since_reversal
 from sioms.reconcile.screen import Motion, dead_band, direction, smoothed_motion
+from sioms.reconcile.verdict import Place
 
 BINS = 16
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """How far one variable orders the residual.
-
-    Attributes:
-        explained: share of the residual's variance between bins; p: permutation p-value.
-        centres, means, spread: per bin, for the picture; force in {F}.
-    """
-
-    variable: str
-    unit: str
-    explained: float
-    p: float
-    centres: Array
-    means: Array
-    spread: Array
 
 
 @dataclass(frozen=True, slots=True)

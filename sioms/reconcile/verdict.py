@@ -1,23 +1,18 @@
-"""What the workflow says, as data: the report, the JSON and the terminal summary are made from it."""
+"""What the workflow says of any subject, as data: the report, the JSON and the terminal summary are made from it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any, Protocol
 
-from sioms.reconcile.channels import Finding
 from sioms.reconcile.effect import TERM_PREFIX, Array
 from sioms.reconcile.errors import BadInputError
-from sioms.reconcile.excitation import Gate
-from sioms.reconcile.experiment import Experiment
-from sioms.reconcile.locate import Place, Spectrum
-from sioms.reconcile.model import AxisModel
-from sioms.reconcile.search import Step
-from sioms.reconcile.session import State
+from sioms.reconcile.ladder import Step
 
 __all__ = [
-    "EXIT", "EXIT_BAD_INPUT", "BadInputError", "Estimate", "Gap", "NamedEffect", "Outcome", "Trace", "Verdict", "apart",
+    "EXIT", "EXIT_BAD_INPUT", "BadInputError", "Estimate", "Gap", "NamedEffect", "Outcome", "Place", "Verdict", "apart",
 ]  # fmt: skip
 
 
@@ -108,52 +103,73 @@ class Gap:
 
 
 @dataclass(frozen=True, slots=True)
-class Trace:
-    """Curves of one record for the pictures: measured, and simulated before and after.
+class Place:
+    """How far one variable orders the residual.
 
     Attributes:
-        untouched_s: from when on nothing of the record was used for any choice or number [s].
+        explained: share of the residual's variance between bins; p: permutation p-value.
+        centres, means, spread: per bin, for the picture; force in {F}.
     """
 
-    name: str
-    time_s: Array
-    measured: Array
-    before: Array
-    after: Array
-    untouched_s: float
+    variable: str
+    unit: str
+    explained: float
+    p: float
+    centres: Array
+    means: Array
+    spread: Array
 
 
-@dataclass(frozen=True, slots=True)
+class Decides(Protocol):
+    """An experiment that would decide: what to do, and by how many times the noise the rivals then differ."""
+
+    @property
+    def text(self) -> str: ...
+    @property
+    def separation(self) -> float: ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """Everything the workflow found out about one axis.
+    """Everything the workflow found out about one subject, as far as all subjects have it.
 
     Attributes:
-        others: numbers of each alternative, per symbol per effect.
-        states: session parameters of the untouched part of each record.
-        rungs: force error on the untouched samples after each step of the ladder, in closed loop where it can be.
+        nominal, model: before and after; effects found by a channel of their own are in ``model`` as well.
+        missing: effects that the records did not excite, with the record that would.
+        pairs: effects that look the same in these records, with the share they have in common.
+        places: where the nominal model disagreed.
+        ratio: residual of the final model in units of what is expected.
     """
 
     outcome: Outcome
-    nominal: AxisModel
-    model: AxisModel
+    nominal: Any
+    model: Any
     effects: tuple[NamedEffect, ...]
     alternatives: tuple[tuple[str, ...], ...]
     symbolic: tuple[NamedEffect, ...]
     gaps: tuple[Gap, ...]
-    ladder: tuple[Step, ...]
-    rungs: tuple[float, ...]
-    findings: tuple[Finding, ...]
-    gate: Gate
+    ladder: tuple[Step[Any], ...]
+    missing: dict[str, str]
+    pairs: tuple[tuple[str, str, float], ...]
     places: tuple[Place, ...]
-    spectra: tuple[Spectrum, Spectrum] | None
-    experiment: Experiment | None
     ratio: float
     smoother_share: float
     burst_share: float
     effective_samples: float
     samples: int
     notes: tuple[str, ...]
-    traces: tuple[Trace, ...]
-    states: tuple[tuple[str, State], ...] = ()
     rejected: tuple[str, ...] = ()
-    others: tuple[Mapping[str, Mapping[str, float]], ...] = ()
+
+    @property
+    def experiment(self) -> Decides | None:
+        """The experiment that would decide best, None where there is nothing to decide."""
+        raise NotImplementedError
+
+    @property
+    def speaking(self) -> Gap:
+        """The gap that speaks for all."""
+        raise NotImplementedError
+
+    def title(self, name: str) -> str | None:
+        """Return what an effect is called; None when the library has none of that name."""
+        raise NotImplementedError

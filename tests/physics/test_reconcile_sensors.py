@@ -23,7 +23,7 @@ def solve(hidden: HiddenFinger | HiddenSensor, folder: Path) -> tuple[int, dict[
         [subject, str(folder), "--model", str(folder / "nominal.toml"), "--out", str(out), "--quiet"]
     )
     page = (out / "report.html").read_text()
-    assert page.startswith("<!doctype html>") and "src='data:image" in page
+    assert page.startswith("<!doctype html>") and 'src="data:image' in page
     return status, json.loads((out / "verdict.json").read_text())
 
 

@@ -19,7 +19,7 @@ from sioms.reconcile.command.sensors import add_parsers as add_sensors
 from sioms.reconcile.command.sensors import run_sensor
 
 if TYPE_CHECKING:
-    from sioms.reconcile.verdict import Verdict
+    from sioms.reconcile.axis_verdict import AxisVerdict
 
 EXIT_BAD_INPUT, EXIT_STOPPED = 2, 1
 SUFFIXES = (".csv", ".npz", ".mat", ".txt")
@@ -200,7 +200,7 @@ def run_node(args: argparse.Namespace, say: Any) -> int:
 
 def reconcile_axis(
     data: Path, model: Path | None, columns: Path | None = None, **options: Any
-) -> tuple[Verdict, float]:
+) -> tuple[AxisVerdict, float]:
     """Read, analyse and time one axis.
 
     Args:
@@ -223,13 +223,14 @@ def reconcile_axis(
     return verdict, time.monotonic() - start
 
 
-def write(verdict: Verdict, seconds: float, out: Path) -> None:
+def write(verdict: AxisVerdict, seconds: float, out: Path) -> None:
     """Write report.html, verdict.json, model.toml and, where one is proposed, the experiment; print the summary."""
     from sioms.reconcile.model_file import write_model
-    from sioms.reconcile.report.axis import as_json, page, summary
+    from sioms.reconcile.report.page import page
+    from sioms.reconcile.report.words import as_json, summary
 
     out.mkdir(parents=True, exist_ok=True)
-    (out / "report.html").write_text(page(verdict, seconds))
+    page(verdict, seconds).write(out / "report.html")
     (out / "verdict.json").write_text(as_json(verdict, seconds))
     (out / "model.toml").write_text(write_model(verdict.model))
     if verdict.experiment is not None:

@@ -214,10 +214,11 @@ def _analysed(args: argparse.Namespace, progress: Any) -> SensorVerdict:
 
 def _write(verdict: SensorVerdict, seconds: float, args: argparse.Namespace) -> None:
     """Write report.html, verdict.json and the models; print the summary."""
-    from sioms.reconcile.report.sensor import as_json, page, summary
+    from sioms.reconcile.report.page import page
+    from sioms.reconcile.report.words import as_json, summary
 
     args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "report.html").write_text(page(verdict, seconds))
+    page(verdict, seconds).write(args.out / "report.html")
     (args.out / "verdict.json").write_text(as_json(verdict, seconds))
     if args.subject == "tactile":
         from sioms.reconcile.files.finger import write_models

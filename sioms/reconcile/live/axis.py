@@ -18,6 +18,7 @@ from sioms.client.reading import AxisReading
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
 from sioms.reconcile.axis import analyse
+from sioms.reconcile.axis_verdict import AxisVerdict
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.experiment import Envelope, Experiment, catalogue, one_speed, repeated
 from sioms.reconcile.live.record import perform
@@ -26,7 +27,7 @@ from sioms.reconcile.model_file import write_model
 from sioms.reconcile.prepare import Options
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.simulate import simulate
-from sioms.reconcile.verdict import Outcome, Verdict
+from sioms.reconcile.verdict import Outcome
 
 #: Shares of the axis's own limits that an experiment asks for.
 SHARE, JERK_SHARE = 0.6, 0.3
@@ -60,7 +61,7 @@ class Live:
     seed: int = 1
 
 
-def live(node: str, nominal: AxisModel, settings: Live, say: Say) -> tuple[Verdict, Session, float]:
+def live(node: str, nominal: AxisModel, settings: Live, say: Say) -> tuple[AxisVerdict, Session, float]:
     """Reconcile an axis behind a daemon.
 
     Returns:
@@ -183,7 +184,7 @@ def _decide(
     records: list[Record],
     settings: Live,
     say: Say,
-) -> tuple[Verdict, Session, float]:
+) -> tuple[AxisVerdict, Session, float]:
     """Analyse; while two effects look alike, run what separates them and analyse anew."""
     options = Options(seed=settings.seed, envelope=envelope, progress=say)
     done: set[str] = set()
@@ -206,12 +207,12 @@ def _decide(
         records = [*records, *run([repeated(replace(best, name=f"separate_{best.name}"), LAPS)])]
 
 
-def _sets(verdict: Verdict) -> str:
+def _sets(verdict: AxisVerdict) -> str:
     names = ["+".join(e.name for e in verdict.effects), *("+".join(a) for a in verdict.alternatives)]
     return " or ".join(names)
 
 
-def install(verdict: Verdict, path: Path, socket: str | None) -> str:
+def install(verdict: AxisVerdict, path: Path, socket: str | None) -> str:
     """Write the corrected model where a simulated twin reads it, and let the daemon take it up.
 
     Returns:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sioms.reconcile.locate import Place
 from sioms.reconcile.noise import effective_samples
 from sioms.reconcile.rules import GAIN, negligible, told_apart
 from sioms.reconcile.sensors.ambiguity import Rival, settle
@@ -25,7 +24,7 @@ from sioms.reconcile.sensors.stand_ins import credible, displaced, ruled
 from sioms.reconcile.sensors.steady import changes
 from sioms.reconcile.sensors.subject import Subject
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
-from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome, apart
+from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome, Place, apart
 
 UNEXPLAINED = 0.2  # share that a generic smoother explains beyond the named model: something is missing
 LEAST_ODD = 1.15  # multiple of the floor below which nothing is called unexplained
@@ -208,27 +207,27 @@ def _conclude(
     mine = subject.whole.view == 0
     e = subject.whole.miss(subject.whole.predict(fit.model))
     return SensorVerdict(
-        outcome,
-        subject.model,
-        fit.model,
-        tuple(named),
-        alternatives,
-        tuple(terms),
-        gaps,
-        found.ladder,
-        floors,
-        missing,
-        pairs,
-        places,
-        plan,
-        max(floors.values()),
-        share,
-        bursts,
-        effective_samples(e[mine]),
-        len(e),
-        tuple(notes),
-        curves,
-        rejected,
+        outcome=outcome,
+        nominal=subject.model,
+        model=fit.model,
+        effects=tuple(named),
+        alternatives=alternatives,
+        symbolic=tuple(terms),
+        gaps=gaps,
+        ladder=found.ladder,
+        floors=floors,
+        missing=missing,
+        pairs=pairs,
+        places=places,
+        experiments=plan,
+        ratio=max(floors.values()),
+        smoother_share=share,
+        burst_share=bursts,
+        effective_samples=effective_samples(e[mine]),
+        samples=len(e),
+        notes=tuple(notes),
+        curves=curves,
+        rejected=rejected,
     )
 
 

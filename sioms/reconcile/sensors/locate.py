@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.reconcile.locate import Place, bins_of, explained
+from sioms.reconcile.locate import bins_of, explained
 from sioms.reconcile.sensors.effect import Array, SensorModel
 from sioms.reconcile.sensors.subject import Subject
+from sioms.reconcile.verdict import Place
 
 
 def locate(subject: Subject, model: SensorModel, rng: np.random.Generator, shifts: int = 99) -> list[Place]:

@@ -15,7 +15,7 @@ from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import observer
 from sioms.reconcile.plausible import physical, small
 from sioms.reconcile.records import Record, Session
-from sioms.reconcile.report.page import span
+from sioms.reconcile.report.words import span
 from sioms.reconcile.simulate import simulate
 from sioms.reconcile.switches import Switches
 from sioms.reconcile.verdict import Estimate, Gap

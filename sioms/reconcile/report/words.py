@@ -1,0 +1,193 @@
+"""What a verdict says in words and as JSON: the terminal's ten lines and verdict.json, alike for all subjects."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+from sioms.reconcile.axis_verdict import AxisVerdict
+from sioms.reconcile.sensors.verdict import SensorVerdict
+from sioms.reconcile.session import knobs
+from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome, Verdict
+
+HEAD = {
+    Outcome.NONE: "Nothing is missing: the model agrees with the measurement down to the noise.",
+    Outcome.NAMED: "Found what the model lacks.",
+    Outcome.UNEXPLAINED: "Something is missing that no effect of the library explains.",
+    Outcome.AMBIGUOUS: "Something is missing, but these records cannot tell which of the look-alikes it is.",
+}
+LINES = 10
+#: Permutations do as well no oftener than this: a variable orders a disagreement.
+CHANCE = 0.05
+
+
+def headline(v: Verdict) -> str:
+    """One sentence."""
+    if v.outcome is Outcome.UNEXPLAINED and v.effects:
+        return "Found part of what the model lacks; something remains that no effect of the library explains."
+    return HEAD[v.outcome]
+
+
+def number(value: float) -> str:
+    """Four significant digits."""
+    return f"{value:.4g}"
+
+
+def span(p: Estimate) -> tuple[str, str, str]:
+    """Value and interval of a number, with as many digits as tell the ends apart, four at least."""
+    width = abs(p.high - p.low)
+    size = max(abs(p.low), abs(p.high))
+    digits = (
+        4 if not 0.0 < width < size < math.inf else min(max(4, 2 + math.ceil(math.log10(size / width))), 9)
+    )
+    return f"{p.value:.{digits}g}", f"{p.low:.{digits}g}", f"{p.high:.{digits}g}"
+
+
+def summary(v: Verdict, out: str) -> list[str]:
+    """Say the verdict in at most ten lines."""
+    lines = [f"verdict: {v.outcome.value} - {headline(v)}"]
+    lines += ["  " + in_words(e) for e in v.effects[:4]]
+    lines += [f"  unexplained part looks like {in_words(e)}" for e in v.symbolic[:2]]
+    more = []
+    if v.alternatives:
+        sets = [[e.name for e in v.effects], *v.alternatives]
+        more.append("  not told apart: " + " or ".join(" + ".join(s) or "nothing" for s in sets))
+    if v.experiment is not None:
+        apart = f"rivals differ by {v.experiment.separation:.0f} times the noise"
+        more.append(f"  decide by: {v.experiment.text} ({apart})")
+    if where := places(v, 3):
+        more.append(f"where: of the disagreement goes {where}")
+    if v.effects:
+        ruled = ", ".join(v.effects[0].ruled_out)
+        more.append(f"why: {v.effects[0].evidence[-1]}" + (f"; ruled out: {ruled}" if ruled else ""))
+    more += [f"note: {note}" for note in reversed(v.notes)]
+    last = [f"gap on untouched data, {shrunk(v.speaking)}", f"report: {out}"]
+    return [*lines, *more[: LINES - len(lines) - len(last)], *last]
+
+
+def shrunk(gap: Gap) -> str:
+    """Say how far a gap shrank."""
+    return f"{gap.channel}: {number(gap.before)} before, {number(gap.after)} after, floor {number(gap.floor)} {gap.unit}"
+
+
+def places(v: Verdict, most: int) -> str:
+    """Say with which variables the disagreement goes, the strongest first; empty where with none."""
+    shown = [p for p in v.places if p.p <= CHANCE][:most]
+    parts = [f"{100 * p.explained:.0f} % with {p.variable}" for p in shown]
+    return f"{', '.join(parts)} (permutation p <= {max(p.p for p in shown):.2f})" if shown else ""
+
+
+def in_words(e: NamedEffect) -> str:
+    """Name an effect with its values; of a number for every element, the spread."""
+    parts = []
+    for p in e.parameters:
+        if "[" not in p.symbol:
+            value, low, high = span(p)
+            parts.append(_with_unit(f"{p.symbol} = {value}", p.unit) + f" [{low}, {high}]")
+    for mine in (mine for mine in groups(e).values() if "[" in mine[0].symbol):
+        least, largest = (pick(mine, key=lambda p: p.value) for pick in (min, max))
+        ends = " to ".join(f"{p.symbol} = {number(p.value)}" for p in (least, largest))
+        parts.insert(0, _with_unit(ends, mine[0].unit))
+    return f"{e.title}: {', '.join(parts[:4])}"
+
+
+def _with_unit(text: str, unit: str) -> str:
+    return text if unit in ("", "1") else f"{text} {unit}"
+
+
+def groups(e: NamedEffect) -> dict[str, list[Estimate]]:
+    """Return the estimates by quantity; one that every element has of its own comes with all its numbers, a matrix as one."""
+    out: dict[str, list[Estimate]] = {}
+    for p in e.parameters:
+        name, each, _ = p.symbol.partition("[")
+        out.setdefault(name.split("_")[0] if each else name, []).append(p)
+    return out
+
+
+def columns(mine: list[Estimate]) -> dict[str, list[Estimate]]:
+    """Return the columns of a matrix by their symbols; one for what is no matrix."""
+    out: dict[str, list[Estimate]] = {}
+    for p in mine:
+        out.setdefault(p.symbol.split("[")[0], []).append(p)
+    return out
+
+
+def as_json(v: Verdict, seconds: float) -> str:
+    """Return everything a program wants from the verdict."""
+    table = {
+        "verdict": v.outcome.value,
+        "effects": [e.name for e in v.effects],
+        "parameters": {e.name: {p.symbol: p.value for p in e.parameters} for e in v.effects},
+        "alternatives": [list(a) for a in v.alternatives],
+        "separating_experiment": v.experiment.text if v.experiment else "",
+        "separation_in_noise": v.experiment.separation if v.experiment else None,
+        "details": [_effect(e) for e in v.effects],
+        "symbolic": [_effect(e) for e in v.symbolic],
+        "located": [{"variable": p.variable, "explained": p.explained, "p": p.p} for p in v.places],
+        "smoother_share": v.smoother_share,
+        "burst_share": v.burst_share,
+        "effective_samples": v.effective_samples,
+        "samples": v.samples,
+        "gaps": [_gap(g, isinstance(v, AxisVerdict)) for g in v.gaps],
+        "ladder": [
+            {"action": s.action, "effect": s.effect, "ratio": s.ratio, "saved": s.saved, "rivals": s.rivals}
+            for s in v.ladder
+        ],
+        "not_excited": v.missing,
+        "same_in_these_records": [list(p) for p in v.pairs],
+        **_more(v),
+        "notes": list(v.notes),
+        "seconds": seconds,
+    }
+    return json.dumps(table, indent=1, default=float) + "\n"
+
+
+def _effect(e: NamedEffect) -> dict[str, Any]:
+    return {
+        "name": e.name,
+        "title": e.title,
+        "equation": e.equation,
+        "channel": e.channel,
+        "saved": e.saved,
+        "standard_errors": min(e.errors, 1e6),
+        "selection_frequency": e.frequency,
+        "evidence": list(e.evidence),
+        "ruled_out": e.ruled_out,
+        "not_ruled_out": e.open,
+        "parameters": {
+            p.symbol: {"value": p.value, "low": p.low, "high": p.high, "unit": p.unit} for p in e.parameters
+        },
+    }
+
+
+def _gap(g: Gap, of_axis: bool) -> dict[str, Any]:
+    table: dict[str, Any] = {
+        "channel": g.channel, "unit": g.unit, "before": g.before, "after": g.after,
+        "floor": g.floor, "floor_from": g.floor_from, "closed": g.closed,
+    }  # fmt: skip
+    return table | ({"frozen_later_half": g.frozen, "session_later_half": g.session} if of_axis else {})
+
+
+def _more(v: Verdict) -> dict[str, Any]:
+    """Return what only this kind of subject has."""
+    if isinstance(v, SensorVerdict):
+        return {"residual_over_floor": v.floors, "rejected": list(v.rejected)}
+    if not isinstance(v, AxisVerdict):
+        return {}
+    return {
+        "ladder": [
+            {
+                "action": s.action,
+                "effect": s.effect,
+                "ratio": s.ratio,
+                "saved": s.saved,
+                "rivals": s.rivals,
+                "untouched_force_error": e,
+            }
+            for s, e in zip(v.ladder, v.rungs, strict=True)
+        ],
+        "alternative_parameters": [{name: dict(values) for name, values in m.items()} for m in v.others],
+        "residual_over_floor": v.ratio,
+        "session": {name: {k: getattr(s, k) for k in knobs(v.model)} for name, s in v.states},
+    }
