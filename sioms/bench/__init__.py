@@ -7,7 +7,7 @@ counts and processor shares, never fails because a bar is missed, and leaves not
     sioms bench --quick                  all sub-benches, some seconds each
     sioms bench read write --json out.json
     sioms bench open --soak 1000000
-    sioms bench protocol --frames 20000000
+    sioms bench fuzz --target message --frames 20000000
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Attacks: what floods by one user cost another, and what is left after deaths at random points.
+"""Attacks: what floods by one user cost another.
 
 The victims and the attackers share the machine: attackers take processor time of their own. What is compared are phases
 of one run, with and without attackers. Run by root, attackers are another user, which is what shares are counted by.
@@ -9,20 +9,16 @@ from __future__ import annotations
 import contextlib
 import os
 import pwd
-import random
-import signal
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from sioms.client.command import command
 from sioms.protocol.flags import Request
 from sioms.protocol.messages import ClientVerb, encode
 
-from .deaths import cruise, wait_cruising
 from .figures import Bar, Figure, Report
 from .options import Options
 from .rig import CpuTimes, Daemon, wait_for
@@ -33,14 +29,12 @@ VICTIMS = ("mod0", "mod1")
 LATER_US = {"p50": 100.0, "p99.9": 1000.0}
 """How much later than without attackers ticks may be."""
 REQUEST_MS = 20.0
-LEASE_S = 0.25
 PACE_S = 0.01
 
 
 def bench_attack(options: Options, report: Report) -> None:
-    """Floods beside victims, then deaths."""
+    """Floods beside victims."""
     _floods(options.count(2, 20), report)
-    _deaths(options.kills(20, 1000), options.seed, report)
 
 
 # --- floods --------------------------------------------------------------------------------------
@@ -230,136 +224,3 @@ FLOODS: Mapping[str, Callable[[Daemon], Iterator[object]]] = {
     "connections": _connections,
     "writes of 8,000 no-ops": _no_ops,
 }
-
-
-# --- deaths --------------------------------------------------------------------------------------
-
-
-def _deaths(trials: int, seed: int, report: Report) -> None:
-    """Kill and stop processes alone and in pairs; look at what halts, what stays stopped, and what is left over."""
-    chance = random.Random(seed)
-    halts: list[int] = []
-    hangs: list[int] = []
-    counts: dict[str, int] = {}
-    found = {"stops lost": 0, "second owners": 0}
-    config = workcell([axes(name, history=HISTORY, limits=False) for name in VICTIMS])
-    with Daemon(config) as daemon, daemon.cell() as cell:
-        begin = _weight(daemon)
-        for trial in range(trials):
-            kind = chance.choices(list(KINDS), list(KINDS.values()))[0]
-            counts[kind] = counts.get(kind, 0) + 1
-            _trial(daemon, cell, kind, chance, hangs if kind == "client stopped" else halts, found)
-            report.progress(f"{kind}: {trial} of {trials}")
-        time.sleep(0.5)
-        grown = {name: now - begin[name] for name, now in _weight(daemon).items()}
-        markers = sum(row[3] for row in cell.status()["sessions"])
-    report.note("trials: " + ", ".join(f"{count} {kind}" for kind, count in sorted(counts.items())))
-    if halts:
-        report.samples("killed client to its axes halting", halts, "ms", bars=[Bar("max", 20.0)])
-    if hangs:
-        limit = LEASE_S * 1e3 + 20.0
-        report.samples(f"stopped client, lease {LEASE_S * 1e3:g} ms, to its axes halting", hangs, "ms",
-                       bars=[Bar("max", limit)])  # fmt: skip
-    for name, count in {**found, "markers left": markers}.items():
-        report.value(name, count, bars=[Bar("value", 0)])
-    report.value("descriptors gained by the daemon", grown["descriptors"], bars=[Bar("value", 0)])
-    report.value("memory gained by the daemon", grown["memory"] / 1e6, "MB")
-    daemons = max(1, trials // 20)
-    left = sum(_daemon_trial(chance) for _ in range(daemons))
-    report.value(f"stops lost by {daemons} deaths of the daemon", left, bars=[Bar("value", 0)])
-
-
-KINDS = {
-    "client": 6,
-    "two clients": 3,
-    "client stopped": 1,
-    "driver": 1,
-    "client and driver": 1,
-    "fork server": 1,
-}
-
-
-def _trial(
-    daemon: Daemon, cell: Any, kind: str, chance: random.Random, halts: list[int], found: dict[str, int]
-) -> None:
-    stopped = kind == "client stopped"
-    nodes = {name: cell.open(f"{name}.readonly") for name in VICTIMS}
-    victims = {name: daemon.fork(cruise(daemon, name, LEASE_S if stopped else 0.0)) for name in VICTIMS}
-    for node in nodes.values():
-        wait_cruising(node)
-    time.sleep(chance.random() * 0.003)
-    watches = {name: Watch(node) for name, node in nodes.items()}
-    pids = daemon.device_pids()
-    if kind in ("driver", "client and driver"):
-        cell.emergency_stop_node("mod1") if hasattr(cell, "emergency_stop_node") else nodes[
-            "mod1"
-        ].emergency_stop()
-        os.kill(pids["mod1"], signal.SIGKILL)
-    if kind == "fork server":
-        for pid in _fork_servers(daemon, {*pids.values()}):
-            os.kill(pid, signal.SIGKILL)
-    killed = ["mod0", "mod1"] if kind == "two clients" else ["mod0"]
-    begins = {}
-    for name in killed:
-        begins[name] = daemon.kill(victims[name], signal.SIGSTOP if stopped else signal.SIGKILL)
-        time.sleep(chance.random() * 0.001)
-    for name in killed:
-        halts.append(halting_ns(watches[name], begins[name]) - begins[name])
-    for pid in victims.values():
-        daemon.kill(pid)
-        daemon.reap(pid)
-    if kind in ("driver", "client and driver"):
-        wait_for(lambda: _is_back(daemon, pids["mod1"]), 20.0, "mod1 to be back")
-        found["stops lost"] += not _is_stopped(cell)
-        cell.reset("mod1")
-    holders = [row[0] for row in cell.status()["holders"]]
-    found["second owners"] += len(holders) - len(set(holders))
-    for name, node in nodes.items():
-        with contextlib.suppress(OSError):
-            node.close()
-        with cell.open(name, "rw", 5.0):
-            pass
-
-
-def _is_back(daemon: Daemon, before: int) -> bool:
-    with daemon.cell() as cell:
-        (device,) = [d for d in cell.status()["devices"] if d["name"] == "mod1"]
-        if device["state"] == "fault":  # it has died too often in short time
-            cell.reset("mod1")
-    return device["state"] == "up" and device["pid"] not in (0, before)
-
-
-def _is_stopped(cell: Any) -> bool:
-    with cell.open("mod1", "rw", 5.0) as node:
-        try:
-            node.write(command(0, velocity=0.01))
-        except OSError:
-            return True
-    return False
-
-
-def _daemon_trial(chance: random.Random) -> int:
-    """Stop the workcell, kill the daemon within a millisecond, look at the file of stops; return stops lost."""
-    with Daemon(workcell([axes("mod0", history=HISTORY, limits=False)])) as daemon:
-        with daemon.cell() as cell:
-            cell.emergency_stop(why="bench")
-        time.sleep(chance.random() * 0.001)
-        os.kill(daemon.pid, signal.SIGKILL)
-        daemon.process.wait(5.0)
-        kept = Path(daemon.socket + ".stops").read_text(encoding="utf-8", errors="replace")
-        return int("bench" not in kept)
-
-
-def _fork_servers(daemon: Daemon, drivers: set[int]) -> list[int]:
-    """Return the fork server, if there is one: after its death one is started when it is needed."""
-    children = Path(f"/proc/{daemon.pid}/task/{daemon.pid}/children").read_text().split()
-    return [int(pid) for pid in children if int(pid) not in drivers]
-
-
-def _weight(daemon: Daemon) -> dict[str, int]:
-    """Return descriptors and memory [bytes] of the daemon."""
-    pages = int(Path(f"/proc/{daemon.pid}/statm").read_text().split()[1])
-    return {
-        "descriptors": len(os.listdir(f"/proc/{daemon.pid}/fd")),
-        "memory": pages * os.sysconf("SC_PAGE_SIZE"),
-    }

@@ -35,11 +35,15 @@ BENCHES: dict[str, tuple[str, str]] = {
         "drivers: cycle against the line's speed, streams without loss, stop on a busy line",
     ),
     "tactile": ("tactile", "shape from strain: time of a frame, errors against theory, convergence"),
-    "attack": (
-        "attack",
-        "floods by one user beside victims of another; deaths at random points (--trials 10000)",
+    "attack": ("attack", "floods by one user beside victims of another"),
+    "deaths": (
+        "killing",
+        "processes killed and stopped at random points, alone and together: --trials N kills",
     ),
-    "protocol": ("fuzzing", "malformed frames on the sockets of daemon and drivers"),
+    "fuzz": (
+        "fuzzing",
+        "malformed frames and files: to each decoder, and on the sockets of daemon and drivers",
+    ),
 }
 """Name of a sub-bench: the module that holds it, as a function of its name, and what it measures."""
 
@@ -62,7 +66,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="few trials: seconds instead of minutes")
     parser.add_argument("--trials", type=int, metavar="N", help="trials of each kill, hang and stop")
     parser.add_argument("--soak", type=int, metavar="N", help="opens and closes of the sub-bench open")
-    parser.add_argument("--frames", type=int, metavar="N", help="frames of the sub-bench protocol")
+    parser.add_argument("--frames", type=int, metavar="N", help="frames of the sub-bench fuzz")
+    parser.add_argument("--files", type=int, metavar="N", help="files of the sub-bench fuzz")
+    parser.add_argument(
+        "--target",
+        action="append",
+        metavar="NAME",
+        help="target of the sub-bench fuzz; all when none is named",
+    )
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of random frames")
     parser.add_argument(
         "--picture",
@@ -86,7 +97,9 @@ def run(args: argparse.Namespace) -> int:
     # However we are ended, our daemons end with us.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    options = Options(args.quick, args.trials, args.soak, args.frames, args.seed, args.picture)
+    options = Options(
+        args.quick, args.trials, args.soak, args.frames, args.files, tuple(args.target or ()), args.seed, args.picture
+    )  # fmt: skip
     report, failed = Report(), []
     try:
         for name in args.names or BENCHES:

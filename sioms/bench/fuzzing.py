@@ -1,296 +1,126 @@
-"""Malformed frames on the sockets of the daemon and of drivers: no crash, no stray exception, no motion.
+"""Fuzzing: frames and files by the million, to each decoder in a process of its own, and to live sockets.
 
-Frames are random bytes, and valid messages with bytes changed, cut, inserted, or arguments exchanged.
-A mutation may by chance be a valid request; those count as answered. What must never happen: a process
-dies, an exception goes to the log, a node cannot be opened afterwards, or an axis moves without a write
-that was acknowledged.
+One list of targets (``decoders.TARGETS`` and ``live.LIVE``). None of what they are fed may end a process, raise what a decoder
+does not name, or take more than its bounds of time and memory.
 """
 
 from __future__ import annotations
 
-import errno
-import random
-import socket
+import shutil
+import subprocess
+import sys
+import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from sioms.protocol.flags import PROTOCOL_VERSION, ControlMode, Request
-from sioms.protocol.messages import ClientVerb, HandleVerb, MalformedMessage, decode, encode
-from sioms.protocol.records import AXIS_WRITE
+from sioms.children import ends_with_us
 
 from .figures import Bar, Report
+from .live import LIVE, bench_live
 from .options import Options
-from .rig import Daemon, descriptors
-from .workcells import axes, workcell
+from .search import counter, guided
 
-BATCH = 200
-PATIENCE_S = 0.004
-"""A frame that draws no answer by then waits for something, or needs none."""
-HISTORY = 4096
-NAN = float("nan")
-STRANGE: tuple[Any, ...] = (
-    None, True, -1, 0, 1, 2**31, 2**53, 2**63, -(2**63), 1e308, NAN, float("inf"), "", "mod0", "x" * 300, b"", b"\0" * 144,
-    [], [[]], {}, {"a": 1}, [None] * 40, [[[[[[[[[[1]]]]]]]]]], "eva\x1b[2J\r\n",
-)  # fmt: skip
-STRAY = ("Traceback", "driver failed", "level=error")
+if TYPE_CHECKING:
+    from .decoders import Target
+
+FRAMES, FILES = 20_000_000, 1_000_000
+QUICK_FRAMES, QUICK_FILES = 60_000, 3_000
+LED = 20
+"""One input in so many is found by coverage; the others are changes at random of what those reached, many times as fast."""
+LIVE_SHARE = 0.05
+"""Of the frames: what goes to live sockets takes ten times as long."""
 
 
-def bench_protocol(options: Options, report: Report) -> None:
-    """Send frames by the million, half to the daemon and half to drivers, and look at what they left."""
-    frames = options.frames if options.frames is not None else options.count(20_000, 1_000_000)
-    config = workcell([axes("mod0", history=HISTORY), axes("mod1", history=HISTORY)])
-    with Daemon(config) as daemon:
-        pids = {"daemon": daemon.pid, **daemon.device_pids()}
-        before = {who: descriptors(pid) for who, pid in pids.items()}
-        fuzz = _Fuzz(daemon, random.Random(options.seed))
-        begin = time.monotonic()
-        try:
-            while fuzz.sent < frames:
-                fuzz.batch()
-                report.progress(f"protocol: {fuzz.sent} of {frames}")
-            fuzz.close()
-        except OSError as error:
-            report.note(f"given up after {fuzz.sent} frames: {error}")
-        took = time.monotonic() - begin
-        outcomes = ", ".join(f"{name} {count}" for name, count in sorted(fuzz.outcomes.items()))
-        report.value("frames sent", fuzz.sent, "", notes=f"{fuzz.sent / took:.0f} a second; {outcomes}")
-        dead = daemon.ended()
-        alive = {"daemon": 0} if dead else {"daemon": daemon.pid, **daemon.device_pids()}
-        deaths = sum(alive.get(who) != pid for who, pid in pids.items())
-        stray = [line for line in daemon.log().splitlines() if any(word in line for word in STRAY)]
-        left = _left(before, {who: pid for who, pid in pids.items() if alive.get(who) == pid})
-        zero = [Bar("value", 0)]
-        report.value("processes that died", deaths, "", bars=zero)
-        report.value(
-            "stray exceptions in the log", len(stray), "", bars=zero, notes="; ".join(stray[:2])[:600]
+def bench_fuzz(options: Options, report: Report) -> None:
+    """Feed the targets that are asked for, or all, their shares of the frames and files."""
+    from .decoders import TARGETS
+
+    names = options.targets or (*TARGETS, *LIVE)
+    if unknown := [name for name in names if name not in TARGETS and name not in LIVE]:
+        raise RuntimeError(f"no target {unknown[0]}; there are: {', '.join((*TARGETS, *LIVE))}")
+    if not guided():
+        report.note("not guided by coverage: atheris is not installed")
+    done = {True: 0, False: 0}
+    broken = 0
+    for name, runs in shares(options, TARGETS).items():
+        if name in names and runs:
+            tried, good = _search(name, runs, options.seed, report)
+            done[TARGETS[name].frames] += tried
+            broken += not good
+    if live := [name for name in LIVE if name in names]:
+        frames = options.frames if options.frames is not None else options.count(QUICK_FRAMES, FRAMES)
+        done[True] += bench_live(live, int(frames * LIVE_SHARE), options.seed, report)
+    report.value("frames in all", done[True])
+    report.value("files in all", done[False])
+    report.value("decoders broken", broken, bars=[Bar("value", 0)])
+
+
+def shares(options: Options, targets: dict[str, Target]) -> dict[str, int]:
+    """Return how many inputs each decoder gets."""
+    frames = options.frames if options.frames is not None else options.count(QUICK_FRAMES, FRAMES)
+    files = options.files if options.files is not None else options.count(QUICK_FILES, FILES)
+    counts = {True: frames * (1.0 - LIVE_SHARE), False: float(files)}
+    whole = {kind: sum(t.share for t in targets.values() if t.frames is kind) for kind in counts}
+    return {name: -int(-counts[t.frames] * t.share // whole[t.frames]) for name, t in targets.items()}
+
+
+def _search(name: str, runs: int, seed: int, report: Report) -> tuple[int, bool]:
+    """Search one decoder; return how many inputs it took, and whether all was well."""
+    folder, begin = Path(tempfile.mkdtemp(prefix="sioms-fuzz-")), time.monotonic()
+    try:
+        (folder / "corpus").mkdir()
+        (folder / "count").write_bytes(bytes(8))
+        tried = counter(str(folder / "count"))
+        led = min(runs, max(runs // LED, 500)) if guided() else 0
+        said, notes = "", ""
+        if led:
+            said = _child(
+                "guided", name, led, seed, folder, lambda: report.progress(f"{name}: {tried[0]} of {runs}")
+            )
+            notes = f"; {tried[0]} guided by coverage, which kept {len(list((folder / 'corpus').iterdir()))}"
+        if not said and runs > led:
+            said = _child(
+                "random",
+                name,
+                runs - led,
+                seed,
+                folder,
+                lambda: report.progress(f"{name}: {tried[0]} of {runs}"),
+            )
+        good = not said and tried[0] >= runs
+        notes = f"{tried[0] / (time.monotonic() - begin):.0f} a second{notes}" + (
+            f"; broken: {said}" if said else ""
         )
-        report.value("motions without an acknowledged write", fuzz.motions, "", bars=zero)
-        report.value("descriptors left open", left, "", bars=zero)
+        report.value(name, tried[0], notes=notes, bars=[Bar("value", runs, at_least=True)])
+        return tried[0], good
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
-def _left(before: dict[str, int], pids: dict[str, int]) -> int:
-    """Return how many descriptors the processes have more than before, when the last closes are through."""
-    for _ in range(20):
-        left = sum(max(0, descriptors(pid) - before[who]) for who, pid in pids.items())
-        if not left:
-            break
-        time.sleep(0.1)
-    return left
-
-
-class _Fuzz:
-    """Connections that frames go to, and the axes that must not move.
-
-    Attributes:
-        sent: frames so far.
-        outcomes: how many frames were answered, refused, or ended their connection.
-        motions: snapshots in motion in batches without an acknowledged write.
-    """
-
-    def __init__(self, daemon: Daemon, generator: random.Random) -> None:
-        self.sent = 0
-        self.outcomes: Counter[str] = Counter()
-        self.motions = 0
-        self._daemon = daemon
-        self._random = generator
-        self._cell = daemon.cell("watcher")
-        self._watched = [self._cell.open(f"mod{i}.readonly") for i in range(2)]
-        self._seen = [node.read().number for node in self._watched]
-        self._accepted = 0
-
-    def batch(self) -> None:
-        """Send a batch to the daemon, to a read-only handle and to an output handle; then look."""
-        self._accepted = 0
-        self._send(self._to_daemon, _client_message, BATCH)
-        self._send(lambda: self._to_driver("mod0.readonly"), _handle_message, BATCH // 2)
-        self._send(lambda: self._to_driver("mod1"), _handle_message, BATCH // 2)
-        for i, node in enumerate(self._watched):
-            snapshots = node.history(self._seen[i])
-            if snapshots:
-                self._seen[i] = snapshots[-1].number
-            if not self._accepted:
-                self.motions += sum(any(s.in_motion) for s in snapshots)
-        if self._cell.status()["stopped_ns"]:
-            self._cell.reset()
-        for i in range(2):
-            self._cell.reset(f"mod{i}")
-
-    def close(self) -> None:
-        """Close the watcher; every node must still open and read."""
-        for watched in self._watched:
-            watched.close()
-        self._cell.close()
-        with self._daemon.cell() as cell:
-            for i in range(2):
-                with cell.open(f"mod{i}", "rw", 5.0) as node:
-                    node.read()
-
-    def _send(
-        self, connect: Callable[[], socket.socket], make: Callable[[random.Random], bytes], count: int
-    ) -> None:
-        """Send frames; after one that ended its connection connect anew."""
-        sock = connect()
-        try:
-            for _ in range(count):
-                if not self._one(sock, self._frame(make)):
-                    sock.close()
-                    sock = connect()
-        finally:
-            sock.close()
-
-    def _one(self, sock: socket.socket, frame: bytes) -> bool:
-        """Send a frame and take what comes at once; return whether the connection lives."""
-        self.sent += 1
-        try:
-            sock.send(frame)
-            answer = sock.recv(65536)
-        except TimeoutError:
-            self.outcomes["waiting"] += 1  # a valid request that waits, or needs no answer
-            return True
-        except OSError as error:
-            if error.errno not in (errno.EPIPE, errno.ECONNRESET):
-                raise
-            answer = b""
-        if not answer:
-            self.outcomes["ended"] += 1
-            return False
-        message: list[Any] = decode(answer)
-        self.outcomes["refused" if message[2] else "answered"] += 1
-        if not message[2] and message[1]:
-            self._accepted += 1
-        return bool(message[1])
-
-    def _frame(self, make: Callable[[random.Random], bytes]) -> bytes:
-        while True:
-            frame = self._mutate(make(self._random))
-            try:
-                message = decode(frame)
-            except MalformedMessage:
-                return frame
-            # A reload is valid without arguments and starts processes: not what is tried here.
-            if make is not _client_message or message[0] != ClientVerb.RELOAD:
-                return frame
-
-    def _mutate(self, frame: bytes) -> bytes:
-        pick, data = self._random.random(), bytearray(frame)
-        if pick < 0.15:
-            return self._random.randbytes(self._random.choice((1, 2, 7, 30, 200, 5000)))
-        for _ in range(self._random.randint(0, 3)):
-            at = self._random.randrange(len(data))
-            how = self._random.randrange(4)
-            if how == 0:
-                data[at] = self._random.randrange(256)
-            elif how == 1:
-                data[at] ^= 1 << self._random.randrange(8)
-            elif how == 2:
-                data[at:at] = self._random.randbytes(self._random.randint(1, 4))
-            else:
-                del data[at : at + self._random.randint(1, 8)]
-            if not data:
-                return b"\xc1"
-        return bytes(data)
-
-    def _to_daemon(self) -> socket.socket:
-        sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        sock.connect(self._daemon.socket)
-        sock.settimeout(PATIENCE_S)
-        return sock
-
-    def _to_driver(self, node: str) -> socket.socket:
-        """Open a node by hand and keep only its socket to the driver; the session lives as long as it is needed."""
-        session = self._to_daemon()
-        session.settimeout(10.0)
-        session.send(encode(ClientVerb.HELLO, 1, PROTOCOL_VERSION, "fuzz"))
-        _, fds, _, _ = socket.recv_fds(session, 65536, 4)
-        _close(fds)
-        session.send(encode(ClientVerb.OPEN, 2, node, 3 if "." not in node else 1, 10.0, 0.0))
-        packet, fds, _, _ = socket.recv_fds(session, 65536, 4)
-        message: list[Any] = decode(packet)
-        if message[2]:
-            raise OSError(message[2], message[3])
-        _close(fds[:2])
-        sock = _Held(fds[2], session)
-        sock.settimeout(PATIENCE_S)
-        return sock
-
-
-class _Held(socket.socket):
-    """A handle's socket that keeps its session; both close together."""
-
-    def __init__(self, fd: int, session: socket.socket) -> None:
-        super().__init__(fileno=fd)
-        self._session = session
-
-    def close(self) -> None:
-        """Close the handle, then the session."""
-        super().close()
-        self._session.close()
-
-
-def _close(fds: list[int]) -> None:
-    for fd in fds:
-        socket.close(fd)
-
-
-def _strange(generator: random.Random, parts: list[Any]) -> bytes:
-    """Exchange an argument, drop one, or add one, now and then."""
-    pick = generator.random()
-    if pick < 0.4 and len(parts) > 2:
-        parts[generator.randrange(2, len(parts))] = generator.choice(STRANGE)
-    elif pick < 0.5:
-        parts.append(generator.choice(STRANGE))
-    elif pick < 0.6:
-        parts.pop()
-    return encode(*parts)
-
-
-def _client_message(generator: random.Random) -> bytes:
-    """Return a message to the daemon, valid or with strange arguments."""
-    number = generator.randint(1, 1 << 20)
-    messages: list[list[Any]] = [
-        [ClientVerb.HELLO, number, PROTOCOL_VERSION, "fuzz"],
-        [
-            ClientVerb.OPEN,
-            number,
-            generator.choice(("mod0", "mod1.a1", "mod0.plant", "nowhere")),
-            3,
-            0.0,
-            0.0,
-        ],
-        [ClientVerb.CLOSE, number, generator.randint(0, 5)],
-        [ClientVerb.LIST, number],
-        [ClientVerb.INFO, number, "mod0.a0"],
-        [ClientVerb.STATUS, number],
-        [ClientVerb.RESERVE_MARKER, number, 3, False],
-        [ClientVerb.FREE_MARKER, number, generator.getrandbits(50)],
-        [ClientVerb.SIGNAL_MARKER, number, generator.getrandbits(50)],
-        [ClientVerb.WAIT_MARKER, number, generator.randint(0, 2000), 0.0],
-        [ClientVerb.EMERGENCY_STOP, number, generator.choice(("", "mod0", "x")), "fuzz"],
-        [ClientVerb.RESET, number, generator.choice(("", "mod1"))],
-        [ClientVerb.CANCEL, number, generator.randint(0, 9)],
+def _child(how: str, name: str, runs: int, seed: int, folder: Path, progress: Callable[[], None]) -> str:
+    """Search in a process of its own; return '' when all was well, else what it said."""
+    words = [
+        sys.executable,
+        "-P",
+        "-m",
+        f"{__package__}.search",
+        how,
+        name,
+        str(runs),
+        str(seed),
+        str(folder),
     ]
-    return _strange(generator, generator.choice(messages))
-
-
-def _handle_message(generator: random.Random) -> bytes:
-    """Return a message to a driver; its records are never valid as they are: every number in them is NaN."""
-    number = generator.randint(1, 1 << 20)
-    mode = generator.choice(
-        [*ControlMode, ControlMode(0x7FFF), ControlMode.POSITION | ControlMode.SPECIFIED_TIME]
-    )
-    record = AXIS_WRITE.pack(generator.randint(-1, 5), int(mode), generator.getrandbits(50), 0, *[NAN] * 15)
-    messages: list[list[Any]] = [
-        [HandleVerb.WRITE, number, generator.randint(0, 3), 0.0, record * generator.randint(1, 3)],
-        [HandleVerb.WRITE, number, 1, 0.0, record[: generator.randint(0, 144)]],
-        [HandleVerb.WRITE, number, 0, 0.0, None],
-        [HandleVerb.IOCTL, number, int(generator.choice(list(Request))), None, 0.0],
-        [HandleVerb.IOCTL, number, int(Request.SET_LIMITS), {"position_max": NAN, "nothing": 1}, 0.0],
-        [HandleVerb.IOCTL, number, int(Request.CALIBRATE_DEVICE), [NAN] * generator.randint(0, 5), 0.0],
-        [HandleVerb.IOCTL, number, int(Request.SEND_EXTERNAL_SYNCH), generator.getrandbits(62), 0.0],
-        [HandleVerb.SUBSCRIBE, number, generator.randint(-5, 100)],
-        [HandleVerb.CANCEL, number, generator.randint(0, 9)],
-        [HandleVerb.KEEPALIVE, 0],
-    ]
-    return _strange(generator, generator.choice(messages))
+    with open(folder / "log", "wb") as log:
+        child = subprocess.Popen(words, stdout=log, stderr=log, preexec_fn=ends_with_us())
+    try:
+        while child.poll() is None:
+            progress()
+            time.sleep(0.1)
+    finally:
+        child.kill()
+        child.wait()
+    if child.returncode == 0:
+        return ""
+    return f"status {child.returncode}: {(folder / 'log').read_text(errors='backslashreplace')[-1500:]}"

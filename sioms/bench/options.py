@@ -11,7 +11,8 @@ class Options:
 
     Attributes:
         quick: seconds instead of minutes.
-        trials, soak, frames: counts that were asked for, None for the usual.
+        trials, soak, frames, files: counts that were asked for, None for the usual.
+        targets: of fuzzing, none for all.
         seed: of random numbers.
         picture: file that a sub-bench which draws writes its picture to, empty for none.
     """
@@ -20,6 +21,8 @@ class Options:
     trials: int | None = None
     soak: int | None = None
     frames: int | None = None
+    files: int | None = None
+    targets: tuple[str, ...] = ()
     seed: int = 1
     picture: str = ""
 

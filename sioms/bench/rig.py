@@ -45,6 +45,11 @@ class Daemon:
         self.log_path = self.folder / "log"
         (self.folder / "bench.toml").write_text(config, encoding="utf-8")
         self._children: list[int] = []
+        self.start(pin)
+
+    def start(self, pin: int | None = None) -> None:
+        """Start the daemon, which has not been started or has ended, and wait until it is ready."""
+        (self.folder / "notify").unlink(missing_ok=True)
         notify = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         notify.bind(str(self.folder / "notify"))
         notify.settimeout(0.2)
@@ -60,7 +65,7 @@ class Daemon:
         ]
         if pin is not None:
             command = ["taskset", "-c", str(pin), *command]
-        with open(self.log_path, "wb") as log:
+        with open(self.log_path, "ab") as log:
             self.start_ns = time.monotonic_ns()
             self.process = subprocess.Popen(
                 [*command, "--socket", self.socket],

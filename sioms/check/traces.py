@@ -12,11 +12,12 @@ nobody causes now are passed over. A request that the trace does not hold ends t
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from sioms.documents import json_of
 
 VERSION = 1
 FAR_NS = 2_000_000_000
@@ -61,7 +62,7 @@ def read_trace(path: Path) -> Trace:
         BadTrace: not one, or of another version.
         OSError: it cannot be read.
     """
-    lines = path.read_text(encoding="utf-8").split("\n")
+    lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
     header = _entry(lines[0], path, 1)
     if header.get("sioms_trace") != VERSION:
         raise BadTrace(f"read {path}: version {header.get('sioms_trace')} of the format; {VERSION} is right")
@@ -69,18 +70,21 @@ def read_trace(path: Path) -> Trace:
     for number, line in enumerate(lines[1:-1], 2):
         entry = _entry(line, path, number)
         try:
+            t_ns, on = int(entry["t"]), int(entry["n"])
             if "b" in entry:
-                messages.append(Message(entry["t"], entry["n"], entry["d"], bytes.fromhex(entry["b"])))
+                if (way := entry["d"]) not in ("<", ">"):
+                    raise ValueError(f"d is {way!r:.40}")
+                messages.append(Message(t_ns, on, way, bytes.fromhex(entry["b"])))
             else:
-                events.append((entry["t"], entry["n"], entry["e"], entry.get("text", "")))
-        except (KeyError, ValueError, TypeError) as error:
+                events.append((t_ns, on, str(entry["e"]), str(entry.get("text", ""))))
+        except (KeyError, ValueError, TypeError, OverflowError) as error:
             raise BadTrace(f"read {path}, line {number}: {error!r}; want keys t, n and d, b or e") from None
     return Trace(header, tuple(messages), tuple(events))
 
 
 def _entry(line: str, path: Path, number: int) -> dict[str, Any]:
     try:
-        entry = json.loads(line)
+        entry = json_of(line)
     except ValueError:
         entry = None
     if not isinstance(entry, dict):

@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     """(device, block, channel, bit): a piece that can be stopped by itself; bit 0 for a channel without bits."""
 
 NODE, WORKCELL, CHECKPOINT = "node", "workcell", "checkpoint"
+MOST_PARTS = 1 << 20
+"""Channels, and bits of a channel, that an entry may name."""
+_DAMAGE = (ValueError, TypeError, LookupError, ArithmeticError)
+"""What an entry raises that is none."""
 
 
 def node_entry(
@@ -62,6 +66,8 @@ def _packed(parts: Iterable[tuple[int, int]]) -> list[list[int]]:
 
 def _unpacked(runs: Iterable[Iterable[int]]) -> Iterable[tuple[int, int]]:
     for first, last, bits in runs:
+        if not (0 <= first <= last < MOST_PARTS and 0 < bits < 1 << 64):
+            raise ValueError(f"channels {first} to {last}, bits {bits:#x}")
         for channel in range(first, last + 1):
             yield from ((channel, bit) for bit in range(bits.bit_length()) if bits >> bit & 1)
 
@@ -84,7 +90,7 @@ class Stopped:
         """Take an entry into account.
 
         Raises:
-            ValueError, TypeError, LookupError: it is none.
+            ValueError, TypeError, LookupError, ArithmeticError: it is none.
         """
         stop, by = bool(entry["stop"]), str(entry["by"])
         if WORKCELL in entry:
@@ -109,7 +115,7 @@ class Stopped:
             if entry is None:
                 raise ValueError
             self.apply(entry)
-        except (ValueError, TypeError, LookupError):
+        except _DAMAGE:
             if not self.workcell:
                 self.workcell = f"the journal of stops, which is damaged: {damage}"
                 self.since_s = now_s
@@ -152,25 +158,29 @@ def replay(data: bytes, start: int, now_s: float) -> Stopped:
     """
     state, at = Stopped(), start
     lines = _lines(data, start)
-    checkpoint = next((entry for _, entry in reversed(lines) if entry and CHECKPOINT in entry), None)
-    if checkpoint is None and start:
+    found = next(((place, entry) for place, entry in reversed(lines) if entry and CHECKPOINT in entry), None)
+    if found is None and start:
         state.take(None, f"nothing is known of what was before byte {start}", now_s)
-    if checkpoint is not None:
-        state, at = _from_checkpoint(checkpoint, start, now_s)
+    if found is not None:
+        state, at = _from_checkpoint(*found, start, now_s)
     for place, entry in lines:
         if place >= at and not (entry and CHECKPOINT in entry):
             state.take(entry, f"it cannot be read at byte {place}", now_s)
     return state
 
 
-def _from_checkpoint(checkpoint: Mapping[str, Any], start: int, now_s: float) -> tuple[Stopped, int]:
-    """Return the state of a checkpoint, and the place from which on entries add to it."""
+def _from_checkpoint(
+    place: int, checkpoint: Mapping[str, Any], start: int, now_s: float
+) -> tuple[Stopped, int]:
+    """Return the state of the checkpoint at a place, and the place from which on entries add to it."""
     state = Stopped()
     try:
         for entry in checkpoint[CHECKPOINT]:
             state.apply(entry)
-        return state, int(checkpoint["from"])
-    except (ValueError, TypeError, LookupError):
+        if (at := int(checkpoint["from"])) > place:
+            raise ValueError(f"it is of byte {at}, which lies behind it")
+        return state, at
+    except _DAMAGE:
         state.take(None, "its checkpoint cannot be read", now_s)
         return state, start
 

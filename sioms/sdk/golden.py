@@ -83,7 +83,7 @@ def _reply_wrong(golden: Golden, data: bytes) -> str:
     }  # fmt: skip
     for how, (fed, step) in tries.items():
         try:
-            value = _read(golden, fed, step)
+            value = read_reply(golden, fed, step)
         except Exception as error:  # whatever a foreign decoder raises is what its author wants to know
             return f"the reply {how}: {type(error).__name__}: {error}"
         if value != golden.value:
@@ -97,7 +97,7 @@ def _flipped(golden: Golden, data: bytes) -> tuple[int, str]:
         byte, bit = divmod(where, 8)
         damaged = data[:byte] + bytes((data[byte] ^ 1 << bit,)) + data[byte + 1 :]
         try:
-            missed += _read(golden, damaged, len(damaged)) != golden.value
+            missed += read_reply(golden, damaged, len(damaged)) != golden.value
         except (LinkError, DeviceError, Incomplete):
             continue
         except Exception as error:
@@ -105,7 +105,7 @@ def _flipped(golden: Golden, data: bytes) -> tuple[int, str]:
     return missed, ""
 
 
-def _read(golden: Golden, data: bytes, step: int) -> Any:
+def read_reply(golden: Golden, data: bytes, step: int) -> Any:
     """Do what a line does: gather bytes until the reply is complete, cut it off, decode it."""
     if golden.read is not None:
         return golden.read(data)

@@ -255,3 +255,9 @@ def test_room_for_many_stops_is_kept(path: str) -> None:
     assert os.stat(path).st_size < 200
     assert os.stat(path).st_blocks * 512 >= stop_record.MOST_BYTES
     os.close(record._fd)
+
+
+def test_a_checkpoint_of_a_place_behind_it_is_damage() -> None:
+    stop = b'{"at":1.0,"workcell":"","stop":true,"by":"me"}\n'
+    assert replay(b'{"checkpoint":[],"from":0}\n' + stop, 0, 5.0).workcell == "me"
+    assert "checkpoint" in replay(b'{"checkpoint":[],"from":999}\n' + stop, 0, 5.0).workcell

@@ -1,21 +1,27 @@
 """Decoders of what strangers send or write: each with bytes to begin with, and what it may raise.
 
 A target takes any bytes. What it raises beside what it names is a finding, and so is more memory or time than a few times
-its input. ``test_corpus.py`` replays what was found and random changes of it in seconds; ``run.py`` searches for hours.
+its input. ``sioms bench fuzz`` searches for hours; a unit test replays in seconds what was found.
+
+This module alone of the bench imports what daemon, drivers and laboratories read with.
 """
 
 from __future__ import annotations
 
+import json
+import os
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import msgpack
 import numpy as np
 
+from sioms.check.traces import BadTrace, read_trace
 from sioms.daemon.config import parse as parse_config
 from sioms.documents import json_of, toml_of
 from sioms.drivers.ascii_stream.codec import LineReceiver
@@ -23,6 +29,7 @@ from sioms.drivers.ati_rdt.codec import parse as parse_rdt
 from sioms.drivers.framed_adc.cobs import FrameReceiver
 from sioms.drivers.framed_adc.codec import parse_samples
 from sioms.drivers.ft300.codec import RecordReceiver
+from sioms.drivers.iio.codec import Element, Layout, ScanReceiver, parse_type
 from sioms.drivers.modbus.regmap import RegisterMapError, parse_map
 from sioms.drivers.schunk_ft.codec import parse as parse_schunk
 from sioms.lab.arrays import UnreadableError, read_mat, read_npz
@@ -41,15 +48,23 @@ from sioms.protocol.messages import (
     reply,
     value_of,
 )
+from sioms.protocol.stopfile import StopRequest
+from sioms.protocol.stopjournal import Stopped, entries_from, node_entry, replay, workcell_entry
 from sioms.protocol.text import printable, shown
 from sioms.protocol.verbs import FROM_CLIENT, ON_HANDLE, take
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.files.axis import read_model
 from sioms.reconcile.files.table import load_table
+from sioms.reconcile.live.force import read_stand
 from sioms.sdk.exchange import DeviceError, LinkError
-from sioms.sdk.golden import Golden, Incomplete, _read
+from sioms.sdk.golden import Golden, Incomplete, read_reply
+from sioms.sdk.keeping import Contents, Entry
+from sioms.sdk.keeping import decode as decode_positions
+from sioms.sdk.keeping import encode as encode_positions
 from sioms.tactile.cylinder import Cylinder
+from sioms.tactile.files import read_recording
 from sioms.tactile.finger import from_toml, nominal_finger, to_toml
+from sioms.tools.tokens import Tokens
 
 
 @dataclass(frozen=True)
@@ -60,11 +75,15 @@ class Target:
         run: is fed any bytes.
         seeds: bytes that it takes.
         raises: what it may raise.
+        share: of the files, or, where it takes frames, of these.
+        frames: whether it takes messages of a wire, as against files.
     """
 
     run: Callable[[bytes], object]
     seeds: Sequence[bytes]
     raises: tuple[type[Exception], ...]
+    share: int = 1
+    frames: bool = False
 
 
 def _message(data: bytes) -> None:
@@ -81,13 +100,13 @@ def _message(data: bytes) -> None:
     assert repr(message) == repr(plain) or len(data) > MAX_PACKET
     assert shown(message).isprintable()
     assert repr(decode(encode(*message))) == repr(message)
-    for verbs in (FROM_CLIENT, ON_HANDLE, TO_DRIVER, FROM_DRIVER, TO_NURSERY):
-        try:
-            _, taken = take(data, verbs)
-        except MalformedMessage as error:
-            assert str(error).isprintable()
-        else:
-            assert len(taken) == len(verbs[message[0]].fields)
+    verbs = (FROM_CLIENT, ON_HANDLE, TO_DRIVER, FROM_DRIVER, TO_NURSERY)[len(data) % 5]
+    try:
+        _, taken = take(data, verbs)
+    except MalformedMessage as error:
+        assert str(error).isprintable()
+    else:
+        assert len(taken) == len(verbs[message[0]].fields)
 
 
 def _reply(data: bytes) -> None:
@@ -131,7 +150,7 @@ GOLDEN = _golden()
 
 def _device(data: bytes) -> object:
     """The decoder of one exchange with a device: the first byte chooses which."""
-    return _read(GOLDEN[data[0] % len(GOLDEN)], data[1:], max(len(data) - 1, 1)) if data else None
+    return read_reply(GOLDEN[data[0] % len(GOLDEN)], data[1:], max(len(data) - 1, 1)) if data else None
 
 
 def _streams(data: bytes) -> None:
@@ -141,13 +160,67 @@ def _streams(data: bytes) -> None:
             receiver.feed(part)
     for parse in (parse_rdt, parse_schunk, parse_samples):
         parse(data)
+    scans = ScanReceiver(SCAN.size)
+    for part in (data[:cut], data[cut:]):
+        SCAN.decode(scans.feed(part))
 
 
-def _saved(save: Callable[[object], None]) -> bytes:
+SCAN = Layout([Element("a", 0, parse_type("le:s12/16>>4")), Element("b", 1, parse_type("be:u24/32>>0"))])
+
+
+def _pipe(data: bytes) -> None:
+    """What comes through a pipe ends the tool with a sentence, or gives finite numbers."""
+    for skip in (False, True):
+        tokens = Tokens(skip)
+        for part in (data[: len(data) // 2], data[len(data) // 2 :], b""):
+            tokens.feed(part)
+        assert all(-1e400 < value < 1e400 for value, _ in tokens.numbers)
+        assert tokens.bad.isprintable() and all(text.isprintable() for text in tokens.skipped)
+
+
+def _journal(data: bytes) -> Stopped:
+    """A journal whose last line has no end has stopped the workcell."""
+    found = replay(data, 0, 1.0)
+    assert found.workcell or not data.rpartition(b"\n")[2].strip(b"\0")
+    replay(data, 1, 1.0)
+    entries, _ = entries_from(data)
+    again = Stopped()
+    for entry in entries:
+        again.take(entry)
+    found.nodes()
+    for entry in found.entries():
+        Stopped().apply(entry)
+    return found
+
+
+def _stop_request(data: bytes) -> None:
+    with tempfile.TemporaryFile(dir="/dev/shm") as file, tempfile.TemporaryFile(dir="/dev/shm") as taken:
+        file.write(data)
+        file.flush()
+        request = StopRequest(os.dup(file.fileno()), os.dup(taken.fileno()))
+        assert request.source.isprintable()
+        request.take(request.mark)
+        request.close()
+
+
+def _positions(data: bytes) -> Contents:
+    found = decode_positions(data)
+    decode_positions(encode_positions(found))
+    return found
+
+
+def _saved(save: Callable[[Any], None]) -> bytes:
     with tempfile.TemporaryFile() as file:
         save(file)
         file.seek(0)
         return file.read()
+
+
+def _mat(file: Any) -> None:
+    from scipy.io import savemat
+
+    given = {"a": np.ones(3), "b": "text", "c": np.array([1, "x"], dtype=object)}
+    savemat(file, given, do_compression=True)
 
 
 def _finger() -> bytes:
@@ -157,7 +230,20 @@ def _finger() -> bytes:
 
 
 MAP = (files("sioms.drivers") / "modbus" / "maps" / "leadshine.toml").read_bytes()
-NOMINAL = Path(__file__).parents[1] / "physics" / "reconcile_axes" / "s18" / "nominal.json"
+AXIS = b"""{"kind": "linear", "unit_position": "m", "unit_force": "N", "sample_time": 0.001, "inertia": 12.4, "viscous": 3.9,
+"encoder_resolution": 5e-08, "index_pitch": 0.01, "start_position": 0.0, "position_max_speed": 0.32, "max_acceleration": 5.1,
+"controller": {"k": 2.3e5, "kz": -0.98, "kp": -0.67, "kb": -0.59, "tau_o": 0.0, "tau_m": 163.2, "vel_filter_hz": 100.0}}"""
+STAND = b'[[push]]\nname = "x"\naxis = "a"\nreference = "r"\nwrench = [1.0, 0.0]\nmost = 5.0\n[[hang]]\nname = "w"\nwrench = [0, 1]\nloads = [2.0]\n'
+TRACE = b"""{"sioms_trace": 1, "device": "a", "driver": "b", "table": {}}
+{"t": 1, "n": 0, "e": "open", "text": ""}\n{"t": 2, "n": 0, "d": ">", "b": "00ff"}\n{"t": 3, "n": 0, "d": "<", "b": ""}
+"""
+JOURNAL = b"\n".join(
+    json.dumps({"at": 1.0, **entry}).encode()
+    for entry in (
+        workcell_entry("a", stop=True), node_entry("n", "d", "b", [(0, 0), (1, 3)], "me", stop=True),
+        {"checkpoint": [node_entry("n", "d", "b", [(2, 0)], "me", stop=True)], "from": 0}, workcell_entry("a", stop=False),
+    )
+) + b"\n"  # fmt: skip
 CONFIG = (
     b'[workcell]\nname = "a"\n[device.io0]\ndriver = "sim-io"\noutputs = 8\n[[grant]]\nrights = ["read"]\n'
     b'[node.x]\nof = "io0"\n[[alarm]]\nnode = "x"\nhigh = 1.0\n[[emergency_stop]]\nnode = "x"\n'
@@ -171,41 +257,44 @@ TARGETS = {
             encode(NurseryVerb.DESCRIBE, 1, "a", "b", {"c": [1, -5, True]}, "/"), b"\x95\x02\x01\x1b" + b"\x91" * 40 + b"\xc0\x00",
             msgpack.packb([1, 1, msgpack.ExtType(5, b"x"), 1 << 63]),
         ],
-        (),
+        (), 4, True,
     ),
-    "reply": Target(_reply, [reply(1, {"a": [1]}, 5), refusal(1, 5, "no"), reply(1, ["x"] * 70_000)], (MalformedMessage,)),
-    "text": Target(_text, [b"a\x1b[2J\r\n", "µ\u202e".encode()], ()),
-    "config": Target(_config, [CONFIG], ()),
-    "toml": Target(toml_of, [CONFIG, b"x = [{ a = 1979-05-27 }]"], (ValueError,)),
+    "reply": Target(
+        _reply, [reply(1, {"a": [1]}, 5), refusal(1, 5, "no"), reply(1, ["x"] * 70_000)], (MalformedMessage,), 3, True
+    ),
+    "device": Target(
+        _device,
+        [bytes([i]) + bytes.fromhex(golden.reply) for i, golden in enumerate(GOLDEN[:256])],
+        (LinkError, DeviceError, Incomplete), 7, True,
+    ),
+    "streams": Target(
+        _streams, [b"1.0, 2.0, 3.0\n1,2,3\n", bytes.fromhex("ff204ed8fe2efb2e16640038ff2c017daf"), bytes(36)], (), 2, True
+    ),
+    "text": Target(_text, [b"a\x1b[2J\r\n", "µ\u202e".encode()], (), 1, True),
+    "pipe": Target(_pipe, [b"1 2.5e-3\n-4\n", b"1 two\n3\n"], (), 2, True),
+    "config": Target(_config, [CONFIG], (), 6),
+    "toml": Target(toml_of, [CONFIG, b"x = [{ a = 1979-05-27 }]"], (ValueError,), 3),
     "json": Target(json_of, [b'{"a": [1, -2.5e3, null, "x"]}'], (ValueError,)),
     "register map": Target(lambda data: parse_map(toml_of(data), "x"), [MAP], (RegisterMapError, ValueError)),
     "effects": Target(lambda data: parse_effects(data.decode("latin-1"), ["x"]), [b"[x.payload]\nmass = 0.5\n"], (EffectsError,)),
     "finger": Target(lambda data: from_toml(data.decode("latin-1")), [_finger()], (ValueError,)),
-    "model": Target(_file(read_model, ".json"), [NOMINAL.read_bytes()], (BadInputError,)),
+    "model": Target(_file(read_model, ".json"), [AXIS], (BadInputError,)),
+    "stand": Target(_file(lambda path: read_stand(path, 2), ".toml"), [STAND], (BadInputError,)),
     "npz": Target(
         _file(read_npz, ".npz"), [_saved(lambda f: np.savez(f, raw=np.ones((2, 3)), time=np.arange(2.0)))], (UnreadableError,)
     ),
-    "table": Target(_file(load_table, ".csv"), [b"time [s],position [m]\n0.0,1.0\n0.1,2.0\n0.2,3\n"], (BadInputError,)),
-    "device": Target(
-        _device,
-        [bytes([i]) + bytes.fromhex(golden.reply) for i, golden in enumerate(GOLDEN[:256])],
-        (LinkError, DeviceError, Incomplete),
+    "recording": Target(
+        _file(read_recording, ".npz"), [_saved(lambda f: np.savez(f, raw=np.ones((2, 3)), time=np.arange(2.0)))], (ValueError,)
     ),
-    "streams": Target(_streams, [b"1.0, 2.0, 3.0\n1,2,3\n", bytes.fromhex("ff204ed8fe2efb2e16640038ff2c017daf"), bytes(36)], ()),
+    "mat": Target(_file(read_mat, ".mat"), [_saved(_mat)], (UnreadableError,)),
+    "table": Target(_file(load_table, ".csv"), [b"time [s],position [m]\n0.0,1.0\n0.1,2.0\n0.2,3\n"], (BadInputError,)),
+    "trace": Target(_file(read_trace, ".trace"), [TRACE], (BadTrace,)),
+    "positions": Target(
+        _positions, [encode_positions(Contents({"x": Entry(3, 0.5, 1.0), "y": Entry(0, -1.0, 2.0)}, True, "boot"))], (ValueError,)
+    ),
+    "journal of stops": Target(_journal, [JOURNAL], (), 2),
+    "stop request": Target(_stop_request, [bytes(16) + b"why", b"\xff" * 300], ()),
 }  # fmt: skip
-
-
-def _mat_seed() -> bytes:
-    from scipy.io import savemat
-
-    return _saved(
-        lambda f: savemat(
-            f, {"a": np.ones(3), "b": "text", "c": np.array([1, "x"], dtype=object)}, do_compression=True
-        )
-    )
-
-
-TARGETS["mat"] = Target(_file(read_mat, ".mat"), [_mat_seed()], (UnreadableError,))
 
 
 def feed(target: Target, data: bytes) -> bool:
