@@ -21,10 +21,11 @@ from sioms.protocol.flags import REQUESTS, Access, Right
 from sioms.protocol.messages import MAX_INLINE, MAX_PACKET, MAX_WRITE, MalformedMessage
 from sioms.protocol.text import shown
 
-from .blocks import AxisBlock
+from .blocks import AnyBlock
 from .exchange import HookError
 from .handles import LATER, Handle, Quota
 from .requests import ioctl
+from .stops import Reason, Stop
 from .writing import write
 
 if TYPE_CHECKING:
@@ -66,16 +67,15 @@ class Attachments:
             self.end(handle, errno_, f"{handle.node}: {text}")
 
     def _halt_all(self, handles: Sequence[Handle]) -> None:
-        """Halt what these handles own, before any of them takes time to be ended."""
-        axes: dict[int, tuple[AxisBlock, list[int]]] = {}
-        for handle in handles:
-            if handle.exclusive and isinstance(handle.block, AxisBlock):
-                axes.setdefault(id(handle.block), (handle.block, []))[1].extend(handle.axes)
-                handle.halted = True
-        for block, owned in axes.values():
-            block.bank.stop(owned, time.monotonic_ns())
-            self._runtime.engine.commands_written(block)
-            self._runtime.tick_early()
+        """Stop what these handles own, before any of them takes time to be ended."""
+        owners = [handle for handle in handles if handle.exclusive and not handle.halted]
+        parts: dict[tuple[int, int], tuple[AnyBlock, list[int], int]] = {}
+        for handle in owners:
+            handle.halted = True
+            key = id(handle.block), handle.bit
+            parts.setdefault(key, (handle.block, [], handle.bit))[1].extend(handle.axes)
+        if parts:
+            self._runtime.stops.safe_stop(Reason(Stop.CONTROLLED, "its owner has gone"), [*parts.values()])
 
     def detach(self, number: int, errno_: int = 0, reason: str = "") -> None:
         """End a handle because the daemon says so, and tell its client why; one that has ended already is confirmed again."""
@@ -219,17 +219,9 @@ class Attachments:
         if handle.every:
             self._runtime.pages.subscribers(handle.block).remove(handle)
         self._runtime.waits.forget(handle)
-        if handle.exclusive:
-            if not isinstance(handle.block, AxisBlock):
-                self._make_safe(handle)
-            elif not handle.halted:
-                self._halt_all([handle])
+        self._halt_all([handle])
         handle.close()
         self._runtime.tell(Detached(handle.number))
-
-    def _make_safe(self, handle: Handle) -> None:
-        """Give the outputs of a handle their safe values; of a bit only that bit."""
-        self._runtime.stops.make_safe(handle.block, handle.channels, handle.bit)
 
 
 def _keep_part(handle: Handle, message: verbs.Part) -> None:

@@ -64,7 +64,7 @@ class Handle:
         waits: unanswered requests by message number; each has a way to be ended.
         writes: whether it may write.
         axes: ``channels`` as plain integers.
-        halted: whether the axes that it owns have been halted because it ends.
+        halted: whether what it owns has been stopped because it ends.
     """
 
     number: int

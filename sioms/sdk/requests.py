@@ -22,6 +22,7 @@ from sioms.protocol.text import shown
 from .blocks import AnalogBlock, AxisBlock
 from .driver import Awaited, Refusal
 from .handles import LATER, Handle, Wait
+from .stops import Reason, Stop
 from .writing import check_link
 
 if TYPE_CHECKING:
@@ -171,8 +172,8 @@ def _axis_request(
         case Request.ZERO_DEVICE:
             bank.zero(axes)
         case Request.STOP:
-            bank.stop(axes, now_ns)
-            runtime.end_axis_waits(handle.block, axes, errno.ECANCELED, f"stopped by {handle.who}")
+            reason = Reason(Stop.CONTROLLED, f"stopped by {handle.who}", errno.ECANCELED)
+            runtime.stops.safe_stop(reason, [(handle.block, handle.axes, -1)])
         case Request.FLUSH:
             bank.flush(axes)
         case Request.HOME:

@@ -17,7 +17,6 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -49,7 +48,7 @@ from .outputs import Outputs
 from .pages import Pages
 from .rt import ChangeWatch, TimerFd, become_realtime, name_process
 from .statistics import TickStatistics
-from .stops import Stops
+from .stops import Reason, Stop, Stops
 from .stream_engine import StreamEngine
 from .tick_engine import TickEngine
 
@@ -209,22 +208,19 @@ class Runtime:
 
     def lose(self, blocks: Sequence[AnyBlock], reason: str) -> None:
         """The device behind some blocks is lost: nothing queued will run, waits end, readers are told."""
-        now_ns = time.monotonic_ns()
-        for block in blocks:
-            if isinstance(block, AxisBlock):
-                block.bank.fault(np.arange(block.n), reason, now_ns)
-        self.effects.note()
-        self.outputs.forget(blocks)
         self.set_link(blocks, PageState.LINK_LOST, reason)
-        self.take_events()
-        ours = {id(block) for block in blocks}
-        self.waits.end_where(lambda w: id(w.handle.block) in ours, errno.EIO, reason)
+        whole = [(block, range(block.n), -1) for block in blocks]
+        self.stops.safe_stop(Reason(Stop.LOSS, reason, errno.EIO), whole)
 
     def after_publication(self, now_ns: int, shown: Sequence[AnyBlock]) -> None:
         """Look at what a publication of some blocks may have brought about."""
         self.take_events()
         self.waits.check(now_ns, shown)
         self.stops.look_at_inputs()
+
+    def end_block_waits(self, block: AnyBlock, errno_: int, text: str) -> None:
+        """End all waits for a block."""
+        self.waits.end_where(lambda w: w.handle.block is block, errno_, text)
 
     def end_axis_waits(self, block: AnyBlock, axes: Any, errno_: int, text: str) -> None:
         """End the waits for motion of some axes."""
@@ -422,16 +418,11 @@ class Runtime:
         if isinstance(error, HookError) and isinstance(error.__cause__, Exception):
             what, error = f" in {error}", error.__cause__
         trace = "".join(traceback.format_exception(error)[-3:])
-        now_ns = time.monotonic_ns()
-        for block in self.blocks:
-            if isinstance(block, AxisBlock):
-                block.bank.emergency_stop(np.arange(block.n), now_ns)
+        until_ns = time.monotonic_ns() + FAIL_GRACE_NS
         attempts: list[Callable[[], None]] = [
-            lambda: self.engine.recover(f"the driver failed: {error!r}"),
-            lambda: self.engine.stop(self.blocks),
-            *(partial(self.stops.make_safe, block, range(block.n)) for block in self.blocks),
+            lambda: self.stops.safe_stop(Reason(Stop.FAILURE, f"the driver failed: {error!r}", errno.EIO)),
             self.engine.close,
-            lambda: self._run_line(now_ns + FAIL_GRACE_NS),
+            lambda: self._run_line(until_ns),
         ]
         for attempt in attempts:
             try:
@@ -457,13 +448,8 @@ class Runtime:
         if self._ending_ns:
             return
         self._ending_ns = time.monotonic_ns()
+        self.stops.safe_stop(Reason(Stop.CONTROLLED, reason))
         self.clients.end_all(errno.EIO, reason)
-        for block in self.blocks:
-            if isinstance(block, AxisBlock):
-                block.bank.stop(np.arange(block.n), self._ending_ns)
-                self.engine.commands_written(block)
-        for block in self.blocks:
-            self.stops.make_safe(block, range(block.n))
         self._end_reason = reason
         self._closing = False
 
@@ -476,7 +462,6 @@ class Runtime:
                 self._moved_ns = now_ns
             if now_ns - self._moved_ns < SETTLE_NS and not late:
                 return
-            self.engine.stop(axes)
             self.engine.close()
             self._closing = True
         if self.engine.is_quiet() or late:

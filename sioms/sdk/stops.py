@@ -8,8 +8,10 @@ from __future__ import annotations
 import errno
 import os
 import time
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Sequence
+from enum import Enum, auto
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -29,6 +31,37 @@ if TYPE_CHECKING:
 
 TOLD_NS = 10_000_000_000
 """How often it is logged that safe outputs could not be set."""
+
+
+class Stop(Enum):
+    """How axes are stopped; what outputs do is the same."""
+
+    CONTROLLED = auto()
+    """They brake and may be commanded anew."""
+    EMERGENCY = auto()
+    """As fast as the device can, latched until reset."""
+    FAILURE = auto()
+    """As EMERGENCY, after a hook has raised what it should not have: what is under way is given up first."""
+    LOSS = auto()
+    """The device does not answer: a fault; outputs are made safe when it is back."""
+
+
+class Reason(NamedTuple):
+    """Why something stops.
+
+    Args:
+        stop: how.
+        text: for those whose requests end.
+        errno: of these requests; 0: they go on.
+    """
+
+    stop: Stop
+    text: str
+    errno: int = 0
+
+
+Part = tuple[AnyBlock, Sequence[int], int]
+"""A block, channels of it, and one bit of them (-1: all)."""
 
 
 class Stops:
@@ -114,8 +147,8 @@ class Stops:
         stopped_ns, resets = latch.stopped_ns, latch.resets
         self._seen = (stopped_ns, resets, mark)
         if (stopped_ns and stopped_ns != seen_stop) or resets != seen_resets:
-            self._runtime.effects.note()
-            self._stop_all()
+            self.stopped = True
+            self.safe_stop(_emergency_stop_by(self.source))
         if fresh:
             if stopped_ns:  # also by another driver, which may not have come to note it
                 self._note(workcell_entry(latch.source, stop=True))
@@ -144,37 +177,77 @@ class Stops:
                 )
                 self.stop_workcell(f"input {name} bit {bit} reads {active}")
 
-    def _stop_all(self) -> None:
-        self.stopped = True
-        runtime, now_ns = self._runtime, time.monotonic_ns()
-        for block in runtime.blocks:
-            if isinstance(block, AxisBlock):
-                block.bank.emergency_stop(np.arange(block.n), now_ns)
-        runtime.engine.stop(runtime.blocks)
-        for block in runtime.blocks:
-            self.make_safe(block, range(block.n))
-        runtime.waits.end_where(  # before the events of the banks would: these know who stopped
-            lambda w: isinstance(w.handle.block, AxisBlock),
-            errno.ECANCELED,
-            f"emergency stop by {self.source}",
-        )
-        runtime.take_events()
+    # --- the one stop ----------------------------------------------------------------------------
+
+    def safe_stop(self, reason: Reason, parts: Sequence[Part] | None = None) -> None:
+        """Stop axes and make outputs safe; every stop of this process is this one.
+
+        The order, which docs/decisions/0176-one-safe-stop.md explains: banks, what is under way after a failure, the stops of
+        the device, its outputs, the requests that wait, the events of the banks. Each is done whatever became of those before.
+
+        Args:
+            reason: how and why.
+            parts: what stops; None: the whole device, and no write that is under way to it goes on.
+
+        Raises:
+            Exception: the first that one of them has raised, when all have been done.
+        """
+        runtime, engine = self._runtime, self._runtime.engine
+        whole = [(block, range(block.n), -1) for block in runtime.blocks] if parts is None else parts
+        blocks = [block for block, _, _ in whole if parts is None or isinstance(block, AxisBlock)]
+        runtime.effects.note()
+        steps: list[Callable[[], None]] = [partial(self._stop_axes, reason, whole)]
+        if reason.stop is Stop.FAILURE:
+            steps.append(partial(engine.recover, reason.text))
+        if reason.stop is Stop.LOSS:
+            steps.append(partial(runtime.outputs.forget, [block for block, _, _ in whole]))
+        else:
+            if blocks:
+                steps.append(partial(engine.stop, blocks))
+            steps += [partial(self.make_safe, *part) for part in whole]
+        if reason.errno:  # before the events of the banks would: these know who stopped
+            steps.append(partial(self._end_waits, reason, whole))
+        steps.append(runtime.take_events)
+        failures = []
+        for step in steps:
+            try:
+                step()
+            except Exception as error:  # nothing may keep the others from being stopped
+                failures.append(error)
+        if failures:
+            raise failures[0]
+
+    def _stop_axes(self, reason: Reason, parts: Iterable[Part]) -> None:
+        now_ns = time.monotonic_ns()
+        for block, channels, _ in parts:
+            if not isinstance(block, AxisBlock):
+                continue
+            axes = np.asarray(channels, dtype=np.intp)
+            match reason.stop:
+                case Stop.CONTROLLED:
+                    block.bank.stop(axes, now_ns)
+                case Stop.EMERGENCY | Stop.FAILURE:
+                    block.bank.emergency_stop(axes, now_ns)
+                case Stop.LOSS:
+                    block.bank.fault(axes, reason.text, now_ns)
+
+    def _end_waits(self, reason: Reason, parts: Iterable[Part]) -> None:
+        runtime = self._runtime
+        for block, channels, _ in parts:
+            if reason.stop is Stop.LOSS:
+                runtime.end_block_waits(block, reason.errno, reason.text)
+            elif isinstance(block, AxisBlock):
+                runtime.end_axis_waits(block, channels, reason.errno, reason.text)
 
     # --- nodes -----------------------------------------------------------------------------------
 
     def stop_node(self, block: AnyBlock, channels: Any, bit: int, source: str) -> None:
         """Emergency stop of some channels, or of one bit of them: latched until reset."""
-        runtime = self._runtime
-        runtime.effects.note()
-        if isinstance(block, AxisBlock):
-            block.bank.emergency_stop(channels, time.monotonic_ns())
-            runtime.engine.stop([block])
-            runtime.end_axis_waits(block, channels, errno.ECANCELED, f"emergency stop by {source}")
-            return
-        for channel in channels:
-            for part in parts_of(int(channel), bit, block.spec.channels[channel].width):
-                self.latched_outputs[id(block), *part] = source
-        self.make_safe(block, channels, bit)
+        if not isinstance(block, AxisBlock):
+            for channel in channels:
+                for part in parts_of(int(channel), bit, block.spec.channels[channel].width):
+                    self.latched_outputs[id(block), *part] = source
+        self.safe_stop(_emergency_stop_by(source), [(block, channels, bit)])
 
     def reset_node(self, block: AnyBlock, channels: Any, bit: int, what: str) -> None:
         """Clear the latched stop and faults of some channels, or the stop of one bit of them.
@@ -304,3 +377,7 @@ class Stops:
     def _reset_axes(self, block: AxisBlock, channels: Any) -> None:
         block.bank.reset(np.array(channels, dtype=np.intp))
         self._runtime.engine.commands_written(block)
+
+
+def _emergency_stop_by(source: str) -> Reason:
+    return Reason(Stop.EMERGENCY, f"emergency stop by {source}", errno.ECANCELED)
