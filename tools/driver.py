@@ -36,7 +36,11 @@ def add_parser(subparsers: Any) -> None:
         "--only", metavar="TRIAL,...", default="", help="these trials alone; a name that is none lists all"
     )
     one.add_argument(
-        "--simulator", metavar="COMMAND", default="", help="module or file of the device, and options"
+        "--simulator",
+        "--counterpart",
+        metavar="COMMAND",
+        default="",
+        help="module or file of the device, and options",
     )
     one.add_argument(
         "--config", metavar="FILE", type=Path, help="TOML of the device; {port} stands for its port"

@@ -1,4 +1,5 @@
-"""Write what is generated: manual pages (docs/man), shell completions (etc/completion), docs/protocol.md and docs/records.md.
+"""Write what is generated: manual pages (docs/man), shell completions (etc/completion), docs/protocol.md,
+docs/records.md, and the table in drivers/README.md.
 
     python -m sioms.tools.generate           write the files that differ
     python -m sioms.tools.generate --check   write nothing; exit 1 and name the files that differ
@@ -9,6 +10,7 @@ Everything comes out of the tables of options, manuals, commands, verbs and colu
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from pathlib import Path
 
@@ -51,10 +53,33 @@ def files() -> dict[str, str]:
     made["docs/man/siomsd.8"] = daemon_page()
     made["docs/protocol.md"] = protocol_page()
     made["docs/records.md"] = records_page()
+    made["drivers/README.md"] = families_page()
     made["etc/completion/sioms.bash"] = bash()
     made["etc/completion/_sioms"] = zsh()
     made["etc/completion/sioms.fish"] = fish()
     return made
+
+
+# --- families of drivers -------------------------------------------------------------------------
+
+CLASSES = ("axis", "analog", "binary")
+_ROW = re.compile(r"<!-- In drivers/README.md: (\|.*\|) -->")
+
+
+def families_page() -> str:
+    """Return the page of all families: what stands there, with the rows that their own pages have for it."""
+    folder = TREE / "drivers"
+    rows = []
+    for page in sorted(folder.glob("*/*.md")):
+        for row in _ROW.findall(page.read_text(encoding="utf-8")):
+            family, driver, node_class, *others = (cell.strip() for cell in row.strip("|").split("|"))
+            link = f"{driver}, [page]({page.relative_to(folder)})"
+            order = CLASSES.index(node_class.partition(",")[0])
+            rows.append((order, str(page), f"| {' | '.join([family, link, node_class, *others])} |"))
+    text = (folder / "README.md").read_text(encoding="utf-8")
+    kept = [line for line in text.splitlines() if not (line.startswith("| ") and "[page](" in line)]
+    at = next(i for i, line in enumerate(kept) if line.startswith("| --- ")) + 1
+    return "\n".join([*kept[:at], *(row for _, _, row in sorted(rows)), *kept[at:], ""])
 
 
 # --- records -------------------------------------------------------------------------------------
