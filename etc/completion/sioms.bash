@@ -23,7 +23,7 @@ _sioms_driver() {
     fi
     case ${COMP_WORDS[2]} in
     list) options='--help --json' ;;
-    check) options='--help --all --full --only --simulator --config --report --json --jobs' ;;
+    check) options='--help --all --full --only --simulator --counterpart --config --report --json --jobs' ;;
     trace) options='--help --output --seconds --socket' ;;
     replay) options='--help --ignore' ;;
     esac

@@ -83,6 +83,7 @@ complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcom
 complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l full
 complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l only
 complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l simulator
+complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l counterpart
 complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l config
 complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l report
 complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from check' -l json
