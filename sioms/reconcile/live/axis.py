@@ -5,9 +5,7 @@ The workflow sees what any client sees: readings of the node. It knows nothing o
 
 from __future__ import annotations
 
-import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,13 +19,12 @@ from sioms.reconcile.axis import analyse
 from sioms.reconcile.axis_verdict import AxisVerdict
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.experiment import Envelope, Experiment, catalogue, one_speed, repeated
+from sioms.reconcile.live.experiments import Say, agree, decide
 from sioms.reconcile.live.record import perform
 from sioms.reconcile.model import AxisModel, Controller
-from sioms.reconcile.model_file import write_model
 from sioms.reconcile.prepare import Options
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.simulate import simulate
-from sioms.reconcile.verdict import Outcome
 
 #: Shares of the axis's own limits that an experiment asks for.
 SHARE, JERK_SHARE = 0.6, 0.3
@@ -37,8 +34,6 @@ LAPS = 2
 LAP_S = 3.0
 #: Separating experiments after the first records.
 ROUNDS = 3
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +56,14 @@ class Live:
     seed: int = 1
 
 
-def live(node: str, nominal: AxisModel, settings: Live, say: Say) -> tuple[AxisVerdict, Session, float]:
+def live(node: str, nominal: AxisModel, settings: Live, folder: Path, say: Say) -> tuple[AxisVerdict, float]:
     """Reconcile an axis behind a daemon.
 
+    Args:
+        folder: where the records go, readable as DATA.
+
     Returns:
-        The verdict, the records it rests on, and the seconds of analysis.
+        The verdict and the seconds of analysis.
 
     Raises:
         BadInputError: the node is no such axis, or the user did not agree.
@@ -83,7 +81,20 @@ def live(node: str, nominal: AxisModel, settings: Live, say: Say) -> tuple[AxisV
         def run(experiments: Sequence[Experiment]) -> list[Record]:
             return perform(cell, node, _gentle(model, experiments, channel), envelope, say)
 
-        return _decide(run, model, envelope, run(plan), settings, say)
+        def separate(best: Experiment) -> None:
+            records.extend(run([repeated(replace(best, name=f"separate_{best.name}"), LAPS)]))
+
+        records = run(plan)
+        options = Options(seed=settings.seed, envelope=envelope, progress=say)
+        found = decide(
+            lambda: analyse(Session(tuple(records)), model, options),
+            separate,
+            lambda verdict: verdict.experiment,
+            ROUNDS,
+            say,
+        )
+    save(Session(tuple(records)), folder)
+    return found
 
 
 def _channel(info: NodeInfo, model: AxisModel) -> ChannelInfo:
@@ -163,70 +174,12 @@ def _agree(
         BadInputError: the answer is not yes, or there is nobody to ask.
     """
     unit, seconds = model.position_unit, sum(len(e.command) for e in plan) * model.sample_time_s
-    print(
+    told = [
         f"{node} will move between {envelope.centre - envelope.reach:.4g} and {envelope.centre + envelope.reach:.4g} {unit}, "
-        f"up to {envelope.speed:.3g} {unit}/s and {envelope.acceleration:.3g} {unit}/s^2, for some {seconds:.0f} s:"
-    )
-    for e in plan:
-        print(f"  {e.name}: {e.text}")
-    if settings.yes:
-        return
-    if not sys.stdin.isatty():
-        raise BadInputError(f"move {node}: nobody to ask; give --yes to move it unattended")
-    if input("move it? [yes/no] ").strip().lower() != "yes":
-        raise BadInputError(f"move {node}: the answer was not yes; nothing was moved")
-
-
-def _decide(
-    run: Callable[[Sequence[Experiment]], list[Record]],
-    model: AxisModel,
-    envelope: Envelope,
-    records: list[Record],
-    settings: Live,
-    say: Say,
-) -> tuple[AxisVerdict, Session, float]:
-    """Analyse; while two effects look alike, run what separates them and analyse anew."""
-    options = Options(seed=settings.seed, envelope=envelope, progress=say)
-    done: set[str] = set()
-    spent = 0.0
-    while True:
-        began = time.monotonic()
-        session = Session(tuple(records))
-        verdict = analyse(session, model, options)
-        spent += time.monotonic() - began
-        best = verdict.experiment
-        if (
-            verdict.outcome is not Outcome.AMBIGUOUS
-            or best is None
-            or best.name in done
-            or len(done) >= ROUNDS
-        ):
-            return verdict, session, spent
-        done.add(best.name)
-        say(f"not told apart: {_sets(verdict)}; deciding by {best.text}")
-        records = [*records, *run([repeated(replace(best, name=f"separate_{best.name}"), LAPS)])]
-
-
-def _sets(verdict: AxisVerdict) -> str:
-    names = ["+".join(e.name for e in verdict.effects), *("+".join(a) for a in verdict.alternatives)]
-    return " or ".join(names)
-
-
-def install(verdict: AxisVerdict, path: Path, socket: str | None) -> str:
-    """Write the corrected model where a simulated twin reads it, and let the daemon take it up.
-
-    Returns:
-        A sentence on what was done.
-    """
-    fresh = path.with_name(path.name + ".new")
-    fresh.write_text(write_model(verdict.model))
-    fresh.replace(path)
-    try:
-        with sioms.Workcell(socket, "reconcile") as cell:
-            cell.reload()
-    except OSError as error:
-        return f"model written to {path}; not taken up: {error.strerror or error}"
-    return f"model installed as {path}"
+        f"up to {envelope.speed:.3g} {unit}/s and {envelope.acceleration:.3g} {unit}/s^2, for some {seconds:.0f} s:",
+        *(f"  {e.name}: {e.text}" for e in plan),
+    ]
+    agree(f"move {node}", told, "move it?", settings.yes)
 
 
 def save(session: Session, folder: Path) -> None:

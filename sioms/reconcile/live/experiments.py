@@ -1,4 +1,4 @@
-"""What live runs of sensors have in common: ask before anything moves, keep records aside until a run is over, decide by rounds."""
+"""What live runs have in common: ask before anything moves, keep records aside until a run is over, decide by rounds, install."""
 
 from __future__ import annotations
 
@@ -8,10 +8,25 @@ import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Protocol, TypeVar
 
+import sioms
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.sensors.verdict import Proposal, SensorVerdict
-from sioms.reconcile.verdict import Outcome
+from sioms.reconcile.verdict import Outcome, Verdict
+
+V = TypeVar("V", bound=Verdict)
+E = TypeVar("E", bound="Named")
+
+
+class Named(Protocol):
+    """An experiment: what it is called, and what is said of it."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def text(self) -> str: ...
+
 
 Say = Callable[[str], None]
 
@@ -59,17 +74,18 @@ def kept(folder: Path) -> Iterator[Path]:
 
 
 def decide(
-    analyse: Callable[[], SensorVerdict],
-    run: Callable[[Proposal], None],
-    known: Collection[str],
-    effort: Callable[[str], float],
+    analyse: Callable[[], V],
+    run: Callable[[E], None],
+    deciding: Callable[[V], E | None],
+    rounds: int,
     say: Say,
-) -> tuple[SensorVerdict, float]:
-    """Analyse; while effects look alike, make what separates them and analyse anew.
+) -> tuple[V, float]:
+    """Analyse; while effects look alike, make what separates them and analyse anew, no experiment twice.
 
     Args:
         run: makes an experiment that was proposed.
-        known: names of those that can be made; effort: what one of them takes.
+        deciding: the experiment that would decide where effects look alike.
+        rounds: experiments at most.
 
     Returns:
         The verdict and the seconds of analysis.
@@ -80,8 +96,8 @@ def decide(
         began = time.monotonic()
         verdict = analyse()
         spent += time.monotonic() - began
-        best = _deciding(verdict, [n for n in known if n not in done], effort)
-        if best is None or len(done) >= ROUNDS:
+        best = deciding(verdict) if verdict.outcome is Outcome.AMBIGUOUS else None
+        if best is None or best.name in done or len(done) >= rounds:
             return verdict, spent
         done.add(best.name)
         sets = ["+".join(e.name for e in verdict.effects), *("+".join(a) for a in verdict.alternatives)]
@@ -89,12 +105,51 @@ def decide(
         run(best)
 
 
-def _deciding(
-    verdict: SensorVerdict, known: Collection[str], effort: Callable[[str], float]
-) -> Proposal | None:
-    """Return the experiment that would decide, of those that can be made."""
-    if verdict.outcome is not Outcome.AMBIGUOUS:
-        return None
-    open_ = [p for p in verdict.experiments if p.name in known and p.separation > LEAST]
-    near = [p for p in open_ if p.separation > NEARLY * open_[0].separation]
-    return min(near, key=lambda p: effort(p.name), default=None)
+def able(
+    names: Collection[str], effort: Callable[[str], float]
+) -> Callable[[SensorVerdict], Proposal | None]:
+    """Return the choice of the experiment that decides best, of those that can be made and were not made yet.
+
+    Args:
+        names: of those that can be made; effort: what one of them takes.
+    """
+    made: set[str] = set()
+
+    def deciding(verdict: SensorVerdict) -> Proposal | None:
+        open_ = [
+            p for p in verdict.experiments if p.name in names and p.name not in made and p.separation > LEAST
+        ]
+        near = [p for p in open_ if p.separation > NEARLY * open_[0].separation]
+        best = min(near, key=lambda p: effort(p.name), default=None)
+        if best is not None:
+            made.add(best.name)
+        return best
+
+    return deciding
+
+
+def install(
+    text: str, path: Path, socket: str | None, what: str, take_up: Callable[[sioms.Workcell], str]
+) -> str:
+    """Write a corrected model where its reader finds it, and have that take it up.
+
+    Args:
+        take_up: lets the workcell take it up, and says so.
+
+    Returns:
+        A sentence on what was done.
+    """
+    fresh = path.with_name(path.name + ".new")
+    fresh.write_text(text, encoding="utf-8")
+    fresh.replace(path)
+    try:
+        with sioms.Workcell(socket, "reconcile") as cell:
+            return f"{what} installed as {path}{take_up(cell)}"
+    except OSError as error:
+        return f"{what} written to {path}; not taken up: {error.strerror or error}"
+
+
+def reload(cell: sioms.Workcell) -> str:
+    """Let the daemon take up what has changed: a simulated device becomes the twin."""
+    cell.reload()
+    return ""

@@ -6,7 +6,7 @@ commands. It knows nothing of what the finger hides.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,8 @@ from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.files.finger import read_model, reconcile_tactile
 from sioms.reconcile.finger.belief import Belief, Scene
 from sioms.reconcile.finger.plan import Bench, Plan, catalogue, first, indenter, one_place
-from sioms.reconcile.live.experiments import Say, agree, decide, have_done, kept
+from sioms.reconcile.live.experiments import ROUNDS, Say, agree, decide, have_done, kept
+from sioms.reconcile.live.experiments import able as choose
 from sioms.reconcile.sensors.verdict import Proposal, SensorVerdict
 from sioms.tactile.live.prober import Prober, Recorder, Rig, Touch
 
@@ -86,8 +87,8 @@ def live(model: Path, asked: Probe, folder: Path, say: Say) -> tuple[SensorVerdi
             return decide(
                 lambda: reconcile_tactile(fresh, model, asked.seed, say, bench),
                 separate,
-                able,
-                lambda name: len(able[name][2].place),
+                choose(able, lambda name: len(able[name][2].place)),
+                ROUNDS,
                 say,
             )
 
@@ -200,18 +201,11 @@ def _agree(asked: Probe, bench: Bench, plan: list[Plan]) -> None:
     agree(f"probe {rig.finger}", told, "the indenter is clear of the finger; move?", asked.yes)
 
 
-def install(text: str, path: Path, node: str, socket: str | None) -> str:
-    """Write the corrected finger where its driver reads it at its start, and have the driver load it now.
+def loads(node: str, text: str) -> Callable[[sioms.Workcell], str]:
+    """Return what has the driver of a finger load a corrected one now, and says so."""
 
-    Returns:
-        A sentence on what was done.
-    """
-    fresh = path.with_name(path.name + ".new")
-    fresh.write_text(text, encoding="utf-8")
-    fresh.replace(path)
-    try:
-        with sioms.Workcell(socket, "reconcile") as cell, cell.open(f"{node}.shape") as shape:
-            name = shape.ioctl(Request.CALIBRATE_DEVICE, text)
-    except OSError as error:
-        return f"finger written to {path}; not taken up: {error.strerror or error}"
-    return f"finger installed as {path} and loaded by {node}.shape ({name})"
+    def take_up(cell: sioms.Workcell) -> str:
+        with cell.open(f"{node}.shape") as shape:
+            return f" and loaded by {node}.shape ({shape.ioctl(Request.CALIBRATE_DEVICE, text)})"
+
+    return take_up

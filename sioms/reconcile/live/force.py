@@ -40,7 +40,8 @@ from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.files.force import read_model, reconcile_force
 from sioms.reconcile.force.plan import LAPS, UP_AND_DOWN, Push, rest
 from sioms.reconcile.force.records import unit_of
-from sioms.reconcile.live.experiments import Say, agree, decide, have_done, kept
+from sioms.reconcile.live.experiments import ROUNDS, Say, agree, decide, have_done, kept
+from sioms.reconcile.live.experiments import able as choose
 from sioms.reconcile.sensors.verdict import Proposal, SensorVerdict
 
 LEASE_S = 1.0
@@ -135,8 +136,8 @@ def live(model: Path, asked: Load, folder: Path, say: Say) -> tuple[SensorVerdic
             return decide(
                 lambda: reconcile_force(fresh, model, None, asked.seed, say, able),
                 separate,
-                plans,
-                lambda name: float(len(plans[name][2].load)),
+                choose(plans, lambda name: float(len(plans[name][2].load))),
+                ROUNDS,
                 say,
             )
 
@@ -328,20 +329,3 @@ def _told(presser: Presser) -> Callable[[], float]:
         return presser.net(seen)
 
     return told
-
-
-def install(text: str, path: Path, socket: str | None) -> str:
-    """Write the corrected model where a simulated twin reads it, and let the daemon take it up.
-
-    Returns:
-        A sentence on what was done.
-    """
-    fresh = path.with_name(path.name + ".new")
-    fresh.write_text(text, encoding="utf-8")
-    fresh.replace(path)
-    try:
-        with sioms.Workcell(socket, "reconcile") as cell:
-            cell.reload()
-    except OSError as error:
-        return f"model written to {path}; not taken up: {error.strerror or error}"
-    return f"model installed as {path}"
