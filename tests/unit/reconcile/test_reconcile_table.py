@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -105,3 +107,10 @@ def test_a_recording_needs_no_description(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.diff(r.time_s), 1e-3, atol=1e-9)
     with pytest.raises(BadInputError, match="no column description"):  # without units they are only words
         read_data(_folder(tmp_path, head.replace(" [rad]", "") + rows, ""), AXIS)
+
+
+def test_a_program_reads_and_analyses_without_tools_and_client() -> None:
+    modules = "sioms.reconcile.axis, sioms.reconcile.files.axis, sioms.reconcile.files.finger, sioms.reconcile.files.force"
+    script = f"import sys, {modules}\nprint(*(n for n in sys.modules if n.startswith(('sioms.tools', 'sioms.client', 'sioms.sdk'))))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert not done.stdout.strip()
