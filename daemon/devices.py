@@ -15,6 +15,7 @@ from enum import Enum
 from functools import partial
 from typing import Any, Protocol
 
+from sioms.descriptors import receive
 from sioms.protocol.driver_verbs import FROM_DRIVER, LinkChanged, Ready, Shutdown
 from sioms.protocol.flags import PageState
 from sioms.protocol.messages import MAX_PACKET, MalformedMessage
@@ -274,7 +275,7 @@ class DriverProcess:
         if self._sock is None:
             return None
         try:
-            packet, fds, _, _ = socket.recv_fds(self._sock, MAX_PACKET + 1, 250)
+            packet, fds = receive(self._sock, MAX_PACKET + 1, 250)
         except BlockingIOError:
             return None
         except ConnectionResetError:

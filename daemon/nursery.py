@@ -13,6 +13,7 @@ import socket
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from sioms.descriptors import receive
 from sioms.protocol.driver_verbs import Describe, Spawn
 from sioms.protocol.messages import MAX_PACKET, MalformedMessage, decode_reply
 from sioms.protocol.verbs import Message
@@ -97,7 +98,7 @@ class Nursery:
 
     def _receive(self) -> None:
         try:
-            packet, fds, _, _ = socket.recv_fds(self._sock, MAX_ANSWER, 8)
+            packet, fds = receive(self._sock, MAX_ANSWER, 8)
         except BlockingIOError:
             return
         except OSError:

@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+from sioms.descriptors import receive
 from sioms.protocol.flags import PROTOCOL_VERSION, ControlMode, Request
 from sioms.protocol.messages import (
     MAX_UNPACKED,
@@ -226,10 +227,10 @@ class _Fuzz:
         """Open a node by hand and keep only its socket to the driver; the session lives as long as it is needed."""
         session = self._to_daemon()
         session.send(encode(ClientVerb.HELLO, 1, PROTOCOL_VERSION, "fuzz"))
-        _, fds, _, _ = socket.recv_fds(session, 65536, 4)
+        _, fds = receive(session, 65536, 4)
         _close(fds)
         session.send(encode(ClientVerb.OPEN, 2, node, 3 if "." not in node else 1, 10.0, 0.0))
-        packet, fds, _, _ = socket.recv_fds(session, 65536, 4)
+        packet, fds = receive(session, 65536, 4)
         message: list[Any] = decode(packet)
         if message[2]:
             raise OSError(message[2], message[3])

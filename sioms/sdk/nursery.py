@@ -17,6 +17,7 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
+from sioms.descriptors import receive
 from sioms.protocol.driver_verbs import TO_NURSERY, Describe, Spawn
 from sioms.protocol.messages import MAX_UNPACKED, encode, pack_compressed, refusal, reply
 from sioms.protocol.verbs import take
@@ -37,7 +38,7 @@ def main(fd: int) -> None:
     while True:
         if not asked.poll(0):
             from . import runtime  # noqa: F401  # what forking needs, while the daemon is not ready to ask
-        packet, fds, _, _ = socket.recv_fds(sock, 1 << 20, 8)
+        packet, fds = receive(sock, 1 << 20, 8)
         if not packet:
             return
         number, message = take(packet, TO_NURSERY, values=MAX_UNPACKED)

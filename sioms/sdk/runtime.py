@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from sioms.descriptors import receive
 from sioms.motion import CommandError, EventKind
 from sioms.protocol import driver_verbs
 from sioms.protocol.flags import PageState
@@ -521,7 +522,7 @@ class Runtime:
     def _take_order(self) -> bool:
         """Obey one message of the daemon; return whether there was one."""
         try:
-            packet, fds, _, _ = socket.recv_fds(self._control, MAX_PACKET, 8)
+            packet, fds = receive(self._control, MAX_PACKET, 8)
         except BlockingIOError:
             return False
         except ConnectionResetError:

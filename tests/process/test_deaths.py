@@ -157,7 +157,10 @@ def test_killed_nursery_harms_no_driver_and_a_new_one_restarts_them(
         axis.stop()
     before = daemon.device("io0")
     os.kill(before["pid"], signal.SIGKILL)
-    daemon.wait_up("io0", before["generation"] + 1)
+    driver = daemon.wait_up("io0", before["generation"] + 1)["pid"]
+    held = [os.readlink(link) for link in Path(f"/proc/{driver}/fd").iterdir()]
+    foreign = [what for what in held if "memfd" in what and any(f":mod{i}" in what for i in range(3))]
+    assert not foreign, "the new fork server had nothing of other devices to hand on"
 
 
 def test_five_deaths_in_a_minute_are_a_fault_until_reset(start_daemon: Callable[..., Daemon]) -> None:
