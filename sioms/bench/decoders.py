@@ -142,6 +142,8 @@ def _golden() -> list[Golden]:
             found += [golden for golden in entry.load().golden(None) if golden.reply]
         except (ImportError, AttributeError, TypeError):
             continue  # without its library, or for golden frames of certain settings only
+    if not found:
+        raise RuntimeError("find golden frames of the drivers: none; install this tree again")
     return found
 
 
