@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable
 
@@ -14,7 +15,7 @@ from daemon_rig import Daemon, axes
 import sioms
 import sioms.aio
 from sioms import command
-from sioms.protocol.flags import AxisStatus
+from sioms.protocol.flags import AxisStatus, Request
 
 TIMES = 20
 STOPPED, WAITING_SYNCH, WAITING_MARKER = (
@@ -203,6 +204,56 @@ def test_in_an_event_loop(daemon: Daemon) -> None:
                     assert eye.read().status[0] & STOPPED
                     await cell.reset("mod0")
                     assert not eye.read().status[0] & STOPPED
+
+    asyncio.run(main())
+
+
+def test_two_clients_on_bits_of_one_port_at_once(daemon: Daemon) -> None:
+    """Each sees its own bit as it was acknowledged, through its own node and through the port, while the other writes beside it."""
+    stale: list[tuple[int, str]] = []
+
+    def turn(number: int, barrier: threading.Barrier) -> None:
+        name = f"io0.bit{number}"
+        with (
+            daemon.cell(f"client {number}") as cell,
+            cell.open(name, "rw") as bit,
+            cell.open("io0.readonly") as port,
+        ):
+            barrier.wait(20.0)
+            for i in range(3 * TIMES):
+                bit.set(i % 2)
+                if bit.read().data[0] != i % 2:
+                    stale.append((i, name))
+                if port.read().data[0] >> number & 1 != i % 2:
+                    stale.append((i, "the port"))
+
+    barrier = threading.Barrier(2)
+    threads = [threading.Thread(target=turn, args=(number, barrier)) for number in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60.0)
+    assert not stale and not any(thread.is_alive() for thread in threads) and not barrier.broken
+
+
+def test_an_event_loop_beside_a_blocking_client(daemon: Daemon) -> None:
+    """What one of them was acknowledged shows to the other in the same process."""
+
+    async def main() -> None:
+        with daemon.cell("blocking") as plain, plain.open("mod0.readonly") as eye:
+            async with await sioms.aio.connect(daemon.socket) as cell:
+                look = await cell.open("mod1.readonly")
+                async with look, await cell.open("mod0.xaxis", "rw") as axis:
+                    with plain.open("mod1.xaxis", "rw") as other:
+                        for i in range(TIMES):
+                            await axis.ioctl(Request.CALIBRATE_DEVICE, 0.001 * i)
+                            assert abs(eye.read().position[0] - 0.001 * i) < 2e-4, i
+                            other.calibrate(0.002 * i)
+                            assert abs((await look.fresh()).position[0] - 0.002 * i) < 2e-4, i
+                            await axis.move(0.001 * i + 0.01)
+                            assert eye.read().in_motion[0], i
+                            await axis.wait_until_idle(5.0)
+                            assert not eye.read().in_motion[0], i
 
     asyncio.run(main())
 
