@@ -41,6 +41,8 @@ class DeviceInfo:
     inputs: tuple[str, ...]
     lease_s: float
     claims: tuple[str, ...] = ()
+    made_of: str = ""
+    """A digest of the driver's file and of those that its table names."""
 
     def facts(self) -> list[object]:
         """Return all it tells as plain values, to be compared."""
@@ -55,12 +57,12 @@ class DeviceInfo:
             ]
             for b in self.blocks
         ]
-        return [self.driver, blocks, self.tick_hz, self.inputs, self.lease_s]
+        return [self.driver, blocks, self.tick_hz, self.inputs, self.lease_s, self.made_of]
 
     @classmethod
     def unpack(cls, name: str, driver: str, packed: list) -> DeviceInfo:  # type: ignore[type-arg]
         """Make it from the nursery's reply."""
-        blocks, tick_hz, inputs, lease_s, claims = packed
+        blocks, tick_hz, inputs, lease_s, claims, made_of = packed
         return cls(
             name,
             driver,
@@ -72,6 +74,7 @@ class DeviceInfo:
             tuple(inputs),
             lease_s,
             tuple(claims),
+            made_of,
         )
 
 

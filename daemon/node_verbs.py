@@ -20,7 +20,7 @@ from sioms.wording import did_you_mean
 
 from .claims import Claims
 from .devices import DriverProcess, State
-from .names import READONLY, Node
+from .names import READONLY, Claim, Node
 from .rights import in_words
 from .sessions import LATER, Handle, Refused, Session, Wait
 from .suspended import Suspended
@@ -51,7 +51,7 @@ class NodeVerbs:
         self._clients = clients
         self._handles: dict[int, Handle] = {}
         self._claims: Claims[Handle] = Claims()
-        self._opens: list[tuple[Wait, Callable[[], None]]] = []
+        self._opens: list[tuple[Wait, Node, Callable[[], None]]] = []
         self._numbers = itertools.count(1)
         self._suspended = Suspended()
         self._then: list[tuple[set[int], Callable[[], None]]] = []
@@ -122,7 +122,7 @@ class NodeVerbs:
                 self._clients.drop(wait)
                 self._clients.send(session, refusal(number, error.errno, str(error)))
 
-        self._opens.append((wait, retry))
+        self._opens.append((wait, node, retry))
         return LATER
 
     def _openable(self, session: Session, name: str) -> Node:
@@ -152,7 +152,11 @@ class NodeVerbs:
         device = self._server.devices.get(node.device)
         if device is None or device.state is not State.UP:
             state, reason = (
-                (device.state.value, device.reason) if device else ("gone", "not configured any more")
+                (device.state.value, device.reason)
+                if device
+                else ("starting", "it has been reloaded")
+                if self._server.is_replaced(node.device)
+                else ("gone", "not configured any more")
             )
             return Refused(
                 errno.EIO,
@@ -162,7 +166,9 @@ class NodeVerbs:
 
     def _is_starting(self, node: Node) -> bool:
         device = self._server.devices.get(node.device)
-        return device is not None and device.state is State.STARTING
+        return self._server.is_replaced(node.device) or (
+            device is not None and device.state is State.STARTING
+        )
 
     def _grant(self, session: Session, number: int, node: Node, access: Access, lease_s: float) -> None:
         device = self._server.devices[node.device]
@@ -203,8 +209,15 @@ class NodeVerbs:
 
     def retry_opens(self) -> None:
         """Try the waiting opens again, the oldest first, and ask again whether they may."""
-        for _, retry in list(self._opens):
+        for _, _, retry in list(self._opens):
             retry()
+
+    def _retry_those_for(self, freed: list[Claim]) -> None:
+        """Try again the opens that wait for what has just become free, until somebody has it."""
+        channels = {claim[:3] for claim in freed}
+        for _, node, retry in list(self._opens):
+            if self._claims.holder(node) is None and any(claim[:3] in channels for claim in node.claims()):
+                retry()
 
     def close(self, session: Session, number: int, handle_number: int) -> Any:
         """Close a handle; answered when its driver has halted what it owned."""
@@ -292,8 +305,8 @@ class NodeVerbs:
         wait = handle.session.waits.get(handle.closing)
         if wait is not None:
             self._clients.answer(wait, reply(handle.closing, None, time.monotonic_ns()))
-        if self._opens:
-            self.retry_opens()
+        if self._opens and handle.claims:
+            self._retry_those_for(handle.claims)
         if self._then:
             self._tell_ended(handle.number)
 

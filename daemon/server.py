@@ -392,6 +392,10 @@ class Server:
         self.devices[name] = device
         device.start()
 
+    def is_replaced(self, name: str) -> bool:
+        """Tell whether a device is leaving and starts again, as configured now, when it has left."""
+        return name in self._leaving and self.config is not None and name in self.config.devices
+
     def _retire(self, device: DriverProcess) -> None:
         del self.devices[device.name]
         self._leaving[device.name] = device

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import os
 import sys
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from sioms.documents import MOST_BYTES, read_bytes
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.page import page_size
 from sioms.protocol.text import shown
@@ -127,8 +130,48 @@ def _anchored(value: Any, folder: str, key: str = "") -> Any:
     return os.path.join(folder, value) if is_file else value
 
 
-def describe(driver: type[Driver], name: str, settings: Any) -> tuple[list[object] | None, list[str]]:
-    """Let a driver describe a device; return the wire form (see DeviceInfo.unpack) and the errors."""
+def _named_files(value: Any, key: str = "") -> Iterator[str]:
+    """The files that an anchored table names, in nested tables too."""
+    if isinstance(value, Mapping):
+        for k, each in value.items():
+            yield from _named_files(each, k)
+    elif isinstance(value, list):
+        for each in value:
+            yield from _named_files(each)
+    elif isinstance(value, str) and (key.endswith("_file") or key == "map") and os.path.isfile(value):
+        yield value
+
+
+def contents(driver: type[Driver], table: Mapping[str, Any], folder: str) -> str:
+    """Return a digest of what a device is made of beside its table: the driver's file, and the files that its table names.
+
+    A file of more than MOST_BYTES is known by its size and the time of its last change.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    source = getattr(sys.modules.get(driver.__module__), "__file__", None)
+    for path in [*([source] if source else []), *_named_files(_anchored(table, folder))]:
+        try:
+            about = os.stat(path)
+            if about.st_size > MOST_BYTES:
+                digest.update(f"{about.st_size} {about.st_mtime_ns}".encode())
+            else:
+                digest.update(read_bytes(Path(path)))
+        except (OSError, ValueError) as error:  # who reads it will say so
+            digest.update(type(error).__name__.encode())
+    return digest.hexdigest()
+
+
+def describe(
+    driver: type[Driver], name: str, settings: Any, made_of: str = ""
+) -> tuple[list[object] | None, list[str]]:
+    """Let a driver describe a device; return the wire form (see DeviceInfo.unpack) and the errors.
+
+    Args:
+        driver: its class.
+        name: of the device.
+        settings: its settings.
+        made_of: see ``contents``; a device whose files have changed is another one.
+    """
     try:
         description = driver.describe(name, settings)
     except ValueError as error:
@@ -144,7 +187,8 @@ def describe(driver: type[Driver], name: str, settings: Any) -> tuple[list[objec
         for b in description.blocks
     ]  # fmt: skip
     claims = list(driver.variant(settings).claims(settings))
-    return [blocks, description.tick_hz, list(description.inputs), description.lease_s, claims], errors
+    facts = [blocks, description.tick_hz, list(description.inputs), description.lease_s, claims, made_of]
+    return facts, errors
 
 
 MOST_HISTORY = 1 << 20

@@ -22,7 +22,7 @@ from sioms.protocol.driver_verbs import TO_NURSERY, Describe, Spawn
 from sioms.protocol.messages import MAX_UNPACKED, encode, pack_compressed, refusal, reply
 from sioms.protocol.verbs import take
 
-from .finding import DriverNotFound, describe, find_driver, read_settings
+from .finding import DriverNotFound, contents, describe, find_driver, read_settings
 
 
 def main(fd: int) -> None:
@@ -74,7 +74,7 @@ def _describe(device: str, driver: str, table: dict[str, Any], folder: str) -> l
     settings, errors = read_settings(found, table, folder)
     if settings is None:
         return [errors, None]
-    packed, more = describe(found, device, settings)
+    packed, more = describe(found, device, settings, contents(found, table, folder))
     return [errors + more, packed]
 
 

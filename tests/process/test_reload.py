@@ -126,6 +126,21 @@ def test_what_has_not_changed_does_not_notice(daemon: Daemon) -> None:
             own.statistics(1)
 
 
+def test_a_changed_driver_file_restarts_its_device_alone(daemon: Daemon) -> None:
+    pids = {name: daemon.device(name)["pid"] for name in ("mod0", "own")}
+    with daemon.cell() as cell:
+        (daemon.folder / "own.py").write_text(SLOW + "# changed, and described as before\n")
+        cell.reload()
+        wait_for(lambda: daemon.device("own")["pid"] not in (0, pids["own"]), "a new process")
+        cell.open("own", "rw").close()
+        cell.reload()  # the same file once more
+        assert daemon.device("mod0")["pid"] == pids["mod0"]
+        assert (
+            daemon.device("own")["generation"]
+            == daemon.wait_up("own", daemon.device("own")["generation"])["generation"]
+        )
+
+
 def test_nothing_is_left_of_reloads(daemon: Daemon) -> None:
     with daemon.cell() as cell:
         cell.reload()

@@ -66,6 +66,7 @@ class Workcell:
         self.loop = Loop()
         self.loads: list[tuple[Callable[..., None], Callable[[], bool]]] = []
         self.done: list[str] = []
+        self.is_replaced = False
         latch = SimpleNamespace(stopped_ns=0, source="")
         record = SimpleNamespace(look=lambda: None, state=SimpleNamespace(nodes=list))
         self.server: Any = SimpleNamespace(
@@ -80,6 +81,7 @@ class Workcell:
             stop_node=lambda node, source: self.done.append(f"stop {node.name}"),
             reset_node=lambda node, who: self.done.append(f"reset {node.name}"),
             load=lambda done, begin: self.loads.append((done, begin)),
+            is_replaced=lambda _name: self.is_replaced,
         )  # fmt: skip
         self.listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.clients = Clients(self.server, self.listener, "test.sock")
@@ -336,3 +338,29 @@ def test_who_has_left_a_group_is_seen_at_a_reload(cell: Workcell) -> None:
     cell.peers["eva"] = Peer(1, 1001, "eva", frozenset())
     cell.clients.take_up_rights(rights)
     assert [arguments[1] for arguments in cell.device.ended()] == [errno.EACCES]
+
+
+def test_what_becomes_free_is_offered_to_who_waits_for_it_alone(
+    cell: Workcell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell.grant((["read", "write"], "eva", "*"), (["read", "write"], "tom", "*"))
+    assert cell.open("eva", "io0.bit0") == 0 == cell.open("eva", "io0.bit1")
+    first, second = list(cell.clients.nodes._handles)
+    assert [cell.open("tom", "io0.bit0", None) for _ in range(20)] == [None] * 20
+    nodes, tried = cell.clients.nodes, []
+    monkeypatch.setattr(nodes, "_obstacle", lambda node: tried.append(node))
+    nodes.detached(cell.device, second)  # type: ignore[arg-type]
+    assert not tried
+    nodes.detached(cell.device, first)  # type: ignore[arg-type]
+    assert len(tried) == 1 and cell.answer("tom") == 0 and cell.answer("tom") is None
+
+
+def test_an_open_of_a_device_that_is_reloaded_waits_until_it_is_back(cell: Workcell) -> None:
+    cell.grant((["read", "write"], "eva", "*"))
+    cell.server.devices = {}
+    assert cell.open("eva", "io0.bit0") == errno.EIO, "it is not configured any more"
+    cell.is_replaced = True
+    assert cell.open("eva", "io0.bit0") is None
+    cell.is_replaced, cell.server.devices = False, {"io0": cell.device}
+    cell.clients.nodes.retry_opens()
+    assert cell.answer("eva") == 0

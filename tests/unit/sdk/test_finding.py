@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sioms.sdk.finding import DriverNotFound, find_driver, read_settings
+from sioms.sdk.finding import DriverNotFound, contents, find_driver, read_settings
 
 FILE = """
 from __future__ import annotations
@@ -70,3 +70,17 @@ def test_a_word_that_is_none_of_the_right_ones_and_a_map_beside_the_configuratio
     table = {"map": "mine.toml", "line": line, "axis": [{"name": "x"}]}
     assert read_settings(driver, table, "/etc/sioms")[0].map == "/etc/sioms/mine.toml"
     assert read_settings(driver, {**table, "map": "leadshine"}, "/etc/sioms")[0].map == "leadshine"
+
+
+def test_the_contents_of_a_device_are_the_files_that_it_names(tmp_path: Path) -> None:
+    driver = find_driver("sim-io", "/")
+    (tmp_path / "a.toml").write_text("x = 1")
+
+    def of(table: dict[str, object]) -> str:
+        return contents(driver, table, str(tmp_path))
+
+    before = of({"map": "a.toml", "axis": [{"model_file": "a.toml"}]})
+    assert before == of({"map": "a.toml", "axis": [{"model_file": "a.toml"}]}) != of({"map": "shipped"})
+    (tmp_path / "a.toml").write_text("x = 2")
+    assert of({"map": "a.toml", "axis": [{"model_file": "a.toml"}]}) != before
+    assert of({"map": "shipped"}) == of({"map": "gone.toml", "description": "a.toml"})
