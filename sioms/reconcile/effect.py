@@ -156,45 +156,63 @@ class Parameter:
     steps: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Effect:
-    """One physical effect. Immutable; share it freely between threads.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnyEffect:
+    """What a physical effect of any subject says of itself. Immutable; share it freely between threads.
 
     Attributes:
-        function: state function, if it has one, and slot: what that returns.
-        mechanism: what it is beside, or instead of, that.
-        trials: how it is screened; None for one that is linear in a function of the state.
         neutral: value of the first parameter at which nothing changes.
-        sized: the first parameter says how large the effect is.
-        rotary, linear: kinds of axis on which it makes sense.
-        rankable: False where moving data can never tell it from its look-alike.
+        session: parameters that belong to the session and not to the subject.
         replaces: effects that this one contains or excludes; switching it on switches them off.
-        joins: effects of which this one is both at once: it is tried where one of them is in the model already.
-        beside: effects one of which must be in the model for this one to be tried; none: it may stand alone.
-        takes: (symbol, symbol): in the place of a look-alike that has the second number, the first is that.
-        ratios: (symbol, symbol, most): the first number is at most so many times the second.
-        session: parameters that belong to the session and not to the axis.
+        rankable: False where the search can never tell it: a channel of its own decides.
     """
 
     name: str
     title: str
     channel: Channel
     equation: str
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[Any, ...]
     signature: str
     lookalikes: tuple[str, ...]
     separate: str
+    neutral: float = 0.0
+    session: tuple[str, ...] = ()
+    replaces: tuple[str, ...] = ()
+    rankable: bool = True
+
+    def wrong(self, given: Iterable[str]) -> str:
+        """Say which symbols of given values are unknown or missing; empty where none is."""
+        known = [p.symbol for p in self.parameters]
+        odd = sorted(set(given) ^ set(known))
+        return (
+            f"read effect {self.name}: parameters {odd} are unknown or missing; needs {known}" if odd else ""
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Effect(AnyEffect):
+    """One physical effect of an axis.
+
+    Attributes:
+        function: state function, if it has one, and slot: what that returns.
+        mechanism: what it is beside, or instead of, that.
+        trials: how it is screened; None for one that is linear in a function of the state.
+        sized: the first parameter says how large the effect is.
+        rotary, linear: kinds of axis on which it makes sense.
+        joins: effects of which this one is both at once: it is tried where one of them is in the model already.
+        beside: effects one of which must be in the model for this one to be tried; none: it may stand alone.
+        takes: (symbol, symbol): in the place of a look-alike that has the second number, the first is that.
+        ratios: (symbol, symbol, most): the first number is at most so many times the second.
+    """
+
+    parameters: tuple[Parameter, ...]
     slot: Slot | None = None
     function: StateFunction | None = None
     mechanism: Mechanism = NONE
     trials: Trials | None = None
-    neutral: float = 0.0
     sized: bool = True
     rotary: bool = True
     linear: bool = True
-    rankable: bool = True
-    session: tuple[str, ...] = ()
-    replaces: tuple[str, ...] = ()
     joins: tuple[str, ...] = ()
     beside: tuple[str, ...] = ()
     ratios: tuple[tuple[str, str, float], ...] = ()
@@ -222,13 +240,9 @@ class Effect:
         Raises:
             ValueError: a name is unknown or missing.
         """
-        known = [p.symbol for p in self.parameters]
-        if set(given) != set(known):
-            odd = sorted(set(given) ^ set(known))
-            raise ValueError(
-                f"read effect {self.name}: parameters {odd} are unknown or missing; needs {known}"
-            )
-        return np.array([given[s] for s in known], dtype=np.float64)
+        if wrong := self.wrong(given):
+            raise ValueError(wrong)
+        return np.array([given[p.symbol] for p in self.parameters], dtype=np.float64)
 
     def row(self, values: Array, pitch: float) -> Array:
         """Lay the parameters out as a state function reads them, shape (ROW,)."""

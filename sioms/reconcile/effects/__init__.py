@@ -7,10 +7,10 @@ A user's package lists an ``Effect`` (or a tuple of them) under the entry-point 
 from __future__ import annotations
 
 from functools import cache
-from importlib.metadata import entry_points
 
 from sioms.reconcile.effect import Effect
 from sioms.reconcile.effects import drive, friction, position, sensor, terms, transmission
+from sioms.reconcile.library import collect
 
 GROUP = "sioms.effects"
 BUILT_IN: tuple[Effect, ...] = (
@@ -29,18 +29,7 @@ def library() -> dict[str, Effect]:
     Raises:
         ValueError: an entry point is no effect, or takes a name that is in use.
     """
-    found = {e.name: e for e in BUILT_IN}
-    for point in entry_points(group=GROUP):
-        given = point.load()
-        for effect in given if isinstance(given, tuple) else (given,):
-            if not isinstance(effect, Effect):
-                raise ValueError(f"load effect {point.name}: got {type(effect).__name__}; needs an Effect")
-            if effect.name in found:
-                raise ValueError(
-                    f"load effect {point.name}: the name {effect.name} is in use; choose another"
-                )
-            found[effect.name] = effect
-    return found
+    return collect(GROUP, BUILT_IN)
 
 
 @cache

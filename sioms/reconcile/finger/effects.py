@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
 from sioms.reconcile.effect import Channel
 from sioms.reconcile.finger.belief import Belief, Scene
 from sioms.reconcile.finger.pressures import Floats
+from sioms.reconcile.library import collect
 from sioms.reconcile.sensors.effect import Quantity, SensorEffect, Values, responding
-from sioms.reconcile.sensors.library import collect
 
 GROUP = "sioms.effects.tactile"
 DEG = np.pi / 180.0
@@ -350,6 +351,7 @@ BUILT_IN = (
 )
 
 
+@cache
 def library() -> dict[str, SensorEffect]:
     """Return every known effect of a finger by name: the built-in ones and those of installed packages."""
     return collect(GROUP, BUILT_IN)

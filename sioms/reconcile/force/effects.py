@@ -7,13 +7,14 @@ A user's package lists a ``SensorEffect`` (or a tuple of them) under the entry-p
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
 from sioms.reconcile.effect import Channel
 from sioms.reconcile.force.belief import Floats, ForceBelief, Loads, lag, late
+from sioms.reconcile.library import collect
 from sioms.reconcile.sensors.effect import Quantity, SensorEffect, Values, responding, term
-from sioms.reconcile.sensors.library import collect
 
 GROUP = "sioms.effects.force"
 SENSOR, MECHANICS = Channel.SENSOR, Channel.MECHANICS
@@ -291,6 +292,7 @@ TERMS = (
 BUILT_IN = (DRIFT, TEMPERATURE, TEMPERATURE_GAIN, GAIN, QUADRATIC, HYSTERESIS)
 
 
+@cache
 def library(names: tuple[str, ...]) -> dict[str, SensorEffect]:
     """Return every known effect of a sensor with these components, and the nameless terms."""
     own = (_cross(names),) if len(names) > 1 else ()

@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sioms.reconcile.effect import Array, Channel, Effect
+from sioms.reconcile.effect import AnyEffect, Array, Channel, Effect
 from sioms.reconcile.effects import library
 from sioms.reconcile.model import AxisModel, Controller
 
@@ -38,37 +39,47 @@ SHOWN = {"encoder_scale": {"gain": 1.02}, "encoder_quantisation": {"factor": 4e5
 
 
 def page() -> str:
-    """Write the whole library as Markdown."""
+    """Write the library of axis effects as Markdown."""
     parts = [HEAD]
     for channel in Channel:
         parts.append(f"## {channel.value}\n")
-        parts += [section(e) for e in library().values() if e.channel is channel]
+        parts += [_section_of_axis(e) for e in library().values() if e.channel is channel]
     return "\n".join(parts)
 
 
-def section(effect: Effect) -> str:
-    """Write one effect."""
+def _section_of_axis(effect: Effect) -> str:
     kinds = " and ".join(k for k, yes in (("rotary", effect.rotary), ("linear", effect.linear)) if yes)
-    lines = [
-        f"### {effect.name}: {effect.title}",
-        "",
-        f"`{effect.equation}`",
-        "",
-        "| parameter | unit | bounds | of | meaning |",
-        "| --- | --- | --- | --- | --- |",
-    ]
-    for p in effect.parameters:
+    beside = f"Only beside {', '.join(effect.beside)}; in the picture beside the first."
+    rows = [(p.symbol, p, p.ref.value) for p in effect.parameters]
+    picture = f"![residual of {effect.title}]({PICTURES}/{effect.name}.png)"
+    more = [beside] if effect.beside else []
+    return section(effect, f"`{effect.equation}`", "of", rows, picture, f" On {kinds} axes.", more)
+
+
+def section(
+    effect: AnyEffect,
+    equation: str,
+    scale: str,
+    rows: Iterable[tuple[str, Any, str]],
+    picture: str,
+    where: str = "",
+    more: Iterable[str] = (),
+) -> str:
+    """Write one effect of any subject.
+
+    Args:
+        scale: head of the column of natural sizes; rows: name of each parameter, itself, and its natural size.
+        where: is said after where its residual is; more: lines after what it is confused with.
+    """
+    lines = [f"### {effect.name}: {effect.title}", "", equation, ""]
+    lines += [f"| parameter | unit | bounds | {scale} | meaning |", "| --- | --- | --- | --- | --- |"]
+    for symbol, p, size in rows:
         bounds = "any" if p.phase else f"{p.lower:g} to {p.upper:g}"
-        lines.append(f"| {p.symbol} | {p.unit} | {bounds} | {p.ref.value} | {p.text} |")
-    lines += [
-        "",
-        f"![residual of {effect.title}]({PICTURES}/{effect.name}.png)",
-        "",
-        f"Where its residual is: {effect.signature}. On {kinds} axes.",
-        f"Confused with: {', '.join(effect.lookalikes)}. Told apart by: {effect.separate}.",
-    ]
-    if effect.beside:
-        lines.append(f"Only beside {', '.join(effect.beside)}; in the picture beside the first.")
+        lines.append(f"| {symbol} | {p.unit} | {bounds} | {size} | {p.text} |")
+    lines += ["", picture, "", f"Where its residual is: {effect.signature}.{where}"]
+    if effect.lookalikes:
+        lines.append(f"Confused with: {', '.join(effect.lookalikes)}. Told apart by: {effect.separate}.")
+    lines += more
     if effect.session:
         lines.append(f"Belongs to the session: {', '.join(effect.session)}.")
     return "\n".join(lines) + "\n"

@@ -11,6 +11,7 @@ from pathlib import Path
 from sioms.reconcile.effect import TERM_PREFIX
 from sioms.reconcile.finger.effects import library as of_fingers
 from sioms.reconcile.force.effects import library as of_force_sensors
+from sioms.reconcile.report.effects import PICTURES, section
 from sioms.reconcile.sensors.effect import SensorEffect
 
 HEAD = """# The libraries of sensor effects
@@ -22,7 +23,6 @@ are shares of each component's full range. Outside its bounds it is not that eff
 A picture shows what an effect of typical size changes: on a finger in all outputs, that of the element under the edge dark; on a force
 sensor in two components, fx dark.
 """
-PICTURES = "pictures/effects"
 
 
 def page() -> str:
@@ -48,24 +48,11 @@ def write(folder: Path) -> None:
 
 
 def _part(title: str, kind: str, effects: Iterable[SensorEffect]) -> list[str]:
-    return [f"## {title}\n", *(section(e, kind) for e in effects)]
+    return [f"## {title}\n", *(_section(e, kind) for e in effects)]
 
 
-def section(effect: SensorEffect, kind: str) -> str:
-    """Write one effect of a finger or of a force sensor."""
-    lines = [f"### {effect.name}: {effect.title}", "", f"`{effect.equation}` ({effect.channel.value})", "",
-             "| parameter | unit | bounds | typical | meaning |", "| --- | --- | --- | --- | --- |"]  # fmt: skip
-    for q in effect.parameters:
-        bounds = "any" if q.phase else f"{q.lower:g} to {q.upper:g}"
-        lines.append(
-            f"| {q.symbol}{' (each)' if q.each else ''} | {q.unit} | {bounds} | {q.size:g} | {q.text} |"
-        )
-    lines += ["", f"![change by {effect.title}]({PICTURES}/{kind}_{effect.name}.png)", ""]
-    lines.append(f"Where its residual is: {effect.signature}.")
-    if effect.lookalikes:
-        lines.append(f"Confused with: {', '.join(effect.lookalikes)}. Told apart by: {effect.separate}.")
-    if effect.session:
-        lines.append(f"Belongs to the session: {', '.join(effect.session)}.")
-    if not effect.rankable:
-        lines.append("Decided by a channel of its own, before the search.")
-    return "\n".join(lines) + "\n"
+def _section(effect: SensorEffect, kind: str) -> str:
+    rows = [(f"{q.symbol}{' (each)' if q.each else ''}", q, f"{q.size:g}") for q in effect.parameters]
+    picture = f"![change by {effect.title}]({PICTURES}/{kind}_{effect.name}.png)"
+    text = section(effect, f"`{effect.equation}` ({effect.channel.value})", "typical", rows, picture)
+    return text if effect.rankable else text + "Decided by a channel of its own, before the search.\n"

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.reconcile.effect import TERM_PREFIX, Channel
+from sioms.reconcile.effect import TERM_PREFIX, AnyEffect, Channel
 
 Array = NDArray[np.float64]
 Values = Mapping[str, Array]
@@ -43,33 +43,18 @@ class Quantity:
     starts: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class SensorEffect:
-    """One physical effect of a sensor. Immutable; share it freely between threads.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorEffect(AnyEffect):
+    """One physical effect of a sensor.
 
     Attributes:
         change: (belief, values) -> belief.
-        neutral: value of the first parameter at which nothing changes.
-        session: parameters that belong to the session and not to the sensor.
-        replaces: effects that this one contains; switching it on switches them off.
         twins: look-alikes that are put to the test however many parameters they have.
-        rankable: False where a channel of its own decides.
     """
 
-    name: str
-    title: str
-    channel: Channel
-    equation: str
     parameters: tuple[Quantity, ...]
-    signature: str
-    lookalikes: tuple[str, ...]
-    separate: str
     change: Callable[[Any, Values], Any]
-    neutral: float = 0.0
-    session: tuple[str, ...] = ()
-    replaces: tuple[str, ...] = ()
     twins: tuple[str, ...] = ()
-    rankable: bool = True
 
     @property
     def primary(self) -> Quantity:
@@ -86,12 +71,8 @@ class SensorEffect:
         Raises:
             ValueError: a name is unknown or missing, or an array has another length.
         """
-        known = [q.symbol for q in self.parameters]
-        if set(values) != set(known):
-            odd = sorted(set(values) ^ set(known))
-            raise ValueError(
-                f"read effect {self.name}: parameters {odd} are unknown or missing; needs {known}"
-            )
+        if wrong := self.wrong(values):
+            raise ValueError(wrong)
         out = {}
         for q in self.parameters:
             value = np.atleast_1d(np.asarray(values[q.symbol], dtype=np.float64))
