@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from queue import Empty, SimpleQueue
 from typing import IO
 
 PATIENCE_S = 300.0
@@ -42,33 +43,58 @@ class Process:
         arguments: of a Python module: ``["sioms.daemon.main", "--config", ...]``.
         ready: text that the ready line contains.
         errors: whether it comes on stderr instead of stdout.
+        told: whether it takes lines (``tell``).
 
     Raises:
         RuntimeError: it ended or stayed mute; with what it said.
     """
 
-    def __init__(self, arguments: Sequence[str], ready: str, errors: bool = False) -> None:
+    def __init__(
+        self, arguments: Sequence[str], ready: str, errors: bool = False, told: bool = False
+    ) -> None:
         pipe: dict[str, int] = {"stderr" if errors else "stdout": subprocess.PIPE}
+        pipe |= {"stdin": subprocess.PIPE} if told else {}
         self._process = subprocess.Popen(  # type: ignore[call-overload]
             [sys.executable, "-P", "-m", *arguments], text=True, preexec_fn=ends_with_us(), **pipe
         )
         stream: IO[str] = self._process.stderr if errors else self._process.stdout
         self.said: list[str] = []
-        found = threading.Event()
+        self._heard: SimpleQueue[str | None] = SimpleQueue()
 
         def listen() -> None:
             for line in stream:
                 self.said.append(line.rstrip())
-                if ready in line:
-                    found.set()
-            found.set()
+                self._heard.put(line)
+            self._heard.put(None)
 
         threading.Thread(target=listen, daemon=True).start()
-        if not found.wait(PATIENCE_S) or not any(ready in line for line in self.said):
+        deadline = time.monotonic() + PATIENCE_S
+        while (line := self._next(deadline)) is not None and ready not in line:
+            pass
+        if line is None:
             self.kill()
             raise RuntimeError(
                 f"start {arguments[0]}: it did not say {ready!r}; it said: {' | '.join(self.said[-5:])}"
             )
+
+    def _next(self, deadline: float) -> str | None:
+        """Return the next line, None when it has ended or stays mute."""
+        try:
+            return self._heard.get(timeout=max(deadline - time.monotonic(), 0.0))
+        except Empty:
+            return None
+
+    def tell(self, line: str) -> None:
+        """Write a line to its standard input and wait for its answer, "ok".
+
+        Raises:
+            RuntimeError: it refused; with what it said.
+        """
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
+        answer = self._next(time.monotonic() + PATIENCE_S)
+        if answer is None or not answer.startswith("ok"):
+            raise RuntimeError(f"tell a child {line!r}: it said {answer!r}; 'ok' was expected")
 
     @property
     def pid(self) -> int:

@@ -3,67 +3,20 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib.resources import files
 from pathlib import Path
 
 import sioms
-from sioms.children import daemon, ends_with_us
-from sioms.tactile.live.prober import START_S, wait_links
+from sioms.children import Process, daemon
+from sioms.tactile.live.prober import wait_links
 
 FINGER = (
     "length_m = 0.012; gain = 3.0; gain_scatter = 0.1; depth_scatter_m = 2e-4; angle_scatter_rad = 0.007; quadratic = 0.03; "
     "adhesion = 0.3; creep = 0.05; drift = 0.3; drift_s = 300.0; mains = 0.03; strip_gain = 0.02; seed = 1"
 )
 """The finger that is probed if none is described: faults of the sizes that the dissertation reports."""
-
-
-class Simulator:
-    """A simulated finger as a process; commands go to its standard input."""
-
-    def __init__(self, words: Sequence[str]) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", *words],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            preexec_fn=ends_with_us(),
-        )
-        self._wait("ready")
-
-    def tell(self, line: str) -> None:
-        """Send a command and wait for its answer.
-
-        Raises:
-            RuntimeError: it refused.
-        """
-        if self._process.stdin is not None:
-            self._process.stdin.write(line + "\n")
-            self._process.stdin.flush()
-        self._wait("ok")
-
-    def end(self) -> None:
-        """End it."""
-        self._process.terminate()
-        try:
-            self._process.wait(5.0)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-
-    def _wait(self, word: str) -> None:
-        said: list[str] = []
-        stream = self._process.stdout
-        if stream is not None:
-            reader = threading.Thread(target=lambda: said.append(stream.readline()), daemon=True)
-            reader.start()
-            reader.join(START_S)
-        if not said or not said[0].startswith(word):
-            raise RuntimeError(f"simulated finger: it said {said}; {word!r} was expected")
 
 
 @contextmanager
@@ -84,7 +37,9 @@ def simulated(
         module = "sioms.drivers.framed_adc.simulated.finger"
         words = ["--link", str(port), "--socket", str(socket), "--finger", finger]
         words += [] if hidden is None else ["--finger-file", str(hidden)]
-        device = Simulator([module, *words, "--mount", *(str(radius) for radius in radii_m)])
+        device = Process(
+            [module, *words, "--mount", *(str(radius) for radius in radii_m)], "ready", told=True
+        )
         stack.callback(device.end)
         config = folder / "prober.toml"
         source = text or files("sioms.tactile.live").joinpath("prober.toml").read_text(encoding="utf-8")
