@@ -9,13 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from sioms.protocol.flags import PROTOCOL_VERSION, NodeClass
+from sioms.protocol.flags import PROTOCOL_VERSION, READONLY, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.wording import did_you_mean
 
 from .config import NodeTable
-
-READONLY = ".readonly"
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,13 +14,13 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.driver_verbs import Attach, Detach
-from sioms.protocol.flags import Access, Right
+from sioms.protocol.flags import READONLY, Access, Right
 from sioms.protocol.messages import refusal, reply
 from sioms.wording import did_you_mean
 
 from .claims import Claims
 from .devices import DriverProcess, State
-from .names import READONLY, Claim, Node
+from .names import Claim, Node
 from .rights import in_words
 from .sessions import LATER, Handle, Refused, Session, Wait
 from .suspended import Suspended

@@ -12,11 +12,9 @@ from typing import Any
 
 from sioms.arguments import positive
 from sioms.client.stopping import emergency_stop
-from sioms.client.workcell import NodeEntry, Workcell
-from sioms.protocol.flags import ControlMode, NodeClass
+from sioms.client.workcell import NodeEntry, Workcell, is_part
+from sioms.protocol.flags import READONLY, ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
-
-READONLY = ".readonly"
 
 
 def add_parser(subparsers: Any) -> None:
@@ -240,18 +238,6 @@ def _touch(one: str, other: str) -> bool:
     """Tell whether of two nodes one is the other or a part of it."""
     one, other = one.removesuffix(READONLY), other.removesuffix(READONLY)
     return one == other or one.startswith(other + ".") or other.startswith(one + ".")
-
-
-def is_part(entry: NodeEntry, entries: Iterable[NodeEntry]) -> bool:
-    """Tell whether a node is a companion, a channel or a bit of another one in the list."""
-    if entry.name.endswith(READONLY):
-        return True
-    parent = entry.name.rpartition(".")[0]
-    return any(
-        other.name == parent and other.device == entry.device and other.node_class == entry.node_class
-        and (other.channels > entry.channels or entry.bit >= 0)
-        for other in entries
-    )  # fmt: skip
 
 
 def describe(info: NodeInfo) -> list[str]:

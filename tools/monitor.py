@@ -23,10 +23,10 @@ from time import localtime, monotonic_ns, strftime
 from typing import Any
 
 from sioms.client.stopping import emergency_stop
-from sioms.client.workcell import NodeEntry, Workcell
+from sioms.client.workcell import NodeEntry, Workcell, is_part
+from sioms.protocol.flags import READONLY
 
 from . import monitor_jog
-from .cell import READONLY, is_part
 from .monitor_events import History
 from .monitor_view import Jog, NodeView, Style, Text, View, page, screen
 

@@ -15,13 +15,13 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
+from sioms.check.daemon import CpuTimes, Daemon, wait_for
 from sioms.client.command import command
 from sioms.protocol.flags import Request
 from sioms.protocol.messages import ClientVerb, encode
 
 from .figures import Bar, Figure, Report
 from .options import Options
-from .rig import CpuTimes, Daemon, wait_for
 from .watching import HISTORY, Watch, halting_ns
 from .workcells import axes, workcell
 

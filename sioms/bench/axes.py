@@ -17,11 +17,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from sioms.check.daemon import CpuTimes, Daemon
 from sioms.client.command import command
 
 from .figures import Bar, Report
 from .options import Options
-from .rig import CpuTimes, Daemon
 from .workcells import workcell
 
 ORIGINAL = {1000: 90, 2000: 35, 3000: 19, 5000: 4}

@@ -9,11 +9,11 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from sioms.check.daemon import Daemon, wait_for
 from sioms.client.command import command
 
 from .figures import Bar, Report
 from .options import Options
-from .rig import Daemon, wait_for
 from .watching import HISTORY, Watch, halting_ns
 from .workcells import axes, workcell
 

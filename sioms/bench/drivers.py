@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+from sioms.check.daemon import CpuTimes
 from sioms.check.motion_trials import run, wait_moving
 from sioms.check.rigs import Rig, find_rig
 from sioms.check.station import Station, wait_for
@@ -22,7 +23,6 @@ from sioms.check.trial import Failed
 
 from .figures import Bar, Report
 from .options import Options
-from .rig import CpuTimes
 
 RATIO = 1.3
 BRAKING = 0.98

@@ -19,12 +19,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from sioms.check.daemon import Daemon, descriptors, wait_for
 from sioms.client.command import command
 from sioms.protocol.flags import Request
 
 from .figures import Bar, Report
 from .options import Options
-from .rig import Daemon, descriptors, wait_for
 from .watching import HISTORY, Watch
 from .workcells import axes, workcell
 

@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+from sioms.check.daemon import Daemon, descriptors
 from sioms.descriptors import receive
 from sioms.protocol.flags import PROTOCOL_VERSION, ControlMode, Request
 from sioms.protocol.messages import (
@@ -31,7 +32,6 @@ from sioms.protocol.messages import (
 from sioms.protocol.records import AXIS_WRITE
 
 from .figures import Bar, Report
-from .rig import Daemon, descriptors
 from .workcells import axes, workcell
 
 BATCH = 400

@@ -9,10 +9,11 @@ import os
 import time
 from typing import Any
 
+from sioms.check.daemon import CpuTimes, Daemon
+
 from .baseline import Wake
 from .figures import Bar, Figure, Report
 from .options import Options
-from .rig import CpuTimes, Daemon
 from .watching import HISTORY, Watch
 from .workcells import axes, wave, workcell
 

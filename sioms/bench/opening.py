@@ -7,12 +7,12 @@ import os
 import time
 from collections.abc import Iterator
 
+from sioms.check.daemon import CpuTimes, Daemon, descriptors, memory_kb
 from sioms.client.workcell import Workcell
 
 from .baseline import RoundTrip
 from .figures import Bar, Report
 from .options import Options
-from .rig import CpuTimes, Daemon, descriptors, memory_kb
 from .workcells import axes, workcell
 
 CHUNK = 100

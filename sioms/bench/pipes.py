@@ -11,12 +11,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from sioms.check.daemon import Daemon
 from sioms.children import ends_with_us
 
 from .baseline import interpreter_ns, run_ns
 from .figures import Bar, Report
 from .options import Options
-from .rig import Daemon
 from .watching import HISTORY, Watch
 from .workcells import axes, wave, workcell
 

@@ -7,10 +7,11 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from sioms.check.daemon import CpuTimes, Daemon, on_one_processor
+
 from .baseline import RoundTrip, Wake
 from .figures import Bar, Report
 from .options import Options
-from .rig import CpuTimes, Daemon, on_one_processor
 from .workcells import axes, force, workcell
 
 CHUNK = 200

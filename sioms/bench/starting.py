@@ -9,10 +9,11 @@ import signal
 import time
 from pathlib import Path
 
+from sioms.check.daemon import CpuTimes, Daemon, memory_kb
+
 from .baseline import interpreter_ns
 from .figures import Bar, Report
 from .options import Options
-from .rig import CpuTimes, Daemon, memory_kb
 from .workcells import axes, wave, workcell
 
 TYPICAL = workcell([axes("mod0"), axes("mod1"), wave("beam0", 0.0313)])

@@ -10,13 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from sioms.check.daemon import CpuTimes, Daemon
 from sioms.client.command import command
 
 from .baseline import interpreter_ns, run_ns
 from .deaths import SPEED, wait_cruising
 from .figures import Bar, Report
 from .options import Options
-from .rig import CpuTimes, Daemon
 from .watching import HISTORY, Watch, halting_ns, standing_ns
 from .workcells import axes, workcell
 

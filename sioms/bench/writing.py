@@ -6,12 +6,12 @@ import os
 import time
 from typing import Any
 
+from sioms.check.daemon import CpuTimes, Daemon
 from sioms.client.command import command
 
 from .baseline import RoundTrip
 from .figures import Bar, Report
 from .options import Options
-from .rig import CpuTimes, Daemon
 from .workcells import axes, workcell
 
 CHUNK = 100

@@ -22,12 +22,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
-from sioms.bench.rig import Daemon
 from sioms.children import ends_with_us
-from sioms.client.workcell import Workcell
-from sioms.protocol.flags import AxisStatus, ControlMode, NodeClass
-from sioms.tools.cell import READONLY, is_part
+from sioms.client.workcell import Workcell, is_part
+from sioms.protocol.flags import READONLY, AxisStatus, ControlMode, NodeClass
 
+from .daemon import Daemon
 from .rigs import Axis, Output, Rig
 
 ANSWER_S = 5.0

@@ -15,9 +15,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sioms.bench.rig import Daemon
 from sioms.children import ends_with_us
 
+from .daemon import Daemon
 from .rigs import LINES
 from .station import Peer, wait_for
 from .traces import BadTrace, Trace, read_trace

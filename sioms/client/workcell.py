@@ -9,7 +9,7 @@ from _socket import socket
 from time import monotonic, monotonic_ns, sleep
 
 from sioms.protocol import verbs
-from sioms.protocol.flags import PROTOCOL_VERSION, Access, NodeClass
+from sioms.protocol.flags import PROTOCOL_VERSION, READONLY, Access, NodeClass
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.socketpath import socket_path
 from sioms.protocol.stopfile import StopRequest
@@ -22,7 +22,7 @@ from .shown import acknowledged_by_daemon
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
     from typing import Any, Self, TypeVar, overload
 
     N = TypeVar("N", bound=Node)
@@ -50,6 +50,18 @@ class NodeEntry:
     def __repr__(self) -> str:
         held = f", held by {self.holder}" if self.holder else ""
         return f"<{self.node_class.name.lower()} node {self.name}: device {self.device} {self.state}{held}>"
+
+
+def is_part(entry: NodeEntry, entries: Iterable[NodeEntry]) -> bool:
+    """Tell whether a node is a companion, a channel or a bit of another one in the list."""
+    if entry.name.endswith(READONLY):
+        return True
+    parent = entry.name.rpartition(".")[0]
+    return any(
+        other.name == parent and other.device == entry.device and other.node_class == entry.node_class
+        and (other.channels > entry.channels or entry.bit >= 0)
+        for other in entries
+    )  # fmt: skip
 
 
 class Marker:

@@ -7,6 +7,8 @@ else:
     from .enumeration import IntEnum, IntFlag
 
 PROTOCOL_VERSION = 2
+READONLY = ".readonly"
+"""What the name of a node's read-only companion ends with."""
 
 
 class NodeClass(IntEnum):
