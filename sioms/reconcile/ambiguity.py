@@ -17,15 +17,9 @@ from sioms.reconcile.bounces import rattles
 from sioms.reconcile.effects import library
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.plausible import physical, size
-from sioms.reconcile.rules import GAIN, SURE
 from sioms.reconcile.search import Found, Searcher
+from sioms.reconcile.thresholds import ALIKE, AMBIGUOUS, GAIN, ROUGH, SAME_TRACE, SURE
 from sioms.reconcile.variation import accompanied, exchanged, named
-
-AMBIGUOUS = 0.015
-#: What a look-alike must miss whose trace has this share of its energy in common with that of the named effect.
-ALIKE, SAME_TRACE = 0.05, 0.98
-#: And beside a gap, whose bounces fall out otherwise with every other number.
-ROUGH = 0.1
 
 Rival = rules.Rival[Fit]
 

@@ -16,7 +16,7 @@ from sioms.reconcile.blocks import better
 from sioms.reconcile.bounces import rattles
 from sioms.reconcile.changes import change, settled
 from sioms.reconcile.channels import with_resolution
-from sioms.reconcile.conclude import LARGE, LEAST_ODD, UNEXPLAINED, Searched, conclude
+from sioms.reconcile.conclude import Searched, conclude
 from sioms.reconcile.effects import known
 from sioms.reconcile.effects.terms import TERMS
 from sioms.reconcile.excitation import Gate, gate
@@ -26,21 +26,26 @@ from sioms.reconcile.plausible import leans
 from sioms.reconcile.prepare import Options, Prepared, noise_read, prepare, reread, searched
 from sioms.reconcile.records import Session
 from sioms.reconcile.refuse import bursts, smoother_share
-from sioms.reconcile.rules import SPECIFIC, SURE
 from sioms.reconcile.search import Found, Searcher, Step
+from sioms.reconcile.thresholds import (
+    ABOUT,
+    AXIS,
+    FELL,
+    HALF,
+    HALVED,
+    HOPELESS,
+    LARGE,
+    LOUD,
+    ROUGHLY,
+    SPECIFIC,
+    SURE,
+    UNEXPLAINED,
+)
 from sioms.reconcile.timed import Timed, known_beside
 from sioms.reconcile.tones import as_timed, hum
 from sioms.reconcile.variation import named as varied
 
-#: A change in time leaves at most this share of what else would be left above the noise; of several that leave about the same, or no more than
-#: noise, the one with the fewest numbers in all is taken.
-HALVED, ROUGHLY, ABOUT = 0.5, 2.0, 1.25
-#: Above this multiple, and with this share of the disagreement left, nothing is named at all.
-HOPELESS, HALF = 5.0, 0.33
-#: Above this multiple a nameless term is looked for, though no smoother explains anything (a bend in force is no function of motion).
-LOUD = 1.4
-#: The noise is taken again from what a search leaves, and the search repeated, when it fell below this share; so often.
-FELL, AGAIN = 0.7, 2
+AGAIN = 2  # times that the noise is taken again at most
 
 
 def analyse(session: Session, nominal: AxisModel, options: Options | None = None) -> AxisVerdict:
@@ -98,7 +103,7 @@ def _upright(s: Searched) -> Searched:
 def _plain(s: Searched) -> Searched:
     """Where much is unexplained take back what a searched order enriched; where nearly all is, all names."""
     ratio, searcher = s.found.fit.ratio, s.searcher
-    if ratio > LARGE or (ratio > LEAST_ODD and s.share > UNEXPLAINED):
+    if ratio > LARGE or (ratio > AXIS.odd and s.share > UNEXPLAINED):
         s = replace(s, found=searcher.plainly(s.found))
     ratio, bare = s.found.fit.ratio, searcher.fit(s.ready.model)
     if ratio <= HOPELESS or s.found.fit.cost <= HALF * bare.cost:
@@ -117,7 +122,7 @@ def _explained(ready: Prepared, o: Options) -> Searched:
     ready, excited, searcher, found = _search(ready, o)
     share = smoother_share(ready.problem, found.fit)
     rejected: tuple[str, ...] = ()
-    odd = found.fit.ratio > LEAST_ODD and share > UNEXPLAINED
+    odd = found.fit.ratio > AXIS.odd and share > UNEXPLAINED
     if odd:
         o.progress(f"a smoother explains {100 * share:.0f} % of what remains: searching for a term")
         before = found
@@ -144,7 +149,7 @@ def _changed(s: Searched) -> Timed | None:
     exceeded does not count.
     """
     model = s.found.fit.model
-    odd = s.found.fit.ratio > LEAST_ODD
+    odd = s.found.fit.ratio > AXIS.odd
     if s.ready.points or not (
         odd or warm(model)
     ):  # between rows that are points, anything would pass for a change
@@ -234,7 +239,7 @@ def _search(ready: Prepared, o: Options) -> tuple[Prepared, Gate, Searcher, Foun
 
 def _beside(ready: Prepared, searcher: Searcher, found: Found) -> Timed | None:
     """Return the force of one frequency that most of what remains is, or that explains more than all that was named."""
-    if found.fit.ratio < LEAST_ODD:
+    if found.fit.ratio < AXIS.odd:
         return None
     fits = [found.fit, *(searcher.fit(step.model) for step in found.ladder)]
     lines = [as_timed(line, f) for f in fits if (line := hum(ready.problem, f)) is not None]

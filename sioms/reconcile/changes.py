@@ -13,14 +13,12 @@ import numpy as np
 
 from sioms.reconcile.course import Course
 from sioms.reconcile.fit import Fit, Problem, refit
-from sioms.reconcile.rules import GAIN
 from sioms.reconcile.swings import swinging
 from sioms.reconcile.switches import switching
+from sioms.reconcile.thresholds import GAIN, PROMISING
 from sioms.reconcile.timed import known_beside
 from sioms.reconcile.windows import NUMBERS, View
 
-#: The course of a number is looked at closely where it leaves less than this share, whatever it is.
-PROMISING = 0.5
 #: A course and the numbers of the model are fitted in turn at most so often, and until the force changes by less than this share.
 SETTLED, STILL = 8, 3e-3
 

@@ -27,22 +27,10 @@ from sioms.reconcile.refuse import loud_turns
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.session import State
 from sioms.reconcile.simulate import replay
+from sioms.reconcile.thresholds import AXIS, BURSTS, CHANCE, LARGE, LOOPS, MOSTLY, QUIET, UNEXPLAINED
 from sioms.reconcile.timed import as_recorded
 from sioms.reconcile.verdict import Gap, Outcome, Place
 
-#: A generic smoother explaining this share more than the named model: something is missing.
-UNEXPLAINED = 0.2
-#: Loudest tenth of the time holds this share of the residual's energy: bursts.
-BURSTS = 0.8
-#: A residual beyond this multiple of the expected innovation is no noise, whatever it looks like.
-LARGE = 3.0
-#: So large a share of the bursts at turns of the motion belongs to them, if chance brings it no oftener than this.
-MOSTLY, CHANCE = 0.5, 0.01
-#: Below these multiples of the expected innovation nothing is called unexplained, or a burst.
-LEAST_ODD = 1.25
-QUIET = 1.6
-#: It is said where the closed loop is beyond this multiple of its floor.
-LOOPS = 2.0
 HELD = (
     "delay and lag are counted from a force that is held from row to row of the log; of a loop much faster than the log they are up to {:.2g} ms longer "
     "(loop_time_s in columns.toml would tell)"
@@ -88,7 +76,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     open_rivals = [r for r in others if r.open]
     ratio = found.fit.ratio
     disturbance = ratio > QUIET and burst > BURSTS and s.share < UNEXPLAINED and not rattles(found.fit.model)
-    odd = ratio > LEAST_ODD and s.share > UNEXPLAINED
+    odd = ratio > AXIS.odd and s.share > UNEXPLAINED
     leaning = [e for e in named if e.name not in s.searcher.frozen and leans(fit.model, e.name)]
     outcome = _outcome(
         bool(named), bool(terms) or bool(leaning) or disturbance or ratio > LARGE or odd, bool(open_rivals)

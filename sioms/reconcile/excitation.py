@@ -22,12 +22,8 @@ from sioms.reconcile.screen import (
     state_columns,
     trial_values,
 )
+from sioms.reconcile.thresholds import AXIS, SAME
 from sioms.reconcile.variation import accompanied
-
-#: An effect of typical size must leave this many times the floor (root mean square) to be ranked.
-LEAST_TRACE = 0.15
-#: Traces that agree to this share of their energy are one to these data.
-SAME = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +46,7 @@ def gate(problem: Problem, model: AxisModel, names: tuple[str, ...]) -> Gate:
     lib = library()
     columns = {n: c for n in names if (c := _trace(problem, model, lib[n])) is not None}
     traces = {n: float(np.sqrt(np.mean(np.sum(c, axis=1) ** 2))) for n, c in columns.items()}
-    missing = {n: lib[n].separate for n, t in traces.items() if t < LEAST_TRACE}
+    missing = {n: lib[n].separate for n, t in traces.items() if t < AXIS.trace}
     pairs = []
     shown = [n for n in columns if n not in missing]
     for i, a in enumerate(shown):

@@ -9,7 +9,8 @@ from sioms.reconcile.effect import Array, Ref
 from sioms.reconcile.effects import known, library
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.rules import NEARLY, negligible
+from sioms.reconcile.rules import negligible
+from sioms.reconcile.thresholds import NEARLY
 from sioms.reconcile.variation import named
 
 #: A refitted candidate: fit, held-out losses, share saved, standard errors.

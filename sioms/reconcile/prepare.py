@@ -28,7 +28,7 @@ TRUSTED = 2
 #: What a little wrong in time would be named.
 TIMES = ("delay", "lag")
 #: Half a period of the loop, in samples of the log, above which the log has its pace.
-SAME = 0.49
+OWN_PACE = 0.49
 #: What a refined number of the model would be named as.
 REFITTED = {"inertia": "payload", "viscous": "viscous"}
 
@@ -97,7 +97,7 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
         check(Session(session.final), nominal)
     if session.loop_time_s is not None:
         late = 0.5 * session.loop_time_s / nominal.sample_time_s
-        if late < SAME:
+        if late < OWN_PACE:
             return _read(session, nominal, notes, o, Sampling(late))
         return _channels(session, nominal, notes, o)
     ready = replace(_channels(session, nominal, notes, o), held=not runs_the_loop(session, nominal))

@@ -15,12 +15,11 @@ from sioms.reconcile.effect import Array
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.screen import Motion, dead_band, direction, instrument_motion, smoothed_motion, thinned
+from sioms.reconcile.thresholds import BURST_S, LOUD_BLOCK, MOST_LOUD
 
 KNOTS = 14
 HARMONICS = 4
 RIDGES = (1e-4, 1e-2, 1.0)
-#: A block is loud above this multiple of the median energy; bursts are no third of the time.
-BURST_S, LOUD, MOST_LOUD = 0.1, 6.0, 0.34
 
 
 def hats(x: Array, knots: Array) -> Array:
@@ -141,7 +140,7 @@ def _loud(problem: Problem, fit: Fit) -> tuple[NDArray[np.int64], Array, NDArray
     """Return the tenth of a second that each sample of the residual is in, the energy of each, and whether it is loud."""
     ids = block_ids(problem, fit.model.sample_time_s, BURST_S)
     energy = np.bincount(ids, weights=fit.residual**2) / np.bincount(ids)
-    return ids, energy, energy > LOUD * float(np.median(energy))
+    return ids, energy, energy > LOUD_BLOCK * float(np.median(energy))
 
 
 def bursts(problem: Problem, fit: Fit) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
 from sioms.reconcile.ladder import Found, Step
+from sioms.reconcile.thresholds import DOUBTFUL, GAIN, SWAPS
 
 
 class Fitted(Protocol):
@@ -21,16 +22,6 @@ class Fitted(Protocol):
 
 F = TypeVar("F", bound=Fitted)
 M = TypeVar("M")
-
-GAIN = 0.05  # least share of what remains that an effect must save on held-out blocks
-SURE = 2.0  # least number of standard errors of that saving
-#: A saving below ``SPECIFIC`` counts only where no unrelated effect saves ``NEARLY`` as much.
-SPECIFIC = 0.3
-NEARLY = 0.5
-#: A larger loss than this is one, however unevenly it falls on the blocks.
-DOUBTFUL = 0.2
-#: Look-alikes that take the place of what is named, one after the other.
-SWAPS = 2
 
 
 def negligible(lost: float, errors: float) -> bool:

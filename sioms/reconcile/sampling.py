@@ -20,7 +20,7 @@ from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Fit, Problem, refit
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.records import Record, Session
-from sioms.reconcile.rules import SURE
+from sioms.reconcile.thresholds import SURE
 
 #: What most axes may lack, fitted along so that it does not pass for time.
 USUAL = ("payload", "viscous", "coulomb", "offset", "gravity")

@@ -32,20 +32,11 @@ from sioms.reconcile.plausible import (
     unspecific,
     vacant,
 )
-from sioms.reconcile.rules import GAIN, SPECIFIC, SURE, negligible
+from sioms.reconcile.rules import negligible
 from sioms.reconcile.screen import Start, screen
+from sioms.reconcile.thresholds import AXIS, CLEAR, GAIN, LOOSE, PAIRS, PERIODIC_SURE, SPECIFIC, SURE
 from sioms.reconcile.variation import accompanied, exchanged, named
 
-FLOOR = 1.05  # stop at this multiple of the expected innovation
-TRIES = 4  # candidates refitted per step
-STEPS = 6
-#: A step that saves this much needs no second look at the friction law.
-CLEAR = 0.5
-#: Two effects are tried at once only above this multiple of the expected innovation, so many firsts with ``TRIES`` seconds.
-PAIRED = 1.5
-PAIRS = 3
-LOOSE = 2.0  # an effect does not make the error of the simulated closed loop this many times larger
-PERIODIC_SURE = 3.0  # for effects whose order is searched over tens of values
 PASSES = 4  # at most so many times more for a new gap, while it gains
 BEST = 2  # of the candidates beside a gap are judged with its numbers searched anew
 #: What the levels of laws of dry friction are called.
@@ -169,8 +160,8 @@ class Searcher:
         """Search from a model."""
         fit, losses = self._on_one_footing(self.fit(start))
         steps = [Step("start", "", fit.ratio, 0.0, fit.model)]
-        for _ in range(STEPS):
-            if fit.ratio <= FLOOR:
+        for _ in range(AXIS.steps):
+            if fit.ratio <= AXIS.floor:
                 break
             step = self._add(fit, losses) or self._add_pair(fit, losses)
             if step is None:
@@ -227,7 +218,7 @@ class Searcher:
         starts = [s for s in self.screen(fit, fresh) if s.gain > 0.5 * GAIN]
         starts += self._upgrades(fit, [n for n in names if replaced(fit.model, n)])
         starts.sort(key=lambda s: -s.gain)
-        chosen, further = starts[passed : passed + TRIES], starts[passed + TRIES :]
+        chosen, further = starts[passed : passed + AXIS.tries], starts[passed + AXIS.tries :]
         if chosen:
             alike = known()[chosen[0].effect].lookalikes
             chosen += [s for s in further if s.effect in alike and s.gain > 0.3 * chosen[0].gain]
@@ -278,7 +269,7 @@ class Searcher:
                 self._try(tried, effect, new, losses)
         sure, good = self._good(tried, fit, losses)
         if sure and not good:  # what cannot be has taken the places of what can
-            for s in self._candidates(fit, TRIES):
+            for s in self._candidates(fit, AXIS.tries):
                 self._try(tried, s.effect, self._with(fit, s, 5), losses)
             sure, good = self._good(tried, fit, losses)
         while good:
@@ -328,7 +319,7 @@ class Searcher:
         Both must be sure together, and each must earn its place beside the other. One that joins the first with another counts as both.
         """
         pairs: dict[str, Tried] = {}
-        if fit.ratio < PAIRED:
+        if fit.ratio < AXIS.paired:
             return None
         for first in self._candidates(fit)[:PAIRS]:
             middle = self._with(fit, first, 5, fit.cost)
@@ -340,7 +331,7 @@ class Searcher:
                 for s in self._candidates(middle)
                 if s.effect not in known()[first.effect].replaces or first.effect in known()[s.effect].joins
             ]
-            for second in beside[:TRIES]:
+            for second in beside[: AXIS.tries]:
                 new = self._with(
                     middle, second, 8, min((t[0].cost for t in pairs.values()), default=middle.cost)
                 )

@@ -7,7 +7,7 @@ from scipy.linalg import block_diag
 
 from sioms.reconcile.course import Course, estimate
 from sioms.reconcile.effect import Array
-from sioms.reconcile.rules import GAIN
+from sioms.reconcile.thresholds import GAIN
 from sioms.reconcile.timed import waves
 from sioms.reconcile.verdict import Estimate
 from sioms.reconcile.windows import Number, Read, View

@@ -10,15 +10,9 @@ from numpy.typing import NDArray
 
 from sioms.reconcile.course import Course, estimate
 from sioms.reconcile.effect import Array
-from sioms.reconcile.rules import GAIN, SURE
+from sioms.reconcile.thresholds import EARNED, GAIN, REGULAR, SECOND, SURE
 from sioms.reconcile.windows import NUMBERS, Number, Read, View
 
-#: A switch saves so many times what it would of noise.
-EARNED = 20.0
-#: A second number that switches with the first leaves at most this share of what is above the noise.
-SECOND = 0.6
-#: Switches come at regular times where their intervals differ by no more than this.
-REGULAR = 0.05
 ROUNDS, LEVELLED = 20, 3
 SAID = 4  # spans of a record
 

@@ -15,14 +15,13 @@ from sioms.reconcile.effect import TERM_PREFIX, Array
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.screen import instrument_motion
+from sioms.reconcile.thresholds import OWN, PURE, TONE
 from sioms.reconcile.timed import Timed, waves
 from sioms.reconcile.verdict import Estimate, NamedEffect
 
+OVERTONES = 3
+
 ZOOMS = 6  # each halves the step of frequency
-#: A line of this share of the residual's energy is no noise.
-TONE = 0.5
-#: A frequency is the motion's own where it holds this share of the motion's speed, or an upper one of what holds the other.
-OWN, PURE, OVERTONES = 0.05, 0.5, 3
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,8 +27,9 @@ from sioms.reconcile.finger.terms import TERMS
 from sioms.reconcile.refuse import hats
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.refuse import knots
-from sioms.reconcile.sensors.subject import SHARPER, Variable, View, by_chance, untouched
+from sioms.reconcile.sensors.subject import Variable, View, by_chance, untouched
 from sioms.reconcile.sensors.verdict import Curve, Proposal
+from sioms.reconcile.thresholds import SHARPER
 from sioms.reconcile.verdict import NamedEffect
 
 TURNED = 0.3  # of the noise, from which on it counts what else a load does

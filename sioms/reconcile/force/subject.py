@@ -18,8 +18,9 @@ from sioms.reconcile.sensors.analyse import Options, analyse
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.fit import ratios
 from sioms.reconcile.sensors.refuse import knots
-from sioms.reconcile.sensors.subject import SHARPER, Variable, View, by_chance
+from sioms.reconcile.sensors.subject import Variable, View, by_chance
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
+from sioms.reconcile.thresholds import SHARPER
 from sioms.reconcile.verdict import NamedEffect
 
 BLOCKS = 40

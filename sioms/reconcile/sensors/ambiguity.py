@@ -8,15 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.reconcile import rules
-from sioms.reconcile.ambiguity import ALIKE, AMBIGUOUS
 from sioms.reconcile.blocks import better
 from sioms.reconcile.effect import TERM_PREFIX
 from sioms.reconcile.sensors.effect import SensorEffect
-from sioms.reconcile.sensors.excitation import FELT
 from sioms.reconcile.sensors.fit import Fit, refit
 from sioms.reconcile.sensors.plausible import alike, physical
 from sioms.reconcile.sensors.screen import screen
 from sioms.reconcile.sensors.search import Found, Searcher
+from sioms.reconcile.thresholds import ALIKE, AMBIGUOUS, FELT
 
 Rival = rules.Rival[Fit]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sioms.reconcile.noise import effective_samples
-from sioms.reconcile.rules import GAIN, negligible, told_apart
+from sioms.reconcile.rules import negligible, told_apart
 from sioms.reconcile.sensors.ambiguity import Rival, settle
 from sioms.reconcile.sensors.effect import Array, SensorEffect, SensorModel
 from sioms.reconcile.sensors.excitation import gate
@@ -24,15 +24,8 @@ from sioms.reconcile.sensors.stand_ins import credible, displaced, ruled
 from sioms.reconcile.sensors.steady import changes
 from sioms.reconcile.sensors.subject import Subject
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
+from sioms.reconcile.thresholds import BURSTS, GAIN, QUIET, REFUSED, SENSOR, SURELY, UNEXPLAINED, UNSTEADY
 from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome, Place, apart
-
-UNEXPLAINED = 0.2  # share that a generic smoother explains beyond the named model: something is missing
-LEAST_ODD = 1.15  # multiple of the floor below which nothing is called unexplained
-BURSTS = 0.8
-QUIET = 1.6
-UNSTEADY = 0.5  # share by which an effect may change along a variable
-SURELY = 2.0  # half intervals by which a change must differ from none
-REFUSED = 3  # names that are refused one after the other
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +88,7 @@ def _smoothed(subject: Subject, searcher: Searcher, found: Found) -> tuple[float
     """Return the largest share of a view that a smoother explains, and the name of that view; one above its floor first."""
     shares = smoother_shares(subject.training, found.fit, searcher.weights, subject.features())
     ratios = searcher.ratios(found.fit.model)
-    view = max(shares, key=lambda v: (bool(ratios[v] > LEAST_ODD and shares[v] > UNEXPLAINED), shares[v]))
+    view = max(shares, key=lambda v: (bool(ratios[v] > SENSOR.odd and shares[v] > UNEXPLAINED), shares[v]))
     return shares[view], subject.training.views[view] if shares[view] > 0.0 else ""
 
 
@@ -140,7 +133,7 @@ def _unsteady(subject: Subject, searcher: Searcher, found: Found, names: Sequenc
 def _odd(searcher: Searcher, found: Found, share: float, view: str) -> bool:
     """Say whether something is left: a view above its floor that the state explains, or one far above it whatever explains it."""
     ratios = searcher.ratios(found.fit.model)
-    if view and share > UNEXPLAINED and ratios[searcher.data.views.index(view)] > LEAST_ODD:
+    if view and share > UNEXPLAINED and ratios[searcher.data.views.index(view)] > SENSOR.odd:
         return True
     return bool(np.max(ratios) > QUIET)
 

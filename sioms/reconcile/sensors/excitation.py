@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from sioms.reconcile.excitation import SAME
 from sioms.reconcile.sensors.effect import Array, SensorEffect
 from sioms.reconcile.sensors.fit import Data
 from sioms.reconcile.sensors.screen import screening_columns
 from sioms.reconcile.sensors.subject import Subject
-
-LARGEST = 30.0  # natural sizes that an effect may have to be searched for
-LEAST_TRACE = 6.0  # an effect of natural size must change the rows by this many standard deviations in all
-FELT = 3.0  # standard deviations that an element's own number must make
+from sioms.reconcile.thresholds import FELT, LARGEST, SAME, SENSOR
 
 
 def gate(subject: Subject) -> tuple[dict[str, str], tuple[tuple[str, str, float], ...], tuple[str, ...]]:
@@ -25,8 +21,8 @@ def gate(subject: Subject) -> tuple[dict[str, str], tuple[tuple[str, str, float]
     model, data = subject.model, subject.training
     columns = {n: screening_columns(data, model, model.library[n]) for n in subject.names}
     trace = {n: float(np.linalg.norm(c)) for n, c in columns.items()}
-    missing = {n: model.library[n].separate for n in columns if trace[n] < LEAST_TRACE}
-    names = tuple(n for n in columns if trace[n] * _largest(model.library[n]) > LEAST_TRACE)
+    missing = {n: model.library[n].separate for n in columns if trace[n] < SENSOR.trace}
+    names = tuple(n for n in columns if trace[n] * _largest(model.library[n]) > SENSOR.trace)
     pairs = []
     shown = [n for n in columns if n not in missing]
     for i, a in enumerate(shown):

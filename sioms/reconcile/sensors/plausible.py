@@ -8,8 +8,7 @@ import numpy as np
 
 from sioms.reconcile.effect import TERM_PREFIX
 from sioms.reconcile.sensors.effect import SensorEffect, SensorModel
-
-MOST_INSIDE = 0.7  # share of the elements whose own number must be one that the effect can have
+from sioms.reconcile.thresholds import MOST_INSIDE
 
 
 def termed(model: SensorModel) -> bool:

@@ -15,18 +15,12 @@ import numpy as np
 from sioms.reconcile import ladder
 from sioms.reconcile.blocks import better, heldout
 from sioms.reconcile.effect import TERM_PREFIX
-from sioms.reconcile.rules import GAIN, NEARLY, SPECIFIC, SURE, negligible
+from sioms.reconcile.rules import negligible
 from sioms.reconcile.sensors.effect import Array, SensorModel
 from sioms.reconcile.sensors.fit import Data, Fit, on_one_footing, ratios, refit
 from sioms.reconcile.sensors.plausible import family, physical, termed, without
 from sioms.reconcile.sensors.screen import Start, screen
-
-FLOOR = 1.15  # stop at this multiple of the noise floor, which is of a sensor's own rows
-TRIES = 5
-STEPS = 8
-DEEP = 3.0  # standard errors, over all blocks, of a saving below the floor
-#: Two effects are tried at once only where a view is above this multiple of its floor, so many firsts and seconds.
-PAIRED, PAIRS = 1.3, 3
+from sioms.reconcile.thresholds import DEEP, GAIN, NEARLY, PAIRS, SENSOR, SPECIFIC, SURE
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +118,7 @@ class Searcher:
         fit = self.levelled(start)
         losses = self.loss(fit)
         steps = [Step("start", "", self.ratio(fit), 0.0, fit.model)]
-        for _ in range(STEPS):
+        for _ in range(SENSOR.steps):
             step = self._add(fit, losses) or self._add_pair(fit, losses) or self._restart(fit)
             if step is None:
                 break
@@ -145,7 +139,11 @@ class Searcher:
 
     def loud(self, fit: Fit) -> list[str]:
         """Views that are above their floor."""
-        return [v for v, ratio in zip(self.data.views, self.ratios(fit.model), strict=True) if ratio > FLOOR]
+        return [
+            v
+            for v, ratio in zip(self.data.views, self.ratios(fit.model), strict=True)
+            if ratio > SENSOR.floor
+        ]
 
     def ratio(self, fit: Fit) -> float:
         """Root mean square over all rows, in units of the floor."""
@@ -201,7 +199,7 @@ class Searcher:
 
         Both must save much together, and each much beside the other; less than that has no name yet.
         """
-        if np.max(self.ratios(fit.model)) < PAIRED:
+        if np.max(self.ratios(fit.model)) < SENSOR.paired:
             return None
         best: tuple[Saving, Fit, str] | None = None
         for first in self.candidates(fit)[:PAIRS]:
@@ -359,10 +357,10 @@ class Searcher:
             starts = screen(self.data, fit, self.weights, fit.model.library[name], self.frozen)
             found += starts[:1]
         found = sorted((s for s in found if s.gain > 0.5 * GAIN), key=lambda s: -s.gain)
-        chosen = found[:TRIES]
+        chosen = found[: SENSOR.tries]
         if chosen:
             alike = family(fit.model, chosen[0].effect)
-            chosen += [s for s in found[TRIES:] if s.effect in alike]
+            chosen += [s for s in found[SENSOR.tries :] if s.effect in alike]
         return chosen
 
 

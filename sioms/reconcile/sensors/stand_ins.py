@@ -6,14 +6,12 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from sioms.reconcile.rules import GAIN, SPECIFIC, negligible
+from sioms.reconcile.rules import negligible
 from sioms.reconcile.sensors.fit import Fit, half_intervals
 from sioms.reconcile.sensors.plausible import without
 from sioms.reconcile.sensors.screen import screen
 from sioms.reconcile.sensors.search import Found, Searcher, beyond_noise, surely
-
-FEWER = 2  # times as few numbers has a nameless rule that takes the place of elements' own numbers
-CLEAR = 0.95  # share of a view that a name must save where the view stays above its floor
+from sioms.reconcile.thresholds import FEWER, GAIN, SPECIFIC, WHOLLY
 
 
 def displaced(searcher: Searcher, found: Found) -> bool:
@@ -92,7 +90,7 @@ def credible(searcher: Searcher, found: Found) -> Found:
         gap = searcher.lost(
             searcher.loss(searcher.fit(found.fit.model.without_effect(name), 4)), found.losses
         )
-        if gap.share < (CLEAR if group[views.index(gap.view)] in odd else SPECIFIC):
+        if gap.share < (WHOLLY if group[views.index(gap.view)] in odd else SPECIFIC):
             model = model.without_effect(name)
     if model is found.fit.model:
         return found

@@ -15,8 +15,7 @@ from scipy.stats import t as student
 from sioms.reconcile.sensors.effect import Array
 from sioms.reconcile.sensors.fit import Data, Fit
 from sioms.reconcile.sensors.subject import Variable
-
-LEAST_TRACE = 6.0  # standard deviations that such a change must make for it to be looked at
+from sioms.reconcile.thresholds import SENSOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +45,7 @@ def changes(
             column = grown - known @ (known.T @ grown)
             energy = np.add.reduceat(column**2, edges)
             total = float(energy.sum())
-            if total < LEAST_TRACE**2 or total < 1e-6 * float(grown @ grown):
+            if total < SENSOR.trace**2 or total < 1e-6 * float(grown @ grown):
                 continue
             share = -float(column @ fit.residual) / total
             score = np.add.reduceat(column * (fit.residual + share * column), edges)

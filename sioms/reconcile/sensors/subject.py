@@ -14,8 +14,6 @@ from sioms.reconcile.sensors.fit import Data
 from sioms.reconcile.sensors.verdict import Curve, Proposal
 from sioms.reconcile.verdict import NamedEffect
 
-SHARPER = 0.6  # share of a stated floor below which the one told beside a model counts
-
 
 @dataclass(frozen=True, slots=True)
 class View:

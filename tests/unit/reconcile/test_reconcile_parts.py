@@ -28,8 +28,9 @@ from sioms.reconcile.refuse import loud_turns
 from sioms.reconcile.screen import screen
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.simulate import replay, simulate
+from sioms.reconcile.thresholds import TONE
 from sioms.reconcile.timed import known_beside
-from sioms.reconcile.tones import TONE, hum, tone
+from sioms.reconcile.tones import hum, tone
 
 AXIS = AxisModel(
     True, 1e-3, 2e-3, 1e-3, 2e-4, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)

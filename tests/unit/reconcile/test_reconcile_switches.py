@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sioms.reconcile.checks import check_scale
-from sioms.reconcile.conclude import LOOPS, _of_loops
+from sioms.reconcile.conclude import _of_loops
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.gaps import measure
 from sioms.reconcile.model import AxisModel, Controller
@@ -18,6 +18,7 @@ from sioms.reconcile.records import Record, Session
 from sioms.reconcile.report.words import span
 from sioms.reconcile.simulate import simulate
 from sioms.reconcile.switches import Switches
+from sioms.reconcile.thresholds import LOOPS
 from sioms.reconcile.verdict import Estimate, Gap
 from sioms.reconcile.windows import NUMBERS, Seen
 
