@@ -42,7 +42,7 @@ def addresses(functions: Sequence[Callable[..., Any]]) -> Any:
 def caller() -> Callable[..., float]:
     """Return the call of state function k of several with row k of parameters: ``(functions, k, rows, x, v, u, temperature)``.
 
-    Compiled, it is a jump to an address. Functions as numba's own values cost ten times as much, arrays as arguments are counted.
+    Compiled, it is a jump to an address. Functions as numba's own values cost four to eleven times as much (decision 0174), arrays as arguments are counted.
     A kernel is kept on disk by its own file: when this changes, ``kernel.py`` must, or it goes on with what it was compiled with.
     """
     if numba() is None:
