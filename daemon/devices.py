@@ -341,6 +341,7 @@ class DriverProcess:
             self._loop.unwatch(self._pidfd)
             self._bury(self._pidfd)
             self._pidfd = -1
+        self._patience = None  # the next process is not to blame for what this one did
         self._lost(reason)
 
     def _lost(self, reason: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import socket
@@ -17,6 +18,7 @@ from sioms.daemon.devices import DriverProcess, State
 from sioms.daemon.loop import Loop
 from sioms.daemon.names import DeviceInfo
 from sioms.daemon.nursery import Nursery
+from sioms.daemon.patience import Patience
 
 
 class _Owner:
@@ -80,4 +82,23 @@ def test_the_next_process_is_forked_when_the_last_one_is_gone(monkeypatch: pytes
         last.kill()
         loop.step()
         assert forked
+    loop.close()
+
+
+def test_the_process_after_one_that_was_stuck_is_not_killed_for_it() -> None:
+    """On a busy machine the fork is told late; the daemon looks at what is slow before."""
+    loop, owner = Loop(), _Owner()
+    forks: list[Any] = []
+    device = _device(loop, SimpleNamespace(spawn=lambda *words: forks.append(words[-1])), owner)
+    device.start()
+    with subprocess.Popen(["sleep", "100"]) as first:
+        forks[0](first.pid, 0, "", [os.pidfd_open(first.pid)])
+        worked = itertools.count(0, 2)
+        device._patience = Patience(first.pid, 1.0, lambda _: float(next(worked)), lambda _: "R")
+        device.check(10**9)
+    assert "2 s of processor time" in device.reason and len(owner.gone) == 1
+    while device.state is not State.STARTING:
+        loop.step()
+    device.check(3 * 10**9)
+    assert device.state is State.STARTING and len(owner.gone) == 1, device.reason
     loop.close()
