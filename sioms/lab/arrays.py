@@ -6,7 +6,10 @@ What a file says of its sizes is looked at before any memory is given to it.
 from __future__ import annotations
 
 import math
+import os
+import struct
 import zipfile
+import zlib
 from pathlib import Path
 from typing import IO, Any
 
@@ -16,6 +19,13 @@ from numpy.typing import NDArray
 MOST_BYTES = 1 << 30
 """Bytes that the arrays of one file may take in memory."""
 MOST_MEMBERS = 4096
+_NUMBERS = {
+    "double",
+    "single",
+    "logical",
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+}
+_COMPRESSED, _PIECE = 15, 1 << 16
 
 
 class UnreadableError(ValueError):
@@ -66,7 +76,7 @@ def _npy_head(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 
 def read_mat(path: Path) -> dict[str, Any]:
-    """Read the variables of a MAT file up to version 7.2, as scipy gives them.
+    """Read the arrays of numbers of a MAT file up to version 7.2, as scipy gives them.
 
     Raises:
         UnreadableError: it is none, it is damaged, too large, or of version 7.3.
@@ -77,12 +87,33 @@ def read_mat(path: Path) -> dict[str, Any]:
         with path.open("rb") as file:
             if b"MATLAB 7.3" in file.read(128) or zipfile.is_zipfile(path):
                 raise ValueError("it is of version 7.3, which is HDF5; save it with -v7")
-        sizes = [math.prod(shape) * 8 for _, shape, _ in whosmat(path)]
-        _limit(sum(sizes))
-        found: dict[str, Any] = loadmat(path, squeeze_me=True)
+        _limit_inflated(path)
+        variables = [v for v in whosmat(path) if v[2] in _NUMBERS]  # what nests states its sizes further in
+        _limit(sum(math.prod(shape) * 8 for _, shape, _ in variables))
+        names = [name for name, _, _ in variables]
+        found: dict[str, Any] = loadmat(path, squeeze_me=True, variable_names=names)
     except Exception as error:  # readers raise whatever their parts raise: a dozen kinds, some of their own
         raise UnreadableError(f"read {path}: it is no MAT file, or damaged: {_words(error)}") from error
     return {name: value for name, value in found.items() if not name.startswith("__")}
+
+
+def _limit_inflated(path: Path) -> None:
+    """Inflate the compressed elements of a MAT file, without keeping any of it: they state their sizes inside only."""
+    with path.open("rb") as file:
+        order = {b"IM": "<II", b"MI": ">II"}.get(file.read(128)[126:])
+        total = 0
+        while order and len(tag := file.read(8)) == 8:
+            kind, left = struct.unpack(order, tag)
+            if kind != _COMPRESSED:
+                file.seek(left, os.SEEK_CUR)
+                continue
+            stream = zlib.decompressobj()
+            while left and (part := file.read(min(left, _PIECE))):
+                left -= len(part)
+                while part:
+                    total += len(stream.decompress(part, _PIECE))
+                    _limit(total)
+                    part = stream.unconsumed_tail
 
 
 def _limit(size: int) -> None:

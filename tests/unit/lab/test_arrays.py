@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import io
+import struct
+import tracemalloc
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +103,27 @@ def test_an_archive_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(
     assert path.stat().st_size < most // 300
     with pytest.raises(UnreadableError, match="MiB of memory; at most 64 "):
         read_npz(path)
+
+
+def test_what_a_mat_file_inflates_to_is_measured_before_it_is_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One number, as its head says, with 64 MiB of data behind it."""
+
+    def part(kind: int, data: bytes) -> bytes:
+        return struct.pack("<II", kind, len(data)) + data + bytes(-len(data) % 8)
+
+    inner = part(6, struct.pack("<II", 6, 0)) + part(5, struct.pack("<ii", 1, 1)) + part(1, b"x")
+    squeezed = zlib.compress(part(14, inner + part(9, bytes(1 << 26))))
+    (tmp_path / "bomb.mat").write_bytes(
+        b"MATLAB 5.0".ljust(124) + b"\0\1IM" + struct.pack("<II", 15, len(squeezed)) + squeezed
+    )
+    monkeypatch.setattr(arrays, "MOST_BYTES", 1 << 22)
+    tracemalloc.start()
+    with pytest.raises(UnreadableError, match="MiB of memory; at most 4 "):
+        read_mat(tmp_path / "bomb.mat")
+    assert tracemalloc.get_traced_memory()[1] < 1 << 21
+    tracemalloc.stop()
 
 
 def test_objects_strings_and_cells_are_no_columns_and_no_code(tmp_path: Path) -> None:
