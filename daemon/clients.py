@@ -275,6 +275,7 @@ class Clients:
             session.peer = peer_of(session.sock, self.users)
             if not rights.anywhere(session.peer):
                 self.markers.end_session(session)
+        self.markers.take_up_rights()
         self.nodes.take_up_rights()
 
     # --- waiting requests ------------------------------------------------------------------------

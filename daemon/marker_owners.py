@@ -103,6 +103,10 @@ class MarkerOwners:
         """Return the reservations of a session."""
         return [r for r in self._reserved.values() if r.owner == owner]
 
+    def owners(self) -> list[object | None]:
+        """Return who owns markers."""
+        return [r.owner for r in self._reserved.values()]
+
     def count_where(self, condition: Callable[[object | None], bool]) -> int:
         """Return how many reservations have an owner for whom a condition holds."""
         return sum(condition(r.owner) for r in self._reserved.values())

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import errno
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.markers import MARKERS, MarkerTable
 from sioms.protocol.messages import refusal, reply
 
 from .marker_owners import MarkerError, MarkerOwners, Reservation
+from .rights import Peer
 from .sessions import LATER, Refused, Session, Wait
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ class Persisting:
 
     uid: int
     user: str
+    gids: frozenset[int] = field(compare=False)
 
     def __str__(self) -> str:
         return f"{self.user} (markers that persist)"
@@ -63,7 +65,7 @@ class MarkerVerbs:
         has = self._owners.count_where(lambda owner: _uid_of(owner) == peer.uid)
         if why := self._clients.quotas.over(peer, "markers", has, "markers", count):
             raise Refused(errno.EBUSY, f"reserve markers: {why}; free some")
-        owner = Persisting(peer.uid, peer.user) if persist else session
+        owner = Persisting(peer.uid, peer.user, peer.gids) if persist else session
         tokens: list[int] = []
         try:
             for _ in range(count):
@@ -107,6 +109,15 @@ class MarkerVerbs:
         for _, wait in list(self._waits):
             if wait.session is session:
                 self._clients.answer(wait, refusal(wait.number, errno.EPERM, f"{wait.what}: {gone}"))
+
+    def take_up_rights(self) -> None:
+        """Free the markers that persist for users who have lost their last right."""
+        rights, users = self._clients.rights, self._clients.users
+        for owner in {each for each in self._owners.owners() if isinstance(each, Persisting)}:
+            peer = Peer(0, owner.uid, owner.user, users.remaining(owner.uid, owner.gids))
+            if not rights.anywhere(peer):
+                for reservation in self._owners.owned_by(owner):
+                    self._release(reservation)
 
     def forget(self, wait: Wait) -> None:
         """Drop a wait that has ended in another way."""

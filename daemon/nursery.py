@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -20,6 +21,7 @@ from sioms.protocol.verbs import Message
 
 from .loop import Loop
 from .nursery_process import NurseryProcess, start_nursery
+from .patience import Patience
 
 MAX_ANSWER = 1 << 20
 """Bytes of an answer of the nursery: the description of a device of many thousands of channels is long, even compressed."""
@@ -48,6 +50,7 @@ class Nursery:
         self._sock, self.pid = process or start_nursery()
         self._pidfd = os.pidfd_open(self.pid)
         self._answers: dict[int, Answer] = {}
+        self._patience = Patience(self.pid)
         self._number = 0
         loop.watch(self._sock.fileno(), self._receive)
         loop.watch(self._pidfd, self._gone)
@@ -64,6 +67,14 @@ class Nursery:
     ) -> None:  # fmt: skip
         """Fork a driver process; answers with its pid and a descriptor of it."""
         self._request(answer, fds, Spawn(device, driver, settings, generation, options))
+
+    def check(self, now_s: float) -> str:
+        """Kill it when it owes an answer and is stuck, in a driver's import or stopped; return why, '' while all is well."""
+        if not self._answers or not (why := self._patience.stuck(now_s)):
+            return ""
+        self._patience.renew(now_s)
+        self._kill()
+        return why
 
     def close(self) -> None:
         """End the nursery, also one that is stuck; the drivers it forked live on."""
@@ -89,6 +100,8 @@ class Nursery:
         if len(packet) > MAX_PACKET:
             answer(None, 7, f"settings of {len(packet)} bytes; want at most {MAX_PACKET}", [])
             return
+        if not self._answers:
+            self._patience.renew(time.monotonic())
         self._answers[self._number] = answer
         try:
             socket.send_fds(self._sock, [packet], list(fds))
@@ -106,6 +119,7 @@ class Nursery:
         if not packet:
             self._end()
             return
+        self._patience.renew(time.monotonic())
         try:
             message = decode_reply(packet, MAX_ANSWER)
         except MalformedMessage:

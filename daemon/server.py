@@ -456,6 +456,8 @@ class Server:
             self.stop_workcell(source)  # a driver could not keep a stop
         for device in list(self.devices.values()):
             device.check(now)
+        if self._nursery is not None and (why := self._nursery.check(now / 1e9)):
+            self.log("error", "nursery killed", why=why)
         self.loop.after(ALIVE_S, self._alive)
 
     def _look_at_budget(self) -> None:

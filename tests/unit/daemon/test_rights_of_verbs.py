@@ -364,3 +364,19 @@ def test_an_open_of_a_device_that_is_reloaded_waits_until_it_is_back(cell: Workc
     cell.is_replaced, cell.server.devices = False, {"io0": cell.device}
     cell.clients.nodes.retry_opens()
     assert cell.answer("eva") == 0
+
+
+def test_markers_persist_for_users_with_a_right(cell: Workcell) -> None:
+    def reserved() -> int:
+        return len(cell.clients.markers._owners.owners())
+
+    cell.grant((["read"], "eva", "*"), (["read"], "tom", "*"))
+    assert (
+        cell.ask("eva", ClientVerb.RESERVE_MARKER, 2, True)
+        == 0
+        == cell.ask("tom", ClientVerb.RESERVE_MARKER, 1, True)
+    )
+    cell.grant((["read"], "eva", "io0"), (["read"], "tom", "*"))
+    assert reserved() == 3
+    cell.grant((["read"], "tom", "*"))
+    assert reserved() == 1
