@@ -5,8 +5,7 @@
             await mod0.write(sioms.command(0, position=0.1))
             await mod0.wait_until_idle()
 
-Requests are the same values that the blocking face sends (``sioms.client.node_core``); only the waiting
-differs. Reading needs no waiting: ``read`` is an ordinary call. Only right after an acknowledgement it may
+Its verbs are those of the blocking face, made of the same list (``sioms.client.faces``); only the waiting differs. Reading needs no waiting: ``read`` is an ordinary call. Only right after an acknowledgement it may
 take until the driver publishes again; ``await node.fresh()`` lets the loop go on meanwhile.
 
 Concurrency: one event loop, any number of its tasks. Cancelling a task cancels its request.
@@ -17,32 +16,74 @@ from __future__ import annotations
 import asyncio
 import errno
 import os
-from collections.abc import AsyncIterator
 from contextlib import suppress
-from time import monotonic, monotonic_ns
-from typing import TYPE_CHECKING, Any, Self
+from select import POLLIN, poll
+from time import monotonic
+from typing import TYPE_CHECKING, Any, Self, TypeVar, overload
 
 from sioms.protocol import verbs
-from sioms.protocol.flags import PROTOCOL_VERSION, Request
-from sioms.protocol.nodeinfo import NodeInfo
+from sioms.protocol.flags import NodeClass
 from sioms.protocol.socketpath import socket_path
-from sioms.protocol.stopfile import StopRequest
-from sioms.protocol.text import printable
 
-from .client.arguments import seconds
+from .client.cell_verbs import MarkerVerbs, WorkcellVerbs
 from .client.channel import Answer, Call, Channel
 from .client.channel import connect as connect_socket
-from .client.command import command
-from .client.node_core import Edges, Event, NodeCore
-from .client.shown import acknowledged_by_daemon
-from .client.workcell import STARTING_S, node_parts, open_call, request_stop
+from .client.faces import Awaiting
+from .client.node_core import S
+from .client.node_verbs import AnalogVerbs, AxisVerbs, BinaryVerbs, NodeVerbs, select_nodes
+from .client.snapshot import AnalogSnapshot, AxisSnapshot, BinarySnapshot
 
 if TYPE_CHECKING:
-    from .client.node_core import Records
+    from collections.abc import Iterable
+
+    from .client.coordinates import AsyncUserAxis
     from .client.overdue import Overdue
 
+N = TypeVar("N", bound="AsyncNode[Any]")
+A = TypeVar("A", bound=AxisVerbs)
+_woken: dict[tuple[asyncio.AbstractEventLoop, int], list[asyncio.Future[None]]] = {}
+"""Tasks that wait for a descriptor; a loop calls one only."""
 
-class _Requests:
+
+def _wake(key: tuple[asyncio.AbstractEventLoop, int]) -> None:
+    for waiting in _woken.get(key, ()):
+        if not waiting.done():
+            waiting.set_result(None)
+
+
+class _Waiter:
+    """What waits in the asyncio face."""
+
+    async def readable(self, fds: Iterable[int], timeout_s: float | None) -> set[int]:
+        """Wait until one of several descriptors is readable; return those that are, none when the time is over."""
+        loop, fds = asyncio.get_running_loop(), list(fds)
+        poller = poll()
+        woken = loop.create_future()
+        for fd in fds:
+            poller.register(fd, POLLIN)
+            waiting = _woken.setdefault((loop, fd), [])
+            if not waiting:
+                loop.add_reader(fd, _wake, (loop, fd))
+            waiting.append(woken)
+        try:
+            async with asyncio.timeout(timeout_s):
+                await woken
+        except TimeoutError:
+            return set()
+        finally:
+            for fd in fds:
+                _woken[loop, fd].remove(woken)
+                if not _woken[loop, fd]:
+                    del _woken[loop, fd]
+                    loop.remove_reader(fd)
+        return {fd for fd, _ in poller.poll(0)}
+
+    async def pause(self, seconds: float) -> None:
+        """Let time pass."""
+        await asyncio.sleep(seconds)
+
+
+class _Requests(_Waiter):
     """Requests in flight on a channel, answered by the event loop."""
 
     def __init__(self, channel: Channel, cancel: type[verbs.Cancel | verbs.CancelOnHandle]) -> None:
@@ -64,6 +105,7 @@ class _Requests:
             self._looks[number] = self._loop.call_later(
                 call.limit_s + call.first_look_s, self._look, number, call, due_s, None
             )
+        self._keep_alive(number)
         try:
             return await future
         except asyncio.CancelledError:
@@ -73,6 +115,17 @@ class _Requests:
             look = self._looks.pop(number, None)
             if look is not None:
                 look.cancel()
+
+    def _keep_alive(self, number: int) -> None:
+        """Renew the lease of a node as long as a request of it waits."""
+        if self._channel.keepalive_s and number in self._futures:
+            self._loop.call_later(self._channel.keepalive_s, self._renew, number)
+
+    def _renew(self, number: int) -> None:
+        if number in self._futures:
+            with suppress(OSError):  # who waits hears of it
+                self._channel.keepalive()
+            self._keep_alive(number)
 
     def _look(self, number: int, call: Call, due_s: float, overdue: Overdue | None) -> None:
         """Judge by the process that owes an overdue answer whether to wait on."""
@@ -136,13 +189,8 @@ class _Requests:
                 future.exception()  # whoever still waits gets it; who does not must not be warned
 
 
-class AsyncNode(NodeCore):
-    """An open node in an event loop; see the blocking nodes for what the calls do."""
-
-    def __init__(self, core: tuple[Any, ...], cell: AsyncWorkcell) -> None:
-        super().__init__(*core)
-        self._cell = cell
-        self._requests = _Requests(self._channel, verbs.CancelOnHandle)
+class AsyncNode(Awaiting, NodeVerbs[S]):
+    """An open node in an event loop. Use it in an ``async with`` block: closing halts its axes."""
 
     async def __aenter__(self) -> Self:
         return self
@@ -150,212 +198,78 @@ class AsyncNode(NodeCore):
     async def __aexit__(self, *_: object) -> None:
         await self.close()
 
-    async def close(self) -> None:
-        """Close the node: axes halt, buffers empty, outputs become safe. Returns when the node is free."""
-        if not self.closed:
-            self._requests.close()
-            self.release()
-            await self._cell.forget(self.handle)
-
-    async def ioctl(self, request: Request, argument: object = None, timeout: float | None = 0.0) -> Any:
-        """Send a request to the driver and return its answer."""
-        return (await self._requests.call(self._ioctl(request, argument, timeout))).value
-
-    async def write(self, records: Records, timeout: float | None = 0.0, *, replace: bool = False) -> int:
-        """Write records, all or none; see ``Node.write``."""
-        call = self._write(records, timeout, replace)
-        tick: int = (await self._requests.call(call)).value
-        return tick
-
-    async def command(
-        self, axis: int | str = 0, *, timeout: float | None = 0.0, replace: bool = False, **words: Any
-    ) -> int:
-        """Append one command to an axis, given by index or name; see ``sioms.command`` for the words."""
-        return await self.write(command(self.index_of(axis), **words), timeout, replace=replace)
-
-    async def move(
-        self,
-        position: float,
-        axis: int | str = 0,
-        *,
-        timeout: float | None = 0.0,
-        replace: bool = False,
-        **words: Any,
-    ) -> int:
-        """Append a position command; see ``AxisNode.move``."""
-        return await self.command(axis, position=position, timeout=timeout, replace=replace, **words)
-
-    async def jog(self, velocity: float, axis: int | str = 0, *, acceleration: float | None = None) -> int:
-        """Go over to a velocity at once, until told otherwise; see ``AxisNode.jog``."""
-        words = {} if acceleration is None else {"acceleration": acceleration}
-        return await self.command(axis, velocity=velocity, replace=True, **words)
-
-    async def tweak(self, step: float, axis: int | str = 0, **words: Any) -> int:
-        """Append a step from where the preceding command ends; see ``AxisNode.tweak``."""
-        return await self.command(axis, position=step, relative=True, **words)
-
-    async def stop(self) -> None:
-        """Stop at maximum deceleration and empty the buffers; not latched."""
-        await self.ioctl(Request.STOP)
-
-    async def stop_all(self) -> None:
-        """Emergency stop of this node, latched until ``reset``."""
-        await self.ioctl(Request.EMERGENCY_STOP)
-
-    async def reset(self) -> None:
-        """Clear a latched stop or fault of this node. Nothing resumes."""
-        await self.ioctl(Request.RESET)
-
-    async def home(self) -> None:
-        """Start homing; ``wait_until_idle`` waits for its end."""
-        await self.ioctl(Request.HOME)
-
-    async def set(self, *values: float) -> int:
-        """Write all channels of a binary or analog output."""
-        return await self.write(self._outputs(values))
-
-    async def fresh(self) -> Any:
-        """Return what ``read`` returns, but let the loop go on until the newest snapshot shows what was acknowledged."""
-        while not self.is_shown():
-            await asyncio.sleep(self.look_s)
-        return self.read()
-
-    async def wait_until_idle(self, timeout: float | None = None) -> None:
-        """Wait until all axes of the node stand still and their buffers are empty."""
-        await self.ioctl(Request.WAIT_UNTIL_IDLE, None, timeout)
-
-    async def subscribed(self, every: int) -> None:
-        """Have the node's descriptor become readable with every n-th publication, -1: with edges only."""
-        if every != self._subscribed:
-            await self._requests.call(Call(f"subscribe to {self.name}", verbs.Subscribe(every)))
-            self._subscribed = every
-
-    async def snapshots(self, every: int = 1) -> AsyncIterator[Any]:
-        """Yield the newest snapshot after every n-th publication, for ever."""
-        await self.subscribed(every)
-        number = 0
-        while True:
-            snapshot = await self.fresh()
-            if snapshot.number > number:
-                number = snapshot.number
-                yield snapshot
-            await self._wake()
-
-    async def wait_event(self, mask: int = -1, last: Any = None, timeout: float | None = None) -> Event:
-        """Wait until a masked bit differs from the last state seen; see ``BinaryNode.wait_event``."""
-        timeout = seconds(f"wait for an event on {self.name}", timeout)
-        if last is None:
-            await self.fresh()
-        edges = Edges(self, mask, last)
-        if self._subscribed == 0:
-            await self.subscribed(-1)
-        try:
-            async with asyncio.timeout(timeout):
-                while True:
-                    event = edges.look()
-                    if event is not None:
-                        return event
-                    await self._wake()
-        except TimeoutError as error:
-            if error.errno:
-                raise
-            text = f"wait for an event on {self.name}: nothing within its time-out"
-            raise TimeoutError(errno.ETIMEDOUT, text) from None
-
-    async def _wake(self) -> None:
-        """Wait for the wake pipe, and look at the page at least every 50 ms: a hung driver wakes nobody."""
-        loop = asyncio.get_running_loop()
-        woken = loop.create_future()
-
-        def wake() -> None:
-            if not woken.done():
-                woken.set_result(None)
-
-        loop.add_reader(self._event, wake)
-        try:
-            async with asyncio.timeout(0.05):
-                await woken
-        except TimeoutError:
-            return
-        finally:
-            loop.remove_reader(self._event)
+    subscribed = NodeVerbs.subscribe  # its name of old
 
 
-class AsyncWorkcell:
+class AsyncAxisNode(AsyncNode[AxisSnapshot], AxisVerbs):
+    __doc__ = AxisVerbs.__doc__
+
+    def user(self, axis: int | str = 0, *, offset: float = 0.0, direction: int = 1) -> AsyncUserAxis:
+        """Return one axis in coordinates of one's own: user = direction * position + offset."""
+        from .client.coordinates import AsyncUserAxis
+
+        return AsyncUserAxis(self, self.channel(axis), offset, direction)
+
+    def __getitem__(self, axis: int | str) -> AsyncUserAxis:
+        """Return one axis by index or name, ``arm["xaxis"]``, in the node's own coordinates."""
+        return self.user(axis)
+
+
+class AsyncAnalogNode(AsyncNode[AnalogSnapshot], AnalogVerbs):
+    __doc__ = AnalogVerbs.__doc__
+
+
+class AsyncBinaryNode(AsyncNode[BinarySnapshot], BinaryVerbs):
+    __doc__ = BinaryVerbs.__doc__
+
+
+NODE: dict[NodeClass, type[AsyncNode[Any]]] = {
+    NodeClass.AXIS: AsyncAxisNode,
+    NodeClass.ANALOG: AsyncAnalogNode,
+    NodeClass.BINARY: AsyncBinaryNode,
+}
+
+
+class AsyncMarker(Awaiting, MarkerVerbs):
+    __doc__ = MarkerVerbs.__doc__
+
+
+class AsyncWorkcell(Awaiting, WorkcellVerbs[AsyncMarker]):
     """A session with the daemon in an event loop; made by ``connect``."""
 
-    def __init__(self, requests: _Requests, page: StopRequest | None, name: str = "") -> None:
-        self._requests = requests
-        self._page = page
-        self.name = name
+    _NODE, _NODES, _MARKER = AsyncNode, NODE, AsyncMarker
 
-    def __repr__(self) -> str:
-        return f"<AsyncWorkcell {self.name}{', closed' if self._requests.closed else ''}>"
+    def _waiter_of(self, channel: Channel) -> _Requests:
+        return _Requests(channel, verbs.CancelOnHandle)
 
     async def __aenter__(self) -> Self:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        self._requests.close()
-        if self._page is not None:
-            self._page.close()
-            self._page = None
+        await self.close()
 
+    @overload
+    async def open(
+        self, name: str, mode: str = "r", timeout: float | None = 0.0, *, lease: float = 0.0, kind: type[N]
+    ) -> N: ...
+
+    @overload
     async def open(
         self, name: str, mode: str = "r", timeout: float | None = 0.0, *, lease: float = 0.0
-    ) -> AsyncNode:
-        """Open a node; see ``Workcell.open``."""
-        answer = await self._requests.call(open_call(name, mode, timeout, lease))
-        return AsyncNode(node_parts(answer.value, answer.fds), self)
+    ) -> Any: ...
 
-    async def info(self, name: str) -> NodeInfo:
-        """Return what a node is, without opening it."""
-        return NodeInfo(await self._call(f"get information of {name}", verbs.Info(name)))
+    async def open(
+        self,
+        name: str,
+        mode: str = "r",
+        timeout: float | None = 0.0,
+        *,
+        lease: float = 0.0,
+        kind: type[AsyncNode[Any]] | None = None,
+    ) -> Any:
+        return await self._open(name, mode, timeout, lease, kind)
 
-    async def status(self) -> dict[str, Any]:
-        """Return devices, sessions, holders and the state of the emergency stop."""
-        value: dict[str, Any] = await self._call("get status", verbs.Status())
-        return value
-
-    async def reserve_marker(self) -> int:
-        """Reserve a marker; return its token."""
-        tokens: list[int] = await self._call("reserve marker", verbs.ReserveMarker(1, False))
-        return tokens[0]
-
-    async def signal_marker(self, token: int) -> None:
-        """Signal a marker."""
-        await self._call("signal marker", verbs.SignalMarker(token))
-
-    async def wait_marker(self, number: int, timeout: float | None = None) -> int:
-        """Wait until a marker is signalled; return when that was [ns, CLOCK_MONOTONIC]."""
-        stamp_ns: int = await self._call("wait for marker", verbs.WaitMarker(number, timeout))
-        return stamp_ns
-
-    async def emergency_stop(self, node: str = "", why: str = "") -> None:
-        """Stop the workcell or a node, latched until reset; the workcell also while the daemon hangs."""
-        call = Call("emergency stop", verbs.EmergencyStop(node, printable(str(why))))
-        taken = call.enough = request_stop(None if node else self._page, printable(str(why)))
-        try:
-            await self._requests.call(call)
-        except OSError:
-            if taken is None or not taken():
-                raise  # else the drivers have latched it without the daemon
-            acknowledged_by_daemon(monotonic_ns())
-
-    async def reset(self, node: str = "") -> None:
-        """Clear the latched stop of the workcell or of a node."""
-        await self._call("reset", verbs.Reset(node))
-
-    async def forget(self, handle: int) -> None:
-        """Tell the daemon that a node was closed."""
-        try:
-            await self._call("close", verbs.Close(handle))
-        except OSError as error:
-            if error.errno not in (errno.EIO, errno.EBADF):
-                raise
-
-    async def _call(self, what: str, message: verbs.Message) -> Any:
-        return (await self._requests.call(Call(what, message))).value
+    open.__doc__ = WorkcellVerbs._open.__doc__
 
 
 async def connect(path: str | None = None, name: str = "") -> AsyncWorkcell:
@@ -365,20 +279,17 @@ async def connect(path: str | None = None, name: str = "") -> AsyncWorkcell:
         path: the daemon's socket; None for $SIOMS_SOCKET or the usual places.
         name: what this client calls itself.
     """
-    channel = Channel(connect_socket(path or socket_path()), "the daemon")
-    requests = _Requests(channel, verbs.Cancel)
-    answer = await _hello(requests, name)
-    return AsyncWorkcell(requests, StopRequest(*answer.fds) if answer.fds else None, answer.value[1])
+    path = path or socket_path()
+    channel = Channel(connect_socket(path), "the daemon")
+    cell = AsyncWorkcell(channel, _Requests(channel, verbs.Cancel), path)
+    await cell._greet(name)
+    return cell
 
 
-async def _hello(requests: _Requests, name: str) -> Answer:
-    """Say hello; to a daemon that is starting again and again, for a while."""
-    deadline = monotonic() + STARTING_S
-    while True:
-        try:
-            return await requests.call(Call("hello", verbs.Hello(PROTOCOL_VERSION, name)))
-        except OSError as error:
-            if error.errno != errno.EAGAIN or monotonic() > deadline:
-                requests.close()
-                raise
-        await asyncio.sleep(0.02)
+async def select(
+    readable: Iterable[N] = (), room: Iterable[A] = (), timeout: float | None = None
+) -> tuple[list[N], list[A]]:
+    return await select_nodes(_Waiter(), readable, room, timeout)
+
+
+select.__doc__ = select_nodes.__doc__

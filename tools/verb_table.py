@@ -100,9 +100,9 @@ def _requests() -> list[str]:
         "## Requests of Ioctl", "",
         "| number | request | right | needs the output node | shown in readings | |", "| ---: | --- | --- | --- | --- | --- |",
     ]  # fmt: skip
-    for number, rule in REQUESTS.items():
-        owner, shown = "yes" if rule.owner else "", "" if rule.looks else "yes"
+    for number, (right, owns, looks, does) in REQUESTS.items():
+        owner, shown = "yes" if owns else "", "" if looks else "yes"
         lines.append(
-            f"| {int(number)} | {Request(number).name} | {_words(rule.right)} | {owner} | {shown} | {rule.does} |"
+            f"| {int(number)} | {Request(number).name} | {_words(right)} | {owner} | {shown} | {does} |"
         )
     return [*lines, ""]

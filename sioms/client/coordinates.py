@@ -9,17 +9,17 @@ Concurrency: as the node that it looks at.
 from __future__ import annotations
 
 from .arguments import integer, number
+from .faces import Awaiting, Blocking, verb
+from .node_verbs import AxisVerbs
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from .node import AxisNode
-
 _SIGNED = ("velocity", "acceleration", "jerk", "force", "force_velocity", "force_offset")
 
 
-class UserAxis:
+class UserAxisVerbs:
     """An axis of an open node, seen as ``user = direction * position + offset``.
 
     Args:
@@ -36,9 +36,7 @@ class UserAxis:
         0.3
     """
 
-    __slots__ = ("axis", "direction", "node", "offset")
-
-    def __init__(self, node: AxisNode, axis: int = 0, offset: float = 0.0, direction: int = 1) -> None:
+    def __init__(self, node: AxisVerbs, axis: int = 0, offset: float = 0.0, direction: int = 1) -> None:
         if integer("make user coordinates: direction", direction, "1 or -1") not in (1, -1):
             raise ValueError(f"make user coordinates: direction {direction!r}; want 1 or -1")
         self.node, self.axis, self.direction = node, axis, direction
@@ -55,7 +53,7 @@ class UserAxis:
             place = f"at {self.position:.6g} {channel.unit}"
         except OSError as error:
             place = error.strerror or str(error)
-        return f"<UserAxis {self.node.name}[{channel.name!r}]{view}: {place}>"
+        return f"<{type(self).__name__} {self.node.name}[{channel.name!r}]{view}: {place}>"
 
     def to_node(self, user: float) -> float:
         """Return the node's position of a user position."""
@@ -83,30 +81,43 @@ class UserAxis:
             - self.direction * self.node.read().position[self.axis]
         )
 
-    def limits(self) -> tuple[float | None, float | None]:
+    @verb
+    async def limits(self) -> tuple[float | None, float | None]:
         """Return the lowest and highest user position, None where there is no soft limit."""
-        found = self.node.limits()
+        found = await AxisVerbs.limits(self.node)
         low, high = (found[name][self.axis] for name in ("position_min", "position_max"))
         ends = [None if end is None else self.to_user(end) for end in (low, high)]
         return (ends[0], ends[1]) if self.direction > 0 else (ends[1], ends[0])
 
-    def move(
-        self, position: float, *, replace: bool = False, timeout: float | None = 0.0, **words: Any
+    @verb
+    async def move(
+        self, /, position: float, *, replace: bool = False, timeout: float | None = 0.0, **words: Any
     ) -> int:
         """Append a command to a user position; the words of ``sioms.command`` in user coordinates."""
         place = self._turn(position) if words.get("relative") else self.to_node(position)
-        return self.node.move(place, self.axis, replace=replace, timeout=timeout, **self._turned(words))
+        words = self._turned(words)
+        return await AxisVerbs.move(self.node, place, self.axis, replace=replace, timeout=timeout, **words)
 
-    def tweak(self, step: float, **words: Any) -> int:
+    @verb
+    async def tweak(self, /, step: float, **words: Any) -> int:
         """Append a step from where the preceding command ends."""
-        return self.node.tweak(self._turn(step), self.axis, **self._turned(words))
+        return await AxisVerbs.tweak(self.node, self._turn(step), self.axis, **self._turned(words))
 
-    def jog(self, velocity: float, *, acceleration: float | None = None) -> int:
+    @verb
+    async def jog(self, velocity: float, *, acceleration: float | None = None) -> int:
         """Go over to a velocity; see ``AxisNode.jog``."""
-        return self.node.jog(self._turn(velocity), self.axis, acceleration=acceleration)
+        return await AxisVerbs.jog(self.node, self._turn(velocity), self.axis, acceleration=acceleration)
 
     def _turn(self, value: float) -> float:
         return self.direction * number("turn user coordinates", value)
 
     def _turned(self, words: dict[str, Any]) -> dict[str, Any]:
         return {name: self._turn(word) if name in _SIGNED else word for name, word in words.items()}
+
+
+class UserAxis(Blocking, UserAxisVerbs):
+    __doc__ = UserAxisVerbs.__doc__
+
+
+class AsyncUserAxis(Awaiting, UserAxisVerbs):
+    __doc__ = UserAxisVerbs.__doc__

@@ -1,6 +1,6 @@
 """What an open node is, without any waiting: reading out of shared memory, and requests as values.
 
-Concurrency: that of the faces, ``node`` and ``sioms.aio``.
+Concurrency: that of the faces, ``node`` and ``sioms.aio``; the verbs of both are in ``node_verbs``.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from sioms.protocol.verbs import Ioctl, Write
 from . import shown
 from .arguments import integer, number, numbers
 from .channel import Call, Channel
+from .faces import Generic
 from .snapshot import SNAPSHOT, BinarySnapshot, Layout
 
 TYPE_CHECKING = False
@@ -28,7 +29,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from typing import Any, TypeAlias
 
+    from typing_extensions import TypeVar
+
+    from .snapshot import Snapshot
+
     Records: TypeAlias = bytes | bytearray | memoryview | Iterable[bytes]
+    S = TypeVar("S", bound=Snapshot, default=Any)
+else:
+    S = None
 
 _WAKES = 4096
 """Bytes taken out of the wake pipe in one go, one a publication."""
@@ -89,7 +97,9 @@ class Edges:
         OSError: EINVAL, a node of another kind.
     """
 
-    def __init__(self, node: NodeCore, mask: int, last: Event | BinarySnapshot | None) -> None:
+    def __init__(
+        self, node: NodeCore[BinarySnapshot], mask: int, last: Event | BinarySnapshot | None
+    ) -> None:
         if node.info.node_class is not NodeClass.BINARY or len(node.info.channels) != 1:
             raise OSError(
                 errno.EINVAL, f"wait for an event on {node.name}: want a node of one binary channel"
@@ -138,7 +148,7 @@ class Edges:
         return event if (final ^ self._state) & self._mask else None
 
 
-class NodeCore:
+class NodeCore(Generic[S]):
     """What the blocking and the asyncio face of an open node share; no waiting in it.
 
     Attributes:
@@ -161,7 +171,7 @@ class NodeCore:
         self._page = PageReader(self._map)
         names = [channel.name for channel in info.channels]
         self._layout = Layout(info.node_class, self._page.channels, channels, bit, names)
-        self._snapshot = SNAPSHOT[info.node_class]
+        self._snapshot: Any = SNAPSHOT[info.node_class]
         self._latest = self._page.latest
         self._subscribed = 0
         self.owed_ns = 0
@@ -174,7 +184,7 @@ class NodeCore:
         """Whether it has been closed."""
         return self._map is None
 
-    def read(self) -> Any:
+    def read(self) -> S:
         """Return the newest snapshot of all channels: a copy of memory, no system call.
 
         Everything that was acknowledged before, to this process and about this device, shows in it. Right after
@@ -192,7 +202,8 @@ class NodeCore:
             raise self._unreadable(error) from None
         if self._subscribed:
             self._drain()
-        return self._snapshot(raw, self._layout)
+        snapshot: S = self._snapshot(raw, self._layout)
+        return snapshot
 
     def is_shown(self) -> bool:
         """Whether ``read`` need not wait: the newest snapshot shows all that has been acknowledged.
@@ -231,7 +242,7 @@ class NodeCore:
         """How often to look for a publication that must come [s]: ten times a tick, within reason."""
         return min(max(0.1 / self.info.tick_hz, 50e-6), 1e-3)
 
-    def history(self, after: int, *, gone: bool = False) -> list[Any]:
+    def history(self, after: int, *, gone: bool = False) -> list[S]:
         """Return the snapshots after a given number that the page still holds, oldest first.
 
         Args:
@@ -242,7 +253,7 @@ class NodeCore:
             self.read()
         return list(self.kept(after, self._page.head))
 
-    def kept(self, after: int, last: int) -> Iterator[Any]:
+    def kept(self, after: int, last: int) -> Iterator[S]:
         """Yield the snapshots after a number, up to a last one, that the page still holds, as they are looked at."""
         page = self._page
         what = f"get the history of {self.name}"
@@ -260,24 +271,21 @@ class NodeCore:
     def fileno(self) -> int:
         """Return a descriptor that is readable when there is new data, for selectors and asyncio.
 
-        The first call subscribes; ``read`` makes it unreadable until the next publication.
+        The node must be subscribed to, which the blocking face sees to. ``read`` makes the descriptor unreadable until the
+        next publication.
+
+        Raises:
+            OSError: EINVAL, it is not subscribed to.
         """
         if not self._subscribed:
-            self.subscribe(1)
+            raise OSError(
+                errno.EINVAL, f"wait for new data of {self.name}: not subscribed; await subscribe(1)"
+            )
         return self._event
-
-    def subscribe(self, every: int) -> None:
-        """Have ``fileno`` become readable with every n-th publication, -1: with edges only, 0: not at all."""
-        raise NotImplementedError
 
     def keepalive(self) -> None:
         """Tell the driver that this client is alive, for nodes opened with a lease; any request does, too."""
         self._channel.keepalive()
-
-    def room(self) -> int:
-        """Return how many commands the fullest of the node's command buffers still takes."""
-        fullest: int = max(self.read().buffered)
-        return self.info.buffer_capacity - fullest
 
     def channel(self, which: int | str) -> int:
         """Return the index of a channel.

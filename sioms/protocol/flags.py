@@ -148,53 +148,33 @@ class Right(IntFlag):
     ALL = 15
 
 
-class Rule:
-    """What a request needs, and what it does to readings.
-
-    Attributes:
-        right: any of these is asked for on the node.
-        owner: it needs the output node itself, not its read-only companion.
-        looks: it changes nothing that readings show; of all others a reading after the answer shows the effect.
-        does: in words.
-    """
-
-    __slots__ = ("does", "looks", "owner", "right")
-
-    def __init__(self, right: Right, does: str, *, owner: bool = False, looks: bool = False) -> None:
-        self.right, self.does, self.owner, self.looks = right, does, owner, looks
-
-
-REQUESTS: dict[int, Rule] = {
-    Request.GET_IO_STRUCT_INFO: Rule(Right.WRITE, "tell what the node is; answered by the client library"),
-    Request.CALIBRATE_DEVICE: Rule(Right.WRITE, "give the present positions new values", owner=True),
-    Request.ZERO_DEVICE: Rule(Right.WRITE, "take what is measured now as zero", owner=True),
-    Request.WAIT_UNTIL_IDLE: Rule(
-        Right.READ, "wait until all axes rest and their buffers are empty", looks=True
-    ),
-    Request.SEND_EXTERNAL_SYNCH: Rule(Right.WRITE, "start what waits for the external synch"),
-    Request.EMERGENCY_STOP: Rule(Right.STOP, "stop the node until it is reset"),
-    Request.SIGNAL_MARKER: Rule(Right.WRITE, "signal a marker; passed on to the daemon"),
-    Request.WAIT_MARKER: Rule(Right.WRITE, "wait for a marker; passed on to the daemon"),
-    Request.RESERVE_MARKER: Rule(Right.WRITE, "reserve a marker; passed on to the daemon"),
-    Request.FREE_MARKER: Rule(Right.WRITE, "free a marker; passed on to the daemon"),
-    Request.WAIT_UNTIL_EVENT: Rule(
-        Right.READ, "wait for an edge; answered by the client library, out of the page"
-    ),
-    Request.SET_GAINS: Rule(Right.WRITE, "set the gain matrix", owner=True),
-    Request.GET_GAINS: Rule(Right.READ, "tell the gain matrix", looks=True),
-    Request.STOP: Rule(Right.STOP | Right.WRITE, "stop at maximum deceleration and empty the buffers"),
-    Request.RESET: Rule(Right.WRITE | Right.ADMINISTER, "clear stops and faults of the node"),
-    Request.HOME: Rule(Right.WRITE, "start homing", owner=True),
-    Request.SET_LIMITS: Rule(Right.WRITE, "narrow the limits", owner=True),
-    Request.GET_LIMITS: Rule(Right.READ, "tell the limits in force", looks=True),
-    Request.FLUSH: Rule(Right.WRITE, "empty the buffers; the running command goes on", owner=True),
-    Request.CANCEL_WAITS: Rule(
-        Right.WRITE | Right.ADMINISTER, "end the waits of all sessions on the node"
-    ),
-    Request.GET_STATISTICS: Rule(Right.READ, "tell tick times and link counters", looks=True),
-    Request.GET_PARTICULARS: Rule(Right.READ, "tell what readings do not", looks=True),
+REQUESTS: dict[int, tuple[Right, bool, bool, str]] = {
+    Request.GET_IO_STRUCT_INFO: (Right.WRITE, False, False, "tell what the node is; answered by the client library"),
+    Request.CALIBRATE_DEVICE: (Right.WRITE, True, False, "give the present positions new values"),
+    Request.ZERO_DEVICE: (Right.WRITE, True, False, "take what is measured now as zero"),
+    Request.WAIT_UNTIL_IDLE: (Right.READ, False, True, "wait until all axes rest and their buffers are empty"),
+    Request.SEND_EXTERNAL_SYNCH: (Right.WRITE, False, False, "start what waits for the external synch"),
+    Request.EMERGENCY_STOP: (Right.STOP, False, False, "stop the node until it is reset"),
+    Request.SIGNAL_MARKER: (Right.WRITE, False, False, "signal a marker; passed on to the daemon"),
+    Request.WAIT_MARKER: (Right.WRITE, False, False, "wait for a marker; passed on to the daemon"),
+    Request.RESERVE_MARKER: (Right.WRITE, False, False, "reserve a marker; passed on to the daemon"),
+    Request.FREE_MARKER: (Right.WRITE, False, False, "free a marker; passed on to the daemon"),
+    Request.WAIT_UNTIL_EVENT: (Right.READ, False, False, "wait for an edge; answered by the client library, out of the page"),
+    Request.SET_GAINS: (Right.WRITE, True, False, "set the gain matrix"),
+    Request.GET_GAINS: (Right.READ, False, True, "tell the gain matrix"),
+    Request.STOP: (Right.STOP | Right.WRITE, False, False, "stop at maximum deceleration and empty the buffers"),
+    Request.RESET: (Right.WRITE | Right.ADMINISTER, False, False, "clear stops and faults of the node"),
+    Request.HOME: (Right.WRITE, True, False, "start homing"),
+    Request.SET_LIMITS: (Right.WRITE, True, False, "narrow the limits"),
+    Request.GET_LIMITS: (Right.READ, False, True, "tell the limits in force"),
+    Request.FLUSH: (Right.WRITE, True, False, "empty the buffers; the running command goes on"),
+    Request.CANCEL_WAITS: (Right.WRITE | Right.ADMINISTER, False, False, "end the waits of all sessions on the node"),
+    Request.GET_STATISTICS: (Right.READ, False, True, "tell tick times and link counters"),
+    Request.GET_PARTICULARS: (Right.READ, False, True, "tell what readings do not"),
 }  # fmt: skip
-"""The table of requests: what an IOCTL may ask for."""
+"""The table of requests: any of which rights it takes; whether it needs the output node itself, not its read-only companion;
+whether it only looks (else a reading after the answer shows its effect); what it does.
+"""
 
 
 class PageState(IntEnum):

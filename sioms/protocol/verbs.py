@@ -71,9 +71,6 @@ KINDS = {
 """Kinds by the annotations of fields."""
 
 
-_NO_RIGHT = Right(0)
-
-
 class Socket(dict[int, "type[Message]"]):
     """The messages that one side of a socket may send, by verb.
 
@@ -105,25 +102,23 @@ class Message(tuple):  # type: ignore[type-arg]
 
     verb: ClassVar[int]
     fields: ClassVar[dict[str, Kind]]
-    notice: ClassVar[bool]
+    notice: ClassVar[bool] = False
     states: ClassVar[tuple[str, ...]]
-    then: ClassVar[str]
-    right: ClassVar[Right]
-    somewhere: ClassVar[str]
-    shown: ClassVar[bool]
-    query: ClassVar[bool]
+    then: ClassVar[str] = ""
+    right: ClassVar[Right] = Right(0)
+    somewhere: ClassVar[str] = ""
+    shown: ClassVar[bool] = False
+    query: ClassVar[bool] = False
 
     if not TYPE_CHECKING:
 
         def __new__(cls, *arguments):
             return tuple.__new__(cls, arguments)
 
-    def __init_subclass__(
-        cls, on: Socket, verb: int, notice: bool = False, states: tuple[str, ...] = (), then: str = "",
-        right: Right = _NO_RIGHT, somewhere: str = "", shown: bool = False, query: bool = False,
-    ) -> None:  # fmt: skip
-        cls.verb, cls.notice, cls.states, cls.then = verb, notice, states or on.states, then
-        cls.right, cls.somewhere, cls.shown, cls.query = right, somewhere, shown, query
+    def __init_subclass__(cls, on: Socket, verb: int, **rules: Any) -> None:
+        cls.verb = verb
+        for name, value in {"states": on.states, **rules}.items():
+            setattr(cls, name, value)
         names = cls.__dict__.get("__annotations__", {})  # noqa: RUF063  # as light as it is
         cls.fields = {name: KINDS[kind] for name, kind in names.items()}
         cls.__match_args__ = tuple(names)  # type: ignore[attr-defined, misc]

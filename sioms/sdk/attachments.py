@@ -168,7 +168,7 @@ class Attachments:
                     records = _whole(handle, number, records)
                 return write(self._runtime, handle, number, flags, timeout_s, records)
             case verbs.Ioctl(request, argument, timeout_s):
-                if (rule := REQUESTS.get(request)) is None or not rule.looks:
+                if request not in REQUESTS or not REQUESTS[request][2]:
                     self._runtime.effects.note()
                 return ioctl(self._runtime, handle, number, request, argument, timeout_s)
             case verbs.Subscribe(every):

@@ -53,10 +53,10 @@ def ioctl(
         raise _refuse(errno.ENOTTY, f"ioctl {request_number} on {handle.node}: no such request") from None
     what = f"{request.name} on {handle.node}"
     owns = handle.exclusive or not _writable(handle)
-    rule = REQUESTS[request]
-    if rule.owner and not owns:
+    right, owner, _, _ = REQUESTS[request]
+    if owner and not owns:
         raise _refuse(errno.EBADF, f"{what}: needs the output node itself, not its read-only companion")
-    if not handle.rights & rule.right:
+    if not handle.rights & right:
         raise _refuse(errno.EPERM, f"{what}: the user has no right to do that; ask for a [[grant]]")
     match request:
         case Request.EMERGENCY_STOP:

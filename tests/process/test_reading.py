@@ -19,6 +19,7 @@ import sioms
 import sioms.aio
 from sioms.protocol.flags import Request
 from sioms.protocol.records import BINARY_WRITE
+from sioms.protocol.verbs import Ioctl
 
 
 def test_all_channels_carry_one_tick_under_a_hasty_reader(cell: sioms.Workcell) -> None:
@@ -322,7 +323,7 @@ def test_requests_of_a_class_that_does_not_know_them(cell: sioms.Workcell) -> No
             with raises(errno.ENOTTY, node.name):
                 node.ioctl(request, [1.0])
         call = axes._ioctl(Request.STOP)
-        call.arguments = (999, None, 0.0)
+        call.message = Ioctl(999, None, 0.0)
         with raises(errno.ENOTTY, "999", "no such request"):
             axes._channel.call(call)
 

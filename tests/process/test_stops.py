@@ -184,7 +184,7 @@ def test_a_read_only_page_is_sealed(cell: sioms.Workcell) -> None:
     import mmap
     import os
 
-    from sioms.client.workcell import open_call
+    from sioms.client.cell_verbs import open_call
 
     answer = cell._channel.call(open_call("mod0.readonly", "r", 0.0, 0.0))
     page = answer.fds[0]

@@ -57,8 +57,6 @@ WORDS = {
 
 def _public(kind: type) -> Iterator[tuple[str, Any]]:
     for name, function in inspect.getmembers(kind, callable):
-        if kind is aio.AsyncNode and name == "subscribe":
-            continue  # what the blocking face has; here it is ``subscribed``
         if not name.startswith("_") and name not in ("close", "release", "forget", "close_handle"):
             yield name, function
 
@@ -187,7 +185,7 @@ def test_asyncio(daemon: Daemon) -> None:
             faults = await attempts(cell, aio.AsyncWorkcell)
             for name in NODES:
                 async with await cell.open(name, "r" if name == "force0" else "rw", 5.0) as node:
-                    faults += await attempts(node, aio.AsyncNode)
+                    faults += await attempts(node, type(node))
                     assert (await node.fresh()).number, "the node works on"
             return faults
 

@@ -1,0 +1,393 @@
+"""The verbs of the connection to a daemon, the one list of which both faces are made (``faces``): names, opens, markers, stops."""
+
+from __future__ import annotations
+
+import errno
+import os
+from _socket import socket
+from time import monotonic, monotonic_ns
+
+from sioms.protocol import verbs
+from sioms.protocol.flags import PROTOCOL_VERSION, READONLY, Access, NodeClass, Request
+from sioms.protocol.nodeinfo import NodeInfo
+from sioms.protocol.stopfile import StopRequest
+from sioms.protocol.text import printable, shown
+
+from .arguments import number as as_number
+from .channel import Call, Channel
+from .faces import Generic, verb
+from .shown import acknowledged_by_daemon
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+    from typing import Any, ClassVar, Self, TypeVar
+
+    from .node_verbs import AxisVerbs, NodeVerbs
+    from .typed_faces import Waiter
+
+    M = TypeVar("M", bound="MarkerVerbs")
+else:
+    M = None
+
+STARTING_S = 5.0
+"""How long a client waits for a daemon that says that it is starting [s]."""
+SYNCH_LEAD_S = 0.01
+"""How far ahead a synchronised start lies: long enough for every driver to hear of it."""
+_ACCESS = {"r": Access.READ, "w": Access.WRITE, "rw": Access.READ | Access.WRITE}
+
+
+class NodeEntry:
+    """A line of the node list.
+
+    Attributes:
+        name, node_class, channels, read_only, device: what and whose.
+        state: state of the device: up, starting, restarting, fault ...
+        holder: who has it open for output, '' when it is free.
+    """
+
+    __slots__ = ("bit", "channels", "device", "holder", "name", "node_class", "read_only", "state")
+
+    def __init__(self, packed: list) -> None:  # type: ignore[type-arg]
+        self.name, cls, self.channels, self.read_only, self.device, self.state, self.holder, self.bit = packed
+        self.node_class = NodeClass(cls)
+
+    def __repr__(self) -> str:
+        held = f", held by {self.holder}" if self.holder else ""
+        return f"<{self.node_class.name.lower()} node {self.name}: device {self.device} {self.state}{held}>"
+
+
+def is_part(entry: NodeEntry, entries: Iterable[NodeEntry]) -> bool:
+    """Tell whether a node is a companion, a channel or a bit of another one in the list."""
+    if entry.name.endswith(READONLY):
+        return True
+    parent = entry.name.rpartition(".")[0]
+    return any(
+        other.name == parent and other.device == entry.device and other.node_class == entry.node_class
+        and (other.channels > entry.channels or entry.bit >= 0)
+        for other in entries
+    )  # fmt: skip
+
+
+class MarkerVerbs(int):
+    """A reserved marker: the integer of its token."""
+
+    _cell: WorkcellVerbs[Any]
+
+    def __new__(cls, cell: WorkcellVerbs[Any], token: int) -> Self:
+        """Make a marker of its token."""
+        marker = int.__new__(cls, token)
+        marker._cell = cell
+        return marker
+
+    @property
+    def token(self) -> int:
+        """Number and key in one integer, below 2**50; needed to signal and to free."""
+        return int(self)
+
+    @property
+    def number(self) -> int:
+        """Its number, which is enough to wait."""
+        return int(self) & 1023
+
+    @verb
+    async def signal(self) -> None:
+        """Signal it; once is enough, more has no effect."""
+        await WorkcellVerbs.signal_marker(self._cell, self)
+
+    @verb
+    async def wait(self, timeout: float | None = None) -> int:
+        """Wait until it is signalled; return when that was [ns, CLOCK_MONOTONIC]."""
+        return await WorkcellVerbs.wait_marker(self._cell, self, timeout)
+
+    @verb
+    async def free(self) -> None:
+        """Free it; who waits for it gets EPIPE."""
+        await WorkcellVerbs.free_marker(self._cell, self)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.number}>"
+
+    __str__ = __repr__
+
+    def __format__(self, spec: str) -> str:
+        return format(str(self), spec)
+
+
+def open_call(name: str, mode: str, timeout: float | None, lease: float) -> Call:
+    """Make the request that opens a node."""
+    access = _ACCESS.get(mode) if isinstance(mode, str) else None
+    if access is None:
+        raise OSError(errno.EINVAL, f"open {name}: mode {shown(mode)}; want 'r', 'w' or 'rw'")
+    return Call(f"open {name}", verbs.Open(name, int(access), timeout, lease), limit_s=timeout)
+
+
+def node_parts(value: Any, fds: list[int]) -> tuple[Any, ...]:
+    """Turn the answer to an open into the arguments of a node."""
+    handle, packed, channels, bit, behind = value
+    info = NodeInfo(packed)
+    return (
+        info,
+        handle,
+        fds[:2],
+        list(channels),
+        bit,
+        Channel(socket(fileno=fds[2]), f"node {info.name}", False, behind=behind),
+    )
+
+
+def request_stop(request: StopRequest | None, why: str) -> Callable[[], bool] | None:
+    """Request a stop of the workcell past the daemon; return what tells whether it has been taken.
+
+    Comes before the request to the daemon: what is written after it may be found after a reset, as a new stop.
+
+    Args:
+        request: the stop-request file; None: this client has no right to it, or does not want it.
+        why: for the log.
+    """
+    if request is None:
+        return None
+    word = request.request(monotonic_ns(), os.getpid(), why)
+    return lambda: request.taken(word)
+
+
+class WorkcellVerbs(Generic[M]):
+    """The verbs of a session with a daemon.
+
+    Attributes:
+        name: what the workcell is called; rights: of this client on all of it.
+    """
+
+    _NODE: ClassVar[type[NodeVerbs[Any]]]
+    _NODES: ClassVar[Mapping[NodeClass, type[NodeVerbs[Any]]]]
+    _MARKER: ClassVar[type[MarkerVerbs]]
+
+    def _waiter_of(self, channel: Channel) -> Waiter:
+        """Return what waits for the answers on the channel of a node."""
+        raise NotImplementedError
+
+    def __init__(self, channel: Channel, waiter: Waiter, path: str) -> None:
+        self._channel = channel
+        self._waiter = waiter
+        self._path = path
+        self.name, self.rights = "", 0
+        self._request: StopRequest | None = None
+        self._nodes: dict[int, NodeVerbs[Any]] = {}
+
+    async def _greet(self, name: str, enough: Callable[[], bool] | None = None) -> None:
+        """Say hello; to a daemon that is starting again and again, for a while."""
+        call = Call("hello", verbs.Hello(PROTOCOL_VERSION, name), enough=enough)
+        deadline = monotonic() + STARTING_S
+        while True:
+            try:
+                answer = await self._waiter.call(call)
+            except OSError as error:
+                if error.errno != errno.EAGAIN or monotonic() > deadline:
+                    self._waiter.close()
+                    raise
+            else:
+                _, self.name, self.rights = answer.value
+                self._request = StopRequest(*answer.fds) if answer.fds else None
+                return
+            await self._waiter.pause(0.02)
+
+    async def _ask(self, what: str, message: verbs.Message, limit_s: float | None = 0.0) -> Any:
+        return (await self._waiter.call(Call(what, message, limit_s=limit_s))).value
+
+    def __repr__(self) -> str:
+        if self._channel.closed:
+            return f"<{type(self).__name__} {self.name}, closed>"
+        nodes = ", ".join(sorted(node.name for node in self._nodes.values()))
+        return f"<{type(self).__name__} {self.name} at {self._path}: {nodes or 'no node'} open>"
+
+    @verb
+    async def close(self) -> None:
+        """End the session: its nodes are closed and its markers freed."""
+        nodes, self._nodes = self._nodes, {}
+        for node in nodes.values():
+            node.release()
+        self._waiter.close()
+        if self._request is not None:
+            self._request.close()
+            self._request = None
+
+    def fileno(self) -> int:
+        """Return the descriptor of the session's socket; it becomes readable when the daemon goes."""
+        return self._channel.fileno()
+
+    async def _open(
+        self, name: str, mode: str, timeout: float | None, lease: float, kind: type | None
+    ) -> Any:
+        """Open a node.
+
+        Args:
+            name: node name.
+            mode: 'r', 'w' or 'rw'. A node that can be written is exclusive in whatever mode; its
+                ``.readonly`` companion opens any number of times.
+            timeout: how long to wait for it to be free [s]; 0: not; None: for ever. For a device that is
+                just starting any open waits 1.5 s.
+            lease: longest silence of this client [s] before its axes are halted, for programs that may
+                hang; 0: none. Any request of the node renews it, ``keepalive`` does, and a call that
+                waits on the node keeps renewing it.
+            kind: the class of the node, as AxisNode, AnalogNode or BinaryNode: what the node must be, for type checkers and against mistakes;
+                None takes any.
+
+        Returns:
+            A node of its class and of this face.
+
+        Raises:
+            OSError: ENOENT no such node; EBUSY held, by whom; EACCES no right; EIO device lost;
+                ETIMEDOUT not free in time; EINVAL not of that kind.
+        """
+        if kind is not None and not (isinstance(kind, type) and issubclass(kind, self._NODE)):
+            raise TypeError(f"open {name}: kind {shown(kind)}; want AxisNode, AnalogNode or BinaryNode")
+        answer = await self._waiter.call(open_call(name, mode, timeout, lease))
+        core = node_parts(answer.value, answer.fds)
+        node = self._NODES[core[0].node_class](core, self, self._waiter_of(core[-1]), lease)
+        self._nodes[node.handle] = node
+        if kind is not None and not isinstance(node, kind):
+            node.release()
+            await self._closed_handle(node.handle)
+            raise OSError(
+                errno.EINVAL, f"open {name}: it is an {type(node).__name__}; want an {kind.__name__}"
+            )
+        return node
+
+    async def _closed_handle(self, handle: int) -> None:
+        """Tell the daemon that a node was closed, and wait until its channels are free (nodes call this)."""
+        self._nodes.pop(handle, None)
+        try:
+            await self._ask("close", verbs.Close(handle))
+        except OSError as error:
+            # The daemon has gone, or knows no such handle any more: the driver has halted the axes
+            # at the end of file of the node's own socket either way.
+            if error.errno not in (errno.EIO, errno.EBADF):
+                raise
+
+    @verb
+    async def nodes(self) -> list[NodeEntry]:
+        """Return all nodes that this user may read."""
+        value = await self._ask("list nodes", verbs.List())
+        return [NodeEntry(packed) for packed in value]
+
+    @verb
+    async def info(self, name: str) -> NodeInfo:
+        """Return what a node is, without opening it."""
+        return NodeInfo(await self._ask(f"get information of {name}", verbs.Info(name)))
+
+    @verb
+    async def status(self) -> dict[str, Any]:
+        """Return devices, sessions, holders and the state of the emergency stop."""
+        value: dict[str, Any] = await self._ask("get status", verbs.Status())
+        return value
+
+    @verb
+    async def synch(self, *nodes: AxisVerbs, lead: float = SYNCH_LEAD_S) -> int:
+        """Start the waiting commands of several nodes at the same instant.
+
+        Args:
+            nodes: open axis nodes, of any number of devices.
+            lead: how far ahead the instant lies [s].
+
+        Returns:
+            The instant [ns, CLOCK_MONOTONIC].
+
+        Raises:
+            OSError: ETIME, a driver heard of it too late; the nodes that had started are stopped.
+        """
+        start_ns = monotonic_ns() + int(as_number("synch: lead", lead, "seconds") * 1e9)
+        told: list[AxisVerbs] = []
+        try:
+            for node in nodes:
+                await node._ask(Request.SEND_EXTERNAL_SYNCH, start_ns)
+                told.append(node)
+        except OSError:
+            for node in told:
+                await node._ask(Request.STOP)
+            raise
+        return start_ns
+
+    # --- markers ---------------------------------------------------------------------------------
+
+    @verb
+    async def reserve_marker(self) -> M:
+        """Reserve a marker; it is freed with the session."""
+        return (await WorkcellVerbs.reserve_markers(self, 1))[0]
+
+    @verb
+    async def reserve_markers(self, count: int, *, persist: bool = False) -> list[M]:
+        """Reserve markers, all or none.
+
+        Args:
+            count: how many.
+            persist: keep them beyond the end of the session.
+        """
+        tokens = await self._ask(f"reserve {count} markers", verbs.ReserveMarker(count, persist))
+        marker: Any = self._MARKER
+        return [marker(self, token) for token in tokens]
+
+    @verb
+    async def free_marker(self, token: int) -> None:
+        """Free a marker; needs its token."""
+        await self._ask("free marker", verbs.FreeMarker(token))
+
+    @verb
+    async def signal_marker(self, token: int) -> None:
+        """Signal a marker; needs its token."""
+        await self._ask("signal marker", verbs.SignalMarker(token))
+
+    @verb
+    async def wait_marker(self, number: int, timeout: float | None = None) -> int:
+        """Wait until a marker is signalled; return when that was [ns, CLOCK_MONOTONIC]."""
+        return int(await self._ask("wait for marker", verbs.WaitMarker(number, timeout), limit_s=timeout))
+
+    # --- stops -----------------------------------------------------------------------------------
+
+    @verb
+    async def emergency_stop_workcell(self, why: str = "") -> None:
+        """Stop the whole workcell, and latch the stop until it is reset.
+
+        Takes effect in every driver's next tick even while the daemon is busy or hung. This is a
+        software stop, not a safety-rated function. ``AxisNode.stop`` is a controlled stop of one node that is not latched,
+        ``AxisNode.emergency_stop`` that of one node which is.
+
+        Args:
+            why: for the log and for who asks why nothing moves.
+        """
+        await self._stop("", why)
+
+    @verb
+    async def emergency_stop(self, node: str = "", why: str = "") -> None:
+        """Stop one node by its name, open or not, and latch the stop until it is reset; '' = the whole workcell.
+
+        Args:
+            node: a node, '' as ``emergency_stop_workcell``.
+            why: for the log and for who asks why nothing moves.
+        """
+        await self._stop(node, why)
+
+    async def _stop(self, node: str, why: str) -> None:
+        call = Call("emergency stop", verbs.EmergencyStop(node, printable(str(why))))
+        taken = call.enough = request_stop(None if node else self._request, printable(str(why)))
+        try:
+            await self._waiter.call(call)
+        except OSError:
+            if taken is None or not taken():
+                raise  # else the drivers have latched it without the daemon
+            acknowledged_by_daemon(monotonic_ns())
+
+    @verb
+    async def reset(self, node: str = "") -> None:
+        """Clear the latched stop of the workcell or of a node. Nothing resumes by itself."""
+        await self._ask("reset", verbs.Reset(node))
+
+    @verb
+    async def reload(self) -> None:
+        """Let the daemon take up its configuration anew.
+
+        Raises:
+            OSError: EINVAL with all errors; nothing was taken up.
+        """
+        errors: list[str] = await self._ask("reload", verbs.Reload(), limit_s=60.0)
+        if errors:
+            raise OSError(errno.EINVAL, "reload: nothing taken up: " + "; ".join(errors))

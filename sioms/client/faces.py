@@ -1,0 +1,127 @@
+"""Two faces, blocking and asyncio, of one list of verbs.
+
+A verb is written once, as a coroutine function of a class that neither face sees: it awaits other verbs, by their class, and the
+calls of a ``Waiter``. asyncio's face inherits it as it is. In the blocking face the waiter waits in its calls, so that a coroutine runs
+to its end without ever being suspended, and ``Blocking`` puts a plain function in the place of each.
+"""
+
+from __future__ import annotations
+
+from select import POLLIN, poll
+from time import sleep
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterable, Iterator
+    from typing import Any
+
+    from .channel import Answer, Call, Channel
+    from .typed_faces import Generic as Generic
+    from .typed_faces import R
+    from .typed_faces import stream as stream
+    from .typed_faces import verb as verb
+else:
+
+    class Generic:
+        """``typing.Generic``, as far as a running program needs it: its module is a fifth of a shell tool's start."""
+
+        __class_getitem__ = classmethod(lambda cls, _parameters: cls)
+
+    def verb(function):
+        """Mark a verb: type checkers see that of the face."""
+        return function
+
+    stream = verb
+
+_COROUTINE, _ASYNC_GENERATOR = 0x80, 0x200
+_FUNCTION = type(lambda: None)
+
+
+class Awaiting:
+    """The asyncio face: verbs are awaited."""
+
+
+class Blocking:
+    """The blocking face: verbs wait. It is the first base of its classes, or an ancestor of that."""
+
+    def __init_subclass__(cls) -> None:
+        done = cls.__bases__[0].__mro__
+        for base in cls.__mro__:
+            if base in done or base.__module__ == "builtins":
+                continue
+            for name, function in vars(base).items():
+                if type(function) is _FUNCTION and name[0] != "_" and name not in vars(cls):
+                    if function.__code__.co_flags & _COROUTINE:
+                        setattr(cls, name, _told(_blocking, function))
+                    elif function.__code__.co_flags & _ASYNC_GENERATOR:
+                        setattr(cls, name, _told(_yielding, function))
+
+
+def run(steps: Coroutine[Any, Any, R]) -> R:
+    """Run a coroutine that waits in the blocking face, and return what it returns."""
+    try:
+        steps.send(None)
+    except StopIteration as end:
+        value: R = end.value
+        return value
+    steps.close()
+    raise RuntimeError("a verb of the blocking face waits for an event loop")
+
+
+def _blocking(function: Any) -> Any:
+    def face(self: Any, *arguments: Any, **words: Any) -> Any:
+        return run(function(self, *arguments, **words))
+
+    return face
+
+
+def _yielding(function: Any) -> Any:
+    def face(self: Any, *arguments: Any, **words: Any) -> Iterator[Any]:
+        values = function(self, *arguments, **words)
+        try:
+            while True:
+                yield run(values.__anext__())
+        except StopAsyncIteration:
+            return
+        finally:
+            run(values.aclose())
+
+    return face
+
+
+def _told(make: Callable[[Any], Any], function: Any) -> Any:
+    """Make a face of a verb that has its name, signature and documentation."""
+    face = make(function)
+    face.__wrapped__ = function
+    for name in ("__name__", "__qualname__", "__module__", "__doc__"):
+        setattr(face, name, getattr(function, name))
+    return face
+
+
+class BlockingWaiter:
+    """What waits in the blocking face. Concurrency: any number of threads."""
+
+    __slots__ = ("_channel",)
+
+    def __init__(self, channel: Channel | None) -> None:
+        self._channel = channel
+
+    async def call(self, call: Call) -> Answer:
+        """Send a request and wait for its answer."""
+        return self._channel.call(call)  # type: ignore[union-attr]
+
+    async def readable(self, fds: Iterable[int], timeout_s: float | None) -> set[int]:
+        """Wait until one of several descriptors is readable; return those that are, none when the time is over."""
+        poller = poll()
+        for fd in fds:
+            poller.register(fd, POLLIN)
+        return {fd for fd, _ in poller.poll(None if timeout_s is None else 1e3 * timeout_s)}
+
+    async def pause(self, seconds: float) -> None:
+        """Let time pass."""
+        sleep(seconds)
+
+    def close(self) -> None:
+        """Close the channel; waiting threads get EBADF."""
+        if self._channel is not None:
+            self._channel.close()
