@@ -18,6 +18,8 @@ from sioms.tactile import command as tactile
 from sioms.tactile.calibration import Calibration
 from sioms.tactile.calibration import calibrate as fit
 from sioms.tactile.command import calibrate as tactile_calibrate
+from sioms.tactile.command import claims
+from sioms.tactile.command import design as tactile_design
 from sioms.tactile.command.claims import chapter_2
 from sioms.tactile.command.experiment import RADII_M, plan
 from sioms.tactile.command.tables import Tables, calibrated
@@ -263,6 +265,45 @@ def test_published_claims_are_judged_by_their_numbers() -> None:
     claims = list(itertools.islice(chapter_2(), 8))
     assert [claim.holds for claim in claims] == [True] * 7 + [False]
     assert claims[-1].where == "2.5.2" and "the -20 dB value is 12.3" in claims[-1].computed
+
+
+@pytest.mark.parametrize(("middle", "holds"), [(0.85, True), (0.80, False), (0.89, False)])
+def test_a_share_that_only_rises_with_the_core_is_no_proof(
+    monkeypatch: pytest.MonkeyPatch, middle: float, holds: bool
+) -> None:
+    monkeypatch.setattr(claims, "exact_equivalent_wedge", lambda *_: (1.2,))
+    monkeypatch.setattr(claims, "_class_share", lambda ratio: claims.CLASS_NOISE * (1.0 + ratio - middle))
+    assert next(claim for claim in claims._classes() if claim.where == "2.6").holds is holds
+
+
+def test_the_table_of_radii_fails_with_other_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    def holds(fitted: Callable[[float, float], tuple[float, float]]) -> list[bool]:
+        monkeypatch.setattr(
+            claims,
+            "radii_fitted",
+            lambda _, adhesion: {rc: fitted(rc, adhesion) for rc in claims.PUBLISHED_RC},
+        )
+        return [
+            bool(claim.holds)
+            for claim in claims._bias(nominal_finger(FINGER_B, np.radians(ANGLES), 10.3e-3, 1.0, 1e-3))
+        ]
+
+    published = claims.PUBLISHED_RC
+    assert holds(lambda rc, a: (published[rc][0], published[rc][1] if a and rc > 13 else rc)) == [True] * 3
+    assert holds(lambda rc, a: (rc, rc)) == [False, True, False]
+    assert holds(lambda rc, a: (published[rc][0], 0.7 * rc)) == [True, False, False]
+
+
+def test_design_warns_of_elements_that_are_too_far_apart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for slow in ("_errors", "_classes", "_pictures"):
+        monkeypatch.setattr(tactile_design, slow, lambda *_: None)
+    for pitch, warns in (("9.22", True), ("7", False)):
+        assert command("design", "--pitch-deg", pitch, "-o", str(tmp_path / "d.html")) == 0
+        said, page = capsys.readouterr().out, (tmp_path / "d.html").read_text()
+        assert ("warning: elements 9.22 deg apart are too coarse: 7." in said) is warns
+        assert ("are too coarse" in page) is warns
 
 
 def test_page_escapes_and_colours(tmp_path: Path) -> None:
