@@ -431,7 +431,7 @@ class Cell:
         assert len(sessions) == sum(at != OUT for at, _ in clients), "no session without a client"
         waiting = tuple(
             ((wait.session.peer.pid - FIRST_UID) % CLIENTS, NAMES.index(wait.what.removeprefix("open ")))
-            for wait, _ in server.clients.nodes._opens
+            for wait, *_ in server.clients.nodes._opens
         )
         waits = sum(len(s.waits) for s in server.clients.sessions)
         closing = sum(d.claim[1:] == (CLOSING,) for d in devices)

@@ -12,7 +12,7 @@ import pytest
 from sioms.daemon.loop import Loop
 from sioms.daemon.nursery import DIED, Nursery
 from sioms.daemon.nursery_process import NurseryProcess
-from sioms.daemon.patience import LIMIT_S
+from sioms.daemon.patience import LIMIT_S, _state
 
 
 @pytest.fixture
@@ -21,6 +21,8 @@ def silent() -> Iterator[NurseryProcess]:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.setblocking(False)
     with subprocess.Popen(["sleep", "100"]) as process, theirs:
+        while _state(process.pid) != "S":
+            time.sleep(0.01)
         yield NurseryProcess(ours, process.pid)
         process.kill()
 
