@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 
+from sioms.tactile import calibration
+from sioms.tactile.calibrate import DEEP, SHALLOW, SMALLEST, TURN, ElementFit
 from sioms.tactile.calibration import Calibration, Options, calibrate
 from sioms.tactile.closedform import equivalent_radius
+from sioms.tactile.emap import MOST_EXTENT
 from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import Finger, from_toml, to_toml
 from sioms.tactile.identify import corrected, truncated
 from sioms.tactile.linearity import Quadratic, find_quadratic, linearise, with_ramps
 from sioms.tactile.preparation import _cell_share
-from sioms.tactile.proximity import Proximity
+from sioms.tactile.proximity import LONGEST, SHORTEST, Proximity
 from sioms.tactile.quality import Quality
 from sioms.tactile.touches import Recording, Touches, average, join, touch_loads
 
@@ -291,6 +296,54 @@ def test_what_no_model_explains_is_doubted(start: Finger, made) -> None:  # type
         touches.output, touches.angle_rad, touches.load, touches.radius_m, 3.0 * touches.load, touches.noise
     )
     assert any("3.00 times the commanded load" in d for d in calibrate(start, cell, options).doubts)
+
+
+def _told(start: Finger, poisson: float = 0.46, **changes: Any) -> list[str]:
+    """Return the doubts of a calibration that has ended with these numbers."""
+    body, found = start.cylinder, {"quadratic": 2.0, "pull": None, "extent_rad": 0.0, **changes}
+    thick = body.outer_m - body.core_m
+    fits = [
+        ElementFit(
+            angle + found.get("turned", 0.0),
+            body.core_m + found.get("depth", 0.5) * thick,
+            0.46,
+            gain,
+            0.0,
+            20,
+        )
+        for angle, gain in zip(start.elements.angle_rad, start.elements.gain, strict=True)
+    ]
+    count = len(fits)
+    elements = msgspec.structs.replace(start.elements, misfit=(0.0,) * count)
+    geometry = msgspec.structs.replace(start.geometry, extent_rad=found["extent_rad"])
+    finger = msgspec.structs.replace(start, elements=elements, geometry=geometry)
+    quadratic = SimpleNamespace(value=np.full(count, found["quadratic"]))
+    faults: Any = SimpleNamespace(quadratic=quadratic, proximity=found["pull"])
+    return calibration._doubts(start, finger, fits, poisson, faults, np.ones(count))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"depth": SHALLOW}, "its effective radius runs to the end of what it can be"),
+        ({"depth": DEEP}, "its effective radius runs to the end of what it can be"),
+        ({"turned": TURN}, "its place runs to the end of what was searched, 8.6 degrees"),
+        ({"turned": -TURN}, "its place runs to the end of what was searched"),
+        ({"extent_rad": MOST_EXTENT}, "the arc of an element runs to the widest that was searched"),
+        ({"poisson": SMALLEST}, "Poisson's ratio runs to the least that was searched"),
+        ({"quadratic": 16.0}, "the quadratic comes out as 0.16 per per cent"),
+        ({"pull": Proximity(-0.2, 0.3)}, "lies beyond the lowest output"),
+        ({"pull": Proximity(-0.12, 0.3)}, "lies near the lowest output"),
+        ({"pull": Proximity(-0.01, LONGEST)}, "reaches 40 degrees, the end of what was searched"),
+        ({"pull": Proximity(-0.01, SHORTEST)}, "reaches 6 degrees, the end of what was searched"),
+    ],
+)
+def test_a_number_at_the_end_of_what_was_searched_is_doubted(
+    start: Finger, changes: dict[str, Any], words: str
+) -> None:
+    assert not _told(start) and not _told(start, pull=Proximity(-0.05, 0.3))
+    doubts = _told(start, **changes)
+    assert doubts and all(words in doubt for doubt in doubts)
 
 
 def _placed(touches: Touches, angle_rad: np.ndarray) -> Touches:
