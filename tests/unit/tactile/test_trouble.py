@@ -166,8 +166,8 @@ def test_an_element_that_moves_alone_is_no_touch(case: tuple[int, float]) -> Non
     one = finger.go(0.4, off)
     assert one["touched"] == 0.0 and one["load"] == 0.0
     assert Quality.BAD_ELEMENTS in Quality(int(one["quality"]))
-    if abs(jump) == 5.0:
-        assert State.TOUCHED not in finger.states
+    if abs(jump) == 5.0:  # a small one may be a light edge, for the first frames
+        assert {frame["touched"] for frame in finger.seen} == {0.0} and State.TOUCHED not in finger.states
     under = finger.go(0.15, off + touch(70.0, 200.0))
     assert under["load"] == pytest.approx(200.0, abs=8.0)
     finger.go(RECOVER_S + 0.3, off)
