@@ -1,13 +1,14 @@
 """Motion: command buffers, profiles, limits and control laws of axes. Pure: no I/O and no clock.
 
-AxisBank closes the loop on the host; DriveBank feeds drives that close their own. Positions are in
+A Bank is the axes of one device: AxisBank closes the loop on the host, DriveBank feeds drives that close their own. Positions are in
 the unit of the axis (m or rad), forces in N or N*m, instants in integer ns of CLOCK_MONOTONIC.
 """
 
 from .actions import ActionKind, DriveAction
-from .bank import AxisBank
+from .bank import Bank
 from .commands import Command
 from .drives import DriveBank
+from .host_loop import AxisBank
 from .queue import Judged, Judgement
 from .settings import (
     SWITCH_HOME,
@@ -33,6 +34,7 @@ __all__ = [
     "AxisKind",
     "AxisSettings",
     "Backlash",
+    "Bank",
     "Command",
     "CommandError",
     "DriveAction",

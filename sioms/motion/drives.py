@@ -2,7 +2,7 @@
 
 The drive makes its own profile; the bank decides when a command goes out and when it has ended.
 poll() takes what the drive reports, take_actions() hands out what shall be sent, action_done() and
-action_failed() tell how that went. Pure, and one thread, as AxisBank.
+action_failed() tell how that went; what verbs mean is in bank.py.
 """
 
 from __future__ import annotations
@@ -11,27 +11,25 @@ import errno
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.protocol.flags import AxisStatus, NodeClass
-from sioms.protocol.records import READ, read_rows
+from sioms.protocol.flags import AxisStatus
 
 from . import modes
 from .actions import ActionKind, DriveAction
-from .arrival import Approach, Arrivals
+from .arrival import Approach
+from .bank import EMERGENCY_STOP, FAULT, Axes, Bank
 from .commands import Command, is_point_move
 from .profile import InfeasibleError
-from .queue import LOST, AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
+from .queue import LOST, AxesLike
 from .settings import AxisSettings
-from .types import CommandError, Event, EventKind, Keeper, MarkerPort
+from .store import NEVER_NS
+from .types import EventKind, MarkerPort
 from .watch import MotionWatch, Order
 
-NEVER_NS = 2**62
-Axes = NDArray[np.int64]
-LATCHED = int(AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP)
+LATCHED = FAULT | EMERGENCY_STOP
 FIRST_REPEAT_NS = 50_000_000
 LONGEST_REPEAT_NS = 1_000_000_000
 """How often a stop is sent again that failed, or that the drive does not obey."""
@@ -39,7 +37,7 @@ DISOBEYED = 4
 """So many stops that a drive has confirmed and does not obey are a fault."""
 
 
-class DriveBank:
+class DriveBank(Bank):
     """The axes of one device whose drives close their own loops.
 
     Args:
@@ -50,8 +48,13 @@ class DriveBank:
         settle_s: how long after its start a command may take to be reported as moving [s]; until
             then 'done' reports are not believed.
 
-    ``fields``, ``rows`` and ``keeper`` as in AxisBank. Concurrency: one thread.
+    Short writes are never taken at once: what a drive is told cannot be carried out later at the instant of the write.
+
+    Concurrency: one thread.
     """
+
+    NOT_SEEN = "the drive has not reported its position yet; wait for it"
+    DEFERS = False
 
     def __init__(
         self,
@@ -61,15 +64,8 @@ class DriveBank:
         capacity: int = 16384,
         settle_s: float = 0.05,
     ) -> None:
-        n = self.n = len(settings)
-        self.settings = tuple(settings)
-        self.fields = np.zeros((len(READ[NodeClass.AXIS]), n))
-        rows = self.rows = read_rows(NodeClass.AXIS, self.fields)
-        self._position, self._velocity, self._force = rows["position"], rows["velocity"], rows["force"]
-        self._desired, self._desired_velocity = rows["commanded_position"], rows["commanded_velocity"]
-        self._following, self._in_motion = rows["following_error"], rows["in_motion"]
-        self._status_word, self._buffered = rows["status"], rows["buffered"]
-        self._queue = CommandQueue(settings, markers, capacity, passing=False)
+        super().__init__(settings, markers, capacity, passing=False)
+        n = self.n
         self._limits = self._queue.limits
         self._velocity_limit, self._acceleration_limit = self._queue.in_force
         self._watch = MotionWatch(settings, self._limits.velocity, self._acceleration_limit)
@@ -81,12 +77,10 @@ class DriveBank:
         self._end_ns = np.full(n, NEVER_NS, dtype=np.int64)
         self._end_fraction = np.zeros(n)
         self._release_ns = np.zeros(n, dtype=np.int64)
-        self._raw, self._offset = np.zeros(n), np.zeros(n)
         self._target = np.zeros(n)
         self._settle_ns = int(settle_s * 1e9)
         self._acknowledged = np.zeros(n, dtype=bool)
         self._approaches = [Approach.of(s) for s in settings]
-        self._arrivals = Arrivals(settings)
         self._take_ups: list[float | None] = [None] * n
         """Targets of the axes on their way to the place from which they take up their play."""
         self._settled_ns = np.full(n, NEVER_NS, dtype=np.int64)
@@ -101,73 +95,70 @@ class DriveBank:
         self._refused_stop = np.zeros(n, dtype=bool)
         self._rests_ns = np.full(n, NEVER_NS, dtype=np.int64)
         self._actions: list[DriveAction] = []
-        self._seen = False
-        self._last_ns = 0
         self._moving = np.zeros(n, dtype=bool)
-        self.keeper: Keeper | None = None
 
-    # -- verbs: as AxisBank --------------------------------------------------------------------
+    # -- what the bank asks for ----------------------------------------------------------------
 
-    def append(self, records: NDArray[Any], axes: AxesLike, now_ns: int, *, replace: bool = False) -> None:
-        """Append written records, all or none; see AxisBank.append()."""
-        self.take(verdict(self.judge(records, axes, now_ns, replace=replace)), now_ns)
+    def _rest_positions(self) -> NDArray[np.float64]:
+        return np.full(self.n, np.nan)
 
-    def offer(
-        self, records: Sequence[tuple[Any, ...]], axes: AxesLike, now_ns: int, *, replace: bool = False
-    ) -> bool:
-        """Never take a write at once: what a drive is told cannot be worked in later at the instant of the write."""
-        return False
+    def _idle(self, axes: Axes) -> NDArray[np.bool_]:
+        idle: NDArray[np.bool_] = ~self._active[axes] & ~self._queue.has_head[axes]
+        return idle
 
-    def judge(
-        self, records: NDArray[Any], axes: AxesLike, now_ns: int, *, replace: bool = False
-    ) -> Judgement:
-        """Judge a long write piece by piece; see AxisBank.judge()."""
-        if not self._seen:
-            raise CommandError(errno.EIO, "write: the drive has not reported its position yet; wait for it")
-        return (yield from self._queue.judge(records, axes, np.full(self.n, np.nan), replace=replace))
+    def _is_open_ended(self, axes: Axes) -> NDArray[np.bool_]:
+        running = [self._running[axis] for axis in axes]
+        lasting = np.array([c is not None and _is_open_ended(c) for c in running], dtype=bool)
+        return np.asarray(~self._active[axes] | lasting)
 
-    def take(self, judged: Judged, now_ns: int) -> bool:
-        """Append a judged write whole; see AxisBank.take()."""
-        if not self._queue.still_holds(judged, np.full(self.n, np.nan)):
-            return False
-        if judged.replace:
-            touched = judged.axes
-            self._queue.clear(touched)
-            self._end_ns[touched] = now_ns
-            self._end_fraction[touched] = 0.0
-            for axis in touched.tolist():
+    def _begin(self, axes: Axes, now_ns: int, *, replace: bool) -> None:
+        if replace:
+            self._end_ns[axes] = now_ns
+            self._end_fraction[axes] = 0.0
+            for axis in axes.tolist():
                 self._running[axis] = None
-        self._queue.append(judged)
         self.advance(now_ns)
-        return True
 
-    def room(self, axes: AxesLike) -> int:
-        """Return how many further commands fit into the fullest buffer of these axes."""
-        return int(self._queue.room_of_all()[np.asarray(axes)].min())
+    def _drop(self, axes: Axes) -> None:
+        self._queue.clear(axes)
 
-    def flush(self, axes: AxesLike) -> None:
-        """Empty the buffers; the running command goes on, one that was to be replaced is stopped."""
-        chosen = np.asarray(axes, dtype=np.int64)
-        self._queue.clear(chosen)
-        replaced = [a for a in chosen.tolist() if self._running[a] is None]
+    def _emptied(self, axes: Axes) -> None:
+        """Stop what was to be replaced by a command that has been flushed."""
+        replaced = [a for a in axes.tolist() if self._running[a] is None]
         orphans = np.array(replaced, dtype=np.int64)
         orphans = orphans[self._active[orphans] & ~self._stopping[orphans] & ~self._homing[orphans]]
         if orphans.size:
-            self._halt(orphans, fastest=False)
+            self._halt(orphans, self._last_ns, fastest=False)
 
-    def synch(self, axes: AxesLike, start_ns: int, now_ns: int) -> tuple[int, ...]:
-        """Release the commands that wait for the external synch; they go out at start_ns (see due_ns)."""
-        chosen = np.asarray(axes, dtype=np.int64)
-        chosen = chosen[
-            self._queue.gated_synch[chosen] & (~self._active[chosen] | self._is_open_ended(chosen))
-        ]
-        self._queue.gated_synch[chosen] = False
-        self._release_ns[chosen] = start_ns
-        return tuple(chosen.tolist())
+    def _release(self, axes: Axes, start_ns: int) -> None:
+        self._release_ns[axes] = start_ns
 
-    def stop(self, axes: AxesLike, now_ns: int) -> None:
-        """Empty the buffers and stop at maximum deceleration, in the next poll."""
-        self._halt(np.asarray(axes, dtype=np.int64), fastest=False)
+    def _let_go(self, axes: Axes) -> None:
+        self._taken[axes] = False  # a faulty drive may let go of its axis
+
+    def _forget_places(self, axes: Axes) -> None:
+        for axis in axes.tolist():
+            self._watch.forget(axis)
+
+    def _recover(self, axes: Axes, latched: Axes) -> None:
+        """Have the drives clear their own faults, too."""
+        faulty = axes[(latched & FAULT) != 0]
+        self._resetting[faulty] = True
+        self._actions.extend(self._action(ActionKind.RESET, axis) for axis in faulty.tolist())
+
+    def _move_coordinates(self, axes: Axes, by: NDArray[np.float64]) -> None:
+        self._target[axes] = self._position[axes] + by
+
+    def _home(self, axes: Axes, now_ns: int) -> None:
+        """Let the drives run their own homing."""
+        for axis in axes.tolist():
+            self._actions.append(self._action(ActionKind.HOME, axis))
+            self._engage(axis, now_ns)
+            self._watch.order(axis, Order.FREE)
+        self._homing[axes] = True
+        self._taken[axes] = False
+
+    # -- driver side ---------------------------------------------------------------------------
 
     def stop_at_limit(self, axes: AxesLike, side: AxisStatus, text: str, now_ns: int) -> None:
         """Stop axes that a velocity or a force would take past a soft limit: who waits hears it, the status says it.
@@ -181,119 +172,13 @@ class DriveBank:
         chosen = np.asarray(axes, dtype=np.int64)
         forces = [a for a in chosen.tolist() if _is_force(self._running[a])]
         self._queue.emit(EventKind.DROPPED, chosen, now_ns, errno.ERANGE, text)
-        self._halt(chosen, fastest=False)
+        self._halt(chosen, now_ns, fastest=False)
         self._outcome[chosen] |= int(side)
         self._outcome[forces] |= int(AxisStatus.FORCE_ENDED)
-
-    def emergency_stop(self, axes: AxesLike, now_ns: int) -> None:
-        """Empty the buffers and stop the fastest way the drive has; latched until reset()."""
-        chosen = np.asarray(axes, dtype=np.int64)
-        fresh = chosen[(self._queue.latched[chosen] & int(AxisStatus.EMERGENCY_STOP)) == 0]
-        busy = fresh[~self._idle(fresh)]
-        self._queue.latched[fresh] |= int(AxisStatus.EMERGENCY_STOP)
-        self._queue.emit(EventKind.DROPPED, busy, now_ns, errno.ECANCELED, "emergency stop")
-        self._halt(fresh, fastest=True)
-
-    def reset(self, axes: AxesLike) -> None:
-        """Clear emergency stop and fault, the drive's own too. Nothing resumes."""
-        chosen = np.asarray(axes, dtype=np.int64)
-        faulty = chosen[(self._queue.latched[chosen] & int(AxisStatus.FAULT)) != 0]
-        self._queue.unlatch(chosen)
-        self._resetting[faulty] = True
-        self._actions.extend(self._action(ActionKind.RESET, axis) for axis in faulty.tolist())
-
-    def fault(self, axes: AxesLike, text: str, now_ns: int | None = None) -> None:
-        """Put axes in fault: buffers dropped, the drive stopped the fastest way; latched until reset()."""
-        chosen = np.asarray(axes, dtype=np.int64)
-        stamp = self._last_ns if now_ns is None else now_ns
-        busy = chosen[~self._idle(chosen)]
-        self._queue.emit(EventKind.DROPPED, busy, stamp, errno.EIO, text)
-        self._halt(chosen, fastest=True)
-        self._taken[chosen] = False  # a faulty drive may let go of its axis
-        self._queue.latch_fault(chosen, text, stamp)
-
-    def lose_place(self, axes: AxesLike, text: str, now_ns: int | None = None) -> None:
-        """Put axes in fault whose device does not know where they are: it restarted, or says so itself.
-
-        Positions are refused (EPERM) until they are homed or calibrated; reset() clears the fault alone.
-        """
-        chosen = np.asarray(axes, dtype=np.int64)
-        fresh = chosen[(self._queue.latched[chosen] & LOST) == 0]
-        if not fresh.size:
-            return
-        self._queue.lose_places(fresh, text)
-        self.fault(fresh, text, now_ns)
-        for axis in fresh.tolist():
-            self._watch.forget(axis)
-
-    def fault_text(self, axis: int) -> str:
-        """Return why an axis is in fault, empty when it is not."""
-        return self._queue.fault_text(axis)
-
-    def calibrate(self, axes: AxesLike, positions: Sequence[float] | NDArray[np.float64]) -> None:
-        """Give the present place of each axis a new coordinate, without motion; see AxisBank.calibrate()."""
-        chosen, wanted = np.asarray(axes, dtype=np.int64), np.asarray(positions, dtype=np.float64)
-        self._queue.check_calibration(chosen, wanted, self._idle(chosen))
-        self._queue.find_places(chosen)
-        self._offset[chosen] = (
-            wanted - self._raw[chosen]
-        )  # a sum of differences would round: 0 must read as 0
-        self._position[chosen] = wanted
-        self._target[chosen] = wanted
-
-    def zero(self, axes: AxesLike) -> None:
-        """Make the present place of each axis position 0; see calibrate()."""
-        self.calibrate(axes, np.zeros(len(axes)))
-
-    def set_limits(self, axes: AxesLike, **limits: LimitValue) -> None:
-        """Narrow the limits of axes; see CommandQueue.set_limits()."""
-        chosen = np.asarray(axes, dtype=np.int64)
-        if not self.is_idle(chosen):
-            raise CommandError(
-                errno.EBUSY, "set limits: an axis moves or has commands; wait until it is idle"
-            )
-        self._queue.set_limits(chosen, limits, self._position)
-
-    def get_limits(self, axes: AxesLike) -> dict[str, list[float | None]]:
-        """Return the limits in force by name, one entry per axis, None where there is none."""
-        return self._queue.get_limits(axes)
-
-    def home(self, axes: AxesLike, now_ns: int) -> None:
-        """Let the drives run their own homing; the end is a HOMED event."""
-        chosen = np.asarray(axes, dtype=np.int64)
-        self._queue.check_homing(chosen, self._idle(chosen))
-        self._queue.latched[chosen] |= int(AxisStatus.HOMING)
-        self._queue.latched[chosen] &= ~int(AxisStatus.HOMED)
-        for axis in chosen.tolist():
-            self._actions.append(self._action(ActionKind.HOME, axis))
-            self._engage(axis, now_ns)
-            self._watch.order(axis, Order.FREE)
-        self._homing[chosen] = True
-        self._taken[chosen] = False
-
-    def is_idle(self, axes: AxesLike) -> bool:
-        """Tell whether these axes stand still and have no commands."""
-        return bool(self._idle(np.asarray(axes, dtype=np.int64)).all())
 
     def is_latched(self, axis: int) -> bool:
         """Tell whether an emergency stop or a fault of an axis is latched: its drive must not be switched on."""
         return bool(self._queue.latched[axis] & LATCHED)
-
-    def particulars(self, axes: AxesLike) -> dict[str, list[float]]:
-        """Return what the readings do not tell of these axes, by name; see AxisBank.particulars()."""
-        chosen = np.asarray(axes)
-        report = {"raw": self._raw[chosen].tolist(), "offset": self._offset[chosen].tolist()}
-        return report | self._arrivals.report(chosen)
-
-    def take_events(self) -> list[Event]:
-        """Return what happened since the last call, oldest first."""
-        return self._queue.take_events()
-
-    def set_homed(self, axes: AxesLike, homed: bool = True) -> None:
-        """Note that the drive has found (or lost) its reference."""
-        self._queue.set_homed(np.asarray(axes, dtype=np.int64), homed, self._last_ns)
-
-    # -- driver side ---------------------------------------------------------------------------
 
     def poll(
         self,
@@ -492,7 +377,7 @@ class DriveBank:
         for axis, number in broken:
             text = f"marker {number} was freed while waited for"
             self._queue.emit(EventKind.DROPPED, np.array([axis]), now_ns, errno.EPIPE, text)
-            self._halt(np.array([axis]), fastest=False)
+            self._halt(np.array([axis]), now_ns, fastest=False)
 
     def _end_reached(
         self,
@@ -574,12 +459,6 @@ class DriveBank:
         self.set_homed([axis])
         self._end(axis, now_ns)
 
-    def _is_open_ended(self, axes: Axes) -> NDArray[np.bool_]:
-        """Tell which running commands last until the next one arrives."""
-        return np.array(
-            [c is not None and _is_open_ended(c) for c in (self._running[a] for a in axes)], dtype=bool
-        )
-
     def _end(self, axis: int, now_ns: int) -> None:
         command, one = self._running[axis], np.array([axis])
         self._running[axis] = None
@@ -596,7 +475,7 @@ class DriveBank:
             if was_stop or command is None or _ends_by_itself(command):
                 self._queue.emit(EventKind.IDLE, one, now_ns)
             else:
-                self._halt(one, fastest=False)
+                self._halt(one, now_ns, fastest=False)
 
     def _start_commands(self, now_ns: int) -> None:
         queue = self._queue
@@ -658,7 +537,7 @@ class DriveBank:
         else:
             self._go(axis, command, approach, now_ns)
 
-    def _halt(self, axes: Axes, *, fastest: bool) -> None:
+    def _halt(self, axes: Axes, now_ns: int, *, fastest: bool) -> None:
         self._queue.clear(axes)
         self._actions = [a for a in self._actions if a.axis not in axes or a.kind is ActionKind.RESET]
         self._queue.latched[axes] &= ~int(AxisStatus.HOMING)
@@ -667,7 +546,7 @@ class DriveBank:
             self._running[axis] = None
             if fastest or self._stops.get(axis) is not ActionKind.QUICK_STOP:
                 self._stops[axis] = ActionKind.QUICK_STOP if fastest else ActionKind.STOP
-            self._engage(axis, self._last_ns)
+            self._engage(axis, now_ns)
             self._watch.order(axis, Order.STOP)
         self._stopping[axes] = True
 
@@ -690,13 +569,8 @@ class DriveBank:
             status |= np.where(forces & self._active, int(AxisStatus.FORCE_MODE), 0)
         status |= np.where(self._queue.gated_marker & ~running, int(AxisStatus.WAITING_MARKER), 0)
         status |= np.where(self._queue.gated_synch & ~running, int(AxisStatus.WAITING_SYNCH), 0)
-        self._status_word[:] = status
+        self._status[:] = status
         self._queue.count(self._buffered)
-
-    def _idle(self, axes: Axes) -> NDArray[np.bool_]:
-        """Tell which axes stand with nothing to do."""
-        idle: NDArray[np.bool_] = ~self._active[axes] & ~self._queue.has_head[axes]
-        return idle
 
 
 def _order_of(command: Command) -> tuple[Order, float]:

@@ -75,20 +75,13 @@ class HomingRuns:
         """Tell whether any axis is homing."""
         return bool(self._runs)
 
-    def begin(self, axes: NDArray[np.int64], idle: NDArray[np.bool_], now_ns: int) -> None:
-        """Start homing these axes.
-
-        Raises:
-            CommandError: EINVAL when an axis has no homing, EBUSY when it moves, EPERM or EIO when latched.
-        """
-        self._queue.check_homing(axes, idle)
+    def begin(self, axes: NDArray[np.int64], now_ns: int) -> None:
+        """Start homing these axes, which may."""
         for axis in axes.tolist():
             homing = self._settings[axis].homing
             if homing is None:
                 continue
             self._runs[axis] = Progress(homing, Phase.SEARCH, self._mover.measured(axis))
-            self._queue.latched[axis] |= int(AxisStatus.HOMING)
-            self._queue.latched[axis] &= ~int(AxisStatus.HOMED)
             self._mover.drive(axis, homing.direction * homing.velocity, now_ns)
 
     def cancel(self, axes: NDArray[np.int64]) -> None:

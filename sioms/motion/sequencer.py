@@ -70,6 +70,7 @@ class Sequencer:
         settings: one per axis.
         queue: the waiting commands.
         law: where gains, offset and force limit of a command are put in force.
+        arrivals: how point moves end.
         position, velocity: measured, (n,), kept up to date by the bank; axes in force mode begin
             what follows from there.
         in_motion: (n,) int64, written here.
@@ -85,6 +86,7 @@ class Sequencer:
         settings: Sequence[AxisSettings],
         queue: CommandQueue,
         law: ControlLaw,
+        arrivals: Arrivals,
         position: Floats,
         velocity: Floats,
         in_motion: NDArray[np.int64],
@@ -113,7 +115,7 @@ class Sequencer:
         self._row_sets = np.zeros(2 * n, dtype=bool)
         self._row_checked = np.zeros(2 * n, dtype=bool)
         self._row_taken = np.zeros(2 * n, dtype=bool)
-        self.arrivals = Arrivals(settings)
+        self.arrivals = arrivals
         self._approaches = [Approach.of(s) for s in settings]
         self._start_velocity = [s.start_velocity for s in settings]
         self._ready = np.zeros(n, dtype=bool)

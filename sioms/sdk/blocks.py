@@ -22,7 +22,7 @@ from sioms.protocol.records import READ, read_rows
 from .alarms import Alarms
 
 if TYPE_CHECKING:
-    from sioms.motion import AxisBank, DriveBank
+    from sioms.motion import Bank
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +192,7 @@ class AxisBlock:
     """
 
     spec: BlockSpec
-    bank: AxisBank | DriveBank
+    bank: Bank
     stamp_ns: int = 0
     asked_ns: int = 0
     n: int = field(init=False)
