@@ -132,8 +132,8 @@ class World:
         self.ticks = 0
         for _ in range(400):
             self.turn(calm=True)
-            if self.runtime.is_good(self.runtime.blocks) and all(
-                map(self.runtime.published, self.runtime.blocks)
+            if self.runtime.pages.is_good(self.runtime.blocks) and all(
+                map(self.runtime.pages.number, self.runtime.blocks)
             ):
                 return
         raise AssertionError("the driver does not come up")
@@ -203,7 +203,7 @@ class World:
         line = engine.line  # type: ignore[attr-defined]
         if line is not None and line.deadline_ns is not None and not device.owes:
             CLOCK.now_ns = max(CLOCK.now_ns, line.deadline_ns)
-            engine._line_due()  # type: ignore[attr-defined]
+            engine.line_due()  # type: ignore[attr-defined]
 
     def order(self, verb: DriverVerb, *arguments: object) -> None:
         """Send an order as the daemon does; it is acknowledged to all nodes."""

@@ -10,8 +10,8 @@ import os
 import socket
 import time
 import traceback
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -20,17 +20,16 @@ from sioms.protocol.driver_verbs import Attach, Detached
 from sioms.protocol.flags import REQUESTS, Access, Right
 from sioms.protocol.messages import MAX_INLINE, MAX_PACKET, MAX_WRITE, MalformedMessage
 from sioms.protocol.text import shown
+from sioms.protocol.verbs import Message
+from sioms.turns import Turns
 
 from .blocks import AnyBlock
 from .exchange import HookError
 from .handles import LATER, Handle, Quota
+from .parts import Service
 from .requests import ioctl
 from .stops import Reason, Stop
 from .writing import write
-
-if TYPE_CHECKING:
-    from .runtime import Runtime
-
 
 OWNERS, READERS = 0, 1
 SHARES = (0.85, 0.125)
@@ -40,13 +39,18 @@ SHARES = (0.85, 0.125)
 class Attachments:
     """The handles of a driver process.
 
-    Attributes:
-        handles: by the daemon's number.
+    Args:
+        handles: where they are kept, by the daemon's number.
+        service: what their requests work with.
+        turns: in which they take turns.
+        tell: sends the daemon a message.
     """
 
-    def __init__(self, runtime: Runtime) -> None:
-        self.handles: dict[int, Handle] = {}
-        self._runtime = runtime
+    def __init__(
+        self, handles: dict[int, Handle], service: Service, turns: Turns, tell: Callable[[Message], None]
+    ) -> None:
+        self.handles = handles
+        self._service, self._turns, self._tell = service, turns, tell
         self._leased: list[Handle] = []
 
     def check_leases(self, now_ns: int) -> None:
@@ -75,13 +79,13 @@ class Attachments:
             key = id(handle.block), handle.bit
             parts.setdefault(key, (handle.block, [], handle.bit))[1].extend(handle.axes)
         if parts:
-            self._runtime.stops.safe_stop(Reason(Stop.CONTROLLED, "its owner has gone"), [*parts.values()])
+            self._service.stops.safe_stop(Reason(Stop.CONTROLLED, "its owner has gone"), [*parts.values()])
 
     def detach(self, number: int, errno_: int = 0, reason: str = "") -> None:
         """End a handle because the daemon says so, and tell its client why; one that has ended already is confirmed again."""
         handle = self.handles.get(number)
         if handle is None:
-            self._runtime.tell(Detached(number))
+            self._tell(Detached(number))
         elif reason:
             self.end(handle, errno_, reason)
         else:
@@ -93,24 +97,24 @@ class Attachments:
         if len(fds) < 2:  # the kernel drops what goes beyond the limit of open descriptors
             for fd in fds:
                 os.close(fd)
-            self._runtime.log("error", f"{node}: {who} could not be served: too many open descriptors")
-            self._runtime.tell(Detached(number))
+            self._service.log("error", f"{node}: {who} could not be served: too many open descriptors")
+            self._tell(Detached(number))
             return
         sock = socket.socket(fileno=fds[0])
         sock.setblocking(False)
         handle = Handle(
-            number, node, who, uid, sock, fds[1], fds[2] if len(fds) > 2 else -1, self._runtime.blocks[block],
+            number, node, who, uid, sock, fds[1], fds[2] if len(fds) > 2 else -1, self._service.blocks[block],
             np.array(channels, dtype=np.intp), bit, Access(access), exclusive, Right(rights), lease_ns,
-            time.monotonic_ns(), self._runtime.effects, Quota(*quota),
+            time.monotonic_ns(), self._service.effects, Quota(*quota),
         )  # fmt: skip
         self.handles[number] = handle
         if lease_ns:
             self._leased.append(handle)
         kind = OWNERS if exclusive else READERS
-        self._runtime.turns.add(sock.fileno(), uid, kind, lambda: self._readable(handle))
+        self._turns.add(sock.fileno(), uid, kind, lambda: self._readable(handle))
         if exclusive and handle.pidfd >= 0:
             # A child of the client may hold the socket open after the client's death.
-            self._runtime.watch(handle.pidfd, lambda: self.drop(handle))
+            self._service.loop.watch(handle.pidfd, lambda: self.drop(handle))
 
     def _readable(self, handle: Handle) -> None:
         """Serve one packet; the tick and the other clients have their turn before the next."""
@@ -130,7 +134,7 @@ class Attachments:
                 return
             self._serve(handle, *verbs.take(packet, verbs.ON_HANDLE, pending=handle.waits))
         except MalformedMessage as error:
-            self._runtime.log(
+            self._service.log(
                 "warning", f"{handle.node}: connection of {handle.who} ended: malformed message: {error}"
             )
             self.end(handle, errno.EPROTO, f"{handle.node}: malformed message: {error}")
@@ -138,7 +142,7 @@ class Attachments:
             raise  # the driver may have done half of it: it stops its device
         except Exception as error:  # a mistake of ours costs this handle, which halts what it moved
             trace = "".join(traceback.format_exception(error)[-3:])
-            self._runtime.log("error", f"{handle.node}: the driver failed to serve {handle.who}: {trace}")
+            self._service.log("error", f"{handle.node}: the driver failed to serve {handle.who}: {trace}")
             self.end(handle, errno.EIO, f"{handle.node}: the driver failed: {shown(error)}")
 
     def _serve(self, handle: Handle, number: int, message: verbs.Message) -> None:
@@ -149,7 +153,7 @@ class Attachments:
             return
         # Nothing is taken after a stop, or refused after its reset, because no tick has come in between; and no order that
         # was acknowledged before undoes what is acknowledged now.
-        self._runtime.heed()
+        self._service.loop.heed()
         if handle.number not in self.handles:
             return  # that was the order
         try:
@@ -163,21 +167,21 @@ class Attachments:
     def _value(self, handle: Handle, number: int, message: verbs.Message) -> Any:
         match message:
             case verbs.Write(flags, timeout_s, records):
-                self._runtime.effects.note()
+                self._service.effects.note()
                 if handle.ahead[1]:
                     records = _whole(handle, number, records)
-                return write(self._runtime, handle, number, flags, timeout_s, records)
+                return write(self._service, handle, number, flags, timeout_s, records)
             case verbs.Ioctl(request, argument, timeout_s):
                 if request not in REQUESTS or not REQUESTS[request][2]:
-                    self._runtime.effects.note()
-                return ioctl(self._runtime, handle, number, request, argument, timeout_s)
+                    self._service.effects.note()
+                return ioctl(self._service, handle, number, request, argument, timeout_s)
             case verbs.Subscribe(every):
                 self._subscribe(handle, every)
                 return None
             case verbs.CancelOnHandle(waiting):
                 wait = handle.waits.get(waiting)
                 if wait is not None:
-                    self._runtime.waits.end(wait, errno.ECANCELED, f"{wait.what}: cancelled")
+                    self._service.waits.end(wait, errno.ECANCELED, f"{wait.what}: cancelled")
                 return wait is not None
             case _:
                 raise NotImplementedError(f"{type(message).__name__} is not served")
@@ -185,7 +189,7 @@ class Attachments:
     def _subscribe(self, handle: Handle, every: int) -> None:
         if not -1 <= every <= 1_000_000:
             raise OSError(errno.EINVAL, f"subscribe to {handle.node}: every {every}; want -1 to 1000000")
-        subscribers = self._runtime.pages.subscribers(handle.block)
+        subscribers = self._service.pages.subscribers(handle.block)
         if handle in subscribers:
             subscribers.remove(handle)
         elif (
@@ -211,17 +215,17 @@ class Attachments:
         """End a handle: halt what it owns, then tell the daemon that the channels are free."""
         if self.handles.pop(handle.number, None) is None:
             return
-        self._runtime.turns.remove(handle.sock.fileno())
+        self._turns.remove(handle.sock.fileno())
         if handle.pidfd >= 0:
-            self._runtime.unwatch(handle.pidfd)
+            self._service.loop.unwatch(handle.pidfd)
         if handle in self._leased:
             self._leased.remove(handle)
         if handle.every:
-            self._runtime.pages.subscribers(handle.block).remove(handle)
-        self._runtime.waits.forget(handle)
+            self._service.pages.subscribers(handle.block).remove(handle)
+        self._service.waits.forget(handle)
         self._halt_all([handle])
         handle.close()
-        self._runtime.tell(Detached(handle.number))
+        self._tell(Detached(handle.number))
 
 
 def _keep_part(handle: Handle, message: verbs.Part) -> None:

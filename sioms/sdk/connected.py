@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sioms.protocol.flags import PageState
 
@@ -15,10 +15,8 @@ from .exchange import DeviceError, Steps
 from .handles import LATER, Handle
 from .line import Counters, Line, Priority
 from .locks import NameLocks
+from .parts import Parts
 from .side_connection import SideConnection
-
-if TYPE_CHECKING:
-    from .runtime import Runtime
 
 HOUSEKEEPING_HZ = 200.0
 FIRST_PAUSE_NS = 250_000_000
@@ -31,19 +29,19 @@ class Connected:
     tick_hz = HOUSEKEEPING_HZ
 
     def __init__(
-        self, runtime: Runtime, driver: LineDriver | StreamDriver, gap_s: float, recovery_s: float
+        self, parts: Parts, driver: LineDriver | StreamDriver, gap_s: float, recovery_s: float
     ) -> None:
         self.counters = Counters()
         self.line: Line | None = None
-        self._runtime = runtime
+        self._loop, self._pages, self._stops = parts.loop, parts.pages, parts.stops
+        self._outputs, self._effects, self._log = parts.outputs, parts.effects, parts.log
         self._base = driver
         self._gap_s = gap_s
         self._recovery_s = recovery_s
         self._connecting: Connection | None = None
-        self._locks = NameLocks(driver.claims(driver.settings), partial(runtime.log, "warning"))
+        self._locks = NameLocks(driver.claims(driver.settings), partial(parts.log, "warning"))
         self._retry_ns = 0
         self._pause_ns = FIRST_PAUSE_NS
-        runtime.line_due = self._line_due
 
     def connect(self, now_ns: int) -> bool:
         """Get the line up, a little at every tick; return whether it is."""
@@ -68,7 +66,7 @@ class Connected:
             if self._connecting is not None:
                 self._connecting.close()
                 self._connecting = None
-            self._runtime.set_link(self._base.blocks, PageState.LINK_LOST, error.strerror or str(error))
+            self._pages.set_link(self._base.blocks, PageState.LINK_LOST, error.strerror or str(error))
             self._retry_ns = now_ns + self._pause_ns
             self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
             return False
@@ -76,9 +74,9 @@ class Connected:
         aside = self._base.aside
         self.line = Line(
             connection, self._gap_s, self._recovery_s, self.counters, self.unsolicited(),
-            None if aside is None else SideConnection(aside), partial(self._runtime.log, "warning"),
+            None if aside is None else SideConnection(aside), partial(self._log, "warning"),
         )  # fmt: skip
-        self._runtime.watch(connection.fd, self._readable)
+        self._loop.watch(connection.fd, self._readable)
         self.connected(now_ns)
         return True
 
@@ -102,11 +100,11 @@ class Connected:
         if line is None:
             return
         self.counters.reconnects += 1
-        self._runtime.unwatch(line.connection.fd)
+        self._loop.unwatch(line.connection.fd)
         line.close()
         self._retry_ns = now_ns + self._pause_ns
         self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
-        self._runtime.lose(self._base.blocks, reason)
+        self._stops.lose(self._base.blocks, reason)
         line.abandon(reason)
 
     def guarded(self, action: Any, now_ns: int) -> None:
@@ -119,13 +117,13 @@ class Connected:
 
     def carry_out(self, handle: Handle, number: int, steps: Steps, what: str) -> Any:
         """Run the steps that a client's request takes; its answer comes when they end."""
-        line, now_ns = self.line, self._runtime.now_ns()
+        line, now_ns = self.line, self._loop.now_ns()
         if line is None:
             raise OSError(errno.EIO, f"{what}: there is no connection to {self._base.line}")
 
         def done(value: Any, error: Exception | None) -> None:
             if error is None:
-                self._runtime.effects.note()
+                self._effects.note()
                 self.acted(handle.block)
                 handle.answer(number, value)
             else:
@@ -136,19 +134,20 @@ class Connected:
         return LATER
 
     def _readable(self) -> None:
-        now_ns = self._runtime.now_ns()
+        now_ns = self._loop.now_ns()
         if self.line is not None:
             line = self.line
             self.guarded(lambda: line.receive(now_ns), now_ns)
 
-    def _line_due(self) -> None:
-        now_ns = self._runtime.now_ns()
+    def line_due(self) -> None:
+        """The line has something to do by now."""
+        now_ns = self._loop.now_ns()
         if self.line is not None:
             line = self.line
             self.guarded(lambda: line.advance_time(now_ns), now_ns)
 
     def _arm(self) -> None:
-        self._runtime.set_line_timer(self.line.deadline_ns if self.line is not None else None)
+        self._loop.set_line_timer(self.line.deadline_ns if self.line is not None else None)
 
     def recover(self, reason: str) -> None:
         """Give up the jobs of the line."""
@@ -158,6 +157,6 @@ class Connected:
     def close_line(self) -> None:
         """Release the line for good."""
         if self.line is not None:
-            self._runtime.unwatch(self.line.connection.fd)
+            self._loop.unwatch(self.line.connection.fd)
             self.line.close()
             self.line = None

@@ -1,21 +1,71 @@
-"""What the runtime needs of an engine: what a tick does for one of the three kinds of driver."""
+"""Engines, what a tick does for one of the three kinds of driver; and the loop that they run in."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
 
 from .blocks import AnyBlock
 from .exchange import Steps
 from .handles import Handle
 from .outputs import Change
 
-if TYPE_CHECKING:
-    pass
+
+class Loop(Protocol):
+    """The loop of a driver process as its parts know it: time, and descriptors."""
+
+    @property
+    def tick(self) -> int:
+        """Number of the present tick."""
+
+    @property
+    def period_ns(self) -> int:
+        """Time between two ticks [ns]."""
+
+    @property
+    def looked_ns(self) -> int:
+        """When it was last looked for stops and orders [ns]."""
+
+    @property
+    def running(self) -> bool:
+        """Whether the process is to go on."""
+
+    def now_ns(self) -> int:
+        """Return the time [ns, CLOCK_MONOTONIC]."""
+
+    def as_of_ns(self) -> int:
+        """Return an instant before which all that was asked for has been heeded."""
+
+    def deadline(self, timeout_s: float | None) -> int | None:
+        """Return when a time-out that begins now ends [ns]."""
+
+    def has_time(self) -> bool:
+        """Whether what can be done in pieces may do another before the next tick."""
+
+    def heed(self) -> None:
+        """Heed the daemon's orders, and stops."""
+
+    def watch(self, fd: int, callback: Callable[[], None]) -> None:
+        """Call back when a descriptor is readable or hung up."""
+
+    def unwatch(self, fd: int) -> None:
+        """Stop watching; call before closing."""
+
+    def set_line_timer(self, when_ns: int | None) -> None:
+        """Have the engine's ``line_due`` called at a time, None = not."""
+
+    def tick_early(self) -> None:
+        """Have a tick as soon as there can be one."""
+
+    def publish(self, block: AnyBlock, stamp_ns: int) -> None:
+        """Publish a block and wake who subscribed to it."""
+
+    def after_publication(self, now_ns: int, shown: Sequence[AnyBlock]) -> None:
+        """Look at what a publication of some blocks may have brought about."""
 
 
 class Engine(Protocol):
-    """What the runtime needs of an engine."""
+    """What the loop and the other parts need of an engine."""
 
     tick_hz: float
 
@@ -35,7 +85,7 @@ class Engine(Protocol):
         """Set outputs for a client."""
 
     def make_safe(self, block: AnyBlock) -> None:
-        """Send the safe values that are wanted of a block (Runtime.outputs) now; later looks send what was lost."""
+        """Send the safe values that are wanted of a block (Outputs) now; later looks send what was lost."""
 
     def carry_out(self, handle: Handle, number: int, steps: Steps, what: str) -> Any:
         """Run the steps that answer a client's request."""
@@ -48,6 +98,9 @@ class Engine(Protocol):
 
     def recover(self, reason: str) -> None:
         """Give up what is under way, so that stops can go out: a hook has raised what it should not have."""
+
+    def line_due(self) -> None:
+        """The time has come that was set by Loop.set_line_timer()."""
 
     def is_quiet(self) -> bool:
         """Whether everything that was asked of the device has been done."""

@@ -11,10 +11,10 @@ from __future__ import annotations
 import errno
 import os
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +24,6 @@ from sioms.protocol.messages import refusal, reply
 
 from .blocks import AnyBlock
 from .effects import Effects
-
-if TYPE_CHECKING:
-    from .writing import AxesWrite
 
 LOOKS_A_MS = 16
 """Waits of each user that are looked at, for every millisecond of a tick's period: some 20 us, 100 where all are answered."""
@@ -39,6 +36,15 @@ class Quota(NamedTuple):
 
     waits: int
     subscriptions: int
+
+
+class Writing(Protocol):
+    """A write of axis records that is not in the buffers yet."""
+
+    lacks_room: bool
+
+    def leave(self) -> None:
+        """Let the later writes of the handle have their turn."""
 
 
 @dataclass(slots=True, eq=False)
@@ -88,7 +94,7 @@ class Handle:
     countdown: int = 0
     writes_under_way: int = 0
     waits: dict[int, Wait] = field(default_factory=dict)
-    writing: list[AxesWrite] = field(default_factory=list)
+    writing: list[Writing] = field(default_factory=list)
     ahead: tuple[int, list[bytes]] = (0, [])
     halted: bool = False
     writes: bool = field(init=False)
@@ -258,6 +264,20 @@ class Waits:
                 if wait.cancelled is not None:
                     wait.cancelled()
         return ended
+
+    def end_block(self, block: AnyBlock, errno_: int, text: str) -> None:
+        """End all waits for a block."""
+        self.end_where(lambda w: w.handle.block is block, errno_, text)
+
+    def end_axes(self, block: AnyBlock, axes: Iterable[int], errno_: int, text: str) -> None:
+        """End the waits for motion of some axes."""
+        ours = {int(a) for a in axes}
+        self.end_where(lambda w: w.handle.block is block and not ours.isdisjoint(w.channels), errno_, text)
+        # A write that waits for room must not be taken after its axes were stopped.
+        self.end_where(
+            lambda w: w.handle.block is block and w.cancelled is not None and not ours.isdisjoint(w.handle.axes),
+            errno_, text,
+        )  # fmt: skip
 
     def forget(self, handle: Handle) -> None:
         """Drop the waits of a handle that is gone."""

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sioms.motion import DriveAction, DriveBank
 from sioms.protocol.flags import PageState
@@ -19,9 +19,7 @@ from .exchange import DeviceError, LinkError, Pause, StateLost, Steps, noting, w
 from .handles import LATER, Handle
 from .line import Done, Line, Priority
 from .outputs import Change
-
-if TYPE_CHECKING:
-    from .runtime import Runtime
+from .parts import Parts
 
 RETRY_S = 0.02
 """Pause before what must get through is sent again, where no poll does it."""
@@ -58,8 +56,8 @@ class _Write:
 class LineEngine(Connected):
     """Runs a LineDriver: opens and polls its units in turn, and carries out actions and outputs."""
 
-    def __init__(self, runtime: Runtime, driver: LineDriver, poll_hz: float) -> None:
-        super().__init__(runtime, driver, driver.gap_s, driver.recovery_s)
+    def __init__(self, parts: Parts, driver: LineDriver, poll_hz: float) -> None:
+        super().__init__(parts, driver, driver.gap_s, driver.recovery_s)
         self._driver = driver
         self._period_ns = int(1e9 / poll_hz)
         self._units = [_UnitState(unit) for unit in driver.units]
@@ -118,27 +116,27 @@ class LineEngine(Connected):
 
     def _poll(self, state: _UnitState) -> Steps:
         """Poll a unit, and note when that began: what it was told until then shows in the readings."""
-        state.as_of_ns = self._runtime.as_of_ns()
-        state.mark = self._runtime.outputs.mark()
+        state.as_of_ns = self._loop.as_of_ns()
+        state.mark = self._outputs.mark()
         state.is_asked = True
         yield from state.unit.poll()
 
     def _opened(self, state: _UnitState, _: Any, error: Exception | None) -> None:
         state.busy = False
-        now_ns = self._runtime.now_ns()
+        now_ns = self._loop.now_ns()
         if error is None:
             state.is_up, state.misses, state.due_ns = True, 0, now_ns
             state.is_asked, state.silent_ticks = False, 0
             state.fresh = True
             return
         kind = PageState.FAULT if isinstance(error, DeviceError) else PageState.LINK_LOST
-        self._runtime.set_link(state.unit.blocks, kind, self._told(state.unit, error))
+        self._pages.set_link(state.unit.blocks, kind, self._told(state.unit, error))
         state.due_ns = now_ns + state.pause_ns
         state.pause_ns = min(max(2 * state.pause_ns, FIRST_PAUSE_NS), LONGEST_PAUSE_NS)
 
     def _polled(self, state: _UnitState, _: Any, error: Exception | None) -> None:
         state.busy = False
-        now_ns = self._runtime.now_ns()
+        now_ns = self._loop.now_ns()
         if not state.is_up:
             return  # it was silent for too long; whatever it says now, it is opened again
         if error is not None:
@@ -156,21 +154,21 @@ class LineEngine(Connected):
             state.fresh = False
             # only now: a port that accepts and closes is no device, nor is one that is opened and never read
             self._pause_ns = state.pause_ns = FIRST_PAUSE_NS
-            self._runtime.set_link(state.unit.blocks, PageState.GOOD, "")
+            self._pages.set_link(state.unit.blocks, PageState.GOOD, "")
             for block in state.unit.blocks:
                 # who wrote them may have gone meanwhile
-                self._runtime.stops.make_unowned_safe(block)
+                self._stops.make_unowned_safe(block)
         for block in state.unit.blocks:
             if isinstance(block, AxisBlock):
                 self._take_actions(state, block, now_ns)
             elif block.spec.writable:
-                self._runtime.stops.look_at_outputs(block, state.mark)
+                self._stops.look_at_outputs(block, state.mark)
         # the line is slower than the rate asked for: poll back to back, and publish while the request is on the line
-        if state.due_ns <= now_ns and self.line is not None and not state.busy and self._runtime.running:
+        if state.due_ns <= now_ns and self.line is not None and not state.busy and self._loop.running:
             self._start(state, now_ns)
         for block in state.unit.blocks:
-            self._runtime.pages.publish(block, block.stamp_ns or now_ns, self._runtime.tick, as_of_ns)
-        self._runtime.after_publication(now_ns, state.unit.blocks)
+            self._pages.publish(block, block.stamp_ns or now_ns, self._loop.tick, as_of_ns)
+        self._loop.after_publication(now_ns, state.unit.blocks)
 
     def _told(self, unit: LineUnit, error: Exception) -> str:
         """Return what failed of which unit, and what to look at unless the driver has said so."""
@@ -190,7 +188,7 @@ class LineEngine(Connected):
         state.is_up = False
         state.due_ns = now_ns + state.pause_ns
         state.pause_ns = min(max(2 * state.pause_ns, FIRST_PAUSE_NS), LONGEST_PAUSE_NS)
-        self._runtime.lose(state.unit.blocks, reason)
+        self._stops.lose(state.unit.blocks, reason)
 
     def _take_actions(self, state: _UnitState, block: AxisBlock, now_ns: int) -> None:
         """Send what the bank wants sent, stops ahead of everything."""
@@ -215,7 +213,7 @@ class LineEngine(Connected):
         _: Any,
         error: Exception | None,
     ) -> None:
-        now_ns = self._runtime.now_ns()
+        now_ns = self._loop.now_ns()
         if error is None:
             bank.action_done(action, now_ns)
         else:
@@ -234,7 +232,7 @@ class LineEngine(Connected):
         self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]
     ) -> Any:
         """Send the values; the client's answer comes when the device has confirmed them."""
-        state, line, now_ns = self._by_block[id(block)], self.line, self._runtime.now_ns()
+        state, line, now_ns = self._by_block[id(block)], self.line, self._loop.now_ns()
         if line is None or not state.is_up:
             raise OSError(errno.EIO, f"write {block.spec.name}: {state.unit.name} does not answer")
         if handle.writes_under_way >= MAX_WRITES:
@@ -250,9 +248,9 @@ class LineEngine(Connected):
             self._writes.remove(write)
             handle.writes_under_way -= 1
             if error is None:
-                self._runtime.effects.note()
+                self._effects.note()
                 self.acted(block)
-                handle.answer(number, self._runtime.tick)
+                handle.answer(number, self._loop.tick)
             else:
                 errno_ = error.errno if isinstance(error, DeviceError) else errno.EIO
                 handle.refuse(number, errno_, f"write {handle.node}: {state.unit.name}: {error}")
@@ -265,14 +263,14 @@ class LineEngine(Connected):
     def acted(self, block: AnyBlock) -> None:
         """Look at once what it did: who reads waits for the poll."""
         state = self._by_block[id(block)]
-        state.due_ns = min(state.due_ns, self._runtime.now_ns())
+        state.due_ns = min(state.due_ns, self._loop.now_ns())
 
     def _write(self, unit: LineUnit, write: _Write) -> Steps:
         """Carry out a write of outputs, and no further once a stop or a safe value has overtaken it.
 
         What the port shall be is made up when its turn on the line has come: others may have written to it meanwhile.
         """
-        outputs = self._runtime.outputs
+        outputs = self._outputs
         channels, values = outputs.merged(write.block, write.changes)
         steps = self._written(unit, write.block, channels, values)
         if not (yield from while_wanted(steps, lambda: not write.is_void)):
@@ -282,21 +280,21 @@ class LineEngine(Connected):
         self, unit: LineUnit, block: AnyBlock, channels: Sequence[int], values: Sequence[float]
     ) -> Steps:
         """Write outputs, and note that the device has them as soon as it says so: a stop may go out before this goes on."""
-        note = partial(self._runtime.outputs.acknowledge, block, channels, values)
+        note = partial(self._outputs.acknowledge, block, channels, values)
         steps = unit.write_outputs(block.spec, channels, values)
         yield from noting(steps, note) if isinstance(block, BinaryBlock) else steps
         note()
 
     def make_safe(self, block: AnyBlock) -> None:
         """Send the safe values that are wanted, ahead of everything but other stops; one message of each block is on its way."""
-        wanted = self._runtime.outputs.unsent(block)
+        wanted = self._outputs.unsent(block)
         for write in self._writes:
             write.is_void |= write.block is block and any(
                 change.contradicts(wanted[channel])
                 for channel, change in write.changes.items()
                 if channel in wanted
             )
-        state, line, now_ns = self._by_block[id(block)], self.line, self._runtime.now_ns()
+        state, line, now_ns = self._by_block[id(block)], self.line, self._loop.now_ns()
         if not wanted or line is None or not state.is_up or id(block) in self._saving:
             return
         self._saving.add(id(block))
@@ -311,7 +309,7 @@ class LineEngine(Connected):
     def _safe(self, unit: LineUnit, block: AnyBlock, pause_s: float) -> Steps:
         if pause_s:
             yield Pause(pause_s)
-        outputs = self._runtime.outputs
+        outputs = self._outputs
         channels, values = outputs.merged(block, outputs.unsent(block))
         if channels:
             yield from self._written(unit, block, channels, values)
@@ -319,21 +317,21 @@ class LineEngine(Connected):
     def _saved(self, line: Line, unit: LineUnit, block: AnyBlock, _: Any, error: Exception | None) -> None:
         self._saving.discard(id(block))
         if error is not None:
-            self._runtime.stops.tell_unsafe(block, str(error))
+            self._stops.tell_unsafe(block, str(error))
         if line is not self.line:
             return
         if self._closed and error is not None:  # no poll comes any more: try for as long as the process lasts
             self._saving.add(id(block))
-            now_ns = self._runtime.now_ns()
+            now_ns = self._loop.now_ns()
             self.guarded(partial(self._send_safe, line, unit, block, RETRY_S, now_ns), now_ns)
         elif error is None:
-            self._runtime.effects.note()
+            self._effects.note()
             self.acted(block)
             self.make_safe(block)  # something more may be wanted by now
 
     def commands_written(self, block: AnyBlock) -> None:
         """Send at once what the bank has to send."""
-        state, now_ns = self._by_block[id(block)], self._runtime.now_ns()
+        state, now_ns = self._by_block[id(block)], self._loop.now_ns()
         if isinstance(block, AxisBlock) and isinstance(block.bank, DriveBank) and state.is_up:
             block.bank.advance(now_ns)
             self._take_actions(state, block, now_ns)
@@ -350,9 +348,9 @@ class LineEngine(Connected):
         return self.line is None or self.line.is_free
 
     def close(self) -> None:
-        """Let every unit leave its device safe; the runtime runs the loop until it is quiet, so no poll begins any more."""
+        """Let every unit leave its device safe; the loop runs until it is quiet, so no poll begins any more."""
         self._closed = True
-        line, now_ns = self.line, self._runtime.now_ns()
+        line, now_ns = self.line, self._loop.now_ns()
         if line is None:
             return
         for state in self._units:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import mmap
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from sioms.protocol.flags import PageState
 from sioms.protocol.page import PageWriter, page_size
@@ -27,12 +27,17 @@ class Pages:
         blocks: the blocks.
         lease_ns: how old the stamp of life may get.
         generation: of the driver process.
+        told: called with state and reason when the device behind blocks gets, or loses, a good link.
 
     Attributes:
         fds: descriptors of the pages in the order of the blocks, until they have been handed over.
     """
 
-    def __init__(self, device: str, blocks: Sequence[AnyBlock], lease_ns: int, generation: int) -> None:
+    def __init__(
+        self, device: str, blocks: Sequence[AnyBlock], lease_ns: int, generation: int,
+        told: Callable[[PageState, str], None],
+    ) -> None:  # fmt: skip
+        self._told = told
         self.fds: list[int] = []
         self._writers: dict[int, PageWriter] = {}
         self._subscribers: dict[int, list[Handle]] = {id(block): [] for block in blocks}
@@ -77,15 +82,16 @@ class Pages:
         """Return who is woken by a block's publications; the list itself, to be changed."""
         return self._subscribers[id(block)]
 
-    def set_link(self, blocks: Sequence[AnyBlock], state: PageState, reason: str) -> bool:
-        """Say how the device behind some blocks is; return whether that is news."""
+    def set_link(self, blocks: Sequence[AnyBlock], state: PageState, reason: str) -> None:
+        """Say how the device behind some blocks is: in their pages, and to the daemon once a change."""
         changed = False
         for block in blocks:
             if self._links.get(id(block)) != (state, reason):
                 self._links[id(block)] = (state, reason)
                 self._writers[id(block)].set_state(state, reason)
                 changed = True
-        return changed
+        if changed:
+            self._told(state, reason)
 
     def is_good(self, blocks: Sequence[AnyBlock]) -> bool:
         """Whether all these blocks have a good link."""

@@ -10,7 +10,7 @@ import errno
 import math
 import traceback
 from collections.abc import Generator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,11 +22,9 @@ from sioms.protocol.text import shown
 from .blocks import AnalogBlock, AxisBlock
 from .driver import Awaited, Refusal
 from .handles import LATER, Handle, Wait
+from .parts import Service
 from .stops import Reason, Stop
 from .writing import check_link
-
-if TYPE_CHECKING:
-    from .runtime import Runtime
 
 FEW_TICKS = 1000
 """Ticks that statistics are told of when nobody asks for more."""
@@ -37,7 +35,7 @@ def _refuse(errno_: int, text: str) -> OSError:
 
 
 def ioctl(
-    runtime: Runtime, handle: Handle, number: int, request_number: int, argument: Any, timeout_s: float | None
+    service: Service, handle: Handle, number: int, request_number: int, argument: Any, timeout_s: float | None
 ) -> Any:
     """Carry out a request; see ``Request``.
 
@@ -61,14 +59,14 @@ def ioctl(
     match request:
         case Request.EMERGENCY_STOP:
             source = f"{handle.who} on {handle.node}"
-            runtime.stops.stop_node(handle.block, handle.channels, handle.bit, source)
-            return runtime.stops.note_node(handle, source, stop=True)
+            service.stops.stop_node(handle.block, handle.channels, handle.bit, source)
+            return service.stops.note_node(handle, source, stop=True)
         case Request.RESET:
-            runtime.stops.reset_node(handle.block, handle.channels, handle.bit, what)
-            return runtime.stops.note_node(handle, handle.who, stop=False)
+            service.stops.reset_node(handle.block, handle.channels, handle.bit, what)
+            return service.stops.note_node(handle, handle.who, stop=False)
         case Request.CANCEL_WAITS:
             ours = {int(c) for c in handle.channels}
-            return runtime.waits.end_where(
+            return service.waits.end_where(
                 lambda w: (
                     w.handle.block is handle.block
                     and w.number != number
@@ -80,45 +78,45 @@ def ioctl(
         case Request.GET_STATISTICS:
             if argument is not None and (type(argument) is not int or argument < 1):
                 raise _refuse(errno.EINVAL, f"{what}: {shown(argument)} ticks; want a number from 1, or none")
-            return _statistics(runtime, handle, number, argument or FEW_TICKS, what)
+            return _statistics(service, handle, number, argument or FEW_TICKS, what)
         case Request.WAIT_UNTIL_EVENT:
             raise _refuse(errno.ENOTTY, f"{what}: is answered by the client library, out of the page")
         case Request.ZERO_DEVICE if _corrected_here(handle):
-            return _zero_analog(runtime, handle, number, argument, timeout_s, what)
+            return _zero_analog(service, handle, number, argument, timeout_s, what)
         case Request.SET_GAINS | Request.GET_GAINS if _corrected_here(handle):
             return _gains(handle, request, argument, what)
     if isinstance(handle.block, AxisBlock):
         try:
-            return _axis_request(runtime, handle, number, request, argument, timeout_s, what)
+            return _axis_request(service, handle, number, request, argument, timeout_s, what)
         except CommandError as error:
             raise _refuse(error.errno, f"{what}: {error}") from None
     try:
-        answer = runtime.driver.ioctl(handle.block.spec, request, [int(c) for c in handle.channels], argument)
+        answer = service.driver.ioctl(handle.block.spec, request, [int(c) for c in handle.channels], argument)
     except Refusal as error:
         raise _refuse(error.errno, f"{what}: {error}") from None
     except Exception as error:  # what a client asks for must not end what others do with the device
         trace = "".join(traceback.format_exception(error)[-3:])
-        runtime.log("error", f"{what} with {shown(argument)}: the driver failed: {trace}")
+        service.log("error", f"{what} with {shown(argument)}: the driver failed: {trace}")
         raise _refuse(errno.EIO, f"{what}: the driver failed: {shown(error)}") from None
     if isinstance(answer, Awaited):
-        return _await(runtime, handle, number, answer, timeout_s, what)
+        return _await(service, handle, number, answer, timeout_s, what)
     if not isinstance(answer, Generator):
         return answer
-    check_link(runtime, handle, what)
-    return runtime.engine.carry_out(handle, number, answer, what)
+    check_link(service, handle, what)
+    return service.engine.carry_out(handle, number, answer, what)
 
 
-def _statistics(runtime: Runtime, handle: Handle, number: int, last: int, what: str) -> Any:
+def _statistics(service: Service, handle: Handle, number: int, last: int, what: str) -> Any:
     """Tell the statistics: what was worked out just now, else when a tick is done and leaves time."""
 
     def report(fresh: bool) -> tuple[Any] | None:
-        found = runtime.statistics_report(handle.uid, last, fresh=fresh)
+        found = service.statistics(handle.uid, last, fresh=fresh)
         return None if found is None else (found,)
 
     known = report(False)
     if known is not None:
         return known[0]
-    runtime.waits.add(Wait(handle, number, what, None, lambda: report(True), looks=True))
+    service.waits.add(Wait(handle, number, what, None, lambda: report(True), looks=True))
     return LATER
 
 
@@ -131,21 +129,21 @@ def _writable(handle: Handle) -> bool:
 
 
 def _axis_request(
-    runtime: Runtime, handle: Handle, number: int, request: Request, argument: Any,
+    service: Service, handle: Handle, number: int, request: Request, argument: Any,
     timeout_s: float | None, what: str,
 ) -> Any:  # fmt: skip
-    bank, axes, now_ns = handle.block.bank, handle.channels, runtime.now_ns()  # type: ignore[union-attr]
+    bank, axes, now_ns = handle.block.bank, handle.channels, service.loop.now_ns()  # type: ignore[union-attr]
     match request:
         case Request.WAIT_UNTIL_IDLE:
             if bank.is_idle(axes):
-                if not runtime.engine.publishes:  # it may have learned so since the last publication
-                    runtime.effects.note()
+                if not service.engine.publishes:  # it may have learned so since the last publication
+                    service.effects.note()
                 return None
             block, channels = handle.block, frozenset(handle.axes)
-            runtime.waits.add(
+            service.waits.add(
                 Wait(
-                    handle, number, what, runtime.deadline(timeout_s),
-                    lambda: (None,) if runtime.waits.is_idle(block, channels) else None, channels, looks=True,
+                    handle, number, what, service.loop.deadline(timeout_s),
+                    lambda: (None,) if service.waits.is_idle(block, channels) else None, channels, looks=True,
                 )
             )  # fmt: skip
             return LATER
@@ -155,7 +153,7 @@ def _axis_request(
                     errno.EINVAL, f"{what}: {shown(argument)} as start; want a time in ns, or none for now"
                 )
             start_ns = argument or now_ns
-            if start_ns < now_ns - runtime.period_ns:
+            if start_ns < now_ns - service.loop.period_ns:
                 raise _refuse(
                     errno.ETIME,
                     f"{what}: its start time passed {(now_ns - start_ns) / 1e6:.2f} ms ago; give it more lead",
@@ -165,7 +163,7 @@ def _axis_request(
                     errno.EINVAL, f"{what}: starts in {(start_ns - now_ns) / 1e9:.0f} s; want at most 60 s"
                 )
             bank.synch(axes, start_ns, now_ns)
-            runtime.engine.commands_written(handle.block)
+            service.engine.commands_written(handle.block)
             return start_ns
         case Request.CALIBRATE_DEVICE:
             bank.calibrate(axes, np.array(_numbers(argument, len(axes), what, "position")))
@@ -173,11 +171,11 @@ def _axis_request(
             bank.zero(axes)
         case Request.STOP:
             reason = Reason(Stop.CONTROLLED, f"stopped by {handle.who}", errno.ECANCELED)
-            runtime.stops.safe_stop(reason, [(handle.block, handle.axes, -1)])
+            service.stops.safe_stop(reason, [(handle.block, handle.axes, -1)])
         case Request.FLUSH:
             bank.flush(axes)
         case Request.HOME:
-            check_link(runtime, handle, what)
+            check_link(service, handle, what)
             bank.home(axes, now_ns)
         case Request.SET_LIMITS:
             bank.set_limits(axes, **_limits(argument, what))
@@ -187,12 +185,12 @@ def _axis_request(
             return bank.particulars(axes)
         case _:
             raise _refuse(errno.ENOTTY, f"{what}: not a request an axis knows")
-    runtime.engine.commands_written(handle.block)
+    service.engine.commands_written(handle.block)
     return None
 
 
 def _zero_analog(
-    runtime: Runtime, handle: Handle, number: int, argument: Any, timeout_s: float | None, what: str
+    service: Service, handle: Handle, number: int, argument: Any, timeout_s: float | None, what: str
 ) -> Any:
     """Take the mean of the next good readings as offset; as many bad ones as good ones are asked for refuse it."""
     block, channels = handle.block, handle.channels
@@ -200,15 +198,15 @@ def _zero_analog(
     samples = 1 if argument is None else argument
     if type(samples) is not int or not 1 <= samples <= 1_000_000:
         raise _refuse(errno.EINVAL, f"{what}: {shown(samples)} samples; want 1 to 1000000")
-    check_link(runtime, handle, what)
+    check_link(service, handle, what)
     total = np.zeros(len(channels))
     good = bad = 0
-    last, asked_ns = runtime.published(block), runtime.now_ns()
+    last, asked_ns = service.pages.number(block), service.loop.now_ns()
 
     def ready() -> tuple[Any] | None:
         nonlocal good, bad, last
-        now = runtime.published(block)
-        if now == last or runtime.pages.as_of_ns(block) < asked_ns:
+        now = service.pages.number(block)
+        if now == last or service.pages.as_of_ns(block) < asked_ns:
             return None  # nothing new, or something measured before
         last = now
         unfit = block.unfit()[channels]
@@ -230,15 +228,15 @@ def _zero_analog(
         block.set_offset(channels, mean)
         return (mean.tolist(),)
 
-    runtime.waits.add(Wait(handle, number, what, runtime.deadline(timeout_s), ready))
+    service.waits.add(Wait(handle, number, what, service.loop.deadline(timeout_s), ready))
     return LATER
 
 
 def _await(
-    runtime: Runtime, handle: Handle, number: int, answer: Awaited, timeout_s: float | None, what: str
+    service: Service, handle: Handle, number: int, answer: Awaited, timeout_s: float | None, what: str
 ) -> Any:
     """Answer when the driver has seen done what was asked."""
-    check_link(runtime, handle, what)
+    check_link(service, handle, what)
 
     def ready() -> tuple[Any] | None:
         try:
@@ -246,7 +244,7 @@ def _await(
         except Refusal as error:
             raise _refuse(error.errno, f"{what}: {error}") from None
 
-    runtime.waits.add(Wait(handle, number, what, runtime.deadline(timeout_s), ready))
+    service.waits.add(Wait(handle, number, what, service.loop.deadline(timeout_s), ready))
     return LATER
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from sioms.descriptors import receive
-from sioms.motion import CommandError, EventKind
+from sioms.motion import CommandError
 from sioms.protocol import driver_verbs
 from sioms.protocol.flags import PageState
 from sioms.protocol.latch import LATCH_SIZE, Latch
@@ -40,13 +40,14 @@ from .driver import Driver, LineDriver, StreamDriver, TickDriver
 from .effects import Effects
 from .engine import Engine
 from .exchange import HookError
-from .handles import LOOKS_A_MS, Waits
+from .handles import LOOKS_A_MS, Handle, Waits
 from .inputs import Input
 from .keeping import keep_positions
 from .line_engine import LineEngine
 from .markers import Markers
 from .outputs import Outputs
 from .pages import Pages
+from .parts import Parts, Service
 from .rt import ChangeWatch, TimerFd, become_realtime, name_process
 from .statistics import TickStatistics
 from .stops import Reason, Stop, Stops
@@ -106,7 +107,6 @@ class Runtime:
         self.looked_ns = 0
         self.outputs = Outputs()
         self.statistics = TickStatistics()
-        self.line_due: Callable[[], None] = lambda: None
         self._control = socket.socket(fileno=fds[0])
         self._control.setblocking(False)
         self.latch = Latch(memoryview(mmap.mmap(fds[1], LATCH_SIZE)))
@@ -124,7 +124,6 @@ class Runtime:
         self._line_due_ns: int | None = None
         self._summaries: dict[int, tuple[int, dict[str, object]]] = {}
         self._summed_ns: dict[int, int] = {}
-        self.stops = Stops(self, self.latch, request, StopJournal(fds[5]), options["stop_sources"])
         self._stopped = options["stopped"]
         self._phase = float(options["phase"])
         self._daemon_lease_ns = int(float(options["daemon_lease_s"]) * 1e9)
@@ -138,9 +137,21 @@ class Runtime:
         set_alarms(self.blocks, options["alarms"])
         self._kept = keep_positions(str(options["state_folder"]), device, self.blocks, self.log)
         lease_ns = int(float(options.get("lease_s") or description.lease_s) * 1e9)
-        self.pages = Pages(device, self.blocks, lease_ns, generation)
-        self.clients = Attachments(self)
-        self.engine = self._make_engine()
+        self.pages = Pages(device, self.blocks, lease_ns, generation, self._link_changed)
+        handles: dict[int, Handle] = {}
+        self.stops = Stops(
+            device, self.blocks, self.outputs, self.effects, self.waits, self.pages, handles, self.log, self.tell,
+            self.latch, request, StopJournal(fds[5]), options["stop_sources"],
+        )  # fmt: skip
+        parts = Parts(
+            self, self.blocks, self.outputs, self.effects, self.waits, self.pages, self.stops, self.log
+        )
+        self.engine = self.stops.engine = self._make_engine(parts)
+        service = Service(
+            self, self.blocks, self.outputs, self.effects, self.waits, self.pages, self.stops, self.log,
+            self.driver, self.engine, self.statistics_report,
+        )  # fmt: skip
+        self.clients = Attachments(handles, service, self.turns, self.tell)
         self.period_ns = int(1e9 / self.engine.tick_hz)
         self.waits.a_look = max(LOOKS_A_MS, LOOKS_A_MS * self.period_ns // 1_000_000)
         self._lead_ns = self.engine.lead_ns if isinstance(self.engine, TickEngine) else 0
@@ -160,7 +171,7 @@ class Runtime:
         """Publish a block and wake who subscribed to it."""
         self.pages.publish(block, stamp_ns, self.tick, self.engine.as_of_ns(block, stamp_ns))
 
-    # --- services to engine and requests ---------------------------------------------------------
+    # --- what parts know of the loop (engine.Loop) -----------------------------------------------
 
     def now_ns(self) -> int:
         """Return the time [ns, CLOCK_MONOTONIC]."""
@@ -178,10 +189,6 @@ class Runtime:
         """Whether what can be done in pieces may do another before the next tick."""
         return time.monotonic_ns() < self._spare_until_ns
 
-    def published(self, block: AnyBlock) -> int:
-        """Return the number of a block's newest snapshot."""
-        return self.pages.number(block)
-
     def watch(self, fd: int, callback: Callable[[], None]) -> None:
         """Call back when a descriptor is readable or hung up."""
         self._callbacks[fd] = callback
@@ -193,47 +200,19 @@ class Runtime:
             self._epoll.unregister(fd)
 
     def set_line_timer(self, when_ns: int | None) -> None:
-        """Have ``line_due`` called at a time, None = not."""
+        """Have the engine's ``line_due`` called at a time, None = not; of a TickEngine, an early tick."""
         if when_ns != self._line_due_ns:  # most bytes that come change nothing about it
             self._line_due_ns = when_ns
             self._line_timer.set(0 if when_ns is None else max(when_ns, 1))
 
-    def set_link(self, blocks: Sequence[AnyBlock], state: PageState, reason: str) -> None:
-        """Say how the device behind some blocks is: in their pages, and to the daemon once a change."""
-        if self.pages.set_link(blocks, state, reason):
-            self.tell(driver_verbs.LinkChanged(int(state), printable(reason)))
-
-    def is_good(self, blocks: Sequence[AnyBlock]) -> bool:
-        """Whether all these blocks have a good link."""
-        return self.pages.is_good(blocks)
-
-    def lose(self, blocks: Sequence[AnyBlock], reason: str) -> None:
-        """The device behind some blocks is lost: nothing queued will run, waits end, readers are told."""
-        self.set_link(blocks, PageState.LINK_LOST, reason)
-        whole = [(block, range(block.n), -1) for block in blocks]
-        self.stops.safe_stop(Reason(Stop.LOSS, reason, errno.EIO), whole)
+    def _link_changed(self, state: PageState, reason: str) -> None:
+        self.tell(driver_verbs.LinkChanged(int(state), printable(reason)))
 
     def after_publication(self, now_ns: int, shown: Sequence[AnyBlock]) -> None:
         """Look at what a publication of some blocks may have brought about."""
-        self.take_events()
+        self.stops.take_events()
         self.waits.check(now_ns, shown)
         self.stops.look_at_inputs()
-
-    def end_block_waits(self, block: AnyBlock, errno_: int, text: str) -> None:
-        """End all waits for a block."""
-        self.waits.end_where(lambda w: w.handle.block is block, errno_, text)
-
-    def end_axis_waits(self, block: AnyBlock, axes: Any, errno_: int, text: str) -> None:
-        """End the waits for motion of some axes."""
-        ours = {int(a) for a in axes}
-        self.waits.end_where(
-            lambda w: w.handle.block is block and not ours.isdisjoint(w.channels), errno_, text
-        )
-        # A write that waits for room must not be taken after its axes were stopped.
-        self.waits.end_where(
-            lambda w: w.handle.block is block and w.cancelled is not None and not ours.isdisjoint(int(c) for c in w.handle.channels),
-            errno_, text,
-        )  # fmt: skip
 
     def statistics_report(self, uid: int, last: int, *, fresh: bool) -> dict[str, object] | None:
         """Return what GET_STATISTICS tells: times of the last ticks, link counters, handles.
@@ -411,7 +390,10 @@ class Runtime:
     def _on_line_timer(self) -> None:
         self._line_timer.expirations()
         self._line_due_ns = None
-        self.line_due()
+        if isinstance(self.engine, TickEngine):
+            self._early_tick()
+        else:
+            self.engine.line_due()
 
     def _fail(self, error: Exception) -> None:
         """Stop first, report second: the driver has raised what it should not have."""
@@ -473,28 +455,14 @@ class Runtime:
 
     # --- pages and links -------------------------------------------------------------------------
 
-    def _make_engine(self) -> Engine:
+    def _make_engine(self, parts: Parts) -> Engine:
         if isinstance(self.driver, TickDriver):
-            self.line_due = self._early_tick
-            return TickEngine(self, self.driver, self._description.tick_hz)
+            return TickEngine(parts, self.driver, self._description.tick_hz)
         if isinstance(self.driver, LineDriver):
-            return LineEngine(self, self.driver, self._description.tick_hz)
+            return LineEngine(parts, self.driver, self._description.tick_hz)
         if isinstance(self.driver, StreamDriver):
-            return StreamEngine(self, self.driver)
+            return StreamEngine(parts, self.driver)
         raise TypeError(f"{type(self.driver).__name__} is no TickDriver, LineDriver or StreamDriver")
-
-    def take_events(self) -> None:
-        """End the waits that events of the axes end, and report faults."""
-        for block in self.blocks:
-            if not isinstance(block, AxisBlock):
-                continue
-            for event in block.bank.take_events():
-                if event.kind in (EventKind.DROPPED, EventKind.FAULT):
-                    self.effects.note()
-                    self.end_axis_waits(block, event.axes, event.errno or errno.EIO, event.text)
-                    if event.kind is EventKind.FAULT:
-                        names = ", ".join(block.spec.channels[a].name for a in event.axes[:4])
-                        self.log("error", f"fault of {names}: {event.text}")
 
     def _miss_daemon(self) -> None:
         if self._daemon_late or self._ending_ns:

@@ -8,26 +8,27 @@ from __future__ import annotations
 import errno
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import Enum, auto
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from sioms.motion import EventKind
 from sioms.protocol.driver_verbs import Stopped
 from sioms.protocol.flags import PageState
 from sioms.protocol.latch import Latch
 from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.stopjournal import StopJournal, channels_and_bits, node_entry, parts_of, workcell_entry
+from sioms.protocol.verbs import Message
 
 from .blocks import AnyBlock, AxisBlock, BinaryBlock
-from .outputs import WHOLE, safe_of
-
-if TYPE_CHECKING:
-    from .handles import Handle
-    from .runtime import Runtime
-
+from .effects import Effects
+from .engine import Engine
+from .handles import Handle, Waits
+from .outputs import WHOLE, Outputs, safe_of
+from .pages import Pages
 
 TOLD_NS = 10_000_000_000
 """How often it is logged that safe outputs could not be set."""
@@ -68,27 +69,39 @@ class Stops:
     """What is stopped, and by whom.
 
     Args:
-        runtime: the driver process.
+        device: its name.
+        blocks: its blocks.
+        outputs, effects, waits, pages: of the driver process.
+        handles: of the clients, by number.
+        log: writes a line of a level to the daemon's log.
+        tell: sends the daemon a message.
         latch: the workcell's emergency-stop latch.
         request: file in which any client asks for an emergency stop.
         journal: where stops are noted before they are acknowledged, so that they outlive this process.
         sources: inputs of this device that stop the workcell, each (block, channel, bit, active level).
 
     Attributes:
+        engine: of the device; set before the first tick.
         stopped: whether the workcell is stopped.
         latched_outputs: parts of outputs (block, channel, bit) under an emergency stop of their node, and by whom; bit 0 for
             channels without bits.
     """
 
+    engine: Engine
+
     def __init__(
-        self, runtime: Runtime, latch: Latch, request: StopRequest, journal: StopJournal,
-        sources: Iterable[Sequence[int]],
+        self, device: str, blocks: Sequence[AnyBlock], outputs: Outputs, effects: Effects, waits: Waits, pages: Pages,
+        handles: Mapping[int, Handle], log: Callable[[str, str], None], tell: Callable[[Message], None],
+        latch: Latch, request: StopRequest, journal: StopJournal, sources: Iterable[Sequence[int]],
     ) -> None:  # fmt: skip
         self.stopped = False
         self.latched_outputs: dict[tuple[int, int, int], str] = {}
         self._unsafe: dict[int, tuple[int, int]] = {}
         """Blocks with safe values that could not be set: when that was logged, and failures since."""
-        self._runtime = runtime
+        self._device, self._blocks = device, blocks
+        self._outputs, self._effects, self._waits, self._pages = outputs, effects, waits, pages
+        self._handles = handles
+        self._log, self._tell = log, tell
         self._latch = latch
         self._request = request
         self._journal = journal
@@ -110,7 +123,7 @@ class Stops:
         if fresh:
             self._note(workcell_entry(source, stop=True))
             self._request.request(time.monotonic_ns(), os.getpid(), source)  # wakes the other drivers
-            self._runtime.tell(Stopped(source))
+            self._tell(Stopped(source))
 
     @property
     def is_up_to_date(self) -> bool:
@@ -143,7 +156,7 @@ class Stops:
             source = self._request.source
             # A reset may have answered it since: a stop that is over must not be latched again.
             if mark != latch.answered_request and latch.stop(time.monotonic_ns(), source):
-                self._runtime.tell(Stopped(latch.source))
+                self._tell(Stopped(latch.source))
         stopped_ns, resets = latch.stopped_ns, latch.resets
         self._seen = (stopped_ns, resets, mark)
         if (stopped_ns and stopped_ns != seen_stop) or resets != seen_resets:
@@ -154,25 +167,24 @@ class Stops:
                 self._note(workcell_entry(latch.source, stop=True))
             self._request.take(mark)
         if not stopped_ns and self.stopped:
-            self._runtime.effects.note()
+            self._effects.note()
             self.stopped = False
             self.latched_outputs.clear()
-            for block in self._runtime.blocks:
+            for block in self._blocks:
                 if isinstance(block, AxisBlock):
                     self._reset_axes(block, range(block.n))
 
     def look_at_inputs(self) -> None:
         """Stop the workcell when an input that is to stop it reads so."""
-        runtime = self._runtime
         for block, channel, bit, active in self._sources:
-            port = runtime.blocks[block]
+            port = self._blocks[block]
             if (
                 isinstance(port, BinaryBlock)
-                and runtime.pages.number(port)  # before the first reading there is nothing to judge
+                and self._pages.number(port)  # before the first reading there is nothing to judge
                 and (int(port.data[channel]) >> bit & 1) == active
                 and not self.stopped
             ):
-                name = f"{runtime.device} {port.spec.name} {port.spec.channels[channel].name}".replace(
+                name = f"{self._device} {port.spec.name} {port.spec.channels[channel].name}".replace(
                     "  ", " "
                 )
                 self.stop_workcell(f"input {name} bit {bit} reads {active}")
@@ -192,22 +204,22 @@ class Stops:
         Raises:
             Exception: the first that one of them has raised, when all have been done.
         """
-        runtime, engine = self._runtime, self._runtime.engine
-        whole = [(block, range(block.n), -1) for block in runtime.blocks] if parts is None else parts
+        engine = self.engine
+        whole = [(block, range(block.n), -1) for block in self._blocks] if parts is None else parts
         blocks = [block for block, _, _ in whole if parts is None or isinstance(block, AxisBlock)]
-        runtime.effects.note()
+        self._effects.note()
         steps: list[Callable[[], None]] = [partial(self._stop_axes, reason, whole)]
         if reason.stop is Stop.FAILURE:
             steps.append(partial(engine.recover, reason.text))
         if reason.stop is Stop.LOSS:
-            steps.append(partial(runtime.outputs.forget, [block for block, _, _ in whole]))
+            steps.append(partial(self._outputs.forget, [block for block, _, _ in whole]))
         else:
             if blocks:
                 steps.append(partial(engine.stop, blocks))
             steps += [partial(self.make_safe, *part) for part in whole]
         if reason.errno:  # before the events of the banks would: these know who stopped
             steps.append(partial(self._end_waits, reason, whole))
-        steps.append(runtime.take_events)
+        steps.append(self.take_events)
         failures = []
         for step in steps:
             try:
@@ -216,6 +228,25 @@ class Stops:
                 failures.append(error)
         if failures:
             raise failures[0]
+
+    def lose(self, blocks: Sequence[AnyBlock], why: str) -> None:
+        """The device behind some blocks is lost: nothing queued will run, waits end, readers are told."""
+        self._pages.set_link(blocks, PageState.LINK_LOST, why)
+        whole = [(block, range(block.n), -1) for block in blocks]
+        self.safe_stop(Reason(Stop.LOSS, why, errno.EIO), whole)
+
+    def take_events(self) -> None:
+        """End the waits that events of the axes end, and report faults."""
+        for block in self._blocks:
+            if not isinstance(block, AxisBlock):
+                continue
+            for event in block.bank.take_events():
+                if event.kind in (EventKind.DROPPED, EventKind.FAULT):
+                    self._effects.note()
+                    self._waits.end_axes(block, event.axes, event.errno or errno.EIO, event.text)
+                    if event.kind is EventKind.FAULT:
+                        names = ", ".join(block.spec.channels[a].name for a in event.axes[:4])
+                        self._log("error", f"fault of {names}: {event.text}")
 
     def _stop_axes(self, reason: Reason, parts: Iterable[Part]) -> None:
         now_ns = time.monotonic_ns()
@@ -232,12 +263,11 @@ class Stops:
                     block.bank.fault(axes, reason.text, now_ns)
 
     def _end_waits(self, reason: Reason, parts: Iterable[Part]) -> None:
-        runtime = self._runtime
         for block, channels, _ in parts:
             if reason.stop is Stop.LOSS:
-                runtime.end_block_waits(block, reason.errno, reason.text)
+                self._waits.end_block(block, reason.errno, reason.text)
             elif isinstance(block, AxisBlock):
-                runtime.end_axis_waits(block, channels, reason.errno, reason.text)
+                self._waits.end_axes(block, channels, reason.errno, reason.text)
 
     # --- nodes -----------------------------------------------------------------------------------
 
@@ -257,7 +287,7 @@ class Stops:
         """
         if self.stopped:
             raise OSError(errno.EPERM, f"{what}: the whole workcell is stopped ({self.source}); reset that")
-        self._runtime.effects.note()
+        self._effects.note()
         if isinstance(block, AxisBlock):
             self._reset_axes(block, channels)
             return
@@ -272,8 +302,8 @@ class Stops:
             part for c in handle.channels.tolist() for part in parts_of(c, handle.bit, spec.channels[c].width)
         ]
         what = f"emergency stop of {handle.node}" if stop else f"reset of {handle.node}"
-        self._runtime.log("warning", f"{what} by {handle.who}")
-        self._note(node_entry(handle.node, self._runtime.device, spec.name, parts, source, stop=stop))
+        self._log("warning", f"{what} by {handle.who}")
+        self._note(node_entry(handle.node, self._device, spec.name, parts, source, stop=stop))
 
     def restore(self, stopped: Iterable[tuple[str, list[list[int]], str, str]]) -> None:
         """Stop what was stopped when the process before this one ended, before anything can move.
@@ -281,7 +311,7 @@ class Stops:
         Args:
             stopped: as Stopped.of_device.
         """
-        blocks = {block.spec.name: block for block in self._runtime.blocks}
+        blocks = {block.spec.name: block for block in self._blocks}
         for name, runs, source, _ in stopped:
             block = blocks.get(name)
             if block is None:
@@ -296,7 +326,7 @@ class Stops:
         try:
             self._journal.append(entry, time.time())
         except OSError as error:
-            self._runtime.log("error", f"a stop or reset is not kept beyond this process: {error.strerror}")
+            self._log("error", f"a stop or reset is not kept beyond this process: {error.strerror}")
 
     # --- outputs ---------------------------------------------------------------------------------
 
@@ -306,13 +336,13 @@ class Stops:
             return
         wanted = {int(c): safe for c in channels if (safe := safe_of(block.spec, int(c), bit)) is not None}
         for channel, safe in wanted.items():
-            self._runtime.outputs.want(block, channel, safe)
+            self._outputs.want(block, channel, safe)
         if wanted:
-            self._runtime.engine.make_safe(block)
+            self.engine.make_safe(block)
 
     def make_unowned_safe(self, block: AnyBlock) -> None:
         """Make outputs safe that no client holds, after the device was opened; a stopped workcell holds none."""
-        holders = [] if self.stopped else self._runtime.clients.handles.values()
+        holders = [] if self.stopped else self._handles.values()
         for channel in range(block.n):
             held = [h for h in holders if h.exclusive and h.block is block and channel in h.axes]
             if not held:
@@ -329,28 +359,28 @@ class Stops:
             block: as it was read.
             mark: of Outputs, from before the reading.
         """
-        outputs, key = self._runtime.outputs, id(block)
+        outputs, key = self._outputs, id(block)
         outputs.read(block, mark, lambda channel: self.held(block, channel)[0] != 0)
         if outputs.unsent(block):
-            self._runtime.engine.make_safe(block)
+            self.engine.make_safe(block)
         elif key in self._unsafe and not outputs.unconfirmed(block):
             del self._unsafe[key]
-            self._runtime.set_link([block], PageState.GOOD, "")
-            self._runtime.log("info", f"{self._name(block)}: safe outputs are confirmed")
+            self._pages.set_link([block], PageState.GOOD, "")
+            self._log("info", f"{self._name(block)}: safe outputs are confirmed")
 
     def tell_unsafe(self, block: AnyBlock, why: str) -> None:
         """Tell clients and log that safe outputs are wanted and could not be set; they are tried again."""
-        now_ns, runtime = time.monotonic_ns(), self._runtime
+        now_ns = time.monotonic_ns()
         told_ns, count = self._unsafe.get(id(block), (0, 0))
         if now_ns - told_ns < TOLD_NS:
             self._unsafe[id(block)] = (told_ns, count + 1)
             return
         self._unsafe[id(block)] = (now_ns, 0)
         text = f"safe outputs not confirmed: {why}"
-        if runtime.is_good([block]):
-            runtime.set_link([block], PageState.GOOD, text)
+        if self._pages.is_good([block]):
+            self._pages.set_link([block], PageState.GOOD, text)
         tries = f" ({count} more tries since)" if count else ""
-        runtime.log(
+        self._log(
             "error", f"{self._name(block)}: {text}; they are sent until the device confirms them{tries}"
         )
 
@@ -372,11 +402,11 @@ class Stops:
         return (sum(1 << bit for bit in sources) if width else WHOLE), next(iter(sources.values()))
 
     def _name(self, block: AnyBlock) -> str:
-        return ".".join(part for part in (self._runtime.device, block.spec.name) if part)
+        return ".".join(part for part in (self._device, block.spec.name) if part)
 
     def _reset_axes(self, block: AxisBlock, channels: Any) -> None:
         block.bank.reset(np.array(channels, dtype=np.intp))
-        self._runtime.engine.commands_written(block)
+        self.engine.commands_written(block)
 
 
 def _emergency_stop_by(source: str) -> Reason:

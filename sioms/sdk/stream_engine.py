@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sioms.protocol.flags import PageState
 
@@ -15,9 +15,7 @@ from .exchange import DeviceError, LinkError
 from .handles import Handle
 from .line import Priority
 from .outputs import Change
-
-if TYPE_CHECKING:
-    from .runtime import Runtime
+from .parts import Parts
 
 
 class StreamEngine(Connected):
@@ -25,8 +23,8 @@ class StreamEngine(Connected):
 
     publishes = False
 
-    def __init__(self, runtime: Runtime, driver: StreamDriver) -> None:
-        super().__init__(runtime, driver, driver.gap_s, driver.recovery_s)
+    def __init__(self, parts: Parts, driver: StreamDriver) -> None:
+        super().__init__(parts, driver, driver.gap_s, driver.recovery_s)
         self._driver = driver
         self._is_up = False
         self._busy = False
@@ -81,17 +79,17 @@ class StreamEngine(Connected):
         if self.line is not None and self.line.connection.settings.path is not None:
             self.line_lost(reason, now_ns)  # a device that has gone keeps its open file silent for ever
         else:
-            self._runtime.lose(self._driver.blocks, reason)
+            self._stops.lose(self._driver.blocks, reason)
 
     def _opened(self, _: Any, error: Exception | None) -> None:
         self._busy = False
-        now_ns = self._runtime.now_ns()
+        now_ns = self._loop.now_ns()
         if error is None:
             self._is_up, self._good_ns, self._heard = True, now_ns, False
             self._heartbeat_ns = now_ns + int(self._driver.heartbeat_s * 1e9)
             return
         kind = PageState.FAULT if isinstance(error, DeviceError) else PageState.LINK_LOST
-        self._runtime.set_link(self._driver.blocks, kind, str(error))
+        self._pages.set_link(self._driver.blocks, kind, str(error))
         self._due_ns = now_ns + self._pause_ns
         self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
 
@@ -104,15 +102,15 @@ class StreamEngine(Connected):
             self._stalled(str(error), now_ns)
             return
         if good:
-            if self._good_ns == 0 or not self._runtime.is_good(self._driver.blocks):
-                self._runtime.set_link(self._driver.blocks, PageState.GOOD, "")
+            if self._good_ns == 0 or not self._pages.is_good(self._driver.blocks):
+                self._pages.set_link(self._driver.blocks, PageState.GOOD, "")
                 self._pause_ns = FIRST_PAUSE_NS
             self._good_ns, self._heard = now_ns, True
-            self._runtime.after_publication(now_ns, self._driver.blocks)
+            self._loop.after_publication(now_ns, self._driver.blocks)
 
     def as_of_ns(self, block: AnyBlock, stamp_ns: int) -> int:
         """Return when the sample was taken: what the device was told after that, it cannot show."""
-        return min(stamp_ns, self._runtime.now_ns())
+        return min(stamp_ns, self._loop.now_ns())
 
     def write_outputs(
         self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]
@@ -136,7 +134,7 @@ class StreamEngine(Connected):
     def close(self) -> None:
         """Stop the stream; no later tick may start it again."""
         self._closed = True
-        line, now_ns = self.line, self._runtime.now_ns()
+        line, now_ns = self.line, self._loop.now_ns()
         if line is not None and self._is_up:
             self._is_up = False
             self.guarded(

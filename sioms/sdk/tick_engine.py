@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sioms.protocol.flags import PageState
 
@@ -15,9 +15,7 @@ from .driver import Refusal, TickDriver
 from .exchange import HookError, LinkError, Steps
 from .handles import Handle
 from .outputs import Change
-
-if TYPE_CHECKING:
-    from .runtime import Runtime
+from .parts import Parts
 
 SELDOM_HZ = 250.0
 """Ticks that come less often find the processor asleep and the caches cold."""
@@ -33,14 +31,15 @@ class TickEngine:
         lead_ns: how long before a tick to wake and warm up [ns]; 0 for ticks that come often.
     """
 
-    def __init__(self, runtime: Runtime, driver: TickDriver, tick_hz: float) -> None:
+    def __init__(self, parts: Parts, driver: TickDriver, tick_hz: float) -> None:
         self.tick_hz = tick_hz
         has_work = type(driver).slack is not TickDriver.slack
         self.lead_ns = 0 if tick_hz > SELDOM_HZ else WAKE_NS + WARM_NS * has_work
-        self._runtime = runtime
+        self._loop, self._pages, self._stops = parts.loop, parts.pages, parts.stops
+        self._outputs = parts.outputs
         self._driver = driver
         self._is_open = False
-        self._outputs = [block for block in driver.blocks if block.spec.writable]
+        self._writable = [block for block in driver.blocks if block.spec.writable]
         self._retry_ns = 0
         self._pause_ns = FIRST_PAUSE_NS
 
@@ -48,16 +47,16 @@ class TickEngine:
         """Tick the driver and publish all blocks."""
         if not self._is_open and not self._open(now_ns):
             return
-        mark = self._runtime.outputs.mark()
+        mark = self._outputs.mark()
         try:
             self._driver.tick(now_ns)
         except LinkError as error:  # the device is gone; open will find it again
             self._is_open, self._retry_ns = False, now_ns + self._pause_ns
-            self._runtime.lose(self._driver.blocks, str(error))
+            self._stops.lose(self._driver.blocks, str(error))
             return
         self._pause_ns = FIRST_PAUSE_NS
-        for block in self._outputs:
-            self._runtime.stops.look_at_outputs(block, mark)
+        for block in self._writable:
+            self._stops.look_at_outputs(block, mark)
 
     def _open(self, now_ns: int) -> bool:
         if now_ns < self._retry_ns:
@@ -65,14 +64,14 @@ class TickEngine:
         try:
             self._driver.open()
         except (LinkError, OSError) as error:
-            self._runtime.set_link(self._driver.blocks, PageState.LINK_LOST, str(error))
+            self._pages.set_link(self._driver.blocks, PageState.LINK_LOST, str(error))
             self._retry_ns = now_ns + self._pause_ns
             self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
             return False
         self._is_open = True
-        self._runtime.set_link(self._driver.blocks, PageState.GOOD, "")
-        for block in self._outputs:
-            self._runtime.stops.make_unowned_safe(block)
+        self._pages.set_link(self._driver.blocks, PageState.GOOD, "")
+        for block in self._writable:
+            self._stops.make_unowned_safe(block)
         return True
 
     @property
@@ -82,27 +81,27 @@ class TickEngine:
 
     def as_of_ns(self, block: AnyBlock, stamp_ns: int) -> int:
         """Return when this tick began: nothing is served in the middle of one."""
-        return self._runtime.looked_ns
+        return self._loop.looked_ns
 
     def write_outputs(
         self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]
     ) -> Any:
         """Hand the values to the driver; they take effect in the next tick."""
         self._write(block, changes)
-        return self._runtime.tick
+        return self._loop.tick
 
     def make_safe(self, block: AnyBlock) -> None:
         """Hand the safe values that are wanted to the driver; what it refuses is tried again after the next tick."""
-        changes = self._runtime.outputs.unsent(block)
+        changes = self._outputs.unsent(block)
         if not changes or not self._is_open:
             return
         try:
             self._write(block, changes)
         except OSError as error:
-            self._runtime.stops.tell_unsafe(block, error.strerror or str(error))
+            self._stops.tell_unsafe(block, error.strerror or str(error))
 
     def _write(self, block: AnyBlock, changes: Mapping[int, Change]) -> None:
-        channels, values = self._runtime.outputs.merged(block, changes)
+        channels, values = self._outputs.merged(block, changes)
         edges = block.edges.copy() if isinstance(block, BinaryBlock) else None
         try:
             self._driver.write_outputs(block.spec, channels, values)
@@ -112,9 +111,9 @@ class TickEngine:
             raise OSError(errno.EIO, str(error)) from None
         except Exception as error:
             raise HookError(f"{type(self._driver).__name__}.write_outputs") from error
-        self._runtime.outputs.acknowledge(block, channels, values)
+        self._outputs.acknowledge(block, channels, values)
         if edges is not None and (edges != block.edges).any():  # type: ignore[union-attr]
-            self._runtime.publish(
+            self._loop.publish(
                 block, time.monotonic_ns()
             )  # an edge of its own, though the tick sees only the last
 
@@ -140,10 +139,13 @@ class TickEngine:
 
     def stop(self, blocks: Sequence[AnyBlock]) -> None:
         """Have a tick soon: in it the banks command the device."""
-        self._runtime.tick_early()
+        self._loop.tick_early()
 
     def recover(self, reason: str) -> None:
         """Nothing is under way between two ticks."""
+
+    def line_due(self) -> None:
+        """Nothing: there is no line."""
 
     def is_quiet(self) -> bool:
         """A tick is all there is."""

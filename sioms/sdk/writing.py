@@ -10,7 +10,7 @@ from __future__ import annotations
 import errno
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,7 @@ from sioms.protocol.records import WRITE_STRUCT, numpy_dtype
 from .blocks import AnyBlock, AxisBlock, BinaryBlock
 from .handles import LATER, Handle, Wait
 from .outputs import WHOLE, Change, safe_of
-
-if TYPE_CHECKING:
-    from .runtime import Runtime
+from .parts import Service
 
 _DTYPE = {cls: np.dtype(numpy_dtype(cls)) for cls in NodeClass}
 _REPLACE = int(WriteFlag.REPLACE)
@@ -33,12 +31,12 @@ _AT_ONCE = 16
 
 
 def write(
-    runtime: Runtime, handle: Handle, number: int, flags: int, timeout_s: float | None, data: bytes
+    service: Service, handle: Handle, number: int, flags: int, timeout_s: float | None, data: bytes
 ) -> Any:
     """Carry out a write of whole records.
 
     Args:
-        runtime: the driver process.
+        service: what it works with.
         handle: who writes.
         number: message number, for an answer that comes later.
         flags: WriteFlag.
@@ -60,26 +58,26 @@ def write(
     size = record.size
     if not data or len(data) % size:
         raise OSError(errno.EINVAL, f"{what}: {len(data)} bytes; want whole records of {size} bytes")
-    if isinstance(block, AxisBlock) and runtime.stops.stopped:
-        raise OSError(errno.EPERM, f"{what}: stopped by emergency stop ({runtime.stops.source}); reset first")
-    check_link(runtime, handle, what)
+    if isinstance(block, AxisBlock) and service.stops.stopped:
+        raise OSError(errno.EPERM, f"{what}: stopped by emergency stop ({service.stops.source}); reset first")
+    check_link(service, handle, what)
     if isinstance(block, AxisBlock):
         # One or a few records need no array; behind an earlier write that is not taken yet they wait their turn.
         if len(data) <= _AT_ONCE * size and not handle.writing:
             short = list(record.iter_unpack(data))
-            if block.bank.offer(short, handle.axes, runtime.now_ns(), replace=bool(flags & _REPLACE)):
-                runtime.engine.commands_written(block)
-                return runtime.tick
-        return _write_axes(runtime, handle, number, flags, timeout_s, np.frombuffer(data, _DTYPE[node_class]))
+            if block.bank.offer(short, handle.axes, service.loop.now_ns(), replace=bool(flags & _REPLACE)):
+                service.engine.commands_written(block)
+                return service.loop.tick
+        return _write_axes(service, handle, number, flags, timeout_s, np.frombuffer(data, _DTYPE[node_class]))
     records = np.frombuffer(data, _DTYPE[node_class])
     changes = _changes(handle, records, what)
-    _take_responsibility(runtime, block, changes, what)
-    return runtime.engine.write_outputs(handle, number, block, changes)
+    _take_responsibility(service, block, changes, what)
+    return service.engine.write_outputs(handle, number, block, changes)
 
 
-def check_link(runtime: Runtime, handle: Handle, what: str) -> None:
+def check_link(service: Service, handle: Handle, what: str) -> None:
     """Refuse what would wait for a lost device and begin by itself when that is back."""
-    reason = runtime.pages.why_not(handle.block)
+    reason = service.pages.why_not(handle.block)
     if reason:
         raise OSError(
             errno.EIO, f"{what}: its device does not answer ({reason}); write again when it is back"
@@ -99,13 +97,13 @@ class AxesWrite:
         lacks_room: whether it has been found to need more room than there is.
     """
 
-    __slots__ = ("_handle", "_judgement", "_patient", "_records", "_replace", "_runtime", "lacks_room")
+    __slots__ = ("_handle", "_judgement", "_patient", "_records", "_replace", "_service", "lacks_room")
 
     def __init__(
-        self, runtime: Runtime, handle: Handle, records: NDArray[Any], replace: bool, patient: bool
+        self, service: Service, handle: Handle, records: NDArray[Any], replace: bool, patient: bool
     ) -> None:
         self.lacks_room = False
-        self._runtime = runtime
+        self._service = service
         self._handle = handle
         self._records = records
         self._replace = replace
@@ -120,9 +118,9 @@ class AxesWrite:
         """
         if not self.has_turn():
             return None
-        while self._runtime.has_time():
+        while self._service.loop.has_time():
             if self.step():
-                return (self._runtime.tick,)
+                return (self._service.loop.tick,)
             if self.lacks_room:
                 return None
         return None
@@ -147,7 +145,7 @@ class AxesWrite:
             OSError: refused; nothing was taken.
         """
         bank, axes = self._handle.block.bank, self._handle.channels  # type: ignore[union-attr]
-        now_ns = self._runtime.now_ns()
+        now_ns = self._service.loop.now_ns()
         self.lacks_room = False
         try:
             if len(self._records) <= _AT_ONCE:
@@ -169,7 +167,7 @@ class AxesWrite:
             return False
         self._end_older()
         self.leave()
-        self._runtime.engine.commands_written(self._handle.block)
+        self._service.engine.commands_written(self._handle.block)
         return True
 
     def leave(self) -> None:
@@ -183,7 +181,7 @@ class AxesWrite:
         older = writing[: writing.index(self)] if self in writing else list(writing)
         if older:
             leaving = [write.leave for write in older]
-            self._runtime.waits.end_where(
+            self._service.waits.end_where(
                 lambda w: w.cancelled in leaving, errno.ECANCELED, "replaced by a later write"
             )
 
@@ -202,16 +200,16 @@ def _next(judgement: Judgement) -> Judged | None:
 
 
 def _write_axes(
-    runtime: Runtime, handle: Handle, number: int, flags: int, timeout_s: float | None, records: NDArray[Any]
+    service: Service, handle: Handle, number: int, flags: int, timeout_s: float | None, records: NDArray[Any]
 ) -> Any:
     patient = timeout_s is None or timeout_s > 0
-    write = AxesWrite(runtime, handle, records, bool(flags & _REPLACE), patient)
+    write = AxesWrite(service, handle, records, bool(flags & _REPLACE), patient)
     # A piece of a long one takes as long as a tick has to spare; it is begun after one.
-    if write.has_turn() and (len(records) <= _AT_ONCE or runtime.has_time()) and write.step():
-        return runtime.tick
-    limit_ns = runtime.deadline(timeout_s) if patient else None
+    if write.has_turn() and (len(records) <= _AT_ONCE or service.loop.has_time()) and write.step():
+        return service.loop.tick
+    limit_ns = service.loop.deadline(timeout_s) if patient else None
     what = f"write {handle.node}"
-    runtime.waits.add(Wait(handle, number, what, limit_ns, write.ready, frozenset(), write.leave))
+    service.waits.add(Wait(handle, number, what, limit_ns, write.ready, frozenset(), write.leave))
     handle.writing.append(write)
     return LATER
 
@@ -219,13 +217,13 @@ def _write_axes(
 # --- outputs -------------------------------------------------------------------------------------
 
 
-def _take_responsibility(runtime: Runtime, block: AnyBlock, changes: Mapping[int, Change], what: str) -> None:
+def _take_responsibility(service: Service, block: AnyBlock, changes: Mapping[int, Change], what: str) -> None:
     """Let a client say what outputs shall be; under a stop that may only be their safe values.
 
     Raises:
         OSError: EPERM, an output is stopped and this is not its safe value.
     """
-    stops, stopped = runtime.stops, []
+    stops, stopped = service.stops, []
     for channel, change in changes.items():
         held, source = stops.held(block, channel)
         if not held & change.mask:
@@ -236,9 +234,9 @@ def _take_responsibility(runtime: Runtime, block: AnyBlock, changes: Mapping[int
             but = "" if safe is None else ", or write its safe value"
             raise OSError(errno.EPERM, f"{what}: stopped by emergency stop ({source}); {first}{but}")
         stopped.append((channel, Change(part, safe.value)))
-    runtime.outputs.release(block, changes)
+    service.outputs.release(block, changes)
     for channel, safe_part in stopped:
-        runtime.outputs.want(block, channel, safe_part)
+        service.outputs.want(block, channel, safe_part)
 
 
 def _changes(handle: Handle, records: NDArray[Any], what: str) -> dict[int, Change]:

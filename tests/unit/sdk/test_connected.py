@@ -21,7 +21,7 @@ class Runtime:
     """What a connection needs of the process; counts what is told about its loss."""
 
     def __init__(self) -> None:
-        self.now, self.told, self.line_due = 1_000_000_000, 0, None
+        self.now, self.told = 1_000_000_000, 0
 
     def now_ns(self) -> int:
         return self.now
@@ -61,7 +61,10 @@ def test_a_port_that_accepts_and_closes_is_tried_less_and_less_often(
         port.close()
     runtime = Runtime()
     driver: Any = SimpleNamespace(line=line, aside=None, blocks=(), settings=None, claims=lambda _: ())
-    engine, tries = Reading(runtime, driver, 0.0, 0.0), []  # type: ignore[arg-type]
+    parts: Any = SimpleNamespace(
+        loop=runtime, pages=runtime, stops=runtime, outputs=None, effects=None, log=runtime.log
+    )
+    engine, tries = Reading(parts, driver, 0.0, 0.0), []
     while runtime.now < 61_000_000_000:
         runtime.now += STEP_NS
         told = runtime.told

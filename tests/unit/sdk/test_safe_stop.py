@@ -13,6 +13,7 @@ import pytest
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AxisBlock, BinaryBlock, BlockSpec
+from sioms.sdk.effects import Effects
 from sioms.sdk.stops import Reason, Stop, Stops
 
 KIT = Path(__file__).parents[3] / "sioms" / "sdk"
@@ -24,25 +25,23 @@ class Device:
     def __init__(self, failing: str = "") -> None:
         self.told: list[str] = []
         self.failing = failing
-        bank: Any = SimpleNamespace(
-            **{verb: self.note(verb) for verb in ("stop", "emergency_stop", "fault")}, n=2
-        )
+        verbs = {verb: self.note(verb) for verb in ("stop", "emergency_stop", "fault")}
+        bank: Any = SimpleNamespace(**verbs, take_events=lambda: self.note("events")() or [])
         axes = tuple(ChannelInfo(name, "m") for name in "xy")
         port = (ChannelInfo("o", "", width=4),)
         self.axes = AxisBlock(BlockSpec("", NodeClass.AXIS, axes), bank)
         self.port = BinaryBlock(BlockSpec("out", NodeClass.BINARY, port, writable=True, safe=(0,)))
-        engine = SimpleNamespace(
+        engine: Any = SimpleNamespace(
             stop=self.note("device stops"), make_safe=self.note("outputs"), recover=self.note("recover")
         )
-        self.runtime: Any = SimpleNamespace(
-            blocks=[self.axes, self.port], engine=engine, effects=SimpleNamespace(note=lambda: None),
-            outputs=SimpleNamespace(want=lambda *_: None, forget=self.note("outputs are forgotten")),
-            end_axis_waits=self.note("waits"), end_block_waits=self.note("all waits"),
-            take_events=self.note("events"),
-        )  # fmt: skip
+        outputs: Any = SimpleNamespace(want=lambda *_: None, forget=self.note("outputs are forgotten"))
+        waits: Any = SimpleNamespace(end_axes=self.note("waits"), end_block=self.note("all waits"))
         latch: Any = SimpleNamespace(resets=0, orders=0)
         nothing: Any = SimpleNamespace(mark=0)
-        self.stops = Stops(self.runtime, latch, nothing, nothing, [])
+        self.stops = Stops(
+            "dev", [self.axes, self.port], outputs, Effects(), waits, nothing, {}, nothing, nothing, latch, nothing, nothing, []
+        )  # fmt: skip
+        self.stops.engine = engine
 
     def note(self, what: str) -> Any:
         """Return a function that notes that it was called, and fails if it is to."""
