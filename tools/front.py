@@ -29,24 +29,24 @@ class Command:
 
 
 COMMANDS: dict[str, Command] = {
-    "demo": Command("sioms.tools.demo", "show the simulated workcell at work"),
-    "init": Command("sioms.tools.init", "write a starter configuration, with what is plugged in"),
+    "demo": Command("sioms.tools.demo", "demonstrate the simulated workcell"),
+    "init": Command("sioms.tools.init", "write a starter configuration with the devices that are connected"),
     "list": Command("sioms.tools.cell", "list the nodes of the workcell"),
-    "info": Command("sioms.tools.cell", "tell what a node is: channels, units, limits"),
-    "status": Command("sioms.tools.cell", "tell how devices, sessions and the emergency stop stand"),
+    "info": Command("sioms.tools.cell", "describe a node: channels, units, limits"),
+    "status": Command("sioms.tools.cell", "print the state of devices, sessions and the emergency stop"),
     "wait": Command("sioms.tools.cell", "wait until the daemon is ready"),
-    "monitor": Command("sioms.tools.monitor", "watch all nodes live, with the emergency stop on a key"),
+    "monitor": Command("sioms.tools.monitor", "display all nodes live; stop, reset and jog by key"),
     "stop": Command("sioms.tools.cell", "emergency stop of a node or of the whole workcell"),
     "reset": Command("sioms.tools.cell", "clear a latched stop or fault"),
-    "reload": Command("sioms.tools.cell", "have the daemon take up its configuration anew"),
+    "reload": Command("sioms.tools.cell", "make the daemon reload its configuration"),
     "check": Command("sioms.tools.cell", "check a configuration"),
     "service": Command("sioms.tools.service", "install the daemon as a service of this machine"),
     "driver": Command("sioms.tools.driver", "list, check, trace and replay drivers"),
     "bench": Command("sioms.bench", "measure latencies and throughput on this machine"),
     "tactile": Command("sioms.tactile.command", "design, calibrate and measure elastic fingers"),
-    "reconcile": Command("sioms.reconcile.command", "find where simulation and measurement disagree"),
+    "reconcile": Command("sioms.reconcile.command", "identify missing effects of a model from measurements"),
 }
-DESCRIPTION = "The devices of a workcell behind one small interface. `sioms COMMAND --help` tells more."
+DESCRIPTION = "Operate the devices of a workcell. See `sioms COMMAND --help`."
 
 
 def main(words: Sequence[str] | None = None) -> int:

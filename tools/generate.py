@@ -86,12 +86,13 @@ def families_page() -> str:
 
 RECORDS = """# Records
 
-What is written to a node and read from it: one record per channel, little-endian. Generated from
+The data written to and read from nodes: one record per channel, little-endian. Generated from
 `sioms/protocol/records.py` by `python -m sioms.tools.generate`.
 
-A write is any number of write records, one after the other, without gaps. A read is an array per column, in this order: 8 bytes
+A write consists of any number of contiguous write records. A read is one array per column, in this order, with 8 bytes
 per channel and column, in the node's page in shared memory. Units are declared per channel; u is m or rad, f is N or N*m.
-`i` and `I` are integers of 4 bytes, `q` of 8 bytes, `d` is a double. A column with a flag counts only where `control_mode` has that flag.
+`i` and `I` are integers of 4 bytes, `q` of 8 bytes, `d` is a double. A column with a flag is used only if that flag is set
+in `control_mode`.
 """
 
 

@@ -26,9 +26,9 @@ class Manual:
 
 
 DEVICES = (
-    "A device is a node of the workcell (see `sioms list`). Of a path, and of a soft link in the current folder, "
-    "the last part counts after all links are followed, so that `ln -s ~rws/dev/mod0 m0` renames a device. "
-    "An option of the first group below holds for the one device that follows it on the command line."
+    "A device is a node of the workcell (see `sioms list`). A path, or a symbolic link in the current folder, denotes "
+    "the node named by its last component after all links are resolved, so that `ln -s ~rws/dev/mod0 m0` renames a "
+    "device. An option of the first group below applies to the device that follows it on the command line."
 )
 MANUALS: dict[str, Manual] = {
     "devin": Manual(
@@ -36,21 +36,21 @@ MANUALS: dict[str, Manual] = {
         ["[-l#h#n#pvfmNVrt#.#L#] DEVICE [[-l#h#n#pvfmNV] DEVICE]..."],
         [
             DEVICES,
-            "Without options it prints a line for each structure of each device: for axes the number, the is-moving "
-            "flag, position, velocity and motor force; for analog and binary devices the number and the data. When "
-            "any of p, v, f, m or N is given, only what is given is printed; without N there is no newline. Units are "
+            "Without options, devin prints one line for each structure of each device: for axes the number, the is-moving "
+            "flag, position, velocity and motor force; for analog and binary devices the number and the data. If "
+            "any of p, v, f, m or N is given, only the given items are printed; without N there is no newline. Units are "
             "SI.",
             "With -r, -t or -L the output is timed: a stream of numbers, each followed by a blank, flushed with every "
-            "sample. Samples are taken on an absolute schedule. One whose time has passed when its turn comes is left "
-            "out and does not count. With -N anywhere, each sample is a line that begins with the time since the "
-            "first sample in seconds and the number of the sample on the schedule. On a busy machine a steady period wants "
-            "real-time priority, for those who may: chrt -f 1 devin ...",
-            "--record makes a table for programs: one line of names with units, then one line for each reading that the "
-            "driver publishes, none twice, with the driver's own time stamp. What it writes of an axis is read by "
-            "`sioms reconcile axis` as it is.",
-            "Reading disturbs nobody: an output node is read through its read-only companion, also while another "
-            "program owns it. A device that is lost, hung or in fault ends devin with an error; old data are never "
-            "printed as new.",
+            "sample. Samples are taken on an absolute schedule. A sample that is late by more than a period is skipped "
+            "and does not count. With -N anywhere, each sample is a line that begins with the time since the "
+            "first sample in seconds and the number of the sample on the schedule. On a busy machine a steady period "
+            "requires real-time priority, if permitted: chrt -f 1 devin ...",
+            "--record prints a table for programs: a header with names and units, then one line for each reading that "
+            "the driver publishes, without duplicates, with the driver's timestamp. The record of an axis can be read by "
+            "`sioms reconcile axis` directly.",
+            "Reading requires no ownership: an output node is read through its read-only companion, also while another "
+            "program owns it. If a device is lost, hangs or is in fault, devin exits with an error; stale data are never "
+            "printed.",
         ],
         [
             ("the state of a module", "devin mod0"),
@@ -71,31 +71,31 @@ MANUALS: dict[str, Manual] = {
         [
             DEVICES,
             "Numbers are taken from the command line, then from standard input, until there are enough for all "
-            "devices; then they are written. An axis takes, whatever the order of its letters: position, velocity, "
+            "devices; then they are written. An axis takes, regardless of the order of its letters: position, velocity, "
             "acceleration, jerk, force, force velocity, force offset, time, wait marker, signal marker; the numbers "
-            "of one axis come after those of the axis before it. Analog and binary devices take one number for each "
+            "of each axis follow those of the preceding axis. Analog and binary devices take one number for each "
             "structure. Units are SI.",
-            "A command without a time lasts until the next one arrives, which takes over at once. Commands with times "
-            "or markers queue up in the axis's buffer and are carried out one after the other; a full buffer holds "
-            "devout back. Position and velocity together pass the position at that velocity.",
-            "At the end of the input devout waits until the axes stand still, except for motion that has no end (a "
+            "A command without a time lasts until the next one arrives, which replaces it immediately. Commands with times "
+            "or markers are queued in the axis's buffer and executed in order; while the buffer is full, devout "
+            "blocks. Position and velocity together pass the position at that velocity.",
+            "At the end of the input devout waits until the axes are idle, except for motion without an end (a "
             "velocity, acceleration, jerk or force without a time), and then closes the devices. Closing halts the "
-            "axes; so does the end of devout for whatever reason, SIGKILL included.",
-            "Outputs of analog and binary devices go to their safe values when the device is closed, as at every end of "
-            "devout: `devout gripper0 1` closes a gripper for a moment only. With -H devout stays at the end of the "
-            "input and holds outputs and motions until it is interrupted or killed.",
-            "With --lease=# the drivers halt the axes when no row has come for that time, be it that the program before "
-            "devout in the pipe hangs or devout itself.",
-            "A word that is no finite number stops devout with an error that names line and word, because in a stream "
-            "without lines nobody can tell which number is meant for what after it. With --skip-bad-lines the line "
-            "that holds it is left out instead. Input that ends within an iteration is an error. A refused command, "
-            "an emergency stop, and the loss of a device or the daemon end devout at once.",
+            "axes, as does the end of devout for any reason, including SIGKILL.",
+            "Outputs of analog and binary devices take their safe values when the device is closed and whenever devout "
+            "ends: `devout gripper0 1` closes a gripper for a moment only. With -H devout does not exit at the end of the "
+            "input but holds outputs and motion until it is interrupted or killed.",
+            "With --lease=# the drivers halt the axes if no row arrives for that time, whether devout hangs or the "
+            "program before it in the pipe.",
+            "A word that is not a finite number stops devout with an error that gives the line and the word, because in a "
+            "stream without lines the meaning of the following numbers is uncertain. With --skip-bad-lines the line "
+            "is skipped instead. Input that ends within an iteration is an error. devout ends immediately if a command is "
+            "refused, at an emergency stop, and if a device or the daemon is lost.",
         ],
         [
             ("move an axis and wait", "devout mod0.xaxis 0.1"),
             ("close the gripper and hold it until Ctrl-C", "devout -H gripper0 1"),
             ("hold it while something else is done", "devout -H gripper0 1 & sleep 5; kill $!"),
-            ("pieces of velocity and time from a file", "devout -rvt -L-1 mod0.xaxis < pieces.txt"),
+            ("segments of velocity and time from a file", "devout -rvt -L-1 mod0.xaxis < pieces.txt"),
             ("move, then signal a marker", "devout -ps mod0.xaxis 0.2 $(smarkers -r)"),
         ],
     ),
@@ -104,20 +104,20 @@ MANUALS: dict[str, Manual] = {
         ["[-zsewcg] [#.##]... DEVICE [[-zsewcg] DEVICE]... [< FILE]"],
         [
             DEVICES,
-            "Devices are served in the order of the command line, the letters of each in theirs. Numbers may stand "
-            "anywhere; -c takes one an axis, -g n*n, first from the command line, then from standard input. All are "
-            "checked before anything is done.",
-            "-e comes before everything else and needs no ownership. It stops all motion at maximum deceleration, "
-            "takes forces to zero, empties the command buffers and latches: writes are refused until `sioms reset`. "
+            "Devices are processed in the order of the command line, and the letters of each in the order given. Numbers "
+            "may be anywhere; -c takes one per axis, -g n*n, first from the command line, then from standard input. All "
+            "are checked before anything is executed.",
+            "-e is executed before everything else and requires no ownership. It stops all motion at maximum deceleration, "
+            "sets forces to zero, empties the command buffers and is latched: writes are refused until `sioms reset`. "
             "Without a device it stops the whole workcell. It is a software stop, not a safety-rated function.",
-            "-s, -e and -w go through the read-only companion and so reach a device that another program owns. -z, -c "
-            "and -g on an output need the device for themselves.",
+            "-s, -e and -w use the read-only companion, so they also work on a device that another program owns. -z, -c "
+            "and -g on an output require ownership.",
         ],
         [
             ("stop everything", "sdev -e"),
             ("start what waits for the synch on two modules at the same instant", "sdev -s mod0 -s mod1"),
             ("wait until a module is idle", "sdev -w mod0"),
-            ("say where the axes are", "sdev -c 0 0 0.05 0 mod0"),
+            ("set the positions of the axes", "sdev -c 0 0 0.05 0 mod0"),
             ("take the present load as zero", "sdev -z lord1"),
             ("set a gain matrix", "sdev -g tactile0 < gains.txt"),
         ],
@@ -126,11 +126,11 @@ MANUALS: dict[str, Manual] = {
         "reserve, free, signal and wait for markers",
         ["-r [COUNT]", "[-fsw] MARKER..."],
         [
-            "A marker tells that something has happened: it is signalled once, by smarkers -s or by a command of an "
-            "axis, and from then on all waits for it return at once.",
-            "-r prints a token for each marker, one a line: number and key in one integer. Freeing and signalling "
-            "need the token; for waiting it or the bare number (token modulo 1024) will do. Markers reserved here "
-            "stay reserved until they are freed.",
+            "A marker is a one-shot event: it is signalled once, by smarkers -s or by a command of an "
+            "axis, and from then on all waits for it return immediately.",
+            "-r prints one token per line: number and key of a marker in one integer. Freeing and signalling require "
+            "the token; for waiting, the number (token modulo 1024) is sufficient. Markers reserved in this way "
+            "persist until they are freed.",
         ],
         [
             ("reserve one", "M=$(smarkers -r)"),
@@ -143,7 +143,7 @@ DAEMON_OPTIONS = [
     Option("", "config", "FILE", ALL, "configuration (TOML)"),
     Option("", "socket", "PATH", ALL, "where to listen, instead of the configured or default path"),
     Option("", "check", "", ALL, "check the configuration and exit"),
-    Option("", "log-level", "LEVEL", ALL, "debug, info, warning or error; info unless told"),
+    Option("", "log-level", "LEVEL", ALL, "debug, info, warning or error; default info"),
     Option("", "help", "", ALL, "print help"),
 ]
 STATUS = (
