@@ -23,6 +23,7 @@ import sioms.client.node_core
 import sioms.sdk.connected
 from sioms.client import shown
 from sioms.client.channel import Call, Channel
+from sioms.client.local import LocalPage
 from sioms.client.node_core import NodeCore
 from sioms.motion import AxisSettings, DriveAction
 from sioms.protocol.driver_verbs import Attach, DriverVerb
@@ -161,7 +162,7 @@ class World:
         )  # fmt: skip
         channel = Channel(_socket.socket(fileno=ours.detach()), info.name, False)
         fd = os.dup(self.page_fds[block])
-        node = NodeCore(info, number, [fd, readable], list(channels), bit, channel)
+        node = NodeCore(info, number, LocalPage(fd, readable), list(channels), bit, channel)
         self.clients.append(Client(self, node, channel))
         return self.clients[-1]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-from _socket import socket
 from time import monotonic, monotonic_ns
 
 from sioms.protocol import verbs
@@ -16,6 +15,7 @@ from sioms.protocol.text import printable, shown
 from .arguments import number as as_number
 from .channel import Call, Channel
 from .faces import Generic, verb
+from .local import node_parts
 from .shown import acknowledged_by_daemon
 
 TYPE_CHECKING = False
@@ -120,20 +120,6 @@ def open_call(name: str, mode: str, timeout: float | None, lease: float) -> Call
     if access is None:
         raise OSError(errno.EINVAL, f"open {name}: mode {shown(mode)}; want 'r', 'w' or 'rw'")
     return Call(f"open {name}", verbs.Open(name, int(access), timeout, lease), limit_s=timeout)
-
-
-def node_parts(value: Any, fds: list[int]) -> tuple[Any, ...]:
-    """Turn the answer to an open into the arguments of a node."""
-    handle, packed, channels, bit, behind = value
-    info = NodeInfo(packed)
-    return (
-        info,
-        handle,
-        fds[:2],
-        list(channels),
-        bit,
-        Channel(socket(fileno=fds[2]), f"node {info.name}", False, behind=behind),
-    )
 
 
 def request_stop(request: StopRequest | None, why: str) -> Callable[[], bool] | None:

@@ -6,15 +6,13 @@ Concurrency: that of the faces, ``node`` and ``sioms.aio``; the verbs of both ar
 from __future__ import annotations
 
 import errno
-import os
-from mmap import PROT_READ, mmap
 from time import monotonic_ns, sleep
 
 from sioms.protocol import text
 from sioms.protocol.flags import NodeClass, PageState, Request, WriteFlag
 from sioms.protocol.messages import MAX_INLINE, MAX_WRITE
 from sioms.protocol.nodeinfo import NodeInfo
-from sioms.protocol.page import NotReadable, PageReader, as_of_ns
+from sioms.protocol.page import NotReadable, as_of_ns
 from sioms.protocol.records import ANALOG_WRITE, BINARY_WRITE
 from sioms.protocol.verbs import Ioctl, Write
 
@@ -32,14 +30,13 @@ if TYPE_CHECKING:
     from typing_extensions import TypeVar
 
     from .snapshot import Snapshot
+    from .transport import Readings
 
     Records: TypeAlias = bytes | bytearray | memoryview | Iterable[bytes]
     S = TypeVar("S", bound=Snapshot, default=Any)
 else:
     S = None
 
-_WAKES = 4096
-"""Bytes taken out of the wake pipe in one go, one a publication."""
 _SHOWN = 8
 """Channels that the representation of a node names."""
 _JUDGED_S = 0.1
@@ -158,17 +155,14 @@ class NodeCore(Generic[S]):
     """
 
     def __init__(
-        self, info: NodeInfo, handle: int, fds: list[int], channels: list[int], bit: int, channel: Channel
+        self, info: NodeInfo, handle: int, readings: Readings, channels: list[int], bit: int, channel: Channel
     ) -> None:
         self.info = info
         self.name = info.name
         self.handle = handle
         self._channel = channel
-        self._event = fds[1]
-        size = os.fstat(fds[0]).st_size
-        self._map: mmap | None = mmap(fds[0], size, prot=PROT_READ)
-        os.close(fds[0])
-        self._page = PageReader(self._map)
+        self._page = readings
+        self._event = readings.fileno()
         names = [channel.name for channel in info.channels]
         self._layout = Layout(info.node_class, self._page.channels, channels, bit, names)
         self._snapshot: Any = SNAPSHOT[info.node_class]
@@ -182,7 +176,7 @@ class NodeCore(Generic[S]):
     @property
     def closed(self) -> bool:
         """Whether it has been closed."""
-        return self._map is None
+        return self._page.closed
 
     def read(self) -> S:
         """Return the newest snapshot of all channels: a copy of memory, no system call.
@@ -201,7 +195,7 @@ class NodeCore(Generic[S]):
         except (NotReadable, ValueError) as error:
             raise self._unreadable(error) from None
         if self._subscribed:
-            self._drain()
+            self._page.drain()
         snapshot: S = self._snapshot(raw, self._layout)
         return snapshot
 
@@ -364,14 +358,8 @@ class NodeCore(Generic[S]):
             [ANALOG_WRITE.pack(i, 0, v) for i, v in enumerate(numbers(f"write {self.name}", values))]
         )
 
-    def _drain(self) -> None:
-        try:
-            os.read(self._event, _WAKES)
-        except BlockingIOError:
-            return
-
     def _unreadable(self, error: Exception) -> OSError:
-        if self._map is None:
+        if self.closed:
             return OSError(errno.EBADF, f"read {self.name}: it is closed")
         if isinstance(error, NotReadable):
             why = error.reason.removeprefix(f"{self.info.device}: ") or "no reason given"
@@ -387,14 +375,10 @@ class NodeCore(Generic[S]):
 
     def release(self) -> None:
         """Let go of memory and descriptors; the driver ends the handle at the end of file."""
-        if self._map is None:
-            return
-        shown.leave(self, self._page.device)
-        self._channel.close()
-        self._page.release()
-        self._map.close()
-        self._map = None
-        os.close(self._event)
+        if not self.closed:
+            shown.leave(self, self._page.device)
+            self._channel.close()
+            self._page.release()
 
 
 def _join(records: Any, name: str) -> bytes:

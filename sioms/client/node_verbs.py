@@ -209,7 +209,7 @@ class NodeVerbs(NodeCore[S]):
             return
         if self._channel.keepalive_s:
             self.keepalive()
-        if self._map is not None:
+        if not self.closed:
             try:
                 self._page.check(monotonic_ns())
             except NotReadable as error:
