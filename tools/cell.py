@@ -21,23 +21,23 @@ def add_parser(subparsers: Any) -> None:
     """Add the commands of this module."""
     one = subparsers.add_parser("list", help="list the nodes of the workcell")
     one.add_argument(
-        "-v", "--verbose", action="store_true", help="also parts of nodes and read-only companions"
+        "-v", "--verbose", action="store_true", help="also channels, bits and read-only companions"
     )
     one.add_argument(
-        "--names", action="store_true", help="only names, one a line; nothing when no daemon is there"
+        "--names", action="store_true", help="only names, one per line; nothing if no daemon is running"
     )
     one.add_argument("--json", action="store_true", help="as JSON")
-    one = subparsers.add_parser("info", help="tell what a node is")
+    one = subparsers.add_parser("info", help="describe a node: channels, units, limits")
     one.add_argument("node", metavar="NODE")
     one.add_argument("--json", action="store_true", help="as JSON")
-    one = subparsers.add_parser("status", help="tell how devices, sessions and the emergency stop stand")
+    one = subparsers.add_parser("status", help="print the state of devices, sessions and the emergency stop")
     one.add_argument("--json", action="store_true", help="as JSON")
-    subparsers.add_parser("reload", help="have the daemon take up its configuration anew")
+    subparsers.add_parser("reload", help="make the daemon reload its configuration")
     one = subparsers.add_parser(
-        "stop", help="emergency stop; latches until `sioms reset`; no safety-rated function"
+        "stop", help="emergency stop, latched until `sioms reset`; not a safety-rated function"
     )
     one.add_argument(
-        "node", metavar="NODE", nargs="?", default="", help="one node; the whole workcell without"
+        "node", metavar="NODE", nargs="?", default="", help="a node; default: the whole workcell"
     )
     one = subparsers.add_parser(
         "wait", help="wait until the daemon is ready: all devices have started, or are in fault"
@@ -48,13 +48,13 @@ def add_parser(subparsers: Any) -> None:
         type=positive,
         default=60.0,
         metavar="SECONDS",
-        help="at most so long (default: 60)",
+        help="time-out (default: 60)",
     )
-    one = subparsers.add_parser("reset", help="clear a latched stop or fault; nothing resumes by itself")
+    one = subparsers.add_parser("reset", help="clear a latched stop or fault; no motion is resumed")
     one.add_argument(
-        "node", metavar="NODE", nargs="?", default="", help="one node; the whole workcell without"
+        "node", metavar="NODE", nargs="?", default="", help="a node; default: the whole workcell"
     )
-    one = subparsers.add_parser("check", help="check a configuration; exit status 2 when it is not good")
+    one = subparsers.add_parser("check", help="check a configuration; exit status 2 if it has errors")
     one.add_argument("config", metavar="CONFIG", help="configuration (TOML)")
 
 

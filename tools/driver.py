@@ -12,9 +12,9 @@ from typing import Any
 from .cell import print_json, table
 
 ABOUT = (
-    "check puts drivers to work under a daemon of its own, against the simulated device that their rig names, over a wire that "
-    "bends messages, loses them, is pulled and put back; it stops axes from every state and kills client, driver and "
-    "daemon in motion. trace records what goes over a device's line, replay lets its driver speak with such a record."
+    "check runs drivers under their own daemon against the simulator given by their rig, over a wire that "
+    "damages and loses messages and is disconnected and reconnected; it stops axes in every state and kills client, "
+    "driver and daemon in motion. trace records the traffic on a device's line, replay runs its driver against the record."
 )
 
 
@@ -22,25 +22,27 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     actions = subparsers.add_parser("driver", help="list and check drivers, record and replay their lines")
     actions = actions.add_subparsers(dest="action", metavar="ACTION", required=True)
-    one = actions.add_parser("list", help="tell which drivers are installed")
+    one = actions.add_parser("list", help="list the installed drivers")
     one.add_argument("--json", action="store_true", help="as JSON")
-    one = actions.add_parser("check", help="put drivers through noise, loss, unplugging, stops and deaths")
+    one = actions.add_parser(
+        "check", help="test drivers with noise, loss, unplugging, stops and process deaths"
+    )
     one.add_argument(
         "drivers", metavar="DRIVER", nargs="*", help="registered name, register map, or a Python file"
     )
     one.add_argument("--all", action="store_true", help="all shipped drivers and register maps")
     one.add_argument(
-        "--full", action="store_true", help="longer trials and all combinations: minutes a driver"
+        "--full", action="store_true", help="longer trials and all combinations: minutes per driver"
     )
     one.add_argument(
-        "--only", metavar="TRIAL,...", default="", help="these trials alone; a name that is none lists all"
+        "--only", metavar="TRIAL,...", default="", help="only these trials; an unknown name lists all"
     )
     one.add_argument(
         "--simulator",
         "--counterpart",
         metavar="COMMAND",
         default="",
-        help="module or file of the device, and options",
+        help="module or file of the simulator, and its options",
     )
     one.add_argument(
         "--config", metavar="FILE", type=Path, help="TOML of the device; {port} stands for its port"
@@ -52,19 +54,17 @@ def add_parser(subparsers: Any) -> None:
     one.add_argument(
         "-j", "--jobs", metavar="N", type=int, default=1, help="drivers checked at the same time"
     )
-    one = actions.add_parser("trace", help="record what goes over a device's line")
+    one = actions.add_parser("trace", help="record the traffic on a device's line")
     one.add_argument("config", metavar="CONFIG", type=Path, help="configuration (TOML)")
     one.add_argument("device", metavar="DEVICE", help="name of the device in it")
-    one.add_argument("-o", "--output", metavar="FILE", type=Path, help="where to; DEVICE.trace unless told")
-    one.add_argument("--seconds", metavar="N", type=float, help="for so long; until interrupted unless told")
+    one.add_argument("-o", "--output", metavar="FILE", type=Path, help="output file (default: DEVICE.trace)")
+    one.add_argument("--seconds", metavar="N", type=float, help="duration (default: until interrupted)")
     one.add_argument(
-        "--socket", metavar="PATH", default="", help="where the daemon listens; a path of its own unless told"
+        "--socket", metavar="PATH", default="", help="socket of the daemon (default: a temporary path)"
     )
-    one = actions.add_parser("replay", help="let a driver speak with a recorded trace")
+    one = actions.add_parser("replay", help="run a driver against a recorded trace")
     one.add_argument("trace", metavar="TRACE", type=Path, help="file of sioms driver trace")
-    one.add_argument(
-        "--ignore", metavar="A:B,...", default="", help="bytes of a request that need not agree, e.g. 0:2"
-    )
+    one.add_argument("--ignore", metavar="A:B,...", default="", help="bytes of a request to ignore, e.g. 0:2")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -38,7 +38,11 @@ def add_parser(subparsers: Any) -> None:
         "in, as a comment unless its USB identity leaves no doubt. With --driver the device is a real one instead."
     )
     one.add_argument(
-        "file", metavar="FILE", nargs="?", default="workcell.toml", help="where to; workcell.toml unless told"
+        "file",
+        metavar="FILE",
+        nargs="?",
+        default="workcell.toml",
+        help="output file (default: workcell.toml)",
     )
     one.add_argument(
         "--driver", metavar="NAME", default="", help="a device of this driver, see `sioms driver list`"
@@ -47,9 +51,9 @@ def add_parser(subparsers: Any) -> None:
         "--port", metavar="PORT", default="", help="serial port, host:port, GPIO chip or IIO device of it"
     )
     one.add_argument(
-        "--name", metavar="NAME", default="", help="of the workcell; that of the folder unless told"
+        "--name", metavar="NAME", default="", help="name of the workcell (default: that of the folder)"
     )
-    one.add_argument("--force", action="store_true", help="overwrite a file that is there")
+    one.add_argument("--force", action="store_true", help="overwrite an existing file")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -47,8 +47,8 @@ _SCROLL = {"\x1b[A": -1, "k": -1, "\x1b[B": 1, "j": 1, "\x1b[5~": -10, "\x1b[6~"
 
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
-    parser = subparsers.add_parser("monitor", help="watch all nodes live, with the emergency stop on a key")
-    parser.add_argument("nodes", metavar="NODE", nargs="*", help="only these (all when none is named)")
+    parser = subparsers.add_parser("monitor", help="display all nodes live; stop, reset and jog by key")
+    parser.add_argument("nodes", metavar="NODE", nargs="*", help="only these (default: all)")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -75,9 +75,9 @@ def add_parser(subparsers: Any) -> None:
         one.add_argument(
             "--root", metavar="FOLDER", type=Path, default=Path("/"), help="instead of /, and start nothing"
         )
-        one.add_argument("--dry-run", action="store_true", help="only tell what would be done")
+        one.add_argument("--dry-run", action="store_true", help="print the steps without executing them")
         if name == "install":
-            one.add_argument("--force", action="store_true", help="overwrite files that somebody has changed")
+            one.add_argument("--force", action="store_true", help="overwrite modified files")
 
 
 def run(args: argparse.Namespace) -> int:
