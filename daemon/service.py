@@ -20,6 +20,7 @@ from .log import Log
 from .loop import Loop
 from .nursery import Nursery
 from .nursery_process import NurseryProcess
+from .realtime import end_promptly
 from .server import Server
 from .stop_record import StopRecord
 
@@ -92,6 +93,9 @@ def _become_prompt(log: Log) -> None:
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
+        for thread in os.listdir("/proc/self/task"):  # those that have begun; later ones do so by themselves
+            if int(thread) != os.getpid():
+                end_promptly(int(thread))
     except OSError as error:
         log("debug", "runs without SCHED_FIFO", why=error.strerror)
 

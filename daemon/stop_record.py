@@ -18,6 +18,8 @@ from typing import Any
 
 from sioms.protocol.stopjournal import CHECKPOINT, StopJournal, Stopped, entries_from, replay
 
+from .realtime import end_promptly
+
 MOST_BYTES = 1 << 18
 """From so many bytes after the last checkpoint on, there is a new one, and what lies before it is freed."""
 _KEEP_SIZE, _PUNCH_HOLE, _BLOCK = 0x01, 0x02 | 0x01, 4096
@@ -139,6 +141,7 @@ class _Flusher:
             self._thread.join()
 
     def _run(self) -> None:
+        end_promptly()
         freed, kept = 0, 0
         while not self._ends or self._wanted.is_set():
             self._wanted.wait()
