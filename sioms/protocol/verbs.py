@@ -17,7 +17,7 @@ from .messages import MAX_PACKET, MAX_VALUES, ClientVerb, HandleVerb, MalformedM
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Container, Sequence
+    from collections.abc import Callable, Container, Sequence
     from typing import Any, ClassVar, Self, TypeAlias, dataclass_transform
 
     Integer: TypeAlias = int
@@ -77,10 +77,13 @@ class Socket(dict[int, "type[Message]"]):
     Attributes:
         sender, receiver: the two ends, in words.
         states: of the connection, as the receiver sees it, in the order in which they are gone through.
+        decoders: of some verbs: they return the parts of a packet whose arguments are of their kinds, and None of any
+            other; empty but in a process that has called ``compiled.add_decoders``.
     """
 
     def __init__(self, sender: str, receiver: str, states: tuple[str, ...]) -> None:
         super().__init__()
+        self.decoders: dict[int, Callable[[bytes], Sequence[Any] | None]] = {}
         self.sender, self.receiver, self.states = sender, receiver, states
 
 
@@ -127,7 +130,7 @@ class Message(tuple):  # type: ignore[type-arg]
         on[int(verb)] = cls
 
     @classmethod
-    def of(cls, arguments: list[Any]) -> Self:
+    def of(cls, arguments: Sequence[Any]) -> Self:
         """Make a message of arguments that have been checked."""
         return tuple.__new__(cls, arguments)
 
@@ -164,9 +167,24 @@ def take(
     Raises:
         MalformedMessage: anything else.
     """
-    parts = decode(packet, most, values)
-    number, arguments = parts[1], parts[2:]
-    kind_of = socket.get(parts[0])
+    parts: Sequence[Any] | None = None
+    if socket.decoders and 1 < len(packet) <= most and (decoder := socket.decoders.get(packet[1])):
+        parts = decoder(packet)
+    if parts is None:
+        parts = _checked(decode(packet, most, values), socket)
+    kind_of, number = socket[parts[0]], parts[1]
+    if state and state not in kind_of.states:
+        raise MalformedMessage(
+            f"{kind_of.__name__} while {state}; want it while {' or '.join(kind_of.states)}"
+        )
+    if not kind_of.notice and (number == 0 or number in pending):
+        raise MalformedMessage(f"message number {number} is zero or in use")
+    return number, kind_of.of(parts[2:])
+
+
+def _checked(parts: list[Any], socket: Socket) -> list[Any]:
+    """Return the parts of a message whose verb and arguments are those of a socket."""
+    kind_of, arguments = socket.get(parts[0]), parts[2:]
     if kind_of is None:
         raise MalformedMessage(f"verb {parts[0]} is none")
     fields = kind_of.fields
@@ -183,13 +201,7 @@ def take(
             raise MalformedMessage(
                 f"verb {parts[0]} with {len(value)} characters; want {kind.words} of at most {kind.most}"
             )
-    if state and state not in kind_of.states:
-        raise MalformedMessage(
-            f"{kind_of.__name__} while {state}; want it while {' or '.join(kind_of.states)}"
-        )
-    if not kind_of.notice and (number == 0 or number in pending):
-        raise MalformedMessage(f"message number {number} is zero or in use")
-    return number, kind_of.of(arguments)
+    return parts
 
 
 # --- from a client to the daemon -----------------------------------------------------------------

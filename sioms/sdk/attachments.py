@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from sioms.protocol import verbs
+from sioms.protocol.compiled import add_decoders
 from sioms.protocol.driver_verbs import Attach, Detached
 from sioms.protocol.flags import REQUESTS, Access, Right
 from sioms.protocol.messages import MAX_INLINE, MAX_PACKET, MAX_WRITE, MalformedMessage
@@ -34,6 +35,7 @@ from .writing import write
 OWNERS, READERS = 0, 1
 SHARES = (0.85, 0.125)
 """Of its time, what a driver spends at most on the requests of who owns outputs, and on those of all others."""
+add_decoders(verbs.ON_HANDLE)
 
 
 class Attachments:
