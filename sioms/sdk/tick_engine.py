@@ -39,6 +39,7 @@ class TickEngine:
         self._outputs = parts.outputs
         self._driver = driver
         self._is_open = False
+        self._is_ticking, self._shown_ns = False, 0
         self._writable = [block for block in driver.blocks if block.spec.writable]
         self._retry_ns = 0
         self._pause_ns = FIRST_PAUSE_NS
@@ -48,12 +49,16 @@ class TickEngine:
         if not self._is_open and not self._open(now_ns):
             return
         mark = self._outputs.mark()
+        self._is_ticking = True
         try:
             self._driver.tick(now_ns)
         except LinkError as error:  # the device is gone; open will find it again
             self._is_open, self._retry_ns = False, now_ns + self._pause_ns
             self._stops.lose(self._driver.blocks, str(error))
             return
+        finally:
+            self._is_ticking = False
+        self._shown_ns = self._loop.looked_ns
         self._pause_ns = FIRST_PAUSE_NS
         for block in self._writable:
             self._stops.look_at_outputs(block, mark)
@@ -80,8 +85,11 @@ class TickEngine:
         return self._is_open
 
     def as_of_ns(self, block: AnyBlock, stamp_ns: int) -> int:
-        """Return when this tick began: nothing is served in the middle of one."""
-        return self._loop.looked_ns
+        """Return when this tick began: nothing is served in the middle of one.
+
+        What a driver publishes itself during its tick, for the sake of an edge, may be of before the last write.
+        """
+        return self._shown_ns if self._is_ticking else self._loop.looked_ns
 
     def write_outputs(
         self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]
