@@ -51,8 +51,8 @@ class Output:
 
     node: str
     width: int
-    safe: float | None
-    other: float | None = None
+    safe: int | float | None  # an integer of a port stays one
+    other: int | float | None = None
 
     @property
     def another(self) -> float:

@@ -87,7 +87,7 @@ def test_a_finger_that_prints_its_elements_is_felt(start: Callable[..., Any], sh
     wire = Wire(
         start,
         short_folder,
-        "ascii_stream",
+        "ascii_stream.simulator",
         "--columns",
         "16",
         "--rate",

@@ -80,7 +80,6 @@ def daemon(start_daemon: Callable[..., Daemon], tmp_path: Path) -> Daemon:
     text += SENSOR.format(name="twin", more='model_file = "twin.toml"')
     running = start_daemon(text, files={"twin.toml": MODEL})
     running.wait_up("force0")
-    hidden.unlink()
     return running
 
 
