@@ -135,9 +135,7 @@ class Clients:
     def _was_silent(self, session: Session) -> None:
         """End a connection on which nothing has been said: it takes the place of others."""
         if session in self.sessions:
-            why = (
-                f"nothing was said within {self.quotas.greeting_s:g} s of connecting (greeting_s of [quota])"
-            )
+            why = f"nothing was said within {self.quotas.greeting_s:g} s of connecting (greeting_s of [quota])"
             self.send(session, refusal(0, errno.ETIMEDOUT, f"connect: {why}"))
             if session in self.sessions:
                 self._end_session(session, why)
@@ -308,9 +306,7 @@ class Clients:
 
     def _timed_out(self, wait: Wait, limit_s: float) -> None:
         why = f": {wait.why()}" if wait.why is not None else ""
-        self.answer(
-            wait, refusal(wait.number, errno.ETIMEDOUT, f"{wait.what}: not within {limit_s:g} s{why}")
-        )
+        self.answer(wait, refusal(wait.number, errno.ETIMEDOUT, f"{wait.what}: not within {limit_s:g} s{why}"))
 
     def _cancel(self, session: Session, number: int) -> bool:
         wait = session.waits.get(number)

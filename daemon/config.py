@@ -149,17 +149,13 @@ def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
     except tomllib.TOMLDecodeError as error:
         return None, [f"read configuration: {str(error)[0].lower() + str(error)[1:]}"]
     except RecursionError:
-        return None, [
-            f"read configuration: arrays or tables nested too deep; at most {DEEPEST} deep is right"
-        ]
+        return None, [f"read configuration: arrays or tables nested too deep; at most {DEEPEST} deep is right"]
     except ValueError as error:  # an integer of more digits than Python converts
         return None, [f"read configuration: {error}"]
     if {"family", "signals"} <= root.keys():
         text = 'this is a register map; name it in the table of a device, map = "FILE", and give that configuration'
         return None, [text]
-    errors = [
-        f"[{key}]: unknown section{did_you_mean(key, _SECTIONS)}" for key in root if key not in _SECTIONS
-    ]
+    errors = [f"[{key}]: unknown section{did_you_mean(key, _SECTIONS)}" for key in root if key not in _SECTIONS]
     workcell = _convert(root.get("workcell", {}), WorkcellTable, "[workcell]", errors) or WorkcellTable()
     quota = _convert(root.get("quota", {}), QuotaTable, "[quota]", errors) or QuotaTable()
     devices: dict[str, Device] = {}
@@ -192,9 +188,7 @@ def _tables(root: Mapping[str, Any], section: str, errors: list[str]) -> list[tu
         if not isinstance(table, dict):
             errors.append(f"[{section}].{name}: want a table [{section}.{name}]")
         elif not _is_name(name) and section == "device":
-            errors.append(
-                f"[device.{name}]: a device name is letters, digits, - and _, beginning with a letter"
-            )
+            errors.append(f"[device.{name}]: a device name is letters, digits, - and _, beginning with a letter")
         elif section == "node" and not all(_is_name(part) for part in name.split(".")):
             errors.append(f"[node.{name}]: a node name is words of letters, digits, - and _, joined by dots")
         else:
@@ -242,9 +236,7 @@ def _strange(value: object, where: str, depth: int = 0) -> Iterator[str]:
             yield f"{where}: nested deeper than {DEEPEST}; no key of a device is"
             return
         for key, each in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _strange(
-                each, f"{where}.{key}" if isinstance(value, dict) else f"{where}[{key}]", depth + 1
-            )
+            yield from _strange(each, f"{where}.{key}" if isinstance(value, dict) else f"{where}[{key}]", depth + 1)
     elif isinstance(value, int) and not -(2**63) <= value < 2**63:
         yield f"{where}: an integer of more than 64 bits; no key of a device takes one"
     elif not isinstance(value, (str, int, float)):

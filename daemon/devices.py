@@ -205,18 +205,14 @@ class DriverProcess:
         try:
             socket.send_fds(self._sock, [message.packed()], list(fds))
         except OSError as error:
-            raise OSError(
-                errno.EIO, f"driver of {self.name} does not take messages: {error.strerror}"
-            ) from None
+            raise OSError(errno.EIO, f"driver of {self.name} does not take messages: {error.strerror}") from None
 
     def tell(self, message: Message) -> None:
         """Send a notice; a driver that cannot take it will be found dead or hung anyway."""
         try:
             self.send(message)
         except OSError as error:
-            self._log(
-                "warning", "notice lost", device=self.name, verb=type(message).__name__, why=error.strerror
-            )
+            self._log("warning", "notice lost", device=self.name, verb=type(message).__name__, why=error.strerror)
 
     def why_unreadable(self, block: int) -> str:
         """Return why readers of a block are refused, empty when they are not."""

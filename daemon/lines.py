@@ -1,7 +1,8 @@
 """Which line of a configuration an error is about: the validator sees values and no lines. Pure; used with errors only.
 
-An error begins with the words for a table, or for a key of one: ``[device.mod0].axis[1].mass: ...``. Where only the table is
-named, as by a driver that judges several keys together, the axis and the key that the sentence names come first are looked for in it.
+An error begins with the words for a table, or for a key of one: ``[device.mod0].axis[1].mass: ...``. Where only the
+table is named, as by a driver that judges several keys together, the axis and the key that the sentence names come
+first are looked for in it.
 """
 
 from __future__ import annotations
@@ -51,7 +52,9 @@ def _line(places: dict[str, int], axes: dict[str, str], error: str) -> int:
 
 
 def _places(text: str) -> tuple[dict[str, int], dict[str, str]]:
-    """Return the line of each table and key, by the words with which errors name them, and those words for axes by their names."""
+    """Return the line of each table and key, by the words with which errors name them, and those words for axes by
+    their names.
+    """
     places: dict[str, int] = {}
     axes: dict[str, str] = {}
     counts: Counter[str] = Counter()

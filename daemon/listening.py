@@ -1,4 +1,6 @@
-"""The listening socket of a daemon: one daemon each, in a folder where nobody else can put another, there only when it answers."""
+"""The listening socket of a daemon: one daemon each, in a folder where nobody else can put another, there only when it
+answers.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,8 @@ from sioms.protocol.socketpath import own_path
 class Listening:
     """A socket that clients can connect to, and the lock that keeps other daemons away from it.
 
-    The lock is taken before anything else is done for the path, so of several daemons that start together one goes on; it
-    is the kernel's, and ends with the process.
+    The lock is taken before anything else is done for the path, so of several daemons that start together one goes on;
+    it is the kernel's, and ends with the process.
 
     Args:
         path: where clients connect.
@@ -41,9 +43,7 @@ class Listening:
         if path == own_path():
             os.makedirs(folder, mode=0o755, exist_ok=True)
         elif not os.path.isdir(folder):
-            raise OSError(
-                errno.ENOENT, f"{path}: there is no folder {folder}; make it or choose another path"
-            )
+            raise OSError(errno.ENOENT, f"{path}: there is no folder {folder}; make it or choose another path")
         _check_folder(folder)
         self._lock = _lock(path + ".lock", path)
         try:
@@ -55,9 +55,7 @@ class Listening:
     def _bind(self, folder: str, mode: int, group: str) -> socket.socket:
         with suppress(FileNotFoundError):
             if not stat.S_ISSOCK(os.lstat(self.path).st_mode):
-                raise OSError(
-                    errno.EEXIST, f"{self.path} is there and is no socket; remove it or choose another path"
-                )
+                raise OSError(errno.EEXIST, f"{self.path} is there and is no socket; remove it or choose another path")
         _refuse_answering(self.path)
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         # Under another name until it listens; by way of the folder's descriptor, as the path may be as long as fits.
@@ -91,9 +89,7 @@ class Listening:
 
     def _unlock(self) -> None:
         with suppress(FileNotFoundError):
-            os.unlink(
-                self.path + ".lock"
-            )  # who has opened it finds another one when it has the lock, and tries again
+            os.unlink(self.path + ".lock")  # who has opened it finds another one when it has the lock, and tries again
         os.close(self._lock)
 
 
@@ -108,7 +104,8 @@ def _check_folder(folder: str) -> None:
         why = "others may write to it" if owner_is_trusted else f"it belongs to user {about.st_uid}"
         raise OSError(
             errno.EPERM,
-            f"{one}: {why}, who could put another socket in the place of {folder}'s; want a folder of the daemon's own, as 0755",
+            f"{one}: {why}, who could put another socket in the place of {folder}'s; want a folder of the daemon's "
+            "own, as 0755",
         )
 
 
@@ -156,9 +153,7 @@ def _refuse_answering(path: str) -> None:
     """Refuse a socket on which somebody answers who knows nothing of the lock."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
         if probe.connect_ex(path) == 0:
-            raise OSError(
-                errno.EADDRINUSE, f"another daemon answers at {path}; stop it or choose another path"
-            )
+            raise OSError(errno.EADDRINUSE, f"another daemon answers at {path}; stop it or choose another path")
 
 
 def _give(path: str, group: str) -> None:

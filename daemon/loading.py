@@ -53,7 +53,8 @@ class Plan:
 
     Attributes:
         stop_sources: for each device with emergency-stop inputs [block, channel, bit, active] lists.
-        watched_inputs: for each device the blocks with emergency-stop inputs that must be readable, and the node of one.
+        watched_inputs: for each device the blocks with emergency-stop inputs that must be readable, and the node of
+            one.
         alarms: for each device with alarm limits [block, channels, lolo, low, high, hihi, hysteresis] lists.
     """
 
@@ -158,9 +159,7 @@ class Loader:
         self._patience.renew(time.monotonic())
         if errno_ == DIED:
             self._errors.append(
-                NotDescribed(
-                    f"describe [device.{name}]: {text}; a driver that is asked before may have ended it"
-                )
+                NotDescribed(f"describe [device.{name}]: {text}; a driver that is asked before may have ended it")
             )
         elif errno_:
             self._errors.append(f"[device.{name}]: {text}")
@@ -169,9 +168,7 @@ class Loader:
                 self._take(name, *unpack_compressed(value))
             except (MalformedMessage, ValueError, TypeError, LookupError) as error:
                 # A nursery of another version: the software was changed under the running daemon.
-                self._errors.append(
-                    f"[device.{name}]: its description is not understood ({error}); restart the daemon"
-                )
+                self._errors.append(f"[device.{name}]: its description is not understood ({error}); restart the daemon")
         if not self._waiting:
             self._guarded(self._finish)
 
@@ -206,9 +203,7 @@ class Loader:
 
     def _finish(self) -> None:
         # Names of devices that failed would only be missed again as targets of aliases.
-        names = NameTable(
-            {n: self._infos[n] for n in self._config.devices if n in self._infos}, self._config.nodes
-        )
+        names = NameTable({n: self._infos[n] for n in self._config.devices if n in self._infos}, self._config.nodes)
         self._errors += _unknown_users(self._config) + shared_claims(names.devices.values())
         sources, alarms = self._stop_sources(names), self._alarms(names)
         if not self._errors:
@@ -242,15 +237,11 @@ class Loader:
         for number, alarm in enumerate(self._config.alarms, 1):
             node = names.nodes.get(alarm.node)
             if node is None or names.block(node).node_class.name != "ANALOG":
-                names.errors.append(
-                    f"[[alarm]] number {number}: node = {alarm.node}; want the name of an analog node"
-                )
+                names.errors.append(f"[[alarm]] number {number}: node = {alarm.node}; want the name of an analog node")
                 continue
             low = [-math.inf if limit is None else limit for limit in (alarm.lolo, alarm.low)]
             high = [math.inf if limit is None else limit for limit in (alarm.high, alarm.hihi)]
-            found.setdefault(node.device, []).append(
-                [node.block, list(node.channels), *low, *high, alarm.hysteresis]
-            )
+            found.setdefault(node.device, []).append([node.block, list(node.channels), *low, *high, alarm.hysteresis])
         return found
 
 
@@ -278,9 +269,7 @@ def _unknown_users(config: Config) -> list[str]:
         try:
             pwd.getpwnam(device.common.user or "root")
         except KeyError:
-            errors.append(
-                f"[device.{name}]: user = {device.common.user}: no such user; create it or name another"
-            )
+            errors.append(f"[device.{name}]: user = {device.common.user}: no such user; create it or name another")
     return errors
 
 

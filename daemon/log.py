@@ -12,7 +12,8 @@ _SYSTEMD = {"debug": 7, "info": 6, "warning": 4, "error": 3}
 
 
 BURST, SPAN_S = 20, 10.0
-"""So many lines of one event from one source (a device, else a user) are written within a span; the others are counted."""
+"""So many lines of one event from one source (a device, else a user) are written within a span; the others are counted.
+"""
 MOST = 1000
 """Sources and events that are told apart; in a flood of these, too, all further ones are one."""
 
@@ -44,9 +45,7 @@ class Log:
         clock: returns the time [s], monotonic.
     """
 
-    def __init__(
-        self, journal: bool = False, level: str = "info", clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, journal: bool = False, level: str = "info", clock: Callable[[], float] = time.monotonic) -> None:
         self._journal = journal
         self._clock = clock
         self._spans: dict[tuple[str, str], _Span] = {}

@@ -110,9 +110,7 @@ class Loop:
         self.turns.serve()
         self._serve_timers()
         if time.monotonic_ns() - self._restless_ns > RESTLESS_NS:
-            time.sleep(
-                PAUSE_S
-            )  # it may run before all other processes: a flood must not take the machine with it
+            time.sleep(PAUSE_S)  # it may run before all other processes: a flood must not take the machine with it
             self._restless_ns = time.monotonic_ns()
 
     def _serve_timers(self) -> None:

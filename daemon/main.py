@@ -16,18 +16,14 @@ def main(argv: list[str] | None = None) -> int:
     import argparse
     import signal
 
-    signal.signal(
-        signal.SIGINT, signal.SIG_DFL
-    )  # until the service listens to signals: the end, and no traceback
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # until the service listens to signals: the end, and no traceback
 
     parser = argparse.ArgumentParser(
         prog="siomsd",
         description="SIOMS device daemon: shows the devices of a workcell as nodes of class axis, analog and binary.",
     )
     parser.add_argument("--config", required=True, metavar="FILE", help="configuration (TOML)")
-    parser.add_argument(
-        "--socket", metavar="PATH", help="where to listen, instead of the configured or default path"
-    )
+    parser.add_argument("--socket", metavar="PATH", help="where to listen, instead of the configured or default path")
     parser.add_argument("--check", action="store_true", help="check the configuration and exit")
     parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
     options = parser.parse_args(argv)

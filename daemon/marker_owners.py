@@ -78,7 +78,8 @@ class MarkerOwners:
         if split_token(token)[1] != reservation.key:
             raise MarkerError(
                 errno.EPERM,
-                f"{what} marker {reservation.number}: the key is missing or wrong; use the token that its reservation returned",
+                f"{what} marker {reservation.number}: the key is missing or wrong; use the token that its reservation "
+                "returned",
             )
         return reservation
 

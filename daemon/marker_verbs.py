@@ -34,9 +34,7 @@ class Persisting:
 
 
 def _uid_of(owner: object) -> int:
-    return (
-        owner.peer.uid if isinstance(owner, Session) else owner.uid if isinstance(owner, Persisting) else -1
-    )
+    return owner.peer.uid if isinstance(owner, Session) else owner.uid if isinstance(owner, Persisting) else -1
 
 
 class MarkerVerbs:

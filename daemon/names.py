@@ -89,9 +89,7 @@ def shared_claims(devices: Iterable[DeviceInfo]) -> list[str]:
             ]
             owner = next((owners[each] for each in there if each in owners), None)
             if owner is not None:
-                errors.append(
-                    f"[device.{device.name}]: {claim} is that of device {owner} already; want one of its own"
-                )
+                errors.append(f"[device.{device.name}]: {claim} is that of device {owner} already; want one of its own")
                 break
         owners |= dict.fromkeys(device.claims, device.name)
     return errors
@@ -114,11 +112,7 @@ class Node:
 
     def claims(self) -> list[Claim]:
         """Return what an open of this node owns: nothing for a read-only one."""
-        return (
-            []
-            if self.read_only
-            else [(self.device, self.block, channel, self.bit) for channel in self.channels]
-        )
+        return [] if self.read_only else [(self.device, self.block, channel, self.bit) for channel in self.channels]
 
 
 class NameTable:
@@ -148,7 +142,8 @@ class NameTable:
             for wanted in device.inputs:
                 if wanted not in self.nodes:
                     self.errors.append(
-                        f"[device.{device.name}]: reads node {wanted}, which there is not{did_you_mean(wanted, self.nodes)}"
+                        f"[device.{device.name}]: reads node {wanted}, which there is "
+                        f"not{did_you_mean(wanted, self.nodes)}"
                     )
 
     def block(self, node: Node) -> BlockInfo:
@@ -204,18 +199,14 @@ class NameTable:
         where = f"[node.{name}]"
         target = self.nodes.get(alias.of)
         if target is None:
-            self.errors.append(
-                f"{where}: of = {alias.of}, which there is not{did_you_mean(alias.of, self.nodes)}"
-            )
+            self.errors.append(f"{where}: of = {alias.of}, which there is not{did_you_mean(alias.of, self.nodes)}")
             return
         channels = target.channels
         if alias.channels:
             names = {self.block(target).channels[i].name: i for i in target.channels}
             wrong = [c for c in alias.channels if c not in names]
             if wrong:
-                self.errors.append(
-                    f"{where}: {alias.of} has no channel {wrong[0]}{did_you_mean(wrong[0], names)}"
-                )
+                self.errors.append(f"{where}: {alias.of} has no channel {wrong[0]}{did_you_mean(wrong[0], names)}")
                 return
             if len(set(alias.channels)) < len(alias.channels):
                 self.errors.append(f"{where}: a channel is named twice in {alias.channels}")

@@ -33,7 +33,9 @@ if TYPE_CHECKING:
 
 _SEND_BUFFER = 1 << 18
 _START_S = 1.5
-"""How long an open that is not to wait for other clients waits for a device that is just starting; below the client's grace."""
+"""How long an open that is not to wait for other clients waits for a device that is just starting; below the client's
+grace.
+"""
 _AGAIN_S = 0.02
 """A driver that had no room for the message that ends a handle is told again after so long [s]."""
 
@@ -71,7 +73,8 @@ class NodeVerbs:
         if not self._clients.rights.on_node(session.peer, node.name) & right:
             raise Refused(
                 errno.EACCES if right is Right.READ else errno.EPERM,
-                f"{what} of {name}: {session.peer.user} has no right to {in_words(right, ' or ')} it; ask for a [[grant]]",
+                f"{what} of {name}: {session.peer.user} has no right to {in_words(right, ' or ')} it; ask for a "
+                "[[grant]]",
             )
         return node
 
@@ -83,9 +86,7 @@ class NodeVerbs:
             raise Refused(errno.EINVAL, f"open {name}: mode {mode}; want read (1), write (2) or both (3)")
         access = Access(mode)
         if access & Access.WRITE and node.read_only:
-            raise Refused(
-                errno.EACCES, f"open {name} for writing: it is a read-only node; open it for reading"
-            )
+            raise Refused(errno.EACCES, f"open {name} for writing: it is a read-only node; open it for reading")
         if not 0 <= float(lease_s) <= 3600:
             raise Refused(errno.EINVAL, f"open {name}: lease {lease_s} s; want 0 (none) to 3600")
         open_ones = self._clients.handles_of(session.peer)
@@ -101,9 +102,7 @@ class NodeVerbs:
                 raise obstacle
             timeout_s = _START_S
         wait = self._clients.wait(session, number, timeout_s, f"open {name}")
-        wait.why = lambda: str(self._obstacle(node) or "it has just become free").removeprefix(
-            f"open {name}: "
-        )
+        wait.why = lambda: str(self._obstacle(node) or "it has just become free").removeprefix(f"open {name}: ")
 
         def retry() -> None:
             try:
@@ -147,7 +146,8 @@ class NodeVerbs:
             other = "" if holder.node.name == node.name else f" through {holder.node.name}"
             return Refused(
                 errno.EBUSY,
-                f"open {node.name}: held by {holder.session} for {held_s:.1f} s{other}; use {node.name}{READONLY} to observe",
+                f"open {node.name}: held by {holder.session} for {held_s:.1f} s{other}; use {node.name}{READONLY} to "
+                "observe",
             )
         device = self._server.devices.get(node.device)
         if device is None or device.state is not State.UP:
@@ -166,9 +166,7 @@ class NodeVerbs:
 
     def _is_starting(self, node: Node) -> bool:
         device = self._server.devices.get(node.device)
-        return self._server.is_replaced(node.device) or (
-            device is not None and device.state is State.STARTING
-        )
+        return self._server.is_replaced(node.device) or (device is not None and device.state is State.STARTING)
 
     def _grant(self, session: Session, number: int, node: Node, access: Access, lease_s: float) -> None:
         device = self._server.devices[node.device]
@@ -198,9 +196,7 @@ class NodeVerbs:
             self._claims.take(handle.claims, handle)
             behind = [os.getpid(), device.pid]
             value = [handle.number, self._server.names.pack(node), node.channels, node.bit, behind]
-            self._clients.send(
-                session, reply(number, value), [device.page_fds[node.block], readable, ours.fileno()]
-            )
+            self._clients.send(session, reply(number, value), [device.page_fds[node.block], readable, ours.fileno()])
         finally:
             os.close(readable)
             os.close(wake)

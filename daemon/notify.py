@@ -25,9 +25,7 @@ class ServiceManager:
         """Send a state, e.g. ``READY=1``; a manager that has gone away is none of our business."""
         if self._address:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sock:
-                sock.settimeout(
-                    0.0 if state == "WATCHDOG=1" else 0.1
-                )  # a manager that is late must not stop us
+                sock.settimeout(0.0 if state == "WATCHDOG=1" else 0.1)  # a manager that is late must not stop us
                 try:
                     sock.sendto(state.encode(), self._address)
                 except OSError:

@@ -24,7 +24,9 @@ from .nursery_process import NurseryProcess, start_nursery
 from .patience import Patience
 
 MAX_ANSWER = 1 << 20
-"""Bytes of an answer of the nursery: the description of a device of many thousands of channels is long, even compressed."""
+"""Bytes of an answer of the nursery: the description of a device of many thousands of channels is long, even
+compressed.
+"""
 _END_S = 2.0
 """A nursery that has been told to end is killed after so long [s]."""
 DIED = -1
@@ -42,9 +44,7 @@ class Nursery:
         process: one that has just been started; None: start one.
     """
 
-    def __init__(
-        self, loop: Loop, died: Callable[[Nursery], None], process: NurseryProcess | None = None
-    ) -> None:
+    def __init__(self, loop: Loop, died: Callable[[Nursery], None], process: NurseryProcess | None = None) -> None:
         self._loop = loop
         self._died = died
         self._sock, self.pid = process or start_nursery()
@@ -55,9 +55,7 @@ class Nursery:
         loop.watch(self._sock.fileno(), self._receive)
         loop.watch(self._pidfd, self._gone)
 
-    def describe(
-        self, device: str, driver: str, settings: dict[str, Any], folder: str, answer: Answer
-    ) -> None:
+    def describe(self, device: str, driver: str, settings: dict[str, Any], folder: str, answer: Answer) -> None:
         """Validate a device's settings and describe its blocks."""
         self._request(answer, [], Describe(device, driver, settings, folder))
 
@@ -69,7 +67,9 @@ class Nursery:
         self._request(answer, fds, Spawn(device, driver, settings, generation, options))
 
     def check(self, now_s: float) -> str:
-        """Kill it when it owes an answer and is stuck, in a driver's import or stopped; return why, '' while all is well."""
+        """Kill it when it owes an answer and is stuck, in a driver's import or stopped; return why, '' while all is
+        well.
+        """
         if not self._answers or not (why := self._patience.stuck(now_s)):
             return ""
         self._patience.renew(now_s)

@@ -1,4 +1,6 @@
-"""The nursery's process, which a daemon starts first of all: it imports its libraries while the daemon imports its own."""
+"""The nursery's process, which a daemon starts first of all: it imports its libraries while the daemon imports its
+own.
+"""
 
 from __future__ import annotations
 

@@ -44,9 +44,7 @@ class Patience:
         seen_s = self._read(self._seen_s)
         used_s, self._seen_s = seen_s - self._seen_s, seen_s
         self._used_s += used_s
-        if (
-            used_s < 1e-3 and self._state(self._pid) not in "RD"
-        ):  # neither waits for a processor nor for a disk
+        if used_s < 1e-3 and self._state(self._pid) not in "RD":  # neither waits for a processor nor for a disk
             self._asleep_s += passed_s
         if self._used_s > self._limit_s:
             return f"it has worked for {self._used_s:.0f} s of processor time without an end"

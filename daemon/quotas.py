@@ -42,9 +42,7 @@ class Quotas:
         if has + more <= most:
             return ""
         allowed = "" if most == getattr(self._table, name) else f", {MORE} times as many for this user"
-        return (
-            f"user {peer.user} has {has} {what}, and at most {most} are allowed ({name} of [quota]{allowed})"
-        )
+        return f"user {peer.user} has {has} {what}, and at most {most} are allowed ({name} of [quota]{allowed})"
 
     def of_device(self, uid: int) -> list[int]:
         """Return what a driver has to know of a user: how many requests may wait, and how many subscriptions."""

@@ -226,9 +226,7 @@ class Server:
         self._note(self._node_entry(node, who, stop=False))
         self.log("warning", "reset", node=node.name, by=who)
 
-    def _order(
-        self, node: Node, order: type[driver_verbs.NodeStop | driver_verbs.NodeReset], source: str
-    ) -> None:
+    def _order(self, node: Node, order: type[driver_verbs.NodeStop | driver_verbs.NodeReset], source: str) -> None:
         device = self.devices.get(node.device) or self._leaving.get(node.device)
         if device is not None and device.is_there:
             device.send(order(node.block, node.channels, node.bit, source, self.shared.latch.resets))

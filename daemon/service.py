@@ -50,9 +50,7 @@ def serve(config_path: str, given_path: str | None, level: str, process: Nursery
         record = StopRecord(record_path)
     except OSError as error:
         listening.close()
-        want = (
-            "free 1 MB there" if error.errno == errno.ENOSPC else "want a folder that the daemon may write to"
-        )
+        want = "free 1 MB there" if error.errno == errno.ENOSPC else "want a folder that the daemon may write to"
         print(
             f"siomsd: keep stops in {record_path}: {error.strerror}; {want} (state_folder in [workcell])",
             file=sys.stderr,
@@ -144,9 +142,7 @@ def _listen(config_path: str, given: str | None) -> tuple[Listening, str]:
         pass  # the loader will report it, with all other errors
     table = config.workcell if config else None
     path = given or (table.socket if table else "") or socket_path()
-    listening = Listening(
-        path, int(table.socket_mode, 8) if table else 0o660, table.socket_group if table else ""
-    )
+    listening = Listening(path, int(table.socket_mode, 8) if table else 0o660, table.socket_group if table else "")
     folder = config.state_folder(os.environ) if config else ""
     return listening, os.path.join(folder, "stops") if folder else path + ".stops"
 

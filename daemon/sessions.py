@@ -114,7 +114,9 @@ class Session:
 
 
 def peer_of(sock: socket.socket, users: Users) -> Peer:
-    """Return the credentials of the other end as they were when it connected, vouched for by the kernel, without groups left since."""
+    """Return the credentials of the other end as they were when it connected, vouched for by the kernel, without groups
+    left since.
+    """
     pid, uid, gid = struct.unpack("3i", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
     try:
         others = array("I", sock.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, 4 * _MOST_GROUPS))

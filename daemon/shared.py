@@ -24,8 +24,8 @@ class Shared:
         record: what is stopped.
 
     Attributes:
-        fds: descriptors of latch, stop-request file, file of the requests taken, marker table and journal of stops, as a
-            driver gets them.
+        fds: descriptors of latch, stop-request file, file of the requests taken, marker table and journal of stops, as
+            a driver gets them.
     """
 
     def __init__(self, path: str, record: StopRecord) -> None:

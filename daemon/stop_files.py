@@ -35,7 +35,8 @@ class StopFiles:
         fd: of the request file, for the daemon and the drivers.
         taken_fd: of the file that says which request has been taken, for the same.
         client_fds: the two for clients that may stop: to write the one, to read the other.
-        unheard: who asked for a stop that the daemon before this one and its drivers did not live to hear, '' for nobody.
+        unheard: who asked for a stop that the daemon before this one and its drivers did not live to hear, '' for
+            nobody.
     """
 
     def __init__(self, path: str) -> None:
@@ -76,7 +77,10 @@ class StopFiles:
         try:
             os.setxattr(self.fd, _ACL, access_list(who.uids, who.gids))
         except OSError as error:
-            return f"give {self._path}{REQUEST} an access list: {error.strerror}; only root and the daemon's owner can stop while it hangs"
+            return (
+                f"give {self._path}{REQUEST} an access list: {error.strerror}; only root and the daemon's owner can "
+                "stop while it hangs"
+            )
         return ""
 
     def remove(self) -> None:

@@ -116,7 +116,9 @@ class StopRecord:
 
 
 class _Flusher:
-    """Sees that the file reaches the disk, has room for what comes next, and frees its beginning; all of it may take long."""
+    """Sees that the file reaches the disk, has room for what comes next, and frees its beginning; all of it may take
+    long.
+    """
 
     def __init__(self, fd: int) -> None:
         self._fd = fd

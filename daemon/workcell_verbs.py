@@ -40,9 +40,7 @@ class WorkcellVerbs:
         """Answer a client that says who it is."""
         version, name = message
         if version != PROTOCOL_VERSION:
-            raise Refused(
-                errno.EPROTO, f"hello: protocol version {version}; this daemon speaks {PROTOCOL_VERSION}"
-            )
+            raise Refused(errno.EPROTO, f"hello: protocol version {version}; this daemon speaks {PROTOCOL_VERSION}")
         session.name = printable(name, 80)
         rights = self._clients.rights.on_workcell(session.peer)
         value = [PROTOCOL_VERSION, self._clients.bounds.name, int(rights)]
@@ -63,17 +61,27 @@ class WorkcellVerbs:
             "stop_source": latch.source if latch.stopped_ns else "",
             "devices": [
                 {
-                    "name": d.name, "driver": d.info.driver, "state": d.state.value, "pid": d.pid,
-                    "generation": d.generation, "reason": d.reason, "link": d.link[0].name.lower(),
-                    "link_reason": d.link[1], "tick_hz": d.info.tick_hz, "deaths": len(d.restarts.deaths_ns),
-                    "trouble": d.trouble, "age_s": (now - d.started_ns) / 1e9 if d.started_ns else 0.0,
+                    "name": d.name,
+                    "driver": d.info.driver,
+                    "state": d.state.value,
+                    "pid": d.pid,
+                    "generation": d.generation,
+                    "reason": d.reason,
+                    "link": d.link[0].name.lower(),
+                    "link_reason": d.link[1],
+                    "tick_hz": d.info.tick_hz,
+                    "deaths": len(d.restarts.deaths_ns),
+                    "trouble": d.trouble,
+                    "age_s": (now - d.started_ns) / 1e9 if d.started_ns else 0.0,
                 }
                 for d in server.devices.values()
             ],
             "node_stops": server.shared.record.state.nodes(),
-            "sessions": [[str(s), len(s.handles), len(s.waits), self._clients.markers.count(s)] for s in self._clients.sessions],
+            "sessions": [
+                [str(s), len(s.handles), len(s.waits), self._clients.markers.count(s)] for s in self._clients.sessions
+            ],
             "holders": [[h.node.name, str(h.session), (now - h.since_ns) / 1e9] for h in self._clients.nodes.holders()],
-        }  # fmt: skip
+        }
 
     def emergency_stop(self, session: Session, message: EmergencyStop) -> None:
         """Stop the workcell, or a node."""
@@ -99,13 +107,9 @@ class WorkcellVerbs:
         (name,) = message
         if not name:
             if not self._clients.rights.on_workcell(session.peer) & message.right:
-                raise Refused(
-                    errno.EPERM, f"reset: {session.peer.user} has no right to write or administer every node"
-                )
+                raise Refused(errno.EPERM, f"reset: {session.peer.user} has no right to write or administer every node")
             if source := self._server.hear_request():
-                raise Refused(
-                    errno.EAGAIN, f"reset: a stop has just been asked for ({source}); look, and reset again"
-                )
+                raise Refused(errno.EAGAIN, f"reset: a stop has just been asked for ({source}); look, and reset again")
             self._server.reset_workcell(str(session))
             return
         node = self._clients.nodes.find(session, "reset", name, message.right)
@@ -116,9 +120,7 @@ class WorkcellVerbs:
             return
         latch = self._server.shared.latch
         if latch.stopped_ns:
-            raise Refused(
-                errno.EPERM, f"reset {name}: the whole workcell is stopped ({latch.source}); reset that"
-            )
+            raise Refused(errno.EPERM, f"reset {name}: the whole workcell is stopped ({latch.source}); reset that")
         try:
             self._server.reset_node(node, str(session))
         except OSError as error:

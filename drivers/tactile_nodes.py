@@ -8,11 +8,12 @@ then has a table ``shape``:
     load_node = "lord1.fz"               # optional: a force sensor under the finger
     load_scale = 50.0                    # N/m for a newton: one over the length of contact in metres
 
-Requests on ``strain`` and ``shape``: ZERO_DEVICE takes a new baseline from the next frames and is answered when it is in force, or refused when
-something touches or the elements fail; CALIBRATE_DEVICE with the text of a finger's file loads that finger, without an argument its own again; on ``strain`` SET_GAINS and GET_GAINS hold strain per output.
+Requests on ``strain`` and ``shape``: ZERO_DEVICE takes a new baseline from the next frames and is answered when it is
+in force, or refused when something touches or the elements fail; CALIBRATE_DEVICE with the text of a finger's file
+loads that finger, without an argument its own again; on ``strain`` SET_GAINS and GET_GAINS hold strain per output.
 
-The physics is imported when there is a finger: it brings scipy, which takes a second, and drivers of many other sensors have
-this part, too.
+The physics is imported when there is a finger: it brings scipy, which takes a second, and drivers of many other sensors
+have this part, too.
 """
 
 from __future__ import annotations
@@ -89,9 +90,7 @@ def specs(settings: ShapeSettings | None, elements: int, history: int) -> tuple[
         raise ValueError(f"shape: load_age_s = {settings.load_age_s:g}; want a positive time in seconds")
     if settings.settle_frames < 1:
         raise ValueError(f"shape: settle_frames = {settings.settle_frames}; want 1 or more")
-    strains = tuple(
-        ChannelInfo(f"e{i}", "", description="radial strain, tension positive") for i in range(elements)
-    )
+    strains = tuple(ChannelInfo(f"e{i}", "", description="radial strain, tension positive") for i in range(elements))
     shape = tuple(ChannelInfo(name, unit, description=what) for name, unit, what in CHANNELS)
     return (
         BlockSpec(STRAIN, NodeClass.ANALOG, strains, history=history),
@@ -252,9 +251,7 @@ def _finger(settings: ShapeSettings, elements: int) -> Finger:
     try:
         finger = from_toml(read_text(path))
     except OSError as error:
-        raise ValueError(
-            f"shape: finger_file {path}: {error.strerror}; sioms tactile calibrate writes one"
-        ) from None
+        raise ValueError(f"shape: finger_file {path}: {error.strerror}; sioms tactile calibrate writes one") from None
     except ValueError as error:
         raise ValueError(f"shape: finger_file {path}: {error}") from None
     _check(finger, elements, f"shape: finger_file {path}")

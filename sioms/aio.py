@@ -5,8 +5,9 @@
             await mod0.write(sioms.command(0, position=0.1))
             await mod0.wait_until_idle()
 
-Its verbs are those of the blocking face, made of the same list (``sioms.client.faces``); only the waiting differs. Reading needs no waiting: ``read`` is an ordinary call. Only right after an acknowledgement it may
-take until the driver publishes again; ``await node.fresh()`` lets the loop go on meanwhile.
+Its verbs are those of the blocking face, made of the same list (``sioms.client.faces``); only the waiting differs.
+Reading needs no waiting: ``read`` is an ordinary call. Only right after an acknowledgement it may take until the driver
+publishes again; ``await node.fresh()`` lets the loop go on meanwhile.
 
 Concurrency: one event loop, any number of its tasks. Cancelling a task cancels its request.
 """
@@ -133,9 +134,7 @@ class _Requests(_Waiter):
         now_s = monotonic()
         until_s = overdue.until(now_s)
         if until_s:
-            self._looks[number] = self._loop.call_later(
-                until_s - now_s, self._look, number, call, due_s, overdue
-            )
+            self._looks[number] = self._loop.call_later(until_s - now_s, self._look, number, call, due_s, overdue)
             return
         future = self._futures.get(number)
         if future is not None and not future.done():
@@ -254,9 +253,7 @@ class AsyncWorkcell(Awaiting, WorkcellVerbs[AsyncMarker]):
     ) -> N: ...
 
     @overload
-    async def open(
-        self, name: str, mode: str = "r", timeout: float | None = 0.0, *, lease: float = 0.0
-    ) -> Any: ...
+    async def open(self, name: str, mode: str = "r", timeout: float | None = 0.0, *, lease: float = 0.0) -> Any: ...
 
     async def open(
         self,

@@ -1,4 +1,6 @@
-"""Numbers on a command line for argparse: what makes no sense is an error of use, before anything is read or moved. Pure."""
+"""Numbers on a command line for argparse: what makes no sense is an error of use, before anything is read or moved.
+Pure.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Processes that end with the program that starts them, however that ends.
 
-A program that is told to end (SIGTERM, SIGHUP, Ctrl-C) ends what it has started by itself; for one that is killed the kernel
+A program that is told to end (SIGTERM, SIGHUP, Ctrl-C) ends what it has started by itself; for one that is killed the
+kernel
 does so: each child asks it for a SIGTERM on the death of its parent. A daemon that gets it stops its drivers.
 """
 
@@ -49,9 +50,7 @@ class Process:
         RuntimeError: it ended or stayed mute; with what it said.
     """
 
-    def __init__(
-        self, arguments: Sequence[str], ready: str, errors: bool = False, told: bool = False
-    ) -> None:
+    def __init__(self, arguments: Sequence[str], ready: str, errors: bool = False, told: bool = False) -> None:
         pipe: dict[str, int] = {"stderr" if errors else "stdout": subprocess.PIPE}
         pipe |= {"stdin": subprocess.PIPE} if told else {}
         self._process = subprocess.Popen(  # type: ignore[call-overload]
@@ -73,9 +72,7 @@ class Process:
             pass
         if line is None:
             self.kill()
-            raise RuntimeError(
-                f"start {arguments[0]}: it did not say {ready!r}; it said: {' | '.join(self.said[-5:])}"
-            )
+            raise RuntimeError(f"start {arguments[0]}: it did not say {ready!r}; it said: {' | '.join(self.said[-5:])}")
 
     def _next(self, deadline: float) -> str | None:
         """Return the next line, None when it has ended or stays mute."""
@@ -126,6 +123,4 @@ class Process:
 def daemon(config: str, socket_path: str) -> Process:
     """Start a daemon; clients of this process and its children will find it."""
     os.environ["SIOMS_SOCKET"] = socket_path
-    return Process(
-        ["sioms.daemon.main", "--config", config, "--socket", socket_path], "event=ready", errors=True
-    )
+    return Process(["sioms.daemon.main", "--config", config, "--socket", socket_path], "event=ready", errors=True)

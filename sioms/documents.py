@@ -1,7 +1,7 @@
 """TOML and JSON files that anybody may have written: whatever the bytes are, tables or one sentence.
 
-A file is read up to a size, and what it holds is bounded in depth before anybody walks through it. Dates, which none of our
-files hold, and integers beyond 64 bits, which nothing that they are handed to takes, are refused here.
+A file is read up to a size, and what it holds is bounded in depth before anybody walks through it. Dates, which none of
+our files hold, and integers beyond 64 bits, which nothing that they are handed to takes, are refused here.
 
 Without input or output but for ``read_bytes``.
 """
@@ -74,9 +74,7 @@ def _text(text: str | bytes) -> str:
         try:
             plain = text.decode("utf-8")
         except UnicodeDecodeError as error:
-            raise ValueError(
-                f"it is no text in UTF-8 (byte {error.start} is {text[error.start]:#04x})"
-            ) from None
+            raise ValueError(f"it is no text in UTF-8 (byte {error.start} is {text[error.start]:#04x})") from None
     if len(plain) > 4 * MOST_BYTES:
         raise ValueError(f"it is larger than {4 * MOST_BYTES / 2**20:g} MiB")
     return plain

@@ -23,7 +23,7 @@ figure { margin: 1.5em 0; } img { max-width: 100%; } figcaption { color: #555; }
 p.good, p.bad, p.warn { color: inherit; padding: .8em 1em; border-left: 6px solid; } p.good { background: #eef8f3; border-color: #2a7; }
 p.bad { background: #fdf2ea; border-color: #c50; } p.warn { border-color: #c90; }
 td.number { text-align: right; white-space: nowrap; } .small { font-size: .85em; color: #555; }
-"""
+"""  # noqa: E501
 
 
 class Cell(str):

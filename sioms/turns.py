@@ -15,7 +15,8 @@ from collections.abc import Callable, Hashable
 Callback = Callable[[], object]
 
 WINDOW_NS = 1_000_000
-"""What a class of sources may use is counted in windows of this length: a neighbour on the processor waits no longer."""
+"""What a class of sources may use is counted in windows of this length: a neighbour on the processor waits no longer.
+"""
 
 
 class _Source:

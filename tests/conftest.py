@@ -28,11 +28,12 @@ settings.register_profile("search", deadline=None, suppress_health_check=[Health
 settings.register_profile("sioms", settings.get_profile("search"), derandomize=True)
 settings.load_profile("sioms")
 
-# As the drivers and `sioms reconcile` set it for themselves, before numpy is loaded: two workers on two cores, each with two
-# threads that wait for each other by spinning, take many times as long.
+# As the drivers and `sioms reconcile` set it for themselves, before numpy is loaded: two workers on two cores, each
+# with two threads that wait for each other by spinning, take many times as long.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# A suite in the background of a non-interactive shell is started with SIGINT ignored, and its children would inherit that.
+# A suite in the background of a non-interactive shell is started with SIGINT ignored, and its children would inherit
+# that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -86,9 +87,7 @@ class Running:
         lines: all lines of stdout and stderr so far, without their ends.
     """
 
-    def __init__(
-        self, command: Sequence[str | os.PathLike[str]], env: Mapping[str, str], cwd: Path | None
-    ) -> None:
+    def __init__(self, command: Sequence[str | os.PathLike[str]], env: Mapping[str, str], cwd: Path | None) -> None:
         self.command = [os.fspath(part) for part in command]
         self.process = subprocess.Popen(
             self.command,

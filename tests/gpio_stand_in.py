@@ -1,8 +1,9 @@
-"""The driver of GPIO lines on a stand-in for the chip, where there is none: everything above the binding is the real one.
+"""The driver of GPIO lines on a stand-in for the chip, where there is none: everything above the binding is the real
+one.
 
-The stand-in takes the place of ``gpiod.Chip`` and of what it requests; settings, values and events are the binding's own
-classes. It does what the kernel's documents say of requests, active-low, sequence numbers and the event buffer (the newest
-stay). Lines 0 to 7 drive lines 8 to 15, as wires would; ``LINES`` bears their names.
+The stand-in takes the place of ``gpiod.Chip`` and of what it requests; settings, values and events are the binding's
+own classes. It does what the kernel's documents say of requests, active-low, sequence numbers and the event buffer (the
+newest stay). Lines 0 to 7 drive lines 8 to 15, as wires would; ``LINES`` bears their names.
 """
 
 from __future__ import annotations
@@ -53,9 +54,7 @@ class Request:
             return
         self.number, self.of_line[offset] = self.number + 1, self.of_line[offset] + 1
         kind = (
-            gpiod.EdgeEvent.Type.RISING_EDGE
-            if level ^ settings.active_low
-            else gpiod.EdgeEvent.Type.FALLING_EDGE
+            gpiod.EdgeEvent.Type.RISING_EDGE if level ^ settings.active_low else gpiod.EdgeEvent.Type.FALLING_EDGE
         ).value
         self.events.append(gpiod.EdgeEvent(kind, now_ns, offset, self.number, self.of_line[offset]))
 
@@ -104,9 +103,7 @@ class Chip:
             raise ValueError("line offset of out range")
         return line
 
-    def request_lines(
-        self, config: dict[int, gpiod.LineSettings], consumer: str, event_buffer_size: int
-    ) -> Request:
+    def request_lines(self, config: dict[int, gpiod.LineSettings], consumer: str, event_buffer_size: int) -> Request:
         if any(offset in held.lines for held in requests for offset in config):
             raise OSError(errno.EBUSY, "Device or resource busy")
         return Request(config, consumer, event_buffer_size)

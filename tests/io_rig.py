@@ -133,6 +133,4 @@ class Joined:
         block.hear()
         if values is not None:
             return block.write_bits(address, values)
-        return (
-            block.read_input(address, count) if function == 4 else block.read_bits(function, address, count)
-        )
+        return block.read_input(address, count) if function == 4 else block.read_bits(function, address, count)

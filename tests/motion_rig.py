@@ -199,9 +199,7 @@ class Cell:
 
     def __init__(self, n=2, start=0.0, **settings):
         self.markers = Markers()
-        self.bank = DriveBank(
-            [axis(modes=DRIVE_MODES, k=None, **settings) for _ in range(n)], markers=self.markers
-        )
+        self.bank = DriveBank([axis(modes=DRIVE_MODES, k=None, **settings) for _ in range(n)], markers=self.markers)
         self.drives = [Drive() for _ in range(n)]
         for drive in self.drives:
             drive.position = start

@@ -109,9 +109,7 @@ class World:
         self.chance = chance
         self.device = device
         self.clients: list[Client] = []
-        latch, request, taken, markers, journal = (
-            _memory(n) for n in (LATCH_SIZE, 4096, 4096, TABLE_SIZE, 0)
-        )
+        latch, request, taken, markers, journal = (_memory(n) for n in (LATCH_SIZE, 4096, 4096, TABLE_SIZE, 0))
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.control = ours
         self.control.setblocking(False)
@@ -139,9 +137,7 @@ class World:
                 return
         raise AssertionError("the driver does not come up")
 
-    def open(
-        self, block: int, channels: Sequence[int], *, exclusive: bool, bit: int = -1, uid: int = 1000
-    ) -> Client:
+    def open(self, block: int, channels: Sequence[int], *, exclusive: bool, bit: int = -1, uid: int = 1000) -> Client:
         """Open a node as the daemon does."""
         number = len(self.clients) + 1
         shown_block = self.runtime.blocks[block]
@@ -151,10 +147,20 @@ class World:
         self.runtime.clients.attach(
             [theirs.detach(), wake],
             Attach(
-                number, block, list(channels), bit, int(access), exclusive, int(Right.ALL), 0, "tester", uid, [256, 128],
+                number,
+                block,
+                list(channels),
+                bit,
+                int(access),
+                exclusive,
+                int(Right.ALL),
+                0,
+                "tester",
+                uid,
+                [256, 128],
                 f"node{number}",
             ),
-        )  # fmt: skip
+        )
         spec = shown_block.spec
         info = NodeInfo(
             [f"node{number}", int(spec.node_class), not exclusive, [spec.channels[c].pack() for c in channels], bit,
@@ -251,21 +257,19 @@ def own_time(world: list[World]) -> Iterator[None]:
         patch.setattr(sioms.client.node_core, "monotonic_ns", CLOCK)
         patch.setattr(sioms.client.node_core, "sleep", sleep)
         patch.setattr("sioms.sdk.runtime.TimerFd", _Timer)
-        patch.setattr(
-            sioms.sdk.connected, "open_connection", lambda settings, _: world_device(world, settings)
-        )
+        patch.setattr(sioms.sdk.connected, "open_connection", lambda settings, _: world_device(world, settings))
         yield
 
 
 @contextmanager
 def worlds() -> Iterator[Callable[..., World]]:
-    """Give what makes a world of a driver's class, its settings, a seed and perhaps a device, the last of which is the one there is."""
+    """Give what makes a world of a driver's class, its settings, a seed and perhaps a device, the last of which is the
+    one there is.
+    """
     made: list[World] = []
     with own_time(made):
 
-        def make(
-            driver: type[Driver], table: dict[str, Any], seed: int, device: Device | None = None
-        ) -> World:
+        def make(driver: type[Driver], table: dict[str, Any], seed: int, device: Device | None = None) -> World:
             made[:] = [World.__new__(World)]
             made[0].__init__(driver, table, random.Random(seed), device)  # type: ignore[misc]
             return made[0]

@@ -1,8 +1,8 @@
 """A workcell of real objects on one thread, which takes the steps of ``ownership_model`` and tells the state it is in.
 
 The daemon is its server with loader, clients, verbs and record of stops; a driver is its runtime with handles, engine,
-banks and pages; files, sockets, memory and pipes are the kernel's. Replaced are only the clock, who forks a process, what
-the kernel says about peers and deaths, and the loops, which here serve what the schedule says.
+banks and pages; files, sockets, memory and pipes are the kernel's. Replaced are only the clock, who forks a process,
+what the kernel says about peers and deaths, and the loops, which here serve what the schedule says.
 """
 
 from __future__ import annotations
@@ -440,9 +440,15 @@ class Cell:
         assert len(handles) == sum(bool(d.claim) for d in devices), "no handle without an owner"
         assert len(server.clients.nodes._claims) == len(handles), "nothing is owned without a handle"
         return State(
-            True, bool(latch.stopped_ns), tuple(name in stopped_nodes for name in NAMES), self._view_request(), self.guest,
-            tuple(clients), waiting, devices,
-        )  # fmt: skip
+            True,
+            bool(latch.stopped_ns),
+            tuple(name in stopped_nodes for name in NAMES),
+            self._view_request(),
+            self.guest,
+            tuple(clients),
+            waiting,
+            devices,
+        )
 
     def _view_request(self) -> int:
         request = self._server.shared.request
@@ -537,9 +543,7 @@ def cells() -> Iterator[Callable[[], Cell]]:
     def make() -> Cell:
         if made:
             made.pop().end()
-        made.append(
-            Cell(tempfile.mkdtemp(prefix="sioms-", dir="/dev/shm" if os.path.isdir("/dev/shm") else None))
-        )
+        made.append(Cell(tempfile.mkdtemp(prefix="sioms-", dir="/dev/shm" if os.path.isdir("/dev/shm") else None)))
         return made[-1]
 
     with pytest.MonkeyPatch.context() as patch:

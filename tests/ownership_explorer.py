@@ -65,7 +65,9 @@ MOST_STEPS_TO_REST = 100
 
 
 class Explored(NamedTuple):
-    """How far it went: states, steps between them, depth to which they are complete, steps that the real objects took."""
+    """How far it went: states, steps between them, depth to which they are complete, steps that the real objects
+    took.
+    """
 
     states: int
     steps: int
@@ -101,10 +103,9 @@ def settle(state: State) -> tuple[State, list[Action]]:
 Graph = dict[State, list[tuple[Action, State, str]]]
 
 
-def explore(
-    way: Iterable[Action], depth: int, goes_on: Callable[[], bool] = lambda: True
-) -> tuple[Graph, State, int]:
-    """Return all states up to a depth (each for those that differ by names) with the steps that leave them, and where it began.
+def explore(way: Iterable[Action], depth: int, goes_on: Callable[[], bool] = lambda: True) -> tuple[Graph, State, int]:
+    """Return all states up to a depth (each for those that differ by names) with the steps that leave them, and where
+    it began.
 
     Raises:
         Broken: a promise does not hold; with the steps that lead there.
@@ -262,7 +263,8 @@ OFTEN = {"move": 8.0, "open": 2.0, "connect": 4.0, "crash": 0.2, "suspend": 0.5,
 
 
 def wander(make: Callable[[], Cell], steps: int, seed: int) -> int:
-    """Take steps at random, from where nothing has happened yet; what happens by itself is favoured, so that all goes on.
+    """Take steps at random, from where nothing has happened yet; what happens by itself is favoured, so that all goes
+    on.
 
     Returns:
         How many different steps that were, names apart.
@@ -332,9 +334,7 @@ def _named(action: Action, clients: tuple[int, ...], devices: tuple[int, ...]) -
 
 
 def _difference(seen: State, wanted: State) -> str:
-    return "; ".join(
-        f"{n} is {a}; want {b}" for n, a, b in zip(State._fields, seen, wanted, strict=True) if a != b
-    )
+    return "; ".join(f"{n} is {a}; want {b}" for n, a, b in zip(State._fields, seen, wanted, strict=True) if a != b)
 
 
 def run(name: str, depth: int, goes_on: Callable[[], bool] = lambda: True) -> Explored:
@@ -369,9 +369,7 @@ def renamed(s: State, clients: tuple[int, ...], devices: tuple[int, ...]) -> Sta
         stops[devices[d]] = s.node_stops[d]
         new_devices[devices[d]] = Device(device.phase, held(device.claim), tuple(map(driver, device.driver)))
     waiting = tuple((clients[c], devices[d]) for c, d in s.waiting)
-    return s._replace(
-        node_stops=tuple(stops), clients=tuple(new_clients), waiting=waiting, devices=tuple(new_devices)
-    )
+    return s._replace(node_stops=tuple(stops), clients=tuple(new_clients), waiting=waiting, devices=tuple(new_devices))
 
 
 ALIKE = [((*clients, GUEST), devices) for clients in ((0, 1), (1, 0)) for devices in ((0, 1), (1, 0))]
@@ -384,15 +382,9 @@ def typical(s: State) -> State:
 
 def main(arguments: list[str]) -> int:
     """Explore, walk, and tell how far it went."""
-    parser = argparse.ArgumentParser(
-        description="Explore the protocol of ownership and stops on the real objects."
-    )
-    parser.add_argument(
-        "--model-depth", type=int, default=0, help="steps from each beginning, in the model only"
-    )
-    parser.add_argument(
-        "--depth", type=int, default=0, help="steps from each beginning, taken by the real objects"
-    )
+    parser = argparse.ArgumentParser(description="Explore the protocol of ownership and stops on the real objects.")
+    parser.add_argument("--model-depth", type=int, default=0, help="steps from each beginning, in the model only")
+    parser.add_argument("--depth", type=int, default=0, help="steps from each beginning, taken by the real objects")
     parser.add_argument("--walks", type=int, default=0, help="random walks of 400 steps")
     parser.add_argument("--seed", type=int, default=0, help="of the first walk")
     options = parser.parse_args(arguments)
@@ -400,9 +392,7 @@ def main(arguments: list[str]) -> int:
         if options.model_depth:
             graph, _, reached = explore(begin(name), options.model_depth)
             steps = sum(map(len, graph.values()))
-            print(
-                f"model, {name}: depth {reached}: {len(graph)} states, {steps} steps between them", flush=True
-            )
+            print(f"model, {name}: depth {reached}: {len(graph)} states, {steps} steps between them", flush=True)
         if options.depth:
             found = run(name, options.depth)
             print(

@@ -1,8 +1,9 @@
 """A model of who owns what and of what is stopped: clients, the daemon and two drivers, and the messages between them.
 
-It says what each step of one process does to all that anybody could tell apart, step by step as the processes take them:
-a message lies in its queue until its receiver takes it, and anybody may die in between. It is written from the documents
-(docs/decisions/0012, 0140, 0152), not from the code; ``ownership_cell.Cell`` takes the same steps on the real objects.
+It says what each step of one process does to all that anybody could tell apart, step by step as the processes take
+them: a message lies in its queue until its receiver takes it, and anybody may die in between. It is written from the
+documents (docs/decisions/0012, 0140, 0152), not from the code; ``ownership_cell.Cell`` takes the same steps on the real
+objects.
 
 Not in it: time (leases and pauses run out as steps of their own), values, and what lies within one step of a process.
 
@@ -77,7 +78,8 @@ class State(NamedTuple):
     Attributes:
         daemon: whether it lives.
         stopped, node_stops: what has been stopped and not been reset, as every answer said it.
-        request: of the stop-request file: 0: none that the daemon does not know; 1: nobody has heard it; 2: a driver has.
+        request: of the stop-request file: 0: none that the daemon does not know; 1: nobody has heard it; 2: a driver
+            has.
         guest: whether GUEST may write.
         clients: each (OUT, IN or DEAD, last words).
         waiting: opens that wait, the oldest first.
@@ -159,9 +161,7 @@ class Step:
             self._grant(c, d)
 
     def _grant(self, c: int, d: int) -> None:
-        granted = self._may_write(c) and self._send(
-            d, ATTACH, c, "dead" if self.clients[c][0] == DEAD else ""
-        )
+        granted = self._may_write(c) and self._send(d, ATTACH, c, "dead" if self.clients[c][0] == DEAD else "")
         self.answer = "done" if granted else "refused"
         if granted:
             self._set(d, claim=(c, OPEN))
@@ -206,9 +206,7 @@ class Step:
         self.stopped, self.node_stops = False, [False] * DEVICES
         for d in range(DEVICES):
             if self._driver(d) is not None:
-                inbox = [
-                    (VOID if v in (STOP, RESET) else v, n, m) for v, n, m in self.devices[d].driver[0].inbox
-                ]
+                inbox = [(VOID if v in (STOP, RESET) else v, n, m) for v, n, m in self.devices[d].driver[0].inbox]
                 self._drive(d, missed=True, asked=False, inbox=tuple(inbox))
 
     def _hear_request(self) -> int:
@@ -411,7 +409,9 @@ class Step:
             self.start(d)
 
     def start(self, d: int) -> None:
-        self._set(d, phase=STARTING, driver=(Driver(outbox=(READY,), node_stop=self.node_stops[d], stopped=self.stopped),))  # fmt: skip
+        self._set(
+            d, phase=STARTING, driver=(Driver(outbox=(READY,), node_stop=self.node_stops[d], stopped=self.stopped),)
+        )
 
     def beat(self) -> None:
         self._hear_request()

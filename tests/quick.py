@@ -2,8 +2,10 @@
 
     python tests/quick.py [--since REVISION] [--seconds S]     print what would run, and why
 
-What is left of the time goes to the quickest of the others. What has changed: against REVISION; without, what is not committed and what is not in the upstream branch, or the last
-commit when there is neither. How near a test file is: by imports, from what it imports or names down to what has changed.
+What is left of the time goes to the quickest of the others. What has changed: against REVISION; without, what is not
+    committed and what is not in the upstream branch, or the last
+commit when there is neither. How near a test file is: by imports, from what it imports or names down to what has
+    changed.
 How long it takes: tests/durations.json, which `./dev test --durations` writes anew.
 """
 
@@ -58,9 +60,7 @@ def choose(distances: Mapping[str, int], seconds: Mapping[str, float], budget_s:
     return chosen
 
 
-def distances(
-    changed: Iterable[str], imports: Mapping[str, set[str]], tests: Mapping[str, set[str]]
-) -> dict[str, int]:
+def distances(changed: Iterable[str], imports: Mapping[str, set[str]], tests: Mapping[str, set[str]]) -> dict[str, int]:
     """Return how many imports lead from each test file to what has changed, FAR for none.
 
     Args:

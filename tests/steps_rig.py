@@ -13,7 +13,8 @@ def carry_out(steps: Steps, answer: Callable[[Step], Any]) -> Any:
 
     Args:
         steps: of the hook.
-        answer: carries out one step; what it returns, or the LinkError or DeviceError that it raises, goes back to the hook.
+        answer: carries out one step; what it returns, or the LinkError or DeviceError that it raises, goes back to the
+            hook.
 
     Returns:
         What the hook returns.

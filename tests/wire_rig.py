@@ -183,9 +183,7 @@ class Wire:
 
     def pid(self, device: str) -> int:
         """Return the process of a driver."""
-        return int(
-            next(each for each in self.client.status()["devices"] if each["name"] == device)["pid"] or 0
-        )
+        return int(next(each for each in self.client.status()["devices"] if each["name"] == device)["pid"] or 0)
 
     def run_client(self, node: str, velocity: float) -> Any:
         """Start a client of its own that can run an axis."""
@@ -198,9 +196,7 @@ class Wire:
         client.wait_line(f"moving {number}")
         wait_for(moving, "motion")
 
-    def check_deaths(
-        self, node: str, velocity: float, speed: Callable[[], float], fast: float, rest_s: float
-    ) -> None:
+    def check_deaths(self, node: str, velocity: float, speed: Callable[[], float], fast: float, rest_s: float) -> None:
         """Kill client, driver and daemon in motion: the device is at rest in time, and nothing resumes.
 
         Args:

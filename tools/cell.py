@@ -20,12 +20,8 @@ from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
 def add_parser(subparsers: Any) -> None:
     """Add the commands of this module."""
     one = subparsers.add_parser("list", help="list the nodes of the workcell")
-    one.add_argument(
-        "-v", "--verbose", action="store_true", help="also channels, bits and read-only companions"
-    )
-    one.add_argument(
-        "--names", action="store_true", help="only names, one per line; nothing if no daemon is running"
-    )
+    one.add_argument("-v", "--verbose", action="store_true", help="also channels, bits and read-only companions")
+    one.add_argument("--names", action="store_true", help="only names, one per line; nothing if no daemon is running")
     one.add_argument("--json", action="store_true", help="as JSON")
     one = subparsers.add_parser("info", help="describe a node: channels, units, limits")
     one.add_argument("node", metavar="NODE")
@@ -33,12 +29,8 @@ def add_parser(subparsers: Any) -> None:
     one = subparsers.add_parser("status", help="print the state of devices, sessions and the emergency stop")
     one.add_argument("--json", action="store_true", help="as JSON")
     subparsers.add_parser("reload", help="make the daemon reload its configuration")
-    one = subparsers.add_parser(
-        "stop", help="emergency stop, latched until `sioms reset`; not a safety-rated function"
-    )
-    one.add_argument(
-        "node", metavar="NODE", nargs="?", default="", help="a node; default: the whole workcell"
-    )
+    one = subparsers.add_parser("stop", help="emergency stop, latched until `sioms reset`; not a safety-rated function")
+    one.add_argument("node", metavar="NODE", nargs="?", default="", help="a node; default: the whole workcell")
     one = subparsers.add_parser(
         "wait", help="wait until the daemon is ready: all devices have started, or are in fault"
     )
@@ -51,9 +43,7 @@ def add_parser(subparsers: Any) -> None:
         help="time-out (default: 60)",
     )
     one = subparsers.add_parser("reset", help="clear a latched stop or fault; no motion is resumed")
-    one.add_argument(
-        "node", metavar="NODE", nargs="?", default="", help="a node; default: the whole workcell"
-    )
+    one.add_argument("node", metavar="NODE", nargs="?", default="", help="a node; default: the whole workcell")
     one = subparsers.add_parser("check", help="check a configuration; exit status 2 if it has errors")
     one.add_argument("config", metavar="CONFIG", help="configuration (TOML)")
 
@@ -138,10 +128,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """
     cells = [tuple(head), *[tuple(row) for row in rows]]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
-    return [
-        "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-        for row in cells
-    ]
+    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in cells]
 
 
 def print_json(value: object) -> None:
@@ -204,16 +191,15 @@ def _list(verbose: bool, names_only: bool, as_json: bool) -> int:
         for e in shown
     ]  # fmt: skip
     print(
-        "\n".join(
-            table(("node", "class", "channels", "access", "device", "state", "held by"), rows)
-            + troubles(status)
-        )
+        "\n".join(table(("node", "class", "channels", "access", "device", "state", "held by"), rows) + troubles(status))
     )
     return 0
 
 
 def troubles(status: dict[str, Any], device: str = "", node: str = "") -> list[str]:
-    """Return what is stopped or in fault, by whom or why, and which command clears it; of one node's device, or of all."""
+    """Return what is stopped or in fault, by whom or why, and which command clears it; of one node's device, or of
+    all.
+    """
     lines = []
     if status["stopped_ns"]:
         lines.append(f"EMERGENCY STOP by {status['stop_source']}; `sioms reset` clears it")
@@ -225,11 +211,13 @@ def troubles(status: dict[str, Any], device: str = "", node: str = "") -> list[s
             continue
         if each["state"] == "fault":
             lines.append(
-                f"{each['name']}: device in fault: {each['reason'].removeprefix(each['name'] + ': ')}; `sioms reset` tries it again"
+                f"{each['name']}: device in fault: {each['reason'].removeprefix(each['name'] + ': ')}; `sioms reset` "
+                "tries it again"
             )
         elif each["trouble"]:
             lines.append(
-                f"{each['name']}: {each['trouble'].removeprefix(each['name'] + ': ')}; `sioms reset {node or each['name']}` clears it"
+                f"{each['name']}: {each['trouble'].removeprefix(each['name'] + ': ')}; `sioms reset "
+                f"{node or each['name']}` clears it"
             )
     return ["", *lines] if lines else []
 
@@ -254,9 +242,7 @@ def describe(info: NodeInfo) -> list[str]:
         lines.append(f"buffer:    {info.buffer_capacity} commands an axis")
     lines.append("")
     rows = [_channel(i, channel, info.node_class) for i, channel in enumerate(info.channels)]
-    return lines + table(
-        ("#", "channel", "unit", "from", "to", "further limits", "modes", "description"), rows
-    )
+    return lines + table(("#", "channel", "unit", "from", "to", "further limits", "modes", "description"), rows)
 
 
 def _channel(index: int, channel: ChannelInfo, node_class: NodeClass) -> tuple[str, ...]:
@@ -265,9 +251,7 @@ def _channel(index: int, channel: ChannelInfo, node_class: NodeClass) -> tuple[s
     limits = ", ".join(f"{name} {value:g}" for name, value in channel.limits.items())
     modes = ""
     if node_class is NodeClass.AXIS:
-        quantities = [
-            m.name.lower().replace("_", " ") for m in ControlMode if m & 0x3F & channel.modes and m.name
-        ]
+        quantities = [m.name.lower().replace("_", " ") for m in ControlMode if m & 0x3F & channel.modes and m.name]
         modes = ", ".join(quantities)
     elif node_class is NodeClass.BINARY:
         limits = f"{channel.width} bit{'s' * (channel.width != 1)}"
@@ -283,16 +267,23 @@ def status_lines(status: dict[str, Any], now_ns: int) -> list[str]:
             f"EMERGENCY STOP for {(now_ns - stopped) / 1e9:.1f} s: {status['stop_source']}; `sioms reset` clears it"
         )
     rows = [
-        (d["name"], d["driver"], d["state"], d["link"], str(d["pid"] or ""), f"{d['tick_hz']:g} Hz", f"{d['age_s']:.0f} s",
-         str(d["deaths"]), d["reason"] or d["link_reason"] or d["trouble"])
+        (
+            d["name"],
+            d["driver"],
+            d["state"],
+            d["link"],
+            str(d["pid"] or ""),
+            f"{d['tick_hz']:g} Hz",
+            f"{d['age_s']:.0f} s",
+            str(d["deaths"]),
+            d["reason"] or d["link_reason"] or d["trouble"],
+        )
         for d in status["devices"]
-    ]  # fmt: skip
+    ]
     head = ("device", "driver", "state", "link", "pid", "rate", "up for", "deaths", "why")
     lines += ["", *table(head, rows), ""]
     lines += [f"{line}" for line in troubles({**status, "stopped_ns": 0})[1:]]
     holders = [(name, who, f"{held_s:.1f} s") for name, who, held_s in status["holders"]]
-    sessions = [
-        (who, str(handles), str(waits), str(markers)) for who, handles, waits, markers in status["sessions"]
-    ]
+    sessions = [(who, str(handles), str(waits), str(markers)) for who, handles, waits, markers in status["sessions"]]
     lines += [*table(("held node", "by", "for"), holders), ""] if holders else []
     return lines + table(("session", "handles", "waits", "markers"), sessions)

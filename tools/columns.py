@@ -84,20 +84,13 @@ class Columns:
             ValueError: a number that must be whole is not.
         """
         if self._info.node_class is NodeClass.ANALOG:
-            return b"".join(
-                [ANALOG_WRITE.pack(c, 0, x) for c, x in zip(self._channels, numbers, strict=True)]
-            )
+            return b"".join([ANALOG_WRITE.pack(c, 0, x) for c, x in zip(self._channels, numbers, strict=True)])
         if self._info.node_class is NodeClass.BINARY:
             return b"".join(
-                [
-                    BINARY_WRITE.pack(c, 0, _whole(x, "data"), 0)
-                    for c, x in zip(self._channels, numbers, strict=True)
-                ]
+                [BINARY_WRITE.pack(c, 0, _whole(x, "data"), 0) for c, x in zip(self._channels, numbers, strict=True)]
             )
         width = len(self._names)
-        return b"".join(
-            [self._axis(c, numbers[i * width : (i + 1) * width]) for i, c in enumerate(self._channels)]
-        )
+        return b"".join([self._axis(c, numbers[i * width : (i + 1) * width]) for i, c in enumerate(self._channels)])
 
     def open_ended(self, numbers: Sequence[float]) -> bool:
         """Tell whether an iteration with these numbers leaves an axis in motion without an end."""

@@ -33,9 +33,7 @@ def _work(words: Sequence[str]) -> None:
     line = fold("devin", words)
     timed = any(key in line.common for key in "rtL")
     if line.numbers:
-        raise UsageError(
-            f"{line.numbers[0]}: devin takes no numbers; an option's number stands right behind it"
-        )
+        raise UsageError(f"{line.numbers[0]}: devin takes no numbers; an option's number stands right behind it")
     if not line.targets:
         raise UsageError("no device named; try --help")
     _check_trailing(line, timed)

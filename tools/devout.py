@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 
 DEFAULT_COUNT = 100
 FROZEN_S = 2.0
-"""A devout that is silent for so long is stopped, frozen or swapped out, and its axes halt [s]; it does not depend on rows."""
+"""A devout that is silent for so long is stopped, frozen or swapped out, and its axes halt [s]; it does not depend on
+rows.
+"""
 
 
 class BadInput(Exception):
@@ -41,13 +43,9 @@ def _work(words: Sequence[str]) -> None:
     if not line.targets:
         raise UsageError("no device named; try --help")
     if line.trailing:
-        raise UsageError(
-            f"-{next(iter(line.trailing))} holds for the device that follows it, and none follows"
-        )
+        raise UsageError(f"-{next(iter(line.trailing))} holds for the device that follows it, and none follows")
     if "H" in line.common and "lease" in line.common:
-        raise UsageError(
-            "-H and --lease exclude each other: one goes on without rows, the other ends without them"
-        )
+        raise UsageError("-H and --lease exclude each other: one goes on without rows, the other ends without them")
     tokens = Tokens("skip-bad-lines" in line.common)
     if line.numbers:
         tokens.feed((" ".join(line.numbers) + " ").encode())

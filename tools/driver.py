@@ -14,7 +14,8 @@ from .cell import print_json, table
 ABOUT = (
     "check runs drivers under their own daemon against the simulator given by their rig, over a wire that "
     "damages and loses messages and is disconnected and reconnected; it stops axes in every state and kills client, "
-    "driver and daemon in motion. trace records the traffic on a device's line, replay runs its driver against the record."
+    "driver and daemon in motion. trace records the traffic on a device's line, replay runs its driver against the "
+    "record."
 )
 
 
@@ -24,19 +25,11 @@ def add_parser(subparsers: Any) -> None:
     actions = actions.add_subparsers(dest="action", metavar="ACTION", required=True)
     one = actions.add_parser("list", help="list the installed drivers")
     one.add_argument("--json", action="store_true", help="as JSON")
-    one = actions.add_parser(
-        "check", help="test drivers with noise, loss, unplugging, stops and process deaths"
-    )
-    one.add_argument(
-        "drivers", metavar="DRIVER", nargs="*", help="registered name, register map, or a Python file"
-    )
+    one = actions.add_parser("check", help="test drivers with noise, loss, unplugging, stops and process deaths")
+    one.add_argument("drivers", metavar="DRIVER", nargs="*", help="registered name, register map, or a Python file")
     one.add_argument("--all", action="store_true", help="all shipped drivers and register maps")
-    one.add_argument(
-        "--full", action="store_true", help="longer trials and all combinations: minutes per driver"
-    )
-    one.add_argument(
-        "--only", metavar="TRIAL,...", default="", help="only these trials; an unknown name lists all"
-    )
+    one.add_argument("--full", action="store_true", help="longer trials and all combinations: minutes per driver")
+    one.add_argument("--only", metavar="TRIAL,...", default="", help="only these trials; an unknown name lists all")
     one.add_argument(
         "--simulator",
         "--counterpart",
@@ -44,24 +37,16 @@ def add_parser(subparsers: Any) -> None:
         default="",
         help="module or file of the simulator, and its options",
     )
-    one.add_argument(
-        "--config", metavar="FILE", type=Path, help="TOML of the device; {port} stands for its port"
-    )
-    one.add_argument(
-        "--report", metavar="FILE", type=Path, help="write the report, as HTML when it ends in .html"
-    )
+    one.add_argument("--config", metavar="FILE", type=Path, help="TOML of the device; {port} stands for its port")
+    one.add_argument("--report", metavar="FILE", type=Path, help="write the report, as HTML when it ends in .html")
     one.add_argument("--json", metavar="FILE", type=Path, help="write all results as JSON")
-    one.add_argument(
-        "-j", "--jobs", metavar="N", type=int, default=1, help="drivers checked at the same time"
-    )
+    one.add_argument("-j", "--jobs", metavar="N", type=int, default=1, help="drivers checked at the same time")
     one = actions.add_parser("trace", help="record the traffic on a device's line")
     one.add_argument("config", metavar="CONFIG", type=Path, help="configuration (TOML)")
     one.add_argument("device", metavar="DEVICE", help="name of the device in it")
     one.add_argument("-o", "--output", metavar="FILE", type=Path, help="output file (default: DEVICE.trace)")
     one.add_argument("--seconds", metavar="N", type=float, help="duration (default: until interrupted)")
-    one.add_argument(
-        "--socket", metavar="PATH", default="", help="socket of the daemon (default: a temporary path)"
-    )
+    one.add_argument("--socket", metavar="PATH", default="", help="socket of the daemon (default: a temporary path)")
     one = actions.add_parser("replay", help="run a driver against a recorded trace")
     one.add_argument("trace", metavar="TRACE", type=Path, help="file of sioms driver trace")
     one.add_argument("--ignore", metavar="A:B,...", default="", help="bytes of a request to ignore, e.g. 0:2")

@@ -75,9 +75,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
         return answer("sioms", "version")
     if as_program and signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
-        signal.signal(
-            signal.SIGINT, signal.default_int_handler
-        )  # the command may have something to put in order
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # the command may have something to put in order
     return _guarded(wanted, module, args)
 
 
@@ -86,7 +84,9 @@ EXTRAS = {"gpiod": "gpio", "matplotlib": "report", "numba": "fast"}
 
 
 def _begin() -> None:
-    """Be a program: one that is told to end leaves nothing behind, an interrupt while modules are imported is the end and no traceback, a closed output an error."""
+    """Be a program: one that is told to end leaves nothing behind, an interrupt while modules are imported is the end
+    and no traceback, a closed output an error.
+    """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     for number in (signal.SIGTERM, signal.SIGHUP):

@@ -93,7 +93,7 @@ A write consists of any number of contiguous write records. A read is one array 
 per channel and column, in the node's page in shared memory. Units are declared per channel; u is m or rad, f is N or N*m.
 `i` and `I` are integers of 4 bytes, `q` of 8 bytes, `d` is a double. A column with a flag is used only if that flag is set
 in `control_mode`.
-"""
+"""  # noqa: E501
 
 
 def records_page() -> str:
@@ -103,9 +103,7 @@ def records_page() -> str:
         for node_class in (NodeClass.AXIS, NodeClass.ANALOG, NodeClass.BINARY):
             rows = [_column_row(column, flagged=verb == "Write") for column in tables[node_class].values()]
             head = (
-                "| column | type | unit | flag | meaning |"
-                if verb == "Write"
-                else "| column | type | unit | meaning |"
+                "| column | type | unit | flag | meaning |" if verb == "Write" else "| column | type | unit | meaning |"
             )
             rule = "| --- " * (head.count("|") - 1) + "|"
             parts.append("\n".join([f"## {verb} {node_class.name.lower()}", "", head, rule, *rows]) + "\n")
@@ -162,9 +160,7 @@ def tool_page(tool: str) -> str:
     options: list[str] = []
     for title, group in option_groups(tool):
         options += [f".SS {roff(title[0].upper() + title[1:])}", *_options(group)]
-    examples = [
-        line for what, command in manual.examples for line in (".TP", f".B {roff(command)}", roff(what))
-    ]
+    examples = [line for what, command in manual.examples for line in (".TP", f".B {roff(command)}", roff(what))]
     return _page(
         tool, 1, manual.does, list(manual.synopsis),
         [
@@ -215,15 +211,15 @@ def driver_page() -> str:
     """Return the manual page of ``sioms driver``."""
     actions = driver_actions()
     synopsis = [
-        f"{name} {parser.format_usage().partition(name)[2].strip()}".strip()
-        for name, (_, parser) in actions.items()
+        f"{name} {parser.format_usage().partition(name)[2].strip()}".strip() for name, (_, parser) in actions.items()
     ]
     body = [
-        line
-        for name, (text, parser) in actions.items()
-        for line in (f".SS {name}", roff(text), *_arguments(parser))
+        line for name, (text, parser) in actions.items() for line in (f".SS {name}", roff(text), *_arguments(parser))
     ]
-    status = "0 when nothing failed, 1 when a trial or a replay failed, 2 for what cannot be done, with one line on standard error."
+    status = (
+        "0 when nothing failed, 1 when a trial or a replay failed, 2 for what cannot be done, with one line on "
+        "standard error."
+    )
     return _page(
         "sioms-driver", 1, "list, check, record and replay drivers", [" ".join(usage.split()) for usage in synopsis],
         [
@@ -244,15 +240,21 @@ def daemon_page() -> str:
         "SIGTERM and SIGINT stop all motion and end it.",
     ]
     return _page(
-        "siomsd", 8, "device daemon of a workcell", ["--config FILE [OPTION]..."],
+        "siomsd",
+        8,
+        "device daemon of a workcell",
+        ["--config FILE [OPTION]..."],
         [
             ("description", _paragraphs(text)),
             ("options", _options(DAEMON_OPTIONS)),
-            ("exit status", [roff("0 after an ordinary end; 1 when it cannot listen; 2 when the configuration is wrong.")]),
+            (
+                "exit status",
+                [roff("0 after an ordinary end; 1 when it cannot listen; 2 when the configuration is wrong.")],
+            ),
             ("environment", [roff(VARIABLES)]),
             ("see also", _see_also("siomsd")),
         ],
-    )  # fmt: skip
+    )
 
 
 # --- completions ---------------------------------------------------------------------------------
@@ -288,10 +290,7 @@ def bash() -> str:
         "        return",
         "    fi",
         "    case ${COMP_WORDS[2]} in",
-        *[
-            f"    {name}) options='{_long_options(parser)}' ;;"
-            for name, (_, parser) in driver_actions().items()
-        ],
+        *[f"    {name}) options='{_long_options(parser)}' ;;" for name, (_, parser) in driver_actions().items()],
         "    esac",
         '    if [[ $word == -* ]]; then mapfile -t COMPREPLY < <(compgen -W "$options" -- "$word")',
         '    else mapfile -t COMPREPLY < <(compgen -f -- "$word"); fi',
@@ -315,9 +314,7 @@ def bash() -> str:
 
 
 def _long_options(parser: argparse.ArgumentParser) -> str:
-    return " ".join(
-        word for action in parser._actions for word in action.option_strings if word.startswith("--")
-    )
+    return " ".join(word for action in parser._actions for word in action.option_strings if word.startswith("--"))
 
 
 def _quoted(text: str) -> str:
@@ -341,40 +338,44 @@ def zsh() -> str:
                 value = f":{o.value}:" if o.value else ""
                 lines.append(f"        '*--{o.long}{glue}[{_quoted(o.text)}]{value}' \\")
                 if o.letter:
-                    lines.append(
-                        f"        '*-{o.letter}{'-' if o.value else ''}[{_quoted(o.text)}]{value}' \\"
-                    )
+                    lines.append(f"        '*-{o.letter}{'-' if o.value else ''}[{_quoted(o.text)}]{value}' \\")
         lines.append("        '*:marker:'" if tool == "smarkers" else "        '*:node:_sioms_nodes'")
         lines.append("    ;;")
     lines += ["sioms)", "    if ((CURRENT == 2)); then", "        local -a commands", "        commands=("]
     lines += [f"            '{name}:{_quoted(c.text)}'" for name, c in COMMANDS.items()]
     lines += [
-        "        )", "        _describe command commands", "    else", "        case $words[2] in",
-        f"        {'|'.join(_NODE_COMMANDS)}) _sioms_nodes ;;", f"        driver) ((CURRENT == 3)) && compadd {' '.join(driver_actions())} || _files ;;", "        *) _files ;;",
-        "        esac", "    fi", "    ;;", "esac", "",
-    ]  # fmt: skip
+        "        )",
+        "        _describe command commands",
+        "    else",
+        "        case $words[2] in",
+        f"        {'|'.join(_NODE_COMMANDS)}) _sioms_nodes ;;",
+        f"        driver) ((CURRENT == 3)) && compadd {' '.join(driver_actions())} || _files ;;",
+        "        *) _files ;;",
+        "        esac",
+        "    fi",
+        "    ;;",
+        "esac",
+        "",
+    ]
     return "\n".join(lines)
 
 
 def fish() -> str:
     """Return the completion for fish."""
-    lines = [
-        "# Completion for fish; node names come from the running daemon. Generated by sioms.tools.generate."
-    ]
+    lines = ["# Completion for fish; node names come from the running daemon. Generated by sioms.tools.generate."]
     for tool in TOOLS:
         nodes = "" if tool == "smarkers" else " -a '(sioms list --names 2>/dev/null)'"
         lines.append(f"complete -c {tool} -f{nodes}")
         for _, group in option_groups(tool):
             for o in group:
                 short = f" -s {o.letter}" if o.letter else ""
-                lines.append(
-                    f"complete -c {tool}{short} -l {o.long}{' -x' if o.value else ''} -d '{_quoted(o.text)}'"
-                )
+                lines.append(f"complete -c {tool}{short} -l {o.long}{' -x' if o.value else ''} -d '{_quoted(o.text)}'")
     lines.append("complete -c sioms -n __fish_use_subcommand -f")
     for name, command in COMMANDS.items():
         lines.append(f"complete -c sioms -n __fish_use_subcommand -a {name} -d '{_quoted(command.text)}'")
     lines.append(
-        f"complete -c sioms -n '__fish_seen_subcommand_from {' '.join(_NODE_COMMANDS)}' -f -a '(sioms list --names 2>/dev/null)'"
+        f"complete -c sioms -n '__fish_seen_subcommand_from {' '.join(_NODE_COMMANDS)}' -f -a '(sioms list --names "
+        "2>/dev/null)'"
     )
     lines.append(
         "complete -c sioms -n 'test (count (commandline -opc)) -eq 2; and __fish_seen_subcommand_from driver' "
@@ -383,7 +384,8 @@ def fish() -> str:
     for name, (_, parser) in driver_actions().items():
         for option in _long_options(parser).split():
             lines.append(
-                f"complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from {name}' -l {option[2:]}"
+                f"complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from {name}' -l "
+                f"{option[2:]}"
             )
     return "\n".join([*lines, ""])
 

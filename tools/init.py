@@ -34,7 +34,8 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     one = subparsers.add_parser("init", help="write a starter configuration")
     one.description = (
-        "Writes a configuration to begin with: simulated devices that work at once, and a block for everything that is plugged "
+        "Writes a configuration to begin with: simulated devices that work at once, and a block for everything that is "
+        "plugged "
         "in, as a comment unless its USB identity leaves no doubt. With --driver the device is a real one instead."
     )
     one.add_argument(
@@ -44,15 +45,9 @@ def add_parser(subparsers: Any) -> None:
         default="workcell.toml",
         help="output file (default: workcell.toml)",
     )
-    one.add_argument(
-        "--driver", metavar="NAME", default="", help="a device of this driver, see `sioms driver list`"
-    )
-    one.add_argument(
-        "--port", metavar="PORT", default="", help="serial port, host:port, GPIO chip or IIO device of it"
-    )
-    one.add_argument(
-        "--name", metavar="NAME", default="", help="name of the workcell (default: that of the folder)"
-    )
+    one.add_argument("--driver", metavar="NAME", default="", help="a device of this driver, see `sioms driver list`")
+    one.add_argument("--port", metavar="PORT", default="", help="serial port, host:port, GPIO chip or IIO device of it")
+    one.add_argument("--name", metavar="NAME", default="", help="name of the workcell (default: that of the folder)")
     one.add_argument("--force", action="store_true", help="overwrite an existing file")
 
 
@@ -60,9 +55,7 @@ def run(args: argparse.Namespace) -> int:
     """Write the file and check it; return the exit status."""
     path = Path(args.file)
     if path.exists() and not args.force:
-        raise OSError(
-            errno.EEXIST, f"write {path}: it is there already; --force overwrites it, another FILE leaves it"
-        )
+        raise OSError(errno.EEXIST, f"write {path}: it is there already; --force overwrites it, another FILE leaves it")
     known = {entry.name: entry for entry in drivers()}
     if args.driver and args.driver not in known:
         text = f"no driver {args.driver}{did_you_mean(args.driver, known)}"
@@ -75,11 +68,7 @@ def run(args: argparse.Namespace) -> int:
         text += (_HERE / "starter_simulated.toml").read_text()
     if args.driver:
         port = Port(args.port, "", (args.driver,)) if args.port else None
-        text += (
-            "\n"
-            + stanza(example(args.driver), port, "device0").replace('"mod0.plant.', '"arm0.plant.')
-            + "\n"
-        )
+        text += "\n" + stanza(example(args.driver), port, "device0").replace('"mod0.plant.', '"arm0.plant.') + "\n"
         told = f": a device of the driver {args.driver}, with the values of its page; put in yours"
     else:
         ports = found()
@@ -88,9 +77,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise OSError(
-            error.errno, f"write {path}: {error.strerror}; give a FILE in a folder that is there"
-        ) from None
+        raise OSError(error.errno, f"write {path}: {error.strerror}; give a FILE in a folder that is there") from None
     print(f"{path} written{told}")
     status = check(path)
     if status == 0:
@@ -103,9 +90,7 @@ def example(driver: str) -> str:
     text = page_of(driver)
     start = re.search(r"^( *)\[device\.[\w-]+\]$", text, re.MULTILINE)
     if start is None:
-        raise OSError(
-            errno.EINVAL, f"the driver {driver} shows no example; see its page in drivers/README.md"
-        )
+        raise OSError(errno.EINVAL, f"the driver {driver} shows no example; see its page in drivers/README.md")
     indent, lines = start[1], []
     for line in text[start.start() :].splitlines():
         if not line.strip() or not line.startswith(indent):
@@ -122,7 +107,10 @@ def _block(port: Port, number: int) -> str:
     """Return the block of something that is plugged in, as a comment unless it can be nothing else."""
     head = f"\n# --- {port.path}: {port.text} ---\n"
     if len(port.drivers) > 1:
-        head += f"# It may be for {', '.join(port.drivers[:-1])} or {port.drivers[-1]} (`sioms init --driver NAME --port {port.path}`).\n"
+        head += (
+            f"# It may be for {', '.join(port.drivers[:-1])} or {port.drivers[-1]} (`sioms init --driver NAME --port "
+            f"{port.path}`).\n"
+        )
     device = f"{NAMES.get(port.drivers[0], port.drivers[0].replace('-', '_'))}{number}"
     text = stanza(example(port.drivers[0]), port, device)
     if not port.sure:

@@ -36,9 +36,11 @@ MANUALS: dict[str, Manual] = {
         ["[-l#h#n#pvfmNVrt#.#L#] DEVICE [[-l#h#n#pvfmNV] DEVICE]..."],
         [
             DEVICES,
-            "Without options, devin prints one line for each structure of each device: for axes the number, the is-moving "
+            "Without options, devin prints one line for each structure of each device: for axes the number, the "
+            "is-moving "
             "flag, position, velocity and motor force; for analog and binary devices the number and the data. If "
-            "any of p, v, f, m or N is given, only the given items are printed; without N there is no newline. Units are "
+            "any of p, v, f, m or N is given, only the given items are printed; without N there is no newline. Units "
+            "are "
             "SI.",
             "With -r, -t or -L the output is timed: a stream of numbers, each followed by a blank, flushed with every "
             "sample. Samples are taken on an absolute schedule. A sample that is late by more than a period is skipped "
@@ -46,10 +48,12 @@ MANUALS: dict[str, Manual] = {
             "first sample in seconds and the number of the sample on the schedule. On a busy machine a steady period "
             "requires real-time priority, if permitted: chrt -f 1 devin ...",
             "--record prints a table for programs: a header with names and units, then one line for each reading that "
-            "the driver publishes, without duplicates, with the driver's timestamp. The record of an axis can be read by "
+            "the driver publishes, without duplicates, with the driver's timestamp. The record of an axis can be read "
+            "by "
             "`sioms reconcile axis` directly.",
             "Reading requires no ownership: an output node is read through its read-only companion, also while another "
-            "program owns it. If a device is lost, hangs or is in fault, devin exits with an error; stale data are never "
+            "program owns it. If a device is lost, hangs or is in fault, devin exits with an error; stale data are "
+            "never "
             "printed.",
         ],
         [
@@ -71,24 +75,29 @@ MANUALS: dict[str, Manual] = {
         [
             DEVICES,
             "Numbers are taken from the command line, then from standard input, until there are enough for all "
-            "devices; then they are written. An axis takes, regardless of the order of its letters: position, velocity, "
+            "devices; then they are written. An axis takes, regardless of the order of its letters: position, "
+            "velocity, "
             "acceleration, jerk, force, force velocity, force offset, time, wait marker, signal marker; the numbers "
             "of each axis follow those of the preceding axis. Analog and binary devices take one number for each "
             "structure. Units are SI.",
-            "A command without a time lasts until the next one arrives, which replaces it immediately. Commands with times "
+            "A command without a time lasts until the next one arrives, which replaces it immediately. Commands with "
+            "times "
             "or markers are queued in the axis's buffer and executed in order; while the buffer is full, devout "
             "blocks. Position and velocity together pass the position at that velocity.",
             "At the end of the input devout waits until the axes are idle, except for motion without an end (a "
             "velocity, acceleration, jerk or force without a time), and then closes the devices. Closing halts the "
             "axes, as does the end of devout for any reason, including SIGKILL.",
             "Outputs of analog and binary devices take their safe values when the device is closed and whenever devout "
-            "ends: `devout gripper0 1` closes a gripper for a moment only. With -H devout does not exit at the end of the "
+            "ends: `devout gripper0 1` closes a gripper for a moment only. With -H devout does not exit at the end of "
+            "the "
             "input but holds outputs and motion until it is interrupted or killed.",
             "With --lease=# the drivers halt the axes if no row arrives for that time, whether devout hangs or the "
             "program before it in the pipe.",
-            "A word that is not a finite number stops devout with an error that gives the line and the word, because in a "
+            "A word that is not a finite number stops devout with an error that gives the line and the word, because "
+            "in a "
             "stream without lines the meaning of the following numbers is uncertain. With --skip-bad-lines the line "
-            "is skipped instead. Input that ends within an iteration is an error. devout ends immediately if a command is "
+            "is skipped instead. Input that ends within an iteration is an error. devout ends immediately if a command "
+            "is "
             "refused, at an emergency stop, and if a device or the daemon is lost.",
         ],
         [
@@ -104,13 +113,17 @@ MANUALS: dict[str, Manual] = {
         ["[-zsewcg] [#.##]... DEVICE [[-zsewcg] DEVICE]... [< FILE]"],
         [
             DEVICES,
-            "Devices are processed in the order of the command line, and the letters of each in the order given. Numbers "
-            "may be anywhere; -c takes one per axis, -g n*n, first from the command line, then from standard input. All "
+            "Devices are processed in the order of the command line, and the letters of each in the order given. "
+            "Numbers "
+            "may be anywhere; -c takes one per axis, -g n*n, first from the command line, then from standard input. "
+            "All "
             "are checked before anything is executed.",
-            "-e is executed before everything else and requires no ownership. It stops all motion at maximum deceleration, "
+            "-e is executed before everything else and requires no ownership. It stops all motion at maximum "
+            "deceleration, "
             "sets forces to zero, empties the command buffers and is latched: writes are refused until `sioms reset`. "
             "Without a device it stops the whole workcell. It is a software stop, not a safety-rated function.",
-            "-s, -e and -w use the read-only companion, so they also work on a device that another program owns. -z, -c "
+            "-s, -e and -w use the read-only companion, so they also work on a device that another program owns. -z, "
+            "-c "
             "and -g on an output require ownership.",
         ],
         [
@@ -146,12 +159,8 @@ DAEMON_OPTIONS = [
     Option("", "log-level", "LEVEL", ALL, "debug, info, warning or error; default info"),
     Option("", "help", "", ALL, "print help"),
 ]
-STATUS = (
-    "0 on success; 1 after a failure, 2 after a wrong command line, each with one line on standard error."
-)
-VARIABLES = (
-    "SIOMS_SOCKET is the daemon's socket; else /run/sioms/siomsd.sock, else one in the user's runtime folder."
-)
+STATUS = "0 on success; 1 after a failure, 2 after a wrong command line, each with one line on standard error."
+VARIABLES = "SIOMS_SOCKET is the daemon's socket; else /run/sioms/siomsd.sock, else one in the user's runtime folder."
 
 
 def answer(tool: str, wanted: str) -> int:
@@ -179,9 +188,7 @@ def help_text(tool: str) -> str:
         lines += [fill(paragraph, 100), ""]
     for title, options in option_groups(tool):
         lines.append(f"{title}:")
-        lines += [
-            fill(o.text, 100, initial_indent=f"  {shape(o):<32}", subsequent_indent=" " * 34) for o in options
-        ]
+        lines += [fill(o.text, 100, initial_indent=f"  {shape(o):<32}", subsequent_indent=" " * 34) for o in options]
         lines.append("")
     lines.append("examples:")
     lines += [f"  {command}\n      {what}" for what, command in manual.examples]

@@ -111,12 +111,8 @@ class Watch:
             if cell is None:
                 self._nodes, self._why = {}, {}
                 cell = Workcell(name="sioms monitor")
-            entries = (
-                [e for e in cell.nodes() if not e.name.endswith(READONLY)] if self._only else cell.nodes()
-            )
-            self._entries = [
-                e for e in entries if (e.name in self._only if self._only else not is_part(e, entries))
-            ]
+            entries = [e for e in cell.nodes() if not e.name.endswith(READONLY)] if self._only else cell.nodes()
+            self._entries = [e for e in entries if (e.name in self._only if self._only else not is_part(e, entries))]
             self._status = cell.status()
             self._open(cell)
             self.cell, self.lost = cell, ""
@@ -150,9 +146,7 @@ class Watch:
         now_ns = monotonic_ns()
         nodes = [self._look(entry, now_ns) for entry in list(self._entries)]
         clock = strftime("%H:%M:%S", localtime())
-        return View(
-            self._status if self.cell else {}, nodes, self.lost, message, now_ns, clock=clock, jog=jog
-        )
+        return View(self._status if self.cell else {}, nodes, self.lost, message, now_ns, clock=clock, jog=jog)
 
     def _look(self, entry: NodeEntry, now_ns: int) -> NodeView:
         node = self._nodes.get(entry.name)
@@ -241,14 +235,10 @@ class Monitor:
             self._scroll += _SCROLL[typed]
         elif self._confirming:
             self._confirming = False
-            self._message = (
-                self._do("reset", lambda cell: cell.reset()) if typed[0] in "yY" else "reset left alone"
-            )
+            self._message = self._do("reset", lambda cell: cell.reset()) if typed[0] in "yY" else "reset left alone"
         elif typed[0] == "R":
             self._confirming = True
-            self._message = (
-                "reset the emergency stop? Motion may be commanded again. y: yes, any other key: no"
-            )
+            self._message = "reset the emergency stop? Motion may be commanded again. y: yes, any other key: no"
         elif typed[0] == "h":
             self._shows_history, self._scroll = not self._shows_history, 0 if self._shows_history else MANY
         elif typed[0] == "\t":

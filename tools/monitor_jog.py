@@ -1,6 +1,7 @@
 """Jogging by keys: an axis is chosen, taken, moved while a key repeats, and let go.
 
-A terminal tells no release of a key. A jog therefore ends by itself when its key has not come again for a moment, and the node is
+A terminal tells no release of a key. A jog therefore ends by itself when its key has not come again for a moment, and
+the node is
 held by a lease: a monitor that hangs, is stopped by Ctrl-Z or killed halts the axis, too.
 """
 
@@ -15,7 +16,9 @@ from sioms.protocol.flags import NodeClass
 from .monitor_view import Jog, NodeView
 
 FIRST_NS, AGAIN_NS = 600_000_000, 200_000_000
-"""How long a jog goes on after its key: terminals repeat it for the first time after half a second, then thirty times a second."""
+"""How long a jog goes on after its key: terminals repeat it for the first time after half a second, then thirty times a
+second.
+"""
 LEASE_S = 0.5
 LADDER = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Speeds, as shares of the axis' limit."""
@@ -111,7 +114,9 @@ class Jogger:
         return self._go(way) if way != self._way else ""
 
     def beat(self, now_ns: int) -> str:
-        """Renew the lease, and end a jog whose key has not come again; return what to tell. To be called every 0.1 s."""
+        """Renew the lease, and end a jog whose key has not come again; return what to tell. To be
+        called every 0.1 s.
+        """
         if self._node is None:
             return ""
         try:

@@ -49,7 +49,8 @@ class NodeView:
         why: why there is none, a sentence.
         holder: who owns it, '' when it is free.
         rate_hz: publications a second, None before there are two looks.
-        age_s: how long ago the snapshot was the newest [s], of a node that cannot be read any more; None: it is current.
+        age_s: how long ago the snapshot was the newest [s], of a node that cannot be read any more; None: it is
+            current.
     """
 
     name: str
@@ -189,11 +190,12 @@ def head(view: View, width: int = 120, height: int = 1000) -> list[Text]:
         for device in devices:
             if device["state"] != "up" or device["link"] != "good":
                 why = device["reason"] or device["link_reason"]
-                text = f"device {device['name']}: {device['state']}, link {device['link']}, {device['deaths']} deaths: {why}"
+                text = (
+                    f"device {device['name']}: {device['state']}, link {device['link']}, {device['deaths']} deaths: "
+                    f"{why}"
+                )
                 lines.append(Text(text.removesuffix(": "), Style.WARN))
-    lines += [
-        Text(text, Style.ALARM) for text in _wrapped([f"{who}: {what}" for who, what in faults(view)], width)
-    ]
+    lines += [Text(text, Style.ALARM) for text in _wrapped([f"{who}: {what}" for who, what in faults(view)], width)]
     if len(lines) > height:
         hidden = len(lines) - height + 1
         lines = [
@@ -260,13 +262,9 @@ def body(view: View, width: int) -> list[Text]:
                 for i, (c, reading) in enumerate(zip(node.info.channels, node.snapshot, strict=True))
             ]
         elif node.info.node_class is NodeClass.ANALOG:
-            lines += _grid(
-                [_analog(c, r) for c, r in zip(node.info.channels, node.snapshot, strict=True)], width
-            )
+            lines += _grid([_analog(c, r) for c, r in zip(node.info.channels, node.snapshot, strict=True)], width)
         else:
-            lines += [
-                _binary(c, reading) for c, reading in zip(node.info.channels, node.snapshot, strict=True)
-            ]
+            lines += [_binary(c, reading) for c, reading in zip(node.info.channels, node.snapshot, strict=True)]
         if node.age_s is not None:
             lines[first + 1 :] = [Text(line.text, Style.DIM) for line in lines[first + 1 :]]
     return lines

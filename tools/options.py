@@ -64,15 +64,27 @@ TOOLS: dict[str, list[Option]] = {
         Option("v", "velocity", "", NODE, "print the velocity of axes"),
         Option("f", "force", "", NODE, "print the motor force of axes"),
         Option("m", "moving", "", NODE, "print the is-moving flag of axes, 0 or 1"),
-        Option("N", "lines", "", NODE, "begin with the structure number and end with a newline; "
-               "in timed output, anywhere: begin each line with its time and sample number"),
+        Option(
+            "N",
+            "lines",
+            "",
+            NODE,
+            "begin with the structure number and end with a newline; "
+            "in timed output, anywhere: begin each line with its time and sample number",
+        ),
         Option("V", "verbose", "", NODE, "print everything with names and units; overrides p, v, f and m"),
         *_range("printing", "structure"),
         Option("r", "repeat", "", ALL, "timed output, one sample a second"),
         Option("t", "period", SECONDS, ALL, "timed output, one sample every SECONDS"),
         Option("L", "count", COUNT, ALL, "timed output of COUNT samples, default 100; -1: unlimited"),
-        Option("", "record", "", ALL, "print a table of all readings, COUNT of them, for programs: a header with names and units, then "
-               "timestamps and values, separated by tabs; with -t one reading every SECONDS"),
+        Option(
+            "",
+            "record",
+            "",
+            ALL,
+            "print a table of all readings, COUNT of them, for programs: a header with names and units, then "
+            "timestamps and values, separated by tabs; with -t one reading every SECONDS",
+        ),
         Option("", "digits", DIGITS, ALL, "digits after the point, instead of 4 (position, velocity) and 2 (others)"),
     ],
     "devout": [
@@ -93,13 +105,20 @@ TOOLS: dict[str, list[Option]] = {
         Option("W", "no-wait", "", ALL, "do not wait for the axes at the end of the input"),
         Option("H", "hold", "", ALL, "at the end of the input, hold outputs and motion until devout is interrupted"),
         Option("", "lease", SECONDS, ALL, "halt the axes and exit if no row arrives for SECONDS, also if devout hangs"),
-        Option("", "skip-bad-lines", "", ALL, "skip lines that contain anything but numbers, instead of stopping there"),
+        Option(
+            "", "skip-bad-lines", "", ALL, "skip lines that contain anything but numbers, instead of stopping there"
+        ),
     ],
     "sdev": [
         Option("z", "zero", "", NODE, "define the present position or reading as 0"),
         Option("s", "synch", "", NODE, "send the external synch; all devices with -s start at the same instant"),
-        Option("e", "emergency-stop", "", NODE, "emergency stop, before anything else; of the whole workcell "
-               "if no device is given"),
+        Option(
+            "e",
+            "emergency-stop",
+            "",
+            NODE,
+            "emergency stop, before anything else; of the whole workcell if no device is given",
+        ),
         Option("w", "wait", "", NODE, "wait until the axes are idle"),
         Option("c", "calibrate", "", NODE, "set the positions of the axes, one number per axis, without motion"),
         Option("g", "gains", "", NODE, "set the gain matrix of a tactile array: n*n numbers, row by row"),
@@ -112,7 +131,7 @@ TOOLS: dict[str, list[Option]] = {
         Option("w", "wait", "", ALL, "wait for all markers in turn; the number without the key is sufficient"),
         Option("t", "timeout", SECONDS, ALL, "time-out of -w for all markers together"),
     ],
-}  # fmt: skip
+}
 
 FLAG, NUMBER, NAME = "flag", "number", "name"
 
@@ -307,9 +326,7 @@ def _long(options: list[Option], word: str) -> Item:
                 raise UsageError(f"{word}: --{name} takes no value")
             value = _value(option, f"--{name}=", text) if option.value else 0
             return Item(FLAG, option.key, value, option.scope)
-    raise UsageError(
-        f"{word}: unknown option; there are: {', '.join('--' + o.long for o in options)}, --help"
-    )
+    raise UsageError(f"{word}: unknown option; there are: {', '.join('--' + o.long for o in options)}, --help")
 
 
 def _number_end(word: str, at: int) -> int:

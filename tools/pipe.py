@@ -90,9 +90,7 @@ def write_all(data: bytes) -> None:
             poller.register(1, POLLOUT)
             poller.poll()
         except OSError as error:
-            raise OSError(
-                error.errno, f"write standard output: {os.strerror(error.errno or 0).lower()}"
-            ) from None
+            raise OSError(error.errno, f"write standard output: {os.strerror(error.errno or 0).lower()}") from None
 
 
 def read_input() -> bytes:

@@ -105,16 +105,13 @@ def stanza(example: str, port: Port | None, device: str) -> str:
         device: name of the device.
 
     Example:
-        >>> stanza('[device.a]\\ndriver = "x"\\nline = { serial = "/dev/ttyUSB0", baud = 9600 }', Port("/dev/p", "", ()), "b")
-        '[device.b]\\ndriver = "x"\\nline = { serial = "/dev/p", baud = 9600 }'
+        >>> stanza('[device.a]\\ndriver = "x"\\nline = { serial = "/dev/ttyUSB0", baud = 9600 }', Port("/dev/p", "",
+        ()), "b") '[device.b]\\ndriver = "x"\\nline = { serial = "/dev/p", baud = 9600 }'
     """
     lines: Sequence[str] = example.splitlines()
     first = next(line for line in lines if line.startswith("[device."))
     old = first.removeprefix("[device.").rstrip("] ")
-    lines = [
-        line.replace(f"[device.{old}", f"[device.{device}") if line.startswith("[") else line
-        for line in lines
-    ]
+    lines = [line.replace(f"[device.{old}", f"[device.{device}") if line.startswith("[") else line for line in lines]
     if port is not None:
         lines = [_with_port(line, port) for line in lines]
     return "\n".join(lines)

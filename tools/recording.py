@@ -1,7 +1,7 @@
 """The text of ``devin --record``: a table for programs, with names and units, and the readings' own time stamps. Pure.
 
-One line a reading, columns parted by tabs, under one line of names with their units. The first column is the stamp that the
-driver gave the reading, in seconds on the monotonic clock. The columns of a node of one axis have the names that
+One line a reading, columns parted by tabs, under one line of names with their units. The first column is the stamp that
+the driver gave the reading, in seconds on the monotonic clock. The columns of a node of one axis have the names that
 ``sioms reconcile axis`` reads without a description.
 """
 

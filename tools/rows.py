@@ -40,9 +40,7 @@ class Rows:
         UsageError: a structure that the node has not, or fields that its class has not.
     """
 
-    def __init__(
-        self, target: Target, info: NodeInfo, timed: bool = False, digits: int | None = None
-    ) -> None:
+    def __init__(self, target: Target, info: NodeInfo, timed: bool = False, digits: int | None = None) -> None:
         flags = target.flags
         self._channels = target.channels(len(info.channels))
         self._info = info

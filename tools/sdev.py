@@ -53,9 +53,7 @@ def _check(line: Line) -> None:
     if not line.targets and list(line.trailing) != ["e"]:
         raise UsageError("no device named; only -e alone does without: it stops the whole workcell")
     if line.targets and line.trailing:
-        raise UsageError(
-            f"-{next(iter(line.trailing))} holds for the device that follows it, and none follows"
-        )
+        raise UsageError(f"-{next(iter(line.trailing))} holds for the device that follows it, and none follows")
     for target in line.targets:
         if not target.flags:
             raise UsageError(f"{target.name}: nothing to do; an option holds for the device that follows it")
@@ -116,7 +114,8 @@ class Setter:
         wanted = NodeClass.ANALOG if key == "g" else NodeClass.AXIS
         if key != "z" and node_class is not wanted:
             raise UsageError(
-                f"-{key} on {node.name}: is for nodes of class {wanted.name.lower()}; this one is {node_class.name.lower()}"
+                f"-{key} on {node.name}: is for nodes of class {wanted.name.lower()}; this one is "
+                f"{node_class.name.lower()}"
             )
         count = len(node.info.channels)
         need = {"c": count, "g": count * count}.get(key, 0)

@@ -1,4 +1,5 @@
-"""``sioms service``: put unit, user, folders, port names, manual pages and completions in place, and take them away again.
+"""``sioms service``: put unit, user, folders, port names, manual pages and completions in place, and take them away
+again.
 
 What it would do to a file is decided first, for all of them (``plan``), so that a refusal leaves nothing half done.
 """
@@ -145,13 +146,9 @@ def plan(source: Path, prefix: Path) -> Iterator[Item]:
             yield Item(f"{completions}/{tool}", link="sioms")
         yield Item(f"usr/local/bin/{tool}", link=f"{prefix}/bin/{tool}")
     yield Item("usr/local/share/zsh/site-functions/_sioms", text(etc / "completion" / "_sioms"))
-    yield Item(
-        "usr/local/share/fish/vendor_completions.d/sioms.fish", text(etc / "completion" / "sioms.fish")
-    )
+    yield Item("usr/local/share/fish/vendor_completions.d/sioms.fish", text(etc / "completion" / "sioms.fish"))
     here = Path(__file__).parent
-    starter = text(here / "starter.toml").replace("{name}", "workcell") + text(
-        here / "starter_simulated.toml"
-    )
+    starter = text(here / "starter.toml").replace("{name}", "workcell") + text(here / "starter_simulated.toml")
     yield Item(CONFIG, starter, mode=0o640, kept=True)
 
 
@@ -176,9 +173,7 @@ def _refuse_unseen(root: Path) -> None:
 
 
 def _install(items: list[Item], root: Path, dry_run: bool, force: bool) -> int:
-    changed = [
-        i for i in items if _is_other(i, root) and not (force and not i.kept) and not _is_ours(i, root)
-    ]
+    changed = [i for i in items if _is_other(i, root) and not (force and not i.kept) and not _is_ours(i, root)]
     for item in items:
         where = root / item.target
         if item.is_there(root):
@@ -196,7 +191,8 @@ def _install(items: list[Item], root: Path, dry_run: bool, force: bool) -> int:
             ("systemctl", "daemon-reload"), ("udevadm", "control", "--reload"),
         )  # fmt: skip
         print(
-            f"next: edit /{CONFIG}, `sioms check /{CONFIG}`, `systemctl enable --now sioms`; `usermod -aG sioms USER` lets a user in"
+            f"next: edit /{CONFIG}, `sioms check /{CONFIG}`, `systemctl enable --now sioms`; `usermod -aG sioms USER` "
+            "lets a user in"
         )
     return 0
 

@@ -63,9 +63,7 @@ def _read(words: Sequence[str]) -> tuple[list[str], list[int], float | None]:
             timeout_s = item.value
         elif item.kind == FLAG:
             actions.append(item.text)
-        elif (
-            item.kind == NAME or not item.text.isascii() or not item.text.isdigit() or int(item.text) > _MOST
-        ):
+        elif item.kind == NAME or not item.text.isascii() or not item.text.isdigit() or int(item.text) > _MOST:
             raise UsageError(f"{item.text}: want a marker, a whole number as smarkers -r prints it")
         else:
             numbers.append(int(item.text))

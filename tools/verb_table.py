@@ -23,7 +23,7 @@ or a notice, `[0, number, errno, value or text, zipped, as_of_ns]` for a reply (
 number above 0 that none of its unanswered ones has; a notice draws no reply. A message that is not in these tables, comes in
 a state in which it is not taken, or has other arguments is malformed: it ends the connection on which it came, and nothing
 else. A request whose meaning is wrong is refused with an errno and a sentence, and ends nothing.
-"""
+"""  # noqa: E501
 
 
 def protocol_page() -> str:
@@ -32,9 +32,7 @@ def protocol_page() -> str:
     for sockets in SOCKETS.values():
         for socket in sockets:
             sender, receiver = (end.replace(" ", "_") for end in (socket.sender, socket.receiver))
-            lines.append(
-                f"    {sender} -->|{_folded([kind.__name__ for kind in socket.values()])}| {receiver}"
-            )
+            lines.append(f"    {sender} -->|{_folded([kind.__name__ for kind in socket.values()])}| {receiver}")
     lines += ["```", ""]
     for title, sockets in SOCKETS.items():
         lines += [f"## {title}", "", *_states(sockets)]
@@ -74,9 +72,7 @@ def _table(socket: Socket) -> list[str]:
         "| verb | message | arguments | taken while | right | |", "| ---: | --- | --- | --- | --- | --- |",
     ]  # fmt: skip
     for verb, kind in socket.items():
-        fields = ", ".join(
-            f"`{name}`: {kind_of.words.split(',')[0]}" for name, kind_of in kind.fields.items()
-        )
+        fields = ", ".join(f"`{name}`: {kind_of.words.split(',')[0]}" for name, kind_of in kind.fields.items())
         states = "" if kind.states == socket.states else " or ".join(kind.states)
         name = f"{kind.__name__}{' (notice)' if kind.notice else ''}"
         lines.append(f"| {verb} | {name} | {fields} | {states} | {_right(kind)} | {_does(kind)} |")
@@ -97,12 +93,12 @@ def _does(kind: type[Message]) -> str:
 
 def _requests() -> list[str]:
     lines = [
-        "## Requests of Ioctl", "",
-        "| number | request | right | needs the output node | shown in readings | |", "| ---: | --- | --- | --- | --- | --- |",
-    ]  # fmt: skip
+        "## Requests of Ioctl",
+        "",
+        "| number | request | right | needs the output node | shown in readings | |",
+        "| ---: | --- | --- | --- | --- | --- |",
+    ]
     for number, (right, owns, looks, does) in REQUESTS.items():
         owner, shown = "yes" if owns else "", "" if looks else "yes"
-        lines.append(
-            f"| {int(number)} | {Request(number).name} | {_words(right)} | {owner} | {shown} | {does} |"
-        )
+        lines.append(f"| {int(number)} | {Request(number).name} | {_words(right)} | {owner} | {shown} | {does} |")
     return [*lines, ""]

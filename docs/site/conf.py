@@ -1,4 +1,6 @@
-"""Sphinx: the documents of the tree as a site, with a reference made from the docstrings. `./dev docs` builds it into out/site."""
+"""Sphinx: the documents of the tree as a site, with a reference made from the docstrings. `./dev docs` builds it into
+out/site.
+"""
 
 from importlib.metadata import version as version_of
 from pathlib import Path

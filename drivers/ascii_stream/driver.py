@@ -1,9 +1,11 @@
-"""Sensors that print lines of numbers: Arduino-class boards, load-cell amplifiers, laboratory meters that talk by themselves.
+"""Sensors that print lines of numbers: Arduino-class boards, load-cell amplifiers, laboratory meters that talk by
+themselves.
 
-One line is one sample of all channels; ``sioms.drivers.ascii_stream.codec`` tells what a line may look like. Most of these devices
-can say no name: the driver takes them for what their lines look like, and for the words of a greeting where they have one.
-With a time column each sample carries the time at which the device took it, by a running fit of its clock; without one the time
-at which the line's last byte arrived.
+One line is one sample of all channels; ``sioms.drivers.ascii_stream.codec`` tells what a line may look like. Most of
+these devices
+can say no name: the driver takes them for what their lines look like, and for the words of a greeting where they have
+one. With a time column each sample carries the time at which the device took it, by a running fit of its clock; without
+one the time at which the line's last byte arrived.
 
     [device.scale0]
     driver = "ascii-stream"
@@ -14,8 +16,8 @@ at which the line's last byte arrived.
     rate_hz = 80.0
     time = "ms"
 
-A finger that prints its elements' readings has a table ``shape``, see ``tactile_nodes``: strains and what touches it are then
-published with every line.
+A finger that prints its elements' readings has a table ``shape``, see ``tactile_nodes``: strains and what touches it
+are then published with every line.
 """
 
 from __future__ import annotations
@@ -240,15 +242,15 @@ class AsciiStream(StreamDriver):
         time_us, last_us = self._device_us(number), self._time_us
         behind_us = 0 if last_us is None else (last_us - time_us) % self._modulus_us
         if last_us is not None and not self._is_open_anew and SET_BACK_US < behind_us < self._modulus_us // 2:
-            raise LinkError(
-                f"{self.name}: its time went from {last_us} back to {time_us} us: it has restarted"
-            )
+            raise LinkError(f"{self.name}: its time went from {last_us} back to {time_us} us: it has restarted")
         is_old = behind_us == 0 if self._is_open_anew else behind_us < self._modulus_us // 2
         if last_us is None or not is_old:
             self._time_us, self._gone_on_ns, self._is_open_anew = time_us, now_ns, False
             return True
         if self._is_open_anew or now_ns - self._gone_on_ns > self.silence_s / 2 * 1e9:
-            self.trouble = f"lines come, but their time stands still at {number:g} {self.settings.time}: the device is frozen"
+            self.trouble = (
+                f"lines come, but their time stands still at {number:g} {self.settings.time}: the device is frozen"
+            )
             return False
         return behind_us == 0
 
@@ -298,9 +300,7 @@ class Inspection:
         """
         end = reply.find(b"\n") + 1  # the first line is cut
         if not end and len(reply) > MAX_LINE_BYTES:
-            raise LinkError(
-                f"{len(reply)} bytes without an end of line; is this the right device and baud rate"
-            )
+            raise LinkError(f"{len(reply)} bytes without an end of line; is this the right device and baud rate")
         receiver, tried, greeted = LineReceiver(self._columns, self._checked), 0, not self._greeting
         receiver.feed(reply[:end])
         greeted = greeted or self._greeting.encode() in reply[:end]
@@ -369,6 +369,7 @@ def _check(settings: AsciiStreamSettings) -> None:
         top_hz = LINE_SHARE * line.baud / line.bits_per_character / shortest
         if settings.rate_hz > top_hz:
             raise ValueError(
-                f"rate_hz = {settings.rate_hz:g}: lines of {shortest} bytes, the shortest possible, at {line.baud} baud "
+                f"rate_hz = {settings.rate_hz:g}: lines of {shortest} bytes, the shortest possible, at {line.baud} "
+                "baud "
                 f"carry {top_hz:.0f} Hz; want a lower rate or a faster line"
             )

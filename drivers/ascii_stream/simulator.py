@@ -1,10 +1,13 @@
-"""A sensor board that prints its samples on a pty or TCP port: ``python -m sioms.drivers.ascii_stream.simulator --link PATH``.
+"""A sensor board that prints its samples on a pty or TCP port: ``python -m sioms.drivers.ascii_stream.simulator --link
+PATH``.
 
-A load-cell amplifier of ``--columns`` channels as hobby boards are programmed: a banner before the first sample, a line of counts for each
-sample, its own clock in the first column (``--time``), a 12-bit converter that clips. Each channel follows its load with a lag of
-first order. Commands on standard input, beside those of the line: ``load CHANNEL NEWTON``, ``say TEXT`` (a line of one's own: a
-comment, a cut line ...), ``lose COUNT`` (lines that are not sent), ``restart``, ``power_cycle [SECONDS]``, ``freeze [COUNT]`` (the last line again),
-``hold on|off`` (lines go on, clock and readings stand still), ``foreign start|stop 0`` (another host's word), ``state``.
+A load-cell amplifier of ``--columns`` channels as hobby boards are programmed: a banner before the first sample, a line
+of counts for each sample, its own clock in the first column (``--time``), a 12-bit converter that clips. Each channel
+follows its load with a lag of
+first order. Commands on standard input, beside those of the line: ``load CHANNEL NEWTON``, ``say TEXT`` (a line of
+one's own: a comment, a cut line ...), ``lose COUNT`` (lines that are not sent), ``restart``, ``power_cycle [SECONDS]``,
+``freeze [COUNT]`` (the last line again), ``hold on|off`` (lines go on, clock and readings stand still), ``foreign
+start|stop 0`` (another host's word), ``state``.
 """
 
 from __future__ import annotations
@@ -168,9 +171,7 @@ def options_parser() -> argparse.ArgumentParser:
     parser.add_argument("--separator", default=",")
     parser.add_argument("--crlf", action="store_true")
     parser.add_argument("--checksum", action="store_true")
-    parser.add_argument(
-        "--banner", default="load cells 1.4", help="comment before the first sample; '' for none"
-    )
+    parser.add_argument("--banner", default="load cells 1.4", help="comment before the first sample; '' for none")
     parser.add_argument("--wait-for", default="", help="send nothing before this word came in a line")
     parser.add_argument("--counts-per-newton", type=float, default=100.0)
     parser.add_argument("--lag-s", type=float, default=0.02)

@@ -1,10 +1,10 @@
 """ATI's raw data transfer (RDT) over UDP and the sensor's own page, without I/O: Net F/T box and Ethernet Axia.
 
-A request of 8 bytes starts and stops the stream, sets the zero ("bias") and clears latches. A datagram holds one record of 36
-bytes, or several in buffered mode; all numbers are big-endian. ``rdt_seq`` counts records from 1 on for each request,
-``ft_seq`` the sensor's internal samples. Forces are counts, whose number per unit stands in the sensor's page. Sources: ATI Net
-F/T manual, section "UDP interface using RDT" and status code; ATI Ethernet Axia manual (9620-05-C-Ethernet Axia-02), status code,
-table 11.2 (page), section 12 (RDT).
+A request of 8 bytes starts and stops the stream, sets the zero ("bias") and clears latches. A datagram holds one record
+of 36 bytes, or several in buffered mode; all numbers are big-endian. ``rdt_seq`` counts records from 1 on for each
+request, ``ft_seq`` the sensor's internal samples. Forces are counts, whose number per unit stands in the sensor's page.
+Sources: ATI Net F/T manual, section "UDP interface using RDT" and status code; ATI Ethernet Axia manual
+(9620-05-C-Ethernet Axia-02), status code, table 11.2 (page), section 12 (RDT).
 """
 
 from __future__ import annotations
@@ -79,7 +79,8 @@ def build(record: Record) -> bytes:
 def start(command: Command, timeout_s: float) -> Exchange:
     """Return the exchange that starts the stream; its value is the first record.
 
-    A request may be lost on its way, and the sensor answers nothing but records: so the request is sent again until one comes.
+    A request may be lost on its way, and the sensor answers nothing but records: so the request is sent again until one
+        comes.
     """
     what = f"start the {command.name.lower()} stream"
 
@@ -109,17 +110,43 @@ _LATCHED_ALONE = 0x80010000
 """Net F/T: a monitored condition is latched and nothing else is wrong."""
 _BITS = {
     Model.NET: {
-        30: "CPU or RAM", 29: "digital board", 28: "analog board", 27: "serial link", 26: "program memory",
-        25: "halted or wrong configuration", 24: "settings", 23: "calibration does not match", 22: "network", 21: "CAN bus", 20: "RDT",
-        19: "EtherNet/IP", 18: "DeviceNet", 17: "saturation or A/D converter", 16: "a monitored condition is latched",
-        7: "analog ground", 6: "supply too high", 5: "supply too low", 4: "no serial data", 3: "reference", 2: "temperature", 1: "HTTP",
+        30: "CPU or RAM",
+        29: "digital board",
+        28: "analog board",
+        27: "serial link",
+        26: "program memory",
+        25: "halted or wrong configuration",
+        24: "settings",
+        23: "calibration does not match",
+        22: "network",
+        21: "CAN bus",
+        20: "RDT",
+        19: "EtherNet/IP",
+        18: "DeviceNet",
+        17: "saturation or A/D converter",
+        16: "a monitored condition is latched",
+        7: "analog ground",
+        6: "supply too high",
+        5: "supply too low",
+        4: "no serial data",
+        3: "reference",
+        2: "temperature",
+        1: "HTTP",
     },
     Model.AXIA: {
-        30: "force or torque out of range", 29: "calibration checksum", 28: "simulated error", 27: "gage out of range",
-        16: "a monitored condition is latched", 7: "calibration not accessible", 5: "other error", 3: "busy", 2: "broken gage",
-        1: "supply voltage", 0: "temperature",
+        30: "force or torque out of range",
+        29: "calibration checksum",
+        28: "simulated error",
+        27: "gage out of range",
+        16: "a monitored condition is latched",
+        7: "calibration not accessible",
+        5: "other error",
+        3: "busy",
+        2: "broken gage",
+        1: "supply voltage",
+        0: "temperature",
     },
-}  # fmt: skip
+}
 _NET_BITS_8_TO_14 = "watchdog, stack, EEPROM, flash, analog watchdog or excitation"
 _SATURATED = {Model.NET: 1 << 17, Model.AXIA: 1 << 30 | 1 << 27}
 
@@ -174,7 +201,8 @@ def force_unit(name: str) -> float | None:
 
 
 def torque_unit(name: str) -> float | None:
-    """Return the newton metres of a unit of torque such as Nm, N-mm or lbf-in, in either order; None for an unknown one.
+    """Return the newton metres of a unit of torque such as Nm, N-mm or lbf-in, in either order; None for an unknown
+    one.
 
     Example:
         >>> torque_unit("N-m"), torque_unit("Nmm"), torque_unit("kN-m"), torque_unit("parsec")
@@ -238,9 +266,7 @@ def _sample_hz(text: str) -> float:
 def _bias(text: str) -> tuple[float, ...]:
     """Return ``setbias``: six numbers apart by semicolon, comma or blank."""
     try:
-        return tuple(
-            float(word) for word in re.split(r"[;,\s]+", _optional(text, "setbias").strip(" ;,")) if word
-        )
+        return tuple(float(word) for word in re.split(r"[;,\s]+", _optional(text, "setbias").strip(" ;,")) if word)
     except ValueError:
         return ()
 

@@ -40,9 +40,12 @@ PAGE_TIMEOUT_S = 2.0
 TRUSTED_NS = 2_000_000_000
 """A sensor that was silent for less than this is still the same one: only the stream is started again."""
 PAGE_S = 5.0
-"""Period in which the page is read while it streams: RDT does not tell that somebody changed the settings or the zero."""
+"""Period in which the page is read while it streams: RDT does not tell that somebody changed the settings or the zero.
+"""
 OLD_S, OLD_RECORDS = 0.1, rdt.MAX_RECORDS
-"""Samples so far behind the newest, or by so many records, are old ones; farther ones are of a sensor that has restarted."""
+"""Samples so far behind the newest, or by so many records, are old ones; farther ones are of a sensor that has
+restarted.
+"""
 BIAS_TRIES, BIAS_PAUSE_S = 3, 0.05
 TAKEN_PAUSE_NS = 60_000_000_000
 LOOK_AT_THE_SENSOR = "look at host and port, and that RDT is enabled on the sensor's communication page"
@@ -98,13 +101,14 @@ class AtiRdt(StreamDriver):
     def golden(cls, settings: Any) -> Sequence[Golden]:
         """Return datagrams of the manual."""
         record = rdt.Record(1, 1, 0, 1000000, -2000000, 3000000, 10000, -20000, 30000)
-        sent = "00 00 00 01 00 00 00 01 00 00 00 00 00 0f 42 40 ff e1 7b 80 00 2d c6 c0 00 00 27 10 ff ff b1 e0 00 00 75 30"
+        sent = (
+            "00 00 00 01 00 00 00 01 00 00 00 00 00 0f 42 40 ff e1 7b 80 00 2d c6 c0 00 00 27 10 ff ff b1 e0 00 00 75 "
+            "30"
+        )
         start = rdt.start(rdt.Command.REALTIME, MARGIN_S)
         return (
             Golden("start", start, "12 34 00 02 00 00 00 00"),
-            Golden(
-                "record", reply=sent, value=record, read=lambda data: start.decode(data[: rdt.RECORD_BYTES])
-            ),
+            Golden("record", reply=sent, value=record, read=lambda data: start.decode(data[: rdt.RECORD_BYTES])),
             Golden("stop", rdt.request(rdt.Command.STOP), "12 34 00 00 00 00 00 00"),
             Golden("bias", rdt.request(rdt.Command.BIAS), "12 34 00 42 00 00 00 00"),
         )
@@ -173,9 +177,7 @@ class AtiRdt(StreamDriver):
         for record in records:
             lost = self._sequence.accept(record.rdt_seq, now_ns)
             if lost is None:
-                self.trouble = (
-                    f"records come, but their number stands still at {record.rdt_seq}: the sensor is frozen"
-                )
+                self.trouble = f"records come, but their number stands still at {record.rdt_seq}: the sensor is frozen"
                 continue
             if not self._is_new_sample(record.ft_seq, now_ns):
                 continue
@@ -262,9 +264,7 @@ class AtiRdt(StreamDriver):
             if (count - last) % rdt.SEQUENCE_MODULUS > rdt.SEQUENCE_MODULUS // 2:
                 self._doubt_zero("the sensor restarted")
                 self._newest, self._known = (count, now_ns), ""
-                raise LinkError(
-                    f"{self.name}: its samples are counted from {count} after {last}: it has restarted"
-                )
+                raise LinkError(f"{self.name}: its samples are counted from {count} after {last}: it has restarted")
         self._newest = count, now_ns
         return True
 
@@ -304,9 +304,7 @@ class AtiRdt(StreamDriver):
             if page.bias != before:
                 break
             if attempt + 1 == BIAS_TRIES:
-                self.kit.log(
-                    "warning", f"{self.name}: the sensor shows the same bias as before: was it the same load"
-                )
+                self.kit.log("warning", f"{self.name}: the sensor shows the same bias as before: was it the same load")
         self._block.take_zero()
 
     def _get_page(self) -> Exchange:
@@ -350,15 +348,14 @@ class AtiRdt(StreamDriver):
             )
         if abs(page.rate_hz - settings.rate_hz) > 0.01 * settings.rate_hz:
             raise self._not_this(
-                f"sends {page.rate_hz:g} records/s; the configuration says rate_hz = {settings.rate_hz:g}; change one of them"
+                f"sends {page.rate_hz:g} records/s; the configuration says rate_hz = {settings.rate_hz:g}; change one "
+                "of them"
             )
         counts = (page.counts_per_force / force, page.counts_per_torque / torque)
         for key, value in zip(("counts_per_force", "counts_per_torque"), counts, strict=True):
             wanted = getattr(settings, key)
             if wanted and abs(wanted - value) > 1e-6 * value:
-                raise self._not_this(
-                    f"has {value:g} counts in an SI unit; the configuration says {key} = {wanted:g}"
-                )
+                raise self._not_this(f"has {value:g} counts in an SI unit; the configuration says {key} = {wanted:g}")
         self._model = model
         if not settings.sample_hz:
             self._clock.state(page.sample_hz or rdt.SAMPLE_HZ)
@@ -391,8 +388,6 @@ def _check(settings: AtiRdtSettings) -> None:
         if settings.page == "none" and not getattr(settings, key):
             raise ValueError(f'{key}: none given; page = "none" needs it, from the calibration sheet')
     if settings.page == "none" and (not settings.model or settings.serial_number):
-        raise ValueError(
-            'page = "none": want model = "net" or "axia", and no serial_number, which RDT does not tell'
-        )
+        raise ValueError('page = "none": want model = "net" or "axia", and no serial_number, which RDT does not tell')
     if settings.page != "none":
         LineSettings(tcp=_page_host(settings))

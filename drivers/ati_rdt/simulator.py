@@ -1,12 +1,15 @@
-"""An ATI Net F/T box or Ethernet Axia on UDP, with its web page: ``python -m sioms.drivers.ati_rdt.simulator --port 0``.
+"""An ATI Net F/T box or Ethernet Axia on UDP, with its web page: ``python -m sioms.drivers.ati_rdt.simulator --port
+0``.
 
-RDT on a UDP port, ``/netftapi2.xml`` on the TCP port of the same number. It answers requests with records to where they came from, and to
-the last client alone; streams for ever when nobody stops it; sets its zero on request without an answer; reports saturation in its model's status
-word; counts its samples at ``--internal-hz``, which its page tells as ``runrate`` (Net) or ``setrate`` (Axia), and repeats a sample when records are
-faster. Its zero goes with its power, its settings stay. Commands on standard input: ``load FX FY FZ TX TY TZ [SECONDS]``, ``status WORD`` (or-ed to
-its own, 0 = none), ``stall``, ``resume`` (samples go on, records do not leave), ``page ELEMENT VALUE``, ``web on|off``, ``garbage SIZE``, ``state``, ``power_cycle
-[SECONDS]``, ``freeze [COUNT]``, ``hold on|off`` (records are numbered on, their sample stands still), ``foreign zero|client|units|rate VALUE``, and the faults of a network:
-``mute COUNT`` (drop), ``double``, ``late SECONDS COUNT``, ``cut``, ``deaf COUNT`` (requests lost).
+RDT on a UDP port, ``/netftapi2.xml`` on the TCP port of the same number. It answers requests with records to where they
+came from, and to the last client alone; streams for ever when nobody stops it; sets its zero on request without an
+answer; reports saturation in its model's status word; counts its samples at ``--internal-hz``, which its page tells as
+``runrate`` (Net) or ``setrate`` (Axia), and repeats a sample when records are
+faster. Its zero goes with its power, its settings stay. Commands on standard input: ``load FX FY FZ TX TY TZ
+[SECONDS]``, ``status WORD`` (or-ed to its own, 0 = none), ``stall``, ``resume`` (samples go on, records do not leave),
+``page ELEMENT VALUE``, ``web on|off``, ``garbage SIZE``, ``state``, ``power_cycle [SECONDS]``, ``freeze [COUNT]``,
+``hold on|off`` (records are numbered on, their sample stands still), ``foreign zero|client|units|rate VALUE``, and the
+faults of a network: ``mute COUNT`` (drop), ``double``, ``late SECONDS COUNT``, ``cut``, ``deaf COUNT`` (requests lost).
 """
 
 from __future__ import annotations
@@ -38,10 +41,16 @@ class Sensor:
         self.extra_status = 0
         self.stalled = False
         self.page = {
-            "prodname": PRODUCTS[options.model], "setserial": options.serial, "cfgcpf": str(options.counts_per_force),
-            "cfgcpt": str(options.counts_per_torque), "scfgfu": options.force_unit, "scfgtu": options.torque_unit,
-            "comrdtrate": str(options.rate), "setbias": "0;0;0;0;0;0", RATES[options.model]: str(round(options.internal_hz)),
-        }  # fmt: skip
+            "prodname": PRODUCTS[options.model],
+            "setserial": options.serial,
+            "cfgcpf": str(options.counts_per_force),
+            "cfgcpt": str(options.counts_per_torque),
+            "scfgfu": options.force_unit,
+            "scfgtu": options.torque_unit,
+            "comrdtrate": str(options.rate),
+            "setbias": "0;0;0;0;0;0",
+            RATES[options.model]: str(round(options.internal_hz)),
+        }
         if options.no_rate:
             del self.page[RATES[options.model]]
         self.supply, self.standstill = Supply(clock, self.boot, options.boot_s), Standstill()
@@ -83,16 +92,12 @@ class Sensor:
         """Take the present load as zero."""
         now_s = self.clock()
         self.load.zero(now_s)
-        counts = [
-            round(value * each) for value, each in zip(self.load.true(now_s), self._scale(), strict=True)
-        ]
+        counts = [round(value * each) for value, each in zip(self.load.true(now_s), self._scale(), strict=True)]
         self.page["setbias"] = ";".join(map(str, counts))
 
     def _scale(self) -> list[float]:
         options = self.options
-        return [options.counts_per_force / options.newton] * 3 + [
-            options.counts_per_torque / options.newton_metre
-        ] * 3
+        return [options.counts_per_force / options.newton] * 3 + [options.counts_per_torque / options.newton_metre] * 3
 
     def due(self, send: Callable[[bytes, Address], None]) -> None:
         """Send the records sampled until now."""
@@ -127,7 +132,9 @@ class Sensor:
     def xml(self) -> str:
         """Return the page."""
         elements = "".join(f"<{name}>{value}</{name}>\r\n" for name, value in self.page.items())
-        return f'<?xml version="1.0" encoding="ISO-8859-1"?>\r\n<netft>\r\n<runstat>0</runstat>\r\n{elements}</netft>\r\n'
+        return (
+            f'<?xml version="1.0" encoding="ISO-8859-1"?>\r\n<netft>\r\n<runstat>0</runstat>\r\n{elements}</netft>\r\n'
+        )
 
     def state(self) -> dict[str, object]:
         """Return what a bystander sees."""
@@ -164,10 +171,17 @@ class Sensor:
             return lambda: setattr(self, "stalled", value)
 
         return {
-            **self.load.handlers(self.clock), "status": status, "stall": set_stall(True), "resume": set_stall(False),
-            "page": page, "state": self.state, "power_cycle": self.supply.cycle, "freeze": self.standstill.set, "hold": hold,
+            **self.load.handlers(self.clock),
+            "status": status,
+            "stall": set_stall(True),
+            "resume": set_stall(False),
+            "page": page,
+            "state": self.state,
+            "power_cycle": self.supply.cycle,
+            "freeze": self.standstill.set,
+            "hold": hold,
             "foreign": foreign,
-        }  # fmt: skip
+        }
 
 
 class WebServer:

@@ -97,7 +97,8 @@ def signed(data: bytes, at: int, size: int) -> int:
 
 
 def find(data: bytes, what: str) -> tuple[int, int] | None:
-    """Return where the status packet in data begins and ends, behind stray bytes and a local echo; None while it is not whole.
+    """Return where the status packet in data begins and ends, behind stray bytes and a local echo; None while it is not
+    whole.
 
     Raises:
         LinkError: data holds none.
@@ -182,18 +183,14 @@ class Bus:
         """Restart a servo: clears a shutdown."""
         return self._one(servo, Op.REBOOT, b"", 0, f"reboot servo {servo}", repeatable=False)
 
-    def _one(
-        self, servo: int, op: Op, parameters: bytes, size: int, what: str, *, repeatable: bool
-    ) -> Exchange:
+    def _one(self, servo: int, op: Op, parameters: bytes, size: int, what: str, *, repeatable: bool) -> Exchange:
         timeout_s = self.turnaround_s + (size + _SHORTEST) * self.character_s
 
         def want(data: bytes) -> int | None:
             found = find(data, what)
             return found[1] if found else None
 
-        return Exchange(
-            packet(servo, op, parameters), want, _from(servo, size, what), timeout_s, repeatable, what
-        )
+        return Exchange(packet(servo, op, parameters), want, _from(servo, size, what), timeout_s, repeatable, what)
 
 
 def sync_read(servos: Sequence[int], address: int, size: int) -> bytes:
@@ -212,9 +209,7 @@ def _from(servo: int, size: int, what: str) -> Callable[[bytes], Any]:
         found = find(data, what) or (0, len(data))
         status = parse(data[slice(*found)], what)
         if status.id != servo or len(status.data) != size:
-            raise LinkError(
-                f"{what}: {len(status.data)} bytes from servo {status.id}; {size} from {servo} are right"
-            )
+            raise LinkError(f"{what}: {len(status.data)} bytes from servo {status.id}; {size} from {servo} are right")
         return status
 
     return decode

@@ -1,9 +1,10 @@
 """Dynamixel X servos on protocol 2.0, several on one line, each an axis.
 
-The operating mode is a choice of the configuration, for it lies in the servo's EEPROM and changes only with the torque off.
-The bus watchdog is the dead-man: without a request for that long the servo stops. Every poll reads torque, watchdog, profile and goal and
-compares them with what was written, and the servo's clock with this one: a servo that restarted, or that somebody else
-has commanded, is opened again. A goal goes out in one packet with the profile that limits it.
+The operating mode is a choice of the configuration, for it lies in the servo's EEPROM and changes only with the torque
+off. The bus watchdog is the dead-man: without a request for that long the servo stops. Every poll reads torque,
+watchdog, profile and goal and compares them with what was written, and the servo's clock with this one: a servo that
+restarted, or that somebody else has commanded, is opened again. A goal goes out in one packet with the profile that
+limits it.
 
     [device.arm0]
     driver = "dynamixel"
@@ -61,10 +62,12 @@ TIME_BASED = 0x04
 FARTHEST = 1_048_575
 """Goal of the extended position mode, 256 turns (e-Manual, Goal Position)."""
 FLUSH = bytes(200)
-"""More than the receiver holds of a packet whose length was damaged. Zeros cannot complete one: they make a CRC of 0 only of a CRC of 0."""
+"""More than the receiver holds of a packet whose length was damaged. Zeros cannot complete one: they make a CRC of 0
+only of a CRC of 0.
+"""
 TICKS, DRIFT, JITTER_MS, TICKS_MS, LONGEST_MS = 32768, 0.1, 200, 1000, 20_000
-"""The servo's clock: where it begins anew [ms], how far it may be from this one (part of the time since a reading, and more [ms]), after
-how long that reading is renewed, and from where on it tells nothing [ms]."""
+"""The servo's clock: where it begins anew [ms], how far it may be from this one (part of the time since a reading, and
+more [ms]), after how long that reading is renewed, and from where on it tells nothing [ms]."""
 CONFIRM_S = 0.05
 """After what pause a finding is looked at again."""
 OUTAGE_NS = 2_000_000_000
@@ -87,9 +90,10 @@ AxisTable: Any = drive_table(
 )
 """Keys of an axis: those of AxisSettings that a drive of its own loop leaves, and
 
-id: of the servo; model: number that it must tell (1020 = XM430-W350), 0 takes any; mode: operating mode; travel_per_turn: m or rad in
-one turn, negative to reverse; steps_per_turn, zero: of its position, and the position that is 0; speed_unit_rpm [rev/min],
-acceleration_unit_rpm2 [rev/min^2], current_unit [A]: of its registers; force_per_ampere: N*m or N in one ampere, for mode = "current".
+id: of the servo; model: number that it must tell (1020 = XM430-W350), 0 takes any; mode: operating mode;
+travel_per_turn: m or rad in one turn, negative to reverse; steps_per_turn, zero: of its position, and the position that
+is 0; speed_unit_rpm [rev/min], acceleration_unit_rpm2 [rev/min^2], current_unit [A]: of its registers;
+force_per_ampere: N*m or N in one ampere, for mode = "current".
 """
 
 
@@ -160,7 +164,9 @@ class ServoUnit(AxesUnit):
     # --- hooks ----------------------------------------------------------------------------------
 
     def open(self) -> Steps:
-        """Identify the servo, stop it, prove its mode, limits and watchdog, and switch it on unless a stop is latched."""
+        """Identify the servo, stop it, prove its mode, limits and watchdog, and switch it on unless a stop is
+        latched.
+        """
         yield from self._begin(self.stop)
 
     def _begin(self, stop: Callable[[], Steps]) -> Steps:
@@ -172,9 +178,7 @@ class ServoUnit(AxesUnit):
             text = f"identify {self.name}: servo {servo} is model {model}, firmware {answer.data[2]}"
             raise DeviceError(errno.ENODEV, f"{text}; the configuration says {axis.model}")
         # at a lower level it answers neither writes nor reads
-        yield Send(
-            dynamixel.packet(servo, dynamixel.Op.WRITE, bytes((RETURN_LEVEL, 0, 2))), "ask for replies"
-        )
+        yield Send(dynamixel.packet(servo, dynamixel.Op.WRITE, bytes((RETURN_LEVEL, 0, 2))), "ask for replies")
         yield Pause(0.01)
         before: Image = yield from self._read()
         lost = self._lost_place(before)
@@ -215,9 +219,7 @@ class ServoUnit(AxesUnit):
         """Set profile and goal at once."""
         goal = self._steps_of(position)
         yield from self._switch_on()
-        yield from self._aim(
-            self._count(action.acceleration_max * self._rate), self._count(speed * self._speed), goal
-        )
+        yield from self._aim(self._count(action.acceleration_max * self._rate), self._count(speed * self._speed), goal)
 
     def start_velocity(self, axis: int, velocity: float, action: DriveAction) -> Steps:
         """Set velocity and profile at once."""
@@ -228,9 +230,7 @@ class ServoUnit(AxesUnit):
     def start_force(self, axis: int, force: float, action: DriveAction) -> Steps:
         """Set the current."""
         yield from self._switch_on()
-        yield from self._write(
-            GOAL_CURRENT, round(force / self._axis.force_per_ampere / self._axis.current_unit), 2
-        )
+        yield from self._write(GOAL_CURRENT, round(force / self._axis.force_per_ampere / self._axis.current_unit), 2)
 
     def halt(self, axis: int, *, fastest: bool) -> Steps:
         """Brake and hold; the fastest stop frees the shaft."""
@@ -268,7 +268,9 @@ class ServoUnit(AxesUnit):
             yield from self._brake()
 
     def _brake(self) -> Steps:
-        """Set the goal where braking ends: one nearer, as the place of now, the servo would overshoot and come back to."""
+        """Set the goal where braking ends: one nearer, as the place of now, the servo would overshoot and come back
+        to.
+        """
         highest = self.bank.settings[0].acceleration_max
         now: Status = yield from self._sure(self._bus.read(self._id, PRESENT_VELOCITY, 8))
         speed, place = signed(now.data, 0, 4) / self._speed, signed(now.data, 4, 4)
@@ -434,7 +436,9 @@ class ServoUnit(AxesUnit):
         return Image(answer.data, answer.alert, asked_ns, self.clock())
 
     def _sure(self, exchange: Exchange) -> Any:
-        """Carry out an exchange that may be repeated; a receiver that waits for the end of a damaged packet is given one."""
+        """Carry out an exchange that may be repeated; a receiver that waits for the end of a damaged packet is given
+        one.
+        """
         try:
             return (yield exchange)
         except LinkError:
@@ -444,9 +448,7 @@ class ServoUnit(AxesUnit):
     def _write(self, address: int, value: int, size: int, *, repeatable: bool = False) -> Steps:
         yield from self._write_all(address, [(value, size)], repeatable=repeatable)
 
-    def _write_all(
-        self, address: int, values: Sequence[tuple[int, int]], *, repeatable: bool = False
-    ) -> Steps:
+    def _write_all(self, address: int, values: Sequence[tuple[int, int]], *, repeatable: bool = False) -> Steps:
         """Write registers at once, and note what they must read from now on."""
         sizes = [size for _, size in values]
         places = [address + sum(sizes[:i]) for i in range(len(sizes))]
@@ -468,7 +470,9 @@ class ServoUnit(AxesUnit):
     def _steps_of(self, position: float) -> int:
         steps: int = round(position * self._per_unit) + self._axis.zero
         if self._axis.mode == "position" and not 0 <= steps < self._axis.steps_per_turn:
-            text = f"position {position:g} is step {steps} of the servo; 0 to {self._axis.steps_per_turn - 1} in this mode"
+            text = (
+                f"position {position:g} is step {steps} of the servo; 0 to {self._axis.steps_per_turn - 1} in this mode"
+            )
             raise DeviceError(errno.ERANGE, text)
         if abs(steps) > FARTHEST:
             text = f"position {position:g} is step {steps} of the servo; {-FARTHEST} to {FARTHEST} is right"
@@ -498,9 +502,7 @@ class Dynamixel(LineDriver):
             )
         for axis in settings.axis:
             if not (axis.travel_per_turn and axis.steps_per_turn > 0 and axis.speed_unit_rpm > 0):
-                raise ValueError(
-                    f"axis {axis.name}: want a travel other than 0, and positive steps and units"
-                )
+                raise ValueError(f"axis {axis.name}: want a travel other than 0, and positive steps and units")
             if axis.mode == "current" and axis.force_per_ampere == 0:
                 raise ValueError(f"axis {axis.name}: mode = current wants force_per_ampere")
         alone = len(settings.axis) == 1

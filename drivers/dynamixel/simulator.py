@@ -2,13 +2,15 @@
 
 Behaves as ROBOTIS' e-Manual says of the XM430-W350, and where that is silent in the way that is worst for a master
 (README.md names page and commit of each): control table with an EEPROM that is locked while the torque is on,
-goals that outlive the torque and are taken up when it is switched on, a mode change that clears the profile and sets the goal
-current to its limit, a bus watchdog that makes the goals read-only, a count of turns that a restart forgets, shutdown that only
-a reboot clears. The receiver is that of Dynamixel2Arduino (``dxl_c/protocol.cpp``): no time-out, silence on a wrong CRC.
+goals that outlive the torque and are taken up when it is switched on, a mode change that clears the profile and sets
+the goal current to its limit, a bus watchdog that makes the goals read-only, a count of turns that a restart forgets,
+shutdown that only
+a reboot clears. The receiver is that of Dynamixel2Arduino (``dxl_c/protocol.cpp``): no time-out, silence on a wrong
+    CRC.
 
-Commands on standard input, beside those of the line: ``state [ID]``, ``hardware BITS [ID]`` (error 70), ``put ADDRESS VALUE
-SIZE [ID]``, ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze [COUNT]``, ``foreign velocity|position|torque|mode VALUE [ID]``
-(steps/s, steps, 0 or 1, number), ``shove STEPS_PER_S [ID]``.
+Commands on standard input, beside those of the line: ``state [ID]``, ``hardware BITS [ID]`` (error 70), ``put ADDRESS
+VALUE SIZE [ID]``, ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze [COUNT]``, ``foreign
+velocity|position|torque|mode VALUE [ID]`` (steps/s, steps, 0 or 1, number), ``shove STEPS_PER_S [ID]``.
 """
 
 from __future__ import annotations
@@ -51,7 +53,9 @@ def crc(data: bytes) -> int:
 
 
 class Servo:
-    """One servo; times in seconds of the given clock, positions in steps. The mover knows the turns, the register may not."""
+    """One servo; times in seconds of the given clock, positions in steps. The mover knows the turns, the register may
+    not.
+    """
 
     def __init__(self, id_: int, model: int, clock: Callable[[], float]) -> None:
         self.id, self.model, self._clock = id_, model, clock
@@ -66,14 +70,21 @@ class Servo:
         self.start(clock())
 
     def start(self, at_s: float) -> None:
-        """Be as after power-up at a time, deaf until then: no torque, all RAM as from the factory, the place within one turn."""
+        """Be as after power-up at a time, deaf until then: no torque, all RAM as from the factory, the place within one
+        turn.
+        """
         self.table[EEPROM_END:] = bytes(len(self.table) - EEPROM_END)
         self.current_ma = 0.0
         self.heard_s = self.back_s = at_s
         self.forget_turns()
         for address, value, size in (
-            (68, 2, 1), (100, self.get(36, 2), 2), (102, self.get(38, 2), 2), (116, self.place, 4), (144, 120, 2), (146, 30, 1),
-        ):  # fmt: skip
+            (68, 2, 1),
+            (100, self.get(36, 2), 2),
+            (102, self.get(38, 2), 2),
+            (116, self.place, 4),
+            (144, 120, 2),
+            (146, 30, 1),
+        ):
             self.put(address, value, size)
         self.mover.stop(COAST)
 
@@ -218,7 +229,9 @@ class Servo:
 
 
 class Receiver:
-    """The vendor's receiver of one port: byte by byte, without a time-out; what does not fit or has a wrong CRC is dropped."""
+    """The vendor's receiver of one port: byte by byte, without a time-out; what does not fit or has a wrong CRC is
+    dropped.
+    """
 
     def __init__(self) -> None:
         self._bytes = b""
@@ -260,9 +273,7 @@ class Receiver:
 class Bus:
     """The servos on their line."""
 
-    def __init__(
-        self, ids: list[int], model: int = 1020, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, ids: list[int], model: int = 1020, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self.servos = {id_: Servo(id_, model, clock) for id_ in ids}
         self._receiver = Receiver()
@@ -323,9 +334,7 @@ class Bus:
             case 0x01:
                 return self._status(servo, 0, servo.model.to_bytes(2, "little") + servo.table[6:7])
             case 0x02 if len(rest) == 4:
-                return self._read(
-                    servo, int.from_bytes(rest[:2], "little"), int.from_bytes(rest[2:], "little")
-                )
+                return self._read(servo, int.from_bytes(rest[:2], "little"), int.from_bytes(rest[2:], "little"))
             case 0x03 | 0x08 if self._refuse:
                 self._refuse -= 1
                 return self._answer(servo, RESULT)

@@ -176,9 +176,7 @@ def _acknowledged(request: bytes, timeout_s: float, what: str, repeatable: bool)
     return _exchange(request, Message.ACKNOWLEDGE, decode, timeout_s, what, repeatable)
 
 
-def _exchange(
-    request: bytes, reply: Message, decode: Any, timeout_s: float, what: str, repeatable: bool
-) -> Exchange:
+def _exchange(request: bytes, reply: Message, decode: Any, timeout_s: float, what: str, repeatable: bool) -> Exchange:
     """Return an exchange whose reply may come behind sample blocks that are still under way."""
 
     def find(data: bytes) -> tuple[int, bytes] | None:

@@ -11,8 +11,8 @@ the last. Each block carries the time at which it was sampled, by a running fit 
     scale = 0.0005
     unit = "N"
 
-The front end of a calibrated tactile finger has a table ``shape``, see ``tactile_nodes``: the strains and what touches the
-finger are then published with every block.
+The front end of a calibrated tactile finger has a table ``shape``, see ``tactile_nodes``: the strains and what touches
+the finger are then published with every block.
 """
 
 from __future__ import annotations
@@ -98,9 +98,7 @@ class FramedAdc(StreamDriver):
         """Tell the channels; raises ValueError for what neither frame nor line could carry."""
         _check(settings)
         names = settings.names or [f"c{i}" for i in range(settings.channels)]
-        channels = tuple(
-            ChannelInfo(each, settings.unit, settings.minimum, settings.maximum) for each in names
-        )
+        channels = tuple(ChannelInfo(each, settings.unit, settings.minimum, settings.maximum) for each in names)
         block = BlockSpec("", NodeClass.ANALOG, channels, history=settings.history)
         more = tactile_nodes.specs(settings.shape, settings.channels, settings.history)
         return Description(
@@ -124,15 +122,21 @@ class FramedAdc(StreamDriver):
 
         return (
             Golden(
-                "samples", reply="04 01 01 07 04 40 e2 01 02 04 02 64 03 38 ff 01 05 ff 7f f5 76 00", value=block, read=first
+                "samples",
+                reply="04 01 01 07 04 40 e2 01 02 04 02 64 03 38 ff 01 05 ff 7f f5 76 00",
+                value=block,
+                read=first,
             ),
             Golden(
-                "hello", stream.hello(), "04 10 c1 f3 00",
-                "04 11 01 04 03 e8 03 01 07 54 41 43 34 de c8 00", about,
+                "hello",
+                stream.hello(),
+                "04 10 c1 f3 00",
+                "04 11 01 04 03 e8 03 01 07 54 41 43 34 de c8 00",
+                about,
             ),
             Golden("start", stream.start(1, 1000), "05 12 01 e8 03 01 03 fc 6d 00", "03 1f 12 03 df c6 00"),
             Golden("stop", stream.stop(1), "05 13 01 0e 5b 00"),
-        )  # fmt: skip
+        )
 
     def __init__(self, name: str, settings: FramedAdcSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
@@ -166,13 +170,9 @@ class FramedAdc(StreamDriver):
         if about.channels != settings.channels:
             raise self._not_this(f"has {about.channels} channels; the configuration says {settings.channels}")
         if about.format.name.lower() != settings.format:
-            raise self._not_this(
-                f"sends {about.format.name.lower()}; the configuration says {settings.format}"
-            )
+            raise self._not_this(f"sends {about.format.name.lower()}; the configuration says {settings.format}")
         if settings.device_name and about.name != settings.device_name:
-            raise self._not_this(
-                f"calls itself {about.name!r}; the configuration says {settings.device_name!r}"
-            )
+            raise self._not_this(f"calls itself {about.name!r}; the configuration says {settings.device_name!r}")
         if settings.rate_hz > about.max_rate_hz:
             raise self._not_this(f"sends at most {about.max_rate_hz} Hz; rate_hz = {settings.rate_hz}")
         self._sequence.expect_anew()
@@ -221,9 +221,7 @@ class FramedAdc(StreamDriver):
         lost = self._sequence.accept(block.sequence, now_ns)
         if lost is None:
             self._t_us = block.t_us if self._t_us is None else self._t_us
-            self.trouble = (
-                f"blocks come, but their number stands still at {block.sequence}: the device is frozen"
-            )
+            self.trouble = f"blocks come, but their number stands still at {block.sequence}: the device is frozen"
             return False
         last_us, self._t_us = self._t_us, block.t_us
         if block.t_us == last_us:
@@ -273,7 +271,9 @@ class FramedAdc(StreamDriver):
         if abs(hz / wanted_hz - 1) <= RATE_TOLERANCE:
             self._granted_hz = wanted_hz
         elif self._granted_hz:
-            text = f"{self.name}: {hz:.1f} blocks a second after {wanted_hz:g}: another host has started the stream anew"
+            text = (
+                f"{self.name}: {hz:.1f} blocks a second after {wanted_hz:g}: another host has started the stream anew"
+            )
             raise LinkError(text)
         else:
             self._granted_hz = hz
@@ -308,9 +308,7 @@ def _check(settings: FramedAdcSettings) -> None:
         value = getattr(settings, key)
         numbers = value if isinstance(value, list) else [value]
         if isinstance(value, list) and len(value) != settings.channels:
-            raise ValueError(
-                f"{key}: {len(value)} for {settings.channels} channels; want one number, or one each"
-            )
+            raise ValueError(f"{key}: {len(value)} for {settings.channels} channels; want one number, or one each")
         if not all(map(math.isfinite, numbers)) or (key == "scale" and 0 in numbers):
             raise ValueError(f"{key} = {value}; want finite numbers{', not 0' if key == 'scale' else ''}")
     if settings.rate_hz < 1:

@@ -1,11 +1,12 @@
 """A front end that streams framed samples on a pty: ``python -m sioms.drivers.framed_adc.simulator --link PATH``.
 
 A tactile array of ``--channels`` elements in rows of ``--columns``, pitch 1, first element at (0, 0), behind an ADC:
-forces spread over the elements, noise, clipping with its flag, an own clock with an error, a dead-man of 5 s. Commands on
-standard input: ``touch NEWTON X Y [RADIUS]``, ``press FROM TO SECONDS X Y [RADIUS]``, ``release``, ``lose COUNT`` (blocks the
-device fails to send), ``restart`` (as after a power cycle), ``power_cycle [SECONDS]``, ``freeze [COUNT]`` (the last block again), ``hold on|off``
-(numbers go on, clock and samples stand still), ``refuse COUNT`` (busy), ``foreign rate|stop|zero VALUE``, ``unplug [SECONDS]``, ``plug``, ``state``, and the
-faults of a line.
+forces spread over the elements, noise, clipping with its flag, an own clock with an error, a dead-man of 5 s. Commands
+on
+standard input: ``touch NEWTON X Y [RADIUS]``, ``press FROM TO SECONDS X Y [RADIUS]``, ``release``, ``lose COUNT``
+(blocks the device fails to send), ``restart`` (as after a power cycle), ``power_cycle [SECONDS]``, ``freeze [COUNT]``
+(the last block again), ``hold on|off`` (numbers go on, clock and samples stand still), ``refuse COUNT`` (busy),
+``foreign rate|stop|zero VALUE``, ``unplug [SECONDS]``, ``plug``, ``state``, and the faults of a line.
 """
 
 from __future__ import annotations
@@ -190,9 +191,7 @@ class FrontEnd:
         """Replace the contact; its force spreads over the elements as a bell of its radius, the sum kept."""
         columns = self.options.columns
         places = [(i % columns, i // columns) for i in range(self.options.channels)]
-        bell = [
-            math.exp(-((x - touch.x) ** 2 + (y - touch.y) ** 2) / (2 * touch.radius**2)) for x, y in places
-        ]
+        bell = [math.exp(-((x - touch.x) ** 2 + (y - touch.y) ** 2) / (2 * touch.radius**2)) for x, y in places]
         total = sum(bell)
         self.touch = touch
         self.shares = [value / total if total > 1e-9 else 0.0 for value in bell]
@@ -244,9 +243,14 @@ class FrontEnd:
                 raise ValueError(f"{kind}; one of rate, stop, zero is right")
 
         return {
-            "restart": self.restart, "state": self.state, "power_cycle": self.supply.cycle, "freeze": self.standstill.set,
-            "refuse": self.refusals.set, "hold": hold, "foreign": foreign,
-        }  # fmt: skip
+            "restart": self.restart,
+            "state": self.state,
+            "power_cycle": self.supply.cycle,
+            "freeze": self.standstill.set,
+            "refuse": self.refusals.set,
+            "hold": hold,
+            "foreign": foreign,
+        }
 
 
 async def _stream(device: FrontEnd, send: Callable[[bytes], None]) -> None:

@@ -1,8 +1,10 @@
 """Robotiq FT 300 on its serial line, without I/O: the registers, and the records that it sends at 100 Hz when told to.
 
-A record is ``20 4E``, six little-endian i16 (0.01 N, 0.001 N m) and CRC-16/MODBUS over these 14 bytes. The two bytes of the head
-occur in data too, so a record is what has the head and the right CRC. While it streams the sensor takes no Modbus request;
-0xFF, sent for half a second, ends the stream. Source: Robotiq FT 300 instruction manual, chapter on serial communication.
+A record is ``20 4E``, six little-endian i16 (0.01 N, 0.001 N m) and CRC-16/MODBUS over these 14 bytes. The two bytes of
+the head occur in data too, so a record is what has the head and the right CRC. While it streams the sensor takes no
+Modbus request;
+0xFF, sent for half a second, ends the stream. Source: Robotiq FT 300 instruction manual, chapter on serial
+    communication.
 """
 
 from __future__ import annotations
@@ -110,9 +112,10 @@ class RecordReceiver:
 class Standstill:
     """Tells a sensor that measures from one that repeats itself. The records carry neither number nor time.
 
-    What can be known: the data sheet gives a noise of 0.1 N and 0.005 N m or more, some counts in each of the six channels, so two records
-    are equal once in 10**6 at the most, and twelve in a row never. A converter at its end may stand still in one channel, not in all
-    six. **A sensor that repeats the last hundred records cannot be told from a load that repeats itself.**
+    What can be known: the data sheet gives a noise of 0.1 N and 0.005 N m or more, some counts in each of the six
+    channels, so two records are equal once in 10**6 at the most, and twelve in a row never. A converter at its end may
+    stand still in one channel, not in all six. **A sensor that repeats the last hundred records cannot be told from a
+    load that repeats itself.**
 
     Attributes:
         equal: records like the last one, in a row.

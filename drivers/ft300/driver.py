@@ -100,18 +100,25 @@ class Ft300(StreamDriver):
 
         return (
             Golden(
-                "read the forces", unit.read_holding(ft300.FORCES_AT, 6), "09 03 00 b4 00 06 84 a6",
-                "09 03 0c fe d8 fb 2e 16 2e 00 64 ff 38 01 2c 9d fc", (0xFED8, 0xFB2E, 0x162E, 0x0064, 0xFF38, 0x012C),
+                "read the forces",
+                unit.read_holding(ft300.FORCES_AT, 6),
+                "09 03 00 b4 00 06 84 a6",
+                "09 03 0c fe d8 fb 2e 16 2e 00 64 ff 38 01 2c 9d fc",
+                (0xFED8, 0xFB2E, 0x162E, 0x0064, 0xFF38, 0x012C),
             ),
             Golden(
-                "start the stream", unit.write_registers(ft300.STREAM_AT, [ft300.START_STREAM]),
-                "09 10 01 9a 00 01 02 02 00 cd ca", "09 10 01 9a 00 01 21 52",
+                "start the stream",
+                unit.write_registers(ft300.STREAM_AT, [ft300.START_STREAM]),
+                "09 10 01 9a 00 01 02 02 00 cd ca",
+                "09 10 01 9a 00 01 21 52",
             ),
             Golden(
-                "record", reply="20 4e d8 fe 2e fb 2e 16 64 00 38 ff 2c 01 7d af", value=(-296, -1234, 5678, 100, -200, 300),
+                "record",
+                reply="20 4e d8 fe 2e fb 2e 16 64 00 38 ff 2c 01 7d af",
+                value=(-296, -1234, 5678, 100, -200, 300),
                 read=first,
             ),
-        )  # fmt: skip
+        )
 
     def __init__(self, name: str, settings: Ft300Settings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
@@ -229,7 +236,9 @@ class Sensor:
         self._known = ""
 
     def end_stream(self) -> Steps:
-        """Send 0xFF for as long as the manual says; the time passes on the line, or beside it where that has no baud rate."""
+        """Send 0xFF for as long as the manual says; the time passes on the line, or beside it where that has no baud
+        rate.
+        """
         piece_s = LINE.duration_s(STOP_PIECE)
         for _ in range(int(ft300.STOP_S / piece_s) + 1):
             yield Send(ft300.STOP_BYTE * STOP_PIECE, "end the stream")
@@ -252,7 +261,9 @@ class Sensor:
         serial, year = about[3] << 16 | about[2], about[4]
         if not (version and version.isascii() and version.decode().isprintable()):
             shown = " ".join(f"{word:04x}" for word in firmware)
-            text = f"registers {ft300.FIRMWARE_AT} to {ft300.FIRMWARE_AT + 2} read {shown}, which is no firmware version"
+            text = (
+                f"registers {ft300.FIRMWARE_AT} to {ft300.FIRMWARE_AT + 2} read {shown}, which is no firmware version"
+            )
             raise DeviceError(errno.ENODEV, f"{self._what}: {text} of an FT 300")
         wanted = self._settings.serial_number
         if wanted and serial != wanted:
@@ -281,9 +292,7 @@ def _force_block(name: str, settings: Ft300Settings, kit: Kit) -> ForceBlock:
 def _check(settings: Ft300Settings) -> None:
     line = settings.line
     if line.udp is not None:
-        raise ValueError(
-            "line.udp: the sensor is on a serial line; want line.serial, or line.tcp of a serial server"
-        )
+        raise ValueError("line.udp: the sensor is on a serial line; want line.serial, or line.tcp of a serial server")
     if line.serial is not None and (line.baud, line.parity, line.stop_bits) != (ft300.BAUD, "N", 1):
         found = f"{line.baud} baud, 8{line.parity}{line.stop_bits}"
         raise ValueError(f"line: {found}; the sensor speaks 19200 baud, 8N1: want baud = 19200")
@@ -291,9 +300,7 @@ def _check(settings: Ft300Settings) -> None:
         raise ValueError(f"address = {settings.address}; want 1 to 247 ({ft300.SLAVE} from the factory)")
     if settings.mode == "stream":
         if settings.acceleration:
-            raise ValueError(
-                'acceleration: the stream has none; want mode = "modbus" or acceleration = false'
-            )
+            raise ValueError('acceleration: the stream has none; want mode = "modbus" or acceleration = false')
         return
     registers = ft300.ACCELERATION_AT + 3 - ft300.FORCES_AT if settings.acceleration else 6
     top_hz = 1 / (LINE.duration_s(8 + 5 + 2 * registers) + 2 * LINE.frame_gap_s)

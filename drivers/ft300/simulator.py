@@ -1,10 +1,12 @@
 """A Robotiq FT 300 on a pty: ``python -m sioms.drivers.ft300.simulator --link PATH``.
 
-Modbus RTU slave 9, functions 03 and 16, until 0x0200 is written to register 410; then a record of 16 bytes a hundred times
-a second, and no answer to anything, until fifty times 0xFF have come in a row. Commands on standard input, beside those of
-the line: ``load FX FY FZ TX TY TZ [SECONDS]``, ``lose COUNT`` (records that are not sent), ``power_cycle [SECONDS]`` (then no stream, or with
-``--streams`` one at once), ``freeze [COUNT]`` (the last record again, and the same registers), ``refuse COUNT`` (busy to writes), ``foreign stream|stop 0``
-(another master starts or ends the stream), ``register ADDRESS VALUE``, ``state``.
+Modbus RTU slave 9, functions 03 and 16, until 0x0200 is written to register 410; then a record of 16 bytes a hundred
+times a second, and no answer to anything, until fifty times 0xFF have come in a row. Commands on standard input, beside
+those of
+the line: ``load FX FY FZ TX TY TZ [SECONDS]``, ``lose COUNT`` (records that are not sent), ``power_cycle [SECONDS]``
+(then no stream, or with ``--streams`` one at once), ``freeze [COUNT]`` (the last record again, and the same registers),
+``refuse COUNT`` (busy to writes), ``foreign stream|stop 0`` (another master starts or ends the stream), ``register
+ADDRESS VALUE``, ``state``.
 """
 
 from __future__ import annotations

@@ -22,9 +22,7 @@ def load_binding() -> Any:
     try:
         import gpiod
     except ImportError:
-        raise ValueError(
-            "the Python binding of libgpiod is missing; install sioms[gpio], or gpiod 2"
-        ) from None
+        raise ValueError("the Python binding of libgpiod is missing; install sioms[gpio], or gpiod 2") from None
     if not hasattr(gpiod, "request_lines"):
         raise ValueError("the Python binding of libgpiod is version 1; install sioms[gpio], or gpiod 2")
     return gpiod
@@ -70,9 +68,7 @@ class GpioChip:
         try:
             return int(self._chip.line_offset_from_id(line))
         except OSError:
-            raise LinkError(
-                f"open {self._path}: no line is named {line!r}; gpioinfo lists the names"
-            ) from None
+            raise LinkError(f"open {self._path}: no line is named {line!r}; gpioinfo lists the names") from None
         except ValueError:
             many = self._chip.get_info().num_lines
             raise LinkError(f"open {self._path}: line {line}; it has {many}, want 0 to {many - 1}") from None

@@ -1,8 +1,10 @@
 """Lines of a Linux GPIO chip (character device), through the Python binding of libgpiod 2: the package ``gpiod``.
 
-Input lines are one port; every edge is published with the kernel's time stamp, also those that fell into one tick. Output lines
-are another; they take their safe levels when the driver opens and before it lets go of them. The kernel gives the lines back when
-the process dies: what level they then have is the board's matter, so a line that must fall needs a resistor that pulls it.
+Input lines are one port; every edge is published with the kernel's time stamp, also those that fell into one tick.
+Output lines are another; they take their safe levels when the driver opens and before it lets go of them. The kernel
+gives the lines back when
+the process dies: what level they then have is the board's matter, so a line that must fall needs a resistor that pulls
+    it.
 
     [device.io0]
     driver = "gpio"
@@ -118,9 +120,7 @@ class Gpio(TickDriver):
         if settings.output:
             safe = sum(table.safe << bit for bit, table in enumerate(settings.output))
             channel = _channel("out", [table.line for table in settings.output])
-            ports.append(
-                BlockSpec("", NodeClass.BINARY, (channel,), True, settings.history, safe=(float(safe),))
-            )
+            ports.append(BlockSpec("", NodeClass.BINARY, (channel,), True, settings.history, safe=(float(safe),)))
         if settings.input:
             channel = _channel("in", [table.line for table in settings.input])
             own = "in" if settings.output else ""
@@ -159,9 +159,7 @@ class Gpio(TickDriver):
                 pins = [chip.offset(table.line) for table in settings.output]
                 keys = [chip.offset(table.line) for table in settings.input]
                 if twice := {offset for offset in pins + keys if (pins + keys).count(offset) > 1}:
-                    raise LinkError(
-                        f"open {settings.chip}: line {twice.pop()} is configured by name and by offset"
-                    )
+                    raise LinkError(f"open {settings.chip}: line {twice.pop()} is configured by name and by offset")
                 whose = f"sioms {self.name}", settings.event_buffer
                 if pins:
                     lines = dict(zip(pins, map(self._output, settings.output), strict=True))
@@ -203,9 +201,7 @@ class Gpio(TickDriver):
         try:
             self._outputs.set_values({pin: levels(value >> bit & 1) for bit, pin in enumerate(self._pins)})
         except OSError as error:
-            raise Refusal(
-                error.errno or errno.EIO, f"set lines of {self.settings.chip}: {error.strerror}"
-            ) from None
+            raise Refusal(error.errno or errno.EIO, f"set lines of {self.settings.chip}: {error.strerror}") from None
         self._blocks[0].set(0, value, time.monotonic_ns())
 
     def counters(self) -> Mapping[str, int]:
@@ -243,9 +239,12 @@ class Gpio(TickDriver):
     def _output(self, table: OutputTable) -> Any:
         words = self._gpiod.line
         return self._gpiod.LineSettings(
-            direction=words.Direction.OUTPUT, bias=words.Bias[table.bias.upper()], drive=words.Drive[table.drive.upper()],
-            active_low=table.active_low, output_value=words.Value(table.safe),
-        )  # fmt: skip
+            direction=words.Direction.OUTPUT,
+            bias=words.Bias[table.bias.upper()],
+            drive=words.Drive[table.drive.upper()],
+            active_low=table.active_low,
+            output_value=words.Value(table.safe),
+        )
 
     def _edge(self, event: Any) -> Edge:
         rising = event.event_type is event.Type.RISING_EDGE
@@ -264,9 +263,7 @@ class Gpio(TickDriver):
                 while request is not None and request.wait_edge_events(0):
                     edges += map(self._edge, request.read_edge_events(self.settings.event_buffer))
         except OSError as error:
-            raise LinkError(
-                f"read lines of {self.settings.chip}: {(error.strerror or str(error)).lower()}"
-            ) from None
+            raise LinkError(f"read lines of {self.settings.chip}: {(error.strerror or str(error)).lower()}") from None
         return edges
 
     def _levels(self) -> int:
@@ -284,18 +281,14 @@ class Gpio(TickDriver):
 
 
 def _channel(name: str, lines: Sequence[int | str]) -> ChannelInfo:
-    about = ", ".join(
-        f"bit{bit} {'line ' if isinstance(line, int) else ''}{line}" for bit, line in enumerate(lines)
-    )
+    about = ", ".join(f"bit{bit} {'line ' if isinstance(line, int) else ''}{line}" for bit, line in enumerate(lines))
     return ChannelInfo(name, minimum=0, maximum=2 ** len(lines) - 1, width=len(lines), description=about)
 
 
 def _check(settings: GpioSettings) -> None:
     """Refuse what no request could be made of."""
     if not settings.input and not settings.output:
-        raise ValueError(
-            "input and output: none given; want a table [[...input]] or [[...output]] for each line"
-        )
+        raise ValueError("input and output: none given; want a table [[...input]] or [[...output]] for each line")
     for kind, tables in (("input", settings.input), ("output", settings.output)):
         if len(tables) > LINES:
             raise ValueError(

@@ -1,7 +1,7 @@
 """A port of input lines from the kernel's edge events, without I/O: levels, stamps, and how many events were lost.
 
-The kernel numbers the events of a request (GPIO character device, version 2: ``seqno`` from 1 on); when its buffer is full it
-drops the oldest, so a gap in the numbers is the number of edges that nobody can tell any more.
+The kernel numbers the events of a request (GPIO character device, version 2: ``seqno`` from 1 on); when its buffer is
+full it drops the oldest, so a gap in the numbers is the number of edges that nobody can tell any more.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""A GPIO chip simulated by the kernel: ``python -m sioms.drivers.gpio.simulator --link PATH`` makes one, PATH leads to it.
+"""A GPIO chip simulated by the kernel: ``python -m sioms.drivers.gpio.simulator --link PATH`` makes one, PATH leads to
+it.
 
-The chip is the kernel's own (gpio-sim, set up in configfs by root), so that what holds of the character device holds here: who
-holds a line, edges and their stamps, bias, debouncing, a chip that vanishes. Where there is no such kernel, one is started by
-``tests/kernel/run.py``. Commands on standard input: ``pull LINE 0|1`` (what is outside of an input), ``level LINE``, ``unplug``,
-``plug``, ``power_cycle [SECONDS]`` (of a chip on USB: gone, then anew), ``state``.
+The chip is the kernel's own (gpio-sim, set up in configfs by root), so that what holds of the character device holds
+here: who holds a line, edges and their stamps, bias, debouncing, a chip that vanishes. Where there is no such kernel,
+one is started by ``tests/kernel/run.py``. Commands on standard input: ``pull LINE 0|1`` (what is outside of an input),
+``level LINE``, ``unplug``, ``plug``, ``power_cycle [SECONDS]`` (of a chip on USB: gone, then anew), ``state``.
 """
 
 from __future__ import annotations
@@ -89,9 +90,7 @@ async def run() -> None:
     """Serve until told to end."""
     parser = argparse.ArgumentParser(description="GPIO chip simulated by the kernel")
     parser.add_argument("--link", type=Path, required=True, help="made to lead to the chip's device")
-    parser.add_argument(
-        "--names", default=",,,,,,,", help="of the lines, by commas (%(default)r: eight without)"
-    )
+    parser.add_argument("--names", default=",,,,,,,", help="of the lines, by commas (%(default)r: eight without)")
     options = parser.parse_args()
     try:
         chip = SimulatedChip(options.names.split(","))
@@ -116,11 +115,15 @@ async def run() -> None:
     await serve(
         str(options.link),
         {
-            "pull": lambda line, level: chip.pull(int(line), int(level)), "level": lambda line: chip.level(int(line)),
-            "unplug": chip.unplug, "plug": plug, "power_cycle": power_cycle, "state": lambda: {"levels": list(map(chip.level, range(chip.count)))},
+            "pull": lambda line, level: chip.pull(int(line), int(level)),
+            "level": lambda line: chip.level(int(line)),
+            "unplug": chip.unplug,
+            "plug": plug,
+            "power_cycle": power_cycle,
+            "state": lambda: {"levels": list(map(chip.level, range(chip.count)))},
         },
         close,
-    )  # fmt: skip
+    )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,10 @@
-"""Grbl 1.1, grblHAL and FluidNC as text, without I/O: lines answered by one ``ok`` or ``error:N``, and single real-time bytes.
+"""Grbl 1.1, grblHAL and FluidNC as text, without I/O: lines answered by one ``ok`` or ``error:N``, and single real-time
+bytes.
 
-Lines end in LF alone: CR LF would draw two answers. Whatever else the controller says meanwhile (messages, alarms) stands
-before the answer and is returned with it. Sources: grbl ``doc/markdown/{interface,commands,jogging,settings}.md`` of 1.1h.
+Lines end in LF alone: CR LF would draw two answers. Whatever else the controller says meanwhile (messages, alarms)
+    stands
+before the answer and is returned with it. Sources: grbl ``doc/markdown/{interface,commands,jogging,settings}.md`` of
+    1.1h.
 """
 
 from __future__ import annotations
@@ -24,22 +27,55 @@ _FLOOD = 16384
 _REPORT = re.compile(r"<([A-Za-z]+)(?::(\d+))?((?:\|[^|<>]*)*)>")
 
 ERRORS = {
-    1: "a letter was expected", 2: "bad number", 3: "unknown $ statement", 4: "negative value", 5: "homing is disabled ($22)",
-    6: "step pulse below 3 us", 7: "EEPROM read failed, defaults restored", 8: "only allowed when idle",
-    9: "locked by alarm or jog", 10: "soft limits need homing", 11: "line too long", 12: "step rate above 30 kHz",
-    13: "safety door is open", 14: "start-up line too long", 15: "jog target outside the machine's travel",
-    16: "bad jog command", 17: "laser mode needs PWM", 20: "unsupported command", 21: "modal group conflict",
-    22: "feed rate undefined", 23: "integer required", 24: "two commands use axis words", 25: "repeated word",
-    26: "axis words missing", 27: "bad line number", 28: "value word missing", 29: "G59.x is not supported",
-    30: "G53 needs G0 or G1", 31: "unused axis words", 32: "arc without axis words", 33: "invalid target",
-    34: "invalid arc radius", 35: "arc without offset", 36: "unused words", 37: "tool length offset on a wrong axis",
+    1: "a letter was expected",
+    2: "bad number",
+    3: "unknown $ statement",
+    4: "negative value",
+    5: "homing is disabled ($22)",
+    6: "step pulse below 3 us",
+    7: "EEPROM read failed, defaults restored",
+    8: "only allowed when idle",
+    9: "locked by alarm or jog",
+    10: "soft limits need homing",
+    11: "line too long",
+    12: "step rate above 30 kHz",
+    13: "safety door is open",
+    14: "start-up line too long",
+    15: "jog target outside the machine's travel",
+    16: "bad jog command",
+    17: "laser mode needs PWM",
+    20: "unsupported command",
+    21: "modal group conflict",
+    22: "feed rate undefined",
+    23: "integer required",
+    24: "two commands use axis words",
+    25: "repeated word",
+    26: "axis words missing",
+    27: "bad line number",
+    28: "value word missing",
+    29: "G59.x is not supported",
+    30: "G53 needs G0 or G1",
+    31: "unused axis words",
+    32: "arc without axis words",
+    33: "invalid target",
+    34: "invalid arc radius",
+    35: "arc without offset",
+    36: "unused words",
+    37: "tool length offset on a wrong axis",
     38: "tool number too large",
-}  # fmt: skip
+}
 ALARMS = {
-    1: "hard limit switch", 2: "target beyond the soft limits", 3: "reset in motion", 4: "probe already triggered",
-    5: "probe found no contact", 6: "homing ended by a reset", 7: "safety door opened while homing",
-    8: "homing did not clear the switch", 9: "homing found no switch", 10: "homing found no second switch of a dual axis",
-}  # fmt: skip
+    1: "hard limit switch",
+    2: "target beyond the soft limits",
+    3: "reset in motion",
+    4: "probe already triggered",
+    5: "probe found no contact",
+    6: "homing ended by a reset",
+    7: "safety door opened while homing",
+    8: "homing did not clear the switch",
+    9: "homing found no switch",
+    10: "homing found no second switch of a dual axis",
+}
 POSITION_KEPT = (2, 4, 5)
 """Alarms after which the position is still true; of all others, unknown ones too, it is not."""
 
@@ -196,7 +232,8 @@ def command(line: str, timeout_s: float, *, repeatable: bool = False) -> Exchang
 def status(timeout_s: float) -> Exchange:
     """Return the exchange of ``?``; its value is the report and the lines that came before it.
 
-    A greeting without a report ends it, as StateLost: the ``?`` went to a controller that was starting, which does not answer it.
+    A greeting without a report ends it, as StateLost: the ``?`` went to a controller that was starting, which does not
+        answer it.
     """
 
     def want(reply: bytes) -> int | None:
@@ -213,7 +250,9 @@ def status(timeout_s: float) -> Exchange:
 
 
 def reset(timeout_s: float) -> Exchange:
-    """Return the exchange of a soft reset; its value is the lines up to the banner. It may be sent again: it is a stop."""
+    """Return the exchange of a soft reset; its value is the lines up to the banner. It may be sent again: it is a
+    stop.
+    """
     return Exchange(
         RESET,
         lambda reply: _end_of(reply, _HELLO),

@@ -1,9 +1,10 @@
 """Controllers with Grbl 1.1, grblHAL or FluidNC on a serial line or TCP, three to nine axes.
 
-All motion is jogging, which can be cancelled without losing the position. A velocity is a chain of short jogs to absolute
-positions, so it ends by itself soon after the host falls silent; Grbl has no other dead-man. The controller has one
-planner: axes whose commands go out together (synch) move together on a straight line, other commands follow one another, and
-what one axis has cancelled brakes all; the others then go on.
+All motion is jogging, which can be cancelled without losing the position. A velocity is a chain of short jogs to
+absolute positions, so it ends by itself soon after the host falls silent; Grbl has no other dead-man. The controller
+has one
+planner: axes whose commands go out together (synch) move together on a straight line, other commands follow one
+another, and what one axis has cancelled brakes all; the others then go on.
 
     [device.mod0]
     driver = "grbl"
@@ -40,7 +41,8 @@ AxisTable: Any = drive_table(
 )
 """Keys of an axis: those of AxisSettings that a drive of its own loop leaves, and
 
-letter: of the axis in the controller; home_required: no motion before homing. A unit of "rad" takes the controller's number for degrees.
+letter: of the axis in the controller; home_required: no motion before homing. A unit of "rad" takes the controller's
+    number for degrees.
 """
 
 
@@ -52,7 +54,8 @@ class GrblSettings(DriveSettings, frozen=True, forbid_unknown_fields=True, kw_on
         version: text that its version must contain, e.g. "1.1h"; '' takes any.
         homing: the controller's homing ($H, all axes) may be used.
         homing_timeout_s: longest time that homing may take [s].
-        quick_stop: "cancel" brakes and keeps the position, and resets what does not obey; "reset" stops at once and loses it.
+        quick_stop: "cancel" brakes and keeps the position, and resets what does not obey; "reset" stops at once and
+            loses it.
         poll_hz: rate of status reports; 5 to 10 is the firmware's advice, 20 to 50 works on an idle line.
     """
 

@@ -16,15 +16,13 @@ from .codec import jog
 
 PLANNER_BLOCKS = 15
 CHAIN_BLOCKS = 8
-"""Jogs of a chain that may be under way: the rest of the planner is left to moves. A full planner withholds its ok, and a line that
-waits there goes out after a cancel."""
+"""Jogs of a chain that may be under way: the rest of the planner is left to moves. A full planner withholds its ok, and
+a line that waits there goes out after a cancel."""
 SHORTEST_S = 0.01
 """The planner wants at least this between two jogs of a chain."""
 
 
-def straight_jog(
-    letters: Sequence[str], here: NDArray[np.float64], moves: Mapping[int, tuple[float, float]]
-) -> str:
+def straight_jog(letters: Sequence[str], here: NDArray[np.float64], moves: Mapping[int, tuple[float, float]]) -> str:
     """Return the line that moves axes together, so fast that none passes its own speed.
 
     Args:
@@ -44,7 +42,8 @@ def straight_jog(
 
 
 class JogChain:
-    """Velocities as jogs to absolute positions that reach a little ahead, so that the motion ends when nobody lengthens it.
+    """Velocities as jogs to absolute positions that reach a little ahead, so that the motion ends when nobody lengthens
+    it.
 
     Args:
         letters: of the axes.
@@ -94,9 +93,7 @@ class JogChain:
             now_ns: time.
             low, high: soft limits, shape (n,); the chain ends there.
         """
-        ahead_s = max(
-            3 / self._poll_hz, float((np.abs(self.wanted) / self._rates).max()) / 2 + 2 / self._poll_hz
-        )
+        ahead_s = max(3 / self._poll_hz, float((np.abs(self.wanted) / self._rates).max()) / 2 + 2 / self._poll_hz)
         begin_ns = max(self._until_ns, now_ns)
         duration_s = now_ns / 1e9 + ahead_s - begin_ns / 1e9
         if duration_s < max(SHORTEST_S, ahead_s / (CHAIN_BLOCKS - 2)):

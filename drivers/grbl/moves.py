@@ -1,4 +1,5 @@
-"""Moves of Grbl axes, without I/O: what was asked for, what is under way, and what a stop of another axis has cut short.
+"""Moves of Grbl axes, without I/O: what was asked for, what is under way, and what a stop of another axis has cut
+short.
 
 Positions and speeds are in the units of the axes (m or rad); the controller's, mm or degrees, stay inside.
 """

@@ -1,4 +1,6 @@
-"""How a Grbl controller is found: brought to rest whatever it does, identified, its limits compared with the configuration."""
+"""How a Grbl controller is found: brought to rest whatever it does, identified, its limits compared with the
+configuration.
+"""
 
 from __future__ import annotations
 
@@ -26,17 +28,17 @@ Hearing = Callable[[Report, Sequence[str]], None]
 def to_rest(clock: Clock, hear: Hearing) -> Generator[Step, Any, tuple[Report, bool, bool]]:
     """Bring the controller to rest and to the state of a fresh start, whatever it does and whoever left it so.
 
-    Jogs and programs are braked with their position kept; a reset at rest then clears lines, modes, overrides, spindle and holds.
+    Jogs and programs are braked with their position kept; a reset at rest then clears lines, modes, overrides, spindle
+    and holds.
 
     Returns:
-        The last report, whether it had to be reset in motion (its position is then lost), and whether it greeted before that.
+        The last report, whether it had to be reset in motion (its position is then lost), and whether it greeted before
+        that.
     """
     yield Send(grbl.END_CUT_LINE + grbl.JOG_CANCEL, "end a cut line, cancel jogs")
     yield Pause(0.1)
     rests, greeted, report = True, False, None
-    with contextlib.suppress(
-        LinkError
-    ):  # booting, or deaf as it homes or waits after an alarm: only a reset ends that
+    with contextlib.suppress(LinkError):  # booting, or deaf as it homes or waits after an alarm: only a reset ends that
         try:
             report, lines = yield grbl.status(TIMEOUT_S)
             greeted = grbl.greets(lines)
@@ -58,7 +60,8 @@ def to_rest(clock: Clock, hear: Hearing) -> Generator[Step, Any, tuple[Report, b
 def brake(clock: Clock, hear: Hearing, limit_s: float) -> Generator[Step, Any, bool]:
     """Brake with the position kept, and send that again until the controller rests; return whether it does.
 
-    A line that has waited for room in the planner goes out when a cancel has emptied it, so one report of rest is not enough.
+    A line that has waited for room in the planner goes out when a cancel has emptied it, so one report of rest is not
+    enough.
 
     Args:
         clock: the time [ns].
@@ -111,9 +114,7 @@ def compare(
     """
     for settings, index, scale in zip(axes, indices, per_unit, strict=True):
         try:
-            told = compare_limits(
-                dict(found), index, float(scale), settings.velocity_max, settings.acceleration_max
-            )
+            told = compare_limits(dict(found), index, float(scale), settings.velocity_max, settings.acceleration_max)
         except DeviceError as error:
             raise DeviceError(error.errno, f"open {name}: axis {settings.name}: {error}") from None
         if not told:

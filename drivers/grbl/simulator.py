@@ -1,12 +1,13 @@
 """A Grbl controller on a pty or TCP port: ``python -m sioms.drivers.grbl.simulator --link PATH``.
 
-Behaves as the sources of Grbl 1.1h say (gnea/grbl, v1.1h.20190825, 40eb439b; ``grbl/{main,protocol,serial,system,motion_control}.c``): one
-``ok`` or ``error:N`` a line, real-time bytes, a planner that looks ahead over 15 blocks and lets a line wait for its ``ok`` when it is full
-(a jog cancel empties it, and the line that waited goes out after it), holds, alarms of which 1 and 2 leave it deaf until a reset, homing during
-which ``?`` is ignored, a position that is wrong after a reset in motion and 0 after the supply was off. Commands on standard
-input, beside those of the line: ``state``, ``alarm N`` (motion ends, position lost), ``door``, ``program DISTANCE FEED`` (somebody else's
-move in X), ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze [COUNT]``, ``foreign KIND VALUE`` (velocity: a jog in X; position; mode: a
-G word).
+Behaves as the sources of Grbl 1.1h say (gnea/grbl, v1.1h.20190825, 40eb439b;
+``grbl/{main,protocol,serial,system,motion_control}.c``): one ``ok`` or ``error:N`` a line, real-time bytes, a planner
+that looks ahead over 15 blocks and lets a line wait for its ``ok`` when it is full (a jog cancel empties it, and the
+line that waited goes out after it), holds, alarms of which 1 and 2 leave it deaf until a reset, homing during which
+``?`` is ignored, a position that is wrong after a reset in motion and 0 after the supply was off. Commands on standard
+input, beside those of the line: ``state``, ``alarm N`` (motion ends, position lost), ``door``, ``program DISTANCE
+FEED`` (somebody else's move in X), ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze [COUNT]``, ``foreign KIND
+VALUE`` (velocity: a jog in X; position; mode: a G word).
 """
 
 from __future__ import annotations
@@ -47,9 +48,29 @@ class Controller:
         self.letters = "XYZABCUVW"[:axes]
         self.hal = hal
         self.settings: dict[int, float] = {
-            0: 10, 1: 25, 2: 0, 3: 0, 4: 0, 5: 0, 6: 0, 10: 3, 11: 0.01, 12: 0.002, 13: 0, 20: 0, 21: 0, 22: int(homing),
-            23: 0, 24: 100, 25: 1500, 26: 25, 27: 1, 30: 1000, 31: 0, 32: 0,
-        }  # fmt: skip
+            0: 10,
+            1: 25,
+            2: 0,
+            3: 0,
+            4: 0,
+            5: 0,
+            6: 0,
+            10: 3,
+            11: 0.01,
+            12: 0.002,
+            13: 0,
+            20: 0,
+            21: 0,
+            22: int(homing),
+            23: 0,
+            24: 100,
+            25: 1500,
+            26: 25,
+            27: 1,
+            30: 1000,
+            31: 0,
+            32: 0,
+        }
         for i in range(axes):
             self.settings |= {100 + i: 250, 110 + i: 6000, 120 + i: 500, 130 + i: 200}
         if factory:
@@ -216,9 +237,7 @@ class Controller:
         scale, digits = (25.4, 4) if self.settings[13] else (1.0, 3)
         work = not int(self.settings[10]) & 1
         offset = self.parser.offset
-        shown = [
-            (p - (o if work else 0.0)) / scale for p, o in zip(self.planner.position, offset, strict=True)
-        ]
+        shown = [(p - (o if work else 0.0)) / scale for p, o in zip(self.planner.position, offset, strict=True)]
         fields = [state, f"{'WPos' if work else 'MPos'}:" + ",".join(f"{v:.{digits}f}" for v in shown)]
         if int(self.settings[10]) & 2:
             fields.append(f"Bf:{BLOCKS - len(self.planner.blocks)},{RX_BYTES}")
@@ -297,9 +316,7 @@ class Controller:
         found = self.parser.jog(text, self.planner.end)
         if isinstance(found, int):
             return found
-        if self.settings[20] and any(
-            not -self.settings[130 + i] <= t <= 0 for i, t in enumerate(found.target)
-        ):
+        if self.settings[20] and any(not -self.settings[130 + i] <= t <= 0 for i, t in enumerate(found.target)):
             return 15
         self.planner.add(found.target, found.feed, jog=True)
         self.state = "Jog"

@@ -1,7 +1,7 @@
 """The axes of a Grbl controller: hooks that turn what the bank wants into jogs.
 
-The controller has one planner. Moves that are asked for together become one line; what one axis has cancelled brakes all, and
-those that nobody has stopped go on from where they came to rest.
+The controller has one planner. Moves that are asked for together become one line; what one axis has cancelled brakes
+all, and those that nobody has stopped go on from where they came to rest.
 """
 
 from __future__ import annotations
@@ -36,16 +36,20 @@ TOGETHER_S = 0.0005
 LATE_S = 0.5
 """What braking may take longer than the motion itself: reports, and a line that waited."""
 OWN_RESET_NS = 300_000_000
-"""A second greeting so soon after that of a reset of ours belongs to it: the reset met a controller that was starting."""
+"""A second greeting so soon after that of a reset of ours belongs to it: the reset met a controller that was starting.
+"""
 STARTED_ANEW = "the controller has started anew: its place, modes and lines are gone"
 SAME_PLACE = 0.01
 """What a place at rest may differ by from one report to another [mm or degrees]; reports have three digits."""
 OFFSET_REPORTS = 35
 """The work offset comes with every 30th report at the latest."""
 NOT_READY = {
-    "Hold": "feed hold; release it at the controller", "Door": "the safety door is open", "Sleep": "the controller sleeps",
-    "Check": "the controller is in check mode", "Run": "the controller runs a program of somebody else",
-}  # fmt: skip
+    "Hold": "feed hold; release it at the controller",
+    "Door": "the safety door is open",
+    "Sleep": "the controller sleeps",
+    "Check": "the controller is in check mode",
+    "Run": "the controller runs a program of somebody else",
+}
 
 
 class Options(Protocol):
@@ -352,7 +356,9 @@ class GrblUnit(AxesUnit):
             self._note_restart()
 
     def _note_restart(self) -> None:
-        """Note that it has greeted: the next poll tells; not of the second greeting that a reset of ours has brought."""
+        """Note that it has greeted: the next poll tells; not of the second greeting that a reset of
+        ours has brought.
+        """
         if self.clock() - self._reset_ns > OWN_RESET_NS:
             self._restarted = True
 
@@ -365,7 +371,9 @@ class GrblUnit(AxesUnit):
             raise
 
     def _look_for_jump(self, report: Report) -> None:
-        """Hear of a new start by the place, should the greeting be lost: it counts from 0, where no axis can have come so soon."""
+        """Hear of a new start by the place, should the greeting be lost: it counts from 0, where no axis can have come
+        so soon.
+        """
         if self._seen is None or not self._place.note(report):
             return
         here = self._place.of(report) / self._per_unit
@@ -466,9 +474,7 @@ class GrblUnit(AxesUnit):
             return
         offset = self.bank.rows["position"] - self._raw
         low, high = self._soft_limits()
-        found = self._chain.next(
-            self.clock(), (low - offset) * self._per_unit, (high - offset) * self._per_unit
-        )
+        found = self._chain.next(self.clock(), (low - offset) * self._per_unit, (high - offset) * self._per_unit)
         if found is None:
             return
         line, targets, until_ns = found

@@ -1,8 +1,9 @@
 """Scans of Linux IIO buffers, without I/O: what an element's type says, where it lies in a scan, what its bits mean.
 
-The kernel describes each element of a scan as ``[be|le]:[s|u]bits/storagebits[Xrepeat][>>shift]``. Elements are stored in the
-order of their index, each aligned to its own storage; the scan is padded to the largest of them. An element's value is its word
-shifted right, cut to its bits, and sign-extended (kernel documents ``sysfs-bus-iio``, ``iio_compute_scan_bytes``).
+The kernel describes each element of a scan as ``[be|le]:[s|u]bits/storagebits[Xrepeat][>>shift]``. Elements are stored
+in the order of their index, each aligned to its own storage; the scan is padded to the largest of them. An element's
+value is its word shifted right, cut to its bits, and sign-extended (kernel documents ``sysfs-bus-iio``,
+``iio_compute_scan_bytes``).
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ UNITS = {
     "angl": ("rad", 1.0), "incli": ("rad", math.pi / 180), "magn": ("T", 1e-4), "pressure": ("Pa", 1e3),
     "humidityrelative": ("%", 1e-3), "illuminance": ("lx", 1.0), "distance": ("m", 1.0), "proximity": ("", 1.0),
 }  # fmt: skip
-"""Kind of a channel to its SI unit and the factor from what the kernel gives after scale and offset (mV, mA, nF, kPa, gauss ...)."""
+"""Kind of a channel to its SI unit and the factor from what the kernel gives after scale and offset (mV, mA, nF, kPa,
+gauss ...).
+"""
 
 
 def unit_of(name: str) -> tuple[str, float]:
@@ -86,9 +89,7 @@ def parse_type(text: str) -> ElementType:
     if match is None:
         raise ValueError(f"read a scan type: {text.strip()!r} is none; e.g. le:s12/16>>4 is right")
     order, sign = match[1], match[2]
-    bits, storage, repeat, shift = (
-        int(match[i] or default) for i, default in ((3, 0), (4, 0), (5, 1), (6, 0))
-    )
+    bits, storage, repeat, shift = (int(match[i] or default) for i, default in ((3, 0), (4, 0), (5, 1), (6, 0)))
     if storage not in STORAGE_BITS or not 0 < bits + shift <= storage or bits < 1 or repeat < 1:
         raise ValueError(
             f"read a scan type: {text.strip()!r} holds {bits} bits shifted by {shift} in {storage}; "

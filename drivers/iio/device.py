@@ -131,9 +131,7 @@ class IioDevice:
             raise LinkError(f"set trigger {wanted!r} of {self.folder.name}: there is {has}")
         if wanted:
             self.write("trigger/current_trigger", wanted)
-        return (
-            there.get(self.read("trigger/current_trigger")) if self.has("trigger/current_trigger") else None
-        )
+        return there.get(self.read("trigger/current_trigger")) if self.has("trigger/current_trigger") else None
 
     def set_rate(self, trigger: IioDevice | None, channels: Sequence[str], rate_hz: float) -> bool:
         """Set how often it samples, by its trigger where that has a rate; return whether anything has one.
@@ -144,9 +142,7 @@ class IioDevice:
         rate = "sampling_frequency"
         own = [rate, f"in_{rate}", *dict.fromkeys(f"in_{kind_of(name)}_{rate}" for name in channels)]
         own += [f"in_{name}_{rate}" for name in channels]
-        holders = (
-            [(trigger, rate)] if trigger is not None and trigger.has(rate) else [(self, name) for name in own]
-        )
+        holders = [(trigger, rate)] if trigger is not None and trigger.has(rate) else [(self, name) for name in own]
         there = [(holder, attribute) for holder, attribute in holders if holder.has(attribute)]
         for holder, attribute in there:
             with contextlib.suppress(LinkError):  # one that only tells its rate, or has no such one

@@ -1,8 +1,8 @@
 """Analog inputs behind Linux IIO: converters, accelerometers, thermometers that the kernel has a driver for.
 
-Mode "raw" reads each channel's attribute in every tick; mode "buffer" lets the kernel collect whole scans, each with the time
-at which it was taken, and reads them from ``/dev/iio:deviceN``. Values are in SI: what the kernel calls millivolts, kilopascals or
-gauss becomes V, Pa and T.
+Mode "raw" reads each channel's attribute in every tick; mode "buffer" lets the kernel collect whole scans, each with
+the time at which it was taken, and reads them from ``/dev/iio:deviceN``. Values are in SI: what the kernel calls
+millivolts, kilopascals or gauss becomes V, Pa and T.
 
     [device.adc0]
     driver = "iio"
@@ -12,8 +12,9 @@ gauss becomes V, Pa and T.
     rate_hz = 860.0
     trigger = "sioms-hrtimer"
 
-A converter behind the elements of a calibrated tactile finger has a table ``shape``, see ``tactile_nodes``; ``element_offset`` and
-``element_scale`` turn its values, which are in SI, into what the finger was calibrated in: per cent of the untouched output.
+A converter behind the elements of a calibrated tactile finger has a table ``shape``, see ``tactile_nodes``;
+``element_offset`` and ``element_scale`` turn its values, which are in SI, into what the finger was calibrated in: per
+cent of the untouched output.
 """
 
 from __future__ import annotations
@@ -58,7 +59,8 @@ class IioSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         minimum, maximum: range of the values, in SI.
         history: snapshots kept for readers.
         shape: of a tactile finger: shows its strains and the shape that touches it, too.
-        element_scale, element_offset: per cent for the finger's file = (value - offset) * scale; one number, or one a channel.
+        element_scale, element_offset: per cent for the finger's file = (value - offset) * scale; one number, or one a
+            channel.
         sysfs: where the devices are.
         dev: where their buffers are.
     """
@@ -260,7 +262,8 @@ class Iio(StreamDriver):
 class IioRaw(TickDriver):
     """Attributes read one by one.
 
-    Concurrency: the one thread of the driver process; a slow converter keeps it, and its tick, for as long as a conversion takes.
+    Concurrency: the one thread of the driver process; a slow converter keeps it, and its tick, for as long as a
+        conversion takes.
     """
 
     Settings = IioSettings
@@ -405,18 +408,14 @@ def _check(settings: IioSettings) -> None:
         raise ValueError("channels: none given; want e.g. voltage0")
     for channel in settings.channels:
         if settings.channels.count(channel) > 1:
-            raise ValueError(
-                f"channels: {channel} is given {settings.channels.count(channel)} times; want each once"
-            )
+            raise ValueError(f"channels: {channel} is given {settings.channels.count(channel)} times; want each once")
         if channel.startswith("in_") or channel.endswith("_raw") or channel == TIMESTAMP:
             raise ValueError(f"channels: {channel}; want the name alone, e.g. voltage0 for in_voltage0_raw")
     for key in ("element_scale", "element_offset"):
         value = getattr(settings, key)
         numbers = value if isinstance(value, list) else [value]
         if isinstance(value, list) and len(value) != len(settings.channels):
-            raise ValueError(
-                f"{key}: {len(value)} for {len(settings.channels)} channels; want one number, or one each"
-            )
+            raise ValueError(f"{key}: {len(value)} for {len(settings.channels)} channels; want one number, or one each")
         if not all(map(math.isfinite, numbers)) or (key == "element_scale" and 0 in numbers):
             raise ValueError(f"{key} = {value}; want finite numbers{', not 0' * (key == 'element_scale')}")
     most_hz = 1000 if settings.mode == "raw" else 20_000

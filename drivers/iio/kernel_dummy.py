@@ -1,10 +1,10 @@
-"""The kernel's dummy IIO device: ``python -m sioms.drivers.iio.kernel_dummy --link PATH`` makes it, with a trigger of a rate.
+"""The kernel's dummy IIO device: ``python -m sioms.drivers.iio.kernel_dummy --link PATH`` makes it, with a trigger of a
+rate.
 
-Device and trigger are the kernel's own (iio_simple_dummy and a timer of hrtimer, set up in configfs by root), with its attributes,
-its buffer and its refusals; the readings are fixed numbers. Where there is no such kernel, one is started by
-``tests/kernel/run.py``. Their names are ``sioms_dummy`` and ``sioms_timer``;
-PATH is only what is told as the port. Commands on standard input:
-``unplug``, ``plug``.
+Device and trigger are the kernel's own (iio_simple_dummy and a timer of hrtimer, set up in configfs by root), with its
+attributes, its buffer and its refusals; the readings are fixed numbers. Where there is no such kernel, one is started
+by ``tests/kernel/run.py``. Their names are ``sioms_dummy`` and ``sioms_timer``; PATH is only what is told as the port.
+Commands on standard input: ``unplug``, ``plug``.
 """
 
 from __future__ import annotations

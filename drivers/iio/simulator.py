@@ -1,11 +1,15 @@
-"""A Linux IIO device as files: ``python -m sioms.drivers.iio.simulator --link FOLDER`` serves FOLDER/sysfs and FOLDER/dev.
+"""A Linux IIO device as files: ``python -m sioms.drivers.iio.simulator --link FOLDER`` serves FOLDER/sysfs and
+FOLDER/dev.
 
-As far as files can it behaves like the kernel's dummy device (``iio_simple_dummy``): the same channels and scan types, a trigger
-with a rate, a buffer that is set up by attributes and read as whole scans from a FIFO, stamps of the chosen clock. What files
-cannot do: refuse a value when it is written, refuse a second reader, or answer EBUSY to raw readings while the buffer runs.
-Commands on standard input: ``volt CHANNEL VALUE``, ``lose COUNT`` (scans that the buffer has no room for), ``bytes COUNT`` (cut the
-stream in pieces of that size), ``unplug``, ``plug``, ``power_cycle [SECONDS]`` (of a converter on USB: gone, then anew), ``freeze [COUNT]`` (the last scan
-again, its time too), ``foreign rate|scale|enable VALUE`` (another program writes the attribute), ``state``.
+As far as files can it behaves like the kernel's dummy device (``iio_simple_dummy``): the same channels and scan types,
+a trigger with a rate, a buffer that is set up by attributes and read as whole scans from a FIFO, stamps of the chosen
+clock. What files
+cannot do: refuse a value when it is written, refuse a second reader, or answer EBUSY to raw readings while the buffer
+    runs.
+Commands on standard input: ``volt CHANNEL VALUE``, ``lose COUNT`` (scans that the buffer has no room for), ``bytes
+COUNT`` (cut the stream in pieces of that size), ``unplug``, ``plug``, ``power_cycle [SECONDS]`` (of a converter on USB:
+gone, then anew), ``freeze [COUNT]`` (the last scan again, its time too), ``foreign rate|scale|enable VALUE`` (another
+program writes the attribute), ``state``.
 """
 
 from __future__ import annotations
@@ -34,8 +38,11 @@ TYPES = {
     "accel_x": "le:s16/16>>0", "timestamp": "le:s64/64>>0",
 }  # fmt: skip
 LARGEST = {
-    "voltage0": (0, 8191), "voltage1-voltage2": (-2048, 2047), "voltage3-voltage4": (-1024, 1023), "accel_x": (-32768, 32767),
-}  # fmt: skip
+    "voltage0": (0, 8191),
+    "voltage1-voltage2": (-2048, 2047),
+    "voltage3-voltage4": (-1024, 1023),
+    "accel_x": (-32768, 32767),
+}
 
 
 class Dummy:
@@ -92,7 +99,9 @@ class Dummy:
         self._pipe = os.open(self.fifo, os.O_RDWR | os.O_NONBLOCK)
 
     def unplug(self) -> None:
-        """Make the files vanish; who has the buffer open hears nothing more, as of a device that the kernel has removed."""
+        """Make the files vanish; who has the buffer open hears nothing more, as of a device that the kernel has
+        removed.
+        """
         if self._pipe >= 0:
             self._gone.append(self._pipe)
             self._pipe = -1
@@ -124,11 +133,7 @@ class Dummy:
 
     def due(self) -> None:
         """Put the scans that were triggered since the last look into the buffer."""
-        if (
-            self._pipe < 0
-            or self.read("buffer/enable") != "1"
-            or self.read("trigger/current_trigger") != "instance1"
-        ):
+        if self._pipe < 0 or self.read("buffer/enable") != "1" or self.read("trigger/current_trigger") != "instance1":
             self.next_s = 0.0
             return
         period_s = 1 / float((self.trigger / "sampling_frequency").read_text().strip() or 100)
@@ -157,11 +162,7 @@ class Dummy:
         on = [channel for channel in TYPES if self.read(f"scan_elements/in_{channel}_en") == "1"]
         for channel in on:
             if channel == "timestamp":
-                ahead_s = (
-                    0.0
-                    if self.read("current_timestamp_clock") == "monotonic"
-                    else time.time() - time.monotonic()
-                )
+                ahead_s = 0.0 if self.read("current_timestamp_clock") == "monotonic" else time.time() - time.monotonic()
                 scan += bytes(-len(scan) % 8) + struct.pack("<q", round((at_s + ahead_s) * 1e9))
             else:
                 raw = self.raw[channel] & (1 << int(TYPES[channel][4:].split("/")[0])) - 1
@@ -171,8 +172,10 @@ class Dummy:
     def foreign(self, kind: str, value: str) -> None:
         """Let another program write an attribute."""
         places = {
-            "rate": self.trigger / "sampling_frequency", "scale": self.root / "in_voltage_scale", "enable": self.root / "buffer/enable",
-        }  # fmt: skip
+            "rate": self.trigger / "sampling_frequency",
+            "scale": self.root / "in_voltage_scale",
+            "enable": self.root / "buffer/enable",
+        }
         if kind not in places:
             raise ValueError(f"{kind}; one of {', '.join(places)} is right")
         places[kind].write_text(f"{value}\n")

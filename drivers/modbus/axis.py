@@ -92,7 +92,8 @@ AxisTable: Any = table_type(
 
 address: of the unit; travel_per_turn: m or rad in one turn of the motor, negative to reverse the axis;
 pulses_per_turn: of the drive's position; velocity_by: "jog" or "path", jog where the map has it as dead-man;
-homing: the drive's own homing may be used; enable: switch the drive on when it is opened; override: keys put over the map's.
+homing: the drive's own homing may be used; enable: switch the drive on when it is opened; override: keys put over the
+    map's.
 """
 
 
@@ -134,9 +135,7 @@ class ModbusAxis(LineDriver):
         addresses = [axis.address for axis in settings.axis]
         for address in set(addresses):
             if addresses.count(address) > 1:
-                raise ValueError(
-                    f"axis: {addresses.count(address)} drives have address {address}; want one each"
-                )
+                raise ValueError(f"axis: {addresses.count(address)} drives have address {address}; want one each")
         drives = [_Drive(settings, axis) for axis in settings.axis]
         _check_dead_man(settings, drives)
         alone = len(drives) == 1

@@ -1,7 +1,8 @@
 """Proves that a Modbus device is as its opening left it: its dead-man runs, and it was not off meanwhile. Pure.
 
-A device that restarts answers again long before its link counts as lost: without its dead-man, with its limits and its place
-as after switching on. So the opening sets the dead-man and reads it back, leaves a token in a register that forgets at
+A device that restarts answers again long before its link counts as lost: without its dead-man, with its limits and its
+place as after switching on. So the opening sets the dead-man and reads it back, leaves a token in a register that
+forgets at
 power off, and the polls read both again. What is read otherwise is StateLost: the opening runs anew.
 
 Concurrency: none; a :class:`Guard` belongs to one driver thread.
@@ -60,7 +61,8 @@ class Guard:
             yield from self._mapped.command("watchdog_restart")
 
     def open(self) -> Generator[Any, Any, bool]:
-        """End a dead-man that has acted, set it, read it back, and leave a token; return whether the device was off meanwhile.
+        """End a dead-man that has acted, set it, read it back, and leave a token; return whether the device was off
+        meanwhile.
 
         Raises:
             DeviceError: EIO, the dead-man does not run as it was set.
@@ -74,7 +76,9 @@ class Guard:
             values = yield from self._read(*(proof.signal for proof in self._proofs))
             for proof in self._proofs:
                 if wrong := self._fails(proof, values):
-                    text = f"set the watchdog of {self._mapped.name}: {wrong}; its outputs would stay when the host dies"
+                    text = (
+                        f"set the watchdog of {self._mapped.name}: {wrong}; its outputs would stay when the host dies"
+                    )
                     raise DeviceError(errno.EIO, text)
         self._say_what_is_not_proved()
         self._due_ns = 0
@@ -86,11 +90,7 @@ class Guard:
             return
         self._said = True
         can_set = "watchdog" in self._mapped.rmap.commands
-        why = (
-            "none is set (watchdog_s = 0)"
-            if can_set
-            else f"whether it is set cannot be read; {self._dead.note}"
-        )
+        why = "none is set (watchdog_s = 0)" if can_set else f"whether it is set cannot be read; {self._dead.note}"
         self._log("warning", f"{self._mapped.name}: its own watchdog: {why}")
 
     def look_soon(self) -> None:
@@ -166,9 +166,7 @@ class Guard:
         if (yield from self._read(name))[name] != token:
             self._missing.add(name)
             self._token = None
-            self._log(
-                "warning", f"{self._mapped.name}: {name} does not keep what is written, so it proves nothing"
-            )
+            self._log("warning", f"{self._mapped.name}: {name} does not keep what is written, so it proves nothing")
         return forgotten
 
     def _restarted(self, values: Mapping[str, Any]) -> str:

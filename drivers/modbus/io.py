@@ -98,9 +98,7 @@ class ModbusIo(LineDriver):
             raise ValueError(f"poll_hz = {settings.poll_hz:g}; want 0.1 to 1000")
         plans = _plan(_load(settings), settings)
         unit_on(settings.line, settings.address, 1.0)
-        return Description(
-            tuple(plan.spec for plan in plans), settings.poll_hz, lease_s=max(0.5, 5 / settings.poll_hz)
-        )
+        return Description(tuple(plan.spec for plan in plans), settings.poll_hz, lease_s=max(0.5, 5 / settings.poll_hz))
 
     @classmethod
     def golden(cls, settings: Any) -> Sequence[Golden]:
@@ -139,9 +137,7 @@ def _counts(rmap: RegisterMap, settings: ModbusIoSettings) -> Mapping[str, int]:
     counts: dict[str, int] = {}
     if settings.model:
         if settings.model not in rmap.models:
-            raise ValueError(
-                f"model = {settings.model}: not in the map{did_you_mean(settings.model, rmap.models)}"
-            )
+            raise ValueError(f"model = {settings.model}: not in the map{did_you_mean(settings.model, rmap.models)}")
         counts |= rmap.models[settings.model]
     elif rmap.models and not settings.channels:
         raise ValueError(f"model: none given; one of {', '.join(rmap.models)} is right")
@@ -164,9 +160,7 @@ def _plan(rmap: RegisterMap, settings: ModbusIoSettings) -> tuple[PortPlan, ...]
             writable = [each for each in counts if rmap.ports[each].writable]
             raise ValueError(f"safe.{port}: no output of this device{did_you_mean(port, writable)}")
     if settings.main and settings.main not in counts:
-        raise ValueError(
-            f"main = {settings.main}: no port of this device{did_you_mean(settings.main, counts)}"
-        )
+        raise ValueError(f"main = {settings.main}: no port of this device{did_you_mean(settings.main, counts)}")
     main = settings.main or next(iter(counts))
     return tuple(_port_plan(rmap, settings, port, counts[port], port == main) for port in counts)
 
@@ -185,8 +179,7 @@ def _port_plan(rmap: RegisterMap, settings: ModbusIoSettings, name: str, count: 
     else:
         unit = UNITS[signal.unit].si
         channels = tuple(
-            ChannelInfo(f"{shown}{i}", unit, port.minimum, port.maximum, description=rmap.title)
-            for i in range(count)
+            ChannelInfo(f"{shown}{i}", unit, port.minimum, port.maximum, description=rmap.title) for i in range(count)
         )
     spec = BlockSpec(
         "" if main else shown,
@@ -281,15 +274,11 @@ class IoUnit(LineUnit):
         try:
             words = to_words(raw if signal.type == "f32" else round(raw), signal.type, order)
         except ValueError as error:
-            raise DeviceError(
-                errno.ERANGE, f"write channel {channel} of {self.name}: {value:g}: {error}"
-            ) from None
+            raise DeviceError(errno.ERANGE, f"write channel {channel} of {self.name}: {value:g}: {error}") from None
         return modbus_pdu.write_registers(signal.address + channel * width(signal.type), words)
 
     def _flag_ends(self, plan: PortPlan, block: AnalogBlock) -> None:
         """Mark values at the ends of an unsigned converter: the true value may lie beyond."""
         if plan.signal.type == "u16" and not plan.port.writable:
-            full = self._mapped.gearing.to_si(
-                0xFFFF, UNITS[plan.signal.unit], plan.signal.scale, plan.signal.offset
-            )
+            full = self._mapped.gearing.to_si(0xFFFF, UNITS[plan.signal.unit], plan.signal.scale, plan.signal.offset)
             block.flags[block.data >= full] = int(AnalogStatus.SATURATED)

@@ -87,7 +87,8 @@ class Bit(Schema, frozen=True):
 
 
 class Item(Schema, frozen=True):
-    """One value of a write: a constant, a quantity of the command converted to the unit, or one that changes the register.
+    """One value of a write: a constant, a quantity of the command converted to the unit, or one that changes the
+    register.
 
     Args:
         type: of the registers.
@@ -186,8 +187,8 @@ class Restart(Schema, frozen=True):
 
     Args:
         counter: signal that only grows while the device is on: its uptime.
-        token: signal of a register that a power cycle sets back and that nothing else uses; ``commands.token`` writes it at
-            opening, the polls look whether it still reads so.
+        token: signal of a register that a power cycle sets back and that nothing else uses; ``commands.token`` writes
+            it at opening, the polls look whether it still reads so.
         minimum, maximum: of the token; its value after switching on is not among them.
         keeps_place: the drive knows its position after a power cycle: an absolute encoder.
     """
@@ -340,7 +341,9 @@ def named_map(name: str, shipped: Path, overrides: Mapping[str, Any] | None = No
         return load_map(Path(name), overrides)
     known = sorted(path.stem for path in shipped.glob("*.toml"))
     if name not in known:
-        problem = f"no shipped map has this name{did_you_mean(name, known)}; one of your own is a path that ends in .toml"
+        problem = (
+            f"no shipped map has this name{did_you_mean(name, known)}; one of your own is a path that ends in .toml"
+        )
         raise RegisterMapError(name, [problem])
     return load_map(shipped / f"{name}.toml", overrides)
 

@@ -68,9 +68,7 @@ def _struct_problems(value: Mapping[str, Any], expected: type[msgspec.Struct], p
     hints = typing.get_type_hints(expected)
     fields = {field.name: field for field in msgspec.structs.fields(expected)}
     problems = [f"{place}{key}: unknown key{did_you_mean(key, fields)}" for key in value if key not in fields]
-    problems += [
-        f"{place}{name}: missing" for name, field in fields.items() if field.required and name not in value
-    ]
+    problems += [f"{place}{name}: missing" for name, field in fields.items() if field.required and name not in value]
     for key, part in value.items():
         if key in fields:
             problems += schema_problems(part, hints[key], f"{place}{key}.")
@@ -199,7 +197,9 @@ def _alternates(m: RegisterMap, place: str, item: Item) -> Iterator[str]:
     if item.differs_from is not None:
         yield from _signal(m, f"{place}.differs_from", item.differs_from)
         if len(set(item.values)) < 2:
-            yield f"{place}: values are {list(item.values)}; two that differ are right, one of which changes the register"
+            yield (
+                f"{place}: values are {list(item.values)}; two that differ are right, one of which changes the register"
+            )
     elif item.values:
         yield f"{place}: values without differs_from, the signal of the register they change"
 
@@ -339,13 +339,7 @@ def _ports(m: RegisterMap) -> Iterator[str]:
 def _fits(place: str, signal: Signal, value: float | None) -> Iterator[str]:
     """Check that a value in SI can be written to a register, of one that does not count turns or pulses."""
     unit = UNITS.get(signal.unit)
-    if (
-        value is None
-        or unit is None
-        or unit.per is not Per.ITSELF
-        or signal.scale == 0
-        or signal.type not in RANGES
-    ):
+    if value is None or unit is None or unit.per is not Per.ITSELF or signal.scale == 0 or signal.type not in RANGES:
         return
     low, high = sorted((raw + signal.offset) * signal.scale * unit.factor for raw in RANGES[signal.type])
     if not low <= value <= high:

@@ -31,7 +31,8 @@ Values = dict[str, Any]
 SIZES = ("speed", "acceleration", "deceleration")
 
 BUSY_TRIES = 4
-"""Times a write is sent that the device answers with "busy": it has not been carried out then, so it may be sent again."""
+"""Times a write is sent that the device answers with "busy": it has not been carried out then, so it may be sent again.
+"""
 BUSY_S = 0.01
 """Pause before it is sent again [s]."""
 
@@ -130,7 +131,9 @@ class MappedUnit:
                 yield Pause(pause_s)
 
     def write(self, pdu: Pdu) -> Steps:
-        """Send a write. What the device is too busy for (exception 6) is sent again; what it still works at (5) is taken."""
+        """Send a write. What the device is too busy for (exception 6) is sent again; what it still works at (5) is
+        taken.
+        """
         for tries in range(BUSY_TRIES):
             try:
                 yield self.unit.exchange(pdu)
@@ -147,9 +150,7 @@ class MappedUnit:
         for write in command.writes:
             self.encode(write, quantities)
 
-    def encode(
-        self, write: Write, quantities: Mapping[str, float], present: Mapping[str, Any] | None = None
-    ) -> Pdu:
+    def encode(self, write: Write, quantities: Mapping[str, float], present: Mapping[str, Any] | None = None) -> Pdu:
         """Return the request of one write; raises ValueError when a quantity does not fit."""
         if write.table == "coil":
             return pdus.write_coil(write.address, bool(write.items[0].value))
@@ -160,9 +161,7 @@ class MappedUnit:
 
     def in_register(self, name: str, source: str, si: float, more: int = 0) -> float:
         """Return the size that a quantity has in the register of a command, ``more`` steps further [SI]."""
-        items = [
-            item for write in self.rmap.commands[name].writes for item in write.items if item.source == source
-        ]
+        items = [item for write in self.rmap.commands[name].writes for item in write.items if item.source == source]
         if not items:
             return si
         item = items[0]
@@ -218,9 +217,7 @@ class MappedUnit:
         if signal.is_bits:
             return reply >> at & ((1 << signal.count) - 1)
         size = width(signal.type, signal.words)
-        values = [
-            self._number(signal, reply[at + i * size : at + (i + 1) * size]) for i in range(signal.count)
-        ]
+        values = [self._number(signal, reply[at + i * size : at + (i + 1) * size]) for i in range(signal.count)]
         return values[0] if signal.count == 1 else values
 
     def _number(self, signal: Signal, words: tuple[int, ...]) -> float | str:
@@ -234,9 +231,7 @@ class MappedUnit:
         raw = self.gearing.from_si(si, UNITS[item.unit], item.scale)
         return abs(raw) if item.source in SIZES else raw
 
-    def _item(
-        self, item: Item, quantities: Mapping[str, float], present: Mapping[str, Any]
-    ) -> tuple[int, ...]:
+    def _item(self, item: Item, quantities: Mapping[str, float], present: Mapping[str, Any]) -> tuple[int, ...]:
         if item.value is not None:
             return to_words(item.value, item.type, self.rmap.word_order)
         if item.values:
@@ -302,9 +297,7 @@ def _golden(rmap: RegisterMap, frame: GoldenFrame) -> list[Golden]:
             if length is None or len(data) < length:
                 raise Incomplete("the reply is not complete")
             reply = exchanges[0].decode(data[:length])
-            return {
-                name: mapped._value(signal, at, reply) for name, signal, at in plan[0].parts if name in wanted
-            }
+            return {name: mapped._value(signal, at, reply) for name, signal, at in plan[0].parts if name in wanted}
 
         return [
             Golden(what, exchanges[0], frame.requests[0], frame.reply, wanted, read),

@@ -1,6 +1,7 @@
 """ODrive's ASCII protocol (firmware 0.5.4 to 0.5.6), without I/O: lines with a checksum each, replies to reads alone.
 
-Set commands draw no reply, and one whose checksum is damaged is dropped without a word. So every set goes out together with
+Set commands draw no reply, and one whose checksum is damaged is dropped without a word. So every set goes out together
+with
 reads behind it, in one exchange: an error line in front of their replies is the refusal, and reading back what was set
 tells that it arrived. Sources: ODrive documentation, "ASCII protocol", and the firmware's ``ascii_protocol.cpp``.
 """
@@ -22,10 +23,19 @@ TORQUE, VELOCITY, POSITION = 1, 2, 3
 PASSTHROUGH, VELOCITY_RAMP, TRAPEZOID = 1, 2, 5
 WATCHDOG_EXPIRED = 1 << 11
 AXIS_ERRORS = {
-    0: "invalid state", 6: "motor failed", 7: "sensorless estimator failed", 8: "encoder failed", 9: "controller failed",
-    11: "watchdog expired", 12: "lower end switch", 13: "upper end switch", 14: "emergency stop was requested",
-    17: "homing without an end switch", 18: "over-temperature", 19: "the position is not known",
-}  # fmt: skip
+    0: "invalid state",
+    6: "motor failed",
+    7: "sensorless estimator failed",
+    8: "encoder failed",
+    9: "controller failed",
+    11: "watchdog expired",
+    12: "lower end switch",
+    13: "upper end switch",
+    14: "emergency stop was requested",
+    17: "homing without an end switch",
+    18: "over-temperature",
+    19: "the position is not known",
+}
 _REFUSAL = re.compile(rb"invalid|unknown|not implemented")
 _TOLERANCE = 1e-4
 """Values that are read back are cut to nine characters."""
@@ -43,9 +53,7 @@ def line(text: str) -> bytes:
     """
     data = text.encode("ascii")
     if len(data) > MAX_LINE - 6 or any(c in data for c in b"\r\n!;*"):
-        raise ValueError(
-            f"line {text[:60]!r}: {len(data)} characters; up to {MAX_LINE - 6} without ! ; * are right"
-        )
+        raise ValueError(f"line {text[:60]!r}: {len(data)} characters; up to {MAX_LINE - 6} without ! ; * are right")
     return data + f"*{xor8(data)}\n".encode()
 
 
@@ -118,9 +126,7 @@ def exchange(
             for text, limit in zip(texts, limits, strict=False)
         ]
         if [len(each) for each in values] != widths:
-            raise LinkError(
-                f"{what}: replies of {[len(each) for each in values]} numbers; {widths} are right"
-            )
+            raise LinkError(f"{what}: replies of {[len(each) for each in values]} numbers; {widths} are right")
         del values[len(reads) :]
         if check is not None:
             check(values)
@@ -130,7 +136,9 @@ def exchange(
 
 
 def _answers(reply: bytes) -> list[bytes]:
-    """Return the complete lines that answer ours; one without a checksum answers stray bytes that have ended as a line."""
+    """Return the complete lines that answer ours; one without a checksum answers stray bytes that have ended as a
+    line.
+    """
     return [each for each in reply.split(b"\n")[:-1] if b"*" in each]
 
 
@@ -158,7 +166,8 @@ def confirmed(
 ) -> Exchange:
     """Return sets and the check that these properties hold these values afterwards.
 
-    A mismatch is a LinkError: a line was lost on its way. The value is the numbers of each reply, those of ``also`` last.
+    A mismatch is a LinkError: a line was lost on its way. The value is the numbers of each reply, those of ``also``
+        last.
 
     Args:
         sets: lines that draw no reply.
@@ -171,9 +180,7 @@ def confirmed(
     def check(values: list[list[float]]) -> None:
         for (path, wanted), (got, *_) in zip(back, values, strict=False):
             if not agrees(got, wanted):
-                raise LinkError(
-                    f"send {', '.join(sets)}: {path} reads {got:g} afterwards; {wanted:g} was sent"
-                )
+                raise LinkError(f"send {', '.join(sets)}: {path} reads {got:g} afterwards; {wanted:g} was sent")
 
     reads = [*(f"r {path}" for path, _ in back), *also]
     return exchange(sets, reads, timeout_s, check=check, repeatable=repeatable, urgent=urgent)

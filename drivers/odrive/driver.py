@@ -1,7 +1,7 @@
 """ODrive 3.x boards (firmware 0.5) on their ASCII protocol, over a UART or USB.
 
-Positions follow the board's trapezoidal trajectories, velocities its ramp, torques go out at once. The board's watchdog is the
-dead-man: every poll feeds it, and without that the axis lets go.
+Positions follow the board's trapezoidal trajectories, velocities its ramp, torques go out at once. The board's watchdog
+is the dead-man: every poll feeds it, and without that the axis lets go.
 
     [device.mod0]
     driver = "odrive"
@@ -52,7 +52,9 @@ LET_GO_S = 0.003
 """Between two requests to let go; the board's thread looks every millisecond."""
 FLUSH_S = 0.02
 AWAY_TURNS, AWAY_S = 0.5, 0.1
-"""So far the set-point of a move may be from where the axis is [turns], and so much more for a moving one [turns / (turns/s)]."""
+"""So far the set-point of a move may be from where the axis is [turns], and so much more for a moving one [turns /
+(turns/s)].
+"""
 
 AxisTable: Any = drive_table(
     {
@@ -67,8 +69,9 @@ AxisTable: Any = drive_table(
 )
 """Keys of an axis: those of AxisSettings that a drive of its own loop leaves, and
 
-number: of the axis on the board; travel_per_turn: m or rad in one turn, negative to reverse; standstill: speed below which the axis
-rests [turns/s]; homing: the board's homing may be used (needs an end switch there); enable: closed loop when it is opened and reset.
+number: of the axis on the board; travel_per_turn: m or rad in one turn, negative to reverse; standstill: speed below
+which the axis rests [turns/s]; homing: the board's homing may be used (needs an end switch there); enable: closed loop
+when it is opened and reset.
 """
 
 
@@ -91,10 +94,10 @@ class OdriveSettings(DriveSettings, frozen=True, forbid_unknown_fields=True, kw_
 class OdriveUnit(AxesUnit):
     """One board.
 
-    What the board must be, and what it is found to be, is kept apart. ``_fixed`` holds what the opening has set and proved, dead-man
-    and speed limit; ``_set`` the set-points and modes of a command that the board has confirmed. Each poll reads one
-    property of these, and the board's time since its start: whatever differs was not set from here, or is gone with a
-    restart.
+    What the board must be, and what it is found to be, is kept apart. ``_fixed`` holds what the opening has set and
+    proved, dead-man and speed limit; ``_set`` the set-points and modes of a command that the board has confirmed. Each
+    poll reads one property of these, and the board's time since its start: whatever differs was not set from here, or
+    is gone with a restart.
     """
 
     def __init__(self, name: str, settings: OdriveSettings, spec: BlockSpec, kit: Kit, **given: Any) -> None:
@@ -184,16 +187,15 @@ class OdriveUnit(AxesUnit):
             f"{path}trap_traj.config.vel_limit": limit, f"{path}trap_traj.config.accel_limit": ramp,
             f"{path}trap_traj.config.decel_limit": ramp,
         }  # fmt: skip
-        # The board plans from its set-point, which a velocity run leaves behind. The setter of the mode takes the present
-        # place as the set-point. It is sent twice: should it be lost, the axis would run back to where the run began.
+        # The board plans from its set-point, which a velocity run leaves behind. The setter of the mode takes the
+        # present place as the set-point. It is sent twice: should it be lost, the axis would run back to where the run
+        # began.
         modes = _modes(path, odrive.POSITION, odrive.TRAPEZOID)
         here = f"w {path}controller.config.control_mode {odrive.POSITION}"
         sets = [*_writes(wanted), here, here, f"t {number} {turns:.7g}", f"w {path}controller.input_vel 0"]
         modes |= {f"{path}controller.input_pos": turns, f"{path}controller.input_vel": 0.0}
         set_point = f"{path}controller.pos_setpoint"
-        values = yield from self._command(
-            axis, sets, wanted | modes, modes, also=[f"r {set_point}", f"f {number}"]
-        )
+        values = yield from self._command(axis, sets, wanted | modes, modes, also=[f"r {set_point}", f"f {number}"])
         (begin,), (place, velocity) = values[-2:]
         if abs(begin - place) > AWAY_TURNS + AWAY_S * abs(velocity):
             yield from self.halt(axis, fastest=True)
@@ -218,16 +220,16 @@ class OdriveUnit(AxesUnit):
         yield from self._command(axis, sets, wanted, wanted)
 
     def halt(self, axis: int, *, fastest: bool) -> Steps:
-        """Brake along the ramp and hold; the fastest stop lets go, or brakes with all there is. Sent until it is confirmed."""
+        """Brake along the ramp and hold; the fastest stop lets go, or brakes with all there is. Sent until it is
+        confirmed.
+        """
         homed, self._homes[axis] = self._homes[axis], False
         if homed or (fastest and self._settings.quick_stop == "idle"):
             yield from self._let_go(axis)
         elif fastest:
             yield from self._velocity(axis, 0.0, None)
         else:
-            yield from self._velocity(
-                axis, 0.0, abs(self.bank.settings[axis].acceleration_max / self._travel[axis])
-            )
+            yield from self._velocity(axis, 0.0, abs(self.bank.settings[axis].acceleration_max / self._travel[axis]))
 
     def home(self, axis: int) -> Steps:
         """Begin the board's homing."""
@@ -243,9 +245,7 @@ class OdriveUnit(AxesUnit):
         number = self._numbers[axis]
         yield odrive.exchange([f"u {number}", "sc"], [f"f {number}"], self._timeout_s)
         yield from self._close_loop(axis)
-        (bits,), (state,) = yield odrive.read(
-            [f"axis{number}.error", f"axis{number}.current_state"], self._timeout_s
-        )
+        (bits,), (state,) = yield odrive.read([f"axis{number}.error", f"axis{number}.current_state"], self._timeout_s)
         yield from self._judge(axis, int(bits), int(state))
         if self._faults[axis]:
             raise DeviceError(errno.EIO, self._faults[axis])
@@ -265,7 +265,9 @@ class OdriveUnit(AxesUnit):
         yield Pause(FLUSH_S)
 
     def _open_axis(self, axis: int) -> Steps:
-        """Stop an axis that may run, check its speed limit, set its watchdog, close its loop unless a stop is latched."""
+        """Stop an axis that may run, check its speed limit, set its watchdog, close its loop unless a stop is
+        latched.
+        """
         table = self._settings.axis[axis]
         number, path = table.number, f"axis{table.number}"
         limit_at, torque_at = f"{path}.controller.config.vel_limit", f"{path}.motor.config.torque_lim"
@@ -348,12 +350,11 @@ class OdriveUnit(AxesUnit):
         yield from self._seed(axis)
 
     def _seed(self, axis: int) -> Steps:
-        """Take the present speed as the set-point of an axis that a torque has set in motion: what follows begins from it."""
+        """Take the present speed as the set-point of an axis that a torque has set in motion: what follows begins from
+        it.
+        """
         path, speed = f"axis{self._numbers[axis]}.controller.", float(self._speeds[axis])
-        if (
-            self._set[axis].get(f"{path}config.control_mode") != odrive.TORQUE
-            or abs(speed) <= self._standstill[axis]
-        ):
+        if self._set[axis].get(f"{path}config.control_mode") != odrive.TORQUE or abs(speed) <= self._standstill[axis]:
             return
         self._set[axis] = {}
         yield confirmed([f"w {path}input_vel {speed:.7g}"], [(f"{path}input_vel", speed)], self._timeout_s,
@@ -362,8 +363,8 @@ class OdriveUnit(AxesUnit):
     def _close_loop(self, axis: int) -> Steps:
         """Switch an axis on; it holds where it is, and one that turns yet brakes: to hold it would be to turn it back.
 
-        The board keeps its inputs while it is idle, and obeys them as soon as the loop is closed: first they are made zero,
-        and read back. Nothing is switched on while a stop is latched, or after a stop that has overtaken this.
+        The board keeps its inputs while it is idle, and obeys them as soon as the loop is closed: first they are made
+        zero, and read back. Nothing is switched on while a stop is latched, or after a stop that has overtaken this.
         """
         if not self._settings.axis[axis].enable or self.bank.is_latched(axis):
             return
@@ -392,7 +393,9 @@ class OdriveUnit(AxesUnit):
             self._may_hold[axis], self._set[axis] = True, wanted
 
     def _let_go(self, axis: int) -> Steps:
-        """Request idle until the board says that it is, and leave nothing that the next closing of the loop would obey."""
+        """Request idle until the board says that it is, and leave nothing that the next closing of the loop would
+        obey.
+        """
         number = self._numbers[axis]
         self._may_hold[axis], self._set[axis] = False, {}
         sets = [f"w axis{number}.requested_state {IDLE}", f"v {number} 0 0"]
@@ -422,7 +425,8 @@ class OdriveUnit(AxesUnit):
         wanted |= {f"{path}input_vel": turns, f"{path}input_torque": 0.0}
         ramps = {} if ramp is None else {f"{path}config.vel_ramp_rate": ramp}
         go, how = f"v {number} {turns:.7g} 0", f"w {path}config.input_mode {mode}"
-        # The ramp begins at the present set-point, so it comes first. Without one the set-point is the input: that comes first.
+        # The ramp begins at the present set-point, so it comes first. Without one the set-point is the input: that
+        # comes first.
         sets = [go, how, go] if ramp is None else [*_writes(ramps), how, go]
         # velocity 0 may be sent again: it is a stop
         yield from self._command(axis, sets, wanted | ramps, wanted, repeatable=turns == 0, urgent=turns == 0)
@@ -507,9 +511,7 @@ class Odrive(LineDriver):
     def golden(cls, settings: Any) -> Sequence[Golden]:
         """Return lines of the documentation, with their checksums."""
         texts = ("v 0 1 0*103", "f 0*118", "c 0 0.1*124", "p 0 -2 0 0*95")
-        lines = [
-            Golden(text, odrive.line(text.partition("*")[0]), (text + "\n").encode().hex()) for text in texts
-        ]
+        lines = [Golden(text, odrive.line(text.partition("*")[0]), (text + "\n").encode().hex()) for text in texts]
         reply = b"24.087744*32\r\n" + odrive.line("0.0 0.0").replace(b"\n", b"\r\n")
         read = Golden("read a property", odrive.read(["vbus_voltage"], 0.1), "", reply.hex(), [[24.087744]])
         return (*lines, read)
@@ -527,6 +529,5 @@ class Odrive(LineDriver):
 
 def _axes(settings: OdriveSettings) -> list[Any]:
     return [
-        drive_axes.axis_settings(axis, MODES, homing=axis.homing, required=axis.home_required)
-        for axis in settings.axis
+        drive_axes.axis_settings(axis, MODES, homing=axis.homing, required=axis.home_required) for axis in settings.axis
     ]

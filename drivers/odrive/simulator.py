@@ -1,14 +1,15 @@
 """An ODrive board (firmware 0.5.6) on a pty: ``python -m sioms.drivers.odrive.simulator --link PATH``.
 
-Its parser is that of the firmware's ``communication/ascii_protocol.cpp`` (fw-v0.5.6, a308314e), line for line: lines end at LF, CR
-or ``!`` and an empty one is an unknown command; ``;`` begins a comment; a wrong checksum is silence, but a line without one is
-obeyed; 256 bytes without an end are dropped, and the next line with them; there is no time-out; only the first letter
-tells the command; numbers are read as far as they go; set commands are not answered; values are cut to nine characters.
-What hangs behind it is in ``odrive_axis``. Commands on standard input, beside those of the line:
+Its parser is that of the firmware's ``communication/ascii_protocol.cpp`` (fw-v0.5.6, a308314e), line for line: lines
+end at LF, CR or ``!`` and an empty one is an unknown command; ``;`` begins a comment; a wrong checksum is silence, but
+a line without one is obeyed; 256 bytes without an end are dropped, and the next line with them; there is no time-out;
+only the first letter tells the command; numbers are read as far as they go; set commands are not answered; values are
+cut to nine characters. What hangs behind it is in ``odrive_axis``. Commands on standard input, beside those of the
+line:
 
-``state [AXIS]``, ``error BITS [AXIS]``, ``switch TURNS [AXIS]`` (end switch for homing), ``set PATH VALUE`` (and keep it
-without supply), ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze [COUNT]``, ``foreign KIND VALUE [AXIS]`` (velocity,
-torque, position, mode), ``shove V [AXIS]``.
+``state [AXIS]``, ``error BITS [AXIS]``, ``switch TURNS [AXIS]`` (end switch for homing), ``set PATH VALUE`` (and keep
+it without supply), ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze [COUNT]``, ``foreign KIND VALUE [AXIS]``
+(velocity, torque, position, mode), ``shove V [AXIS]``.
 """
 
 from __future__ import annotations
@@ -31,19 +32,28 @@ FOREVER = 1 << 30
 _INTEGER = r"\s*([+-]?\d+)"
 _FLOAT = r"\s*([+-]?(?:\d+\.?\d*(?:e[+-]?\d+)?|\.\d+(?:e[+-]?\d+)?|nan|inf(?:inity)?))"
 HELP = (
-    "Please see documentation for more details", "", "Available commands syntax reference:",
-    "Position: q axis pos vel-lim I-lim", "Position: p axis pos vel-ff I-ff", "Velocity: v axis vel I-ff", "Torque: c axis T",
-    "", "Properties start at odrive root, such as axis0.requested_state", "Read: r property", "Write: w property value", "",
-    "Save config: ss", "Erase config: se", "Reboot: sr",
-)  # fmt: skip
+    "Please see documentation for more details",
+    "",
+    "Available commands syntax reference:",
+    "Position: q axis pos vel-lim I-lim",
+    "Position: p axis pos vel-ff I-ff",
+    "Velocity: v axis vel I-ff",
+    "Torque: c axis T",
+    "",
+    "Properties start at odrive root, such as axis0.requested_state",
+    "Read: r property",
+    "Write: w property value",
+    "",
+    "Save config: ss",
+    "Erase config: se",
+    "Reboot: sr",
+)
 
 
 class Board:
     """The board; times in seconds of the given clock."""
 
-    def __init__(
-        self, version: str = "0.5.6", dry: float = 0.05, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, version: str = "0.5.6", dry: float = 0.05, clock: Callable[[], float] = time.monotonic) -> None:
         self.version = [int(part) for part in version.split(".")]
         self.axes = [Axis(dry), Axis(dry)]
         self.time = Stepper(self._step, lambda: False, clock)
@@ -229,9 +239,7 @@ class Board:
             return ["invalid command format"]
         found = self._find(words[0])
         if found is None:
-            return [
-                "not implemented" if self._read(f"r {words[0]}") != "invalid property" else "invalid property"
-            ]
+            return ["not implemented" if self._read(f"r {words[0]}") != "invalid property" else "invalid property"]
         axis, path = found
         kind = _INTEGER if path in UNSIGNED or path in FLAGS else _FLOAT
         value = re.match(kind, words[1] if len(words) > 1 else "", re.IGNORECASE)

@@ -1,10 +1,12 @@
 """SCHUNK FTS sensors behind the Ethernet interface box (IFB-EN), without I/O: commands on TCP, records on UDP.
 
-Both frames begin ``FF FF``, a counter (u16) and the length of what follows (u16); all numbers are little-endian. A reply has command,
-error code and data. **Its counter is no echo**: the box numbers its replies on each connection from 1 on, and the vendor's library
-sends 0 in every command; so a reply belongs to a command by its order and by the command byte. A record of 35 bytes comes a thousand
-times a second; its ``packet`` is a second counter of 8 bits that runs with every record. Source: the vendor's public driver and
-simulator (SCHUNK-SE-Co-KG/schunk_force_torque_sensor b0e4359: ``schunk_fts_dummy/src/tcp.rs``, ``udp.rs``, ``schunk_fts_library/utility.py``).
+Both frames begin ``FF FF``, a counter (u16) and the length of what follows (u16); all numbers are little-endian. A
+reply has command,
+error code and data. **Its counter is no echo**: the box numbers its replies on each connection from 1 on, and the
+vendor's library sends 0 in every command; so a reply belongs to a command by its order and by the command byte. A
+record of 35 bytes comes a thousand times a second; its ``packet`` is a second counter of 8 bits that runs with every
+record. Source: the vendor's public driver and simulator (SCHUNK-SE-Co-KG/schunk_force_torque_sensor b0e4359:
+``schunk_fts_dummy/src/tcp.rs``, ``udp.rs``, ``schunk_fts_library/utility.py``).
 """
 
 from __future__ import annotations
@@ -47,14 +49,27 @@ PRODUCT, PRODUCT_ID, UNIT, FIRMWARE = (0x0001, 0), (0x0001, 3), (0x0050, 0), (0x
 """Index and subindex of parameters."""
 
 _ERRORS = {
-    0x01: (errno.ENOTSUP, "unknown command"), 0x02: (errno.EINVAL, "wrong length"), 0x03: (errno.EINVAL, "wrong value"),
-    0x04: (errno.EBUSY, "busy"), 0x05: (errno.EBUSY, "not while it streams"), 0x06: (errno.EIO, "storage"),
-    0x07: (errno.EIO, "internal bus"), 0x08: (errno.EIO, "time-out inside the sensor"), 0x10: (errno.EPERM, "user level too low"),
-    0x11: (errno.EACCES, "read only"), 0x12: (errno.EACCES, "write only"), 0x13: (errno.ENXIO, "unknown index"),
-    0x14: (errno.ENXIO, "unknown subindex"), 0x15: (errno.EINVAL, "wrong length of the value"), 0x16: (errno.EINVAL, "wrong value"),
-    0x17: (errno.EACCES, "login failed"), 0x18: (errno.EACCES, "login blocked"), 0x19: (errno.EACCES, "locked"),
-    0x30: (errno.EBUSY, "firmware update"), 0x31: (errno.EBUSY, "firmware update"),
-}  # fmt: skip
+    0x01: (errno.ENOTSUP, "unknown command"),
+    0x02: (errno.EINVAL, "wrong length"),
+    0x03: (errno.EINVAL, "wrong value"),
+    0x04: (errno.EBUSY, "busy"),
+    0x05: (errno.EBUSY, "not while it streams"),
+    0x06: (errno.EIO, "storage"),
+    0x07: (errno.EIO, "internal bus"),
+    0x08: (errno.EIO, "time-out inside the sensor"),
+    0x10: (errno.EPERM, "user level too low"),
+    0x11: (errno.EACCES, "read only"),
+    0x12: (errno.EACCES, "write only"),
+    0x13: (errno.ENXIO, "unknown index"),
+    0x14: (errno.ENXIO, "unknown subindex"),
+    0x15: (errno.EINVAL, "wrong length of the value"),
+    0x16: (errno.EINVAL, "wrong value"),
+    0x17: (errno.EACCES, "login failed"),
+    0x18: (errno.EACCES, "login blocked"),
+    0x19: (errno.EACCES, "locked"),
+    0x30: (errno.EBUSY, "firmware update"),
+    0x31: (errno.EBUSY, "firmware update"),
+}
 
 
 class Status(IntFlag):

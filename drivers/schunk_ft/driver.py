@@ -71,7 +71,9 @@ class SchunkFt(StreamDriver):
     @classmethod
     def golden(cls, settings: Any) -> Sequence[Golden]:
         """Return frames of the vendor's repository."""
-        sent = "ff ff 40 11 1d 00 40 01 00 00 00 55 50 02 3f f2 04 e6 be 01 98 7e bf 04 1b 20 bf 7c 2a a3 3e ad 43 78 3f"
+        sent = (
+            "ff ff 40 11 1d 00 40 01 00 00 00 55 50 02 3f f2 04 e6 be 01 98 7e bf 04 1b 20 bf 7c 2a a3 3e ad 43 78 3f"
+        )
         values = (0.50904, -0.44926, -0.99451, -0.62541, 0.31868, 0.96978)
 
         def read(data: bytes) -> tuple[int, int, int, tuple[float, ...]]:
@@ -153,9 +155,7 @@ class SchunkFt(StreamDriver):
             if is_first and self._sequence.last is not None:
                 self._compare(record.counter, now_ns)
             else:
-                self.trouble = (
-                    f"records come, but their number stands still at {record.counter}: the sensor is frozen"
-                )
+                self.trouble = f"records come, but their number stands still at {record.counter}: the sensor is frozen"
             return 0
         self._newest, self.trouble = (record.counter, now_ns), ""
         flags = int(AnalogStatus.OVERRUN) if lost else 0
@@ -214,9 +214,7 @@ class SchunkFt(StreamDriver):
         half = ifb.SEQUENCE_MODULUS // 2
         off = (counter - expected + half) % ifb.SEQUENCE_MODULUS - half
         if away_ns > SAME_RUN_NS or abs(off) > SAME_RUN_RECORDS + 0.02 * away_ns * 1e-9 * ifb.RATE_HZ:
-            self._doubt_zero(
-                f"the sensor was away for {away_ns * 1e-9:.1f} s and has counted anew, as after a restart"
-            )
+            self._doubt_zero(f"the sensor was away for {away_ns * 1e-9:.1f} s and has counted anew, as after a restart")
 
     def _doubt_zero(self, why: str) -> None:
         if self._block.is_zeroed:
@@ -230,12 +228,13 @@ class SchunkFt(StreamDriver):
             raise _not_this(f"calls itself {product!r}; the configuration says {self.settings.product!r}")
         known = f"{product}, firmware {firmware}"
         if unit == product.encode("ascii", "replace"):
-            known += "; it answers every parameter with its name, as the vendor's simulator does, so units are taken for N and N*m"
+            known += (
+                "; it answers every parameter with its name, as the vendor's simulator does, so units are taken for N "
+                "and N*m"
+            )
         elif unit.strip(b"\0"):
             number = int.from_bytes(unit, "little")
-            raise _not_this(
-                f"has unit selection {number}; N and N*m, 0, are right: set them on the sensor's page"
-            )
+            raise _not_this(f"has unit selection {number}; N and N*m, 0, are right: set them on the sensor's page")
         if known != self._known:
             self._known = known
             self.kit.log("info", f"identified {self.name} at {self.settings.line}: {known}")

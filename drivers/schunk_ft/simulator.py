@@ -1,15 +1,16 @@
 """A SCHUNK FTS sensor with its Ethernet box: ``python -m sioms.drivers.schunk_ft.simulator --port 0 --data-port 0``.
 
-Commands on TCP, a record of 35 bytes a thousand times a second on UDP to the host that the commands came from, each with a counter of 16
-bits and one of 8. As in the vendor's own simulator replies are numbered on each connection from 1 on whatever the command's
-number, what one segment brings is one command, and a piece of less than 7 bytes ends the connection. The stream goes on when the
-commands' connection ends. With ``--vendor`` it is that simulator in the rest too: it streams from its start and always, answers every
-parameter with its name, takes all and does nothing of it.
+Commands on TCP, a record of 35 bytes a thousand times a second on UDP to the host that the commands came from, each
+with a counter of 16 bits and one of 8. As in the vendor's own simulator replies are numbered on each connection from 1
+on whatever the command's number, what one segment brings is one command, and a piece of less than 7 bytes ends the
+connection. The stream goes on when the commands' connection ends. With ``--vendor`` it is that simulator in the rest
+too: it streams from its start and always, answers every parameter with its name, takes all and does nothing of it.
 
-Commands on standard input: ``load FX FY FZ TX TY TZ [SECONDS]``, ``status BITS`` (or-ed to its own), ``stall``, ``resume``, ``hang_up``,
-``product NAME``, ``unit NUMBER``, ``garbage SIZE``, ``state``, ``power_cycle [SECONDS]`` (connections die without a word), ``refuse COUNT`` (busy),
-``freeze [COUNT]``, ``foreign zero|tool|filter|stop|unit VALUE``, ``shift COUNT`` (the counter jumps), and the faults of the records' way: ``mute COUNT``
-(drop), ``double``, ``late SECONDS COUNT``, ``cut``; ``deaf COUNT`` loses commands.
+Commands on standard input: ``load FX FY FZ TX TY TZ [SECONDS]``, ``status BITS`` (or-ed to its own), ``stall``,
+``resume``, ``hang_up``, ``product NAME``, ``unit NUMBER``, ``garbage SIZE``, ``state``, ``power_cycle [SECONDS]``
+(connections die without a word), ``refuse COUNT`` (busy), ``freeze [COUNT]``, ``foreign zero|tool|filter|stop|unit
+VALUE``, ``shift COUNT`` (the counter jumps), and the faults of the records' way: ``mute COUNT`` (drop), ``double``,
+``late SECONDS COUNT``, ``cut``; ``deaf COUNT`` loses commands.
 """
 
 from __future__ import annotations
@@ -51,8 +52,11 @@ class Sensor:
         self.options, self.clock = options, clock
         self.load = Load(options.range_n, options.range_nm)
         self.parameters: dict[tuple[int, int], bytes] = {
-            (0x0001, 0): options.product.encode(), (0x0001, 3): b"\x2a\x00", (0x0050, 0): b"\x00", (0x1002, 1): b"1.0.4",
-        }  # fmt: skip
+            (0x0001, 0): options.product.encode(),
+            (0x0001, 3): b"\x2a\x00",
+            (0x0050, 0): b"\x00",
+            (0x1002, 1): b"1.0.4",
+        }
         self.extra_status = 0
         self.stalled = False
         self.supply = Supply(clock, self.boot, options.boot_s)
@@ -84,11 +88,7 @@ class Sensor:
         command = payload[0]
         if self.options.vendor:
             if command in (0xF0, 0xF1):
-                return (
-                    bytes((command, OK))
-                    + payload[1:4]
-                    + (self.options.product.encode() if command == 0xF0 else b"")
-                )
+                return bytes((command, OK)) + payload[1:4] + (self.options.product.encode() if command == 0xF0 else b"")
             return bytes((command, OK if command in LENGTHS or command in (0x10, 0x11, 0x20) else UNKNOWN))
         if command == 0xF1:
             return bytes((command, LOCKED))
@@ -180,10 +180,19 @@ class Sensor:
             }  # fmt: skip
 
         return {
-            **self.load.handlers(self.clock), "status": status, "product": product, "unit": unit, "foreign": foreign, "shift": shift,
-            "power_cycle": self.supply.cycle, "freeze": self.standstill.set, "refuse": self.refusals.set,
-            "stall": set_stall(True), "resume": set_stall(False), "state": state,
-        }  # fmt: skip
+            **self.load.handlers(self.clock),
+            "status": status,
+            "product": product,
+            "unit": unit,
+            "foreign": foreign,
+            "shift": shift,
+            "power_cycle": self.supply.cycle,
+            "freeze": self.standstill.set,
+            "refuse": self.refusals.set,
+            "stall": set_stall(True),
+            "resume": set_stall(False),
+            "state": state,
+        }
 
 
 class CommandPort:
@@ -267,9 +276,7 @@ async def run() -> None:
         return commands.host, data_port
 
     streaming = asyncio.create_task(
-        stream(
-            lambda: sensor.due(lambda record: data.send(record, to())), lambda: sensor.next_s, sensor.clock
-        )
+        stream(lambda: sensor.due(lambda record: data.send(record, to())), lambda: sensor.next_s, sensor.clock)
     )
 
     async def close() -> None:

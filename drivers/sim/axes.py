@@ -201,9 +201,7 @@ class SimAxes(TickDriver):
             beside_ns = now_ns - self._last_ns - ticks * self._tick_ns
         if 20 * abs(beside_ns) < self._tick_ns or abs(beside_ns) > self._tick_ns:
             beside_ns = 0
-        self._last_ns = (
-            now_ns - beside_ns
-        )  # where the world is: it goes by whole ticks, also when one came early
+        self._last_ns = now_ns - beside_ns  # where the world is: it goes by whole ticks, also when one came early
         self._measure()
         if beside_ns:
             self._shift(beside_ns * 1e-9)
@@ -214,7 +212,9 @@ class SimAxes(TickDriver):
             self._look(self._port, now_ns)
 
     def slack(self, now_ns: int, until_ns: int) -> None:
-        """Let the world go on to the next tick, which is sooner done then, and plan profiles ahead while there is time."""
+        """Let the world go on to the next tick, which is sooner done then, and plan profiles ahead while there is
+        time.
+        """
         if self._command is not None and not self._ahead:
             self._advance(self._command)
             self._ahead = 1
@@ -274,9 +274,7 @@ def _axes(settings: SimAxesSettings) -> list[Any]:
         if axis.count == 1:
             axes.append(axis)
         else:
-            axes += [
-                msgspec.structs.replace(axis, name=f"{axis.name}{i}", count=1) for i in range(axis.count)
-            ]
+            axes += [msgspec.structs.replace(axis, name=f"{axis.name}{i}", count=1) for i in range(axis.count)]
     return axes
 
 
@@ -314,10 +312,7 @@ def _boxes(settings: SimAxesSettings) -> list[list[Box]]:
             if not low <= high:
                 raise ValueError(f"beam {number}: interval {low:g} to {high:g} of {axis}; want low first")
     return [
-        [
-            Box(tuple((names.index(axis), low, high) for axis, (low, high) in box.items()))
-            for box in beam.boxes
-        ]
+        [Box(tuple((names.index(axis), low, high) for axis, (low, high) in box.items())) for box in beam.boxes]
         for beam in settings.beam
     ]
 
@@ -327,9 +322,7 @@ def _effects(settings: SimAxesSettings, servos: Sequence[str]) -> tuple[Effect, 
     effects = build_effects(settings.effects, servos, "effects")
     if not settings.effects_file:
         return effects
-    return effects + parse_effects(
-        _text("effects_file", settings.effects_file), servos, settings.effects_file
-    )
+    return effects + parse_effects(_text("effects_file", settings.effects_file), servos, settings.effects_file)
 
 
 def _text(key: str, path: str) -> str:
@@ -420,9 +413,7 @@ def _plant_channels(axes: Sequence[Any]) -> list[ChannelInfo]:
                 axis.unit,
                 description=f"true position of the load{_model_sum(axis)}",
             ),
-            ChannelInfo(
-                f"{axis.name}_contact", force_unit.get(axis.unit, "N"), description="force on the wall"
-            ),
+            ChannelInfo(f"{axis.name}_contact", force_unit.get(axis.unit, "N"), description="force on the wall"),
         )
     ]
 

@@ -129,9 +129,7 @@ class SimIo(TickDriver):
         if settings.inputs:
             channel = ChannelInfo("in", minimum=0, maximum=2**settings.inputs - 1, width=settings.inputs)
             ports.append(
-                BlockSpec(
-                    "in" if settings.outputs else "", NodeClass.BINARY, (channel,), history=settings.history
-                )
+                BlockSpec("in" if settings.outputs else "", NodeClass.BINARY, (channel,), history=settings.history)
             )
         return Description(tuple(ports), settings.tick_hz, tuple(_nodes(settings)), lease_s=1.0)
 
@@ -225,9 +223,7 @@ class SimIo(TickDriver):
             if len(self._positions) == len(self._nodes) and stamp_ns > self._seen_ns:
                 self._seen_ns = stamp_ns
                 positions = [self._positions[index] for index in range(len(self._nodes))]
-                edges += [
-                    (edge, bit) for bit, beam in self._beams for edge in beam.sample(positions, stamp_ns)
-                ]
+                edges += [(edge, bit) for bit, beam in self._beams for edge in beam.sample(positions, stamp_ns)]
         return edges
 
     def _gripper_edges(self, now_ns: int) -> list[tuple[Edge, int]]:
@@ -256,9 +252,7 @@ def _nodes(settings: SimIoSettings) -> list[str]:
 
 
 def _boxes(table: BeamTable, nodes: Sequence[str]) -> list[Box]:
-    return [
-        Box(tuple((nodes.index(node), low, high) for node, (low, high) in box.items())) for box in table.boxes
-    ]
+    return [Box(tuple((nodes.index(node), low, high) for node, (low, high) in box.items())) for box in table.boxes]
 
 
 def _check(settings: SimIoSettings) -> None:
@@ -277,21 +271,15 @@ def _check(settings: SimIoSettings) -> None:
     for kind, bits, width in (("input", driven, settings.inputs), ("output", used, settings.outputs)):
         for bit in bits:
             if bit >= width:
-                raise ValueError(
-                    f"{kind} bit {bit} is used but there are {width}; want {kind}s = {bit + 1} or more"
-                )
+                raise ValueError(f"{kind} bit {bit} is used but there are {width}; want {kind}s = {bit + 1} or more")
     for bit in driven:
         if driven.count(bit) > 1:
-            raise ValueError(
-                f"input bit {bit} is driven {driven.count(bit)} times; want one source for a bit"
-            )
+            raise ValueError(f"input bit {bit} is driven {driven.count(bit)} times; want one source for a bit")
     if settings.safe is not None and not 0 <= settings.safe < 2**settings.outputs:
         raise ValueError(f"safe = {settings.safe}; want 0 to {2**settings.outputs - 1}")
     for wave in settings.wave:
         if not 0 < wave.high_s < wave.period_s:
-            raise ValueError(
-                f"wave on bit {wave.bit}: high_s {wave.high_s:g} of period_s {wave.period_s:g}; want less"
-            )
+            raise ValueError(f"wave on bit {wave.bit}: high_s {wave.high_s:g} of period_s {wave.period_s:g}; want less")
     for beam in settings.beam:
         for low, high in (interval for box in beam.boxes for interval in box.values()):
             if not low <= high:

@@ -10,10 +10,10 @@ The driver knows the contact force and, where told, the contact angle from nodes
     angle_rad = 1.29
     indenter_radius_m = 0.006
 
-With a table ``shape``, see ``tactile_nodes``, it shows strains and shape as a real finger does. With a ``model_file`` (as ``sioms
-reconcile tactile`` writes it) it is the twin of the finger that the model was found for: elements, body and all effects come
-from the file, the length of contact from ``finger``. A check sum of the model shows in the channels' description, so that a reload takes up
-a changed file.
+With a table ``shape``, see ``tactile_nodes``, it shows strains and shape as a real finger does. With a ``model_file``
+(as ``sioms reconcile tactile`` writes it) it is the twin of the finger that the model was found for: elements, body and
+all effects come from the file, the length of contact from ``finger``. A check sum of the model shows in the channels'
+description, so that a reload takes up a changed file.
 """
 
 from __future__ import annotations
@@ -146,7 +146,8 @@ def _check(settings: SimTactileSettings) -> int:
     """Return the number of elements.
 
     Raises:
-        ValueError: numbers of another length than the elements, a radius that is no radius, or a model that cannot be read.
+        ValueError: numbers of another length than the elements, a radius that is no radius, or a model that cannot be
+            read.
     """
     shape = from_table(FingerShape, settings.finger)
     elements = _twin(settings).count if settings.model_file else len(shape.angles_rad)

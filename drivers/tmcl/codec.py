@@ -1,9 +1,11 @@
 """Trinamic TMCL in its binary form, without I/O: nine bytes each way, closed by the sum of the first eight.
 
-There is nothing to resynchronise on: the vendor's receiver waits for nine bytes for ever (TMC-EvalSystem ``tmc/TMCL.c``, ``rx``), so one
-byte too many or too few and it cuts every telegram that follows at the wrong place. :class:`Framing` gets it back into step. After a bad or
-missing reply the line has to fall silent before the next request (``LineDriver.recovery_s``), because a reply does not say which
-parameter it is of. Source of the telegrams: TMCL firmware manuals (TMCM-1140, TMCM-1276), chapter "TMCL and the TMCL-IDE".
+There is nothing to resynchronise on: the vendor's receiver waits for nine bytes for ever (TMC-EvalSystem
+``tmc/TMCL.c``, ``rx``), so one byte too many or too few and it cuts every telegram that follows at the wrong place.
+:class:`Framing` gets it back into step. After a bad or missing reply the line has to fall silent before the next
+request (``LineDriver.recovery_s``), because a reply does not say which
+parameter it is of. Source of the telegrams: TMCL firmware manuals (TMCM-1140, TMCM-1276), chapter "TMCL and the
+    TMCL-IDE".
 """
 
 from __future__ import annotations
@@ -163,9 +165,7 @@ class Module:
             if status == 1 and host == self.host:  # module and command are those of the last good telegram
                 raise LinkError(f"{what}: the module received a wrong checksum")
             if (host, module) != (self.host, self.address):
-                text = (
-                    f"{what}: the reply goes from {module} to {host}; {self.address} to {self.host} is right"
-                )
+                text = f"{what}: the reply goes from {module} to {host}; {self.address} to {self.host} is right"
                 raise LinkError(text)
             if command != op:
                 raise LinkError(f"{what}: the reply answers command {command}; {int(op)} is right")
@@ -184,15 +184,19 @@ def is_telegram(data: bytes) -> bool:
 
 # --- into step ------------------------------------------------------------------------------------
 #
-# A receiver out of step holds 0 to 8 bytes. Single bytes complete them, and the module answers: nine bytes with a wrong checksum draw
-# status 1 at once, and with that reply it is in step. What it holds may be a motion command short of a byte, so the single bytes
-# must complete no valid telegram. Zeros may: of "rotate right 1019" (01 01 00 00 00 00 03 fb 00) with one 00 lost, one more 00 makes
-# 260864. What is held is a piece of what was sent last; of each piece of 9 - k bytes the k-th byte may not be the checksum: ten
-# values at most that the k-th byte must avoid, of 256.
+# A receiver out of step holds 0 to 8 bytes. Single bytes complete them, and the module answers: nine bytes with a wrong
+# checksum draw status 1 at once, and with that reply it is in step. What it holds may be a motion command short of a
+# byte, so the single bytes
+# must complete no valid telegram. Zeros may: of "rotate right 1019" (01 01 00 00 00 00 03 fb 00) with one 00 lost, one
+# more 00 makes
+# 260864. What is held is a piece of what was sent last; of each piece of 9 - k bytes the k-th byte may not be the
+# checksum: ten values at most that the k-th byte must avoid, of 256.
 
 
 def remnants(telegram: bytes) -> set[bytes]:
-    """Return what a receiver may hold of a telegram that lost one run of bytes, or part of which went to the telegram before."""
+    """Return what a receiver may hold of a telegram that lost one run of bytes, or part of which went to the telegram
+    before.
+    """
     return {telegram[:i] + telegram[j:] for i in range(SIZE) for j in range(i + 1, SIZE + 1)}
 
 
@@ -214,7 +218,9 @@ def padding(module: int, suspects: Iterable[bytes]) -> bytes:
 
 
 def separator(telegram: bytes) -> int:
-    """Return a byte that, sent between repetitions of a telegram, makes no valid telegram wherever a receiver cuts them."""
+    """Return a byte that, sent between repetitions of a telegram, makes no valid telegram wherever a receiver cuts
+    them.
+    """
 
     def is_safe(value: int) -> bool:
         row = telegram + bytes((value,)) + telegram
@@ -226,7 +232,8 @@ def separator(telegram: bytes) -> int:
 class Framing:
     """Whether a module is in step, and the single bytes that bring it back.
 
-    Concurrency: one thread; several jobs of one line may share it, for a stop may come between any two exchanges of another.
+    Concurrency: one thread; several jobs of one line may share it, for a stop may come between any two exchanges of
+        another.
 
     Attributes:
         unanswered: the telegram that drew no right answer, b"" when the module is in step.

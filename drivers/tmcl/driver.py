@@ -1,8 +1,9 @@
 """Trinamic modules and evaluation boards on TMCL, up to six motors a module.
 
-The module makes its own ramps. Its serial heartbeat (global parameter 68) is the dead-man: without a request for that long
-the motors stop. A module that restarts has neither heartbeat nor ramps nor place; every poll proves that it has not. One that is out of
-step, so that not even a stop reaches it, is brought back by single bytes (sioms.drivers.tmcl.codec.Framing).
+The module makes its own ramps. Its serial heartbeat (global parameter 68) is the dead-man: without a request for that
+long the motors stop. A module that restarts has neither heartbeat nor ramps nor place; every poll proves that it has
+not. One that is out of step, so that not even a stop reaches it, is brought back by single bytes
+(sioms.drivers.tmcl.codec.Framing).
 
     [device.mod0]
     driver = "tmcl"
@@ -45,7 +46,8 @@ HIGHEST_INTERNAL = 2047
 DRIVER_FAULTS = {
     1: "stall", 2: "overtemperature", 8: "short to ground, coil A", 16: "short to ground, coil B",
 }  # fmt: skip
-"""Bits of axis parameter 208 on the TMC26x and TMC5130 drivers; 4 (warning), 32, 64 (open load) and 128 are no faults."""
+"""Bits of axis parameter 208 on the TMC26x and TMC5130 drivers; 4 (warning), 32, 64 (open load) and 128 are no faults.
+"""
 EXTENDED_FAULTS = {1: "motor stalled", 2: "deviation from the encoder too large"}
 """Bits of axis parameter 207."""
 FAULT_BITS = {Axis.DRIVER_ERRORS: DRIVER_FAULTS, Axis.EXTENDED_ERRORS: EXTENDED_FAULTS}
@@ -53,7 +55,9 @@ SELDOM_NS = 500_000_000
 PAD_S = 0.01
 """How long after a single byte, beside the time of the characters, the module has to say that it was the ninth."""
 DRIFT, JITTER_MS, TICKS_MS = 0.1, 200, 1000
-"""How far the module's clock may be from this one: part of the time since a reading, and more [ms]; after how long that is renewed [ms]."""
+"""How far the module's clock may be from this one: part of the time since a reading, and more [ms]; after how long that
+is renewed [ms].
+"""
 ROUNDING = {Axis.MAX_SPEED: 2, Axis.MAX_ACCELERATION: 256}
 """By how much, beside 2 %, a ramp may read otherwise than it was set: modules hold it in steps of their own."""
 
@@ -70,9 +74,9 @@ AxisTable: Any = drive_table(
 )
 """Keys of an axis: those of AxisSettings that a drive of its own loop leaves, and
 
-motor: number in the module; travel_per_turn: m or rad in one turn, negative to reverse the axis; microsteps_per_turn: full steps
-times microstep resolution; pulse_divisor, ramp_divisor: of the motor, for speed_unit = "internal" alone; homing: the
-module's reference search (parameters 193 to 195) may be used.
+motor: number in the module; travel_per_turn: m or rad in one turn, negative to reverse the axis; microsteps_per_turn:
+full steps times microstep resolution; pulse_divisor, ramp_divisor: of the motor, for speed_unit = "internal" alone;
+homing: the module's reference search (parameters 193 to 195) may be used.
 """
 
 
@@ -202,12 +206,8 @@ class TmclUnit(AxesUnit):
         version = yield from self._ask(module.exchange(Op.VERSION, 1), search=True)
         number, firmware = version >> 16 & 0xFFFF, version & 0xFFFF
         if settings.module and number != settings.module:
-            text = (
-                f"identify {self.name}: module {number}, firmware {firmware >> 8}.{firmware & 0xFF:02d}; the "
-            )
-            raise DeviceError(
-                errno.ENODEV, f"{text}configuration says {settings.module}; check address and wiring"
-            )
+            text = f"identify {self.name}: module {number}, firmware {firmware >> 8}.{firmware & 0xFF:02d}; the "
+            raise DeviceError(errno.ENODEV, f"{text}configuration says {settings.module}; check address and wiring")
         yield from self._end_programs()
         yield from self.stop()
         self._lost = self._lost or (yield from self._what_is_lost())
@@ -224,9 +224,7 @@ class TmclUnit(AxesUnit):
         try:
             present = yield from self._ask(self._module.exchange(Op.GGP, SERIAL_HEARTBEAT))
             if present != wanted:  # never written without need: some modules keep it in their EEPROM
-                yield from self._ask(
-                    self._module.exchange(Op.SGP, SERIAL_HEARTBEAT, 0, wanted), repeatable=True
-                )
+                yield from self._ask(self._module.exchange(Op.SGP, SERIAL_HEARTBEAT, 0, wanted), repeatable=True)
                 present = yield from self._ask(self._module.exchange(Op.GGP, SERIAL_HEARTBEAT))
         except DeviceError as error:
             if wanted:
@@ -238,7 +236,9 @@ class TmclUnit(AxesUnit):
             raise DeviceError(errno.EIO, f"{text}; heartbeat_s = {present / 1000:g} is what the module takes")
 
     def _limit(self) -> Steps:
-        """Set the ramps of all motors to the limits of the axes, so that nobody's own are in force, and read them back."""
+        """Set the ramps of all motors to the limits of the axes, so that nobody's own are in force, and read them
+        back.
+        """
         for axis, scale in enumerate(self._scales):
             settings = self._settings.axis[axis]
             for parameter, value in (
@@ -248,7 +248,9 @@ class TmclUnit(AxesUnit):
                 yield from self._ramp(axis, parameter, value)
                 present = yield from self._ask(self._module.get(parameter, self._motors[axis]))
                 if not _is_near(parameter, present, value):
-                    text = f"limit motor {self._motors[axis]} of {self.name}: parameter {int(parameter)} reads {present}"
+                    text = (
+                        f"limit motor {self._motors[axis]} of {self.name}: parameter {int(parameter)} reads {present}"
+                    )
                     raise DeviceError(errno.ERANGE, f"{text}, {value} was set; the module cannot do it")
 
     def poll(self) -> Steps:
@@ -259,9 +261,7 @@ class TmclUnit(AxesUnit):
         moving, done = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         for axis, (motor, scale) in enumerate(zip(self._motors, self._scales, strict=True)):
             # before the position, which the end of a search changes
-            searches = (
-                self._homes[axis] and (yield from self._ask(self._module.exchange(Op.RFS, 2, motor))) != 0
-            )
+            searches = self._homes[axis] and (yield from self._ask(self._module.exchange(Op.RFS, 2, motor))) != 0
             steps = yield from self._ask(self._module.get(Axis.ACTUAL_POSITION, motor))
             speed = yield from self._ask(self._module.get(Axis.ACTUAL_SPEED, motor))
             reached = yield from self._ask(self._module.get(Axis.POSITION_REACHED, motor))
@@ -313,9 +313,7 @@ class TmclUnit(AxesUnit):
 
     # --- the line ----------------------------------------------------------------------------------
 
-    def _ask(
-        self, exchange: Exchange, *, search: bool = False, repeatable: bool = False
-    ) -> Generator[Any, Any, Any]:
+    def _ask(self, exchange: Exchange, *, search: bool = False, repeatable: bool = False) -> Generator[Any, Any, Any]:
         """Carry out an exchange; where it fails, bring the module into step, and repeat what may be.
 
         Args:
@@ -364,7 +362,8 @@ class TmclUnit(AxesUnit):
     # --- what must hold ----------------------------------------------------------------------------
 
     def _prove(self) -> Steps:
-        """Prove that the module has not restarted, and one by one that the heartbeat and all ramps are as they were set.
+        """Prove that the module has not restarted, and one by one that the heartbeat and all ramps are as they were
+        set.
 
         Raises:
             StateLost: they are not; the kit opens the module again.
@@ -383,7 +382,9 @@ class TmclUnit(AxesUnit):
             raise StateLost(f"{self.name}: {lost}: it restarted, or somebody else has set it")
 
     def _what_is_lost(self) -> Generator[Any, Any, str]:
-        """Return how a module that was opened before shows that it restarted since, so that its place is not to be trusted."""
+        """Return how a module that was opened before shows that it restarted since, so that its place is not to be
+        trusted.
+        """
         if not self._ramps:
             return ""
         lost: str = yield from self._believed(self._time_jumped)
@@ -396,7 +397,9 @@ class TmclUnit(AxesUnit):
         return lost
 
     def _believed(self, look: Callable[[], Generator[Any, Any, str]]) -> Generator[Any, Any, str]:
-        """Return what is found twice: a reply does not tell of which parameter it is, and one that came late is that of another."""
+        """Return what is found twice: a reply does not tell of which parameter it is, and one that came late is that of
+        another.
+        """
         found: str = yield from look()
         if not found:
             return ""
@@ -429,9 +432,7 @@ class TmclUnit(AxesUnit):
     def _heartbeat_lost(self) -> Generator[Any, Any, str]:
         wanted = round(self._settings.heartbeat_s * 1000)
         present = yield from self._ask(self._module.exchange(Op.GGP, SERIAL_HEARTBEAT))
-        return (
-            "" if present == wanted else f"the heartbeat (global parameter 68) is {present} ms, not {wanted}"
-        )
+        return "" if present == wanted else f"the heartbeat (global parameter 68) is {present} ms, not {wanted}"
 
     def _ramp_lost(self, axis: int, parameter: Axis) -> Generator[Any, Any, str]:
         wanted, motor = self._ramps[axis, parameter], self._motors[axis]
@@ -441,7 +442,9 @@ class TmclUnit(AxesUnit):
         return f"parameter {int(parameter)} of motor {motor} is {present}, not {wanted}"
 
     def _end_programs(self) -> Steps:
-        """End what may start a motor again: a program in the module, and reference searches of a process before this one."""
+        """End what may start a motor again: a program in the module, and reference searches of a process before this
+        one.
+        """
         with suppress(DeviceError):  # an evaluation board runs none
             yield from self._ask(self._module.exchange(Op.END_PROGRAM), repeatable=True)
         for motor in self._motors:
@@ -527,8 +530,7 @@ class Tmcl(LineDriver):
 
 def _axes(settings: TmclSettings) -> list[Any]:
     return [
-        drive_axes.axis_settings(axis, MODES, homing=axis.homing, required=axis.home_required)
-        for axis in settings.axis
+        drive_axes.axis_settings(axis, MODES, homing=axis.homing, required=axis.home_required) for axis in settings.axis
     ]
 
 

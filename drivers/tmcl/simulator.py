@@ -1,14 +1,17 @@
 """A Trinamic TMCL module on a pty: ``python -m sioms.drivers.tmcl.simulator --link PATH``.
 
-Behaves as the firmware manuals and the vendor's TMC-EvalSystem say (``tmc/TMCL.c``, ``boards/TMC5130_eval.c``; drivers/tmcl/README.md
-names the commit). The receiver waits for nine bytes without a time-out. Nine with a wrong checksum draw status 1, whatever their address,
-with module and command of the last good telegram; a good one for another address draws nothing. The ramp generator is that of
-the TMC5130: a stop is velocity mode with target 0 and leaves the target position; "reached" compares places in any mode; setting the
-actual position in position mode starts the motor. A restart forgets all but the EEPROM, and counts from 0 where the motor stands.
+Behaves as the firmware manuals and the vendor's TMC-EvalSystem say (``tmc/TMCL.c``, ``boards/TMC5130_eval.c``;
+drivers/tmcl/README.md names the commit). The receiver waits for nine bytes without a time-out. Nine with a wrong
+checksum draw status 1, whatever their address, with module and command of the last good telegram; a good one for
+another address draws nothing. The ramp generator is that of
+the TMC5130: a stop is velocity mode with target 0 and leaves the target position; "reached" compares places in any
+mode; setting the actual position in position mode starts the motor. A restart forgets all but the EEPROM, and counts
+from 0 where the motor stands.
 
-Commands on standard input, beside those of the line: ``state [MOTOR]``, ``flags VALUE [MOTOR]`` (driver errors), ``ends LOW HIGH
-[MOTOR]``, ``store`` (what was written to the EEPROM), ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze [COUNT]``,
-``foreign velocity|position VALUE [MOTOR]``, ``shove VELOCITY [MOTOR]``, ``brown_out`` (of an evaluation board's motor supply).
+Commands on standard input, beside those of the line: ``state [MOTOR]``, ``flags VALUE [MOTOR]`` (driver errors), ``ends
+LOW HIGH [MOTOR]``, ``store`` (what was written to the EEPROM), ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze
+[COUNT]``, ``foreign velocity|position VALUE [MOTOR]``, ``shove VELOCITY [MOTOR]``, ``brown_out`` (of an evaluation
+board's motor supply).
 """
 
 from __future__ import annotations

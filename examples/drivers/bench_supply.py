@@ -7,7 +7,8 @@ The supply (a made-up "PS-202") takes lines of ASCII that end in LF and answers 
     VSET 1,12.000   OK, or ERR 2 for a value out of range
     WDOG 1.0        OK; without a line for that long the outputs go to 0 V
 
-Nodes: ``NAME`` the voltages to be set, ``NAME.meas`` what is measured, ``NAME.cc`` a bit for each output in current limiting.
+Nodes: ``NAME`` the voltages to be set, ``NAME.meas`` what is measured, ``NAME.cc`` a bit for each output in current
+    limiting.
 
     [device.supply0]
     driver = "./bench_supply.py"
@@ -167,13 +168,9 @@ class BenchSupply(LineDriver):
         if not 0.5 <= settings.watchdog_s <= 60:
             raise ValueError(f"watchdog_s = {settings.watchdog_s:g}; want 0.5 to 60")
         if settings.watchdog_s * settings.poll_hz < 3:
-            raise ValueError(
-                f"poll_hz = {settings.poll_hz:g}: too slow for the watchdog; want three polls in it"
-            )
+            raise ValueError(f"poll_hz = {settings.poll_hz:g}: too slow for the watchdog; want three polls in it")
         outputs = [ChannelInfo(f"out{i}", "V", 0.0, settings.voltage_max) for i in (1, 2)]
-        readings = [
-            ChannelInfo(f"{what}{i}", unit) for i in (1, 2) for what, unit in (("u", "V"), ("i", "A"))
-        ]
+        readings = [ChannelInfo(f"{what}{i}", unit) for i in (1, 2) for what, unit in (("u", "V"), ("i", "A"))]
         return Description(
             (
                 BlockSpec("", NodeClass.ANALOG, tuple(outputs), writable=True, safe=(0.0, 0.0)),
@@ -196,9 +193,7 @@ class BenchSupply(LineDriver):
                 b"TERN,PS-202,00417,1.08\n".hex(),
                 "TERN,PS-202,00417,1.08",
             ),
-            Golden(
-                "reading", measure(), b"MEAS?\n".hex(), reading, ((12.003, 0.501, False), (5.0, 0.1, True))
-            ),
+            Golden("reading", measure(), b"MEAS?\n".hex(), reading, ((12.003, 0.501, False), (5.0, 0.1, True))),
             Golden("set", order("VSET 1,12.000"), b"VSET 1,12.000\n".hex(), b"OK\n".hex(), None),
         )
 

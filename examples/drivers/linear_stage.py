@@ -1,7 +1,7 @@
 """A driver of one's own with an axis: a linear stage that closes its own loop, on a serial line.
 
-The stage (a made-up "LINA-2") takes lines that end in * and the sum of the characters before it, two hexadecimal digits, and
-answers each with such a line:
+The stage (a made-up "LINA-2") takes lines that end in * and the sum of the characters before it, two hexadecimal
+digits, and answers each with such a line:
 
     ID?*CC               LINA-2,1.04
     ST?*E6               I 12345 0 0: idle, moving (M) or in fault (F); position [steps], velocity [steps/s], fault
@@ -172,7 +172,8 @@ class StageDriver(LineDriver):
     Settings = Settings
     # for `sioms driver check`: how to run it against its simulated device
     rig = {  # noqa: RUF012
-        "tables": '[device.stage]\ndriver = "./linear_stage.py"\nline = { serial = "{port}", baud = 115200 }\nsteps_per_m = 1e6\n'
+        "tables": '[device.stage]\ndriver = "./linear_stage.py"\nline = { serial = "{port}", baud = 115200 '
+        "}\nsteps_per_m = 1e6\n"
         '[[device.stage.axis]]\nname = "x"\nvelocity_max = 0.1\nacceleration_max = 1.0\n',
         "simulator": ["linear_stage_device.py"],
     }
@@ -185,9 +186,7 @@ class StageDriver(LineDriver):
         if settings.steps_per_m <= 0:
             raise ValueError(f"steps_per_m = {settings.steps_per_m:g}; want a positive number")
         if not 3 / settings.poll_hz <= settings.watchdog_s <= 10:
-            raise ValueError(
-                f"watchdog_s = {settings.watchdog_s:g}; want three polls, {3 / settings.poll_hz:g}, to 10"
-            )
+            raise ValueError(f"watchdog_s = {settings.watchdog_s:g}; want three polls, {3 / settings.poll_hz:g}, to 10")
         spec = drive_axes.axis_spec("", _axes(settings), "LINA-2", settings.capacity, settings.history)
         return Description((spec,), settings.poll_hz, lease_s=max(0.5, 5 / settings.poll_hz))
 
@@ -196,9 +195,7 @@ class StageDriver(LineDriver):
         """Return lines of the manual, and what they mean."""
         return (
             Golden("identity", identity(), b"ID?*CC\n".hex(), framed("LINA-2,1.04").hex(), "LINA-2,1.04"),
-            Golden(
-                "state", state(), b"ST?*E6\n".hex(), framed("M 12345 -500 0").hex(), ("M", 12345, -500, 0)
-            ),
+            Golden("state", state(), b"ST?*E6\n".hex(), framed("M 12345 -500 0").hex(), ("M", 12345, -500, 0)),
         )
 
     def __init__(self, name: str, settings: Settings, kit: Kit) -> None:

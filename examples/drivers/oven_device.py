@@ -1,6 +1,7 @@
 """The oven controller of ``oven.toml``, simulated on Modbus RTU: ``python oven_device.py --link PATH``.
 
-Written from its manual: two zones that warm towards what their heaters give, a two-point controller each, a watchdog that
+Written from its manual: two zones that warm towards what their heaters give, a two-point controller each, a watchdog
+    that
 switches the heaters off. Commands on standard input, beside those of the line: ``state``.
 """
 
@@ -96,9 +97,7 @@ def simulated(oven: Oven) -> SimDevice:
             image = oven.registers()
             if any(at not in image for at in range(address, address + count)):
                 return ExcCodes.ILLEGAL_ADDRESS
-            current[address - start : address - start + count] = [
-                image[at] for at in range(address, address + count)
-            ]
+            current[address - start : address - start + count] = [image[at] for at in range(address, address + count)]
         return None
 
     coils = [SimData(0, count=16, values=0, datatype=DataType.BITS)]

@@ -90,9 +90,7 @@ def bench_axes(options: Options, report: Report) -> None:
             f"axes carried at {rate} Hz", carried.axes if carried else 0, "", bars=bars,
             notes=f"the 486DX2 of table F.8: {ORIGINAL[rate]}{_notes(carried)}",
         )  # fmt: skip
-        report.value(
-            f"axes in time at {rate} Hz", in_time.axes if in_time else 0, "", notes=_notes(in_time)[2:]
-        )
+        report.value(f"axes in time at {rate} Hz", in_time.axes if in_time else 0, "", notes=_notes(in_time)[2:])
         best += [carried] if carried else []
     for load in [_measure(12, 1000, seconds), *best]:
         _break_down(load, report)
@@ -173,8 +171,10 @@ def _groups(axes: int) -> int:
 
 def _config(axes: int, rate: int) -> str:
     device = (
-        f'[device.many]\ndriver = "sim-axes"\nrealtime_priority = {PRIORITY}\ntick_hz = {rate}\nhistory = 4\ncapacity = 64\n'
-        f'[[device.many.axis]]\nname = "a"\ncount = {axes}\nposition_min = -0.4\nposition_max = 0.4\nvelocity_max = 1.0\n'
+        f'[device.many]\ndriver = "sim-axes"\nrealtime_priority = {PRIORITY}\ntick_hz = {rate}\nhistory = 4\ncapacity '
+        "= 64\n"
+        f'[[device.many.axis]]\nname = "a"\ncount = {axes}\nposition_min = -0.4\nposition_max = 0.4\nvelocity_max = '
+        "1.0\n"
         "acceleration_max = 10.0\njerk_max = 1000.0\nforce_max = 60.0\nfollowing_error_max = 0.1\n"
         "motor = { mass = 1.0, viscous = 2.0, coulomb = 1.0, stiction = 1.5, encoder_step = 1e-6 }\n"
     )
@@ -198,10 +198,14 @@ def _fill(group: Any) -> None:
 def _break_down(load: Load, report: Report) -> None:
     """Say where the time of a tick goes, as table F.7 does."""
     names = {
-        "late_ns": "scheduling", "input_ns": "stops, leases, measurement",
-        "control_ns": "plans, limits, law, watching", "publish_ns": "publication, waits, events", "busy_ns": "whole tick",
-        "total_ns": "from schedule to end", "spent_ns": "whole tick and, after it, simulated mechanics and plans ahead",
-    }  # fmt: skip
+        "late_ns": "scheduling",
+        "input_ns": "stops, leases, measurement",
+        "control_ns": "plans, limits, law, watching",
+        "publish_ns": "publication, waits, events",
+        "busy_ns": "whole tick",
+        "total_ns": "from schedule to end",
+        "spent_ns": "whole tick and, after it, simulated mechanics and plans ahead",
+    }
     for phase, text in names.items():
         p = load.phases[phase]
         report.value(

@@ -107,9 +107,7 @@ def run_ns(command: list[str], environment: dict[str, str] | None = None) -> int
     _, status = os.waitpid(pid, 0)
     took = time.perf_counter_ns() - begin
     if status:
-        raise RuntimeError(
-            f"run {' '.join(command)}: exit status {os.waitstatus_to_exitcode(status)}; want 0"
-        )
+        raise RuntimeError(f"run {' '.join(command)}: exit status {os.waitstatus_to_exitcode(status)}; want 0")
     return took
 
 

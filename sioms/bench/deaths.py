@@ -82,9 +82,7 @@ def bench_client(options: Options, report: Report) -> None:
             daemon.reap(victim)
             report.progress(f"client hung: {trial} of {trials}")
         bars = [Bar("max", LEASE_S * 1e3 + 20.0)]
-        report.samples(
-            f"client SIGSTOP, lease {LEASE_S * 1e3:g} ms, to its axes halting", hangs, "ms", bars=bars
-        )
+        report.samples(f"client SIGSTOP, lease {LEASE_S * 1e3:g} ms, to its axes halting", hangs, "ms", bars=bars)
 
 
 def bench_daemon(options: Options, report: Report) -> None:

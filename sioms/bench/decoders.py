@@ -1,7 +1,7 @@
 """Decoders of what strangers send or write: each with bytes to begin with, and what it may raise.
 
-A target takes any bytes. What it raises beside what it names is a finding, and so is more memory or time than a few times
-its input. ``sioms bench fuzz`` searches for hours; a unit test replays in seconds what was found.
+A target takes any bytes. What it raises beside what it names is a finding, and so is more memory or time than a few
+times its input. ``sioms bench fuzz`` searches for hours; a unit test replays in seconds what was found.
 
 This module alone of the bench imports what daemon, drivers and laboratories read with.
 """
@@ -234,18 +234,23 @@ def _finger() -> bytes:
 MAP = (files("sioms.drivers") / "modbus" / "maps" / "leadshine.toml").read_bytes()
 AXIS = b"""{"kind": "linear", "unit_position": "m", "unit_force": "N", "sample_time": 0.001, "inertia": 12.4, "viscous": 3.9,
 "encoder_resolution": 5e-08, "index_pitch": 0.01, "start_position": 0.0, "position_max_speed": 0.32, "max_acceleration": 5.1,
-"controller": {"k": 2.3e5, "kz": -0.98, "kp": -0.67, "kb": -0.59, "tau_o": 0.0, "tau_m": 163.2, "vel_filter_hz": 100.0}}"""
-STAND = b'[[push]]\nname = "x"\naxis = "a"\nreference = "r"\nwrench = [1.0, 0.0]\nmost = 5.0\n[[hang]]\nname = "w"\nwrench = [0, 1]\nloads = [2.0]\n'
+"controller": {"k": 2.3e5, "kz": -0.98, "kp": -0.67, "kb": -0.59, "tau_o": 0.0, "tau_m": 163.2, "vel_filter_hz": 100.0}}"""  # noqa: E501
+STAND = b'[[push]]\nname = "x"\naxis = "a"\nreference = "r"\nwrench = [1.0, 0.0]\nmost = 5.0\n[[hang]]\nname = "w"\nwrench = [0, 1]\nloads = [2.0]\n'  # noqa: E501
 TRACE = b"""{"sioms_trace": 1, "device": "a", "driver": "b", "table": {}}
 {"t": 1, "n": 0, "e": "open", "text": ""}\n{"t": 2, "n": 0, "d": ">", "b": "00ff"}\n{"t": 3, "n": 0, "d": "<", "b": ""}
 """
-JOURNAL = b"\n".join(
-    json.dumps({"at": 1.0, **entry}).encode()
-    for entry in (
-        workcell_entry("a", stop=True), node_entry("n", "d", "b", [(0, 0), (1, 3)], "me", stop=True),
-        {"checkpoint": [node_entry("n", "d", "b", [(2, 0)], "me", stop=True)], "from": 0}, workcell_entry("a", stop=False),
+JOURNAL = (
+    b"\n".join(
+        json.dumps({"at": 1.0, **entry}).encode()
+        for entry in (
+            workcell_entry("a", stop=True),
+            node_entry("n", "d", "b", [(0, 0), (1, 3)], "me", stop=True),
+            {"checkpoint": [node_entry("n", "d", "b", [(2, 0)], "me", stop=True)], "from": 0},
+            workcell_entry("a", stop=False),
+        )
     )
-) + b"\n"  # fmt: skip
+    + b"\n"
+)
 CONFIG = (
     b'[workcell]\nname = "a"\n[device.io0]\ndriver = "sim-io"\noutputs = 8\n[[grant]]\nrights = ["read"]\n'
     b'[node.x]\nof = "io0"\n[[alarm]]\nnode = "x"\nhigh = 1.0\n[[emergency_stop]]\nnode = "x"\n'
@@ -254,12 +259,17 @@ TARGETS = {
     "message": Target(
         _message,
         [
-            encode(ClientVerb.OPEN, 2, "mod0", 3, 0.5, 0.0), encode(HandleVerb.IOCTL, 2, 23, {"position_max": [0.2, None]}, 0.0),
-            encode(HandleVerb.WRITE, 1, 0, None, bytes(144)), encode(DriverVerb.LOG, 0, "error", "no"),
-            encode(NurseryVerb.DESCRIBE, 1, "a", "b", {"c": [1, -5, True]}, "/"), b"\x95\x02\x01\x1b" + b"\x91" * 40 + b"\xc0\x00",
+            encode(ClientVerb.OPEN, 2, "mod0", 3, 0.5, 0.0),
+            encode(HandleVerb.IOCTL, 2, 23, {"position_max": [0.2, None]}, 0.0),
+            encode(HandleVerb.WRITE, 1, 0, None, bytes(144)),
+            encode(DriverVerb.LOG, 0, "error", "no"),
+            encode(NurseryVerb.DESCRIBE, 1, "a", "b", {"c": [1, -5, True]}, "/"),
+            b"\x95\x02\x01\x1b" + b"\x91" * 40 + b"\xc0\x00",
             msgpack.packb([1, 1, msgpack.ExtType(5, b"x"), 1 << 63]),
         ],
-        (), 4, True,
+        (),
+        4,
+        True,
     ),
     "reply": Target(
         _reply, [reply(1, {"a": [1]}, 5), refusal(1, 5, "no"), reply(1, ["x"] * 70_000)], (MalformedMessage,), 3, True
@@ -267,10 +277,16 @@ TARGETS = {
     "device": Target(
         _device,
         [bytes([i]) + bytes.fromhex(golden.reply) for i, golden in enumerate(GOLDEN[:256])],
-        (LinkError, DeviceError, Incomplete), 7, True,
+        (LinkError, DeviceError, Incomplete),
+        7,
+        True,
     ),
     "streams": Target(
-        _streams, [b"1.0, 2.0, 3.0\n1,2,3\n", bytes.fromhex("ff204ed8fe2efb2e16640038ff2c017daf"), bytes(36)], (), 2, True
+        _streams,
+        [b"1.0, 2.0, 3.0\n1,2,3\n", bytes.fromhex("ff204ed8fe2efb2e16640038ff2c017daf"), bytes(36)],
+        (),
+        2,
+        True,
     ),
     "text": Target(_text, [b"a\x1b[2J\r\n", "µ\u202e".encode()], (), 1, True),
     "pipe": Target(_pipe, [b"1 2.5e-3\n-4\n", b"1 two\n3\n"], (), 2, True),
@@ -278,25 +294,33 @@ TARGETS = {
     "toml": Target(toml_of, [CONFIG, b"x = [{ a = 1979-05-27 }]"], (ValueError,), 3),
     "json": Target(json_of, [b'{"a": [1, -2.5e3, null, "x"]}'], (ValueError,)),
     "register map": Target(lambda data: parse_map(toml_of(data), "x"), [MAP], (RegisterMapError, ValueError)),
-    "effects": Target(lambda data: parse_effects(data.decode("latin-1"), ["x"]), [b"[x.payload]\nmass = 0.5\n"], (EffectsError,)),
+    "effects": Target(
+        lambda data: parse_effects(data.decode("latin-1"), ["x"]), [b"[x.payload]\nmass = 0.5\n"], (EffectsError,)
+    ),
     "finger": Target(lambda data: from_toml(data.decode("latin-1")), [_finger()], (ValueError,)),
     "model": Target(_file(read_model, ".json"), [AXIS], (BadInputError,)),
     "stand": Target(_file(lambda path: read_stand(path, 2), ".toml"), [STAND], (BadInputError,)),
     "npz": Target(
-        _file(read_npz, ".npz"), [_saved(lambda f: np.savez(f, raw=np.ones((2, 3)), time=np.arange(2.0)))], (UnreadableError,)
+        _file(read_npz, ".npz"),
+        [_saved(lambda f: np.savez(f, raw=np.ones((2, 3)), time=np.arange(2.0)))],
+        (UnreadableError,),
     ),
     "recording": Target(
-        _file(read_recording, ".npz"), [_saved(lambda f: np.savez(f, raw=np.ones((2, 3)), time=np.arange(2.0)))], (ValueError,)
+        _file(read_recording, ".npz"),
+        [_saved(lambda f: np.savez(f, raw=np.ones((2, 3)), time=np.arange(2.0)))],
+        (ValueError,),
     ),
     "mat": Target(_file(read_mat, ".mat"), [_saved(_mat)], (UnreadableError,)),
     "table": Target(_file(load_table, ".csv"), [b"time [s],position [m]\n0.0,1.0\n0.1,2.0\n0.2,3\n"], (BadInputError,)),
     "trace": Target(_file(read_trace, ".trace"), [TRACE], (BadTrace,)),
     "positions": Target(
-        _positions, [encode_positions(Contents({"x": Entry(3, 0.5, 1.0), "y": Entry(0, -1.0, 2.0)}, True, "boot"))], (ValueError,)
+        _positions,
+        [encode_positions(Contents({"x": Entry(3, 0.5, 1.0), "y": Entry(0, -1.0, 2.0)}, True, "boot"))],
+        (ValueError,),
     ),
     "journal of stops": Target(_journal, [JOURNAL], (), 2),
     "stop request": Target(_stop_request, [bytes(16) + b"why", b"\xff" * 300], ()),
-}  # fmt: skip
+}
 
 
 def feed(target: Target, data: bytes) -> bool:

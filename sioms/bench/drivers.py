@@ -1,8 +1,10 @@
-"""Drivers on lines that take their time: cycle against the arithmetic limit, streams, processor share, stops on a busy line.
+"""Drivers on lines that take their time: cycle against the arithmetic limit, streams, processor share, stops on a busy
+line.
 
 The simulators' ptys have no speed of their own, so a wire between carries each character at the configured baud rate in
-both directions. The limit of a cycle is its characters times bits over baud, and the silences that the protocol demands;
-the time that the simulated device takes to answer is measured by the wire and taken off, because it is not the driver's.
+both directions. The limit of a cycle is its characters times bits over baud, and the silences that the protocol
+demands; the time that the simulated device takes to answer is measured by the wire and taken off, because it is not the
+driver's.
 """
 
 from __future__ import annotations
@@ -138,7 +140,9 @@ def _serial(options: Options, report: Report, rig: Rig, case: Case) -> None:
         least_s = max(line_s + silence_s, 1 / case.poll_hz)
         name = f"{case.rig} {case.baud}"
         gaps = [b - a for a, b in itertools.pairwise(stamps)] or [int(1e9 * cycle_s)]
-        notes = f"{moved['requests']:.1f} requests, {moved['request_bytes'] + moved['reply_bytes']:.1f} characters a cycle"
+        notes = (
+            f"{moved['requests']:.1f} requests, {moved['request_bytes'] + moved['reply_bytes']:.1f} characters a cycle"
+        )
         report.samples(f"{name}: cycle", gaps, "ms", cpu=share, notes=notes)
         report.value(f"{name}: line time of a cycle", 1e3 * line_s, "ms")
         if silence_s:
@@ -146,9 +150,7 @@ def _serial(options: Options, report: Report, rig: Rig, case: Case) -> None:
         report.value(f"{name}: the device's own time in a cycle", 1e3 * device_s, "ms")
         report.value(f"{name}: cycle over line time", cycle_s / line_s, "")
         bars = [Bar("value", RATIO, source="1.3 times the arithmetic limit of the line")]
-        report.value(
-            f"{name}: cycle less the device's time, over limit", (cycle_s - device_s) / least_s, "", bars=bars
-        )
+        report.value(f"{name}: cycle less the device's time, over limit", (cycle_s - device_s) / least_s, "", bars=bars)
         report.value(f"{name}: processor share of the driver", share["driver"], "")
         node.close()
         if case.stops:

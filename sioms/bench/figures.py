@@ -42,9 +42,7 @@ class Summary:
         ordered = sorted(samples)
         last = len(ordered) - 1
         scale = UNITS.get(unit, 1.0)
-        return cls(
-            len(ordered), {n: ordered[min(last, int(p * len(ordered)))] * scale for n, p in PERCENTILES}
-        )
+        return cls(len(ordered), {n: ordered[min(last, int(p * len(ordered)))] * scale for n, p in PERCENTILES})
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,9 +147,7 @@ class Report:
         bars: Sequence[Bar] = (), notes: str = "",
     ) -> Figure:  # fmt: skip
         """Add a figure of one number."""
-        return self._add(
-            Figure(self._bench, name, unit, value=value, cpu=cpu or {}, bars=tuple(bars), notes=notes)
-        )
+        return self._add(Figure(self._bench, name, unit, value=value, cpu=cpu or {}, bars=tuple(bars), notes=notes))
 
     def note(self, text: str) -> None:
         """Print a line between the figures."""
@@ -183,17 +179,30 @@ class Report:
         """Write everything as JSON."""
         figures = [
             {
-                "bench": f.bench, "name": f.name, "unit": f.unit, "value": f.value, "baseline": f.baseline,
-                "ratio": f.ratio, "count": f.summary.count if f.summary else None,
-                "percentiles": dict(f.summary.values) if f.summary else None, "cpu_share": dict(f.cpu), "notes": f.notes,
+                "bench": f.bench,
+                "name": f.name,
+                "unit": f.unit,
+                "value": f.value,
+                "baseline": f.baseline,
+                "ratio": f.ratio,
+                "count": f.summary.count if f.summary else None,
+                "percentiles": dict(f.summary.values) if f.summary else None,
+                "cpu_share": dict(f.cpu),
+                "notes": f.notes,
                 "bars": [
-                    {"statistic": bar.statistic, "limit": bar.limit, "at_least": bar.at_least, "found": found,
-                     "met": met, "source": bar.source}
+                    {
+                        "statistic": bar.statistic,
+                        "limit": bar.limit,
+                        "at_least": bar.at_least,
+                        "found": found,
+                        "met": met,
+                        "source": bar.source,
+                    }
                     for bar, found, met in f.verdicts()
                 ],
             }
             for f in self.figures
-        ]  # fmt: skip
+        ]
         with open(path, "w", encoding="utf-8") as file:
             json.dump({"machine": self._machine(), **facts, "figures": figures}, file, indent=1)
             file.write("\n")
@@ -218,4 +227,7 @@ class Report:
     def _machine(self) -> str:
         cores = len(os.sched_getaffinity(0))
         load = f"load {self._load_before:.1f} before and {os.getloadavg()[0]:.1f} after"
-        return f"{cores} cores, {platform.machine()}, {platform.system()} {platform.release()}, Python {platform.python_version()}, {load}"
+        return (
+            f"{cores} cores, {platform.machine()}, {platform.system()} {platform.release()}, Python "
+            f"{platform.python_version()}, {load}"
+        )

@@ -1,7 +1,7 @@
 """Fuzzing: frames and files by the million, to each decoder in a process of its own, and to live sockets.
 
-One list of targets (``decoders.TARGETS`` and ``live.LIVE``). None of what they are fed may end a process, raise what a decoder
-does not name, or take more than its bounds of time and memory.
+One list of targets (``decoders.TARGETS`` and ``live.LIVE``). None of what they are fed may end a process, raise what a
+decoder does not name, or take more than its bounds of time and memory.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 FRAMES, FILES = 20_000_000, 1_000_000
 QUICK_FRAMES, QUICK_FILES = 60_000, 3_000
 LED = 20
-"""One input in so many is found by coverage; the others are changes at random of what those reached, many times as fast."""
+"""One input in so many is found by coverage; the others are changes at random of what those reached, many times as
+fast.
+"""
 LIVE_SHARE = 0.05
 """Of the frames: what goes to live sockets takes ten times as long."""
 
@@ -76,9 +78,7 @@ def _search(name: str, runs: int, seed: int, report: Report) -> tuple[int, bool]
         led = min(runs, max(runs // LED, 500)) if guided() else 0
         said, notes = "", ""
         if led:
-            said = _child(
-                "guided", name, led, seed, folder, lambda: report.progress(f"{name}: {tried[0]} of {runs}")
-            )
+            said = _child("guided", name, led, seed, folder, lambda: report.progress(f"{name}: {tried[0]} of {runs}"))
             notes = f"; {tried[0]} guided by coverage, which kept {len(list((folder / 'corpus').iterdir()))}"
         if not said and runs > led:
             said = _child(
@@ -90,9 +90,7 @@ def _search(name: str, runs: int, seed: int, report: Report) -> tuple[int, bool]
                 lambda: report.progress(f"{name}: {tried[0]} of {runs}"),
             )
         good = not said and tried[0] >= runs
-        notes = f"{tried[0] / (time.monotonic() - begin):.0f} a second{notes}" + (
-            f"; broken: {said}" if said else ""
-        )
+        notes = f"{tried[0] / (time.monotonic() - begin):.0f} a second{notes}" + (f"; broken: {said}" if said else "")
         report.value(name, tried[0], notes=notes, bars=[Bar("value", runs, at_least=True)])
         return tried[0], good
     finally:

@@ -1,8 +1,9 @@
-"""Deaths at random points: clients, drivers, fork server and daemon are killed or stopped, alone and within a millisecond of each other.
+"""Deaths at random points: clients, drivers, fork server and daemon are killed or stopped, alone and within a
+millisecond of each other.
 
 Clients move an axis each, at one speed, and ask at random for everything that does not change it, so that a death meets
-any request half done. What is looked at: how soon axes halt, whether what was stopped stays stopped, whether an output has
-two owners, and what is left of the dead.
+any request half done. What is looked at: how soon axes halt, whether what was stopped stays stopped, whether an output
+has two owners, and what is left of the dead.
 """
 
 from __future__ import annotations
@@ -84,9 +85,7 @@ WRONG = ("stops lost", "second owners", "axes that never halted", "nodes never f
 
 
 def _progress(report: Report, tally: Tally, wanted: int) -> None:
-    report.progress(
-        f"{tally.signals[signal.SIGKILL]} of {wanted} kills, {tally.signals[signal.SIGSTOP]} stops"
-    )
+    report.progress(f"{tally.signals[signal.SIGKILL]} of {wanted} kills, {tally.signals[signal.SIGSTOP]} stops")
 
 
 def _tell(tally: Tally, report: Report) -> None:
@@ -135,9 +134,7 @@ def _round(daemon: Daemon, kind: str, chance: random.Random, tally: Tally) -> No
         nodes, clients = _set_going(daemon, cell, chance, LEASE_S if stops else 0.0)
         watches = {name: Watch(node) for name, node in nodes.items()}
         pids = daemon.device_pids()
-        stopped = chance.choice(
-            (*DEVICES, "", "")
-        )  # a node of it is stopped within a millisecond of the deaths
+        stopped = chance.choice((*DEVICES, "", ""))  # a node of it is stopped within a millisecond of the deaths
         if stopped:
             nodes[stopped].emergency_stop()
         time.sleep(chance.random() * 0.001)
@@ -146,9 +143,7 @@ def _round(daemon: Daemon, kind: str, chance: random.Random, tally: Tally) -> No
         servers = _fork_servers(daemon, set(pids.values())) if "fork server" in kind else []
         driver_signal = signal.SIGSTOP if kind == "driver stopped" else signal.SIGKILL
         acts = [(clients[axis], signal.SIGSTOP if stops else signal.SIGKILL, axis) for axis in victims]
-        acts += [(pids[name], driver_signal, "") for name in drivers] + [
-            (pid, signal.SIGKILL, "") for pid in servers
-        ]
+        acts += [(pids[name], driver_signal, "") for name in drivers] + [(pid, signal.SIGKILL, "") for pid in servers]
         chance.shuffle(acts)
         begins = _send([(pid, how) for pid, how, _ in acts], chance, tally)
         begin_of = {axis: begin for (_, _, axis), begin in zip(acts, begins, strict=True)}
@@ -235,9 +230,7 @@ def _marked(cell: Any) -> None:
 def _take_halt(watch: Watch, axis: int, begin: int, what: str, tally: Tally) -> None:
     """Take how long an axis took from a signal to its first slower snapshot."""
     try:
-        snapshot = watch.first(
-            lambda s: abs(s.commanded_velocity[axis]) < SPEED - 1e-6, begin, 5.0, "an axis halting"
-        )
+        snapshot = watch.first(lambda s: abs(s.commanded_velocity[axis]) < SPEED - 1e-6, begin, 5.0, "an axis halting")
     except (TimeoutError, OSError) as error:
         tally.is_wrong("axes that never halted", f"{what}: {error}")
         return
@@ -281,7 +274,9 @@ def _is_back(daemon: Daemon, cell: Any, name: str, before: int) -> bool:
 
 
 def _end(daemon: Daemon, chance: random.Random, tally: Tally) -> None:
-    """Kill or stop the daemon while axes move and a stop has just been acknowledged; nothing of it may be left but the stop."""
+    """Kill or stop the daemon while axes move and a stop has just been acknowledged; nothing of it may be left but the
+    stop.
+    """
     kind = chance.choices(list(ENDS), list(ENDS.values()))[0]
     tally.kinds[kind] += 1
     cell = daemon.cell("judge")
@@ -289,9 +284,7 @@ def _end(daemon: Daemon, chance: random.Random, tally: Tally) -> None:
     watches = {name: Watch(node) for name, node in nodes.items()}
     pids = daemon.device_pids()
     servers = _fork_servers(daemon, set(pids.values()))
-    others = {"client": [clients["mod0.a0"]], "driver": [pids["mod0"]], "server": servers}.get(
-        kind.split()[-1], []
-    )
+    others = {"client": [clients["mod0.a0"]], "driver": [pids["mod0"]], "server": servers}.get(kind.split()[-1], [])
     nodes["mod2"].emergency_stop()
     how = signal.SIGSTOP if kind == "daemon stopped" else signal.SIGKILL
     acts = [(daemon.pid, how), *((pid, signal.SIGKILL) for pid in others)]
@@ -312,9 +305,7 @@ def _end(daemon: Daemon, chance: random.Random, tally: Tally) -> None:
         cell.close()
     daemon.process.wait(10.0)
     try:
-        wait_for(
-            lambda: not any(_lives(pid) for pid in (*pids.values(), *servers)), 10.0, "its processes to end"
-        )
+        wait_for(lambda: not any(_lives(pid) for pid in (*pids.values(), *servers)), 10.0, "its processes to end")
     except TimeoutError:
         tally.is_wrong("processes left", kind)
     daemon.start()

@@ -43,17 +43,37 @@ LIVE = ("daemon socket", "reader's handle", "writer's handle")
 HISTORY = 4096
 NAN = float("nan")
 STRANGE: tuple[Any, ...] = (
-    None, True, -1, 0, 1, 2**31, 2**53, 2**63, -(2**63), 1e308, NAN, float("inf"), "", "mod0", "x" * 300, b"", b"\0" * 144,
-    [], [[]], {}, {"a": 1}, [None] * 40, [[[[[[[[[[1]]]]]]]]]], "eva\x1b[2J\r\n",
-)  # fmt: skip
+    None,
+    True,
+    -1,
+    0,
+    1,
+    2**31,
+    2**53,
+    2**63,
+    -(2**63),
+    1e308,
+    NAN,
+    float("inf"),
+    "",
+    "mod0",
+    "x" * 300,
+    b"",
+    b"\0" * 144,
+    [],
+    [[]],
+    {},
+    {"a": 1},
+    [None] * 40,
+    [[[[[[[[[[1]]]]]]]]]],
+    "eva\x1b[2J\r\n",
+)
 STRAY = ("Traceback", "driver failed", "level=error")
 
 
 def bench_live(names: Sequence[str], frames: int, seed: int, report: Report) -> int:
     """Send frames to live sockets and look at what they left; return how many were sent."""
-    slow = partial(
-        axes, tick_hz=100.0, axis_keys="bandwidth_hz = 5.0", history=HISTORY
-    )  # not ticks are what is tried
+    slow = partial(axes, tick_hz=100.0, axis_keys="bandwidth_hz = 5.0", history=HISTORY)  # not ticks are what is tried
     config = workcell([slow("mod0"), slow("mod1")])
     with Daemon(config) as daemon:
         pids = {"daemon": daemon.pid, **daemon.device_pids()}
@@ -82,9 +102,7 @@ def bench_live(names: Sequence[str], frames: int, seed: int, report: Report) -> 
         left = _left(before, {who: pid for who, pid in pids.items() if alive.get(who) == pid})
         zero = [Bar("value", 0)]
         report.value("processes that died", deaths, "", bars=zero)
-        report.value(
-            "stray exceptions in the log", len(stray), "", bars=zero, notes="; ".join(stray[:2])[:600]
-        )
+        report.value("stray exceptions in the log", len(stray), "", bars=zero, notes="; ".join(stray[:2])[:600])
         report.value("motions without an acknowledged write", fuzz.motions, "", bars=zero)
         report.value("descriptors left open", left, "", bars=zero)
         return fuzz.sent
@@ -151,9 +169,7 @@ class _Fuzz:
                 with cell.open(f"mod{i}", "rw", 5.0) as node:
                     node.read()
 
-    def _send(
-        self, connect: Callable[[], socket.socket], make: Callable[[random.Random], bytes], count: int
-    ) -> None:
+    def _send(self, connect: Callable[[], socket.socket], make: Callable[[random.Random], bytes], count: int) -> None:
         """Send frames; after one that ended its connection connect anew."""
         sock = connect()
         try:
@@ -301,9 +317,7 @@ def _client_message(generator: random.Random) -> bytes:
 def _handle_message(generator: random.Random) -> bytes:
     """Return a message to a driver; its records are never valid as they are: every number in them is NaN."""
     number = generator.randint(1, 1 << 20)
-    mode = generator.choice(
-        [*ControlMode, ControlMode(0x7FFF), ControlMode.POSITION | ControlMode.SPECIFIED_TIME]
-    )
+    mode = generator.choice([*ControlMode, ControlMode(0x7FFF), ControlMode.POSITION | ControlMode.SPECIFIED_TIME])
     record = AXIS_WRITE.pack(generator.randint(-1, 5), int(mode), generator.getrandbits(50), 0, *[NAN] * 15)
     messages: list[list[Any]] = [
         [HandleVerb.WRITE, number, generator.randint(0, 3), 0.0, record * generator.randint(1, 3)],

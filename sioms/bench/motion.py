@@ -97,9 +97,7 @@ def _marker_from_client(cell: Any, node: Any, trials: int, report: Report) -> No
         took.append(moving.stamp_ns - begin)
         node.wait_until_idle(5.0)
         marker.free()
-    report.samples(
-        "marker of a client to the waiting axis in motion", took, bars=[Bar("p50", 2000), Bar("p99", 2000)]
-    )
+    report.samples("marker of a client to the waiting axis in motion", took, bars=[Bar("p50", 2000), Bar("p99", 2000)])
 
 
 def _marker_from_axis(cell: Any, first: Any, second: Any, trials: int, report: Report) -> None:

@@ -65,9 +65,7 @@ def _soak(cell: Workcell, pids: dict[str, int], count: int, report: Report) -> N
     notes = f"{count} opens and closes in {took:.0f} s"
     for who, pid in pids.items():
         fds, private = descriptors(pid), memory_kb(pid)["private"]
-        report.value(
-            f"descriptors gained by the {who}", fds - before[who][0], "", bars=[Bar("value", 0)], notes=notes
-        )
+        report.value(f"descriptors gained by the {who}", fds - before[who][0], "", bars=[Bar("value", 0)], notes=notes)
         report.value(
             f"private memory gained by the {who}",
             private - before[who][1],

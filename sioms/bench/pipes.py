@@ -55,9 +55,7 @@ def _start(options: Options, report: Report, devin: str, environment: dict[str, 
         bare.append(interpreter_ns())
         took.append(run_ns([devin, "mod0"], environment))
     base = report.samples("bare interpreter, start to exit", bare, "ms")
-    report.samples(
-        "devin mod0, start to exit", took, "ms", baseline=base, bars=[Bar("ratio", 2.5), Bar("ratio", 1.5)]
-    )
+    report.samples("devin mod0, start to exit", took, "ms", baseline=base, bars=[Bar("ratio", 2.5), Bar("ratio", 1.5)])
 
 
 @contextlib.contextmanager
@@ -70,9 +68,7 @@ def _realtime() -> Iterator[None]:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-def _loop(
-    options: Options, report: Report, devin: str, devout: str, environment: dict[str, str], how: str
-) -> None:
+def _loop(options: Options, report: Report, devin: str, devout: str, environment: dict[str, str], how: str) -> None:
     """Let rows pass through our hands: when they come, which are left out, and whether devout keeps up."""
     rows = 1000 * options.count(2, 60)
     source = subprocess.Popen(
@@ -106,12 +102,15 @@ def _loop(
     report.samples(f"rows of devin -t0.001 through the pipe{how}", late)
     share = 100 * sum(one < PERIOD_NS for one in late) / len(late)
     report.value(f"cycles within 1 ms of schedule{how}", share, "%", bars=[Bar("value", 99.0, True)])
-    report.value(f"rows lost between devin and devout{how}", rows - len(arrivals), "", bars=[Bar("value", 0)],
-                 notes=f"of {rows}; exit statuses {statuses}; devout ends {drained_ms:.0f} ms after its last row")  # fmt: skip
-    left_out = arrivals[-1][0] + 1 - len(arrivals)
     report.value(
-        f"samples left out, their time had passed{how}", left_out, "", notes=f"of {arrivals[-1][0] + 1}"
+        f"rows lost between devin and devout{how}",
+        rows - len(arrivals),
+        "",
+        bars=[Bar("value", 0)],
+        notes=f"of {rows}; exit statuses {statuses}; devout ends {drained_ms:.0f} ms after its last row",
     )
+    left_out = arrivals[-1][0] + 1 - len(arrivals)
+    report.value(f"samples left out, their time had passed{how}", left_out, "", notes=f"of {arrivals[-1][0] + 1}")
 
 
 def _steps(
@@ -136,9 +135,7 @@ def _steps(
         source.terminate()
         source.wait()
         sink.wait(10.0)
-    report.samples(
-        "edge of the beam to the axis following it, through the pipe", took, bars=[Bar("p50", 5000)]
-    )
+    report.samples("edge of the beam to the axis following it, through the pipe", took, bars=[Bar("p50", 5000)])
 
 
 def _step_times(beam: Any, axis: Any, seconds: float) -> list[int]:
@@ -150,9 +147,7 @@ def _step_times(beam: Any, axis: Any, seconds: float) -> list[int]:
         watch = Watch(axis)
         event = beam.wait_event(last=last, timeout=5.0)
         last = event
-        before = watch.first(
-            lambda s: True, event.stamp_ns - 2 * PERIOD_NS, 1.0, "a look before"
-        ).commanded_velocity[0]
+        before = watch.first(lambda s: True, event.stamp_ns - 2 * PERIOD_NS, 1.0, "a look before").commanded_velocity[0]
         sign = 1 if event.final else -1
 
         def follows(snapshot: Any, sign: int = sign, before: float = before) -> bool:

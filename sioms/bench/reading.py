@@ -47,9 +47,7 @@ def bench_read(options: Options, report: Report) -> None:
             bars = [Bar("p50", 2.0), Bar("ratio", 1 / SPEED)] if "4 axes" in name else [Bar("p50", 5.0)]
             report.samples(name, samples, baseline=base, bars=bars)
         rate = 1e9 / sorted(taken["read of 1 axis, position taken"])[count // 2]
-        report.value(
-            "reads per second, one Python client", rate, "1/s", cpu=shares, bars=[Bar("value", 7000, True)]
-        )
+        report.value("reads per second, one Python client", rate, "1/s", cpu=shares, bars=[Bar("value", 7000, True)])
         report.value("channel values per second, 48 at a time", 48e9 / sorted(
             taken["read of 48 analog channels, values taken"])[count // 2], "1/s", bars=[Bar("value", 20_000, True)],
             notes=f"bare round trips per second {1e6 / trip:.0f}")  # fmt: skip

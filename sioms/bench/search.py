@@ -1,8 +1,9 @@
-"""The search for bytes that break one decoder, in a process of its own: ``python -m sioms.bench.search HOW TARGET RUNS SEED FOLDER``.
+"""The search for bytes that break one decoder, in a process of its own: ``python -m sioms.bench.search HOW TARGET RUNS
+SEED FOLDER``.
 
-``guided``: libFuzzer finds the way by what the bytes reach, and keeps what reached something new in the folder; it needs atheris
-(``pip install atheris``). ``random``: changes at random of what is in the folder, many times as fast. Bytes that break a target are
-left in ``fuzz-*`` in the working directory.
+``guided``: libFuzzer finds the way by what the bytes reach, and keeps what reached something new in the folder; it
+needs atheris (``pip install atheris``). ``random``: changes at random of what is in the folder, many times as fast.
+Bytes that break a target are left in ``fuzz-*`` in the working directory.
 """
 
 from __future__ import annotations

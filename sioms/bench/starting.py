@@ -83,9 +83,7 @@ def bench_restart(options: Options, report: Report) -> None:
                 stamps = [snapshot.stamp_ns for snapshot in neighbour.history(before)]
                 gaps += [b - a for a, b in itertools.pairwise(stamps)]
                 report.progress(f"restart: {trial}")
-    report.samples(
-        "driver killed to its node open and read again", back, "ms", bars=[Bar("p50", 500), Bar("p50", 50)]
-    )
+    report.samples("driver killed to its node open and read again", back, "ms", bars=[Bar("p50", 500), Bar("p50", 50)])
     report.samples("period of the neighbour's publications meanwhile", gaps, "us")
 
 

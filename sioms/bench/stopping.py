@@ -30,8 +30,9 @@ LONG_S = 30.0
 def bench_stop(options: Options, report: Report) -> None:
     """From the call to every driver braking and to the last axis at rest."""
     devices = [
-        axes(f"mod{i}", history=HISTORY, capacity=CAPACITY, acceleration=DECELERATION, limits=False) for i in range(MODULES)
-    ]  # fmt: skip
+        axes(f"mod{i}", history=HISTORY, capacity=CAPACITY, acceleration=DECELERATION, limits=False)
+        for i in range(MODULES)
+    ]
     with Daemon(workcell(devices)) as daemon, daemon.cell() as cell:
         nodes = [cell.open(f"mod{i}", "rw") for i in range(MODULES)]
         daemon.fork(lambda: _wait_for_ever(daemon))
@@ -43,9 +44,7 @@ def bench_stop(options: Options, report: Report) -> None:
         bars = [Bar("max", 2 * TICK_MS), Bar("p99", 2 * TICK_MS)]
         report.samples("emergency stop to the last of 4 drivers braking", acted, "ms", bars=bars)
         bars = [Bar("p50", 5.0), Bar("p99", 10.0)]
-        report.samples(
-            "emergency stop to the last of 16 axes at rest", rested, "ms", bars=bars, cpu=cpu.shares()
-        )
+        report.samples("emergency stop to the last of 16 axes at rest", rested, "ms", bars=bars, cpu=cpu.shares())
         _shell(options, report, daemon, cell, nodes)
 
 

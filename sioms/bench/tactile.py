@@ -1,4 +1,6 @@
-"""Shape estimation: time of a frame, share of a core, errors against theory, convergence, frames a second on all cores."""
+"""Shape estimation: time of a frame, share of a core, errors against theory, convergence, frames a second on all
+cores.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,9 @@ def frames_of(finger: Finger, count: int, seed: int) -> tuple[Floats, Floats]:
 
 
 def fit_share(work: tuple[int, int]) -> Floats:
-    """Fit one process's share; one row a frame: truth's angle [rad], error [deg], doubted, error over theory of each."""
+    """Fit one process's share; one row a frame: truth's angle [rad], error [deg], doubted, error
+    over theory of each.
+    """
     count, seed = work
     finger = finger_of(16)
     frames, truth = frames_of(finger, count, seed)
@@ -94,9 +98,7 @@ def _frames(report: Report, finger: Finger, count: int) -> None:
         except ImportError as error:
             report.note(str(error))
             continue
-        report.samples(
-            f"fit of 16 strains, {name}", _times(estimator.frame, frames, count), bars=[Bar("p50", bar)]
-        )
+        report.samples(f"fit of 16 strains, {name}", _times(estimator.frame, frames, count), bars=[Bar("p50", bar)])
         report.samples(
             f"the same with a load, {name}",
             _times(lambda y, fit=estimator.frame: fit(y, load), frames, count),  # type: ignore[misc]
@@ -113,13 +115,9 @@ def _many_elements(report: Report, finger: Finger, count: int) -> None:
         except ImportError:
             continue
         share = _share(estimator.frame, frames, count)
-        report.value(
-            f"fit of 48 strains at 1 kHz, share of a core, {name}", share, "%", bars=[Bar("value", 100 / 3)]
-        )
+        report.value(f"fit of 48 strains at 1 kHz, share of a core, {name}", share, "%", bars=[Bar("value", 100 / 3)])
         share = _share(_sensing(finger, compiled, frames.shape[1]), frames, count)
-        report.value(
-            f"48 raw to shape at 1 kHz, share of a core, {name}", share, "%", bars=[Bar("value", 100 / 3)]
-        )
+        report.value(f"48 raw to shape at 1 kHz, share of a core, {name}", share, "%", bars=[Bar("value", 100 / 3)])
 
 
 def _share(work: Callable[[Floats], object], frames: Floats, count: int) -> float:
@@ -180,6 +178,4 @@ def _worth(report: Report, finger: Finger, count: int) -> None:
     for column, what in ((3, "place"), (4, "load"), (5, "R")):
         # a robust width: R of small touches is far from normal
         width = float(np.subtract(*np.nanpercentile(found[:, column], [84.13, 15.87]))) / 2.0
-        report.value(
-            f"error over theory, {what}", width, "", bars=[Bar("value", 1.1), Bar("value", 0.9, True)]
-        )
+        report.value(f"error over theory, {what}", width, "", bars=[Bar("value", 1.1), Bar("value", 0.9, True)])

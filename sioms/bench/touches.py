@@ -1,7 +1,9 @@
-"""What the estimates of a finger in the driver are worth: frames of the simulated finger, whose mechanics are not the estimator's.
+"""What the estimates of a finger in the driver are worth: frames of the simulated finger, whose mechanics are not the
+estimator's.
 
-Finite elements and contacts found point by point (`sioms.plant.finger`) press the demo's finger; its readings go through `ShapeSensor` as
-they do in a driver. Asked are bias and coverage of what is stated, the state that is told, and the time and processor time of a frame.
+Finite elements and contacts found point by point (`sioms.plant.finger`) press the demo's finger; its readings go
+through `ShapeSensor` as they do in a driver. Asked are bias and coverage of what is stated, the state that is told, and
+the time and processor time of a frame.
 """
 
 from __future__ import annotations
@@ -32,16 +34,22 @@ APART = math.radians(20.0)  # of two touches: nearer ones take means over many f
 REST, HELD = 60, 8  # frames between touches, and of each
 NAMES = ("place", "load", "R")
 EXPECTED = {
-    "rest": State.UNTOUCHED, "touch": State.TOUCHED, "pull": State.DOUBTFUL, "two touches": State.DOUBTFUL, "hole": State.BLIND,
-}  # fmt: skip
+    "rest": State.UNTOUCHED,
+    "touch": State.TOUCHED,
+    "pull": State.DOUBTFUL,
+    "two touches": State.DOUBTFUL,
+    "hole": State.BLIND,
+}
 """What is done to the finger, and the state that is true then."""
 
 
 @dataclass(slots=True)
 class Found:
-    """What came out: errors and stated deviations of touches, loads, states told by what was done, times of frames [ns].
+    """What came out: errors and stated deviations of touches, loads, states told by what was done, times of frames
+    [ns].
 
-    Rows of ``touches`` are load [N/m], then the errors of place [deg], load [N/m] and R [mm], then their stated deviations.
+    Rows of ``touches`` are load [N/m], then the errors of place [deg], load [N/m] and R [mm], then their stated
+    deviations.
     """
 
     touches: list[tuple[float, ...]] = field(default_factory=list)
@@ -133,17 +141,30 @@ def bench_touches(options: Options, report: Report) -> None:
     rows = found.rows
     for column, (name, unit) in enumerate(zip(NAMES, ("deg", "N/m", "mm"), strict=True), 1):
         z = rows[:, column] / rows[:, column + 3]
-        report.value(f"simulated finger: mean error of {name} in its deviations", float(np.mean(z)), "",
-                     bars=[Bar("value", 1.0), Bar("value", -1.0, True)], notes=f"error {np.mean(rows[:, column]):+.3g} +- {np.std(rows[:, column]):.2g} {unit}")  # fmt: skip
-        report.value(f"simulated finger: {name} within two deviations", 100.0 * float(np.mean(np.abs(z) < 2.0)), "%",
-                     bars=[Bar("value", 95.0, True)], notes=f"{100.0 * np.mean(np.abs(z) < 3.0):.1f} % within three")  # fmt: skip
+        report.value(
+            f"simulated finger: mean error of {name} in its deviations",
+            float(np.mean(z)),
+            "",
+            bars=[Bar("value", 1.0), Bar("value", -1.0, True)],
+            notes=f"error {np.mean(rows[:, column]):+.3g} +- {np.std(rows[:, column]):.2g} {unit}",
+        )
+        report.value(
+            f"simulated finger: {name} within two deviations",
+            100.0 * float(np.mean(np.abs(z) < 2.0)),
+            "%",
+            bars=[Bar("value", 95.0, True)],
+            notes=f"{100.0 * np.mean(np.abs(z) < 3.0):.1f} % within three",
+        )
     for what, right in found.right.items():
-        report.value(f"simulated finger: right state, {what}", 100.0 * float(np.mean(right)), "%", bars=[Bar("value", 99.0, True)],
-                     notes=f"{len(right)} frames")  # fmt: skip
+        report.value(
+            f"simulated finger: right state, {what}",
+            100.0 * float(np.mean(right)),
+            "%",
+            bars=[Bar("value", 99.0, True)],
+            notes=f"{len(right)} frames",
+        )
     report.samples("simulated finger: raw frame to shape, rests and touches", found.times)
-    report.value(
-        "simulated finger: processor time of a frame", 1e-3 * found.processor_ns / len(found.times), "us"
-    )
+    report.value("simulated finger: processor time of a frame", 1e-3 * found.processor_ns / len(found.times), "us")
     if options.picture:
         draw(found, options.picture)
         report.note(f"drew {options.picture}")
@@ -155,9 +176,7 @@ def draw(found: Found, path: str) -> None:
 
     figure, rows = Figure(figsize=(13.0, 7.0), layout="constrained"), found.rows
     errors, (within, states, times) = figure.subplots(2, 3)
-    for column, (axes, name) in enumerate(
-        zip(errors, ("place [deg]", "load [N/m]", "R [mm]"), strict=True), 1
-    ):
+    for column, (axes, name) in enumerate(zip(errors, ("place [deg]", "load [N/m]", "R [mm]"), strict=True), 1):
         axes.errorbar(
             rows[:, 0],
             rows[:, column],

@@ -59,9 +59,7 @@ def halting_ns(watch: Watch, since_ns: int, deceleration: float | None = None, t
     Raises:
         TimeoutError: an axis went on.
     """
-    before = watch.first(
-        lambda s: True, since_ns - LOOK_BACK_NS, timeout_s, "a first look"
-    ).commanded_velocity
+    before = watch.first(lambda s: True, since_ns - LOOK_BACK_NS, timeout_s, "a first look").commanded_velocity
 
     def slower(snapshot: Any) -> bool:
         pairs = zip(snapshot.commanded_velocity, before, strict=True)

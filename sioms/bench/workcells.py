@@ -26,7 +26,10 @@ def axes(
         f"velocity_max = {velocity}\nacceleration_max = {acceleration}\nforce_max = 60.0\n{soft}"
         f"motor = {{ mass = 1.0, viscous = 2.0, encoder_step = 1e-6 }}\n{axis_keys}\n"
     )
-    head = f'[device.{name}]\ndriver = "sim-axes"\nrealtime_priority = 50\nlate_max_s = 0.5\ntick_hz = {tick_hz}\nhistory = {history}\ncapacity = {capacity}\n'
+    head = (
+        f'[device.{name}]\ndriver = "sim-axes"\nrealtime_priority = 50\nlate_max_s = 0.5\ntick_hz = {tick_hz}\nhistory '
+        f"= {history}\ncapacity = {capacity}\n"
+    )
     return head + "".join(f'[[device.{name}.axis]]\nname = "a{i}"\n{one}' for i in range(count))
 
 

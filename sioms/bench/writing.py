@@ -88,6 +88,4 @@ def _append_many(node: Any, options: Options, report: Report) -> None:
         samples.append(time.perf_counter_ns() - begin)
         node.stop()
         node.wait_until_idle(5.0)
-    report.samples(
-        "append 10,000 commands in one write", samples, "ms", bars=[Bar("p50", 100), Bar("max", 100)]
-    )
+    report.samples("append 10,000 commands in one write", samples, "ms", bars=[Bar("p50", 100), Bar("max", 100)])

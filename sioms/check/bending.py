@@ -133,9 +133,7 @@ class Bender:
             case "bytes":
                 return [Piece(data[i : i + 1], delay_ns if i == 0 else 150_000) for i in range(len(data))]
             case "cuts":
-                places = sorted(
-                    self.chance.sample(range(1, len(data)), min(len(data) - 1, self.chance.randint(1, 3)))
-                )
+                places = sorted(self.chance.sample(range(1, len(data)), min(len(data) - 1, self.chance.randint(1, 3))))
                 ends = [0, *places, len(data)]
                 pieces = [data[a:b] for a, b in itertools.pairwise(ends)]
                 return [

@@ -1,7 +1,7 @@
 """Readings of a device at rest: what they are while nothing is wrong, and whether any differs later.
 
-A device at rest publishes the same readings again and again. A reading that differs while its messages are bent was made
-out of damaged bytes, or out of the reply to another request.
+A device at rest publishes the same readings again and again. A reading that differs while its messages are bent was
+made out of damaged bytes, or out of the reply to another request.
 """
 
 from __future__ import annotations
@@ -55,11 +55,7 @@ class Calm:
     def _learn(self) -> None:
         """Note what the readings are now; the first time so many of an analog node that its noise is known."""
         noise, seen = self._station.noise, dict.fromkeys(range(len(self._nodes)), 0)
-        fresh = [
-            i
-            for i, (n, _) in enumerate(self._nodes)
-            if n.node_class is NodeClass.ANALOG and n.name not in noise
-        ]
+        fresh = [i for i, (n, _) in enumerate(self._nodes) if n.node_class is NodeClass.ANALOG and n.name not in noise]
         for i, (_, opened) in enumerate(self._nodes):
             self._numbers[i] = opened.read().number
         began_s = time.monotonic()

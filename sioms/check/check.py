@@ -97,6 +97,4 @@ def _not_calm(result: Result, error: Exception) -> Result:
     if result.verdict is Verdict.FAILED:
         return result
     expected = "the driver good again after the trial"
-    return Result(
-        result.name, result.text, Verdict.FAILED, str(error), expected, result.traffic, result.took_s
-    )
+    return Result(result.name, result.text, Verdict.FAILED, str(error), expected, result.traffic, result.took_s)

@@ -50,10 +50,7 @@ def run_check(args: argparse.Namespace) -> int:
     if args.report:
         write_report(args.report, reports)
     failed = [
-        f"{r['driver']}: {t['name']}"
-        for r in reports
-        for t in r["trials"]
-        if t["verdict"] == Verdict.FAILED.value
+        f"{r['driver']}: {t['name']}" for r in reports for t in r["trials"] if t["verdict"] == Verdict.FAILED.value
     ]
     tried = sum(t["verdict"] != Verdict.NOT_APPLICABLE.value for r in reports for t in r["trials"])
     print(f"\n{tried} trials, {len(failed)} failed" + (f": {', '.join(failed)}" if failed else ""))
@@ -64,9 +61,7 @@ def _one(name: str, args: argparse.Namespace, only: list[str]) -> dict[str, Any]
     """Check one driver in this process, and print its trials as they end."""
     subject = subject_of(name, args.simulator, args.config)
     print(f"{name}: {'all trials' if args.full else 'quick trials'}", flush=True)
-    results = check(
-        subject, full=args.full, only=only, told=lambda result: print(line_of(result), flush=True)
-    )
+    results = check(subject, full=args.full, only=only, told=lambda result: print(line_of(result), flush=True))
     return {"driver": name, "full": args.full, "trials": [result.as_dict() for result in results]}
 
 
@@ -98,9 +93,7 @@ def _many(names: list[str], args: argparse.Namespace) -> list[dict[str, Any]]:
                 said, complaint = process.communicate()
             print(said.rpartition("\n\n")[0] + complaint.rstrip(), flush=True)
             if not out.exists():
-                raise Unusable(
-                    f"{name}: {(complaint.strip().splitlines() or ['it ended without a report'])[-1]}"
-                )
+                raise Unusable(f"{name}: {(complaint.strip().splitlines() or ['it ended without a report'])[-1]}")
             report: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))[0]
             return report
 
@@ -130,7 +123,8 @@ def subject_of(name: str, simulator: str = "", config: Path | None = None) -> Su
     folder = path.parent if is_file else None
     if path.suffix == ".toml":
         raise Unusable(
-            f"{name}: a register map is checked with its driver: give modbus-axis or modbus-io, and in a --config FILE a "
+            f"{name}: a register map is checked with its driver: give modbus-axis or modbus-io, and in a --config FILE "
+            "a "
             f'device with map = "{name}"; --simulator "COMMAND" names what simulates it'
         )
     rig = _named_by_class(path) if is_file else find_rig(name)

@@ -91,9 +91,7 @@ class Daemon:
                     return
             except TimeoutError:
                 continue
-        raise RuntimeError(
-            f"start daemon: not ready; want READY=1 within {READY_S:g} s; it said:\n{self.log()}"
-        )
+        raise RuntimeError(f"start daemon: not ready; want READY=1 within {READY_S:g} s; it said:\n{self.log()}")
 
     def __enter__(self) -> Self:
         return self

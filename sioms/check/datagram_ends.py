@@ -1,4 +1,6 @@
-"""The ends of a wire that carries datagrams: to and from a device that is spoken to, and from one that sends by itself."""
+"""The ends of a wire that carries datagrams: to and from a device that is spoken to, and from one that sends by
+itself.
+"""
 
 from __future__ import annotations
 

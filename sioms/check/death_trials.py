@@ -115,16 +115,12 @@ def _kill_driver(station: Station, set_going: Callable[[Station], tuple[float, C
     text = ""
     try:
         if fast:
-            text = (
-                f"device at rest after {1e3 * _device_rests(station, fast, 'SIGKILL of the driver'):.0f} ms, "
-            )
+            text = f"device at rest after {1e3 * _device_rests(station, fast, 'SIGKILL of the driver'):.0f} ms, "
     finally:
         if client is not None:
             client.kill()
     if not wait_for(lambda: station.status()["generation"] > before["generation"], GONE_S):
-        raise Failed(
-            f"a new driver process within {GONE_S:g} s", f"the device is {station.status()['state']}"
-        )
+        raise Failed(f"a new driver process within {GONE_S:g} s", f"the device is {station.status()['state']}")
     station.wait_good()
     text += f"new driver good after {1e3 * (time.monotonic() - began):.0f} ms"
     _check_still(station, "the driver's death")
@@ -141,9 +137,7 @@ def daemon_killed(station: Station, full: bool) -> str:
     text = ""
     try:
         if fast:
-            text = (
-                f"device at rest after {1e3 * _device_rests(station, fast, 'SIGKILL of the daemon'):.0f} ms, "
-            )
+            text = f"device at rest after {1e3 * _device_rests(station, fast, 'SIGKILL of the daemon'):.0f} ms, "
         if not wait_for(lambda: _is_gone(pid), GONE_S):
             raise Failed(f"the driver process to end within {GONE_S:g} s", f"process {pid} is still there")
         text += f"driver gone after {1e3 * (time.monotonic() - began):.0f} ms"
@@ -224,9 +218,7 @@ def _set_homing(station: Station) -> tuple[float, Client | None]:
 def _device_rests(station: Station, fast: float, after: str) -> float:
     began = time.monotonic()
     if not wait_for(lambda: abs(station.speed() or 0.0) <= SLOW * fast, REST_S):
-        raise Failed(
-            f"the device at rest within {REST_S:g} s after {after}", f"it moves at {station.speed():.6g}"
-        )
+        raise Failed(f"the device at rest within {REST_S:g} s after {after}", f"it moves at {station.speed():.6g}")
     return time.monotonic() - began
 
 
@@ -239,9 +231,7 @@ def _check_still(station: Station, after: str) -> None:
             time.sleep(STILL_S)
             reading = seen.read()
             if abs(reading.position[0] - place) > 2 * axis.tolerance or reading.in_motion[0]:
-                seen_text = (
-                    f"it went from {place:.6g} to {reading.position[0]:.6g}, in_motion {reading.in_motion[0]}"
-                )
+                seen_text = f"it went from {place:.6g} to {reading.position[0]:.6g}, in_motion {reading.in_motion[0]}"
                 raise Failed(f"rest after {after}, and nothing to resume", seen_text)
 
 

@@ -1,4 +1,6 @@
-"""Trials of a line that adds and loses bytes, readings that stand still, another master, and a motor that moves by itself."""
+"""Trials of a line that adds and loses bytes, readings that stand still, another master, and a motor that moves by
+itself.
+"""
 
 from __future__ import annotations
 
@@ -85,9 +87,7 @@ def other_master(station: Station, full: bool) -> str:
         return _foreign_outputs(station)
     axis = first_axis(station)
     fast = usual_speed(station, axis)
-    with station.cell.open(
-        f"{axis.node}.readonly"
-    ) as seen:  # else the motion is taken for the end of the last stop
+    with station.cell.open(f"{axis.node}.readonly") as seen:  # else the motion is taken for the end of the last stop
         wait_for(lambda: not seen.read().in_motion[0], 2.0)
     try:
         device.tell(f"foreign velocity {0.5 * fast:.9g}")

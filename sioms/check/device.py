@@ -1,7 +1,7 @@
 """What the simulated device behind a driver tells and can be told, and what is checked of it in several trials.
 
-What moves and which outputs are on is what the device itself says, not what the driver reads. A verb that it lacks makes a trial
-not applicable (``docs/driver-check.md``, "A simulated device").
+What moves and which outputs are on is what the device itself says, not what the driver reads. A verb that it lacks
+makes a trial not applicable (``docs/driver-check.md``, "A simulated device").
 """
 
 from __future__ import annotations

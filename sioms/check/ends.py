@@ -1,4 +1,5 @@
-"""The two ends of a wire: what a driver opens, and what leads to its device. Serial ports and TCP; UDP is in ``datagram_ends``.
+"""The two ends of a wire: what a driver opens, and what leads to its device. Serial ports and TCP; UDP is in
+``datagram_ends``.
 
 All are non-blocking. ``read`` returns whole datagrams on UDP. A line that is not there takes bytes and loses them.
 """

@@ -58,10 +58,7 @@ def check_frames(rig: Rig, folder: Path | None) -> Result:
     if wrong:
         seen = "; ".join(f"{frame['what']}: {frame['wrong']}" for frame in wrong[:3])
         traffic = [
-            line
-            for frame in wrong
-            for line in (f"> {frame['request']}", f"< {frame['reply']}")
-            if len(line) > 2
+            line for frame in wrong for line in (f"> {frame['request']}", f"< {frame['reply']}") if len(line) > 2
         ]
         return Result(NAME, TEXT, Verdict.FAILED, seen, EXPECTED, traffic, took_s)
     flips = sum(frame["flips"] for frame in frames)

@@ -1,4 +1,6 @@
-"""Trials of the line: messages chopped, damaged, late, doubled, lost; a mute device; cables pulled; random bytes; speed."""
+"""Trials of the line: messages chopped, damaged, late, doubled, lost; a mute device; cables pulled; random bytes;
+speed.
+"""
 
 from __future__ import annotations
 
@@ -35,9 +37,7 @@ def prepare(station: Station) -> None:
             node.wait_until_idle(20.0)
 
 
-def disturbed(
-    station: Station, seconds: float, *, judge: bool = True, babble: float = 0.0, **faults: Any
-) -> Calm:
+def disturbed(station: Station, seconds: float, *, judge: bool = True, babble: float = 0.0, **faults: Any) -> Calm:
     """Bend messages for a time, and check that the driver lives, reads nothing wrong, and is good again after.
 
     Args:
@@ -66,9 +66,7 @@ def disturbed(
         _check_alive(station, before)
         if judge and calm.wrong:
             seen = f"{len(calm.wrong)} of {calm.count} readings were wrong, the first: {calm.wrong[0]}"
-            raise Failed(
-                "no reading made of a bent message, or of the reply to another request", seen, calm.traffic
-            )
+            raise Failed("no reading made of a bent message, or of the reply to another request", seen, calm.traffic)
         check_back(station)
     return calm
 
@@ -80,11 +78,7 @@ def _bent_since(station: Station, before: int) -> int:
 def _check_alive(station: Station, before: dict[str, Any]) -> None:
     after = station.status()
     if (after["pid"], after["deaths"]) != (before["pid"], before["deaths"]):
-        said = [
-            line
-            for line in (station.daemon.log() if station.daemon else "").splitlines()
-            if "level=error" in line
-        ]
+        said = [line for line in (station.daemon.log() if station.daemon else "").splitlines() if "level=error" in line]
         why = said[-1][-400:] if said else after["reason"]
         raise Failed("the driver process to live on", f"it died: {why}")
 
@@ -112,11 +106,7 @@ def _bent(seconds: tuple[float, float], *, needs_check: bool = True, **faults: A
             raise NotApplicable("no message of the device passed meanwhile")
         if judge:
             return _summary(station, calm, before)
-        why = (
-            "TCP and UDP guard their own bytes"
-            if station.rig.line != "serial"
-            else "its messages carry no checksum"
-        )
+        why = "TCP and UDP guard their own bytes" if station.rig.line != "serial" else "its messages carry no checksum"
         return f"{station.totals()['bent'] - before['bent']} messages bent; readings not judged: {why}"
 
     return run
@@ -131,9 +121,7 @@ def chopped(station: Station, full: bool) -> str:
         seconds = 3.0 if full else 0.35
         calm = disturbed(station, seconds, chop=how)
         if calm.count < 2:
-            raise Failed(
-                "readings while replies come in pieces", f"{calm.count} readings in {seconds:g} s ({how})"
-            )
+            raise Failed("readings while replies come in pieces", f"{calm.count} readings in {seconds:g} s ({how})")
         texts.append(f"{how}: {calm.count} readings")
     return ", ".join(texts)
 
@@ -150,9 +138,7 @@ def unplugged(station: Station, full: bool) -> str:
     except Unanswered:
         raise NotApplicable("the driver has no line, and no device that can be pulled") from None
     for _ in range(4 if full else 1):
-        text = _cut_off(
-            station, lambda: station.pull("unplug"), lambda: station.pull("plug"), "the cable was pulled"
-        )
+        text = _cut_off(station, lambda: station.pull("unplug"), lambda: station.pull("plug"), "the cable was pulled")
     return text
 
 
@@ -223,9 +209,7 @@ def _timeout(station: Station) -> tuple[float, float]:
             raise NotApplicable("no request was answered")
         answer_s = gaps[len(gaps) // 2] / 1e9
         replies = node.statistics(1)["link"]["replies"]
-        wait_for(
-            lambda: node.statistics(1)["link"]["replies"] > replies + LEAST, MORE_S, 0.01
-        )  # nothing is owed
+        wait_for(lambda: node.statistics(1)["link"]["replies"] > replies + LEAST, MORE_S, 0.01)  # nothing is owed
         before = node.statistics(1)["link"]["timeouts"]
         began_ns = time.monotonic_ns()
         station.fault(lose=1.0, count=1)
@@ -283,9 +267,7 @@ def _cycle(station: Station, full: bool) -> str:
     if station.wires:
         figures += f"; {characters / cycles:.1f} characters a cycle"
     if line_s:
-        figures += (
-            f" = {1e3 * line_s:.2f} ms at {station.baud:g} baud, line {100 * line_s / cycle_s:.0f} % busy"
-        )
+        figures += f" = {1e3 * line_s:.2f} ms at {station.baud:g} baud, line {100 * line_s / cycle_s:.0f} % busy"
     least_s = max(1 / asked_hz, line_s, waited_s * cycle_s)
     if cycle_s > RATIO * least_s:
         most = f"; at most {0.9 / line_s:.0f} Hz fit on this line" if line_s else ""
@@ -329,9 +311,7 @@ def outputs_missing(station: Station, full: bool) -> str:
         time.sleep(0.1)
         moved = node.read().position[0] - place
     if not -axis.tolerance <= moved / step <= 1 + axis.tolerance / abs(step):
-        raise Failed(
-            f"a relative move of {step:g} carried out once or not at all", f"the axis moved {moved:g}"
-        )
+        raise Failed(f"a relative move of {step:g} carried out once or not at all", f"the axis moved {moved:g}")
     return f"moved {moved:.4g} of {step:.4g}"
 
 

@@ -103,9 +103,7 @@ def check_let_go(station: Station, read: Callable[[], Any], axis: Axis, fast: fl
     began = time.monotonic()
     limit = station.cell.info(axis.node).channels[0].limits.get("force", 1.0)
     if not wait_for(lambda: abs(read().force[0]) < 0.02 * limit or not read().in_motion[0], REST_S):
-        raise Failed(
-            f"force 0 or rest after {after}", f"force {read().force[0]:.4g}, in_motion {read().in_motion[0]}"
-        )
+        raise Failed(f"force 0 or rest after {after}", f"force {read().force[0]:.4g}, in_motion {read().in_motion[0]}")
     return time.monotonic() - began
 
 
@@ -294,9 +292,6 @@ def _takes(node: Any, output: Output) -> bool:
 
 
 TRIALS = (
-    *(
-        Trial(f"stop {state}", f"stops of an axis that is {state}", stops(state), wire=False)
-        for state in STATES
-    ),
+    *(Trial(f"stop {state}", f"stops of an axis that is {state}", stops(state), wire=False) for state in STATES),
     Trial("outputs", "safe outputs after emergency stop and close", safe_outputs, wire=False),
 )

@@ -76,7 +76,9 @@ def _hindrances(station: Station) -> list[tuple[str, Callable[[], Any], Callable
 
 
 def lost_outputs(station: Station, full: bool) -> str:
-    """Lose or refuse the safe value: outputs must become safe as soon as the device listens, under a latched stop, too."""
+    """Lose or refuse the safe value: outputs must become safe as soon as the device listens, under a latched stop,
+    too.
+    """
     outputs = [o for o in station.rig.outputs if o.safe is not None]
     if not outputs:
         raise NotApplicable("the device has no outputs with a safe value")
@@ -131,9 +133,7 @@ def revived(station: Station, full: bool) -> str:
             raise Failed("the bit that was written on", f"{state_of(station)['outputs']:#x}")
         time.sleep(0.2)
         if dropped and state_of(station)["outputs"] & 1:
-            raise Failed(
-                "bit 0 off, as the device left it", f"{state_of(station)['outputs']:#x}: it is on again"
-            )
+            raise Failed("bit 0 off, as the device left it", f"{state_of(station)['outputs']:#x}: it is on again")
         last.set(0)
     return "dropped bits stay off" if dropped else "the device keeps its outputs over a power cycle"
 

@@ -27,9 +27,7 @@ def lines_of(trial: dict[str, Any]) -> str:
         return fill(head + trial["seen"], WIDTH, subsequent_indent=" " * 36)
     lines = [head + trial["text"]]
     for what in ("expected", "seen"):
-        lines.append(
-            fill(f"{what}: {trial[what]}", WIDTH, initial_indent=" " * 10, subsequent_indent=" " * 20)
-        )
+        lines.append(fill(f"{what}: {trial[what]}", WIDTH, initial_indent=" " * 10, subsequent_indent=" " * 20))
     if trial["traffic"]:
         lines.append(" " * 10 + "on the line (> to the device, < from it):")
         lines += [" " * 12 + line for line in trial["traffic"]]
@@ -53,9 +51,7 @@ _MARKS = {Verdict.PASSED.value: "ok: ", Verdict.FAILED.value: "no: ", Verdict.NO
 
 def _page(reports: Sequence[dict[str, Any]]) -> Page:
     page = Page("Driver check")
-    rows = [
-        (r["driver"], *(sum(t["verdict"] == v.value for t in r["trials"]) for v in Verdict)) for r in reports
-    ]
+    rows = [(r["driver"], *(sum(t["verdict"] == v.value for t in r["trials"]) for v in Verdict)) for r in reports]
     page.table(("driver", *(v.value for v in Verdict)), rows)
     for report in reports:
         page.head(report["driver"])

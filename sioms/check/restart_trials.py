@@ -170,7 +170,10 @@ def power_cycled(station: Station, full: bool) -> str:
         except OSError as error:
             text = f"place lost ({place:.4g} reads {shown:.4g}), told, and moves refused: {error.strerror}"
         else:
-            seen = f"place {place:.6g} reads {shown:.6g}, {'a fault' if told else 'no fault'}, and after RESET a move is taken"
+            seen = (
+                f"place {place:.6g} reads {shown:.6g}, {'a fault' if told else 'no fault'}, and after RESET a move is "
+                "taken"
+            )
             raise Failed("no move to a position until somebody has said where the axis is", seen)
         restore(station, node, axis)
         node.move(0.25 * axis.reach, timeout=2.0)
@@ -220,9 +223,7 @@ def _outputs_alone(station: Station, output: Output) -> str:
     with station.cell.open(output.node, "rw", timeout=5.0) as node:
         set_all(node, output)
         if not wait_for(lambda: state_of(station)["outputs"] == int(output.another), 2.0):
-            raise Failed(
-                f"outputs {int(output.another):#x} after a write", f"{state_of(station)['outputs']:#x}"
-            )
+            raise Failed(f"outputs {int(output.another):#x} after a write", f"{state_of(station)['outputs']:#x}")
         station.tell_wire("unplug")
         try:
             if not wait_for(lambda: not state_of(station)["outputs"] & int(output.another), SAFE_S):
@@ -250,9 +251,7 @@ def streams_again(station: Station, full: bool) -> str:
         if (after["pid"], after["deaths"]) != (before["pid"], before["deaths"]):
             raise Failed("the driver process to live on", after["reason"] or "it died")
         if calm.wrong and station.is_good():
-            raise Failed(
-                "no reading of another range, rate or zero without a flag", calm.wrong[0], calm.traffic
-            )
+            raise Failed("no reading of another range, rate or zero without a flag", calm.wrong[0], calm.traffic)
     return f"good again {1e3 * took_s:.0f} ms after the supply"
 
 

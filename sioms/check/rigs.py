@@ -74,7 +74,8 @@ class Rig:
         driver: registered name, or the path of a file.
         tables: TOML of its device; ``{port}`` is the simulator's port; ``{device}`` too, but past any wire that a test
             puts between: for a second connection to the device; ``{data}`` is where it sends datagrams unasked.
-        simulator: module or path of a Python file, and options; empty for a driver that needs none; with ``--link PATH`` left out, as it is added, unless ``tcp``.
+        simulator: module or path of a Python file, and options; empty for a driver that needs none; with ``--link
+            PATH`` left out, as it is added, unless ``tcp``.
         tcp: the simulator chooses its own TCP or UDP port.
         axes, analogs, inputs, outputs: its nodes.
         name: of the rig where it is not the driver's, as for register maps.
@@ -154,9 +155,7 @@ def rig_of(keys: Mapping[str, Any]) -> Rig:
     """
     unknown = sorted(set(keys) - set(Rig.__dataclass_fields__))
     if unknown:
-        raise ValueError(
-            f"rig: unknown key {unknown[0]}; one of {', '.join(Rig.__dataclass_fields__)} is right"
-        )
+        raise ValueError(f"rig: unknown key {unknown[0]}; one of {', '.join(Rig.__dataclass_fields__)} is right")
     try:
         return msgspec.convert(dict(keys), Rig)
     except msgspec.ValidationError as error:

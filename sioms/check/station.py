@@ -61,12 +61,8 @@ class Peer:
                 line = self._line(START_S)
         except Unanswered as error:
             self.close()
-            said = (
-                self._process.stderr.read().decode("utf-8", "replace")[-600:] if self._process.stderr else ""
-            )
-            raise Unanswered(
-                f"start {what}: no line 'ready PORT' ({error}); it said: {said.strip()}"
-            ) from None
+            said = self._process.stderr.read().decode("utf-8", "replace")[-600:] if self._process.stderr else ""
+            raise Unanswered(f"start {what}: no line 'ready PORT' ({error}); it said: {said.strip()}") from None
         self.port = line.split(maxsplit=1)[1]
         with contextlib.suppress(OSError):  # a real device waits for nobody
             os.sched_setscheduler(self._process.pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
@@ -146,9 +142,7 @@ class Station:
         cell: the session.
     """
 
-    def __init__(
-        self, rig: Rig, *, paced: bool = True, wired: bool = True, folder: Path | None = None
-    ) -> None:
+    def __init__(self, rig: Rig, *, paced: bool = True, wired: bool = True, folder: Path | None = None) -> None:
         self.rig = rig
         self._base = folder or Path.cwd()
         self._folder = Path(tempfile.mkdtemp(prefix="sioms-check-"))
@@ -181,9 +175,7 @@ class Station:
         self.port = self.simulator.port
         if not (wired and rig.line):
             return
-        speed = (
-            ["--baud", str(self.baud), "--bits", str(rig.bits_per_character)] if paced and self.baud else []
-        )
+        speed = ["--baud", str(self.baud), "--bits", str(rig.bits_per_character)] if paced and self.baud else []
         for kind in (rig.line, "pushed") if rig.pushes else (rig.line,):
             command = [sys.executable, "-P", "-m", "sioms.check.wire", "--kind", kind, *speed]
             command += ["--device", self.simulator.port, "--link", str(self._folder / "port")]
@@ -245,9 +237,7 @@ class Station:
     def _look(self) -> None:
         """Find out the nodes of the device, and its axes and outputs unless the rig tells them."""
         entries = [e for e in self.cell.nodes() if e.device == self.rig.device]
-        whole = [
-            e for e in entries if not is_part(e, entries) and not _is_same(e.name, {o.name for o in entries})
-        ]
+        whole = [e for e in entries if not is_part(e, entries) and not _is_same(e.name, {o.name for o in entries})]
         self.nodes = [Node(e.name, e.node_class, e.read_only) for e in whole]
         rig = self.rig
         if not rig.axes:
@@ -255,9 +245,7 @@ class Station:
             rig = replace(rig, axes=tuple(self._axis(name) for name in names if not name.endswith(READONLY)))
         if not rig.outputs:
             names = [e.name for e in whole if e.node_class is NodeClass.BINARY and not e.read_only]
-            rig = replace(
-                rig, outputs=tuple(Output(n, self.cell.info(n).channels[0].width, None) for n in names)
-            )
+            rig = replace(rig, outputs=tuple(Output(n, self.cell.info(n).channels[0].width, None) for n in names))
         self.rig = rig
 
     def _axis(self, name: str) -> Axis:
@@ -306,7 +294,8 @@ class Station:
         return time.monotonic() - began
 
     def wait_fresh(self, timeout_s: float = UP_S) -> float:
-        """Wait for a good link and a reading made from now on, so that nothing of before can lose it; return the time [s].
+        """Wait for a good link and a reading made from now on, so that nothing of before can lose it; return the time
+        [s].
 
         Raises:
             TimeoutError: as wait_good.

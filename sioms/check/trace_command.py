@@ -45,9 +45,7 @@ def run_trace(args: argparse.Namespace) -> int:
             "--socket",
             path,
         ]
-        daemon = subprocess.Popen(
-            command, env=environment, stdin=subprocess.DEVNULL, preexec_fn=ends_with_us()
-        )
+        daemon = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, preexec_fn=ends_with_us())
         print(f"recording {args.device} to {out}; commands reach it with SIOMS_SOCKET={path}", flush=True)
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         with contextlib.suppress(KeyboardInterrupt, subprocess.TimeoutExpired):

@@ -1,8 +1,9 @@
 """Traces of lines, and the peer that answers out of one. Pure: bytes and times in, bytes and times out.
 
-The format is described in docs/driver-trace.md. A :class:`Replay` is the device of the trace: to each request it gives the
-replies that followed the same request in the trace, looking ahead first, so that requests which a client caused then and
-nobody causes now are passed over. A request that the trace does not hold ends the replay, with both sides' bytes.
+The format is described in docs/driver-trace.md. A :class:`Replay` is the device of the trace: to each request it gives
+the replies that followed the same request in the trace, looking ahead first, so that requests which a client caused
+then and nobody causes now are passed over. A request that the trace does not hold ends the replay, with both sides'
+bytes.
 
     replay = Replay(read_trace(Path("mod0.trace")))
     replay.take(request, now_ns)
@@ -193,11 +194,7 @@ class Replay:
         for places, again in ((indices, False), (before, True)):
             for i in places:
                 message = self._messages[i]
-                if (
-                    message.way == ">"
-                    and len(self._got) >= len(message.data)
-                    and self._same(message.data, self._got)
-                ):
+                if message.way == ">" and len(self._got) >= len(message.data) and self._same(message.data, self._got):
                     return i, again
         if any(m.way == ">" and self._same(m.data[: len(self._got)], self._got) for m in self._messages):
             return None
@@ -208,9 +205,7 @@ class Replay:
 
     def _same(self, recorded: bytes, got: bytes) -> bool:
         pairs = zip(recorded, got[: len(recorded)], strict=True)
-        return all(
-            a == b or any(low <= i < high for low, high in self.ignore) for i, (a, b) in enumerate(pairs)
-        )
+        return all(a == b or any(low <= i < high for low, high in self.ignore) for i, (a, b) in enumerate(pairs))
 
     def _answer(self, at: int, request: bytes, now_ns: int) -> None:
         """Put what followed a request under way."""

@@ -8,7 +8,8 @@ standard input, each answered by ``ok``, ``ok JSON`` or ``error`` with a sentenc
     babble RATE SECONDS     random bytes to the driver, so many a second
     unplug, plug            pull the cable, put it back
     log [COUNT]             the last messages: [time ns, direction, hex, what was done to it]
-    totals                  messages and bytes of both directions, messages bent, time that the device took to answer [ns]
+    totals                  messages and bytes of both directions, messages bent, time that the device took to answer
+    [ns]
 """
 
 from __future__ import annotations
@@ -94,9 +95,13 @@ class Wire:
     def totals(self) -> dict[str, int]:
         """Return what was carried."""
         return {
-            "requests": self.to_device.messages, "request_bytes": self.to_device.characters,
-            "replies": self.to_host.messages, "reply_bytes": self.to_host.characters, "bent": self.bender.hits, "device_ns": self.device_ns,
-        }  # fmt: skip
+            "requests": self.to_device.messages,
+            "request_bytes": self.to_device.characters,
+            "replies": self.to_host.messages,
+            "reply_bytes": self.to_host.characters,
+            "bent": self.bender.hits,
+            "device_ns": self.device_ns,
+        }
 
     def turn(self) -> None:
         """Carry what is due, then wait for the next thing and take it."""
@@ -168,9 +173,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="wire between a driver and its device")
     parser.add_argument("--kind", choices=KINDS, required=True)
     parser.add_argument("--device", required=True, metavar="PORT")
-    parser.add_argument(
-        "--link", type=Path, default=Path("/nonexistent"), help="path of the driver's serial port"
-    )
+    parser.add_argument("--link", type=Path, default=Path("/nonexistent"), help="path of the driver's serial port")
     parser.add_argument("--baud", type=float, default=0.0, help="speed of the line; 0 takes no time")
     parser.add_argument("--bits", type=int, default=10, help="bits of a character")
     parser.add_argument("--seed", type=int, default=1)

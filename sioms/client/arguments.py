@@ -1,7 +1,8 @@
 """Checks of what a program hands to the client library, before anything is sent.
 
-A wrong kind of value costs the caller a TypeError, and one that no message holds a ValueError, with a sentence that says what
-was attempted; the node goes on. What a good kind of value means is for the daemon or the driver to judge, and to
+A wrong kind of value costs the caller a TypeError, and one that no message holds a ValueError, with a sentence that
+says what was attempted; the node goes on. What a good kind of value means is for the daemon or the driver to judge, and
+to
 refuse by an OSError: only they know ranges, limits and states.
 
 Numbers of numpy are numbers; booleans and text are none.
@@ -82,11 +83,7 @@ def integer(what: str, value: Any, want: str = "an integer", *, flags: bool = Fa
     real = hasattr(value, "__float__") and not _is_array(value)
     if hasattr(value, "__index__") and (flags or not isinstance(value, bool)) and not _is_array(value):
         found = index(value)
-    elif (
-        float(value).is_integer()
-        if flags and real
-        else hasattr(value, "__int__") and not hasattr(value, "__float__")
-    ):
+    elif float(value).is_integer() if flags and real else hasattr(value, "__int__") and not hasattr(value, "__float__"):
         found = int(value)
     else:
         raise _wrong(what, value, want)
@@ -130,7 +127,8 @@ def plain(what: str, value: Any, depth: int = _DEPTH) -> Any:
 
 
 def checked(what: str, message: M) -> M:
-    """Return a message of what a program has handed over with its arguments as the verb takes them (``protocol.verbs``).
+    """Return a message of what a program has handed over with its arguments as the verb takes them
+    (``protocol.verbs``).
 
     Raises:
         TypeError: one is of another kind.

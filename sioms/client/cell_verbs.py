@@ -1,4 +1,6 @@
-"""The verbs of the connection to a daemon, the one list of which both faces are made (``faces``): names, opens, markers, stops."""
+"""The verbs of the connection to a daemon, the one list of which both faces are made (``faces``): names, opens,
+markers, stops.
+"""
 
 from __future__ import annotations
 
@@ -201,9 +203,7 @@ class WorkcellVerbs(Generic[M]):
         """Return the descriptor of the session's socket; it becomes readable when the daemon goes."""
         return self._channel.fileno()
 
-    async def _open(
-        self, name: str, mode: str, timeout: float | None, lease: float, kind: type | None
-    ) -> Any:
+    async def _open(self, name: str, mode: str, timeout: float | None, lease: float, kind: type | None) -> Any:
         """Open a node.
 
         Args:
@@ -215,8 +215,8 @@ class WorkcellVerbs(Generic[M]):
             lease: longest silence of this client [s] before its axes are halted, for programs that may
                 hang; 0: none. Any request of the node renews it, ``keepalive`` does, and a call that
                 waits on the node keeps renewing it.
-            kind: the class of the node, as AxisNode, AnalogNode or BinaryNode: what the node must be, for type checkers and against mistakes;
-                None takes any.
+            kind: the class of the node, as AxisNode, AnalogNode or BinaryNode: what the node must be, for type checkers
+                and against mistakes; None takes any.
 
         Returns:
             A node of its class and of this face.
@@ -234,9 +234,7 @@ class WorkcellVerbs(Generic[M]):
         if kind is not None and not isinstance(node, kind):
             node.release()
             await self._closed_handle(node.handle)
-            raise OSError(
-                errno.EINVAL, f"open {name}: it is an {type(node).__name__}; want an {kind.__name__}"
-            )
+            raise OSError(errno.EINVAL, f"open {name}: it is an {type(node).__name__}; want an {kind.__name__}")
         return node
 
     async def _closed_handle(self, handle: int) -> None:
@@ -334,8 +332,8 @@ class WorkcellVerbs(Generic[M]):
         """Stop the whole workcell, and latch the stop until it is reset.
 
         Takes effect in every driver's next tick even while the daemon is busy or hung. This is a
-        software stop, not a safety-rated function. ``AxisNode.stop`` is a controlled stop of one node that is not latched,
-        ``AxisNode.emergency_stop`` that of one node which is.
+        software stop, not a safety-rated function. ``AxisNode.stop`` is a controlled stop of one node that is not
+        latched, ``AxisNode.emergency_stop`` that of one node which is.
 
         Args:
             why: for the log and for who asks why nothing moves.

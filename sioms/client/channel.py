@@ -51,7 +51,8 @@ KEEPALIVE = Keepalive().packed()
 INTERRUPTIBLE_S = 1.0
 """A signal that comes just before the interpreter goes to sleep is seen when that wakes: it sleeps this long [s]."""
 FIRST_LOOK_S = 1.0
-"""How long after its own time-out an answer is overdue: then the process that owes it is looked at (``overdue``) [s]."""
+"""How long after its own time-out an answer is overdue: then the process that owes it is looked at (``overdue``) [s].
+"""
 ENOUGH_LOOK_S = 0.25
 """The same for an answer that may be needless when it is overdue [s]."""
 CONNECT_S = 2.0
@@ -69,7 +70,8 @@ class Call:
         enough: tells of an overdue answer whether it is not needed any more.
 
     Raises:
-        TypeError, ValueError: an argument is none that the verb takes; the other side would take it for a broken client.
+        TypeError, ValueError: an argument is none that the verb takes; the other side would take it for a broken
+            client.
     """
 
     __slots__ = ("ahead", "enough", "limit_s", "message", "what")
@@ -126,7 +128,8 @@ def connect(path: str, timeout_s: float = CONNECT_S) -> socket:
         sock.close()
         number = error.errno or errno.ENAMETOOLONG  # Python itself refuses a path that no address holds
         hint = {
-            errno.ENOENT: "no daemon listens there; start one with `siomsd --config FILE`, or name its socket in SIOMS_SOCKET",
+            errno.ENOENT: "no daemon listens there; start one with `siomsd --config FILE`, or name its socket in "
+            "SIOMS_SOCKET",
             errno.ECONNREFUSED: "the daemon that made this socket is gone; start one with `siomsd --config FILE`",
             errno.EACCES: "no permission; ask to be put into the group of the socket",
             errno.ENAMETOOLONG: "the path of a socket has at most 107 bytes",
@@ -250,9 +253,7 @@ class Channel:
             number = self._number
             packet = call.message.packed(number)
             if len(packet) > MAX_PACKET:
-                raise OSError(
-                    errno.EMSGSIZE, f"{call.what}: {len(packet)} bytes in one message; at most {MAX_PACKET}"
-                )
+                raise OSError(errno.EMSGSIZE, f"{call.what}: {len(packet)} bytes in one message; at most {MAX_PACKET}")
             try:
                 for part in call.ahead:
                     self._sock.send(Part(number, part).packed())
@@ -269,7 +270,9 @@ class Channel:
             raise self._gone(error, "send") from None
 
     def keepalive(self) -> None:
-        """Tell the other side, and those of the channels that are kept alive with this one, that this client is alive."""
+        """Tell the other side, and those of the channels that are kept alive with this one, that this client is
+        alive.
+        """
         for channel in self.fellows or (self,):
             channel.notice(KEEPALIVE)
 

@@ -59,9 +59,7 @@ def command(
     for name, value in values.items():
         flag = _FLAGS.get(name)
         if flag is None:
-            raise ValueError(
-                f"make command: unknown word {name}; there are: {', '.join([*_QUANTITY, *_WITH])}"
-            )
+            raise ValueError(f"make command: unknown word {name}; there are: {', '.join([*_QUANTITY, *_WITH])}")
         fields[name] = number(f"make command: {name}", value)
         mode |= flag
     for group in _TOGETHER:

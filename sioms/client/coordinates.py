@@ -44,11 +44,7 @@ class UserAxisVerbs:
 
     def __repr__(self) -> str:
         channel = self.node.info.channels[self.axis]
-        view = (
-            ""
-            if (self.offset, self.direction) == (0.0, 1)
-            else f", {self.direction:+d} * position {self.offset:+g}"
-        )
+        view = "" if (self.offset, self.direction) == (0.0, 1) else f", {self.direction:+d} * position {self.offset:+g}"
         try:
             place = f"at {self.position:.6g} {channel.unit}"
         except OSError as error:
@@ -77,8 +73,7 @@ class UserAxisVerbs:
     def call_here(self, user: float) -> None:
         """Let the present place have this user coordinate; nothing moves, and no other client sees it."""
         self.offset = (
-            number("call a place by a user coordinate", user)
-            - self.direction * self.node.read().position[self.axis]
+            number("call a place by a user coordinate", user) - self.direction * self.node.read().position[self.axis]
         )
 
     @verb

@@ -1,8 +1,9 @@
 """Two faces, blocking and asyncio, of one list of verbs.
 
-A verb is written once, as a coroutine function of a class that neither face sees: it awaits other verbs, by their class, and the
-calls of a ``Waiter``. asyncio's face inherits it as it is. In the blocking face the waiter waits in its calls, so that a coroutine runs
-to its end without ever being suspended, and ``Blocking`` puts a plain function in the place of each.
+A verb is written once, as a coroutine function of a class that neither face sees: it awaits other verbs, by their
+class, and the calls of a ``Waiter``. asyncio's face inherits it as it is. In the blocking face the waiter waits in its
+calls, so that a coroutine runs to its end without ever being suspended, and ``Blocking`` puts a plain function in the
+place of each.
 """
 
 from __future__ import annotations

@@ -94,13 +94,9 @@ class Edges:
         OSError: EINVAL, a node of another kind.
     """
 
-    def __init__(
-        self, node: NodeCore[BinarySnapshot], mask: int, last: Event | BinarySnapshot | None
-    ) -> None:
+    def __init__(self, node: NodeCore[BinarySnapshot], mask: int, last: Event | BinarySnapshot | None) -> None:
         if node.info.node_class is not NodeClass.BINARY or len(node.info.channels) != 1:
-            raise OSError(
-                errno.EINVAL, f"wait for an event on {node.name}: want a node of one binary channel"
-            )
+            raise OSError(errno.EINVAL, f"wait for an event on {node.name}: want a node of one binary channel")
         self._node = node
         self._mask = integer(f"wait for an event on {node.name}: mask", mask)
         if not (last is None or isinstance(last, Event | BinarySnapshot)):
@@ -265,16 +261,14 @@ class NodeCore(Generic[S]):
     def fileno(self) -> int:
         """Return a descriptor that is readable when there is new data, for selectors and asyncio.
 
-        The node must be subscribed to, which the blocking face sees to. ``read`` makes the descriptor unreadable until the
-        next publication.
+        The node must be subscribed to, which the blocking face sees to. ``read`` makes the descriptor unreadable until
+        the next publication.
 
         Raises:
             OSError: EINVAL, it is not subscribed to.
         """
         if not self._subscribed:
-            raise OSError(
-                errno.EINVAL, f"wait for new data of {self.name}: not subscribed; await subscribe(1)"
-            )
+            raise OSError(errno.EINVAL, f"wait for new data of {self.name}: not subscribed; await subscribe(1)")
         return self._event
 
     def keepalive(self) -> None:
@@ -315,9 +309,7 @@ class NodeCore(Generic[S]):
         what = f"<{type(self).__name__} {self.name}"
         if self.closed:
             return f"{what}, closed>"
-        channels = ", ".join(
-            f"{c.name} [{c.unit}]" if c.unit else c.name for c in self.info.channels[:_SHOWN]
-        )
+        channels = ", ".join(f"{c.name} [{c.unit}]" if c.unit else c.name for c in self.info.channels[:_SHOWN])
         more = len(self.info.channels) - _SHOWN
         return f"{what}: {channels}{f' and {more} more' if more > 0 else ''}>"
 
@@ -325,9 +317,7 @@ class NodeCore(Generic[S]):
 
     def _ioctl(self, request: Request, argument: object = None, timeout: float | None = 0.0) -> Call:
         if not isinstance(request, Request):
-            raise TypeError(
-                f"ioctl on {self.name}: {text.shown(request)} is no request; want one of sioms.Request"
-            )
+            raise TypeError(f"ioctl on {self.name}: {text.shown(request)} is no request; want one of sioms.Request")
         what = f"{request.name} on {self.name}"
         return Call(what, Ioctl(int(request), argument, timeout), limit_s=timeout)
 
@@ -354,9 +344,7 @@ class NodeCore(Generic[S]):
             if any(value >= 1 << 63 for value in data):
                 raise ValueError(f"{what}: {data}; want {words}")
             return b"".join([BINARY_WRITE.pack(i, 0, value, 0) for i, value in enumerate(data)])
-        return b"".join(
-            [ANALOG_WRITE.pack(i, 0, v) for i, v in enumerate(numbers(f"write {self.name}", values))]
-        )
+        return b"".join([ANALOG_WRITE.pack(i, 0, v) for i, v in enumerate(numbers(f"write {self.name}", values))])
 
     def _unreadable(self, error: Exception) -> OSError:
         if self.closed:

@@ -42,9 +42,7 @@ def deadline_of(what: str, timeout: float | None) -> float | None:
 class NodeVerbs(NodeCore[S]):
     """The verbs of every node."""
 
-    def __init__(
-        self, core: tuple[Any, ...], cell: WorkcellVerbs[Any], waiter: Waiter, lease: float = 0.0
-    ) -> None:
+    def __init__(self, core: tuple[Any, ...], cell: WorkcellVerbs[Any], waiter: Waiter, lease: float = 0.0) -> None:
         super().__init__(*core)
         self._cell = cell
         self._waiter = waiter
@@ -145,7 +143,8 @@ class NodeVerbs(NodeCore[S]):
     async def emergency_stop(self) -> None:
         """Emergency stop of this node alone: maximum deceleration, buffers emptied, latched until ``reset``.
 
-        ``AxisNode.stop`` is the controlled stop, which is not latched; ``Workcell.emergency_stop_workcell`` stops everything.
+        ``AxisNode.stop`` is the controlled stop, which is not latched; ``Workcell.emergency_stop_workcell`` stops
+        everything.
         """
         await self._ask(Request.EMERGENCY_STOP)
 
@@ -173,7 +172,9 @@ class NodeVerbs(NodeCore[S]):
 
     @verb
     async def fresh(self) -> S:
-        """Return what ``read`` returns, but let an event loop go on until the newest snapshot shows what was acknowledged."""
+        """Return what ``read`` returns, but let an event loop go on until the newest snapshot shows what was
+        acknowledged.
+        """
         await self._settled()
         return self.read()
 
@@ -366,16 +367,16 @@ class AnalogVerbs(NodeVerbs[AnalogSnapshot]):
     async def zero(self, samples: int = 1, timeout: float | None = 10.0) -> list[float]:
         """Take the mean of the next readings as offset; return what it was.
 
-        Readings that were measured before the request, INVALID or SATURATED ones do not count. What is read after it counts from
-        the new zero.
+        Readings that were measured before the request, INVALID or SATURATED ones do not count. What is read after it
+        counts from the new zero.
 
         Args:
             samples: readings to be averaged, from 1.
             timeout: longest wait [s], None = for ever.
 
         Raises:
-            OSError: EIO as many bad readings came as good ones were asked for, or the device is lost; EBUSY a tactile finger is touched
-                or blind; the offset is then as before.
+            OSError: EIO as many bad readings came as good ones were asked for, or the device is lost; EBUSY a tactile
+                finger is touched or blind; the offset is then as before.
             TimeoutError: too few readings came in time.
         """
         value: list[float] = await self._ask(

@@ -1,8 +1,10 @@
 """The seam between nodes and what carries them; type checkers see it, running programs load nothing of it.
 
-A node has its snapshots from ``Readings`` and sends its requests through a ``Waiter`` (``typed_faces``); nothing else of it knows
-of sockets, shared memory or descriptors that are passed. ``local`` and ``channel`` are the transport on one machine. Another one, as to
-another machine or out of a recording, brings both of its own and the same node on top: tests/unit/client/test_transport.py does.
+A node has its snapshots from ``Readings`` and sends its requests through a ``Waiter`` (``typed_faces``); nothing else
+of it knows of sockets, shared memory or descriptors that are passed. ``local`` and ``channel`` are the transport on one
+machine. Another one, as to
+another machine or out of a recording, brings both of its own and the same node on top:
+    tests/unit/client/test_transport.py does.
 """
 
 from __future__ import annotations

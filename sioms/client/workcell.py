@@ -74,9 +74,7 @@ class Workcell(Blocking, WorkcellVerbs[Marker]):
         ) -> N: ...
 
         @overload
-        def open(
-            self, name: str, mode: str = "r", timeout: float | None = 0.0, *, lease: float = 0.0
-        ) -> Any: ...
+        def open(self, name: str, mode: str = "r", timeout: float | None = 0.0, *, lease: float = 0.0) -> Any: ...
 
     def open(
         self,

@@ -118,9 +118,7 @@ def _limit_inflated(path: Path) -> None:
 
 def _limit(size: int) -> None:
     if size > MOST_BYTES:
-        raise ValueError(
-            f"its arrays take {size / 2**20:.0f} MiB of memory; at most {MOST_BYTES / 2**20:.0f} are read"
-        )
+        raise ValueError(f"its arrays take {size / 2**20:.0f} MiB of memory; at most {MOST_BYTES / 2**20:.0f} are read")
 
 
 def _words(error: Exception) -> str:

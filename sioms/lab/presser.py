@@ -1,7 +1,7 @@
 """Press on something with an axis until a force is felt: feel for the surface, learn the way in, press with a force.
 
-Two nodes make a presser: an axis that presses [m, larger is further in] and one channel of a force [N, larger when pressed].
-The axis' own limits, its guard and the emergency stop hold as ever; whatever it does is watched.
+Two nodes make a presser: an axis that presses [m, larger is further in] and one channel of a force [N, larger when
+pressed]. The axis' own limits, its guard and the emergency stop hold as ever; whatever it does is watched.
 """
 
 from __future__ import annotations
@@ -37,9 +37,7 @@ class Presser:
         watched: further axes that must not be stopped while this presses; they are kept alive, too.
     """
 
-    def __init__(
-        self, axis: Any, force: Any, most_n: float, clear_m: float, watched: Sequence[Any] = ()
-    ) -> None:
+    def __init__(self, axis: Any, force: Any, most_n: float, clear_m: float, watched: Sequence[Any] = ()) -> None:
         self.axis, self.force, self.most_n = axis, force, most_n
         self._clear_m, self._axes = clear_m, (axis, *watched)
         self.surface = self.tare_n = math.nan
@@ -108,9 +106,7 @@ class Presser:
         """
         limits = node.info.channels[0].limits  # those of a command stay in force until others come
         speed, acceleration = limits["velocity"], limits["acceleration"]
-        taken = node.command(
-            position=position, max_velocity=speed, max_acceleration=acceleration, replace=True
-        )
+        taken = node.command(position=position, max_velocity=speed, max_acceleration=acceleration, replace=True)
         deadline = time.monotonic() + MOVE_S
         while True:
             time.sleep(POLL_S)
@@ -177,7 +173,8 @@ class Presser:
                 break
             if seen and seen[-1].tick > taken and not seen[-1].in_motion[0]:
                 raise ExperimentStopped(
-                    f"feel for a surface with {self.axis.name}: no {until_n:.3g} N on {self.force.name} up to {end:.4g} m; "
+                    f"feel for a surface with {self.axis.name}: no {until_n:.3g} N on {self.force.name} up to "
+                    f"{end:.4g} m; "
                     "see to the force, the place and what is to be pressed"
                 )
         self.axis.stop()
@@ -187,15 +184,15 @@ class Presser:
 
 
 def _rising(position: Floats, force: Floats, bins: int = 40) -> tuple[Floats, Floats]:
-    """Return positions and the force that grows with them, from no force on; a line through what is pressed leads to none."""
+    """Return positions and the force that grows with them, from no force on; a line through what is pressed leads to
+    none.
+    """
     inside = slice(0, int(np.argmax(position)) + 1)
     position, force = position[inside], force[inside]
     edges = np.linspace(position[0], position[-1], bins * 4)
     which = np.clip(np.searchsorted(edges, position) - 1, 0, len(edges) - 2)
     count = np.bincount(which, minlength=len(edges) - 1)
-    at, felt = (
-        np.bincount(which, v, len(edges) - 1)[count > 0] / count[count > 0] for v in (position, force)
-    )
+    at, felt = (np.bincount(which, v, len(edges) - 1)[count > 0] / count[count > 0] for v in (position, force))
     pressed = felt > 0.05 * felt.max()
     first = int(np.flatnonzero(~pressed)[-1]) + 1 if not pressed.all() else 0
     at, felt = at[first:], np.maximum.accumulate(felt[first:])

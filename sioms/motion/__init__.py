@@ -1,7 +1,7 @@
 """Motion: command buffers, profiles, limits and control laws of axes. Pure: no I/O and no clock.
 
-A Bank is the axes of one device: AxisBank closes the loop on the host, DriveBank feeds drives that close their own. Positions are in
-the unit of the axis (m or rad), forces in N or N*m, instants in integer ns of CLOCK_MONOTONIC.
+A Bank is the axes of one device: AxisBank closes the loop on the host, DriveBank feeds drives that close their own.
+Positions are in the unit of the axis (m or rad), forces in N or N*m, instants in integer ns of CLOCK_MONOTONIC.
 """
 
 from .actions import ActionKind, DriveAction

@@ -75,7 +75,9 @@ class Approach(NamedTuple):
 
 
 class Arrivals:
-    """How near the axes of a bank must come. Arrays (n,): ``tries`` of the last point move, ``misses`` since the start."""
+    """How near the axes of a bank must come. Arrays (n,): ``tries`` of the last point move, ``misses`` since the
+    start.
+    """
 
     def __init__(self, settings: Sequence[AxisSettings]) -> None:
         given = [s.arrival for s in settings]

@@ -2,8 +2,8 @@
 
 A bank owns what is published, the commands that wait, the latches, the coordinates and the events. *How* axes run is a
 loop's: ``AxisBank`` closes it on the host, ``DriveBank`` feeds drives that close their own. A loop is asked through the
-hooks at the end of the class and finds every command in the queue's buffers: short writes that have been acknowledged and not yet
-put there (decision 0023) never get past a verb, because each begins with ``_settle`` or ``_forget``.
+hooks at the end of the class and finds every command in the queue's buffers: short writes that have been acknowledged
+and not yet put there (decision 0023) never get past a verb, because each begins with ``_settle`` or ``_forget``.
 
 Pure: no I/O and no clock; every call that depends on time takes ``now_ns`` (CLOCK_MONOTONIC), never falling.
 """
@@ -69,9 +69,7 @@ class Bank(ABC):
     DEFERS: ClassVar[bool]
     """Whether the loop can begin a command later as if it had begun at the instant of its write."""
 
-    def __init__(
-        self, settings: Sequence[AxisSettings], markers: MarkerPort, capacity: int, *, passing: bool
-    ) -> None:
+    def __init__(self, settings: Sequence[AxisSettings], markers: MarkerPort, capacity: int, *, passing: bool) -> None:
         n = self.n = len(settings)
         self.settings = tuple(settings)
         self.fields = np.zeros((len(READ[NodeClass.AXIS]), n))
@@ -108,9 +106,7 @@ class Bank(ABC):
         if not (short and self.offer(records.tolist(), axes, now_ns, replace=replace)):
             self.take(verdict(self.judge(records, axes, now_ns, replace=replace)), now_ns)
 
-    def offer(
-        self, records: Sequence[tuple[Any, ...]], axes: AxesLike, now_ns: int, *, replace: bool = False
-    ) -> bool:
+    def offer(self, records: Sequence[tuple[Any, ...]], axes: AxesLike, now_ns: int, *, replace: bool = False) -> bool:
         """Take a short write at once; False, and nothing taken, when append() has to judge it.
 
         The next tick or verb carries it out at its own instant: the writer has its acknowledgement sooner, and
@@ -135,9 +131,7 @@ class Bank(ABC):
             self._settle()
         return True
 
-    def judge(
-        self, records: NDArray[Any], axes: AxesLike, now_ns: int, *, replace: bool = False
-    ) -> Judgement:
+    def judge(self, records: NDArray[Any], axes: AxesLike, now_ns: int, *, replace: bool = False) -> Judgement:
         """Judge a long write piece by piece, between ticks; what append() would refuse is refused here.
 
         Args, Raises: as append(). Returns, at its end: what take() takes.
@@ -183,8 +177,8 @@ class Bank(ABC):
         """Start the commands that wait for the external synch, all exactly at start_ns.
 
         A command is started when it holds its axis: it is the next, and what runs before it is a
-        hold or lasts until the next command. Other axes are not affected. Axes that the host moves, and for which start_ns
-        passed more than a tick ago, are stopped and their buffers dropped (ETIME), never hurried.
+        hold or lasts until the next command. Other axes are not affected. Axes that the host moves, and for which
+        start_ns passed more than a tick ago, are stopped and their buffers dropped (ETIME), never hurried.
 
         Returns:
             the axes released.
@@ -227,9 +221,7 @@ class Bank(ABC):
         if self._written:
             dropped = frozenset(chosen.tolist())
             left = [(write, [c for c in write.commands if c.axis not in dropped]) for write in self._written]
-            self._written = [
-                write._replace(commands=cs, axes=write.axes - dropped) for write, cs in left if cs
-            ]
+            self._written = [write._replace(commands=cs, axes=write.axes - dropped) for write, cs in left if cs]
         return chosen
 
     # -- stopping -----------------------------------------------------------------------------
@@ -274,7 +266,8 @@ class Bank(ABC):
         return self._queue.fault_text(axis)
 
     def reset(self, axes: AxesLike) -> None:
-        """Clear emergency stop and fault, a drive's own too; axes that were let go, and steppers that lost steps, hold where they are.
+        """Clear emergency stop and fault, a drive's own too; axes that were let go, and steppers that lost steps, hold
+        where they are.
 
         Nothing resumes.
         """
@@ -317,9 +310,7 @@ class Bank(ABC):
         """Narrow the limits of axes, or with None return to the configured ones; see CommandQueue.set_limits()."""
         chosen = np.asarray(axes, dtype=np.int64)
         if not self.is_idle(chosen):
-            raise CommandError(
-                errno.EBUSY, "set limits: an axis moves or has commands; wait until it is idle"
-            )
+            raise CommandError(errno.EBUSY, "set limits: an axis moves or has commands; wait until it is idle")
         self._queue.set_limits(chosen, limits, self._position)
         self._limits_changed(chosen)
 

@@ -21,9 +21,7 @@ from .settings import AxisKind, AxisSettings
 from .types import CommandError, MarkerPort, RecordError
 
 WIRE_DTYPE = np.dtype(numpy_dtype(NodeClass.AXIS))
-COMMAND_DTYPE = np.dtype(
-    [*numpy_dtype(NodeClass.AXIS), ("signal_generation", "<i8"), ("wait_generation", "<i8")]
-)
+COMMAND_DTYPE = np.dtype([*numpy_dtype(NodeClass.AXIS), ("signal_generation", "<i8"), ("wait_generation", "<i8")])
 """A record as buffered: ``axis`` is the bank axis, marker tokens are resolved to number and generation."""
 
 M = ControlMode
@@ -87,9 +85,7 @@ class Limits:
         room = float(max(self.room_below[axis], self.room_above[axis]))
         return f" with {room:g} left for the take-up of backlash" if room else ""
 
-    def reach(
-        self, axis: NDArray[np.int64], mode: NDArray[Any]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def reach(self, axis: NDArray[np.int64], mode: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the lowest and highest position that each command of these modes may lead its axis to."""
         low, high, point = self.minimum[axis], self.maximum[axis], is_point_move(mode)
         return low + point * self.room_below[axis], high - point * self.room_above[axis]
@@ -214,8 +210,7 @@ class Validator:
                 errno.EINVAL,
                 commands,
                 i,
-                f"control_mode {int(mode[i]):#06x} is no command; one of {names}, "
-                "RELATIVE only with POSITION",
+                f"control_mode {int(mode[i]):#06x} is no command; one of {names}, RELATIVE only with POSITION",
             )
         passes = int(M.POSITION | M.VELOCITY)
         bad = (mode & passes) == passes
@@ -260,9 +255,7 @@ class Validator:
             towards = (mode & QUANTITIES) == int(M.VELOCITY | M.ACCELERATION)
             bad = towards & (commands["acceleration"] <= 0)
             if bad.any():
-                raise self._out_of_range(
-                    commands, int(bad.argmax()), TOWARDS, self._limits.acceleration[axis]
-                )
+                raise self._out_of_range(commands, int(bad.argmax()), TOWARDS, self._limits.acceleration[axis])
         if present & M.SPECIFIED_GAINS:
             bad = ((mode & int(M.SPECIFIED_GAINS)) != 0) & (np.abs(commands["kp"]) >= 1)
             if bad.any():
@@ -274,9 +267,7 @@ class Validator:
                     f"kp {commands['kp'][i]} makes the law unstable; between -1 and 1",
                 )
 
-    def _out_of_range(
-        self, commands: NDArray[Any], i: int, rule: Rule, bound: NDArray[np.float64]
-    ) -> RecordError:
+    def _out_of_range(self, commands: NDArray[Any], i: int, rule: Rule, bound: NDArray[np.float64]) -> RecordError:
         settings = self._settings[int(commands["axis"][i])]
         unit = rule.unit.format(u=settings.unit, f=settings.force_unit)
         low = "above 0" if rule.positive else f"{-bound[i]:g}"

@@ -192,7 +192,8 @@ class DriveBank(Bank):
         holds: NDArray[np.bool_] | None = None,
         asked_ns: int = 0,
     ) -> None:
-        """Take the drives' reports, look whether they move as they were told, end what has ended and begin what follows.
+        """Take the drives' reports, look whether they move as they were told, end what has ended and begin what
+        follows.
 
         Args:
             now_ns: instant of the report [ns].
@@ -226,9 +227,7 @@ class DriveBank(Bank):
         if self.keeper is not None and self._seen:
             homed = (self._queue.latched & int(AxisStatus.HOMED)) != 0
             lost = (self._queue.latched & LOST) != 0
-            self.keeper.note(
-                ~self._active & ~self._moving & ~lost, homed, self._raw, self._position, self._last_ns
-            )
+            self.keeper.note(~self._active & ~self._moving & ~lost, homed, self._raw, self._position, self._last_ns)
 
     def advance(self, now_ns: int) -> None:
         """Do what time and markers allow without a new report: end timed commands, begin what waits."""
@@ -300,7 +299,10 @@ class DriveBank(Bank):
                 continue
             if self._repeats[axis] > DISOBEYED and not self._refused_stop[axis]:
                 unit = self.settings[axis].unit
-                text = f"axis {self.settings[axis].name} does not stop: told so {self._repeats[axis]} times, it moves at {self._velocity[axis]:.3g} {unit}/s"
+                text = (
+                    f"axis {self.settings[axis].name} does not stop: told so {self._repeats[axis]} times, it moves at "
+                    f"{self._velocity[axis]:.3g} {unit}/s"
+                )
                 self._fault_fresh(np.array([axis]), text, now_ns)
             latched = bool(self._queue.latched[axis] & LATCHED)
             self._again_ns[axis] = NEVER_NS
@@ -501,9 +503,7 @@ class DriveBank(Bank):
             approach = self._approach_of(axis, command)
             try:
                 if not low <= target <= high:
-                    raise InfeasibleError(
-                        f"position {target:g} is outside the soft limits; {low:g} to {high:g}"
-                    )
+                    raise InfeasibleError(f"position {target:g} is outside the soft limits; {low:g} to {high:g}")
                 if approach is not None:
                     approach.begin_of_take_up(target, low, high)
             except InfeasibleError as error:
@@ -552,9 +552,7 @@ class DriveBank(Bank):
 
     def _publish(self) -> None:
         running = np.array([c is not None for c in self._running])
-        position_mode = np.array(
-            [c is not None and bool(c.control_mode & modes.POSITION) for c in self._running]
-        )
+        position_mode = np.array([c is not None and bool(c.control_mode & modes.POSITION) for c in self._running])
         self._target[~self._active] = self._position[~self._active]
         np.copyto(self._desired, np.where(position_mode, self._target, self._position))
         np.copyto(self._desired_velocity, self._velocity)

@@ -69,9 +69,7 @@ class Feasibility:
         axis, mode = c["axis"].astype(np.int64), c["control_mode"]
         first = np.concatenate(([True], axis[1:] != axis[:-1]))
         velocity = _filled(c["max_velocity"], (mode & modes.MAX_VEL_ACC) != 0, first, tail.velocity[axis])
-        acceleration = _filled(
-            c["max_acceleration"], (mode & modes.MAX_VEL_ACC) != 0, first, tail.acceleration[axis]
-        )
+        acceleration = _filled(c["max_acceleration"], (mode & modes.MAX_VEL_ACC) != 0, first, tail.acceleration[axis])
         end, begin = self._states(c, first, tail, acceleration)
         self._check_reach(commands, order, c, end, velocity)
         bounds = np.stack(
@@ -92,9 +90,7 @@ class Feasibility:
         last = np.flatnonzero(np.concatenate((first[1:], [True])))
         tail.set_rows(axis[last], Tail(end[last], velocity[last], acceleration[last]))
 
-    def _states(
-        self, c: NDArray[Any], first: NDArray[np.bool_], tail: Tail, limit: Floats
-    ) -> tuple[Floats, Floats]:
+    def _states(self, c: NDArray[Any], first: NDArray[np.bool_], tail: Tail, limit: Floats) -> tuple[Floats, Floats]:
         """Return the states (m, 3) in which the commands end and begin, NaN where unknown."""
         mode, time = c["control_mode"], c["time"]
         timed = (mode & modes.TIME) != 0
@@ -107,9 +103,7 @@ class Feasibility:
         begin = np.where(first[:, None], before, np.roll(end, 1, axis=0))
         free = certain & timed & ((mode & modes.PASS) == modes.PASS) & ((mode & modes.ACCELERATION) == 0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            own = pass_acceleration(
-                begin[:, 0], begin[:, 1], end[:, 0], end[:, 1], np.where(timed, time, 1.0)
-            )
+            own = pass_acceleration(begin[:, 0], begin[:, 1], end[:, 0], end[:, 1], np.where(timed, time, 1.0))
         own = np.clip(own, -limit, limit)
         end[:, 2] = np.where(free, own, np.where((mode & modes.ACCELERATION) != 0, c["acceleration"], 0.0))
         begin = np.where(first[:, None], before, np.roll(end, 1, axis=0))
@@ -146,9 +140,7 @@ class Feasibility:
         rows = np.flatnonzero(timed & passing)
         if rows.size:
             b, e, t = begin[rows].T, end[rows].T, c["time"][rows]
-            position, velocity, acceleration = enclosures(
-                quintic((b[0], b[1], b[2]), (e[0], e[1], e[2]), t), t
-            )
+            position, velocity, acceleration = enclosures(quintic((b[0], b[1], b[2]), (e[0], e[1], e[2]), t), t)
             v, a, _, low, high = bounds[rows].T
             doubtful[rows] = (
                 (np.abs(velocity).max(axis=0) > v)

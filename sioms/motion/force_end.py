@@ -1,11 +1,12 @@
-"""What follows a force command that ends without another command: the axis brakes and holds, and presses no harder than it was told.
+"""What follows a force command that ends without another command: the axis brakes and holds, and presses no harder than
+it was told.
 
 The place to be held follows from a profile of braking. Where something stands within that way, the control law would
 press on it with all it has, although a few newtons were asked for. So the actuator may work against the motion with
 all its force, but in the direction of the motion, or of the force when the axis stood, at most with the force that was
 asked for, beside the offset. Where that is not enough to follow the set-point, the set-point yields: the axis holds
-where it is. An axis that is thrown back is braked with a tenth of its force if that is more. At rest the bound is lifted; what is held then is
-held against what pushes from outside.
+where it is. An axis that is thrown back is braked with a tenth of its force if that is more. At rest the bound is
+lifted; what is held then is held against what pushes from outside.
 
 Pure; concurrency: that of its bank.
 """
@@ -83,9 +84,7 @@ class ForceEnds:
         self._presses &= direction != 0.0
         np.copyto(output, np.minimum(output * direction, most) * direction, where=self._presses)
 
-    def look(
-        self, velocity: NDArray[np.float64], limit: NDArray[np.float64], now_ns: int
-    ) -> NDArray[np.int64]:
+    def look(self, velocity: NDArray[np.float64], limit: NDArray[np.float64], now_ns: int) -> NDArray[np.int64]:
         """Lift the bounds of axes at rest; return the axes whose set-point has to yield.
 
         Args:

@@ -23,7 +23,8 @@ class LimitGuard:
     Velocity, acceleration and jerk commands may lead out of the limits, so may a position profile
     that begins at speed: there the set-point is watched and stands at the limit exactly. In force
     mode the measured state is watched, of velocity too, and the axis goes over to a position-held
-    stop that presses no harder than the force that was asked for (force_end.py), and says so: FORCE_ENDED. Concurrency: that of the bank.
+    stop that presses no harder than the force that was asked for (force_end.py), and says so: FORCE_ENDED. Concurrency:
+    that of the bank.
     """
 
     def __init__(self, queue: CommandQueue, sequencer: Sequencer) -> None:

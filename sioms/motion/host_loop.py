@@ -1,7 +1,7 @@
 """AxisBank: axes whose loop the host closes.
 
-A tick measures, advances plans, keeps limits, applies the control law and fills ``fields``; what verbs mean is in bank.py,
-which plan an axis runs and what follows it in sequencer.py.
+A tick measures, advances plans, keeps limits, applies the control law and fills ``fields``; what verbs mean is in
+bank.py, which plan an axis runs and what follows it in sequencer.py.
 """
 
 from __future__ import annotations
@@ -305,9 +305,7 @@ class AxisBank(Bank):
             self._sequencer.release(np.array(released), now_ns)
             self._sequencer.refresh(np.array(released))
         for axis, number in broken:
-            self._abandon(
-                np.array([axis]), now_ns, errno.EPIPE, f"marker {number} was freed while waited for"
-            )
+            self._abandon(np.array([axis]), now_ns, errno.EPIPE, f"marker {number} was freed while waited for")
 
     def _control(self, dt: float) -> None:
         law, desired = self._law, self._desired
@@ -370,9 +368,7 @@ class AxisBank(Bank):
         for axis in axes[(self._queue.latched[axes] & bits) == 0].tolist():
             self._queue.latched[axis] |= bits | (int(AxisStatus.STALLED) if self.stepper[axis] else 0)
             unit = self.settings[axis].unit
-            text = (
-                f"following error {self._following[axis]:g} {unit}; at most {self._error_max[axis]:g} {unit}"
-            )
+            text = f"following error {self._following[axis]:g} {unit}; at most {self._error_max[axis]:g} {unit}"
             self.fault([axis], text, now_ns)
             if not self.stepper[axis]:
                 self._actuator[axis] = self._force[axis] = self._law.output[axis] = 0.0

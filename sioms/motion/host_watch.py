@@ -1,15 +1,17 @@
 """The motion watch of axes whose loop the host closes: what watch.py finds of drives, for all axes of a bank at once.
 
-The host knows in each tick where an axis should be, so less has to be reckoned with than of a drive that plans by itself. Looked
-at is the raw position. Found are
+The host knows in each tick where an axis should be, so less has to be reckoned with than of a drive that plans by
+itself. Looked at is the raw position. Found are
 
 * *lost*: a step between two ticks that no axis can make, and that stands in the next tick. What was seen once is not
   believed: one damaged reading must stop nothing.
 * *too fast*: as in watch.py: the distance covered beyond ``1 + speed_margin`` times velocity_max adds up.
 * *uncommanded*: an axis that has settled and holds is farther than ``tolerance`` from where it came to rest.
-* *away*: an axis runs against the velocity that is commanded: its motor or its encoder is connected the wrong way round.
+* *away*: an axis runs against the velocity that is commanded: its motor or its encoder is connected the wrong way
+    round.
 
-Steps are looked at in each tick; the rest every LOOK_S, and is a finding when it is seen twice. Why so: docs/decisions/0165-the-watch-of-host-closed-loops.md.
+Steps are looked at in each tick; the rest every LOOK_S, and is a finding when it is seen twice. Why so:
+docs/decisions/0165-the-watch-of-host-closed-loops.md.
 
 Pure; concurrency: that of its bank.
 """
@@ -167,13 +169,10 @@ class HostWatch:
         away = self._against > AGAINST * self._tolerance
         odd = too_fast | (self._off > 1) | away
         return [
-            self._told(axis, way[axis] / dt, raw, commanded, too_fast, away)
-            for axis in np.flatnonzero(odd).tolist()
+            self._told(axis, way[axis] / dt, raw, commanded, too_fast, away) for axis in np.flatnonzero(odd).tolist()
         ]
 
-    def _told(
-        self, axis: int, speed: float, raw: Floats, commanded: Floats, too_fast: Flags, away: Flags
-    ) -> Finding:
+    def _told(self, axis: int, speed: float, raw: Floats, commanded: Floats, too_fast: Flags, away: Flags) -> Finding:
         one = self._settings[axis]
         if too_fast[axis]:
             text = fast_text(one, speed, float(self._velocity[axis]))

@@ -7,7 +7,8 @@ gain ki, which the section does not have, u gets ``ki sum(e dt)``, bounded by ta
 
 Stepper: the same form slews the output position: e is desired minus output position, the law gives
 the output velocity w (``kp`` acts on w[n-1], ``kb`` on the desired velocity), which is clipped to
-the limits of velocity and acceleration, and to what can be braked, before it moves the output. k = 1/tick with the rest zero
+the limits of velocity and acceleration, and to what can be braked, before it moves the output. k = 1/tick with the rest
+zero
 is dead beat: the output is on the set-point in every tick as long as the limits allow it.
 """
 
@@ -42,9 +43,7 @@ class ControlLaw:
         self.kb: Vector = gains[3]
         for given in settings:
             if given.kind is AxisKind.SERVO and given.k is None:
-                raise ValueError(
-                    f"axis {given.name}: a servo needs the gain k; without it nothing holds its position"
-                )
+                raise ValueError(f"axis {given.name}: a servo needs the gain k; without it nothing holds its position")
         default = [1.0 / tick_s if s.kind is AxisKind.STEPPER else 0.0 for s in settings]
         self.k[:] = [d if s.k is None else s.k for s, d in zip(settings, default, strict=True)]
         self.kz[:] = [s.kz for s in settings]
@@ -162,9 +161,7 @@ class ControlLaw:
             self.force_ends.bound(self.output, velocity, self.velocity_limit, self.force_limit)
         np.not_equal(self.output, self._u, out=self.saturated)
 
-    def _slew(
-        self, desired: Vector, desired_velocity: Vector, w_last: Vector, e_last: Vector, dt: float
-    ) -> None:
+    def _slew(self, desired: Vector, desired_velocity: Vector, w_last: Vector, e_last: Vector, dt: float) -> None:
         s = self.stepper_rows
         dv, limit = desired_velocity[s], self.acceleration_limit[s]
         e = desired[s] - self.slewed[s]
@@ -189,10 +186,10 @@ class ControlLaw:
         self.error[s] = e
         self.saturated[s] = ~locked & (np.abs(w - free) > 1e-3 * v)
 
-    def _jump_over(
-        self, low: Vector, high: Vector, a: Vector, s: slice | NDArray[np.int64]
-    ) -> tuple[Vector, Vector]:
-        """Widen the velocities that can be had in this tick: those up to the start velocity follow from each other at once."""
+    def _jump_over(self, low: Vector, high: Vector, a: Vector, s: slice | NDArray[np.int64]) -> tuple[Vector, Vector]:
+        """Widen the velocities that can be had in this tick: those up to the start velocity follow from each other at
+        once.
+        """
         jump = self._start_velocity[s]
         within = (low <= jump) & (high >= -jump)
         return (
@@ -200,9 +197,7 @@ class ControlLaw:
             np.where(within, np.maximum(high, jump + a), high),
         )
 
-    def _spare(
-        self, limit: Vector, desired_velocity: Vector, s: slice | NDArray[np.int64], dt: float
-    ) -> Vector:
+    def _spare(self, limit: Vector, desired_velocity: Vector, s: slice | NDArray[np.int64], dt: float) -> Vector:
         """Return the acceleration that is left to catch up with a set-point that accelerates itself."""
         own = np.abs(desired_velocity - self._last_velocity[s]) / dt
         self._last_velocity[s] = desired_velocity

@@ -123,9 +123,7 @@ class Planner:
             plan = Plan([*plan.segments, hold], math.inf, final, plan.guard)
         return plan
 
-    def timed_pass(
-        self, state: State, final: State, given_acceleration: bool, time: float, bounds: Bounds
-    ) -> Plan:
+    def timed_pass(self, state: State, final: State, given_acceleration: bool, time: float, bounds: Bounds) -> Plan:
         """Return the motion from state to final in exactly ``time`` [s]: the quintic when it keeps the limits.
 
         Otherwise Ruckig's profile stretched to that time, which needs less velocity and acceleration.

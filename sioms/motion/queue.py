@@ -88,9 +88,7 @@ class CommandQueue:
         self.gated_synch = np.zeros(self.n, dtype=bool)
         self.gated_marker = np.zeros(self.n, dtype=bool)
         self.latched = np.zeros(self.n, dtype=np.int64)
-        self.home_required = np.array(
-            [s.homing is not None and s.homing.required for s in settings], dtype=bool
-        )
+        self.home_required = np.array([s.homing is not None and s.homing.required for s in settings], dtype=bool)
         self._buffers = CommandBuffers(self.n, capacity)
         self._markers = markers
         self._validator = Validator(settings, self.limits, markers, passing)
@@ -107,9 +105,7 @@ class CommandQueue:
 
     # -- writing ------------------------------------------------------------------------------
 
-    def judge(
-        self, records: NDArray[Any], axes: AxesLike, at_rest: NDArray[np.float64], *, replace: bool
-    ) -> Judgement:
+    def judge(self, records: NDArray[Any], axes: AxesLike, at_rest: NDArray[np.float64], *, replace: bool) -> Judgement:
         """Check a written array and the state of its axes, piece by piece; nothing is taken yet.
 
         Args:
@@ -378,9 +374,7 @@ class CommandQueue:
             if not free:
                 raise CommandError(errno.EBUSY, what + "it moves or has commands; wait until it is idle")
 
-    def set_limits(
-        self, axes: NDArray[np.int64], limits: dict[str, LimitValue], position: NDArray[np.float64]
-    ) -> None:
+    def set_limits(self, axes: NDArray[np.int64], limits: dict[str, LimitValue], position: NDArray[np.float64]) -> None:
         """Set limits of axes; a value of None returns to the configured one.
 
         Args:
@@ -397,9 +391,7 @@ class CommandQueue:
             array = self._limit_array(name)
             values = list(given) if isinstance(given, Sequence) else [given] * len(axes)
             if len(values) != len(axes):
-                raise CommandError(
-                    errno.EINVAL, f"set limits: {len(values)} values of {name}; {len(axes)} or one"
-                )
+                raise CommandError(errno.EINVAL, f"set limits: {len(values)} values of {name}; {len(axes)} or one")
             for axis, value in zip(axes.tolist(), values, strict=True):
                 changes.append((array, axis, self._checked_limit(axis, name, value, position)))
         for array, axis, value in changes:
@@ -422,9 +414,7 @@ class CommandQueue:
             raise CommandError(errno.EINVAL, f"set limits: no limit {name!r}; one of {', '.join(arrays)}")
         return arrays[name]
 
-    def _checked_limit(
-        self, axis: int, name: str, value: float | None, position: NDArray[np.float64]
-    ) -> float:
+    def _checked_limit(self, axis: int, name: str, value: float | None, position: NDArray[np.float64]) -> float:
         what = f"set limits of axis {axis} ({self.settings[axis].name}): "
         configured = getattr(self.settings[axis], name)
         lower = name == "position_min"
@@ -494,9 +484,7 @@ class CommandQueue:
         for axis in axes.tolist():
             self._fault_text.pop(axis, None)
 
-    def emit(
-        self, kind: EventKind, axes: NDArray[np.int64], stamp_ns: int, errno_: int = 0, text: str = ""
-    ) -> None:
+    def emit(self, kind: EventKind, axes: NDArray[np.int64], stamp_ns: int, errno_: int = 0, text: str = "") -> None:
         """Note an event; it becomes an Event when it is taken."""
         if axes.size:
             self._events.append((kind, axes, stamp_ns, errno_, text))

@@ -33,7 +33,9 @@ Floats = NDArray[np.float64]
 REST = 1e-9
 """Speed below which a set-point is at rest [unit/s]."""
 PIECES = 2
-"""Pieces of a period that are not short: time itself bounds how many of them end in a tick, and they keep their instants."""
+"""Pieces of a period that are not short: time itself bounds how many of them end in a tick, and they keep their
+instants.
+"""
 SPARE_SHARE, BEGIN_S = 0.05, 50e-6
 """Share of the period, and what beginning a command takes of it [s]: how many may follow short ones on axes at rest."""
 
@@ -299,9 +301,7 @@ class Sequencer:
             rest = ~go
             self._rest(axes[rest], state[rest], start_ns[rest], fraction[rest], now_ns)
 
-    def _hold_back(
-        self, axes: Axes, state: Floats, short: NDArray[np.bool_], free: NDArray[np.bool_]
-    ) -> None:
+    def _hold_back(self, axes: Axes, state: Floats, short: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
         """Count what follows short commands; take out of ``free`` the axes that have had their share of this tick."""
         begun, rests = self._begun[axes], np.abs(state[:, 1]) <= REST
         over = free & short & (begun >= np.where(rests, 1, self._pieces))
@@ -329,7 +329,9 @@ class Sequencer:
         return axes[~np.isin(axes, tries)]
 
     def _try_again(self, axis: int) -> bool:
-        """Begin the running point move of a stepper anew, from where it is measured to be; tell whether that is possible."""
+        """Begin the running point move of a stepper anew, from where it is measured to be; tell whether that is
+        possible.
+        """
         store, row = self.store, int(self.store.row[axis])
         command, approach = self._row_command[row], self._approaches[axis]
         if command is None or approach is None:
@@ -404,9 +406,7 @@ class Sequencer:
                 command.max_acceleration,
             )
 
-    def _rest(
-        self, axes: Axes, state: Floats, start_ns: NDArray[np.int64], fraction: Floats, now_ns: int
-    ) -> None:
+    def _rest(self, axes: Axes, state: Floats, start_ns: NDArray[np.int64], fraction: Floats, now_ns: int) -> None:
         """Nothing follows: hold the axes at rest, brake the others."""
         store = self.store
         still = np.abs(state[:, 1]) <= REST

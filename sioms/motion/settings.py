@@ -248,13 +248,9 @@ class AxisSettings:
             if value is not None and not value > 0:
                 raise ValueError(f"axis {self.name}: {name} {value:g}; want a positive number")
         if not self.velocity_filter_s >= 0:
-            raise ValueError(
-                f"axis {self.name}: velocity_filter_s {self.velocity_filter_s:g}; want 0 or more"
-            )
+            raise ValueError(f"axis {self.name}: velocity_filter_s {self.velocity_filter_s:g}; want 0 or more")
         if not -1 < self.kp < 1:
-            raise ValueError(
-                f"axis {self.name}: kp {self.kp:g} makes the law unstable; want between -1 and 1"
-            )
+            raise ValueError(f"axis {self.name}: kp {self.kp:g} makes the law unstable; want between -1 and 1")
         if not 0 <= self.ki < float("inf"):
             raise ValueError(f"axis {self.name}: ki {self.ki:g}; want 0 or more")
         self._check_arrival()
@@ -268,7 +264,8 @@ class AxisSettings:
             range_, distance = self.position_max - self.position_min, abs(self.backlash.distance)
             if distance >= range_:
                 raise ValueError(
-                    f"axis {self.name}: backlash: distance {distance:g} does not fit between the soft limits; want below {range_:g}"
+                    f"axis {self.name}: backlash: distance {distance:g} does not fit between the soft limits; want "
+                    f"below {range_:g}"
                 )
         if self.kind is AxisKind.STEPPER and self.ki:
             raise ValueError(f"axis {self.name}: ki {self.ki:g}; want 0: a stepper goes where it is told")
@@ -276,7 +273,8 @@ class AxisSettings:
             return
         if self.arrival is not None and self.arrival.retries:
             raise ValueError(
-                f"axis {self.name}: arrival: retries {self.arrival.retries}; want 0: the loop of a servo tries all the time"
+                f"axis {self.name}: arrival: retries {self.arrival.retries}; want 0: the loop of a servo tries all the "
+                "time"
             )
         if self.start_velocity:
             raise ValueError(

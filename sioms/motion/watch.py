@@ -8,8 +8,8 @@ change. Found are
   two looks running, and the drive reports such a speed. A sum does not mind when looks come unevenly, and neither the
   noise of a differentiated encoder nor a short overshoot adds up.
 * *uncommanded*: an axis that is to hold is farther than ``tolerance`` from where it came to rest.
-* *away*: a move to a place gets farther from it (a velocity runs the other way) than braking from the speed at its start
-  needs.
+* *away*: a move to a place gets farther from it (a velocity runs the other way) than braking from the speed at its
+  start needs.
 * *lost*: the position is where the axis cannot have come since the last look. Its place is then no longer known.
 
 What is seen once is not believed, for one damaged reading must stop nothing; two looks make a finding: 20 to 40 ms at
@@ -32,7 +32,9 @@ from numpy.typing import NDArray
 from .settings import AxisSettings
 
 JITTER_S = 0.01
-"""Time at velocity_max that a speed may be exceeded by in all, and that an axis may be pushed by where no tolerance is given [s]."""
+"""Time at velocity_max that a speed may be exceeded by in all, and that an axis may be pushed by where no tolerance is
+given [s].
+"""
 LATE_S = 0.05
 """How much later than the reading its time stamp may be: a reply that was asked for twice [s]."""
 LATEST_S = 0.5
@@ -243,9 +245,7 @@ class MotionWatch:
         """Return how far an axis may run on: twice what it brakes in, and the way of the order over the line."""
         return velocity * velocity / float(self._acceleration[axis]) + 2 * LATE_S * abs(velocity)
 
-    def _reach(
-        self, axis: int, state: _State, gap_ns: int, confirmed: bool, watched: bool
-    ) -> tuple[float, float]:
+    def _reach(self, axis: int, state: _State, gap_ns: int, confirmed: bool, watched: bool) -> tuple[float, float]:
         """Return where the axis can have come since the last look."""
         slack, place = self._tolerance(axis), state.place
         if state.order is Order.HOLD and watched:
@@ -296,9 +296,7 @@ class MotionWatch:
             within_s = (now_ns - state.doubted_ns) / 1e9 if not gap else None
             return Finding(axis, lost_text(self._settings[axis], before, place, within_s), lost=True)
         if held:
-            return Finding(
-                axis, uncommanded_text(self._settings[axis], reference, place, velocity), lost=False
-            )
+            return Finding(axis, uncommanded_text(self._settings[axis], reference, place, velocity), lost=False)
         return Finding(axis, self._fast_text(axis, velocity), lost=False)
 
     def _is_too_fast(self, axis: int, state: _State, now_ns: int, place: float, velocity: float) -> bool:
@@ -308,11 +306,7 @@ class MotionWatch:
             state.late_before_s = state.late_s
         state.excess = max(0.0, state.excess + beyond)
         state.fast = state.fast + 1 if beyond > 0 else 0
-        return (
-            state.fast > 1
-            and state.excess > (JITTER_S + state.late_before_s) * fastest
-            and abs(velocity) > fastest
-        )
+        return state.fast > 1 and state.excess > (JITTER_S + state.late_before_s) * fastest and abs(velocity) > fastest
 
     def _is_away(self, axis: int, state: _State, place: float, velocity: float, confirmed: bool) -> bool:
         if state.order is Order.POINT:
@@ -341,7 +335,10 @@ class MotionWatch:
         if state.order is not Order.POINT:
             return away_text(self._settings[axis], velocity, state.goal)
         name, unit = self._settings[axis].name, self._settings[axis].unit
-        return f"axis {name} moves away from its target {state.goal:.6g} {unit}: at {state.place:.6g} {unit}, {velocity:.3g} {unit}/s"
+        return (
+            f"axis {name} moves away from its target {state.goal:.6g} {unit}: at {state.place:.6g} {unit}, "
+            f"{velocity:.3g} {unit}/s"
+        )
 
 
 # --- what is the same for axes whose loop the host closes --------------------------------------------
@@ -360,9 +357,7 @@ def fast_text(axis: AxisSettings, velocity: float, most: float) -> str:
 
 def away_text(axis: AxisSettings, velocity: float, commanded: float) -> str:
     """Say that an axis runs the other way; velocities in unit/s."""
-    return (
-        f"axis {axis.name} runs at {velocity:.3g} {axis.unit}/s; {commanded:.3g} {axis.unit}/s were commanded"
-    )
+    return f"axis {axis.name} runs at {velocity:.3g} {axis.unit}/s; {commanded:.3g} {axis.unit}/s were commanded"
 
 
 def uncommanded_text(axis: AxisSettings, reference: float, place: float, velocity: float) -> str:

@@ -115,6 +115,4 @@ _ORDER: dict[str, Callable[[Effect, float], DriveEffect]] = {
 
 def build_drive(effects: tuple[Effect, ...], tick_s: float) -> list[DriveEffect]:
     """Return the drive's effects in the order of the drive."""
-    return [
-        make(effect, tick_s) for name, make in _ORDER.items() for effect in effects if effect.name == name
-    ]
+    return [make(effect, tick_s) for name, make in _ORDER.items() for effect in effects if effect.name == name]

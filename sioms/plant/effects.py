@@ -117,9 +117,7 @@ CATALOGUE: Mapping[str, Kind] = {
     ),
     "offset": Kind(Place.PARAMETER, "constant force", {"force": Parameter("force")}),
     "payload": Kind(Place.PARAMETER, "further mass or inertia", {"mass": Parameter("mass", low=0.0)}),
-    "delay": Kind(
-        Place.DRIVE, "transport delay of the command", {"delay_s": Parameter("s", low=0.0, high=1.0)}
-    ),
+    "delay": Kind(Place.DRIVE, "transport delay of the command", {"delay_s": Parameter("s", low=0.0, high=1.0)}),
     "lag": Kind(Place.DRIVE, "first-order lag of the drive", {"tau_s": Parameter("s", low=0.0)}),
     "saturation": Kind(
         Place.DRIVE,
@@ -225,9 +223,7 @@ CATALOGUE: Mapping[str, Kind] = {
             "damping": Parameter("1", low=0.0, high=2.0, default=0.3),
         },
     ),
-    "encoder_scale": Kind(
-        Place.ENCODER, "reading = gain x", {"gain": Parameter("1", low=0.1, high=10.0, neutral=1.0)}
-    ),
+    "encoder_scale": Kind(Place.ENCODER, "reading = gain x", {"gain": Parameter("1", low=0.1, high=10.0, neutral=1.0)}),
     "encoder_eccentricity": Kind(
         Place.ENCODER,
         "reading = x + amplitude sin(2 pi x/pitch + phase)",
@@ -257,9 +253,7 @@ def parse_effects(text: str, axes: Sequence[str], source: str = "effects") -> tu
     return build_effects(table, axes, source)
 
 
-def build_effects(
-    table: Mapping[str, object], axes: Sequence[str], source: str = "effects"
-) -> tuple[Effect, ...]:
+def build_effects(table: Mapping[str, object], axes: Sequence[str], source: str = "effects") -> tuple[Effect, ...]:
     """Turn tables of effects by axis into effects of the bank.
 
     Raises:
@@ -307,9 +301,7 @@ def _collect(
     taken = {axis for (kind, _), axes in given.items() if kind == name for axis in axes}
     for layer, numbers in enumerate(layers):
         if not isinstance(numbers, Mapping):
-            mistakes.append(
-                f"{where}: {numbers!r} is no table; want {{ {', '.join(CATALOGUE[name].parameters)} }}"
-            )
+            mistakes.append(f"{where}: {numbers!r} is no table; want {{ {', '.join(CATALOGUE[name].parameters)} }}")
             continue
         values = _numbers(where, CATALOGUE[name].parameters, numbers, mistakes)
         for axis in members:

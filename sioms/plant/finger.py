@@ -144,9 +144,7 @@ class TactileArray:
         self.shape, self.truth = shape, scattered(shape)
         body = Layer(shape.core_m, shape.radius_m, shape.poisson_ratio, shape.shear_modulus_pa)
         self._rubber = rubber(body, tuple(self.truth.radii_m.tolist()))
-        self._factor, self.offset = (
-            np.broadcast_to(np.asarray(v, dtype=np.float64), n).copy() for v in (gain, offset)
-        )
+        self._factor, self.offset = (np.broadcast_to(np.asarray(v, dtype=np.float64), n).copy() for v in (gain, offset))
         self._noise, self._step = noise, resolution
         self._random = np.random.default_rng(seed)
         self._late = np.zeros(n)
@@ -202,9 +200,7 @@ class TactileArray:
             clearance_m: of an indenter that does not touch, for the pull of a conductor.
         """
         shape = self.shape
-        linear = self.strain(force / shape.length_m, angle_rad, indenter_radius_m) * (
-            -100.0 / self.truth.gains
-        )
+        linear = self.strain(force / shape.length_m, angle_rad, indenter_radius_m) * (-100.0 / self.truth.gains)
         if shape.creep:
             linear = self._crept(linear, time_s)
         np.multiply(linear, self._factor * (1.0 + shape.quadratic * linear), out=out)
@@ -212,9 +208,7 @@ class TactileArray:
         clear = 0.0 if force > 0.0 else clearance_m
         if shape.proximity and clear < 10 * _CLEARANCE_M:
             away = np.abs(np.remainder(self.truth.angles_rad - angle_rad + math.pi, math.tau) - math.pi)
-            out += (
-                shape.proximity * math.exp(-clear / _CLEARANCE_M) * np.exp(-away / shape.proximity_range_rad)
-            )
+            out += shape.proximity * math.exp(-clear / _CLEARANCE_M) * np.exp(-away / shape.proximity_range_rad)
         if shape.drift:
             out += shape.drift * math.sin(math.tau * time_s / shape.drift_s)
         if shape.mains:

@@ -100,8 +100,7 @@ class ForceSensor:
         self._sliders = None if flaws is None else _Sliders(flaws)
         self._began_s: float | None = None
         self._noise, self._step, self.bias, self._limit = (
-            np.broadcast_to(np.asarray(v, dtype=np.float64), 6).copy()
-            for v in (noise, resolution, bias, limit)
+            np.broadcast_to(np.asarray(v, dtype=np.float64), 6).copy() for v in (noise, resolution, bias, limit)
         )
         self._has_step = bool(np.all(self._step > 0))
         if not self._has_step and np.any(self._step != 0):

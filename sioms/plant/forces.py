@@ -132,7 +132,9 @@ class Spring:
 
 
 class Presliding:
-    """LuGre friction without its damping, Dahl's where the level does not rise: relaxed exactly at the velocity of the substep."""
+    """LuGre friction without its damping, Dahl's where the level does not rise: relaxed exactly at the velocity of the
+    substep.
+    """
 
     def __init__(self, effect: Effect, substep_s: float) -> None:
         self._level, self._rise = effect.values["level"], effect.values["rise"]

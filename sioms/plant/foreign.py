@@ -29,7 +29,8 @@ class Laws:
     Args:
         drive: change the force of the drive once a tick, after the effects of the drive.
         motor: add a force on the motor, in every substep.
-        resistance: add a level of dry friction, at least 0, in every substep; it varies as all dry friction of the bank does.
+        resistance: add a level of dry friction, at least 0, in every substep; it varies as all dry friction of the bank
+            does.
     """
 
     drive: tuple[DriveEffect, ...] = ()
@@ -69,7 +70,9 @@ class TwinForce(Protocol):
 
 
 class TwinFinger(Protocol):
-    """A finger as a model has it; the entry point ``finger`` makes it of (table, path, length_m, noise, resolution, seed)."""
+    """A finger as a model has it; the entry point ``finger`` makes it of (table, path, length_m, noise, resolution,
+    seed).
+    """
 
     @property
     def count(self) -> int:
@@ -95,6 +98,4 @@ def twin(kind: str) -> Any:
     """
     for point in entry_points(group=GROUP, name=kind):
         return point.load()
-    raise ValueError(
-        f"model_file: no installed package makes a twin ({kind}); its entry point goes to [{GROUP}]"
-    )
+    raise ValueError(f"model_file: no installed package makes a twin ({kind}); its entry point goes to [{GROUP}]")

@@ -104,9 +104,7 @@ def check_motors(motors: Sequence[Motor], tick_s: float) -> None:
         ValueError: names motor, number and what would be right.
     """
     if not motors or not 0 < tick_s < 1:
-        raise ValueError(
-            f"build motors: {len(motors)} motors, tick {tick_s:g} s; want 1 or more, and 0 to 1 s"
-        )
+        raise ValueError(f"build motors: {len(motors)} motors, tick {tick_s:g} s; want 1 or more, and 0 to 1 s")
     for axis, motor in enumerate(motors):
         where = f"build motor {axis}"
         if not 0 < motor.mass < math.inf:
@@ -149,9 +147,7 @@ def mechanics(motors: Sequence[Motor], effects: Sequence[Effect]) -> Mechanics:
         values = effect.values
         match effect.name:
             case "viscous":
-                viscous = Directed(
-                    viscous.plus + values["coefficient"], viscous.minus + values["coefficient_minus"]
-                )
+                viscous = Directed(viscous.plus + values["coefficient"], viscous.minus + values["coefficient_minus"])
             case "coulomb":
                 sliding = Directed(sliding.plus + values["level"], sliding.minus + values["level_minus"])
             case "payload":
@@ -225,9 +221,7 @@ def choose_substeps(
         if "stiffness" in effect.values:
             stiffness = stiffness + np.where(effect.active, effect.values["stiffness"], 0.0)
     if transmission is not None:
-        mass = np.where(
-            transmission.elastic, np.minimum(transmission.motor_mass, transmission.load_mass), mass
-        )
+        mass = np.where(transmission.elastic, np.minimum(transmission.motor_mass, transmission.load_mass), mass)
         stiffness, damping = stiffness + transmission.stiffness, damping + transmission.damping
     rate = float(np.max(np.maximum(np.sqrt(stiffness / mass), damping / mass)))
     needed = max(wanted, math.ceil(rate * tick_s / _PHASE_STEP))

@@ -1,4 +1,5 @@
-"""An elastic layer on a rigid core under an indenter, by finite elements in the radius and complementarity at the surface.
+"""An elastic layer on a rigid core under an indenter, by finite elements in the radius and complementarity at the
+surface.
 
 Independent of `sioms.tactile`, which it is there to test: no closed forms, exact shapes of the indenters, the
 contact found point by point.  Plane strain; traction and strain positive in tension, loads in compression.
@@ -44,9 +45,7 @@ class Layer:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.core_m < self.outer_m:
-            raise ValueError(
-                f"build layer: core {self.core_m} m, outer {self.outer_m} m; need 0 < core < outer"
-            )
+            raise ValueError(f"build layer: core {self.core_m} m, outer {self.outer_m} m; need 0 < core < outer")
         if not 0.0 <= self.poisson_ratio <= 0.495:
             raise ValueError(f"build layer: Poisson's ratio {self.poisson_ratio}; need 0 to 0.495")
         if not self.shear_modulus_pa > 0.0:
@@ -87,9 +86,7 @@ class Rubber:
         self.layer = layer
         radii = np.asarray(radii_m, dtype=np.float64)
         if not (np.all(radii - gauge_m / 2 >= layer.core_m) and np.all(radii + gauge_m / 2 <= layer.outer_m)):
-            raise ValueError(
-                f"build finger: elements at {radii.min()} to {radii.max()} m do not lie inside the layer"
-            )
+            raise ValueError(f"build finger: elements at {radii.min()} to {radii.max()} m do not lie inside the layer")
         answers = _mesh(layer, radii, gauge_m)
         half = POINTS // 2
         k = np.arange(half + 1, dtype=np.float64)
@@ -99,9 +96,7 @@ class Rubber:
         self.compliance = np.stack([own, cross, cross, own])
         self.compliance[:, : _MESHED + 1] = answers[:4]
         self._patterns: dict[tuple[float, float], Array] = {}
-        place = self._place = np.arange(
-            round(_REACH * POINTS / (2 * math.pi))
-        )  # one side; the other is its mirror
+        place = self._place = np.arange(round(_REACH * POINTS / (2 * math.pi)))  # one side; the other is its mirror
         push = np.fft.irfft(self.compliance[0], POINTS)  # u_r at 0 of p = 1 at one point
         self._normal: Array = push[place[:, None] - place] + push[place[:, None] + place]
         self._normal[:, 0] *= 0.5
@@ -136,7 +131,9 @@ class Rubber:
         return Pressing(load, step * float(np.count_nonzero(w) - 0.5), profile)
 
     def pattern(self, loads: Array, radius_m: float, adhesion: float) -> Array:
-        """Return the profiles per unit load at some loads, shape (loads, POINTS, nr); tabulated once for an indenter."""
+        """Return the profiles per unit load at some loads, shape (loads, POINTS, nr); tabulated
+        once for an indenter.
+        """
         key = (radius_m, adhesion)
         if key not in self._patterns:
             profiles, points = [], 8
@@ -213,9 +210,7 @@ def _complement(normal: Array, h: Array, weight: Array, load: float, guess: int)
         if not (inside.any() or pulled.any()):
             return w
         active = (active & ~pulled) | (inside & ~pulled.any())
-    raise ValueError(
-        f"press indenter: no contact found under {load} N/m; the load is too high for the finger"
-    )
+    raise ValueError(f"press indenter: no contact found under {load} N/m; the load is too high for the finger")
 
 
 def _mesh(layer: Layer, radii: Array, gauge_m: float) -> Array:
@@ -229,9 +224,7 @@ def _mesh(layer: Layer, radii: Array, gauge_m: float) -> Array:
     nodes = np.empty(2 * _ELEMENTS + 1)
     nodes[::2], nodes[1::2] = ends, (ends[1:] + ends[:-1]) / 2
     size = nodes.size
-    matrices = np.zeros(
-        (3, 2 * size, 2 * size)
-    )  # the factors of 1, k and k^2; u and v of a node side by side
+    matrices = np.zeros((3, 2 * size, 2 * size))  # the factors of 1, k and k^2; u and v of a node side by side
     constant, linear, square = matrices
     abscissae, weights = np.polynomial.legendre.leggauss(4)
     for element in range(_ELEMENTS):

@@ -100,9 +100,7 @@ class StepperBank:
         self._state = np.zeros((2, n))
         self.velocity, self.position = self._state
         self.position[:] = _column(steppers, "start")
-        self._rotor = FrictionStep(
-            self._state, mass, Directed.both(viscous), sliding, sliding, self._substep_s
-        )
+        self._rotor = FrictionStep(self._state, mass, Directed.both(viscous), sliding, sliding, self._substep_s)
         self._viscous, self._damping_of_move = viscous, viscous / tick_s
         self._micro = self._step / _column(steppers, "microsteps")
         self._wave_number = math.pi / (2 * self._step)
@@ -221,9 +219,7 @@ def _column(steppers: Sequence[Stepper], name: str) -> Array:
 
 def _check(steppers: Sequence[Stepper], tick_s: float) -> None:
     if not steppers or not 0 < tick_s < 1:
-        raise ValueError(
-            f"build steppers: {len(steppers)} motors, tick {tick_s:g} s; want 1 or more, and 0 to 1 s"
-        )
+        raise ValueError(f"build steppers: {len(steppers)} motors, tick {tick_s:g} s; want 1 or more, and 0 to 1 s")
     for axis, motor in enumerate(steppers):
         for name in ("mass", "step", "microsteps", "hold_force", "corner_velocity"):
             value = getattr(motor, name)

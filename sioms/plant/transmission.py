@@ -31,9 +31,7 @@ class Transmission:
         count = np.sum([effect.active for effect in effects], axis=0)
         if np.any(count > 1):
             axis = int(np.argmax(count))
-            raise EffectsError(
-                f"build transmission of axis {axis}: {count[axis]} effects; must be one at most"
-            )
+            raise EffectsError(f"build transmission of axis {axis}: {count[axis]} effects; must be one at most")
         n = mass.size
         self.elastic = count == 1
         self._rigid = ~self.elastic

@@ -44,7 +44,9 @@ TO_DRIVER = Socket("daemon", "driver", ("starting", "up", "ending"))
 
 
 class Attach(Message, on=TO_DRIVER, verb=DriverVerb.ATTACH, notice=True, states=("up",)):
-    """Serve a handle from now on; descriptors: its socket, the writing end of the wake pipe, and the client's pidfd if any."""
+    """Serve a handle from now on; descriptors: its socket, the writing end of the wake pipe, and the client's pidfd if
+    any.
+    """
 
     handle: Integer
     block: Integer
@@ -112,7 +114,7 @@ class NodeReset(Message, on=TO_DRIVER, verb=DriverVerb.NODE_RESET, notice=True):
 FROM_DRIVER = Socket("driver", "daemon", TO_DRIVER.states)
 
 
-class Ready(Message, on=FROM_DRIVER, verb=DriverVerb.READY, notice=True, states=("starting", "ending"), then="up"):  # fmt: skip
+class Ready(Message, on=FROM_DRIVER, verb=DriverVerb.READY, notice=True, states=("starting", "ending"), then="up"):
     """Publishing has begun; descriptors: one page a block, writable until the daemon seals it."""
 
     blocks: Integer
@@ -165,7 +167,8 @@ class Describe(Message, on=TO_NURSERY, verb=NurseryVerb.DESCRIBE, query=True):
 
 
 class Spawn(Message, on=TO_NURSERY, verb=NurseryVerb.SPAWN):
-    """Fork a driver; descriptors: control socket, latch, stop-request file, file of the requests taken, markers, journal.
+    """Fork a driver; descriptors: control socket, latch, stop-request file, file of the requests taken, markers,
+    journal.
 
     Answer: its pid; descriptor: its pidfd.
     """

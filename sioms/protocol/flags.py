@@ -159,7 +159,12 @@ REQUESTS: dict[int, tuple[Right, bool, bool, str]] = {
     Request.WAIT_MARKER: (Right.WRITE, False, False, "wait for a marker; passed on to the daemon"),
     Request.RESERVE_MARKER: (Right.WRITE, False, False, "reserve a marker; passed on to the daemon"),
     Request.FREE_MARKER: (Right.WRITE, False, False, "free a marker; passed on to the daemon"),
-    Request.WAIT_UNTIL_EVENT: (Right.READ, False, False, "wait for an edge; answered by the client library, out of the page"),
+    Request.WAIT_UNTIL_EVENT: (
+        Right.READ,
+        False,
+        False,
+        "wait for an edge; answered by the client library, out of the page",
+    ),
     Request.SET_GAINS: (Right.WRITE, True, False, "set the gain matrix"),
     Request.GET_GAINS: (Right.READ, False, True, "tell the gain matrix"),
     Request.STOP: (Right.STOP | Right.WRITE, False, False, "stop at maximum deceleration and empty the buffers"),
@@ -171,9 +176,9 @@ REQUESTS: dict[int, tuple[Right, bool, bool, str]] = {
     Request.CANCEL_WAITS: (Right.WRITE | Right.ADMINISTER, False, False, "end the waits of all sessions on the node"),
     Request.GET_STATISTICS: (Right.READ, False, True, "tell tick times and link counters"),
     Request.GET_PARTICULARS: (Right.READ, False, True, "tell what readings do not"),
-}  # fmt: skip
-"""The table of requests: any of which rights it takes; whether it needs the output node itself, not its read-only companion;
-whether it only looks (else a reading after the answer shows its effect); what it does.
+}
+"""The table of requests: any of which rights it takes; whether it needs the output node itself, not its read-only
+companion; whether it only looks (else a reading after the answer shows its effect); what it does.
 """
 
 

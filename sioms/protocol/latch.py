@@ -92,9 +92,7 @@ class Latch:
         return printable(bytes(self._bytes[at : at + _TEXT_SIZE]).split(b"\0")[0].decode("utf-8", "replace"))
 
     def _set_text(self, at: int, text: str) -> None:
-        self._bytes[at : at + _TEXT_SIZE] = (
-            printable(text).encode()[: _TEXT_SIZE - 1].ljust(_TEXT_SIZE, b"\0")
-        )
+        self._bytes[at : at + _TEXT_SIZE] = printable(text).encode()[: _TEXT_SIZE - 1].ljust(_TEXT_SIZE, b"\0")
 
     def release(self) -> None:
         """Drop the views, so that the mapping can be closed."""

@@ -52,9 +52,7 @@ if "site" in sys.modules:
 
     def _unpack(data: bytes, most: int = MAX_UNPACKED) -> Any:
         wire.check(data, most)
-        return unpackb(
-            data, raw=False, use_list=True, strict_map_key=True, max_ext_len=0, ext_hook=_no_extension
-        )
+        return unpackb(data, raw=False, use_list=True, strict_map_key=True, max_ext_len=0, ext_hook=_no_extension)
 
     def _no_extension(kind: int, data: bytes) -> None:
         raise ValueError(f"extension type {kind}; messages hold no such thing")
@@ -154,11 +152,7 @@ def decode_reply(packet: bytes, most: int = MAX_PACKET) -> list[Any]:
         message += (False, 0)[len(message) - 4 :]
         if message[2] and type(message[3]) is str:
             message[3] = printable(message[3])
-        if (
-            type(message[4]) is bool
-            and type(message[5]) is int
-            and (not message[2] or type(message[3]) is str)
-        ):
+        if type(message[4]) is bool and type(message[5]) is int and (not message[2] or type(message[3]) is str):
             return message
     raise MalformedMessage("decode reply: not an array of 0, id, errno and value or text")
 
@@ -185,9 +179,7 @@ def unpack_compressed(data: object) -> Any:
             raise ValueError(f"not one whole stream of at most {MAX_UNPACKED} bytes")
         return _unpack(plain)
     except Exception as error:
-        raise MalformedMessage(
-            f"decompress answer: {type(error).__name__}: {printable(str(error), 200)}"
-        ) from None
+        raise MalformedMessage(f"decompress answer: {type(error).__name__}: {printable(str(error), 200)}") from None
 
 
 def reply(number: int, value: object = None, as_of_ns: int = 0) -> bytes:

@@ -4,8 +4,8 @@ Writing follows table F.3 of the dissertation column by column. Reading is kept 
 column ("struct of arrays") in the shared page, because a driver fills and a client takes whole
 columns; the record of one channel is one value of each.
 
-The classes ``AxisWrite``, ``AxisRead``, ... are the tables. Everything else is made from them and asks for columns by name:
-structs and dtypes, the rows of blocks and banks, snapshots and readings, which words of a command set which flag,
+The classes ``AxisWrite``, ``AxisRead``, ... are the tables. Everything else is made from them and asks for columns by
+name: structs and dtypes, the rows of blocks and banks, snapshots and readings, which words of a command set which flag,
 what devout takes, and ``docs/records.md``. The order in a table is the order on the wire.
 
 Units are SI and declared per channel in the node's information: {u} is m or rad, {f} is N or N*m.
@@ -76,17 +76,13 @@ class AxisWrite:
     )
     jerk: float = _real("{u}/s^3", "jerk", ControlMode.JERK)
     max_velocity: float = _real("{u}/s", "greatest velocity from now on", ControlMode.SPECIFIED_MAX_VEL_ACC)
-    max_acceleration: float = _real(
-        "{u}/s^2", "greatest acceleration from now on", ControlMode.SPECIFIED_MAX_VEL_ACC
-    )
+    max_acceleration: float = _real("{u}/s^2", "greatest acceleration from now on", ControlMode.SPECIFIED_MAX_VEL_ACC)
     time: float = _real("s", "duration; below 0 it lasts until the next command", ControlMode.SPECIFIED_TIME)
     k: float = _real("", "gain k of the control law", ControlMode.SPECIFIED_GAINS)
     kz: float = _real("", "gain kz of the control law", ControlMode.SPECIFIED_GAINS)
     kp: float = _real("", "gain kp of the control law", ControlMode.SPECIFIED_GAINS)
     kb: float = _real("", "gain kb of the control law", ControlMode.SPECIFIED_GAINS)
-    force_offset: float = _real(
-        "{f}", "force added to that of the control law", ControlMode.SPECIFIED_FORCE_OFFSET
-    )
+    force_offset: float = _real("{f}", "force added to that of the control law", ControlMode.SPECIFIED_FORCE_OFFSET)
     force: float = _real("{f}", "force to press with", ControlMode.FORCE)
     force_velocity: float = _real("{f}/s", "rate at which the force grows", ControlMode.FORCE_VELOCITY)
     max_force: float = _real("{f}", "greatest force from now on", ControlMode.SPECIFIED_MAX_FORCE)
@@ -194,13 +190,13 @@ def read_rows(node_class: NodeClass, fields: Any) -> dict[str, Any]:
     """
     words = fields.view("<i8")
     table = READ[node_class].values()
-    return {
-        column.name: fields[row] if column.code == "d" else words[row] for row, column in enumerate(table)
-    }
+    return {column.name: fields[row] if column.code == "d" else words[row] for row, column in enumerate(table)}
 
 
 def tuple_of(name: str, names: Iterable[str]) -> Any:
-    """Return a named tuple class of columns, to be derived from beside their table, which tells type checkers about them."""
+    """Return a named tuple class of columns, to be derived from beside their table, which tells type checkers about
+    them.
+    """
     from collections import namedtuple  # a tenth of the start time of a shell tool
 
     return namedtuple(name, names)

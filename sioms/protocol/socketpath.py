@@ -28,8 +28,8 @@ def own_path() -> str:
 def may_serve(uid: int, path: str) -> bool:
     """Tell whether a user's process can be the daemon at a path: root's, one's own, or that of its folder's owner.
 
-    Anybody can make a socket in a folder like /tmp, take a stop there and say that all is well. The owner of a folder is
-    no proof at one's own path, whose folder somebody else may have made first.
+    Anybody can make a socket in a folder like /tmp, take a stop there and say that all is well. The owner of a folder
+    is no proof at one's own path, whose folder somebody else may have made first.
     """
     if uid in (0, os.getuid()):
         return True

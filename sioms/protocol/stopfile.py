@@ -83,7 +83,9 @@ class StopRequest:
 
 
 def open_stop_request(path: str) -> StopRequest | None:
-    """Open the files beside a daemon's socket for requesting; None where there are none of a daemon or one has no right to."""
+    """Open the files beside a daemon's socket for requesting; None where there are none of a daemon or one has no right
+    to.
+    """
     try:
         fd = _open(path + REQUEST, os.O_WRONLY, path)
     except OSError:

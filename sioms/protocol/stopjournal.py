@@ -1,12 +1,12 @@
 """The journal of stops: what is stopped outlives every process that acts on it.
 
-A file of lines that are only ever appended, each one JSON object: a stop, or a reset, of the workcell or of a node. Daemon
-and drivers append to it before they acknowledge the request; who starts reads it and finds what was stopped, by whom, and
-that nobody has reset it since. A line is one write(2), which no death of a process can divide; what the power takes from
-the last one, or a full disk, is found, and counts as a stop of the workcell. So the file is never empty.
+A file of lines that are only ever appended, each one JSON object: a stop, or a reset, of the workcell or of a node.
+Daemon and drivers append to it before they acknowledge the request; who starts reads it and finds what was stopped, by
+whom, and that nobody has reset it since. A line is one write(2), which no death of a process can divide; what the power
+takes from the last one, or a full disk, is found, and counts as a stop of the workcell. So the file is never empty.
 
-From time to time the daemon appends a checkpoint, the state as of an earlier place in the file, and frees what lies before
-that place.
+From time to time the daemon appends a checkpoint, the state as of an earlier place in the file, and frees what lies
+before that place.
 
 Concurrency: any number of processes append; only the daemon makes checkpoints.
 """
@@ -125,7 +125,9 @@ class Stopped:
         return [[name, by] for by, name in dict.fromkeys(self.parts.values())]
 
     def of_device(self, device: str) -> list[list[Any]]:
-        """Return what is stopped of a device, each [block, [[first channel, last channel, bits], ...], who, name of the node]."""
+        """Return what is stopped of a device, each [block, [[first channel, last channel, bits], ...], who, name of the
+        node].
+        """
         groups: dict[tuple[str, str, str], list[tuple[int, int]]] = {}
         for (of, block, channel, bit), (by, name) in self.parts.items():
             if of == device:
@@ -169,9 +171,7 @@ def replay(data: bytes, start: int, now_s: float) -> Stopped:
     return state
 
 
-def _from_checkpoint(
-    place: int, checkpoint: Mapping[str, Any], start: int, now_s: float
-) -> tuple[Stopped, int]:
+def _from_checkpoint(place: int, checkpoint: Mapping[str, Any], start: int, now_s: float) -> tuple[Stopped, int]:
     """Return the state of the checkpoint at a place, and the place from which on entries add to it."""
     state = Stopped()
     try:
@@ -192,7 +192,9 @@ def entries_from(data: bytes) -> tuple[list[dict[str, Any] | None], int]:
 
 
 def _lines(data: bytes, start: int = 0) -> list[tuple[int, dict[str, Any] | None]]:
-    """Return the lines of a journal, each its place and its entry, None for what is none, as a last line without its end."""
+    """Return the lines of a journal, each its place and its entry, None for what is none, as a last line without its
+    end.
+    """
     lines: list[tuple[int, dict[str, Any] | None]] = []
     *whole, rest = data.split(b"\n")
     for line in whole:
@@ -227,8 +229,8 @@ class StopJournal:
     def append(self, entry: Mapping[str, Any], at_s: float) -> None:
         """Append an entry; begin a line of its own, whatever has become of the last one.
 
-        A stop that cannot be written damages the journal, which takes no room on the disk: whoever reads it finds that and
-        stops the workcell. Of a reset that cannot be written nothing is left, so that what was stopped stays so.
+        A stop that cannot be written damages the journal, which takes no room on the disk: whoever reads it finds that
+        and stops the workcell. Of a reset that cannot be written nothing is left, so that what was stopped stays so.
 
         Args:
             entry: of a stop, a reset or a checkpoint.

@@ -1,9 +1,11 @@
-"""The verb table: every message of every socket, with its arguments, who may send it, in which state, and by which right.
+"""The verb table: every message of every socket, with its arguments, who may send it, in which state, and by which
+right.
 
-A class is a message, its fields are the arguments in the order of the wire, and an instance is one that is sent or has been
-received. ``take`` decodes a packet of a peer and checks number and kinds of the arguments, the message number and the state, so
-that a TypeError of whoever serves it is its own mistake and not the peer's. What a value means (a channel that is none, a
-limit out of range) is judged, and refused, by who serves it. Messages between daemon, drivers and fork server: ``driver_verbs``.
+A class is a message, its fields are the arguments in the order of the wire, and an instance is one that is sent or has
+been received. ``take`` decodes a packet of a peer and checks number and kinds of the arguments, the message number and
+the state, so that a TypeError of whoever serves it is its own mistake and not the peer's. What a value means (a channel
+that is none, a limit out of range) is judged, and refused, by who serves it. Messages between daemon, drivers and fork
+server: ``driver_verbs``.
 
 docs/protocol.md is generated from this table.
 """
@@ -174,9 +176,7 @@ def take(
         parts = _checked(decode(packet, most, values), socket)
     kind_of, number = socket[parts[0]], parts[1]
     if state and state not in kind_of.states:
-        raise MalformedMessage(
-            f"{kind_of.__name__} while {state}; want it while {' or '.join(kind_of.states)}"
-        )
+        raise MalformedMessage(f"{kind_of.__name__} while {state}; want it while {' or '.join(kind_of.states)}")
     if not kind_of.notice and (number == 0 or number in pending):
         raise MalformedMessage(f"message number {number} is zero or in use")
     return number, kind_of.of(parts[2:])
@@ -192,9 +192,7 @@ def _checked(parts: list[Any], socket: Socket) -> list[Any]:
         raise MalformedMessage(f"verb {parts[0]} with {len(arguments)} arguments; want {len(fields)}")
     for value, kind in zip(arguments, fields.values(), strict=True):
         if type(value) not in kind.types and kind.types:
-            raise MalformedMessage(
-                f"verb {parts[0]} with {type(value).__name__} as an argument; want {kind.words}"
-            )
+            raise MalformedMessage(f"verb {parts[0]} with {type(value).__name__} as an argument; want {kind.words}")
         if value != value and kind.types:
             raise MalformedMessage(f"verb {parts[0]} with NaN as an argument; want {kind.words}")
         if kind.most and len(value) > kind.most:
@@ -211,7 +209,9 @@ FROM_CLIENT = Socket("client", "daemon", ("starting", "serving"))
 
 
 class Hello(Message, on=FROM_CLIENT, verb=ClientVerb.HELLO, query=True):
-    """Say who one is. Answer: [protocol version, workcell, rights]; descriptors of the stop-request file if it may stop."""
+    """Say who one is. Answer: [protocol version, workcell, rights]; descriptors of the stop-request file if it may
+    stop.
+    """
 
     version: Integer
     name: Text
@@ -220,8 +220,8 @@ class Hello(Message, on=FROM_CLIENT, verb=ClientVerb.HELLO, query=True):
 class Open(Message, on=FROM_CLIENT, verb=ClientVerb.OPEN, right=Right.READ):
     """Open a node, which takes the right to write, too, if the node can be written.
 
-    Answer: [handle, node, channels, bit, [process that made the socket, process behind it]]; descriptors of page, wake pipe
-    and the handle's socket.
+    Answer: [handle, node, channels, bit, [process that made the socket, process behind it]]; descriptors of page, wake
+    pipe and the handle's socket.
     """
 
     node: Name
@@ -263,17 +263,13 @@ class FreeMarker(Message, on=FROM_CLIENT, verb=ClientVerb.FREE_MARKER, shown=Tru
     token: Integer
 
 
-class SignalMarker(
-    Message, on=FROM_CLIENT, verb=ClientVerb.SIGNAL_MARKER, somewhere="signal a marker", shown=True
-):
+class SignalMarker(Message, on=FROM_CLIENT, verb=ClientVerb.SIGNAL_MARKER, somewhere="signal a marker", shown=True):
     """Signal a marker."""
 
     token: Integer
 
 
-class WaitMarker(
-    Message, on=FROM_CLIENT, verb=ClientVerb.WAIT_MARKER, somewhere="wait for a marker", shown=True
-):
+class WaitMarker(Message, on=FROM_CLIENT, verb=ClientVerb.WAIT_MARKER, somewhere="wait for a marker", shown=True):
     """Wait until a marker, by number or token, is signalled. Answer: when that was [ns]."""
 
     marker: Integer
@@ -313,7 +309,9 @@ ON_HANDLE = Socket("client", "driver", ("open",))
 
 
 class Write(Message, on=ON_HANDLE, verb=HandleVerb.WRITE, right=Right.WRITE, shown=True):
-    """Write records, those sent ahead in parts first, all or none; needs a handle that is open for writing. Answer: the tick."""
+    """Write records, those sent ahead in parts first, all or none; needs a handle that is open for writing. Answer: the
+    tick.
+    """
 
     flags: Integer
     timeout_s: Seconds

@@ -72,9 +72,7 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
     return rules.closest(out)
 
 
-def settle(
-    searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]]
-) -> tuple[Found, list[Rival]]:
+def settle(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]]) -> tuple[Found, list[Rival]]:
     """Find the rivals; where one does better than what is named, and the closed loop agrees, search on from it."""
     return rules.settle(
         found,

@@ -53,8 +53,8 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
 
     Args:
         session: recordings of one axis, in order.
-        nominal: the model to be corrected; effects already in it may be re-estimated and may leave. A resolution of zero
-            is the smallest step of the recorded position.
+        nominal: the model to be corrected; effects already in it may be re-estimated and may leave. A resolution of
+            zero is the smallest step of the recorded position.
 
     Returns:
         The verdict with its evidence.
@@ -93,11 +93,7 @@ def _upright(s: Searched) -> Searched:
             fit = searcher.fit(varied(found.fit.model.without_effect(name)), 6)
             step = Step("leave", name, fit.ratio, 1.0 - fit.cost / found.fit.cost, fit.model)
             found = Found(fit, searcher.loss(fit), (*found.ladder, step))
-    return (
-        replace(s, found=found, share=smoother_share(s.ready.problem, found.fit))
-        if found is not s.found
-        else s
-    )
+    return replace(s, found=found, share=smoother_share(s.ready.problem, found.fit)) if found is not s.found else s
 
 
 def _plain(s: Searched) -> Searched:
@@ -110,7 +106,8 @@ def _plain(s: Searched) -> Searched:
         return s
     # Names given to half of nothing mislead: the model, or a column, belongs to something else.
     note = (
-        f"whatever is added, {bare.ratio:.0f} times what noise would leave remains: the nominal model does not match these "
+        f"whatever is added, {bare.ratio:.0f} times what noise would leave remains: the nominal model does not match "
+        "these "
         "data; are model, force and position of the same axis?"
     )
     found = replace(s.found, fit=bare, losses=searcher.loss(bare))
@@ -143,16 +140,15 @@ def _explained(ready: Prepared, o: Options) -> Searched:
 
 
 def _changed(s: Searched) -> Timed | None:
-    """Return the change in time that leaves far less than everything that was named, and than any function of the state could.
+    """Return the change in time that leaves far less than everything that was named, and than any function of the state
+    could.
 
-    What warms up may stand for it, or a gap: it is looked for beside models without. Beside what warms up by how much the noise is
-    exceeded does not count.
+    What warms up may stand for it, or a gap: it is looked for beside models without. Beside what warms up by how much
+    the noise is exceeded does not count.
     """
     model = s.found.fit.model
     odd = s.found.fit.ratio > AXIS.odd
-    if s.ready.points or not (
-        odd or warm(model)
-    ):  # between rows that are points, anything would pass for a change
+    if s.ready.points or not (odd or warm(model)):  # between rows that are points, anything would pass for a change
         return None
     problem, frozen = s.ready.problem, s.searcher.frozen
     models = [m for m in (*(step.model for step in s.found.ladder), model) if not (warm(m) or rattles(m))]
@@ -185,7 +181,9 @@ def _terms(model: AxisModel) -> tuple[str, ...]:
 
 
 def _promising(searcher: Searcher, model: AxisModel, found: Found) -> bool:
-    """Say whether a nameless term, beside what was found or in the place of one of it, could save enough to be worth a search."""
+    """Say whether a nameless term, beside what was found or in the place of one of it, could save enough to be worth a
+    search.
+    """
     named = [n for n in found.fit.model.effects if n not in searcher.frozen]
     bare = [found.fit, *(searcher.fit(found.fit.model.without_effect(n), 6) for n in named)]
     left = [(1.0 - s.gain) * fit.cost for fit in bare for s in searcher.screen(fit, _terms(model))]
@@ -208,9 +206,7 @@ def _search(ready: Prepared, o: Options) -> tuple[Prepared, Gate, Searcher, Foun
         o.progress("excitation: what can these records show")
         excited = gate(ready.problem, ready.model, ready.names)
         names = tuple(n for n in ready.names if n not in excited.missing)
-        searcher = Searcher(
-            ready.problem, tuple(f.effect for f in ready.findings), names, progress=o.progress
-        )
+        searcher = Searcher(ready.problem, tuple(f.effect for f in ready.findings), names, progress=o.progress)
         found = searcher.run(start)
         if earlier:
             found = replace(
@@ -226,13 +222,9 @@ def _search(ready: Prepared, o: Options) -> tuple[Prepared, Gate, Searcher, Foun
         anew = noise_read(ready.problem, start)
         if turn == AGAIN or anew.noise.drive > FELL * ready.problem.noise.drive:
             break
-        o.progress(
-            f"the noise is {anew.noise.drive / ready.problem.noise.drive:.2f} of what it seemed: searching on"
-        )
+        o.progress(f"the noise is {anew.noise.drive / ready.problem.noise.drive:.2f} of what it seemed: searching on")
         earlier = found.ladder
-        final = replace(
-            anew, weights=None, session=ready.final.session, begin=ready.final.begin, end=ready.final.end
-        )
+        final = replace(anew, weights=None, session=ready.final.session, begin=ready.final.begin, end=ready.final.end)
         ready = replace(ready, problem=anew, final=final)
     return ready, excited, searcher, found
 

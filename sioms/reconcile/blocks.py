@@ -22,9 +22,11 @@ from sioms.reconcile.effect import Array
 from sioms.reconcile.fit import Problem
 
 BLOCK_S = 0.5
-#: A step without a fold that moves a parameter by more than this share of its size is tried, as long or shorter, not extrapolated.
+#: A step without a fold that moves a parameter by more than this share of its size is tried, as long or shorter, not
+#: extrapolated.
 NEAR, SHORTER = 0.1, (1.0, 0.3)
-#: Variances from which on it makes sense to ask how they scatter, and half the most degrees of freedom that the others lend.
+#: Variances from which on it makes sense to ask how they scatter, and half the most degrees of freedom that the others
+#: lend.
 LEAST_MODERATED, MOST_PRIOR = 4, 500.0
 
 
@@ -66,8 +68,8 @@ def heldout(
     """Sum of squares of each block when the parameters come from the other folds, shape (blocks,).
 
     Args:
-        moved: residual with the parameters changed by so many of their sizes. Where one fold tells most of a parameter the others
-            would move it far, to where the slopes of here say nothing; None: they are believed.
+        moved: residual with the parameters changed by so many of their sizes. Where one fold tells most of a parameter
+            the others would move it far, to where the slopes of here say nothing; None: they are believed.
     """
     h, g, c = _normal(fit, ids)
     if fit.jacobian.shape[1] == 0:
@@ -105,12 +107,14 @@ def intervals(fit: Fitted, ids: NDArray[np.int64], level: float = 0.95) -> Array
     """Half-widths of confidence intervals, in units of the parameters' scale, shape (k,).
 
     The parameters are moved by leaving out each block in turn (the jackknife, which does not count on the blocks
-    weighing alike), and Student's t is of as many blocks as the information on a parameter comes from. Where two blocks tell
-    a parameter, its own spread says next to nothing: it is drawn towards what the spreads of all are, in units of the formal ones.
+    weighing alike), and Student's t is of as many blocks as the information on a parameter comes from. Where two blocks
+    tell
+    a parameter, its own spread says next to nothing: it is drawn towards what the spreads of all are, in units of the
+        formal ones.
     Source: A. C. Cameron, D. L. Miller, "A practitioner's guide to cluster-robust inference", J. Human Resources 50
     (2015), sec. VI; A. V. Carter, K. T. Schnepel, D. G. Steigerwald, "Asymptotic behavior of a t-test robust to cluster
-    heterogeneity", Rev. Econ. Stat. 99 (2017) 698-709; G. K. Smyth, "Linear models and empirical Bayes methods", Stat. Appl.
-    Genet. Mol. Biol. 3 (2004), sec. 6.
+    heterogeneity", Rev. Econ. Stat. 99 (2017) 698-709; G. K. Smyth, "Linear models and empirical Bayes methods", Stat.
+    Appl. Genet. Mol. Biol. 3 (2004), sec. 6.
     """
     h, g, _ = _normal(fit, ids)
     b, k = g.shape
@@ -129,7 +133,8 @@ def intervals(fit: Fitted, ids: NDArray[np.int64], level: float = 0.95) -> Array
 def formal(fit: Fitted, level: float = 0.95) -> Array:
     """Half-widths of the intervals of least squares under white noise, in units of the parameters' scale, shape (k,).
 
-    Noise that is alike for a while only makes the truth wider: where the blocks say less, they are few, and it is chance. The larger
+    Noise that is alike for a while only makes the truth wider: where the blocks say less, they are few, and it is
+        chance. The larger
     of both is the safer. Source: J. D. Angrist, J.-S. Pischke, "Mostly Harmless Econometrics", 2009, sec. 8.2.
     """
     n, k = fit.jacobian.shape
@@ -140,7 +145,8 @@ def formal(fit: Fitted, level: float = 0.95) -> Array:
 
 
 def _moderated(variance: Array, formal: Array, freedom: Array) -> tuple[Array, Array]:
-    """Draw variances towards a common multiple of the formal ones, as strongly as they scatter less than chance would have it.
+    """Draw variances towards a common multiple of the formal ones, as strongly as they scatter less than chance would
+    have it.
 
     Returns:
         Variances and degrees of freedom; both as given where fewer than ``LEAST_MODERATED`` are told.

@@ -12,7 +12,8 @@ from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Fit, Free, Problem, descended, free_parameters, get, put, refit, shifted
 from sioms.reconcile.model import AxisModel
 
-#: Relative steps in which the numbers of a gap are searched: when it is new, and when it was found beside other effects.
+#: Relative steps in which the numbers of a gap are searched: when it is new, and when it was found beside other
+#: effects.
 UNPOLISHED = tuple(
     (symbol, width * spread)
     for spread in (0.25, 0.08, 0.025, 0.008)
@@ -20,7 +21,8 @@ UNPOLISHED = tuple(
 )
 POLISHED = (("gap", 0.08), ("gap", 0.025), ("gap", 0.008))
 BOUNCE = 3.0  # in units of the median residual
-#: Steps over which slopes are taken beside a gap, before and after its numbers are searched, in sizes of the numbers; that of intervals.
+#: Steps over which slopes are taken beside a gap, before and after its numbers are searched, in sizes of the numbers;
+#: that of intervals.
 STRIDES, INTERVALS = ((0.05, 0.02), (0.01, 0.003)), 0.03
 #: Fits from numbers that are off by so many of their sizes, to see what other minima are as deep.
 OTHERS, OFF = 3, 0.04
@@ -65,9 +67,10 @@ def polish(
 def bent(problem: Problem, model: AxisModel) -> Problem:
     """Let what a model leaves by bounces that fall out otherwise count little more than what it leaves elsewhere.
 
-    Few, they hold most of the squares. With these to go by, all other numbers would follow them, and what acts between the bounces
-    would not be seen. Source: P. W. Holland, R. E. Welsch, "Robust regression using iteratively reweighted least-squares", Comm.
-    Stat. A6 (1977) 813-827.
+    Few, they hold most of the squares. With these to go by, all other numbers would follow them, and what acts between
+    the bounces
+    would not be seen. Source: P. W. Holland, R. E. Welsch, "Robust regression using iteratively reweighted
+    least-squares", Comm. Stat. A6 (1977) 813-827.
     """
     return replace(problem, bend=spread(replace(problem, bend=np.inf).residual(model)))
 
@@ -89,14 +92,13 @@ def _inside(model: AxisModel, name: str) -> bool:
     )
 
 
-def deepest(
-    problem: Problem, model: AxisModel, frozen: Sequence[str], rng: np.random.Generator
-) -> tuple[Fit, ...]:
-    """Fit all numbers beside a gap, from the given ones and from others near them; the fit that leaves least comes first.
+def deepest(problem: Problem, model: AxisModel, frozen: Sequence[str], rng: np.random.Generator) -> tuple[Fit, ...]:
+    """Fit all numbers beside a gap, from the given ones and from others near them; the fit that leaves least comes
+    first.
 
-    Every bounce that comes to fall otherwise is a step in the cost: a slope over 0.2 % is that of the nearest step, not of the cost, and descent
-    by it ends where it began. Over some per cent steps average out. How far apart the minima are that it leads to from here and there is
-    how little the data tell.
+    Every bounce that comes to fall otherwise is a step in the cost: a slope over 0.2 % is that of the nearest step, not
+    of the cost, and descent by it ends where it began. Over some per cent steps average out. How far apart the minima
+    are that it leads to from here and there is how little the data tell.
     """
     free = free_parameters(model, frozen)
     starts = [model, *(shifted(model, free, OFF * rng.standard_normal(len(free))) for _ in range(OTHERS))]

@@ -41,9 +41,7 @@ def calibrated(problem: Problem, session: Session, model: AxisModel) -> Problem:
     stiffness = model.inertia * (2.0 * np.pi * UNMEASURED_HZ) ** 2
     coarse = model.effects.get("encoder_quantisation", {}).get("factor", 1.0)
     sensor = sensor_noise(session, model.resolution * coarse)
-    problem = replace(
-        problem, noise=observer(model, max(sensor, problem.noise.drive / stiffness), problem.noise.drive)
-    )
+    problem = replace(problem, noise=observer(model, max(sensor, problem.noise.drive / stiffness), problem.noise.drive))
     for _ in range(2):
         if any(laps):
             pairs = [
@@ -75,8 +73,8 @@ def calibrated(problem: Problem, session: Session, model: AxisModel) -> Problem:
 def _lowered(problem: Problem, model: AxisModel, design: Callable[[float], Noise]) -> Problem:
     """Halve the drive noise while that is more likely, by the innovations of most of the time in motion.
 
-    A measured force has noise of its own, of which the axis feels nothing; and where the sensor makes most of the innovation,
-    its size says little of the drive, but too fast an observer is seen.
+    A measured force has noise of its own, of which the axis feels nothing; and where the sensor makes most of the
+    innovation, its size says little of the drive, but too fast an observer is seen.
     """
     bare = replace(problem, weights=None)
     ids = block_ids(bare, model.sample_time_s, 0.1)

@@ -1,8 +1,8 @@
 """A number of the axis that changes in time: a load picked up, a brake that drags for a while, a supply that sags.
 
 No function of the state says this, for the state comes back and the number does not. What a number must have been in
-every short window of time is read off the residual by regression; then the sparsest courses are tried: it has two values and
-switches between them, or it swings with one frequency.
+every short window of time is read off the residual by regression; then the sparsest courses are tried: it has two
+values and switches between them, or it swings with one frequency.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from sioms.reconcile.thresholds import GAIN, PROMISING
 from sioms.reconcile.timed import known_beside
 from sioms.reconcile.windows import NUMBERS, View
 
-#: A course and the numbers of the model are fitted in turn at most so often, and until the force changes by less than this share.
+#: A course and the numbers of the model are fitted in turn at most so often, and until the force changes by less than
+#: this share.
 SETTLED, STILL = 8, 3e-3
 
 

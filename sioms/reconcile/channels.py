@@ -201,7 +201,9 @@ def drive(session: Session, model: AxisModel) -> list[Finding]:
 
 @dataclass(frozen=True, slots=True)
 class _Late:
-    """How late a drive is: by delay or lag, by how much [s] with its standard error; squares left by it, by the other, by neither."""
+    """How late a drive is: by delay or lag, by how much [s] with its standard error; squares left by it, by the other,
+    by neither.
+    """
 
     name: str
     value: float
@@ -239,9 +241,7 @@ def _latest(records: list[Record], limit: float, dt: float) -> _Late:
     name, other = sorted(left, key=lambda s: left[s])
     value = delay if name == "delay" else lag
     step = STEP * dt
-    ahead, behind = (
-        (t, 0.0) if name == "delay" else (0.0, t) for t in (value + step, max(value - step, 0.0))
-    )
+    ahead, behind = ((t, 0.0) if name == "delay" else (0.0, t) for t in (value + step, max(value - step, 0.0)))
     slope = (off(*ahead) - off(*behind)) / (step + min(step, value))
     size = max(float(slope @ slope), 1e-300)
     error = float(np.sqrt(left[name] / len(slope) / size))

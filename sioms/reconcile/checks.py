@@ -41,11 +41,13 @@ MISTAKES = {
     39.37: "inches against metres",
     9.80665: "kgf against N, or ten",
 }
-#: Measured may be so many times the commanded force; samples it is judged on, their share of the largest force, and seconds of a mean.
+#: Measured may be so many times the commanded force; samples it is judged on, their share of the largest force, and
+#: seconds of a mean.
 FORCE_SCALE, LEAST_SLOW, SLOW_SHARE, SLOW_S = 1.33, 200, 0.8, 0.05
 #: Share of samples at the controller's limit above which nothing is left to learn.
 SATURATED = 0.5
-#: Share of the force above which what feedback does not explain is told, and samples until a filter of speed has settled.
+#: Share of the force above which what feedback does not explain is told, and samples until a filter of speed has
+#: settled.
 FOREIGN, SETTLED = 0.05, 100
 
 
@@ -92,12 +94,11 @@ def _check_record(r: Record, model: AxisModel) -> None:
         if a is None:
             continue
         if len(a) != len(r):
-            raise BadInputError(
-                f"{where}: {name} has {len(a)} samples, position {len(r)}; needs the same number"
-            )
+            raise BadInputError(f"{where}: {name} has {len(a)} samples, position {len(r)}; needs the same number")
         if not np.all(np.isfinite(a)):
             raise BadInputError(
-                f"{where}: {name} has {int(np.sum(~np.isfinite(a)))} of {len(a)} values that are no numbers; needs a number in "
+                f"{where}: {name} has {int(np.sum(~np.isfinite(a)))} of {len(a)} values that are no numbers; needs a "
+                "number in "
                 f"{100 * (1 - MOST):.0f} % of the rows (gaps are then interpolated), or no such column"
             )
     for name, a, what in (
@@ -145,12 +146,8 @@ def _check_time(r: Record, time: Array, dt: float) -> None:
         raise BadInputError(f"read record {r.name}: time does not increase; needs seconds, rising")
     factor = typical / dt
     if not 0.98 < factor < 1.02:
-        hint = (
-            f" (a factor of {factor:.4g}: is it in another unit?)" if factor > 30 or factor < 1 / 30 else ""
-        )
-        raise BadInputError(
-            f"read record {r.name}: time steps are {typical:.6g} s, the model says {dt:.6g} s{hint}"
-        )
+        hint = f" (a factor of {factor:.4g}: is it in another unit?)" if factor > 30 or factor < 1 / 30 else ""
+        raise BadInputError(f"read record {r.name}: time steps are {typical:.6g} s, the model says {dt:.6g} s{hint}")
     odd = np.flatnonzero(np.abs(steps - typical) > 0.5 * typical)
     if len(odd):
         i = int(odd[0])
@@ -173,7 +170,8 @@ def _check_command(r: Record, command: Array, model: AxisModel) -> None:
 
 
 def _check_measured(session: Session, model: AxisModel) -> None:
-    """Compare measured with commanded force where both are slow and far from a limit, so that no drive effect passes for a scale.
+    """Compare measured with commanded force where both are slow and far from a limit, so that no drive effect passes
+    for a scale.
 
     Raises:
         BadInputError: the measured force is of another scale or sign; its noise and its limit would be misread.
@@ -188,8 +186,7 @@ def _check_measured(session: Session, model: AxisModel) -> None:
         span = max(round(SLOW_S / model.sample_time_s), 1)
         calm = [maximum_filter1d(np.abs(u), 2 * span) < top for u, _ in pairs]
         u, m = (
-            np.concatenate([uniform_filter1d(p[i], span)[k] for p, k in zip(pairs, calm, strict=True)])
-            for i in (0, 1)
+            np.concatenate([uniform_filter1d(p[i], span)[k] for p, k in zip(pairs, calm, strict=True)]) for i in (0, 1)
         )
         if len(u) < LEAST_SLOW or np.ptp(u) == 0.0 or abs(np.corrcoef(u, m)[0, 1]) < 0.9:
             return
@@ -200,7 +197,8 @@ def _check_measured(session: Session, model: AxisModel) -> None:
             + (
                 f"; {_in_another_unit(ratio)}"
                 if not 1.0 / OTHER_UNIT < ratio < OTHER_UNIT
-                else ", also where nothing limits it; needs the same sign and scale (a scale in columns.toml), or no such column"
+                else ", also where nothing limits it; needs the same sign and scale (a scale in columns.toml), or no "
+                "such column"
             )
         )
 
@@ -208,22 +206,19 @@ def _check_measured(session: Session, model: AxisModel) -> None:
 def _notes(session: Session, model: AxisModel) -> list[str]:
     out = []
     if all(r.force_measured is None for r in session.records):
-        out.append(
-            "no force was measured: drive delay, lag and saturation are judged by their effect on motion only"
-        )
+        out.append("no force was measured: drive delay, lag and saturation are judged by their effect on motion only")
     if all(r.index is None for r in session.records):
         out.append("no index marks: encoder scale and payload cannot be told apart")
     if model.controller is None:
-        out.append(
-            "no controller in the model: the closed loop is not simulated, gaps are given in force only"
-        )
+        out.append("no controller in the model: the closed loop is not simulated, gaps are given in force only")
     if model.controller is not None and any(r.command is None for r in session.records):
         out.append("no command recorded: the closed loop is not simulated, gaps are given in force only")
     if model.controller is not None:
         shares = [(r.name, _beyond_feedback(r, model)) for r in session.records + session.final]
         if odd := [f"{name} {100 * share:.0f} %" for name, share in shares if share > FOREIGN]:
             out.append(
-                "the controller of the model does not make the recorded force from command and position (off by, share of the "
+                "the controller of the model does not make the recorded force from command and position (off by, share "
+                "of the "
                 f"force: {', '.join(odd)}), and the closed loop suffers; if a feed-forward or a test signal was added, "
                 "name its column feedforward"
             )
@@ -277,13 +272,15 @@ def check_scale(problem: Problem, model: AxisModel) -> list[str]:
         )
     if not LEAST_INERTIA < ratio < MOST_INERTIA:
         raise BadInputError(
-            f"compare force with motion: force is {ratio:.4g} times what the nominal inertia of {model.inertia:.4g} needs; "
+            f"compare force with motion: force is {ratio:.4g} times what the nominal inertia of {model.inertia:.4g} "
+            "needs; "
             f"{_in_another_unit(ratio)} check the units of force, position and inertia, or the model is of another axis"
         )
     if UNLIKELY_INERTIA[0] < ratio < UNLIKELY_INERTIA[1]:
         return []
     return [
-        f"force is {ratio:.3g} times what the nominal inertia of {model.inertia:.4g} needs: a heavy payload, or a wrong unit (turns for "
+        f"force is {ratio:.3g} times what the nominal inertia of {model.inertia:.4g} needs: a heavy payload, or a "
+        "wrong unit (turns for "
         "radians make 6.3)"
     ]
 

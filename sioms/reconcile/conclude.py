@@ -1,4 +1,6 @@
-"""From what a search ended with to a verdict: figures on untouched samples, intervals, evidence, what to say and to do next."""
+"""From what a search ended with to a verdict: figures on untouched samples, intervals, evidence, what to say and to do
+next.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,8 @@ from sioms.reconcile.timed import as_recorded
 from sioms.reconcile.verdict import Gap, Outcome, Place
 
 HELD = (
-    "delay and lag are counted from a force that is held from row to row of the log; of a loop much faster than the log they are up to {:.2g} ms longer "
+    "delay and lag are counted from a force that is held from row to row of the log; of a loop much faster than the "
+    "log they are up to {:.2g} ms longer "
     "(loop_time_s in columns.toml would tell)"
 )
 #: Steps of the last fit.
@@ -146,7 +149,8 @@ def _pictures(
 ) -> tuple[tuple[Place, ...], tuple[Spectrum, Spectrum] | None, tuple[Trace, ...]]:
     """Localise the disagreement, and keep curves, if pictures are wanted.
 
-    The places are of the samples on which the search was made; the curves show the records on which the gap is measured, by the
+    The places are of the samples on which the search was made; the curves show the records on which the gap is
+    measured, by the
     models that it is measured of: those to which the untouched samples have contributed nothing.
     """
     if not o.pictures:
@@ -173,8 +177,10 @@ def _of_bursts(problem: Problem, fit: Fit, burst: float) -> str:
     turning, loud, usual = loud_turns(problem, fit)
     if turning > MOSTLY * loud and binom.sf(turning - 1, loud, usual) < CHANCE:
         return (
-            f"{text}, {turning} of {loud} where the motion turns, starts or stops (which is {100 * usual:.0f} % of the time): "
-            "play, presliding or stick-slip in a form that no effect of the library has, rather than a disturbance from outside"
+            f"{text}, {turning} of {loud} where the motion turns, starts or stops (which is {100 * usual:.0f} % of the "
+            "time): "
+            "play, presliding or stick-slip in a form that no effect of the library has, rather than a disturbance "
+            "from outside"
         )
     return f"{text} that no state of the axis orders: a disturbance from outside, not an effect"
 
@@ -182,7 +188,8 @@ def _of_bursts(problem: Problem, fit: Fit, burst: float) -> str:
 def _of_loops(gaps: Sequence[Gap], ratio: float) -> list[str]:
     """Say what it means that the closed loop is farther from its floor than short windows are."""
     return [
-        f"in closed loop {g.after / g.floor:.1f} times the floor remains, in short windows {ratio:.2f} times the noise: what is slow and too small for a "
+        f"in closed loop {g.after / g.floor:.1f} times the floor remains, in short windows {ratio:.2f} times the "
+        "noise: what is slow and too small for a "
         "window, or when the axis sticks, differs each time; repeated laps would show the floor of that"
         for g in gaps
         if g.channel == "force, closed loop" and g.after > LOOPS * g.floor
@@ -216,7 +223,9 @@ def _seen(session: Session, model: AxisModel) -> Envelope:
 
 
 def _traces(problems: tuple[Problem, Problem], models: tuple[AxisModel, AxisModel]) -> tuple[Trace, ...]:
-    """Keep force curves for the pictures, before and after: in closed loop where it can be, else what short windows leave."""
+    """Keep force curves for the pictures, before and after: in closed loop where it can be, else what short windows
+    leave.
+    """
     curves: list[list[Array]] = []
     for problem, model in zip(problems, models, strict=True):
         unit, heat = problem.noise.drive / problem.noise.innovation, 0.0

@@ -39,9 +39,10 @@ def descend(
         lower, upper: bounds, infinite where there is none.
         iterations: largest number of accepted steps.
         tolerance: stop when a step gains less than this share of the sum of squares.
-        damping: at first, and ``ease`` its change after a good step; small for a residual that is smooth in its numbers.
-        left: share of a number that can only be positive which a step leaves at least: where it nearly vanishes (the speed
-            over which friction drops), nothing changes with it any more.
+        damping: at first, and ``ease`` its change after a good step; small for a residual that is smooth in its
+            numbers.
+        left: share of a number that can only be positive which a step leaves at least: where it nearly vanishes (the
+            speed over which friction drops), nothing changes with it any more.
 
     Returns:
         Numbers, residual and slopes at the best point found.
@@ -56,9 +57,7 @@ def descend(
         for _ in range(TRIALS):
             more = damping * np.diag(np.diag(h) + 1e-12 * np.trace(h) + 1e-30)
             low, high = np.maximum((least - at) / size, -LONGEST), np.minimum((upper - at) / size, LONGEST)
-            trial = np.clip(
-                at + within(h + more, g, np.minimum(low, 0.0), np.maximum(high, 0.0)) * size, least, upper
-            )
+            trial = np.clip(at + within(h + more, g, np.minimum(low, 0.0), np.maximum(high, 0.0)) * size, least, upper)
             rt = residual(trial)
             ct = float(rt @ rt)
             if ct < cost:
@@ -77,9 +76,11 @@ def descend(
 
 
 def within(h: Array, g: Array, low: Array, high: Array) -> Array:
-    """Minimise d'hd/2 + g'd over low <= d <= high, which hold 0; the furthest outside is held at its end first, the others freed again.
+    """Minimise d'hd/2 + g'd over low <= d <= high, which hold 0; the furthest outside is held at its end first, the
+    others freed again.
 
-    Numbers that trade against each other go far together: cut off one by one, they would no longer make up for each other.
+    Numbers that trade against each other go far together: cut off one by one, they would no longer make up for each
+        other.
     """
     d, free = np.linalg.lstsq(h, -g, rcond=1e-12)[0], np.ones(len(g), dtype=bool)
     while True:
@@ -89,6 +90,4 @@ def within(h: Array, g: Array, low: Array, high: Array) -> Array:
         if beyond[far] == 0.0:
             return np.asarray(d)
         free[far], d[far] = False, end[far]
-        d[free] = np.linalg.lstsq(
-            h[np.ix_(free, free)], -(g[free] + h[np.ix_(free, ~free)] @ d[~free]), rcond=1e-12
-        )[0]
+        d[free] = np.linalg.lstsq(h[np.ix_(free, free)], -(g[free] + h[np.ix_(free, ~free)] @ d[~free]), rcond=1e-12)[0]

@@ -1,10 +1,10 @@
 """What an effect is: one small object that says everything the workflow, a plant and a reader need.
 
-An effect enters the simulation as a state function, or through a mechanism of its own. State functions have the signature
-``f(x, v, u, temperature, p)`` with x position [m | rad], v velocity, u actuator force after the
-drive [N | N m], temperature the dimensionless heat state and p the parameters in the order of
-``Effect.parameters`` and 2 pi / pitch in ``p[TURN]``; written without branches, the plain form takes arrays of axes, and
-``p[i]`` may then be an array too. Sign convention: a FORCE acts along +x.
+An effect enters the simulation as a state function, or through a mechanism of its own. State functions have the
+signature ``f(x, v, u, temperature, p)`` with x position [m | rad], v velocity, u actuator force after the drive [N | N
+m], temperature the dimensionless heat state and p the parameters in the order of ``Effect.parameters`` and 2 pi / pitch
+in ``p[TURN]``; written without branches, the plain form takes arrays of axes, and ``p[i]`` may then be an array too.
+Sign convention: a FORCE acts along +x.
 """
 
 from __future__ import annotations
@@ -51,14 +51,17 @@ class Mechanism:
 
     Attributes:
         enter: (row, p) writes the numbers p into the row, by the names of ``kernel``'s places in lower case.
-        twin: (p, pitch) returns the effects of ``sioms.plant.effects`` that mean the same; None where no plant can carry it out.
+        twin: (p, pitch) returns the effects of ``sioms.plant.effects`` that mean the same; None where no plant can
+            carry it out.
         last: enters after all others, as it needs the whole inertia.
         substeps: steps in a millisecond that it needs.
         bounces: impacts whose timing shifts with any number: the cost of a fit is rough.
         warms: what it does depends on what the axis did before.
-        builds_up: friction p[0] over the displacement p[1] after a reversal; at rest of level p[2], dropping over the speed p[3].
+        builds_up: friction p[0] over the displacement p[1] after a reversal; at rest of level p[2], dropping over the
+            speed p[3].
         varies: dry friction, of levels and of what builds up alike, times 1 + p[0] sin(p[2] theta + p[1]).
-        column: (motion, wave number, phase, dry friction) returns the force per unit of the first parameter, for the screening.
+        column: (motion, wave number, phase, dry friction) returns the force per unit of the first parameter, for the
+            screening.
     """
 
     enter: Callable[[Any, Array], None] = lambda row, p: None
@@ -134,10 +137,10 @@ class Parameter:
     ``fixed`` marks numbers that are searched, not differentiated (orders, lattice factors).
     ``phase`` marks an angle: free, wrapped, without bounds that mean anything.
     ``shape`` marks a force in which the effect is not linear.
-    ``least`` is the smallest size (of a factor: distance from one), either way, that is named; what is smaller may belong to something else.
-    ``soft`` marks one that may lie at its bound: a contact harder than what is seen is as good as hard.
-    ``vanishes`` marks one that at its lower bound makes another effect of this, as every time constant does.
-    ``steps``: what is within so many steps of the encoder is not seen.
+    ``least`` is the smallest size (of a factor: distance from one), either way, that is named; what is smaller may
+    belong to something else. ``soft`` marks one that may lie at its bound: a contact harder than what is seen is as
+    good as hard. ``vanishes`` marks one that at its lower bound makes another effect of this, as every time constant
+    does. ``steps``: what is within so many steps of the encoder is not seen.
     """
 
     symbol: str
@@ -184,9 +187,7 @@ class AnyEffect:
         """Say which symbols of given values are unknown or missing; empty where none is."""
         known = [p.symbol for p in self.parameters]
         odd = sorted(set(given) ^ set(known))
-        return (
-            f"read effect {self.name}: parameters {odd} are unknown or missing; needs {known}" if odd else ""
-        )
+        return f"read effect {self.name}: parameters {odd} are unknown or missing; needs {known}" if odd else ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

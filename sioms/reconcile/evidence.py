@@ -1,4 +1,6 @@
-"""What speaks for the effects of a model: intervals of their numbers, what each saves, and the look-alikes it was told from."""
+"""What speaks for the effects of a model: intervals of their numbers, what each saves, and the look-alikes it was told
+from.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +20,7 @@ from sioms.reconcile.thresholds import GAIN
 from sioms.reconcile.verdict import Estimate, NamedEffect, apart
 
 
-def spans_of(
-    problem: Problem, fit: Fit, others: Sequence[Fit] = ()
-) -> dict[tuple[str, str], tuple[float, float]]:
+def spans_of(problem: Problem, fit: Fit, others: Sequence[Fit] = ()) -> dict[tuple[str, str], tuple[float, float]]:
     """Return the 95 % interval of every free number by (effect, symbol), within its bounds.
 
     It is that of leaving out each block of time, and, where the cost is rough, of how far from this minimum others are.
@@ -115,15 +115,12 @@ def _numbers(name: str, rival: str, others: Sequence[Rival]) -> str:
     """Say with which numbers a look-alike stands in the place of an effect."""
     model = next(r.fit.model for r in others if (r.effect, r.rival) == (name, rival))
     return ", ".join(
-        f"{p.symbol} = {model.effects[rival][p.symbol]:.4g}"
-        + ("" if model.unit(p) == "1" else f" {model.unit(p)}")
+        f"{p.symbol} = {model.effects[rival][p.symbol]:.4g}" + ("" if model.unit(p) == "1" else f" {model.unit(p)}")
         for p in known()[rival].parameters
     )
 
 
-def _worth(
-    found: Found, searcher: Searcher, name: str, rng: np.random.Generator
-) -> tuple[float, float, float]:
+def _worth(found: Found, searcher: Searcher, name: str, rng: np.random.Generator) -> tuple[float, float, float]:
     """How much an effect saves beyond the others, in how many standard errors and bootstrap replicates."""
     bare = refit(searcher.problem, found.fit.model.without_effect(name), searcher.frozen, 4)
     loss = searcher.loss(bare)

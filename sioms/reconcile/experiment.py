@@ -84,12 +84,8 @@ def catalogue(model: AxisModel, envelope: Envelope, duration_s: float = DURATION
     half = min(0.55 * WHOLE, e.reach) if model.rotary else e.reach
     turn = ", one full turn" if model.rotary and half >= 0.5 * WHOLE else ""
     speed = min(4.2 * half / duration_s, e.speed)
-    path = np.concatenate(
-        [_move(half, speed, e, dt), _move(-2.0 * half, speed, e, dt), _move(half, speed, e, dt)]
-    )
-    yield Experiment(
-        "full_turn", f"slowly over {2.0 * half:.3g} {unit} and back{turn}", _lap(path, e, dt, duration_s)
-    )
+    path = np.concatenate([_move(half, speed, e, dt), _move(-2.0 * half, speed, e, dt), _move(half, speed, e, dt)])
+    yield Experiment("full_turn", f"slowly over {2.0 * half:.3g} {unit} and back{turn}", _lap(path, e, dt, duration_s))
     yield Experiment(
         "multi_sine",
         "sum of sines from 0.7 to 9 Hz at two amplitudes",
@@ -128,9 +124,7 @@ def separate(
     best: Experiment | None = None
     for lap in catalogue(rivals[0], envelope, duration_s):
         forces = [simulate(replace(m, start_position=envelope.centre), lap.command).force for m in rivals]
-        apart = min(
-            float(np.sqrt(np.mean((a - b) ** 2))) for i, a in enumerate(forces) for b in forces[i + 1 :]
-        )
+        apart = min(float(np.sqrt(np.mean((a - b) ** 2))) for i, a in enumerate(forces) for b in forces[i + 1 :])
         apart = apart / drive_noise if np.isfinite(apart) else 0.0
         if best is None or apart > best.separation:
             best = replace(lap, separation=apart)

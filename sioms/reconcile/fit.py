@@ -28,7 +28,8 @@ BASE = "base"
 #: Samples, and seconds, at the start of a record in which the observer finds the state.
 SKIP, SKIP_S = 50, 0.05
 
-#: A change of the residual by the small step of a slope may be a jump from this size on, and where it is so many times the usual one.
+#: A change of the residual by the small step of a slope may be a jump from this size on, and where it is so many times
+#: the usual one.
 JUMP, PEAK = 1.0, 8.0
 #: Share of a positive number that a step of a fit leaves at least.
 LEFT = 0.3
@@ -56,9 +57,10 @@ class Problem:
     Attributes:
         begin, end: share of each record that counts; the rest is simulated but not looked at.
         weights: factor on each residual, shape (n,), for resampled blocks; None: all alike.
-        bend: residuals beyond this count little more than it (Cauchy's loss): bounces in a gap that come a little late or early.
-        mapper: applies a function to many trials, in order, as ``map`` does; one that uses all cores may be given. Not to be used
-            within a trial: every fit uses it, and a pool that waits for itself waits for ever.
+        bend: residuals beyond this count little more than it (Cauchy's loss): bounces in a gap that come a little late
+            or early.
+        mapper: applies a function to many trials, in order, as ``map`` does; one that uses all cores may be given. Not
+            to be used within a trial: every fit uses it, and a pool that waits for itself waits for ever.
     """
 
     session: Session
@@ -111,7 +113,9 @@ class Problem:
 
     @property
     def factors(self) -> Array | float:
-        """Factors on the residual: of the blocks that are drawn anew, and of samples whose force is known less; shape (n,), or 1."""
+        """Factors on the residual: of the blocks that are drawn anew, and of samples whose force is known less; shape
+        (n,), or 1.
+        """
         records = self.session.records
         if all(r.trust is None for r in records):
             return 1.0 if self.weights is None else self.weights
@@ -119,17 +123,15 @@ class Problem:
         return trust if self.weights is None else trust * self.weights
 
     def slope(self, residual: Array) -> Array:
-        """How a residual, as ``residual`` gives it, goes with the innovation over its expected standard deviation, shape (n,)."""
+        """How a residual, as ``residual`` gives it, goes with the innovation over its expected standard deviation,
+        shape (n,).
+        """
         weights = np.ones_like(residual) * self.factors
         if self.bend == np.inf:
             return weights
         bent = (residual / np.where(weights > 0.0, weights, 1.0) / self.bend) ** 2
         straight = np.expm1(bent)
-        return (
-            weights
-            * np.sqrt(np.where(bent > 0.0, straight / np.maximum(bent, 1e-300), 1.0))
-            / (1.0 + straight)
-        )
+        return weights * np.sqrt(np.where(bent > 0.0, straight / np.maximum(bent, 1e-300), 1.0)) / (1.0 + straight)
 
     def join(self, parts: Sequence[Array]) -> Array:
         """Lay per-record arrays out as ``residual`` does."""
@@ -251,8 +253,9 @@ def jacobian(
 ) -> Array:
     """Differences in the scaled parameters.
 
-    Where so small a step moves some innovation by more than noise, the axis may have stuck, slipped or lost contact otherwise: a jump,
-    which is no slope, however large. There the step is taken the other way, too, and what both agree on is kept.
+    Where so small a step moves some innovation by more than noise, the axis may have stuck, slipped or lost contact
+    otherwise: a jump, which is no slope, however large. There the step is taken the other way, too, and what both agree
+    on is kept.
     """
 
     def difference(i: int, h: float) -> Array:
@@ -267,9 +270,7 @@ def jacobian(
         peak = float(np.max(np.abs(slope)))
         if peak > max(JUMP, PEAK * float(np.sqrt(np.mean(slope**2)))) and f.lower <= at[i] - h <= f.upper:
             back = -difference(i, -h)
-            slope = np.where(
-                slope * back > 0.0, np.sign(slope) * np.minimum(np.abs(slope), np.abs(back)), 0.0
-            )
+            slope = np.where(slope * back > 0.0, np.sign(slope) * np.minimum(np.abs(slope), np.abs(back)), 0.0)
         return slope * (f.scale / h)
 
     return np.stack(list(problem.mapper(column, range(len(free)))), axis=1)

@@ -1,8 +1,9 @@
 """How far measurement and model disagree on samples that took no part in any choice, and the floor under it.
 
-The floor in closed loop comes from repeated laps where all that drives the axis repeats itself (difference over sqrt 2),
-else from sensor and drive noise propagated through the linear loop. It is an estimate of its own: what a model reaches does not
-change it.
+The floor in closed loop comes from repeated laps where all that drives the axis repeats itself (difference over sqrt
+2),
+else from sensor and drive noise propagated through the linear loop. It is an estimate of its own: what a model reaches
+does not change it.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ LAPS, THROUGH_LOOP, OF_WINDOWS = "repeated laps", "noise through the loop", "noi
 def lap(record: Record, sample_time_s: float) -> int:
     """Return the period in samples of all that drives the axis, 0 where it does not repeat.
 
-    Laps of one command are no laps where a known force or a test signal differs from one to the next by more than a part of what
+    Laps of one command are no laps where a known force or a test signal differs from one to the next by more than a
+    part of what
     differs in the force: that would pass for noise.
     """
     period = _period(record, sample_time_s)
@@ -81,26 +83,19 @@ def loop_floor(model: AxisModel, noise: Noise) -> tuple[float, float]:
     z = np.exp(1j * np.linspace(1e-3, np.pi, 4096))
     a, b = rigid(model)
     plant = (b[0] * (z - a[1, 1]) + a[0, 1] * b[1]) / ((z - a[0, 0]) * (z - a[1, 1]) - a[0, 1] * a[1, 0])
-    alpha = (
-        1.0 - np.exp(-2.0 * np.pi * c.velocity_filter_hz * model.sample_time_s)
-        if c.velocity_filter_hz
-        else 1.0
-    )
+    alpha = 1.0 - np.exp(-2.0 * np.pi * c.velocity_filter_hz * model.sample_time_s) if c.velocity_filter_hz else 1.0
     speed = alpha * (1.0 - 1.0 / z) / model.sample_time_s / (1.0 - (1.0 - alpha) / z)
     gain = (c.k * (1.0 + c.kz / z) - c.kb * speed) / (1.0 + c.kp / z)
     loop = gain * plant
     close = 1.0 / (1.0 + loop)
     force = np.sqrt(
-        np.mean(np.abs(gain * close) ** 2) * noise.sensor**2
-        + np.mean(np.abs(loop * close) ** 2) * noise.drive**2
+        np.mean(np.abs(gain * close) ** 2) * noise.sensor**2 + np.mean(np.abs(loop * close) ** 2) * noise.drive**2
     )
     place = np.sqrt(np.mean(np.abs(plant * close) ** 2) * noise.drive**2 + noise.sensor**2)
     return float(force), float(place)
 
 
-def measure(
-    problem: Problem, nominal: AxisModel, model: AxisModel, states: Sequence[State] = ()
-) -> tuple[Gap, ...]:
+def measure(problem: Problem, nominal: AxisModel, model: AxisModel, states: Sequence[State] = ()) -> tuple[Gap, ...]:
     """Compare before and after on the samples of ``problem`` (the untouched ones).
 
     Args:
@@ -123,11 +118,7 @@ def measure(
     how = LAPS if floors else THROUGH_LOOP
     out.append(Gap("force, closed loop", unit, errors[0][0], errors[1][0], force, frozen[1], session[1], how))
     place_unit = nominal.position_unit
-    out.append(
-        Gap(
-            "position, closed loop", place_unit, errors[0][1], errors[1][1], place, frozen[2], session[2], how
-        )
-    )
+    out.append(Gap("position, closed loop", place_unit, errors[0][1], errors[1][1], place, frozen[2], session[2], how))
     return tuple(out)
 
 

@@ -47,9 +47,7 @@ def table_in(table: Mapping[str, Any], key: str, where: str, *, needed: bool = T
     if key not in table and not needed:
         return {}
     if not isinstance(table.get(key), Mapping):
-        wrong = (
-            f"there is no table [{key}]" if key not in table else f"{key} is {table[key]!r}; needs a table"
-        )
+        wrong = f"there is no table [{key}]" if key not in table else f"{key} is {table[key]!r}; needs a table"
         raise BadInputError(f"{where}: {wrong}")
     return dict(table[key])
 
@@ -78,9 +76,7 @@ def number(
         raise BadInputError(f"{where} has no {key}" + (f" ({about})" if about else ""))
     real = isinstance(value, int | float) and not isinstance(value, bool)
     if not real or not (math.isfinite(value) or (endless and value == math.inf)):
-        raise BadInputError(
-            f"{where}: {key} is {value!r}; needs a finite number" + (f", {about}" if about else "")
-        )
+        raise BadInputError(f"{where}: {key} is {value!r}; needs a finite number" + (f", {about}" if about else ""))
     return float(value)
 
 
@@ -131,9 +127,7 @@ def columns_in(
     only(found, allowed, f"{where}, [{key}]")
     for quantity, spec in found.items():
         if not isinstance(spec, Mapping) or not isinstance(spec.get("name", None if named else ""), str):
-            raise BadInputError(
-                f'{where}: {quantity} is {spec!r}; needs {{ name = "COLUMN", unit = "UNIT" }}'
-            )
+            raise BadInputError(f'{where}: {quantity} is {spec!r}; needs {{ name = "COLUMN", unit = "UNIT" }}')
         column = f"{where}, column {quantity}"
         only(spec, keys, column)
         if not isinstance(spec.get("unit", ""), str):

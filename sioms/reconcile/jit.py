@@ -40,10 +40,13 @@ def addresses(functions: Sequence[Callable[..., Any]]) -> Any:
 
 
 def caller() -> Callable[..., float]:
-    """Return the call of state function k of several with row k of parameters: ``(functions, k, rows, x, v, u, temperature)``.
+    """Return the call of state function k of several with row k of parameters: ``(functions, k, rows, x, v, u,
+    temperature)``.
 
-    Compiled, it is a jump to an address. Functions as numba's own values cost four to eleven times as much (decision 0174), arrays as arguments are counted.
-    A kernel is kept on disk by its own file: when this changes, ``kernel.py`` must, or it goes on with what it was compiled with.
+    Compiled, it is a jump to an address. Functions as numba's own values cost four to eleven times as much (decision
+    0174), arrays as arguments are counted.
+    A kernel is kept on disk by its own file: when this changes, ``kernel.py`` must, or it goes on with what it was
+        compiled with.
     """
     if numba() is None:
         return lambda functions, k, rows, *state: float(functions[k](*state, rows[k]))
@@ -54,9 +57,7 @@ def caller() -> Callable[..., float]:
     def call(typing: Any, functions: Any, k: Any, rows: Any, x: Any, v: Any, u: Any, temperature: Any) -> Any:
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             codes, index, table, *state = arguments
-            code = builder.load(
-                builder.gep(context.make_array(functions)(context, builder, codes).data, [index])
-            )
+            code = builder.load(builder.gep(context.make_array(functions)(context, builder, codes).data, [index]))
             place = context.make_array(rows)(context, builder, table)
             offset = builder.mul(builder.extract_value(place.strides, 0), index)
             start = builder.ptrtoint(place.data, offset.type)
@@ -96,8 +97,7 @@ def state_function(function: F) -> F:
     taken = len(inspect.signature(function).parameters)
     if taken != STATE_ARGUMENTS:
         raise TypeError(
-            f"define state function {function.__name__}: it takes {taken} arguments; "
-            "needs (x, v, u, temperature, p)"
+            f"define state function {function.__name__}: it takes {taken} arguments; needs (x, v, u, temperature, p)"
         )
     return function
 

@@ -86,9 +86,7 @@ def varied(level: float, wave: tuple[float, float, float], x: float) -> float:
 
 
 @inlined
-def friction(
-    levels: Any, p: Array, wave: tuple[float, float, float], x: float, v: float, u: float, t: float
-) -> float:
+def friction(levels: Any, p: Array, wave: tuple[float, float, float], x: float, v: float, u: float, t: float) -> float:
     """Sum the FRICTION levels in the direction of v, never negative."""
     return varied(max(summed(levels, p, x, v, u, t), 0.0), wave, x)
 
@@ -108,7 +106,9 @@ def coupling(plant: Array, dx: float, dv: float) -> float:
 
 @kernel
 def delayed(u: Array, before: float, n: int, start: float, end: float, delay: float, dt: float) -> float:
-    """Mean over [start, end] inside sample n of the held command, late by ``delay``; ``before`` is that before the first."""
+    """Mean over [start, end] inside sample n of the held command, late by ``delay``; ``before`` is that before the
+    first.
+    """
     a, b = n * dt + start - delay, n * dt + end - delay
     i, j = int(np.floor(a / dt + 1e-9)), int(np.floor(b / dt - 1e-9))
     ui = u[i] if i >= 0 else before
@@ -169,10 +169,11 @@ def march(
     """Run the axis over one record.
 
     Args:
-        command, measured, force_in: shape (n,); ``command`` is read when closed, ``measured`` when tracking; ``force_in``
-            is the whole force when tracking, and what is added to the controller's when closed.
+        command, measured, force_in: shape (n,); ``command`` is read when closed, ``measured`` when tracking;
+            ``force_in`` is the whole force when tracking, and what is added to the controller's when closed.
         external: force on the axis beside the drive's, shape (n,).
-        gain: corrections of place and speed of the motor, and of the load, by the innovation: in contact, and out of it; shape (8,).
+        gain: corrections of place and speed of the motor, and of the load, by the innovation: in contact, and out of
+            it; shape (8,).
         lost: innovation at which, held for ``PATIENCE`` samples, the speed is taken from the measurement.
         start: x, v, temperature, error of the controller and force at the sample before the first, and by how much the
             load is behind the motor, and slower.
@@ -217,12 +218,7 @@ def march(
             y_older = y_old
             y_old = y
             e = command[i] - y
-            u = (
-                ctl[CTL_K] * (e + ctl[CTL_KZ] * e_old)
-                - ctl[CTL_KP] * u_old
-                + ctl[CTL_KB] * v_f
-                + ctl[CTL_OFFSET]
-            )
+            u = ctl[CTL_K] * (e + ctl[CTL_KZ] * e_old) - ctl[CTL_KP] * u_old + ctl[CTL_KB] * v_f + ctl[CTL_OFFSET]
             u = min(max(u, -ctl[CTL_MAX]), ctl[CTL_MAX])
             e_old, u_old = e, u
             u = min(max(u + force_in[i], -ctl[CTL_MAX]), ctl[CTL_MAX])

@@ -21,12 +21,8 @@ def collect(group: str, built_in: tuple[E, ...]) -> dict[str, E]:
         given = point.load()
         for effect in given if isinstance(given, tuple) else (given,):
             if not isinstance(effect, kind):
-                raise ValueError(
-                    f"load effect {point.name}: got {type(effect).__name__}; needs {kind.__name__}"
-                )
+                raise ValueError(f"load effect {point.name}: got {type(effect).__name__}; needs {kind.__name__}")
             if effect.name in found:
-                raise ValueError(
-                    f"load effect {point.name}: the name {effect.name} is in use; choose another"
-                )
+                raise ValueError(f"load effect {point.name}: the name {effect.name} is in use; choose another")
             found[effect.name] = effect
     return found

@@ -115,7 +115,9 @@ class AxisModel:
 
 
 def plant_row(model: AxisModel) -> SimpleNamespace:
-    """Lay a model out as the time step reads it: numbers by the names of ``kernel``'s places, in lower case; what is absent is 0."""
+    """Lay a model out as the time step reads it: numbers by the names of ``kernel``'s places, in lower case; what is
+    absent is 0.
+    """
     row = SimpleNamespace(
         inertia=model.inertia,
         viscous=model.viscous,
@@ -145,6 +147,4 @@ def controller_row(model: AxisModel) -> Array:
         raise ValueError(f"simulate {model.name}: the model has no controller; a closed loop needs one")
     f = c.velocity_filter_hz
     alpha = 1.0 - np.exp(-2.0 * np.pi * f * model.sample_time_s) if f > 0.0 else 1.0
-    return np.array(
-        [c.k, c.kz, c.kp, c.kb, c.offset, c.limit, alpha, float(c.velocity_mean)], dtype=np.float64
-    )
+    return np.array([c.k, c.kz, c.kp, c.kb, c.offset, c.limit, alpha, float(c.velocity_mean)], dtype=np.float64)

@@ -63,9 +63,7 @@ def model_from(table: Mapping[str, Any], where: str = "read model") -> AxisModel
     }
     model = AxisModel(
         rotary=a["kind"] == "rotary",
-        controller=_controller(table_in(table, "controller", where), where)
-        if "controller" in table
-        else None,
+        controller=_controller(table_in(table, "controller", where), where) if "controller" in table else None,
         refine=words(a, "refine", of_axis, ", ".join(REFINED)) or (),
         name=str(a.get("name", "axis")),
         **numbers,
@@ -73,9 +71,7 @@ def model_from(table: Mapping[str, Any], where: str = "read model") -> AxisModel
     effects = table_in(table, "effects", where, needed=False)
     for name in effects:
         if name not in known():
-            raise BadInputError(
-                f"{where}: effect {name!r} is not known; known are {', '.join(sorted(known()))}"
-            )
+            raise BadInputError(f"{where}: effect {name!r} is not known; known are {', '.join(sorted(known()))}")
         given, of_effect = table_in(effects, name, where), f"{where}, [effects.{name}]"
         if truth(given, "on", of_effect, True):
             symbols = [p.symbol for p in known()[name].parameters]
@@ -95,13 +91,9 @@ def check_model(model: AxisModel, where: str) -> None:
         value = getattr(model, key)
         if value < 0.0 or (value == 0.0 and key in ABOVE_ZERO):
             wants = "above zero" if key in ABOVE_ZERO else "zero or more"
-            raise BadInputError(
-                f"{where}, [axis]: {key} is {value:g}; needs {wants} ({AXIS_NUMBERS[key][0]})"
-            )
+            raise BadInputError(f"{where}, [axis]: {key} is {value:g}; needs {wants} ({AXIS_NUMBERS[key][0]})")
     if not set(model.refine) <= set(REFINED):
-        raise BadInputError(
-            f"{where}, [axis]: refine is {list(model.refine)}; needs a list of {', '.join(REFINED)}"
-        )
+        raise BadInputError(f"{where}, [axis]: refine is {list(model.refine)}; needs a list of {', '.join(REFINED)}")
     if model.controller is not None and not model.controller.limit > 0.0:
         raise BadInputError(
             f"{where}, [controller]: limit is {model.controller.limit:g}; needs the largest force, above zero"

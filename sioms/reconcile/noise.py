@@ -58,7 +58,9 @@ def alone(inertia: float, viscous: float, t: float) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Two masses and what is between them: inertia of both, share of the load in it, stiffness, damping, and the motor's viscous friction."""
+    """Two masses and what is between them: inertia of both, share of the load in it, stiffness, damping, and the
+    motor's viscous friction.
+    """
 
     inertia: float
     share: float
@@ -69,7 +71,9 @@ class Pair:
 
 @lru_cache(maxsize=16)
 def coupled(pair: Pair, sample_time_s: float) -> tuple[Array, Array]:
-    """Return the exact sampled pair: state matrix (4, 4) and force input (4,); motor place and speed, load place and speed."""
+    """Return the exact sampled pair: state matrix (4, 4) and force input (4,); motor place and speed, load place and
+    speed.
+    """
     motor, load = pair.inertia * (1.0 - pair.share), pair.inertia * pair.share
     k, d = pair.stiffness, pair.damping
     rates = np.zeros((5, 5))
@@ -90,17 +94,16 @@ def observer(model: AxisModel, sensor: float, drive: float) -> Noise:
 def corrections(noise: Noise, pair: Pair | None, sample_time_s: float) -> tuple[float, ...]:
     """Corrections of place [1] and speed [1/s] of motor and load by the innovation: in contact, and out of it.
 
-    A transmission that rings is corrected as a Kalman filter of its own does it. Corrected alike, its masses would ring on from what
-    noise did to them long ago: the innovation keeps their tone, damping comes out too large, and the cost has a minimum at every beat.
-    Out of contact nothing tells of the load.
+    A transmission that rings is corrected as a Kalman filter of its own does it. Corrected alike, its masses would ring
+    on from what
+    noise did to them long ago: the innovation keeps their tone, damping comes out too large, and the cost has a minimum
+    at every beat. Out of contact nothing tells of the load.
     """
     if pair is not None:
         try:
             gain, _ = _kalman(*coupled(pair, sample_time_s), sample_time_s, noise.sensor, noise.drive)
             motor = pair.inertia * (1.0 - pair.share)
-            free, _ = _kalman(
-                *alone(motor, pair.viscous, sample_time_s), sample_time_s, noise.sensor, noise.drive
-            )
+            free, _ = _kalman(*alone(motor, pair.viscous, sample_time_s), sample_time_s, noise.sensor, noise.drive)
             return *gain, *free, 0.0, 0.0
         except (LinAlgError, ValueError):
             pass

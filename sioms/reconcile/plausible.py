@@ -37,7 +37,9 @@ def replaced(model: AxisModel, name: str) -> bool:
 
 
 def vacant(model: AxisModel, name: str, other: str) -> bool:
-    """Say whether the place of an effect may be given to another: neither that nor what it excludes is in the model beside."""
+    """Say whether the place of an effect may be given to another: neither that nor what it excludes is in the model
+    beside.
+    """
     return other not in model.effects and not replaced(model.without_effect(name), other)
 
 
@@ -61,7 +63,8 @@ def unspecific(name: str, gains: dict[str, float]) -> bool:
 def simplest(good: dict[str, Tried]) -> str:
     """Of the candidates within one standard error and ``GAIN`` of the best, the one with the fewest parameters.
 
-    A named effect goes before a nameless term that does no better. Names may be of several effects at once, joined by ``AND``.
+    A named effect goes before a nameless term that does no better. Names may be of several effects at once, joined by
+    ``AND``.
     """
     best = max(good, key=lambda n: good[n][2])
     near = []
@@ -85,9 +88,9 @@ def physical(fit: Fit, name: str) -> bool:
 def leans(model: AxisModel, name: str) -> bool:
     """Say whether a number of an effect leans on its bound: then it belongs to something else.
 
-    The stiffness and damping of a contact may: harder than what is seen is as good as hard. So may a time constant that is longer
-    than the records. Of friction with a path of its own, a drop within no speed or a build-up within no path, or within a path
-    that the encoder does not see, is another friction.
+    The stiffness and damping of a contact may: harder than what is seen is as good as hard. So may a time constant that
+    is longer than the records. Of friction with a path of its own, a drop within no speed or a build-up within no path,
+    or within a path that the encoder does not see, is another friction.
     """
     effect, given = known()[name], model.effects[name]
     if any(given[a] > most * given[b] for a, b, most in effect.ratios):

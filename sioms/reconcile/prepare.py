@@ -40,7 +40,8 @@ class Options:
     Attributes:
         seed: of permutations, bootstrap and starts.
         pictures: keep curves and localisation for the report.
-        resample: seed with which the blocks of time are drawn anew, to see whether the verdict stands; None: as they are.
+        resample: seed with which the blocks of time are drawn anew, to see whether the verdict stands; None: as they
+            are.
         mapper: as of ``Problem``.
         envelope: within which an experiment may be proposed; None takes it from the records.
     """
@@ -80,9 +81,7 @@ class Prepared:
     def beside(self, force: Timed) -> Prepared:
         """Take a force in time for known; records of their own have had none of it."""
         final = self.final if self.apart else known_beside(self.final, force.forces)
-        return replace(
-            self, problem=known_beside(self.problem, force.forces), final=final, timed=(*self.timed, force)
-        )
+        return replace(self, problem=known_beside(self.problem, force.forces), final=final, timed=(*self.timed, force))
 
 
 def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
@@ -105,7 +104,9 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
 
 
 def reread(ready: Prepared, model: AxisModel, frozen: Sequence[str], o: Options) -> Prepared | None:
-    """Prepare anew where, beside what a model explains, the force is not what is held from row to row; None: it is, or is known to be."""
+    """Prepare anew where, beside what a model explains, the force is not what is held from row to row; None: it is, or
+    is known to be.
+    """
     if not ready.held:
         return None
     problem = replace(ready.problem, session=as_recorded(ready.problem, ready.timed).session)
@@ -117,17 +118,13 @@ def reread(ready: Prepared, model: AxisModel, frozen: Sequence[str], o: Options)
     return replace(ready, names=tuple(n for n in ready.names if n not in TIMES))
 
 
-def _read(
-    session: Session, nominal: AxisModel, notes: Sequence[str], o: Options, sampling: Sampling
-) -> Prepared:
+def _read(session: Session, nominal: AxisModel, notes: Sequence[str], o: Options, sampling: Sampling) -> Prepared:
     """Prepare with the force read otherwise; the controller has made none of it row by row."""
     points = sampling.late is not None
     return _channels(read_as(session, sampling), replace(nominal, controller=None), notes, o, points)
 
 
-def _channels(
-    session: Session, nominal: AxisModel, notes: Sequence[str], o: Options, points: bool = False
-) -> Prepared:
+def _channels(session: Session, nominal: AxisModel, notes: Sequence[str], o: Options, points: bool = False) -> Prepared:
     """Read the noise floor and go through the channels.
 
     Args:
@@ -172,9 +169,7 @@ def _channels(
         excluded.add("encoder_scale")
     if any(r.force_measured is not None for r in session.records):
         excluded |= {"delay", "lag", "saturation"}
-    names = tuple(
-        n for n, e in library().items() if e.rankable and nominal.applicable(e) and n not in excluded
-    )
+    names = tuple(n for n, e in library().items() if e.rankable and nominal.applicable(e) and n not in excluded)
     final = replace(problem, begin=1.0 - UNTOUCHED, end=1.0)
     if session.final:
         final = replace(final, session=Session(session.final, continuous=False), begin=0.0)
@@ -195,7 +190,9 @@ def _channels(
 
 
 def searched(session: Session) -> Session:
-    """Return the samples on which choices are made: all but the last part of every record, or all where whole records are kept apart."""
+    """Return the samples on which choices are made: all but the last part of every record, or all where whole records
+    are kept apart.
+    """
     if session.final:
         return session
     return replace(session, records=tuple(r.cut(0, int((1.0 - UNTOUCHED) * len(r))) for r in session.records))

@@ -26,7 +26,8 @@ class Record:
         filled: True where a sample was lost and is interpolated, or None.
         feedforward: the part of ``force`` that is no feedback (a feed-forward, an injected test signal), or None.
         external: known force that acts on the axis beside the drive's, held over each sample, [{F}], or None.
-        trust: factor on the residual of each sample, less than 1 where the force is known to worse than the drive's noise, or None.
+        trust: factor on the residual of each sample, less than 1 where the force is known to worse than the drive's
+            noise, or None.
     """
 
     name: str

@@ -93,7 +93,8 @@ def smoother_share(problem: Problem, fit: Fit) -> float:
 
 
 def smoother_rest(problem: Problem, fit: Fit, folds: int = 5) -> Array:
-    """Residual that the generic smoother leaves on blocks it has not seen; the residual itself where it explains nothing.
+    """Residual that the generic smoother leaves on blocks it has not seen; the residual itself where it explains
+    nothing.
 
     Returns:
         The rows of ``thinned``.
@@ -123,7 +124,8 @@ def loud_turns(problem: Problem, fit: Fit) -> tuple[int, int, float]:
     """Count the bursts of the residual that come while the motion turns, starts or stops.
 
     Returns:
-        Loud tenths of a second that hold such a moment or follow one, all loud ones, and the share of all tenths that do.
+        Loud tenths of a second that hold such a moment or follow one, all loud ones, and the share of all tenths that
+        do.
     """
     ids, energy, loud = _loud(problem, fit)
     dead, length = dead_band(problem, fit.model), max(int(BURST_S / fit.model.sample_time_s), 1)
@@ -137,7 +139,9 @@ def loud_turns(problem: Problem, fit: Fit) -> tuple[int, int, float]:
 
 
 def _loud(problem: Problem, fit: Fit) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
-    """Return the tenth of a second that each sample of the residual is in, the energy of each, and whether it is loud."""
+    """Return the tenth of a second that each sample of the residual is in, the energy of each, and whether it is
+    loud.
+    """
     ids = block_ids(problem, fit.model.sample_time_s, BURST_S)
     energy = np.bincount(ids, weights=fit.residual**2) / np.bincount(ids)
     return ids, energy, energy > LOUD_BLOCK * float(np.median(energy))

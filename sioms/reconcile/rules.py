@@ -29,9 +29,7 @@ def negligible(lost: float, errors: float) -> bool:
     return lost < GAIN or (errors < 1.0 and lost < DOUBTFUL)
 
 
-@dataclass(
-    frozen=True
-)  # with slots, calling Rival[Fit] fails in Python 3.11: typing sets an attribute of its own
+@dataclass(frozen=True)  # with slots, calling Rival[Fit] fails in Python 3.11: typing sets an attribute of its own
 class Rival(Generic[F]):
     """A look-alike refitted in the place of a named effect.
 
@@ -107,7 +105,8 @@ def settle(
 ) -> tuple[Found[F, M], list[Rival[F]]]:
     """Find the rivals; where one does better than what is named, search on from it, ``SWAPS`` times at most.
 
-    A step adds what saves most beside the effects of that moment; what came later may have made a look-alike the better one.
+    A step adds what saves most beside the effects of that moment; what came later may have made a look-alike the better
+    one.
 
     Args:
         rivals: of what was found, refitted.

@@ -1,8 +1,9 @@
-"""What a row of a log tells of the force between it and the next: held by the loop, or a point of what a faster loop made.
+"""What a row of a log tells of the force between it and the next: held by the loop, or a point of what a faster loop
+made.
 
-A log with the period of the loop holds every force over its sample, exactly. One that is slower has points of a force that has moved on
-meanwhile; held until the next row it comes half a sample late, which passes for elasticity, for another inertia, for friction. And a log may
-pair the position of a row with the force of the row before.
+A log with the period of the loop holds every force over its sample, exactly. One that is slower has points of a force
+that has moved on meanwhile; held until the next row it comes half a sample late, which passes for elasticity, for
+another inertia, for friction. And a log may pair the position of a row with the force of the row before.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ class Sampling:
     """How the rows of a log tell the force.
 
     Attributes:
-        late: half a period of the loop, in samples of the log: the force comes so late after the points of the log; below 0 the log
-            is late with it. None: the row after the present one holds the force.
+        late: half a period of the loop, in samples of the log: the force comes so late after the points of the log;
+            below 0 the log is late with it. None: the row after the present one holds the force.
         left: share of the squares that the force held over its sample leaves.
     """
 
@@ -56,12 +57,15 @@ class Sampling:
             return f"the force of a row acts before its position: it is taken from the row after{share}"
         if self.late < 0.0:
             return (
-                f"the log tells the force late, by some {-1e3 * self.late * sample_time_s:.2g} ms (a filter?): it is read as a curve that much "
+                f"the log tells the force late, by some {-1e3 * self.late * sample_time_s:.2g} ms (a filter?): it is "
+                "read as a curve that much "
                 f"earlier{share}, and a delay or lag does not show"
             )
         return (
-            f"the log is slower than the loop that makes the force (a period of some {2e3 * self.late * sample_time_s:.2g} ms fits best"
-            f"{share}): the force is read as a curve through the rows, and a delay or lag below half a sample does not show. "
+            f"the log is slower than the loop that makes the force (a period of some "
+            f"{2e3 * self.late * sample_time_s:.2g} ms fits best"
+            f"{share}): the force is read as a curve through the rows, and a delay or lag below half a sample does not "
+            "show. "
             "loop_time_s in columns.toml would tell the period"
         )
 
@@ -69,8 +73,8 @@ class Sampling:
 def read_as(session: Session, sampling: Sampling) -> Session:
     """Return the session with the mean force of every sample [{F}] in the place of the logged one, in all its records.
 
-    What the loop makes, and the drive's current with it, comes ``sampling.late``; a force from outside is nobody's loop and is
-    read as it was measured.
+    What the loop makes, and the drive's current with it, comes ``sampling.late``; a force from outside is nobody's loop
+    and is read as it was measured.
     """
 
     def mean(signal: Array | None, late: float | None) -> Array | None:
@@ -90,7 +94,9 @@ def read_as(session: Session, sampling: Sampling) -> Session:
 
 
 def _mean(signal: Array, late: float | None) -> Array:
-    """Mean of a signal over every sample, shape (n,): of a cubic spline through the rows, ``late`` samples earlier, or the next row."""
+    """Mean of a signal over every sample, shape (n,): of a cubic spline through the rows, ``late`` samples earlier, or
+    the next row.
+    """
     if late is None:
         return np.append(signal[1:], signal[-1])
     n = len(signal)
@@ -101,8 +107,8 @@ def _mean(signal: Array, late: float | None) -> Array:
 def trusted(problem: Problem, model: AxisModel) -> Problem:
     """Let samples count less where the force between the rows is not known: where its fourth difference stands out.
 
-    A step of the force between two rows leaves an error of 0.29 of it in the mean (it may be anywhere between them) and a fourth difference
-    of three of it.
+    A step of the force between two rows leaves an error of 0.29 of it in the mean (it may be anywhere between them) and
+    a fourth difference of three of it.
 
     Args:
         problem: whose noise says how large the innovation is that is expected.
@@ -175,11 +181,7 @@ def _between(lates: Sequence[float | None], costs: Sequence[float], i: int) -> f
 def _usual(model: AxisModel) -> AxisModel:
     for name in USUAL:
         effect = known()[name]
-        if (
-            name in model.effects
-            or not model.applicable(effect)
-            or any(n in model.effects for n in effect.replaces)
-        ):
+        if name in model.effects or not model.applicable(effect) or any(n in model.effects for n in effect.replaces):
             continue
         start = {p.symbol: p.start * (1.0 if p.fixed else model.scale(p)) for p in effect.parameters}
         model = model.with_effect(name, start)

@@ -28,7 +28,8 @@ FEW = 4  # trials that further values are tried with
 #: First guesses of the level at speed and of the breakaway level, of a level that stood for both.
 DROPS = ((1.0, 1.4), (0.85, 1.05))
 SPEED_STEPS, PLACES = 7, 15
-#: Below this the measured motion stands for one without noise; a command is followed up to COMMAND_HZ, if to this share.
+#: Below this the measured motion stands for one without noise; a command is followed up to COMMAND_HZ, if to this
+#: share.
 SLOW_HZ, COMMAND_HZ, FOLLOWED = 5.0, 30.0, 0.2
 #: A regression on more rows than this leaves some out.
 MOST_ROWS = 40_000
@@ -36,7 +37,9 @@ MOST_ROWS = 40_000
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Smoothed motion of one record; arrays of shape (n,). ``u`` is the drive's force, ``outer`` a known one beside it."""
+    """Smoothed motion of one record; arrays of shape (n,). ``u`` is the drive's force, ``outer`` a known one beside
+    it.
+    """
 
     x: Array
     v: Array
@@ -85,9 +88,7 @@ def direction(v: Array, dead: float) -> Array:
     return s
 
 
-def state_columns(
-    effect: Effect, model: AxisModel, motion: Motion, shape: dict[str, float], dead: float
-) -> Array:
+def state_columns(effect: Effect, model: AxisModel, motion: Motion, shape: dict[str, float], dead: float) -> Array:
     """Forces per unit of each amplitude of a state effect (two columns where it has a phase), shape (n, k)."""
     columns = []
     m, way = motion, direction(motion.v, dead)
@@ -112,9 +113,7 @@ def amplitudes(effect: Effect) -> list[tuple[Parameter, Parameter | None]]:
     out: list[tuple[Parameter, Parameter | None]] = []
     for i, p in enumerate(effect.parameters):
         linear = (
-            ("{F}" in p.unit and not p.shape)
-            or (effect.slot is Slot.GAIN and i == 0)
-            or (i == 0 and p.unit == "1")
+            ("{F}" in p.unit and not p.shape) or (effect.slot is Slot.GAIN and i == 0) or (i == 0 and p.unit == "1")
         )
         if linear:
             following = effect.parameters[i + 1] if i + 1 < len(effect.parameters) else None
@@ -126,13 +125,12 @@ def shapes(effect: Effect, model: AxisModel, travel: tuple[float, float]) -> Ite
     """Yield trial values of the parameters in which a state effect is not linear.
 
     Args:
-        travel: range of motion; of the orders those are tried of which it holds (nearly) one period, of places those within.
+        travel: range of motion; of the orders those are tried of which it holds (nearly) one period, of places those
+            within.
     """
     linear = {p.symbol for p, _ in amplitudes(effect)}
     order = next((p for p in effect.parameters if p.fixed), None)
-    shape = next(
-        (p for p in effect.parameters if p.symbol not in linear and not p.fixed and not p.phase), None
-    )
+    shape = next((p for p in effect.parameters if p.symbol not in linear and not p.fixed and not p.phase), None)
     if order is not None:
         # a wave of one period in a turn of the axis is gravity
         turn = model.pitch / (2.0 * np.pi) if model.rotary and effect.slot is Slot.FORCE else 0.0
@@ -154,9 +152,7 @@ def shapes(effect: Effect, model: AxisModel, travel: tuple[float, float]) -> Ite
         yield {}
 
 
-def screen(
-    problem: Problem, fit: Fit, names: list[str], levels: Mapping[str, float] | None = None
-) -> list[Start]:
+def screen(problem: Problem, fit: Fit, names: list[str], levels: Mapping[str, float] | None = None) -> list[Start]:
     """Rank effects by what they could explain beyond the fitted model.
 
     Args:
@@ -234,9 +230,7 @@ def _moved_by(model: AxisModel, command: Array) -> Motion:
 def low_passed(x: Array, cutoff_hz: float, dt: float) -> Array:
     """Filter forth and back, shape (n,)."""
     sos = butter(3, min(2.0 * cutoff_hz * dt, 0.8), output="sos")
-    out: Array = sosfiltfilt(
-        sos, x, padtype="odd", padlen=min(int(max(300, 0.5 / (cutoff_hz * dt))), len(x) - 1)
-    )
+    out: Array = sosfiltfilt(sos, x, padtype="odd", padlen=min(int(max(300, 0.5 / (cutoff_hz * dt))), len(x) - 1))
     return out
 
 
@@ -351,7 +345,9 @@ def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator
 def _screen_trials(
     problem: Problem, fit: Fit, effect: Effect, q: Array, rest: Array, levels: Mapping[str, float]
 ) -> list[Start]:
-    """Try an effect on a grid in the simulation; the change it makes may be stretched, and turned round where its size has a sign."""
+    """Try an effect on a grid in the simulation; the change it makes may be stretched, and turned round where its size
+    has a sign.
+    """
     model, way = room_for(fit.model, effect.name), effect.trials or Trials(lambda seen: ())
     trials = [{**t, **levels} for t in trial_values(effect, model, problem)]
     if effect.joins:
@@ -376,7 +372,8 @@ def _scored(
     """Simulate trials beside a model and say what each could explain, the best first.
 
     Args:
-        stretched: their sizes are only typical, and are stretched to what is seen; else they are those of what they replace.
+        stretched: their sizes are only typical, and are stretched to what is seen; else they are those of what they
+            replace.
     """
     best: list[Start] = []
     least = -9.0 if effect.neutral or effect.primary.lower < 0.0 else 0.0
@@ -392,9 +389,7 @@ def _scored(
             continue
         stretch = float(np.clip(-(d @ rest) / size, least, 9.0))
         gain = 1.0 - float(np.sum((rest + stretch * d) ** 2)) / float(rest @ rest)
-        best.append(
-            Start(effect.name, gain, _stretched(effect, model, values, stretch) if stretched else values)
-        )
+        best.append(Start(effect.name, gain, _stretched(effect, model, values, stretch) if stretched else values))
     return sorted(best, key=lambda s: -s.gain)
 
 
@@ -408,9 +403,7 @@ def _beside(trials: list[dict[str, float]], model: AxisModel, effect: Effect) ->
     return list({tuple(t.items()): t for t in made}.values())
 
 
-def _stretched(
-    effect: Effect, model: AxisModel, values: dict[str, float], stretch: float
-) -> dict[str, float]:
+def _stretched(effect: Effect, model: AxisModel, values: dict[str, float], stretch: float) -> dict[str, float]:
     """Scale the amplitude where the effect is linear in it."""
     p = effect.parameters[0]
     if effect.joins or effect.trials is None or not effect.trials.stretched:

@@ -91,9 +91,7 @@ class Searcher:
                 del self._fits[next(iter(self._fits))]
         return self._fits[key]
 
-    def screen(
-        self, fit: Fit, names: Sequence[str], levels: Mapping[str, float] | None = None
-    ) -> list[Start]:
+    def screen(self, fit: Fit, names: Sequence[str], levels: Mapping[str, float] | None = None) -> list[Start]:
         """Screen as ``sioms.reconcile.screen.screen`` does; what was screened before is looked up."""
         key = (values_of(fit.model), tuple(sorted((levels or {}).items())))
         fresh = [n for n in names if (key, n) not in self._starts]
@@ -130,7 +128,9 @@ class Searcher:
         return fit
 
     def loss(self, fit: Fit) -> Array:
-        """Held-out loss per block; beside a gap, whose rough cost has no slope to go by, with all numbers as they are."""
+        """Held-out loss per block; beside a gap, whose rough cost has no slope to go by, with all numbers as they
+        are.
+        """
         if len(self.ids) != len(fit.residual):
             self.ids = block_ids(self.problem, fit.model.sample_time_s)
         losses = heldout(
@@ -145,7 +145,8 @@ class Searcher:
         )
 
     def follows(self, model: AxisModel, before: AxisModel) -> bool:
-        """Say whether the closed loop agrees with the records about as well as that of another model, where it can be simulated.
+        """Say whether the closed loop agrees with the records about as well as that of another model, where it can be
+        simulated.
 
         A model that hardly listens to its force (a huge inertia) predicts short windows by the measured motion alone.
         """
@@ -188,7 +189,9 @@ class Searcher:
         return fit, self.loss(fit)
 
     def plainly(self, found: Found) -> Found:
-        """Take back what a searched order enriched, unless it saves half: where much is unexplained some order always fits."""
+        """Take back what a searched order enriched, unless it saves half: where much is unexplained some order always
+        fits.
+        """
         fit, losses, steps = found.fit, found.losses, list(found.ladder)
         for name in [n for n in fit.model.effects if n not in self.frozen and self._enrichment(n)]:
             other = next(o for o in plainer(name, self.names) if o in known()[name].replaces)
@@ -210,11 +213,7 @@ class Searcher:
             and not any(f in known()[n].replaces for f in self.frozen)
             and accompanied(fit.model, n)
         ]
-        fresh = [
-            n
-            for n in names
-            if not replaced(fit.model, n) and not self._enrichment(n) and not known()[n].joins
-        ]
+        fresh = [n for n in names if not replaced(fit.model, n) and not self._enrichment(n) and not known()[n].joins]
         starts = [s for s in self.screen(fit, fresh) if s.gain > 0.5 * GAIN]
         starts += self._upgrades(fit, [n for n in names if replaced(fit.model, n)])
         starts.sort(key=lambda s: -s.gain)
@@ -227,9 +226,7 @@ class Searcher:
     def _enrichment(self, name: str) -> bool:
         """Say whether an effect with a searched order only enriches a plainer one, which goes first."""
         effect = known()[name]
-        return any(p.fixed for p in effect.parameters) and any(
-            o in effect.replaces for o in plainer(name, self.names)
-        )
+        return any(p.fixed for p in effect.parameters) and any(o in effect.replaces for o in plainer(name, self.names))
 
     def _upgrades(self, fit: Fit, names: list[str]) -> list[Start]:
         """Screen richer forms of an effect in the model, on top of the level it has."""
@@ -243,9 +240,7 @@ class Searcher:
             old = next(n for n in known()[name].replaces if n in fit.model.effects)
             given = fit.model.effects[old]
             level = next((given[s] for s in LEVELS if s in given), None)
-            levels = {
-                p.symbol: level for p in known()[name].parameters if level is not None and p.symbol in LEVELS
-            }
+            levels = {p.symbol: level for p in known()[name].parameters if level is not None and p.symbol in LEVELS}
             out += self.screen(fit, [name], levels)
         return out
 
@@ -287,9 +282,7 @@ class Searcher:
         rivals = {n: t[2] for n, t in tried.items() if n != name}
         return new, loss, Step("add", name, new.ratio, gain, new.model, rivals)
 
-    def _good(
-        self, tried: dict[str, Tried], fit: Fit, losses: Array
-    ) -> tuple[dict[str, Tried], dict[str, Tried]]:
+    def _good(self, tried: dict[str, Tried], fit: Fit, losses: Array) -> tuple[dict[str, Tried], dict[str, Tried]]:
         """Pick those that save enough, surely; and of them those that can be.
 
         Beside a gap, whose bounces fall out otherwise with any other number, a small saving says nothing.
@@ -305,7 +298,9 @@ class Searcher:
         return sure, {n: t for n, t in good.items() if t[2] >= least and t[3] >= self._sure(n)}
 
     def _plainer_beside(self, new: Fit, fit: Fit) -> list[Fit]:
-        """Put a plainer effect, or none, in the place of each that can no longer be beside a new one: it stood for both."""
+        """Put a plainer effect, or none, in the place of each that can no longer be beside a new one: it stood for
+        both.
+        """
         out = []
         for name in [n for n in new.model.effects if n in fit.model.effects and not self._stays(new, fit, n)]:
             others = [o for o in plainer(name, self.names) if vacant(new.model, name, o)]
@@ -316,7 +311,8 @@ class Searcher:
     def _add_pair(self, fit: Fit, losses: Array) -> tuple[Fit, Array, Step] | None:
         """Add two effects at once where neither saves enough alone: each hides what the other would save.
 
-        Both must be sure together, and each must earn its place beside the other. One that joins the first with another counts as both.
+        Both must be sure together, and each must earn its place beside the other. One that joins the first with another
+        counts as both.
         """
         pairs: dict[str, Tried] = {}
         if fit.ratio < AXIS.paired:
@@ -332,21 +328,14 @@ class Searcher:
                 if s.effect not in known()[first.effect].replaces or first.effect in known()[s.effect].joins
             ]
             for second in beside[: AXIS.tries]:
-                new = self._with(
-                    middle, second, 8, min((t[0].cost for t in pairs.values()), default=middle.cost)
-                )
+                new = self._with(middle, second, 8, min((t[0].cost for t in pairs.values()), default=middle.cost))
                 joined = first.effect in known()[second.effect].joins
                 if first.effect not in new.model.effects and not joined:
                     continue
                 loss = self.loss(new)
                 gain, sure = better(loss, losses)
                 more, surer = better(loss, inner)
-                good = (
-                    gain >= SPECIFIC
-                    and sure >= SURE
-                    and more >= SPECIFIC
-                    and surer >= self._sure(second.effect)
-                )
+                good = gain >= SPECIFIC and sure >= SURE and more >= SPECIFIC and surer >= self._sure(second.effect)
                 if good and self._sound(new, fit):
                     name = second.effect if joined else f"{first.effect}{AND}{second.effect}"
                     pairs[name] = new, loss, gain, sure
@@ -382,10 +371,10 @@ class Searcher:
             tried[effect] = (new, loss, gain, sure)
 
     def _enriched(self, tried: Mapping[str, Tried]) -> list[tuple[str, Fit]]:
-        """Start rich effects from their plain form too, where both were tried: from far the speed of a drop is not found."""
-        pairs = [
-            (n, o) for n in tried for o in plainer(n, self.names) if o in tried and o in known()[n].replaces
-        ]
+        """Start rich effects from their plain form too, where both were tried: from far the speed of a drop is not
+        found.
+        """
+        pairs = [(n, o) for n in tried for o in plainer(n, self.names) if o in tried and o in known()[n].replaces]
         return [
             (name, self._with(tried[other][0], start, 5))
             for name, other in pairs
@@ -398,15 +387,10 @@ class Searcher:
         for name in [n for n in fit.model.effects if n not in self.frozen]:
             for other in [o for o in plainer(name, self.names) if o in known()[name].replaces]:
                 base = self.fit(swapped(fit.model, name, other), 5)
-                starts = [
-                    s for s in self._candidates(base) if name not in (s.effect, *known()[s.effect].replaces)
-                ]
+                starts = [s for s in self._candidates(base) if name not in (s.effect, *known()[s.effect].replaces)]
                 for s in starts[:2]:
                     middle = self._with(base, s, 5)
-                    out += [
-                        (s.effect, self._with(middle, again, 6))
-                        for again in self._upgrades(middle, [name])[:1]
-                    ]
+                    out += [(s.effect, self._with(middle, again, 6)) for again in self._upgrades(middle, [name])[:1]]
         return out
 
     def _sure(self, name: str) -> float:

@@ -127,9 +127,7 @@ def estimate(problem: Problem, model: AxisModel, record: Record, stop: int, heat
 
 def _slope(residual: Callable[[State], Array], state: State, knob: _Knob, base: Array) -> Array:
     step = 1e-3
-    return (
-        residual(replace(state, **{knob.name: getattr(state, knob.name) + step * knob.spread})) - base
-    ) / step
+    return (residual(replace(state, **{knob.name: getattr(state, knob.name) + step * knob.spread})) - base) / step
 
 
 def _moved(state: State, moving: list[_Knob], step: Array) -> State:

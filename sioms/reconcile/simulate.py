@@ -22,8 +22,8 @@ from sioms.reconcile.records import Record
 
 #: Corrections of an observer that follows nothing.
 IDLE = (0.0,) * 8
-#: A record begins in motion that at first makes more way than this share of the largest speed would. Its start is fitted
-#: over so many periods of an elastic transmission, and samples.
+#: A record begins in motion that at first makes more way than this share of the largest speed would. Its start is
+#: fitted over so many periods of an elastic transmission, and samples.
 MOVING, PERIODS, FEWEST = 0.01, 4.0, 40
 #: Numbers of a start, and how many memories of an observer tell the speed in it.
 START, MEMORIES = 7, 2.0
@@ -31,7 +31,9 @@ START, MEMORIES = 7, 2.0
 
 @dataclass(frozen=True, slots=True)
 class Packed:
-    """A model as the kernel reads it: its numbers, and per kind of state function the functions and their rows (n, ROW)."""
+    """A model as the kernel reads it: its numbers, and per kind of state function the functions and their rows (n,
+    ROW).
+    """
 
     plant: Array
     functions: dict[Slot, Any]
@@ -165,9 +167,7 @@ def simulate(model: AxisModel, command: Array, temperature: float = 0.0, substep
     """
     command = np.ascontiguousarray(command, dtype=np.float64)
     start = np.array([model.start_position, 0.0, temperature, 0.0, 0.0, 0.0, 0.0])
-    return _march(
-        pack(model, substeps), True, command, command, None, None, controller_row(model), IDLE, start
-    )
+    return _march(pack(model, substeps), True, command, command, None, None, controller_row(model), IDLE, start)
 
 
 def replay(model: AxisModel, record: Record, temperature: float = 0.0) -> Run:
@@ -234,7 +234,9 @@ def _set_going(
     steps: Array,
     n: int,
 ) -> Array:
-    """Start in motion with those numbers, of as many as there are small steps (k, len(start)), that leave least of the first n samples."""
+    """Start in motion with those numbers, of as many as there are small steps (k, len(start)), that leave least of the
+    first n samples.
+    """
 
     def innovation(at: Array) -> Array:
         outer = None if external is None else external[:n]
@@ -252,10 +254,11 @@ def _set_going(
 def _unknown_at_first(
     p: Packed, y: Array, noise: Noise, pair: Pair | None, model: AxisModel
 ) -> tuple[Array, int] | None:
-    """Return small steps of what a record in motion does not tell of its start, and the samples that do; None where it tells all.
+    """Return small steps of what a record in motion does not tell of its start, and the samples that do; None where it
+    tells all.
 
-    Of two masses it is the speed, the wind-up and its rate, told by the first periods; of one the speed, where counts are too coarse to
-    show it in 20 ms, told by as many samples as the observer remembers.
+    Of two masses it is the speed, the wind-up and its rate, told by the first periods; of one the speed, where counts
+    are too coarse to show it in 20 ms, told by as many samples as the observer remembers.
     """
     if not _moves(y, model):
         return None

@@ -56,10 +56,7 @@ def _course(view: View, number: Number, hz: float, sized: tuple[Array, Array, fl
             estimate(view, number, amplitude, wide),
             Estimate("f", hz, hz - off, hz + off, "Hz", "frequency"),
         ),
-        tuple(
-            view.column(i, number) * (waves(len(r), hz, view.dt) @ swung[i])
-            for i, r in enumerate(view.records)
-        ),
+        tuple(view.column(i, number) * (waves(len(r), hz, view.dt) @ swung[i]) for i, r in enumerate(view.records)),
         left * len(view.residual) / len(view.rows),
         1 + len(size),
         lambda view: _course(view, number, hz, _sized(view, number, hz, steady), steady),

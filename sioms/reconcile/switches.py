@@ -46,7 +46,9 @@ class Switches:
                 yield from ((i, k, to) for to in (at - step, at + step) if before < to < after)
 
     def fewer(self) -> Iterator[Switches]:
-        """Yield what is left without the first or the last switch of a record, or without two that follow each other."""
+        """Yield what is left without the first or the last switch of a record, or without two that
+        follow each other.
+        """
         for i, (own, first) in enumerate(zip(self.edges, self.first, strict=True)):
             if own:
                 yield self.put(i, own[1:], not first)
@@ -122,9 +124,7 @@ class _Sized:
 
     def columns(self, view: View, record: int) -> Array:
         """Forces per unit of the numbers in a record, shape (n, parts)."""
-        return np.stack(
-            [view.column(record, p, s) for p, s in zip(self.parts, self.sizes, strict=True)], axis=1
-        )
+        return np.stack([view.column(record, p, s) for p, s in zip(self.parts, self.sizes, strict=True)], axis=1)
 
 
 def switching(view: View, number: Number, read: Read) -> Course | None:
@@ -156,7 +156,8 @@ def _course(view: View, sized: _Sized, switches: Switches, steady: bool) -> Cour
     return Course(
         "switch",
         f"F = {force} while it is on",
-        f"the {' and the '.join(p.text for p in parts)} switch{'es' * (len(parts) < 2)} in time, {_when(view, switches)}",
+        f"the {' and the '.join(p.text for p in parts)} switch{'es' * (len(parts) < 2)} in time, "
+        f"{_when(view, switches)}",
         tuple(estimate(view, *q) for q in zip(parts, sized.added, sized.spread, strict=True)),
         tuple(going.on(i, n) * (sized.columns(view, i) @ sized.added) for i, n in enumerate(counts)),
         sized.left * len(view.residual) / len(view.rows),
@@ -200,7 +201,9 @@ def _path(value: Array, weight: Array, low: float, high: float, price: float) ->
 
 
 def _settled(view: View, parts: Sequence[Number], switches: Switches) -> Switches:
-    """Move every switch to where it leaves least, to a sample, and take out those that save less than an effect must."""
+    """Move every switch to where it leaves least, to a sample, and take out those that save less
+    than an effect must.
+    """
     if not switches.any():
         return switches
     best = _Sized.of(view, parts, switches)

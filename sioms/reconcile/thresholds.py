@@ -1,8 +1,8 @@
 """Every threshold that decides what a verdict says: what it separates, and the data it was set on.
 
-Both stacks, of axes and of sensors, read this table. Numbers in brackets are decisions; "forty axes" are those of docs/reconcile.md,
-"Figures", and the sets A to I those of its second generator. Where no data are named, none are on record. Numbers that only steer
-the work (grids, steps of a fit, sizes of blocks) stand where they are used.
+Both stacks, of axes and of sensors, read this table. Numbers in brackets are decisions; "forty axes" are those of
+docs/reconcile.md, "Figures", and the sets A to I those of its second generator. Where no data are named, none are on
+record. Numbers that only steer the work (grids, steps of a fit, sizes of blocks) stand where they are used.
 """
 
 from __future__ import annotations
@@ -12,15 +12,18 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Footing:
-    """Thresholds that axes and sensors have alike, but not of one value: the floor of an axis is an expected innovation, that of a sensor the scatter of its own rows.
+    """Thresholds that axes and sensors have alike, but not of one value: the floor of an axis is an expected
+    innovation, that of a sensor the scatter of its own rows.
 
     Attributes:
-        floor: a search stops at this multiple of the floor. Axes: 1.05 instead of 1.15, set A (0073); 120 force sensors were no better with 1.05 (0074).
+        floor: a search stops at this multiple of the floor. Axes: 1.05 instead of 1.15, set A (0073); 120 force sensors
+            were no better with 1.05 (0074).
         tries: candidates refitted in a step.
         steps: steps of a search at most.
         paired: two effects are tried at once only above this multiple. Sensors: set of a fresh origin (0072).
         odd: nothing is called unexplained below this multiple.
-        trace: what an effect of natural size must leave to be ranked: on axes over the floor, root mean square; on sensors in standard deviations of all rows.
+        trace: what an effect of natural size must leave to be ranked: on axes over the floor, root mean square; on
+            sensors in standard deviations of all rows.
     """
 
     floor: float
@@ -43,32 +46,46 @@ SURE = 2.0
 PERIODIC_SURE = 3.0
 """The same for effects whose order is searched over tens of values. Forty axes (0063)."""
 SPECIFIC = 0.3
-"""A saving below this counts only where no unrelated effect saves ``NEARLY`` as much. Forty axes (0063); beside a gap always, set D (0075)."""
+"""A saving below this counts only where no unrelated effect saves ``NEARLY`` as much. Forty axes (0063); beside a gap
+always, set D (0075).
+"""
 NEARLY = 0.5
 """See ``SPECIFIC``. Forty axes (0063)."""
 DOUBTFUL = 0.2
 """A larger loss than this is one, however unevenly it falls on the blocks."""
 CLEAR = 0.5
-"""A step that saves this much needs no second look at the friction law; a searched order must save it in a refusal. Set A (0073)."""
+"""A step that saves this much needs no second look at the friction law; a searched order must save it in a refusal. Set
+A (0073).
+"""
 LOOSE = 2.0
-"""An effect does not make the error of the simulated closed loop this many times larger: an inertia so huge that it does not listen to its force. Set A (0073)."""
+"""An effect does not make the error of the simulated closed loop this many times larger: an inertia so huge that it
+does not listen to its force. Set A (0073).
+"""
 DEEP = 3.0
-"""Standard errors, over all blocks, of a saving below the floor of a sensor. Where nothing is hidden none saved 0.03 of everything; fingers and force sensors of a fresh origin (0074)."""
+"""Standard errors, over all blocks, of a saving below the floor of a sensor. Where nothing is hidden none saved 0.03 of
+everything; fingers and force sensors of a fresh origin (0074).
+"""
 PAIRS = 3
 """Firsts of two effects at once, each with the best few seconds."""
 
 # --- when a look-alike is ruled out
 
 AMBIGUOUS = 0.015
-"""Share of an effect's contribution that a look-alike must miss: pairs made alike missed 0.0 to 1.3 %, pairs told apart by full records 4 % and more. Forty axes (0063)."""
+"""Share of an effect's contribution that a look-alike must miss: pairs made alike missed 0.0 to 1.3 %, pairs told apart
+by full records 4 % and more. Forty axes (0063).
+"""
 ALIKE = 0.05
-"""The same where the gate found one trace for both: gravity over 0.4 rad was told from a constant force that missed 2.2 %. Seeds 101 and 202 (0069)."""
+"""The same where the gate found one trace for both: gravity over 0.4 rad was told from a constant force that missed 2.2
+%. Seeds 101 and 202 (0069).
+"""
 SAME_TRACE = 0.98
 """Share of energy in common from which on two traces are one, for ``ALIKE``. Seeds 101 and 202 (0069)."""
 SAME = 0.95
 """The same for what the report says looks alike in these records."""
 ROUGH = 0.1
-"""What a look-alike must miss beside a gap, whose bounces fall out otherwise with every other number. Eleven axes with a gap (0080)."""
+"""What a look-alike must miss beside a gap, whose bounces fall out otherwise with every other number. Eleven axes with
+a gap (0080).
+"""
 SWAPS = 2
 """Look-alikes that take the place of what is named, one after the other."""
 
@@ -79,15 +96,21 @@ UNEXPLAINED = 0.2
 LARGE = 3.0
 """A residual beyond this multiple of the floor is no noise, whatever it looks like; beside a gap when bent (0080)."""
 LOUD = 1.4
-"""Above this multiple a nameless term is looked for though no smoother explains anything: a bend in force is no function of motion. Set A (0073)."""
+"""Above this multiple a nameless term is looked for though no smoother explains anything: a bend in force is no
+function of motion. Set A (0073).
+"""
 QUIET = 1.6
-"""Below this multiple nothing is called a burst; above it a sensor is searched again with nameless terms. 49 force sensors, 35 fingers (0072)."""
+"""Below this multiple nothing is called a burst; above it a sensor is searched again with nameless terms. 49 force
+sensors, 35 fingers (0072).
+"""
 BURSTS = 0.8
 """The loudest tenth of the time holds this share of the residual's energy: a disturbance."""
 MOSTLY, CHANCE = 0.5, 0.01
 """So large a share of the bursts at turns of the motion belongs to them, if chance brings it no oftener than this."""
 BURST_S, LOUD_BLOCK, MOST_LOUD = 0.1, 6.0, 0.34
-"""A block of so many seconds is loud above this multiple of the median energy; bursts are no larger share of the time than the last."""
+"""A block of so many seconds is loud above this multiple of the median energy; bursts are no larger share of the time
+than the last.
+"""
 HOPELESS, HALF = 5.0, 0.33
 """Above this multiple, and with this share of the disagreement left, nothing is named at all."""
 LOOPS = 2.0
@@ -98,17 +121,22 @@ FELL = 0.7
 # --- what keeps time
 
 HALVED, ROUGHLY, ABOUT = 0.5, 2.0, 1.25
-"""A change in time leaves at most the first share of what else would be left above the noise; of several that leave about the same, or no
-more than noise, the one with the fewest numbers is taken. Fifteen axes of the second generator (0082)."""
+"""A change in time leaves at most the first share of what else would be left above the noise; of several that leave
+about the same, or no more than noise, the one with the fewest numbers is taken. Fifteen axes of the second generator
+(0082)."""
 PROMISING = 0.5
 """The course of a number is looked at closely where it leaves less than this share, whatever it is (0082)."""
 EARNED, SECOND, REGULAR = 20.0, 0.6, 0.05
-"""A switch saves so many times what it would of noise; a second number that switches with the first leaves at most this share; switches come at
-regular times where their intervals differ by no more than the last. Fifteen axes (0082)."""
+"""A switch saves so many times what it would of noise; a second number that switches with the first leaves at most this
+share; switches come at regular times where their intervals differ by no more than the last. Fifteen axes (0082)."""
 TONE = 0.5
-"""A line of this share of the residual's energy is no noise: of noise the strongest holds less than 0.1, of a vibration 0.9 and more. Set D (0075)."""
+"""A line of this share of the residual's energy is no noise: of noise the strongest holds less than 0.1, of a vibration
+0.9 and more. Set D (0075).
+"""
 OWN, PURE = 0.05, 0.5
-"""A frequency is the motion's own where it holds the first share of the motion's speed, or is an upper one of what holds the second. Set D (0075)."""
+"""A frequency is the motion's own where it holds the first share of the motion's speed, or is an upper one of what
+holds the second. Set D (0075).
+"""
 
 # --- stand-ins on sensors; all on fingers and force sensors of a fresh origin
 
@@ -119,7 +147,9 @@ REFUSED = 3
 FEWER = 2
 """Times as few numbers has a nameless rule that takes the place of elements' own numbers (0074)."""
 WHOLLY = 0.95
-"""Share of a view that a name must save where the view stays above its floor: less may be a part of what has no name (0074)."""
+"""Share of a view that a name must save where the view stays above its floor: less may be a part of what has no name
+(0074).
+"""
 MOST_INSIDE = 0.7
 """Share of the elements whose own number must be one that the effect can have (0072)."""
 SHARPER = 0.6

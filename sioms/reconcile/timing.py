@@ -1,8 +1,8 @@
 """Lay records on the grid of the sample time by their time stamps: stamps jitter, samples are lost.
 
-Stamps that lie beside the grid by less than half a step are taken for late notes of samples that were in time, and so are
-worse ones where as many samples share a place as places are empty. A few lost samples, or rows with a value that is no
-number, are interpolated, a longer gap parts the record.
+Stamps that lie beside the grid by less than half a step are taken for late notes of samples that were in time, and so
+are worse ones where as many samples share a place as places are empty. A few lost samples, or rows with a value that is
+no number, are interpolated, a longer gap parts the record.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from scipy.interpolate import CubicSpline
 from sioms.reconcile.effect import Array
 from sioms.reconcile.records import Record, Session
 
-#: Longest gap that is interpolated [samples], largest share of all samples, and least length of a record, or of what a gap leaves of one.
+#: Longest gap that is interpolated [samples], largest share of all samples, and least length of a record, or of what a
+#: gap leaves of one.
 LONGEST, MOST, LEAST_SAMPLES = 5, 0.2, 250
 #: As many samples more or fewer than their stamps say are the jitter of the first and the last of them.
 WANDER = 2
@@ -29,8 +30,9 @@ def on_grid(session: Session, sample_time_s: float) -> tuple[Session, list[str]]
     """Put every record that has usable time stamps on an even grid.
 
     Returns:
-        The session, in which a longer gap has made two records of one (the heat state no longer carries over), and notes on
-        what was lost. Records whose stamps do not fit the sample time are left as they are, for ``check`` to refuse.
+        The session, in which a longer gap has made two records of one (the heat state no longer carries over), and
+        notes on what was lost. Records whose stamps do not fit the sample time are left as they are, for ``check`` to
+        refuse.
     """
     notes: list[str] = []
     parts = [_pieces(r, sample_time_s, notes) for r in session.records]

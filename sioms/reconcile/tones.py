@@ -61,7 +61,9 @@ def tone(problem: Problem, fit: Fit) -> Tone:
 
 
 def hum(problem: Problem, fit: Fit) -> Tone | None:
-    """Return the tone that most of a residual is, if it is one; what the motion itself does at that frequency is none."""
+    """Return the tone that most of a residual is, if it is one; what the motion itself does at that frequency is
+    none.
+    """
     found = tone(problem, fit)
     return found if found.share > TONE and not _moved(problem, fit.model, found.frequency_hz) else None
 

@@ -99,9 +99,7 @@ def twins(
                         f"simulate {name} of {model.name}: a plant cannot carry it out; "
                         "switch the effect off in the model file"
                     )
-                table.setdefault(names[i], {}).update(
-                    effect.mechanism.twin(effect.values(values), model.pitch)
-                )
+                table.setdefault(names[i], {}).update(effect.mechanism.twin(effect.values(values), model.pitch))
             if effect.slot is not None:
                 acting.setdefault(name, []).append((i, effect.row(effect.values(values), model.pitch)))
     heat = _heat(models, len(motors), tick_s)

@@ -1,6 +1,8 @@
-"""Dry friction that varies over the turn: one effect with Coulomb friction alone, a factor beside any other law of dry friction.
+"""Dry friction that varies over the turn: one effect with Coulomb friction alone, a factor beside any other law of dry
+friction.
 
-Where one law takes the place of another, what varied goes on varying, and is named as it is named there (decision 0083).
+Where one law takes the place of another, what varied goes on varying, and is named as it is named there (decision
+0083).
 """
 
 from __future__ import annotations

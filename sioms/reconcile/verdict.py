@@ -97,7 +97,9 @@ class Gap:
 
     @property
     def closed(self) -> float:
-        """Share of the gap above the floor that the model closes, at most 1; 0 where the gap did not stand above the floor."""
+        """Share of the gap above the floor that the model closes, at most 1; 0 where the gap did not stand above the
+        floor.
+        """
         gap = self.before - self.floor
         return min((self.before - self.after) / gap, 1.0) if gap > 0.0 else 0.0
 

@@ -23,8 +23,8 @@ WINDOW_S, MOST_WINDOWS = 0.1, 160
 class Seen:
     """Motion of one record, arrays of shape (n,).
 
-    The acceleration is that of the model, not the measured one: force and measured acceleration together explain whatever
-    there is, since their difference is what is unknown.
+    The acceleration is that of the model, not the measured one: force and measured acceleration together explain
+    whatever there is, since their difference is what is unknown.
 
     Attributes:
         u: force of the drive; v: speed; a: acceleration of the model.
@@ -75,7 +75,9 @@ NUMBERS = (
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """What a number was in every window: values, and their weights in squares, per record, and the squares that this leaves."""
+    """What a number was in every window: values, and their weights in squares, per record, and the squares that this
+    leaves.
+    """
 
     values: list[Array]
     weights: list[Array]
@@ -94,8 +96,8 @@ class View:
         """Look at a fit.
 
         Args:
-            forces: of every record, shape (n,), known to the problem, and so to the acceleration, that are to be looked at with the
-                rest.
+            forces: of every record, shape (n,), known to the problem, and so to the acceleration, that are to be looked
+                at with the rest.
         """
         self.problem, self.model, self.residual = problem, fit.model, fit.residual
         self.records, self.dt = problem.session.records, fit.model.sample_time_s
@@ -115,9 +117,7 @@ class View:
             rest = rest + shown * self.factors
         self.rest = self._beside(rest)
         self.window = max(round(WINDOW_S / self.dt), total // MOST_WINDOWS)
-        self.cuts = [
-            np.linspace(s.start, s.stop, max(len(s) // self.window, 1) + 1).astype(int) for s in self.spans
-        ]
+        self.cuts = [np.linspace(s.start, s.stop, max(len(s) // self.window, 1) + 1).astype(int) for s in self.spans]
 
     def _beside(self, columns: Array) -> Array:
         out: Array = columns - self.q @ (self.q.T @ columns)

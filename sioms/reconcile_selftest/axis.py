@@ -16,7 +16,8 @@ Numbers = dict[str, float]
 class Servo(NamedTuple):
     """Sampled controller: u = clip(k (e + kz e1) - kp u1 + kb v, +-limit).
 
-    v is the first difference of position through one pole at ``filter_hz`` (0: none), or, with ``mean``, half of that over two samples.
+    v is the first difference of position through one pole at ``filter_hz`` (0: none), or, with ``mean``, half of that
+    over two samples.
     """
 
     k: float

@@ -1,6 +1,7 @@
 """Draw axes, hidden effects and controllers at random. All numbers SI; a draw is reproducible by its seed.
 
-What is drawn is run before it is taken: the loop must hold, and a drive that saturates do so in some of the samples, not in most.
+What is drawn is run before it is taken: the loop must hold, and a drive that saturates do so in some of the samples,
+    not in most.
 """
 
 from __future__ import annotations
@@ -58,7 +59,8 @@ NAMELESS = (
     "stop",
     "detent",
 )
-#: Of each of these at most one is in a mixture: one drive, one transmission, one law of dry friction, one force along the range.
+#: Of each of these at most one is in a mixture: one drive, one transmission, one law of dry friction, one force along
+#: the range.
 EXCLUSIVE = (
     ("coulomb", "coulomb_position", "stribeck", "presliding", "lugre"),
     ("delay", "lag", "saturation"),
@@ -104,7 +106,9 @@ def draw_axis(name: str, kind: str, rng: np.random.Generator, only: str = "") ->
 
 
 def _sound(axis: Axis) -> bool:
-    """Say whether the loop holds, the drive saturates as it should, the motor warms up enough, and a small range is small."""
+    """Say whether the loop holds, the drive saturates as it should, the motor warms up enough, and a small range is
+    small.
+    """
     world = World(axis)
     runs = [world.record(c) for c in commands(axis, DRY_RUN_S)]
     force, place = np.abs([r.force for r in runs]), np.abs([r.counts for r in runs]) * axis.resolution
@@ -114,10 +118,7 @@ def _sound(axis: Axis) -> bool:
         share = float(np.mean(force[:4] > axis.named["saturation"]["limit"]))
         if not SATURATED[0] < share < SATURATED[1]:
             return False
-    if (
-        "thermal_gain" in axis.named
-        and not WARM[0] < axis.named["thermal_gain"]["loss"] * world.heat < WARM[1]
-    ):
+    if "thermal_gain" in axis.named and not WARM[0] < axis.named["thermal_gain"]["loss"] * world.heat < WARM[1]:
         return False
     return axis.excitation != "small" or float(np.max(place[:4])) < SMALL
 
@@ -234,9 +235,7 @@ def _servo(inertia: float, rated: float, resolution: float, dt: float, rng: np.r
         else:
             hz = filtered * w / (2.0 * np.pi) if form == "cascade" else 0.0
             own = 0.7 * w  # the speed loop's crossover is near w
-            servo = Servo(
-                inertia * own**2, 0.0, 0.0, -2.0 * damping * inertia * own, limit, hz, form == "mean"
-            )
+            servo = Servo(inertia * own**2, 0.0, 0.0, -2.0 * damping * inertia * own, limit, hz, form == "mean")
         if _by_count(servo, dt) * resolution < CHATTER * rated:
             return servo
         w *= 0.9

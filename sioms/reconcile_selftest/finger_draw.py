@@ -75,7 +75,8 @@ class HiddenFinger:
         """Return what the solver may know: a model file."""
         angles = ", ".join(repr(float(a)) for a in self.angle)
         return (
-            f'[finger]\nname = "{self.name}"\ncore_m = {self.core!r}\nouter_m = {self.outer!r}\nshear_modulus_pa = 83000.0\n'
+            f'[finger]\nname = "{self.name}"\ncore_m = {self.core!r}\nouter_m = {self.outer!r}\nshear_modulus_pa = '
+            "83000.0\n"
             f"poisson = {self.poisson!r}\nangle_rad = [{angles}]\nradius_m = {self.radius!r}\ngain = {self.gain!r}\n"
         )
 

@@ -101,9 +101,7 @@ class FingerWorld:
     def _read(self, ideal: Array, time: Array) -> Array:
         """Add zero, drift, line, noise and the converter's step; per cent."""
         f, rng = self.f, self._rng
-        out = (
-            ideal + self._one("temperature_drift", "k") * (self._temperature(time) - self._power_up)[:, None]
-        )
+        out = ideal + self._one("temperature_drift", "k") * (self._temperature(time) - self._power_up)[:, None]
         if "mains_line" in f.named:
             phase = 0.7 * np.arange(ideal.shape[1]) ** 2
             out = out + self._one("mains_line", "a") * np.sin(
@@ -120,7 +118,9 @@ class FingerWorld:
         return np.asarray(gain * load + CELL_NOISE * self._rng.standard_normal(len(load)))
 
     def touches(self, place: Array, load: Array, radius: Array) -> Tables:
-        """Touch at places [rad] with loads [N/m] and indenters [m]; baseline frames, a second's hold, frames under load."""
+        """Touch at places [rad] with loads [N/m] and indenters [m]; baseline frames, a second's hold, frames under
+        load.
+        """
         raw, time, touch, phase, force = [], [], [], [], []
         step = np.arange(FRAMES) / RATE_HZ
         late = self.f.named.get("creep")
@@ -132,10 +132,7 @@ class FingerWorld:
             under = onset + _HOLD_S + step
             out = np.repeat(self.steady(float(place[j]), true, float(radius[j]), onset)[None], FRAMES, axis=0)
             if late is not None:
-                out = (
-                    out
-                    * (1.0 - float(late["c"][0]) * np.exp(-(under - onset) / float(late["tau"][0])))[:, None]
-                )
+                out = out * (1.0 - float(late["c"][0]) * np.exp(-(under - onset) / float(late["tau"][0])))[:, None]
             if "knocks" in self.f.nameless and self._touches % 17 == 5:
                 out = out + self.f.nameless["knocks"]["height"] * self._rng.standard_normal(len(self.angle))
             self._touches += 1
@@ -172,11 +169,7 @@ class FingerWorld:
             warm = self._thermometer(time)
         else:
             near = time[:, None] + np.arange(averaged) / RATE_HZ
-            raw = (
-                self._read(np.zeros((near.size, len(self.angle))), near.ravel())
-                .reshape(frames, averaged, -1)
-                .mean(1)
-            )
+            raw = self._read(np.zeros((near.size, len(self.angle))), near.ravel()).reshape(frames, averaged, -1).mean(1)
             warm = self._thermometer(near.ravel()).reshape(frames, averaged).mean(1)
         nothing = np.full(frames, -1)
         return {

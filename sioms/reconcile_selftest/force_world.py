@@ -1,4 +1,5 @@
-"""Force/torque sensors with hidden effects: drawn, loaded with known weights, and read. Nothing is shared with the solver.
+"""Force/torque sensors with hidden effects: drawn, loaded with known weights, and read. Nothing is shared with the
+solver.
 
 Hysteresis is a handful of springs with dry friction in parallel (Iwan's model), not the solver's single play.
 """
@@ -135,7 +136,9 @@ def _get(s: HiddenSensor, effect: str, symbol: str, nothing: Array | None = None
 
 
 def _friction(load: Array, reach: float) -> Array:
-    """Return the force of springs with dry friction in parallel that give way one after the other up to ``reach``, at most 1."""
+    """Return the force of springs with dry friction in parallel that give way one after the other up to ``reach``, at
+    most 1.
+    """
     limits = reach * (np.arange(6) + 0.5) / 6.0
     state = np.zeros((6, load.shape[1]))
     out = np.zeros_like(load)
@@ -149,9 +152,7 @@ def _friction(load: Array, reach: float) -> Array:
 
 def _programme(s: HiddenSensor, rng: np.random.Generator) -> Array:
     """Weights hung on one after the other, then arms and pulleys in any direction."""
-    up = np.concatenate(
-        [np.linspace(0, 1, 8), np.linspace(0.86, -1, 14), np.linspace(-0.86, 0, 7), np.zeros(3)]
-    )
+    up = np.concatenate([np.linspace(0, 1, 8), np.linspace(0.86, -1, 14), np.linspace(-0.86, 0, 7), np.zeros(3)])
     if s.excitation == "one_way":
         way = rng.uniform(0.3, 0.8, 6) * rng.choice([-1.0, 1.0], 6)
         size = np.repeat(np.tile(0.9 * up, 6), 3)

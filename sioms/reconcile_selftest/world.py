@@ -1,7 +1,8 @@
 """Integrate a drawn axis in continuous time, at a fixed small step, until its records are full.
 
-Drift, kick, drift steps of 10 us; dry friction as a spring-loaded bristle that breaks (elasto-plastic), presliding as LuGre's
-bristle with its damping; backlash contact as a spring with damping in proportion to the depth; everything written against time.
+Drift, kick, drift steps of 10 us; dry friction as a spring-loaded bristle that breaks (elasto-plastic), presliding as
+LuGre's bristle with its damping; backlash contact as a spring with damping in proportion to the depth; everything
+written against time.
 """
 
 from __future__ import annotations
@@ -211,7 +212,8 @@ def _march(
     measured: Array,
     marks: NDArray[np.bool_],
 ) -> float:
-    """Fill the commands of the controller (after ``late`` samples), counts, mean currents (added to their noise) and marks.
+    """Fill the commands of the controller (after ``late`` samples), counts, mean currents (added to their noise) and
+    marks.
 
     Returns:
         The heat at the end.
@@ -235,9 +237,7 @@ def _march(
     e_old = u_old = y_old = y_older = speed = 0.0
     for i in range(len(command)):
         seen = p.encoder_scale_gain * x + p.eccentricity_amp * np.sin(turn * x + p.eccentricity_phase)
-        counts[i] = int(
-            np.floor((seen + jitter[i]) / quantum + 0.5) * np.round(p.encoder_quantisation_factor)
-        )
+        counts[i] = int(np.floor((seen + jitter[i]) / quantum + 0.5) * np.round(p.encoder_quantisation_factor))
         y = counts[i] * p.resolution
         if i == 0:
             y_old = y_older = y

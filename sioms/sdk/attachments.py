@@ -84,7 +84,9 @@ class Attachments:
             self._service.stops.safe_stop(Reason(Stop.CONTROLLED, "its owner has gone"), [*parts.values()])
 
     def detach(self, number: int, errno_: int = 0, reason: str = "") -> None:
-        """End a handle because the daemon says so, and tell its client why; one that has ended already is confirmed again."""
+        """End a handle because the daemon says so, and tell its client why; one that has ended already is confirmed
+        again.
+        """
         handle = self.handles.get(number)
         if handle is None:
             self._tell(Detached(number))
@@ -136,9 +138,7 @@ class Attachments:
                 return
             self._serve(handle, *verbs.take(packet, verbs.ON_HANDLE, pending=handle.waits))
         except MalformedMessage as error:
-            self._service.log(
-                "warning", f"{handle.node}: connection of {handle.who} ended: malformed message: {error}"
-            )
+            self._service.log("warning", f"{handle.node}: connection of {handle.who} ended: malformed message: {error}")
             self.end(handle, errno.EPROTO, f"{handle.node}: malformed message: {error}")
         except HookError:
             raise  # the driver may have done half of it: it stops its device
@@ -153,8 +153,8 @@ class Attachments:
         if isinstance(message, verbs.Part):
             _keep_part(handle, message)
             return
-        # Nothing is taken after a stop, or refused after its reset, because no tick has come in between; and no order that
-        # was acknowledged before undoes what is acknowledged now.
+        # Nothing is taken after a stop, or refused after its reset, because no tick has come in between; and no order
+        # that was acknowledged before undoes what is acknowledged now.
         self._service.loop.heed()
         if handle.number not in self.handles:
             return  # that was the order

@@ -85,9 +85,7 @@ class Block:
         shape = (len(READ[spec.node_class]), self.n)
         self.fields = np.zeros(shape) if fields is None else fields
         if self.fields.shape != shape or not self.fields.flags.c_contiguous:
-            raise ValueError(
-                f"make block {spec.name!r}: fields of shape {self.fields.shape}; want {shape}, contiguous"
-            )
+            raise ValueError(f"make block {spec.name!r}: fields of shape {self.fields.shape}; want {shape}, contiguous")
         self.rows = read_rows(spec.node_class, self.fields)
         self.stamp_ns = 0
 
@@ -178,7 +176,9 @@ class BinaryBlock(Block):
         return True
 
     def count_lost(self, port: int, edges: int) -> None:
-        """Count edges that happened and that nobody can tell any more: who compares ``edges`` sees that he missed them."""
+        """Count edges that happened and that nobody can tell any more: who compares ``edges`` sees that he missed
+        them.
+        """
         self.edges[port] += edges
 
 

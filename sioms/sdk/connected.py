@@ -28,9 +28,7 @@ class Connected:
 
     tick_hz = HOUSEKEEPING_HZ
 
-    def __init__(
-        self, parts: Parts, driver: LineDriver | StreamDriver, gap_s: float, recovery_s: float
-    ) -> None:
+    def __init__(self, parts: Parts, driver: LineDriver | StreamDriver, gap_s: float, recovery_s: float) -> None:
         self.counters = Counters()
         self.line: Line | None = None
         self._loop, self._pages, self._stops = parts.loop, parts.pages, parts.stops

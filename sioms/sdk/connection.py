@@ -88,9 +88,7 @@ class Connection:
         except BlockingIOError:
             return b""
         except OSError as error:
-            raise OSError(
-                error.errno, f"{self.settings} is gone: {os.strerror(error.errno or 5).lower()}"
-            ) from None
+            raise OSError(error.errno, f"{self.settings} is gone: {os.strerror(error.errno or 5).lower()}") from None
         if not data:
             raise OSError(errno.EIO, f"{self.settings} is gone: it was closed from the other side")
         return data

@@ -1,4 +1,6 @@
-"""The clock of a device that stamps its samples: mapped to the host's, and told of when its rate is not the stated one."""
+"""The clock of a device that stamps its samples: mapped to the host's, and told of when its rate is not the stated
+one.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,9 @@ class DeviceClock:
         self._fit.expect_anew()
 
     def to_host(self, count: int, now_ns: int) -> int:
-        """Return the time of a sample [ns, CLOCK_MONOTONIC]: never later than its arrival, nor earlier than the last."""
+        """Return the time of a sample [ns, CLOCK_MONOTONIC]: never later than its arrival, nor
+        earlier than the last.
+        """
         fit = self._fit
         self._last_ns = max(fit.to_host(count, now_ns), self._last_ns)
         if fit.rate_error != self._told:
@@ -76,6 +80,9 @@ class DeviceClock:
         """Log a rate once; one that is measured better is no news."""
         if abs(error) > TOLD_FROM and abs(error - self._told) > TOLD_FROM:
             hz = self._rate_hz / (1 + error)
-            text = f"{self._name}: the device counts {hz:.0f} a second, not {self._rate_hz:g}; stamps follow what it counts"
+            text = (
+                f"{self._name}: the device counts {hz:.0f} a second, not {self._rate_hz:g}; stamps follow what it "
+                "counts"
+            )
             self._kit.log("warning", text + (self._advice and "; " + self._advice.format(hz=f"{hz:.0f}")))
         self._told = error

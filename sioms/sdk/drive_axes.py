@@ -1,8 +1,9 @@
 """Axes of drives that close their own loop: their configuration, and a unit that obeys the bank.
 
-A driver of such a family subclasses :class:`AxesUnit`, reads the drive in ``poll`` and calls ``report``, and tells how to
-start, stop, home and reset one axis. What is the same for all is here: the actions of the bank, starts that a stop has made
-void, the speed of a move of given time, and velocities that would run past a soft limit.
+A driver of such a family subclasses :class:`AxesUnit`, reads the drive in ``poll`` and calls ``report``, and tells how
+to
+start, stop, home and reset one axis. What is the same for all is here: the actions of the bank, starts that a stop has
+made void, the speed of a move of given time, and velocities that would run past a soft limit.
 """
 
 from __future__ import annotations
@@ -72,17 +73,13 @@ def drive_table(extra: Mapping[str, tuple[Any, Any]], *, force: bool = False) ->
     return table_type(AxisSettings, without=without, extra=extra)
 
 
-def axis_settings(
-    axis: Any, modes: ControlMode, *, homing: bool = False, required: bool = False
-) -> AxisSettings:
+def axis_settings(axis: Any, modes: ControlMode, *, homing: bool = False, required: bool = False) -> AxisSettings:
     """Return an axis as the bank knows it; a drive homes by its own parameters, so only "required" matters."""
     own = Homing(axis.velocity_max, axis.velocity_max, required=required) if homing else None
     return from_table(AxisSettings, axis, {"modes": modes, "homing": own})
 
 
-def axis_spec(
-    name: str, settings: Sequence[AxisSettings], about: str, capacity: int, history: int
-) -> BlockSpec:
+def axis_spec(name: str, settings: Sequence[AxisSettings], about: str, capacity: int, history: int) -> BlockSpec:
     """Return the block of these axes."""
     channels = []
     for axis in settings:
@@ -193,9 +190,7 @@ class AxesUnit(LineUnit):
 
     def home(self, axis: int) -> Steps:
         """Begin the drive's own homing."""
-        raise DeviceError(
-            errno.EOPNOTSUPP, f"{self.name}: the drive cannot home by itself; use CALIBRATE_DEVICE"
-        )
+        raise DeviceError(errno.EOPNOTSUPP, f"{self.name}: the drive cannot home by itself; use CALIBRATE_DEVICE")
 
     def reset(self, axis: int) -> Steps:
         """Clear the drive's fault; raises DeviceError with what is left of it."""
@@ -237,9 +232,10 @@ class AxesUnit(LineUnit):
     def lose_place(self, axis: int, text: str) -> None:
         """Say that the drive does not know where this axis is, for a reason that only the family can see.
 
-        A counter of uptime or boots that went back, a bit "reference lost", an encoder error. The axis is in fault, and takes
-        no positions until it is homed or calibrated: RESET alone does not do. May be called from ``open`` and ``poll``, again
-        and again while it lasts.
+        A counter of uptime or boots that went back, a bit "reference lost", an encoder error. The axis is in fault, and
+        takes
+        no positions until it is homed or calibrated: RESET alone does not do. May be called from ``open`` and ``poll``,
+        again and again while it lasts.
         """
         self.bank.lose_place([axis], f"{self.name}: {text}", self.clock())
 
@@ -321,7 +317,10 @@ class AxesUnit(LineUnit):
                 self._stood_ns[axis] = now_ns
             elif now_ns - self._stood_ns[axis] > SHORT_NS:
                 self._goes[axis] = False
-                text = f"{self.name}: came to rest at {self.bank.rows['position'][axis]:g} before its target; look at its limit switches"
+                text = (
+                    f"{self.name}: came to rest at {self.bank.rows['position'][axis]:g} before its target; look at its "
+                    "limit switches"
+                )
                 self.bank.fault([axis], text, now_ns)
 
     def _guard(self, now_ns: int) -> None:
@@ -350,9 +349,7 @@ def end_at_soft_limit(
     low, high = limits["position_min"][0], limits["position_max"][0]
     position, velocity = float(bank.rows["position"][axis]), float(bank.rows["velocity"][axis])
     # up to two polls and the stop's way over the line pass before the drive brakes
-    ahead = velocity * (2 * between_s + LATENCY_S) + velocity * abs(velocity) / (
-        2 * settings.acceleration_max
-    )
+    ahead = velocity * (2 * between_s + LATENCY_S) + velocity * abs(velocity) / (2 * settings.acceleration_max)
     passed_low = low is not None and velocity < 0 and position + ahead < low
     passed_high = high is not None and velocity > 0 and position + ahead > high
     if not passed_low and not passed_high:

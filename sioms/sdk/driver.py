@@ -86,8 +86,8 @@ class Awaited:
     """The answer of ``Driver.ioctl`` to a request that readings to come will have done.
 
     Args:
-        ready: asked after each publication: (value,) when it is done, None while it is not; raises Refusal when it cannot be.
-            A device that is lost, and the client's time-out, end the request without it.
+        ready: asked after each publication: (value,) when it is done, None while it is not; raises Refusal when it
+            cannot be. A device that is lost, and the client's time-out, end the request without it.
     """
 
     ready: Callable[[], tuple[Any] | None]
@@ -166,7 +166,8 @@ class Driver(ABC):
         """Answer a request that the kit does not answer itself: CALIBRATE_DEVICE of a sensor with a tare of its own ...
 
         The kit answers all axis requests through the bank, and zero and gains of analog blocks. Return a
-        msgpack-able value, ``Awaited`` for one that comes with later readings, or in a driver with a line the steps that end in one.
+        msgpack-able value, ``Awaited`` for one that comes with later readings, or in a driver with a line the steps
+        that end in one.
 
         Raises:
             Refusal: not supported or not now.
@@ -200,7 +201,9 @@ class TickDriver(Driver):
         raise NotImplementedError(f"{type(self).__name__} describes a writable block but takes no outputs")
 
     def slack(self, now_ns: int, until_ns: int) -> None:  # a hook that may stay empty
-        """Use the time between two ticks, e.g. for ``bank.plan_ahead``: after a tick, or, of a slow rate, before the next."""
+        """Use the time between two ticks, e.g. for ``bank.plan_ahead``: after a tick, or, of a slow rate, before the
+        next.
+        """
 
     def close(self) -> None:  # a hook that may stay empty
         """Leave the device safe; axes have already been stopped."""
@@ -336,8 +339,8 @@ class StreamDriver(Driver):
             now_ns: time of their arrival [ns, CLOCK_MONOTONIC].
 
         Returns:
-            The number of good frames in them; the kit supervises the stream by it. A frame is good when it is new: one that
-            was seen before, or whose number or clock stands still, is none.
+            The number of good frames in them; the kit supervises the stream by it. A frame is good when it is new: one
+            that was seen before, or whose number or clock stands still, is none.
 
         Raises:
             LinkError: what comes is no longer the stream that was opened: the device restarted, or somebody else set it

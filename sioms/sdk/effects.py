@@ -1,4 +1,5 @@
-"""When what somebody asked for took effect, and which publication shows it (docs/decisions/0090-read-your-own-writes.md).
+"""When what somebody asked for took effect, and which publication shows it
+(docs/decisions/0090-read-your-own-writes.md).
 
 Concurrency: the one thread of a driver process. No request is served in the middle of a tick, so a tick that
 begins after an effect shows the whole of it.

@@ -79,9 +79,7 @@ class Engine(Protocol):
     def tick(self, now_ns: int) -> None:
         """Do the work of one tick and publish."""
 
-    def write_outputs(
-        self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]
-    ) -> Any:
+    def write_outputs(self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]) -> Any:
         """Set outputs for a client."""
 
     def make_safe(self, block: AnyBlock) -> None:

@@ -48,8 +48,8 @@ class DeviceError(Exception):
 class StateLost(DeviceError):
     """A poll found that what the opening had set is gone: the device restarted, or somebody else has set it.
 
-    The kit counts the unit as lost at once, without waiting for ``misses``, and opens it again at once: nothing moves and
-    no output is believed until the opening has set and proved everything anew.
+    The kit counts the unit as lost at once, without waiting for ``misses``, and opens it again at once: nothing moves
+    and no output is believed until the opening has set and proved everything anew.
 
     Args:
         text: what was read, and what it should be.

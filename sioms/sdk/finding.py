@@ -85,9 +85,7 @@ def _from_file(path: str) -> type[Driver]:
 def _checked(found: object, name: str) -> type[Driver]:
     kinds = (TickDriver, LineDriver, StreamDriver)
     if not (isinstance(found, type) and issubclass(found, kinds)):
-        raise DriverNotFound(
-            f"driver = {name}: {found!r} is no class of TickDriver, LineDriver or StreamDriver"
-        )
+        raise DriverNotFound(f"driver = {name}: {found!r} is no class of TickDriver, LineDriver or StreamDriver")
     return found
 
 
@@ -143,7 +141,8 @@ def _named_files(value: Any, key: str = "") -> Iterator[str]:
 
 
 def contents(driver: type[Driver], table: Mapping[str, Any], folder: str) -> str:
-    """Return a digest of what a device is made of beside its table: the driver's file, and the files that its table names.
+    """Return a digest of what a device is made of beside its table: the driver's file, and the files that its table
+    names.
 
     A file of more than MOST_BYTES is known by its size and the time of its last change.
     """
@@ -206,9 +205,7 @@ def _block_errors(blocks: Any) -> list[str]:
         channels = [channel.name for channel in block.channels]
         if not channels:
             errors.append(f": block {block.name!r} has no channel; want at least one")
-        for name in [
-            c for c in channels if not 0 < len(c) < 256 or not c.isprintable() or any(x in c for x in " /")
-        ]:
+        for name in [c for c in channels if not 0 < len(c) < 256 or not c.isprintable() or any(x in c for x in " /")]:
             errors.append(f": a channel is named {shown(name)}; want a name without blanks and without /")
         for channel in [c for c in block.channels if not c.unit.isprintable() or len(c.unit) > 32]:
             errors.append(f": the unit of {channel.name} is {shown(channel.unit)}; want up to 32 characters")
@@ -216,15 +213,14 @@ def _block_errors(blocks: Any) -> list[str]:
             errors.append(f": history = {block.history}; want a power of two, 4 to {MOST_HISTORY}")
         elif (size := page_size(block.node_class, len(channels), block.history)) > MOST_PAGE:
             errors.append(
-                f": history = {block.history} of {len(channels)} channels takes {size >> 20} MiB; want at most {MOST_PAGE >> 20}"
+                f": history = {block.history} of {len(channels)} channels takes {size >> 20} MiB; want at most "
+                f"{MOST_PAGE >> 20}"
             )
         if not 0 <= block.capacity <= MOST_COMMANDS:
             errors.append(f": capacity = {block.capacity}; want 1 to {MOST_COMMANDS}")
         if block.node_class is NodeClass.AXIS:
             for channel in [c for c in block.channels if c.unit not in ("m", "rad")]:
-                errors.append(
-                    f": axis {channel.name}: unit = {channel.unit}; want m or rad, as all numbers are SI"
-                )
+                errors.append(f": axis {channel.name}: unit = {channel.unit}; want m or rad, as all numbers are SI")
         for name in [c for c, count in Counter(channels).items() if count > 1]:
             errors.append(f": two channels are named {name}; names must differ")
         if names.count(block.name) > 1:

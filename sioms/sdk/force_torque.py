@@ -71,9 +71,9 @@ def check_whole(block: BlockSpec, channels: Sequence[int]) -> None:
 class ForceBlock(AnalogBlock):
     """Forces and torques of one sensor; values at or beyond full scale are flagged as saturated.
 
-    **A zero that vanished is told.** Once the sensor has taken a zero of its own (``zeroed``), readings count from there. When that
-    zero is gone or may be (``lose_zero``), they are INVALID until somebody says what counts: a new zero of the
-    sensor, one of the driver's (ZERO_DEVICE), or the sensor's own taken back (``forget_zero``).
+    **A zero that vanished is told.** Once the sensor has taken a zero of its own (``zeroed``), readings count from
+    there. When that zero is gone or may be (``lose_zero``), they are INVALID until somebody says what counts: a new
+    zero of the sensor, one of the driver's (ZERO_DEVICE), or the sensor's own taken back (``forget_zero``).
 
     Attributes:
         saturated, invalid: readings so far that were flagged as such.

@@ -1,8 +1,9 @@
 """Golden frames: messages out of the vendor's manual, and what a driver makes of them.
 
-A driver names its own in the class method ``golden``; ``sioms driver check`` tries them. A request must be byte for byte
-what the manual prints. A reply is fed whole, byte by byte, with trailing bytes, and once with each of its bits flipped:
-a damaged reply may be refused or left incomplete, never raise anything else, and never decode to another value.
+A driver names its own in the class method ``golden``; ``sioms driver check`` tries them. A request must be byte for
+byte what the manual prints. A reply is fed whole, byte by byte, with trailing bytes, and once with each of its bits
+flipped: a damaged reply may be refused or left incomplete, never raise anything else, and never decode to another
+value.
 """
 
 from __future__ import annotations
@@ -79,8 +80,10 @@ def _request_wrong(golden: Golden) -> str:
 
 def _reply_wrong(golden: Golden, data: bytes) -> str:
     tries = {
-        "whole": (data, len(data)), "byte by byte": (data, 1), "with trailing bytes": (data + b"\x55\xaa\x00", len(data) + 3),
-    }  # fmt: skip
+        "whole": (data, len(data)),
+        "byte by byte": (data, 1),
+        "with trailing bytes": (data + b"\x55\xaa\x00", len(data) + 3),
+    }
     for how, (fed, step) in tries.items():
         try:
             value = read_reply(golden, fed, step)

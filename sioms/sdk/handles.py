@@ -1,7 +1,8 @@
 """Handles: the connections of clients to this driver process, and what they are waiting for.
 
-A handle is a socket, a pipe and, for its owner's death, a pidfd. All three belong to the kernel, so a client that dies in any way is noticed here directly, without the daemon. The client holds the other ends: nothing
-it does to them makes a call of this process block.
+A handle is a socket, a pipe and, for its owner's death, a pidfd. All three belong to the kernel, so a client that dies
+in any way is noticed here directly, without the daemon. The client holds the other ends: nothing it does to them makes
+a call of this process block.
 
 Concurrency: owned by the driver process's one thread.
 """
@@ -26,7 +27,9 @@ from .blocks import AnyBlock
 from .effects import Effects
 
 LOOKS_A_MS = 16
-"""Waits of each user that are looked at, for every millisecond of a tick's period: some 20 us, 100 where all are answered."""
+"""Waits of each user that are looked at, for every millisecond of a tick's period: some 20 us, 100 where all are
+answered.
+"""
 LATER = object()
 """Returned instead of a value when the answer comes later."""
 

@@ -1,6 +1,7 @@
 """Positions that outlive their driver process: a small file for each block of axes, mapped into memory.
 
-While an axis is at rest (told to, and its reading still for STILL_NS) its entry holds where it is, marked "at rest"; the mark is taken away before anything
+While an axis is at rest (told to, and its reading still for STILL_NS) its entry holds where it is, marked "at rest";
+the mark is taken away before anything
 moves it, and comes back, with the new place, when it rests again. That is a store into memory: no call that
 could delay a tick, and what a killed process has stored is in the file. What the kernel has not written out when
 the power goes is lost, so entries of an earlier boot count only if the process that wrote them ended in order.
@@ -33,7 +34,8 @@ CLOSED, CLOSED_AT = Struct("<Q"), 16
 MOST_BYTES = 1 << 20
 AT_REST, HOMED = 1, 2
 STILL_NS = 100_000_000
-"""So long the reading of an axis at rest has stayed within its tolerance: servos go on settling after their set-points."""
+"""So long the reading of an axis at rest has stayed within its tolerance: servos go on settling after their set-points.
+"""
 
 Log = Callable[[str, str], None]
 
@@ -58,9 +60,7 @@ def encode(contents: Contents) -> bytes:
     """Return the bytes of a file: header, names, then the columns state, raw and position."""
     names = "\n".join(contents.entries).encode()
     names += b"\n" * (-len(names) % 8)
-    header = HEADER.pack(
-        MAGIC, len(contents.entries), len(names), int(contents.closed), contents.boot.encode()
-    )
+    header = HEADER.pack(MAGIC, len(contents.entries), len(names), int(contents.closed), contents.boot.encode())
     state = np.array([entry.state for entry in contents.entries.values()], dtype="<i8")
     places = np.array([entry[1:] for entry in contents.entries.values()], dtype="<f8").reshape(-1, 2)
     return header + names + state.tobytes() + places.T.tobytes()
@@ -83,9 +83,7 @@ def decode(data: bytes) -> Contents:
     except UnicodeDecodeError:
         raise ValueError("its names are no text") from None
     state = np.frombuffer(data, "<i8", count, HEADER.size + length).tolist()
-    raw, position = (
-        np.frombuffer(data, "<f8", 2 * count, HEADER.size + length + 8 * count).reshape(2, count).tolist()
-    )
+    raw, position = np.frombuffer(data, "<f8", 2 * count, HEADER.size + length + 8 * count).reshape(2, count).tolist()
     entries = {name: Entry(*entry) for name, *entry in zip(names, state, raw, position, strict=True)}
     return Contents(entries, bool(closed), written_in)
 

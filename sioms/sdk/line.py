@@ -28,7 +28,9 @@ STRAY = 8
 """Bytes in front of a reply that may be skipped where a checksum says that the rest is one: an adapter that switches
 its direction puts a 0x00 or 0xFF there."""
 PAUSE_NS = 20_000_000
-"""Longest pause within a reply that begins with stray bytes, or is damaged; a USB adapter hands on what it has every 16 ms."""
+"""Longest pause within a reply that begins with stray bytes, or is damaged; a USB adapter hands on what it has every 16
+ms.
+"""
 BABBLE_NS = 500_000_000
 """How much longer than the silence it owes a line may go on after a bad reply; then the exchange has failed."""
 
@@ -158,11 +160,7 @@ class Line:
     def abandon(self, reason: str) -> None:
         """End all jobs with a LinkError; the connection is gone."""
         running = [self._running] if self._running else []
-        jobs = (
-            [r.job for r in running]
-            + [r.job for r, _ in self._suspended]
-            + [job for _, _, job in self._queue]
-        )
+        jobs = [r.job for r in running] + [r.job for r, _ in self._suspended] + [job for _, _, job in self._queue]
         self._running, self._suspended, self._queue, self._state = None, [], [], _State.IDLE
         for job in jobs:
             job.steps.close()
@@ -229,9 +227,7 @@ class Line:
                     return None  # it may become the echo of the request
                 if data.startswith(exchange.data):
                     self._has_echo = True
-                    self._told(
-                        "the line returns what is sent to it; that is dropped (local echo of the adapter)"
-                    )
+                    self._told("the line returns what is sent to it; that is dropped (local echo of the adapter)")
                     del reply[: len(exchange.data)]
                     return self._reply_in(exchange, reply) if reply else None
             found, waits = _behind_stray(exchange, data) if exchange.has_checksum else (None, False)
@@ -310,10 +306,7 @@ class Line:
             self._next_job(now_ns)
             return
         try:
-            if isinstance(value, Exception):
-                step = running.job.steps.throw(value)
-            else:
-                step = running.job.steps.send(value)
+            step = running.job.steps.throw(value) if isinstance(value, Exception) else running.job.steps.send(value)
         except StopIteration as end:
             self._finish(running.job, end.value, None, now_ns)
         except (LinkError, DeviceError) as error:

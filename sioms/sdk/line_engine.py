@@ -110,9 +110,7 @@ class LineEngine(Connected):
             steps, done = self._poll(state), self._polled
         else:
             steps, done = state.unit.open(), self._opened
-        self.guarded(
-            lambda: line.submit(steps, Priority.POLL, lambda v, e: done(state, v, e), now_ns), now_ns
-        )
+        self.guarded(lambda: line.submit(steps, Priority.POLL, lambda v, e: done(state, v, e), now_ns), now_ns)
 
     def _poll(self, state: _UnitState) -> Steps:
         """Poll a unit, and note when that began: what it was told until then shows in the readings."""
@@ -179,9 +177,7 @@ class LineEngine(Connected):
             where = "what answers there" if error.heard else "the device, and who else is connected to it"
             return f"{text}; look at {where}"
         if error.heard:
-            return (
-                f"{text}; look at wiring and speed ({line.speed}), and whether two devices have one address"
-            )
+            return f"{text}; look at wiring and speed ({line.speed}), and whether two devices have one address"
         return f"{text}; look at power, wiring, address and speed ({line.speed})"
 
     def _lose_unit(self, state: _UnitState, reason: str, now_ns: int) -> None:
@@ -228,9 +224,7 @@ class LineEngine(Connected):
         """Return when the present poll of the block's unit began."""
         return self._by_block[id(block)].as_of_ns
 
-    def write_outputs(
-        self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]
-    ) -> Any:
+    def write_outputs(self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]) -> Any:
         """Send the values; the client's answer comes when the device has confirmed them."""
         state, line, now_ns = self._by_block[id(block)], self.line, self._loop.now_ns()
         if line is None or not state.is_up:
@@ -255,9 +249,7 @@ class LineEngine(Connected):
                 errno_ = error.errno if isinstance(error, DeviceError) else errno.EIO
                 handle.refuse(number, errno_, f"write {handle.node}: {state.unit.name}: {error}")
 
-        self.guarded(
-            lambda: line.submit(self._write(state.unit, write), Priority.OUTPUT, done, now_ns), now_ns
-        )
+        self.guarded(lambda: line.submit(self._write(state.unit, write), Priority.OUTPUT, done, now_ns), now_ns)
         return LATER
 
     def acted(self, block: AnyBlock) -> None:
@@ -276,23 +268,23 @@ class LineEngine(Connected):
         if not (yield from while_wanted(steps, lambda: not write.is_void)):
             raise DeviceError(errno.ECANCELED, "overtaken by a stop or a safe value")
 
-    def _written(
-        self, unit: LineUnit, block: AnyBlock, channels: Sequence[int], values: Sequence[float]
-    ) -> Steps:
-        """Write outputs, and note that the device has them as soon as it says so: a stop may go out before this goes on."""
+    def _written(self, unit: LineUnit, block: AnyBlock, channels: Sequence[int], values: Sequence[float]) -> Steps:
+        """Write outputs, and note that the device has them as soon as it says so: a stop may go out before this goes
+        on.
+        """
         note = partial(self._outputs.acknowledge, block, channels, values)
         steps = unit.write_outputs(block.spec, channels, values)
         yield from noting(steps, note) if isinstance(block, BinaryBlock) else steps
         note()
 
     def make_safe(self, block: AnyBlock) -> None:
-        """Send the safe values that are wanted, ahead of everything but other stops; one message of each block is on its way."""
+        """Send the safe values that are wanted, ahead of everything but other stops; one message of each block is on
+        its way.
+        """
         wanted = self._outputs.unsent(block)
         for write in self._writes:
             write.is_void |= write.block is block and any(
-                change.contradicts(wanted[channel])
-                for channel, change in write.changes.items()
-                if channel in wanted
+                change.contradicts(wanted[channel]) for channel, change in write.changes.items() if channel in wanted
             )
         state, line, now_ns = self._by_block[id(block)], self.line, self._loop.now_ns()
         if not wanted or line is None or not state.is_up or id(block) in self._saving:
@@ -302,9 +294,7 @@ class LineEngine(Connected):
 
     def _send_safe(self, line: Line, unit: LineUnit, block: AnyBlock, pause_s: float, now_ns: int) -> None:
         priority = Priority.ACT if pause_s else Priority.STOP
-        line.submit(
-            self._safe(unit, block, pause_s), priority, partial(self._saved, line, unit, block), now_ns
-        )
+        line.submit(self._safe(unit, block, pause_s), priority, partial(self._saved, line, unit, block), now_ns)
 
     def _safe(self, unit: LineUnit, block: AnyBlock, pause_s: float) -> Steps:
         if pause_s:

@@ -7,7 +7,8 @@ its process, however that ends, and tells who holds it. Lines of GPIO chips and 
 gives to one only.
 
 All of these could be taken by anybody who has an account. A lock counts when its holder could use the device: for a
-serial port by the port's mode, for the network when it is root, a system user or oneself. Another one is told, not obeyed.
+serial port by the port's mode, for the network when it is root, a system user or oneself. Another one is told, not
+obeyed.
 """
 
 from __future__ import annotations

@@ -1,10 +1,13 @@
-"""What the outputs of a device are and shall be: the base of writes of single bits, and safe values until they are confirmed.
+"""What the outputs of a device are and shall be: the base of writes of single bits, and safe values until they are
+confirmed.
 
-A port is written whole, so a write of some of its bits begins from what the device has: what it read last, and what it has
+A port is written whole, so a write of some of its bits begins from what the device has: what it read last, and what it
+    has
 acknowledged since. Nothing is begun from what was asked for: what the device refused or dropped does not come back.
 
-A safe value is state, not a message: it is sent again until the device has acknowledged it and then reads so, whatever was
-lost, refused or restarted in between; under a stop it is compared with every reading after that. Every write of a port carries
+A safe value is state, not a message: it is sent again until the device has acknowledged it and then reads so, whatever
+was lost, refused or restarted in between; under a stop it is compared with every reading after that. Every write of a
+port carries
 the safe bits that are wanted of it. Why so: docs/decisions/0095-safe-outputs-are-state.md.
 
 Pure; concurrency: the one thread of the driver process.

@@ -51,9 +51,7 @@ class Pages:
             os.ftruncate(fd, size)
             self.fds.append(fd)
             memory = memoryview(mmap.mmap(fd, size))
-            writer = PageWriter(
-                memory, spec.node_class, block.n, spec.history, lease_ns, generation, device_number
-            )
+            writer = PageWriter(memory, spec.node_class, block.n, spec.history, lease_ns, generation, device_number)
             writer.alive(time.monotonic_ns())
             self._writers[id(block)] = writer
 

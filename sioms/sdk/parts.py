@@ -1,7 +1,7 @@
 """The parts of a driver process, as they are handed to those that work with them; none of them knows the process.
 
-The loop (runtime.py) makes each part once and owns it. A part takes what it needs when it is made: what engines need is Parts,
-what the requests of clients need is Service.
+The loop (runtime.py) makes each part once and owns it. A part takes what it needs when it is made: what engines need is
+Parts, what the requests of clients need is Service.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
-"""Looks at a driver without a device: ``python -m sioms.sdk.probe DRIVER FOLDER [TABLE]``, one JSON object on standard output.
+"""Looks at a driver without a device: ``python -m sioms.sdk.probe DRIVER FOLDER [TABLE]``, one JSON object on standard
+output.
 
-For tools, which know no driver: its rig, its kind, and what came of its golden frames. TABLE is the device's table as JSON.
+For tools, which know no driver: its rig, its kind, and what came of its golden frames. TABLE is the device's table as
+    JSON.
 """
 
 from __future__ import annotations

@@ -149,9 +149,7 @@ def _axis_request(
             return LATER
         case Request.SEND_EXTERNAL_SYNCH:
             if argument is not None and type(argument) is not int:
-                raise _refuse(
-                    errno.EINVAL, f"{what}: {shown(argument)} as start; want a time in ns, or none for now"
-                )
+                raise _refuse(errno.EINVAL, f"{what}: {shown(argument)} as start; want a time in ns, or none for now")
             start_ns = argument or now_ns
             if start_ns < now_ns - service.loop.period_ns:
                 raise _refuse(
@@ -159,9 +157,7 @@ def _axis_request(
                     f"{what}: its start time passed {(now_ns - start_ns) / 1e6:.2f} ms ago; give it more lead",
                 )
             if start_ns > now_ns + 60_000_000_000:
-                raise _refuse(
-                    errno.EINVAL, f"{what}: starts in {(start_ns - now_ns) / 1e9:.0f} s; want at most 60 s"
-                )
+                raise _refuse(errno.EINVAL, f"{what}: starts in {(start_ns - now_ns) / 1e9:.0f} s; want at most 60 s")
             bank.synch(axes, start_ns, now_ns)
             service.engine.commands_written(handle.block)
             return start_ns
@@ -217,7 +213,8 @@ def _zero_analog(
             names = ", ".join(block.spec.channels[channel].name for channel in channels[unfit])
             raise _refuse(
                 errno.EIO,
-                f"{what}: {bad} readings of {good + bad} were no measurement (last {names}: INVALID, SATURATED or not finite); "
+                f"{what}: {bad} readings of {good + bad} were no measurement (last {names}: INVALID, SATURATED or not "
+                "finite); "
                 "the offset stays as it was",
             )
         total[:] += block.data[channels]
@@ -232,9 +229,7 @@ def _zero_analog(
     return LATER
 
 
-def _await(
-    service: Service, handle: Handle, number: int, answer: Awaited, timeout_s: float | None, what: str
-) -> Any:
+def _await(service: Service, handle: Handle, number: int, answer: Awaited, timeout_s: float | None, what: str) -> Any:
     """Answer when the driver has seen done what was asked."""
     check_link(service, handle, what)
 
@@ -252,9 +247,7 @@ def _gains(handle: Handle, request: Request, argument: Any, what: str) -> list[f
     block = handle.block
     n = len(handle.channels)
     if n != block.n:
-        raise _refuse(
-            errno.EINVAL, f"{what}: the gain matrix belongs to the whole array of {block.n} channels"
-        )
+        raise _refuse(errno.EINVAL, f"{what}: the gain matrix belongs to the whole array of {block.n} channels")
     if request is Request.GET_GAINS:
         gains = np.eye(n) if block.gains is None else block.gains  # type: ignore[union-attr]
         values: list[float] = gains.ravel().tolist()

@@ -79,8 +79,8 @@ def run(
         device: device name.
         settings: its validated settings.
         generation: number of this process among the device's.
-        options: stop_sources, alarms, daemon_lease_s, lease_s, realtime_priority, user, phase of the tick [period], state_folder,
-            stopped: what of the device is stopped, see ``Stops.restore``.
+        options: stop_sources, alarms, daemon_lease_s, lease_s, realtime_priority, user, phase of the tick [period],
+            state_folder, stopped: what of the device is stopped, see ``Stops.restore``.
         fds: control socket, latch page, stop-request file, file of the requests taken, marker table, journal of stops.
     """
     name_process(f"sioms:{device}")
@@ -143,9 +143,7 @@ class Runtime:
             device, self.blocks, self.outputs, self.effects, self.waits, self.pages, handles, self.log, self.tell,
             self.latch, request, StopJournal(fds[5]), options["stop_sources"],
         )  # fmt: skip
-        parts = Parts(
-            self, self.blocks, self.outputs, self.effects, self.waits, self.pages, self.stops, self.log
-        )
+        parts = Parts(self, self.blocks, self.outputs, self.effects, self.waits, self.pages, self.stops, self.log)
         self.engine = self.stops.engine = self._make_engine(parts)
         service = Service(
             self, self.blocks, self.outputs, self.effects, self.waits, self.pages, self.stops, self.log,
@@ -410,9 +408,7 @@ class Runtime:
         for attempt in attempts:
             try:
                 attempt()
-            except (
-                Exception
-            ) as second:  # nothing may keep the others from being stopped, nor this from being told
+            except Exception as second:  # nothing may keep the others from being stopped, nor this from being told
                 trace += f" (and while stopping: {second!r})"
         self.log("error", f"driver failed{what}: {error!r}: {trace}")
 

@@ -16,8 +16,8 @@ class LineSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ``line = { serial = "/dev/ttyUSB0", baud = 115200, parity = "N" }``,
     ``line = { tcp = "192.168.0.20:502" }`` or
     ``line = { udp = "192.168.1.1:49152" }``. ``local`` is the address on this side, where it matters; with it the port
-    of ``udp`` may be 0, which listens to any port of that host. ``path`` is a device file that only sends; drivers of the
-    kernel's own interfaces give it, not the configuration.
+    of ``udp`` may be 0, which listens to any port of that host. ``path`` is a device file that only sends; drivers of
+    the kernel's own interfaces give it, not the configuration.
     """
 
     serial: str | None = None
@@ -33,9 +33,7 @@ class LineSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         named = [key for key in ("serial", "tcp", "udp", "path") if getattr(self, key) is not None]
         if len(named) != 1:
-            raise ValueError(
-                f"line names {', '.join(named) or 'nothing'}; want exactly one of serial, tcp, udp"
-            )
+            raise ValueError(f"line names {', '.join(named) or 'nothing'}; want exactly one of serial, tcp, udp")
         if not 300 <= self.baud <= 12_000_000:
             raise ValueError(f"baud = {self.baud}; want 300 to 12000000")
         if self.local:

@@ -70,9 +70,7 @@ class SideConnection:
         if found is None and now_ns > self._until_ns:
             self.close()
             why = "no reply within its time-out" if self._sent else "nobody answers there"
-            raise LinkError(
-                f"{exchange.what} at {self.settings}: {why}; look at its address, power and cable"
-            )
+            raise LinkError(f"{exchange.what} at {self.settings}: {why}; look at its address, power and cable")
         if found is not None:
             self._exchange = None
         return found
@@ -109,9 +107,7 @@ class SideConnection:
         except OSError:
             self._connection.close()
             self._connection = None
-            return (
-                exchange.decode(bytes(self._reply)),
-            )  # the end of the connection may be the end of the reply
+            return (exchange.decode(bytes(self._reply)),)  # the end of the connection may be the end of the reply
         size = exchange.want(bytes(self._reply))
         if size is None or len(self._reply) < size:
             return None

@@ -23,9 +23,7 @@ class TickStatistics:
     """
 
     def __init__(self) -> None:
-        self._ring = [
-            array("q", bytes(8 * _SIZE)) for _ in PHASES
-        ]  # of fixed size, as lists of numbers are not
+        self._ring = [array("q", bytes(8 * _SIZE)) for _ in PHASES]  # of fixed size, as lists of numbers are not
         self.ticks = 0
         self.skipped = 0
         self.longest_ns = 0
@@ -74,7 +72,5 @@ class TickStatistics:
             kept = np.frombuffer(ring, dtype=np.int64)
             ranks = [min(n - 1, int(n * p / 100)) for p in percentiles]
             values = np.partition(np.take(kept, chosen, mode="wrap"), ranks) if n else kept
-            result[phase] = {
-                str(p): int(values[rank]) for p, rank in zip(percentiles, ranks, strict=True) if n
-            }
+            result[phase] = {str(p): int(values[rank]) for p, rank in zip(percentiles, ranks, strict=True) if n}
         return result

@@ -83,8 +83,8 @@ class Stops:
     Attributes:
         engine: of the device; set before the first tick.
         stopped: whether the workcell is stopped.
-        latched_outputs: parts of outputs (block, channel, bit) under an emergency stop of their node, and by whom; bit 0 for
-            channels without bits.
+        latched_outputs: parts of outputs (block, channel, bit) under an emergency stop of their node, and by whom; bit
+            0 for channels without bits.
     """
 
     engine: Engine
@@ -184,9 +184,7 @@ class Stops:
                 and (int(port.data[channel]) >> bit & 1) == active
                 and not self.stopped
             ):
-                name = f"{self._device} {port.spec.name} {port.spec.channels[channel].name}".replace(
-                    "  ", " "
-                )
+                name = f"{self._device} {port.spec.name} {port.spec.channels[channel].name}".replace("  ", " ")
                 self.stop_workcell(f"input {name} bit {bit} reads {active}")
 
     # --- the one stop ----------------------------------------------------------------------------
@@ -194,8 +192,9 @@ class Stops:
     def safe_stop(self, reason: Reason, parts: Sequence[Part] | None = None) -> None:
         """Stop axes and make outputs safe; every stop of this process is this one.
 
-        The order, which docs/decisions/0176-one-safe-stop.md explains: banks, what is under way after a failure, the stops of
-        the device, its outputs, the requests that wait, the events of the banks. Each is done whatever became of those before.
+        The order, which docs/decisions/0176-one-safe-stop.md explains: banks, what is under way after a failure, the
+        stops of the device, its outputs, the requests that wait, the events of the banks. Each is done whatever became
+        of those before.
 
         Args:
             reason: how and why.
@@ -298,9 +297,7 @@ class Stops:
     def note_node(self, handle: Handle, source: str, *, stop: bool) -> None:
         """Note that a client has stopped or reset the node that it holds or watches."""
         spec = handle.block.spec
-        parts = [
-            part for c in handle.channels.tolist() for part in parts_of(c, handle.bit, spec.channels[c].width)
-        ]
+        parts = [part for c in handle.channels.tolist() for part in parts_of(c, handle.bit, spec.channels[c].width)]
         what = f"emergency stop of {handle.node}" if stop else f"reset of {handle.node}"
         self._log("warning", f"{what} by {handle.who}")
         self._note(node_entry(handle.node, self._device, spec.name, parts, source, stop=stop))
@@ -318,9 +315,7 @@ class Stops:
                 continue
             for channel, bit in channels_and_bits(runs):
                 if channel < block.n:
-                    self.stop_node(
-                        block, [channel], bit if block.spec.channels[channel].width else -1, source
-                    )
+                    self.stop_node(block, [channel], bit if block.spec.channels[channel].width else -1, source)
 
     def _note(self, entry: dict[str, Any]) -> None:
         try:
@@ -331,7 +326,9 @@ class Stops:
     # --- outputs ---------------------------------------------------------------------------------
 
     def make_safe(self, block: AnyBlock, channels: Any, bit: int = -1) -> None:
-        """Want the safe values of output channels, or of one bit, until the device has them; those without one keep the last."""
+        """Want the safe values of output channels, or of one bit, until the device has them; those without one keep the
+        last.
+        """
         if isinstance(block, AxisBlock):
             return
         wanted = {int(c): safe for c in channels if (safe := safe_of(block.spec, int(c), bit)) is not None}
@@ -380,9 +377,7 @@ class Stops:
         if self._pages.is_good([block]):
             self._pages.set_link([block], PageState.GOOD, text)
         tries = f" ({count} more tries since)" if count else ""
-        self._log(
-            "error", f"{self._name(block)}: {text}; they are sent until the device confirms them{tries}"
-        )
+        self._log("error", f"{self._name(block)}: {text}; they are sent until the device confirms them{tries}")
 
     def held(self, block: AnyBlock, channel: int) -> tuple[int, str]:
         """Return which bits of an output channel are stopped (WHOLE: all), and by whom."""
@@ -393,9 +388,7 @@ class Stops:
             return 0, ""
         width = block.spec.channels[channel].width
         sources = {
-            bit: latched[id(block), channel, bit]
-            for bit in range(width or 1)
-            if (id(block), channel, bit) in latched
+            bit: latched[id(block), channel, bit] for bit in range(width or 1) if (id(block), channel, bit) in latched
         }
         if not sources:
             return 0, ""

@@ -51,9 +51,7 @@ class StreamEngine(Connected):
         if not self._is_up:
             if now_ns >= self._due_ns:
                 self._busy = True
-                self.guarded(
-                    lambda: line.submit(self._driver.open(), Priority.POLL, self._opened, now_ns), now_ns
-                )
+                self.guarded(lambda: line.submit(self._driver.open(), Priority.POLL, self._opened, now_ns), now_ns)
         elif now_ns - self._good_ns > self._driver.silence_s * 1e9:
             trouble = self._driver.trouble
             self._stalled(
@@ -112,9 +110,7 @@ class StreamEngine(Connected):
         """Return when the sample was taken: what the device was told after that, it cannot show."""
         return min(stamp_ns, self._loop.now_ns())
 
-    def write_outputs(
-        self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]
-    ) -> Any:
+    def write_outputs(self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]) -> Any:
         """Refuse: a stream has no outputs."""
         raise OSError(errno.EBADF, f"write {block.spec.name}: this device only sends")
 
@@ -137,6 +133,4 @@ class StreamEngine(Connected):
         line, now_ns = self.line, self._loop.now_ns()
         if line is not None and self._is_up:
             self._is_up = False
-            self.guarded(
-                lambda: line.submit(self._driver.close(), Priority.ACT, lambda v, e: None, now_ns), now_ns
-            )
+            self.guarded(lambda: line.submit(self._driver.close(), Priority.ACT, lambda v, e: None, now_ns), now_ns)

@@ -54,9 +54,7 @@ def from_table(kind: type[T], table: msgspec.Struct, given: Mapping[str, Any] | 
             continue
         value = getattr(table, field.name)
         inner = next((k for k in (hints[field.name], *get_args(hints[field.name])) if _is_dataclass(k)), None)
-        values[field.name] = (
-            from_table(inner, value) if isinstance(value, msgspec.Struct) and inner else value
-        )
+        values[field.name] = from_table(inner, value) if isinstance(value, msgspec.Struct) and inner else value
     return kind(**values)
 
 

@@ -91,9 +91,7 @@ class TickEngine:
         """
         return self._shown_ns if self._is_ticking else self._loop.looked_ns
 
-    def write_outputs(
-        self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]
-    ) -> Any:
+    def write_outputs(self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]) -> Any:
         """Hand the values to the driver; they take effect in the next tick."""
         self._write(block, changes)
         return self._loop.tick
@@ -121,9 +119,7 @@ class TickEngine:
             raise HookError(f"{type(self._driver).__name__}.write_outputs") from error
         self._outputs.acknowledge(block, channels, values)
         if edges is not None and (edges != block.edges).any():  # type: ignore[union-attr]
-            self._loop.publish(
-                block, time.monotonic_ns()
-            )  # an edge of its own, though the tick sees only the last
+            self._loop.publish(block, time.monotonic_ns())  # an edge of its own, though the tick sees only the last
 
     def carry_out(self, handle: Handle, number: int, steps: Steps, what: str) -> Any:
         """Refuse: a driver without a line has none to send steps on."""

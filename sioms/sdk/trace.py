@@ -1,7 +1,8 @@
-"""Records what goes over a driver's lines, as JSON lines with time stamps; the format is described in docs/driver-trace.md.
+"""Records what goes over a driver's lines, as JSON lines with time stamps; the format is described in
+docs/driver-trace.md.
 
-The environment variable ``SIOMS_TRACE=DEVICE=PATH`` switches it on in the driver process of that device. Then its lines are
-opened as a class that records; without, nothing of this module is loaded.
+The environment variable ``SIOMS_TRACE=DEVICE=PATH`` switches it on in the driver process of that device. Then its lines
+are opened as a class that records; without, nothing of this module is loaded.
 
 Concurrency: the one thread of the driver process.
 """

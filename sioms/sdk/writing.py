@@ -30,9 +30,7 @@ _AT_ONCE = 16
 """Records that are judged and taken at once."""
 
 
-def write(
-    service: Service, handle: Handle, number: int, flags: int, timeout_s: float | None, data: bytes
-) -> Any:
+def write(service: Service, handle: Handle, number: int, flags: int, timeout_s: float | None, data: bytes) -> Any:
     """Carry out a write of whole records.
 
     Args:
@@ -79,9 +77,7 @@ def check_link(service: Service, handle: Handle, what: str) -> None:
     """Refuse what would wait for a lost device and begin by itself when that is back."""
     reason = service.pages.why_not(handle.block)
     if reason:
-        raise OSError(
-            errno.EIO, f"{what}: its device does not answer ({reason}); write again when it is back"
-        )
+        raise OSError(errno.EIO, f"{what}: its device does not answer ({reason}); write again when it is back")
 
 
 # --- axes ----------------------------------------------------------------------------------------
@@ -99,9 +95,7 @@ class AxesWrite:
 
     __slots__ = ("_handle", "_judgement", "_patient", "_records", "_replace", "_service", "lacks_room")
 
-    def __init__(
-        self, service: Service, handle: Handle, records: NDArray[Any], replace: bool, patient: bool
-    ) -> None:
+    def __init__(self, service: Service, handle: Handle, records: NDArray[Any], replace: bool, patient: bool) -> None:
         self.lacks_room = False
         self._service = service
         self._handle = handle
@@ -257,9 +251,7 @@ def _changes(handle: Handle, records: NDArray[Any], what: str) -> dict[int, Chan
                     raise OSError(errno.EINVAL, f"{what}: data {value}; want 0 or 1")
                 value, mask = value << handle.bit, 1 << handle.bit
             elif not 0 <= value < 1 << width:
-                raise OSError(
-                    errno.EINVAL, f"{what}: channel {info.name}: data {value}; want 0 to {(1 << width) - 1}"
-                )
+                raise OSError(errno.EINVAL, f"{what}: channel {info.name}: data {value}; want 0 to {(1 << width) - 1}")
             mask &= (1 << width) - 1
             before = changes.get(channel, Change(0, 0))
             changes[channel] = Change(before.mask | mask, Change(mask, value).over(before.value))
@@ -268,9 +260,7 @@ def _changes(handle: Handle, records: NDArray[Any], what: str) -> dict[int, Chan
             low = -math.inf if info.minimum is None else info.minimum
             high = math.inf if info.maximum is None else info.maximum
             if not math.isfinite(number):
-                raise OSError(
-                    errno.EINVAL, f"{what}: channel {info.name}: data {number}; want a finite number"
-                )
+                raise OSError(errno.EINVAL, f"{what}: channel {info.name}: data {number}; want a finite number")
             if not low <= number <= high:
                 raise OSError(
                     errno.ERANGE,

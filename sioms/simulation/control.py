@@ -1,8 +1,8 @@
 """The life of a simulator: one ready line, then commands on standard input until it ends.
 
 Each command is a line of words and is answered by one line: ``ok``, ``ok`` with a JSON value, or ``error`` with a
-sentence; ``verbs`` lists them. When standard input is a pipe or a socket its end ends the process, so that a simulator does not
-outlive its test; a terminal or /dev/null does not.
+sentence; ``verbs`` lists them. When standard input is a pipe or a socket its end ends the process, so that a simulator
+does not outlive its test; a terminal or /dev/null does not.
 """
 
 from __future__ import annotations

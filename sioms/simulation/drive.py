@@ -107,10 +107,7 @@ class Mover:
         wanted = self.top_speed
         if self.target is not None:
             distance = self.target - self.position
-            if (
-                abs(distance) <= max(abs(self.velocity) * dt, 0.5)
-                and abs(self.velocity) <= 2 * self.deceleration * dt
-            ):
+            if abs(distance) <= max(abs(self.velocity) * dt, 0.5) and abs(self.velocity) <= 2 * self.deceleration * dt:
                 self.position = self.target
                 self.halt()
                 return False
@@ -178,8 +175,8 @@ class SimulatedDrive(Protocol):
 def drive_handlers(drives: Mapping[int, SimulatedDrive]) -> dict[str, Callable[..., object]]:
     """Return the commands of drives, those of the first unless one is named.
 
-    ``state [UNIT]``, ``alarm CODE [UNIT]``, ``slip PULSES [UNIT]``, ``ends LOW HIGH [UNIT]``, ``foreign KIND VALUE [UNIT]``,
-    ``shove VELOCITY [UNIT]``.
+    ``state [UNIT]``, ``alarm CODE [UNIT]``, ``slip PULSES [UNIT]``, ``ends LOW HIGH [UNIT]``, ``foreign KIND VALUE
+    [UNIT]``, ``shove VELOCITY [UNIT]``.
     """
     first = str(next(iter(drives)))
 

@@ -1,4 +1,6 @@
-"""What presses on a simulated force/torque sensor: six components, noise, a bias, and a range that it leaves when overloaded."""
+"""What presses on a simulated force/torque sensor: six components, noise, a bias, and a range that it leaves when
+overloaded.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What all simulated sensors share: a supply that can be switched off, a stream that can stand still, requests that are refused."""
+"""What all simulated sensors share: a supply that can be switched off, a stream that can stand still, requests that are
+refused.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +18,7 @@ class Supply:
         boot_s: time that it takes from power to readiness [s].
     """
 
-    def __init__(
-        self, clock: Callable[[], float], boot: Callable[[float], None], boot_s: float = 0.0
-    ) -> None:
+    def __init__(self, clock: Callable[[], float], boot: Callable[[float], None], boot_s: float = 0.0) -> None:
         self._clock, self._boot, self._boot_s = clock, boot, boot_s
         self._on_s = float("-inf")
         self.cycles = 0

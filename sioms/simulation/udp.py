@@ -24,9 +24,7 @@ class UdpPort(asyncio.DatagramProtocol):
         sent: datagrams that have left.
     """
 
-    def __init__(
-        self, faults: Faults, received: Callable[[bytes, Address], None] = lambda data, sender: None
-    ) -> None:
+    def __init__(self, faults: Faults, received: Callable[[bytes, Address], None] = lambda data, sender: None) -> None:
         self._faults, self._received = faults, received
         self._transport: asyncio.DatagramTransport | None = None
         self.name = ""
@@ -70,7 +68,9 @@ class UdpPort(asyncio.DatagramProtocol):
 
 
 def missed(next_s: float, now_s: float, rate_hz: float) -> int:
-    """Return how many records a sensor's time has passed by while its process was held up; a sensor does not make up for them."""
+    """Return how many records a sensor's time has passed by while its process was held up; a sensor does not make up
+    for them.
+    """
     return int((now_s - next_s) * rate_hz) if now_s - next_s > HELD_UP_S else 0
 
 

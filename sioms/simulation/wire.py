@@ -86,17 +86,13 @@ def parser(description: str, *, tcp: bool = False) -> argparse.ArgumentParser:
     """Return the options that all have."""
     options = argparse.ArgumentParser(description=description)
     options.add_argument("--link", type=Path, help="fixed path of the port")
-    options.add_argument(
-        "--baud", type=int, default=0, help="let replies take the time of a line of this speed"
-    )
+    options.add_argument("--baud", type=int, default=0, help="let replies take the time of a line of this speed")
     if tcp:
         options.add_argument("--tcp", type=int, default=-1, help="TCP port instead of a pty, 0 = a free one")
     return options
 
 
-async def run(
-    device: Device, options: argparse.Namespace, handlers: Mapping[str, Callable[..., object]]
-) -> None:
+async def run(device: Device, options: argparse.Namespace, handlers: Mapping[str, Callable[..., object]]) -> None:
     """Serve a device until told to end."""
     loop, faults = asyncio.get_running_loop(), Faults()
     character_s = 10 / options.baud if options.baud else 0.0

@@ -1,4 +1,5 @@
-"""Fit the elements of a finger to recorded touches: place, effective depth, Poisson's ratio and gain (dissertation 3.4).
+"""Fit the elements of a finger to recorded touches: place, effective depth, Poisson's ratio and gain (dissertation
+3.4).
 
 For each element over the touches within 25 degrees: minimise the squares of the residual in OUTPUT units, the
 gain by linear least squares inside.  (In strain units with a free gain the objective falls when all strains
@@ -93,8 +94,14 @@ class NearTouches:
     """One element with the touches near the place where its fit begins."""
 
     def __init__(
-        self, cylinder: Cylinder, start: ElementFit, output: Floats, touches: Touches, loads: TouchLoads, adhesion: float
-    ) -> None:  # fmt: skip
+        self,
+        cylinder: Cylinder,
+        start: ElementFit,
+        output: Floats,
+        touches: Touches,
+        loads: TouchLoads,
+        adhesion: float,
+    ) -> None:
         near = np.abs(touches.angle_rad - start.angle_rad) <= NEAR
         self._cylinder, self._adhesion = cylinder, adhesion
         self._output, self._touches = output[near], touches.pick(near)
@@ -171,9 +178,7 @@ def starts(
     loudest = np.max(np.where(near, np.abs(touches.output), 0.0), axis=0, initial=0.0)
     alive = loudest > _SILENT * np.median(loudest[enough]) if enough.any() else enough
     return [
-        ElementFit(float(angle), float(radius), cylinder.poisson, 1.0, np.nan, int(count), extent_rad)
-        if good
-        else None
+        ElementFit(float(angle), float(radius), cylinder.poisson, 1.0, np.nan, int(count), extent_rad) if good else None
         for angle, radius, count, good in zip(angles, radii, near.sum(axis=0), enough & alive, strict=True)
     ]
 
@@ -192,9 +197,7 @@ def fit_elements(
     for element, start in enumerate(begin):
         found = None
         if start is not None:
-            found = fit_element(
-                cylinder, start, touches.output[:, element], touches, loads, adhesion, freedom
-            )
+            found = fit_element(cylinder, start, touches.output[:, element], touches, loads, adhesion, freedom)
         out.append(found)
         tick()
     return out

@@ -150,9 +150,7 @@ def calibrate(
                 f"element {element}: too few touches within 25 degrees, or no answer to them; left out of the finger"
             )
     if sum(fit is not None for fit in begin) < 4:
-        raise ValueError(
-            "calibrate finger: fewer than 4 elements have touches near them; probe more of the finger"
-        )
+        raise ValueError("calibrate finger: fewer than 4 elements have touches near them; probe more of the finger")
     begin = _with_extent(body, begin, touches, loads)
     tick("width of the elements")
     for _ in range(_ROUNDS):
@@ -168,9 +166,7 @@ def calibrate(
         touches, faults = straight, again
         body = Cylinder(body.core_m, body.outer_m, nu, body.shear_pa)
         widths, begin = rigid_core_table(body), own
-        loads = touch_loads(
-            body, widths, touches, loads.highest, options.edge_half_angle_rad, faults.wider(touches)
-        )
+        loads = touch_loads(body, widths, touches, loads.highest, options.edge_half_angle_rad, faults.wider(touches))
         tick("loads of the touches")
     loads, widths = tractions, table
     body = Cylinder(body.core_m, body.outer_m, nu, body.shear_pa)
@@ -193,15 +189,11 @@ def calibrate(
     finger = _finger(nominal, body, best, kind, adhesion, widths, faults, touches, residuals, direct, peak)
     doubts = _doubts(nominal, finger, best, sought, faults, touches.force / touches.load)
     halves = [
-        _half(finger, body, best, touches, loads, adhesion, np.arange(len(touches)) % 2 == parity)
-        for parity in (0, 1)
+        _half(finger, body, best, touches, loads, adhesion, np.arange(len(touches)) % 2 == parity) for parity in (0, 1)
     ]
     tick("estimates of left-out touches")
     worth = held_out.joined(
-        [
-            held_out.estimates(half, recorded.pick(~train), faults.recorded.load[~train])
-            for half, train in halves
-        ]
+        [held_out.estimates(half, recorded.pick(~train), faults.recorded.load[~train]) for half, train in halves]
     )
     finger = msgspec.structs.replace(finger, systematic=held_out.systematic(worth))
     doubts += held_out.doubts(worth, finger.systematic)
@@ -222,16 +214,17 @@ def calibrate(
     )
 
 
-def _doubts(
-    nominal: Finger, finger: Finger, fits: Fits, poisson: float, faults: Faults, cell: Floats
-) -> list[str]:
-    """Return why the finger is not to be believed: parameters at the end of what they may be, residuals, contradictions."""
+def _doubts(nominal: Finger, finger: Finger, fits: Fits, poisson: float, faults: Faults, cell: Floats) -> list[str]:
+    """Return why the finger is not to be believed: parameters at the end of what they may be, residuals,
+    contradictions.
+    """
     doubts, body = [], finger.cylinder
     known = [(element, fit) for element, fit in enumerate(fits) if fit is not None]
     off = 100.0 * float(np.mean([finger.elements.misfit[element] for element, _ in known]))
     if off > MOST_MISFIT:
         doubts.append(
-            f"the touches leave {off:.1f} % of the peak strain unexplained beside their noise; a sound finger leaves less than "
+            f"the touches leave {off:.1f} % of the peak strain unexplained beside their noise; a sound finger leaves "
+            "less than "
             f"{MOST_MISFIT:g} %: something acts that no model here knows, or the recordings contradict each other"
         )
     thick = body.outer_m - body.core_m
@@ -239,13 +232,15 @@ def _doubts(
     for element, fit in known:
         if not low + _CLOSE * thick < fit.radius_m < high - _CLOSE * thick:
             doubts.append(
-                f"element {element}: its effective radius runs to the end of what it can be, {1e3 * fit.radius_m:.2f} mm between a "
+                f"element {element}: its effective radius runs to the end of what it can be, {1e3 * fit.radius_m:.2f} "
+                "mm between a "
                 f"core of {1e3 * body.core_m:.2f} and a surface of {1e3 * body.outer_m:.2f} mm"
             )
         turned = abs(fit.angle_rad - nominal.elements.angle_rad[element])
         if turned > (1.0 - _CLOSE) * TURN:
             doubts.append(
-                f"element {element}: its place runs to the end of what was searched, {np.degrees(turned):.1f} degrees from the nominal one"
+                f"element {element}: its place runs to the end of what was searched, {np.degrees(turned):.1f} degrees "
+                "from the nominal one"
             )
     if min(finger.geometry.extent_rad, MOST_EXTENT) > (1.0 - _CLOSE) * MOST_EXTENT:
         doubts.append(
@@ -256,20 +251,20 @@ def _doubts(
     gains = [fit.gain / nominal.elements.gain[element] for element, fit in known]
     ratio = float(np.median(gains))
     if not 1.0 / _FAR_GAIN < ratio < _FAR_GAIN:
-        doubts.append(
-            f"the gains come out {ratio:.3g} times the nominal ones: a wrong unit, or a wrong nominal finger"
-        )
+        doubts.append(f"the gains come out {ratio:.3g} times the nominal ones: a wrong unit, or a wrong nominal finger")
     quadratic, pull = faults.quadratic, faults.proximity
     if quadratic is not None and float(np.max(np.abs(quadratic.value))) > _MOST_QUADRATIC:
         doubts.append(
-            f"the quadratic comes out as {float(np.max(np.abs(quadratic.value))) / 100.0:.2f} per per cent: at {_MOST_QUADRATIC / 100.0:.2f} and "
+            f"the quadratic comes out as {float(np.max(np.abs(quadratic.value))) / 100.0:.2f} per per cent: at "
+            f"{_MOST_QUADRATIC / 100.0:.2f} and "
             "more an output of a few per cent is at the end of its range"
         )
     if pull is not None and quadratic is not None:
         bent = 4.0 * float(np.max(quadratic.value)) * abs(pull.amplitude)
         if bent > _MOST_BENT:
             doubts.append(
-                f"the pull of the conductor, {100.0 * pull.amplitude:.1f} % of output, lies {'beyond' if bent > 1.0 else 'near'} the lowest "
+                f"the pull of the conductor, {100.0 * pull.amplitude:.1f} % of output, lies "
+                f"{'beyond' if bent > 1.0 else 'near'} the lowest "
                 "output that a quadratic of this size can give: what is below cannot be undone; shield the elements"
             )
     if pull is not None and not SHORTEST < pull.range_rad < LONGEST:
@@ -278,7 +273,8 @@ def _doubts(
         )
     if np.isfinite(cell).all() and not 1.0 / _FAR_CELL < float(np.median(cell)) < _FAR_CELL:
         doubts.append(
-            f"the load cell reads {float(np.median(cell)):.2f} times the commanded load: strains and loads contradict each other in scale"
+            f"the load cell reads {float(np.median(cell)):.2f} times the commanded load: strains and loads contradict "
+            "each other in scale"
         )
     return doubts
 
@@ -286,17 +282,11 @@ def _doubts(
 def _check(nominal: Finger, touches: Touches, warnings: list[str]) -> None:
     count = len(nominal.angles_rad)
     if touches.output.shape[1] != count:
-        raise ValueError(
-            f"calibrate finger: touches have {touches.output.shape[1]} elements; the finger has {count}"
-        )
+        raise ValueError(f"calibrate finger: touches have {touches.output.shape[1]} elements; the finger has {count}")
     if len(touches) < FEWEST_TOUCHES:
-        raise ValueError(
-            f"calibrate finger: {len(touches)} touches; need at least {FEWEST_TOUCHES} over all elements"
-        )
+        raise ValueError(f"calibrate finger: {len(touches)} touches; need at least {FEWEST_TOUCHES} over all elements")
     if not np.all(touches.load > 0.0):
-        raise ValueError(
-            f"calibrate finger: a touch has load {touches.load.min()} N/m; pressing loads are positive"
-        )
+        raise ValueError(f"calibrate finger: a touch has load {touches.load.min()} N/m; pressing loads are positive")
     # about each touch's own mean: a conductor lowers all outputs, but the pressed ones stand out
     own = touches.output - touches.output.mean(axis=1, keepdims=True)
     nearest = np.abs(np.array(nominal.angles_rad) - touches.angle_rad[:, None]).argmin(axis=1)
@@ -309,18 +299,18 @@ def _check(nominal: Finger, touches: Touches, warnings: list[str]) -> None:
     span = float(np.ptp(touches.angle_rad))
     if span < 0.1 * arc:
         raise ValueError(
-            f"calibrate finger: touches lie within {np.degrees(span):.3g} of {np.degrees(arc):.0f} degrees; places must be in "
+            f"calibrate finger: touches lie within {np.degrees(span):.3g} of {np.degrees(arc):.0f} degrees; places "
+            "must be in "
             "degrees and spread over the elements"
         )
     if away.size and np.median(away) > max(arc / 6.0, 1.5 * arc / (count - 1)):
         raise ValueError(
-            f"calibrate finger: the element that answers most lies {np.degrees(np.median(away)):.0f} degrees from the touch, "
+            f"calibrate finger: the element that answers most lies {np.degrees(np.median(away)):.0f} degrees from the "
+            "touch, "
             "as a rule; places must be in degrees, in direction and order of the elements' angles"
         )
     if np.median(own[np.arange(len(touches)), nearest]) < 0.0:
-        raise ValueError(
-            "calibrate finger: pressing lowers the output; compression must be positive: change its sign"
-        )
+        raise ValueError("calibrate finger: pressing lowers the output; compression must be positive: change its sign")
     ratio = float(np.median(touches.force / touches.load)) if np.isfinite(touches.force).all() else 1.0
     if ratio < 0.0:
         warnings.append(
@@ -334,13 +324,12 @@ def _check(nominal: Finger, touches: Touches, warnings: list[str]) -> None:
 
 
 def _check_gains(nominal: Finger, fits: Fits, warnings: list[str]) -> None:
-    found = [
-        fit.gain / gain for fit, gain in zip(fits, nominal.elements.gain, strict=True) if fit is not None
-    ]
+    found = [fit.gain / gain for fit, gain in zip(fits, nominal.elements.gain, strict=True) if fit is not None]
     ratio = float(np.median(found))
     if not 1.0 / _FAR_GAIN < ratio < _FAR_GAIN:
         warnings.append(
-            f"the gains come out {ratio:.3g} times the nominal ones: outputs must be in the finger's raw unit (per cent of "
+            f"the gains come out {ratio:.3g} times the nominal ones: outputs must be in the finger's raw unit (per "
+            "cent of "
             "the untouched output), loads in N/m"
         )
 
@@ -351,12 +340,8 @@ def _contact(
 ) -> tuple[ContactKind, float, dict[str, float], TouchLoads, WidthTable]:  # fmt: skip
     """Choose the contact model by the residual of a fit with free depths."""
     half = hertz_table(body)
-    other = touch_loads(
-        body, half, touches, loads.highest, options.edge_half_angle_rad, faults.wider(touches)
-    )
-    tried: dict[str, tuple[ContactKind, float, TouchLoads, WidthTable]] = {
-        "hertz": ("hertz", 0.0, other, half)
-    }
+    other = touch_loads(body, half, touches, loads.highest, options.edge_half_angle_rad, faults.wider(touches))
+    tried: dict[str, tuple[ContactKind, float, TouchLoads, WidthTable]] = {"hertz": ("hertz", 0.0, other, half)}
     for share in SHARES:
         name = "frictionless" if share == 0.0 else f"adhesion {share:g}"
         tried[name] = ("frictionless" if share == 0.0 else "adhering", share, loads, widths)
@@ -372,9 +357,7 @@ def _contact(
         best = "frictionless"
     kind, share, tractions, table = tried[best]
     if kind == "adhering" and options.contact is None:
-        share = _between(
-            {entry[1]: score[name] for name, entry in tried.items() if entry[0] != "hertz"}, share
-        )
+        share = _between({entry[1]: score[name] for name, entry in tried.items() if entry[0] != "hertz"}, share)
     return kind, share, score, tractions, table
 
 
@@ -391,9 +374,7 @@ def edge_peak(body: Cylinder, fits: Fits, half_angle: float) -> float:
     """Return the mean over elements of the model strain right under a 200 N/m edge, positive."""
     known = [fit for fit in fits if fit is not None]
     highest = max(highest_needed(body, max(fit.radius_m for fit in known), 1e-3), _PEAK_WAVES)
-    series = width_for_load(body, Wedge(half_angle), REFERENCE_LOAD).series(0.0, highest)[
-        : 2 * highest + 1 : 2
-    ]
+    series = width_for_load(body, Wedge(half_angle), REFERENCE_LOAD).series(0.0, highest)[: 2 * highest + 1 : 2]
     factors = respond(body, np.arange(highest + 1), [fit.radius_m for fit in known]).e_rr[:, :, 0].T
     return float(-np.mean(factors @ (series * felt(highest, known[0].extent_rad))))
 
@@ -422,7 +403,9 @@ def _with_extent(body: Cylinder, begin: Fits, touches: Touches, loads: TouchLoad
 def _together(
     body: Cylinder, begin: Fits, touches: Touches, loads: TouchLoads, adhesion: float, warnings: list[str]
 ) -> tuple[Fits, float, float]:
-    """Fit depths of all elements with one Poisson's ratio, the body's if the data do not support another, and the one sought."""
+    """Fit depths of all elements with one Poisson's ratio, the body's if the data do not support another, and the one
+    sought.
+    """
     wide = any(fit is not None and fit.extent_rad > 0.0 for fit in begin)
     found, shared = fit_together(body, begin, touches, loads, adhesion, Common(extent=wide))
     nu, deviation = shared.poisson, shared.poisson_deviation
@@ -472,8 +455,14 @@ def _left_out(
 
 
 def _half(
-    finger: Finger, body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, adhesion: float, train: NDArray[np.bool_]
-) -> tuple[Finger, NDArray[np.bool_]]:  # fmt: skip
+    finger: Finger,
+    body: Cylinder,
+    fits: Fits,
+    touches: Touches,
+    loads: TouchLoads,
+    adhesion: float,
+    train: NDArray[np.bool_],
+) -> tuple[Finger, NDArray[np.bool_]]:
     """Return the finger with elements and map from some of the touches alone, and which."""
     part, tractions = touches.pick(train), TouchLoads(loads.normal[train], loads.shear[train])
     depth = finger.notes["map"] != "uniform"
@@ -538,9 +527,7 @@ def _finger(
         return tuple(fallback[e] if fit is None else float(getattr(fit, name)) for e, fit in enumerate(fits))
 
     method = (
-        "uniform"
-        if np.nanmean(residuals["uniform"]) <= np.nanmean(residuals["elements"]) / _BETTER
-        else "elements"
+        "uniform" if np.nanmean(residuals["uniform"]) <= np.nanmean(residuals["elements"]) / _BETTER else "elements"
     )
     misfit, rows = residuals[method], None
     if direct is not None and np.nanmean(residuals["corrected"]) < _BETTER * np.nanmean(misfit):

@@ -12,16 +12,18 @@ drift time in long rests (temperature moves it by per cents an hour), faster aft
 it, and hardly while what the touch left of creep is above the noise. So touches in quick succession leave it what
 little their pauses tell. A touch is what rises above the noise in sum over all elements, what all have in common
 left out; it ends at half that level.  A touch from the first frame on cannot be told from an offset: call `rebase`
-untouched, which keeps the old baseline until the new one is there and found to be steady, or `zero`, which trusts its caller.
+untouched, which keeps the old baseline until the new one is there and found to be steady, or `zero`, which trusts its
+caller.
 
 What is no touch is kept from freezing the baseline (`sioms.tactile.witness`):
-an element that moves alone is suspect and left out, until it has stood still for `RECOVER_S` while nothing touched: then it gets a
-baseline of its own again. So does an element that comes to life late. What moves all elements alike, a step of the supply, is taken
-into the baseline at once.
+an element that moves alone is suspect and left out, until it has stood still for `RECOVER_S` while nothing touched:
+then it gets a baseline of its own again. So does an element that comes to life late. What moves all elements alike, a
+step of the supply, is taken into the baseline at once.
 
-Readings that repeat may be those of a converter with steps above its noise: they count as they are, with the step as their
-uncertainty, for as long as a touch is held. But where most elements have been seen to be noisy since the last `zero`, an element that repeats its reading
-for `DEAD_FRAMES` is dead; if all do, the converter is stuck, and the finger blind.
+Readings that repeat may be those of a converter with steps above its noise: they count as they are, with the step as
+their uncertainty, for as long as a touch is held. But where most elements have been seen to be noisy since the last
+`zero`, an element that repeats its reading for `DEAD_FRAMES` is dead; if all do, the converter is stuck, and the finger
+blind.
 """
 
 from __future__ import annotations
@@ -82,7 +84,8 @@ class StrainFrame:
         settled: whether the baseline is known yet; before, strains are nan.
         strength: chi square of the outputs against the noise, per element; about 1 when untouched.
         blind: the usable elements cannot tell whether there is a touch; `touched` is then what it was.
-        variance: of the strains, shape (ns,), where the converter's steps or noise are above those of the finger's file.
+        variance: of the strains, shape (ns,), where the converter's steps or noise are above those of the finger's
+            file.
         held: the mean over a touch that has been steady; the same object until there is a longer one.
     """
 
@@ -107,9 +110,7 @@ class SignalChain:
         table: the finger's, if it is at hand.
     """
 
-    def __init__(
-        self, finger: Finger, settle_frames: int = SETTLE_FRAMES, table: StrainTable | None = None
-    ) -> None:
+    def __init__(self, finger: Finger, settle_frames: int = SETTLE_FRAMES, table: StrainTable | None = None) -> None:
         if settle_frames < 1:
             raise ValueError(f"make signal chain: {settle_frames} frames to settle; need at least 1")
         e, self._signal = finger.elements, finger.signal
@@ -193,9 +194,7 @@ class SignalChain:
         """
         new = np.array(gain, dtype=np.float64)
         if new.shape not in ((self._count,), (self._count, self._count)):
-            raise ValueError(
-                f"set gain: {new.size} gains in shape {new.shape}; the finger has {self._count} elements"
-            )
+            raise ValueError(f"set gain: {new.size} gains in shape {new.shape}; the finger has {self._count} elements")
         own = new if new.ndim == 1 else np.diag(new)
         if not (np.all(np.isfinite(new)) and np.all(own > 0.0)):
             raise ValueError(
@@ -218,12 +217,11 @@ class SignalChain:
         reading = np.asarray(raw, dtype=np.float64)
         if reading.shape != (self._count,):
             raise ValueError(
-                f"process frame: {reading.size} readings in shape {reading.shape}; the finger has {self._count} elements"
+                f"process frame: {reading.size} readings in shape {reading.shape}; the finger has {self._count} "
+                "elements"
             )
         if self._stamp_ns is not None and stamp_ns < self._stamp_ns:
-            raise ValueError(
-                f"process frame: stamp {stamp_ns} ns is before the last one, {self._stamp_ns} ns"
-            )
+            raise ValueError(f"process frame: stamp {stamp_ns} ns is before the last one, {self._stamp_ns} ns")
         elapsed_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
         self._stamp_ns = stamp_ns
         finite = np.isfinite(reading)
@@ -250,7 +248,9 @@ class SignalChain:
         return told
 
     def _judge(self, change: Floats, usable: Flags, sight: Sight) -> tuple[Flags, float]:
-        """Find whether there is a touch; an element that moves alone is suspect from then on, a step of all is taken up."""
+        """Find whether there is a touch; an element that moves alone is suspect from then on, a step of all is taken
+        up.
+        """
         square, common = self._squares(change, usable)
         strength, count = float(square.sum()), int(np.count_nonzero(usable))
         if strength > count + TOUCH_SIGMA * math.sqrt(2.0 * count):
@@ -262,9 +262,7 @@ class SignalChain:
         self._touch(strength / count, count)
         noise = math.sqrt(float(self._noise[usable].mean()) * 1.6 / count)
         if not self._touched and abs(common) > _COMMON_SIGMA * noise:
-            step = np.where(
-                usable, common + (change - common) * self._noise / (self._noise + self._crept**2), 0.0
-            )
+            step = np.where(usable, common + (change - common) * self._noise / (self._noise + self._crept**2), 0.0)
             self._baseline += step
             change -= step
             self._variance[usable] = 1.0
@@ -272,8 +270,8 @@ class SignalChain:
 
     def _squares(self, change: Floats, usable: Flags) -> tuple[Floats, float]:
         """Return each element's square in units of its noise, without what all have in common, and that."""
-        # a touch is somewhere; what moves all elements alike is temperature or the supply, which a fast change would else
-        # turn into a touch
+        # a touch is somewhere; what moves all elements alike is temperature or the supply, which a fast change would
+        # else turn into a touch
         common = float(np.median(change[usable]))
         square = (change - common) ** 2 / (self._noise + (_ALIKE * common) ** 2)
         square[~usable] = 0.0
@@ -306,25 +304,18 @@ class SignalChain:
         self, change: Floats, usable: Flags, saturated: Flags, dead: Flags, strength: float, blind: bool
     ) -> StrainFrame:
         linear = linearise(change, self._quadratic)
-        if self._mixing is None:
-            strains = -self._gain * linear
-        else:
-            strains = -self._mixing @ np.where(usable, linear, 0.0)
+        strains = -self._gain * linear if self._mixing is None else -self._mixing @ np.where(usable, linear, 0.0)
         strains[~usable] = np.nan
         variance = None if self._is_own else self._gain**2 * self._noise
         held = None
         if self._touched and not blind:
             before = self._average.held
-            held = self._average.take(
-                strains, usable, self._gain**2 * self._noise, self._variance, not self._is_own
-            )
+            held = self._average.take(strains, usable, self._gain**2 * self._noise, self._variance, not self._is_own)
             if held is not None and held is not before:
                 self._look_longer(held, usable)
         else:
             self._average.clear()
-        return StrainFrame(
-            strains, usable, saturated, dead, self._touched, True, strength, blind, variance, held
-        )
+        return StrainFrame(strains, usable, saturated, dead, self._touched, True, strength, blind, variance, held)
 
     def _look_longer(self, held: Held, usable: Flags) -> None:
         """Find whether one element has moved alone, in the mean over a steady touch: its noise is that much less."""
@@ -381,9 +372,7 @@ class SignalChain:
         if blind or not self._is_seen(alive):
             self._miss(asked, alive)
         elif self._touched is not asked.touched:
-            asked.refused = (
-                "it was touched or released while its baseline was taken; keep off, and zero it again"
-            )
+            asked.refused = "it was touched or released while its baseline was taken; keep off, and zero it again"
         else:
             rest.take(output, alive)
             if rest.left == 0:
@@ -432,7 +421,9 @@ class SignalChain:
             self._rebasing.done, self._rebasing = True, None
 
     def _louder(self, rest: Rest) -> float:
-        """Return the noise's variance over that of the finger's file, 1 if the first readings do not tell it is more."""
+        """Return the noise's variance over that of the finger's file, 1 if the first readings do
+        not tell it is more.
+        """
         ratio, freedom = rest.variance / self._own_noise, float(np.sum(np.maximum(rest.seen - 1.0, 0.0)))
         if not np.isfinite(ratio).any():
             return 1.0
@@ -453,9 +444,7 @@ class SignalChain:
             self._variance = (np.sqrt(self._variance) + _DRIFT_SHARE * share) ** 2
             np.maximum(self._crept, _CREPT * np.abs(change), out=self._crept)
             return
-        self._variance += (
-            share**2
-        )  # so much that in the long run a reading counts by its share of the drift time
+        self._variance += share**2  # so much that in the long run a reading counts by its share of the drift time
         believed = self._variance / (self._variance + 1.0 + self._crept**2 / self._noise)
         believed[~usable] = 0.0
         self._baseline += believed * change
@@ -481,9 +470,7 @@ class _Average:
         """Return the mean so far."""
         return self._held
 
-    def take(
-        self, strains: Floats, usable: Flags, noise: Floats, baseline: Floats, stepped: bool
-    ) -> Held | None:
+    def take(self, strains: Floats, usable: Flags, noise: Floats, baseline: Floats, stepped: bool) -> Held | None:
         """Add a frame of a touch; return the mean to be looked at.
 
         Args:

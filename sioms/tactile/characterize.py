@@ -1,4 +1,5 @@
-"""Characterise a finger's outputs beside the touch itself: noise, mains lines, temperature, creep, relaxation, proximity.
+"""Characterise a finger's outputs beside the touch itself: noise, mains lines, temperature, creep, relaxation,
+proximity.
 
 As section 3.3 of the dissertation does.
 """
@@ -58,9 +59,7 @@ def noise_of(recording: Recording, outstanding: float = 8.0) -> Noise:
         if here > outstanding * floor and here >= density[place - 1] and here > density[place + 1]:
             lines.append((float(frequency[place]), float(np.sqrt(2.0 * (here - floor) * width))))
     gaps = np.diff(np.unique(np.round(recording.raw[:, 0], 9)))
-    return Noise(
-        raw.std(0, ddof=1), float(gaps.min()) if gaps.size else 0.0, frequency, density, tuple(lines)
-    )
+    return Noise(raw.std(0, ddof=1), float(gaps.min()) if gaps.size else 0.0, frequency, density, tuple(lines))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,8 +87,8 @@ class Creep:
     """Hold what comes or goes late, as a share of the output under load.
 
     Args:
-        share: that comes late under a constant load (creep: out = 1 + share (1 - exp(-t/time)) from its first value), or is
-            left at the first frame after a release (relaxation: out = share exp(-t/time)).
+        share: that comes late under a constant load (creep: out = 1 + share (1 - exp(-t/time)) from its first value),
+            or is left at the first frame after a release (relaxation: out = share exp(-t/time)).
         deviation: of the share.
         time_s: time constant; nan if the share is within two deviations of zero.
     """
@@ -109,7 +108,9 @@ def creep_of(recording: Recording) -> Creep | None:
 
 
 def relaxation_of(recording: Recording) -> Creep | None:
-    """Fit the mean course after release; None without at least five frames of phase 2 after the loaded ones of a touch."""
+    """Fit the mean course after release; None without at least five frames of phase 2 after the loaded ones of a
+    touch.
+    """
     fitted = _fit_course(_courses(recording, released=True))
     if fitted is None:
         return None
@@ -123,7 +124,9 @@ def _creep(share: float, deviation: float, time_s: float) -> Creep:
 
 
 def _courses(recording: Recording, released: bool) -> list[tuple[Floats, Floats, float]]:
-    """Return of the loudest element of each touch the time from the first frame, its output over its mean under load, and that mean [raw]."""
+    """Return of the loudest element of each touch the time from the first frame, its output over its mean under load,
+    and that mean [raw].
+    """
     out = []
     for number in np.unique(recording.touch[recording.touch >= 0]):
         mine = recording.touch == number

@@ -1,5 +1,5 @@
-"""Give the contacts that have a closed solution: Hertz, wedge, rounded wedge and flat-ended punch on a half plane (appendix
-C).
+"""Give the contacts that have a closed solution: Hertz, wedge, rounded wedge and flat-ended punch on a half plane
+(appendix C).
 
 Half plane of shear modulus mu and Poisson's ratio nu, no friction, no core: the contact widths are wrong on a
 finger with a rigid core (`sioms.tactile.contact` has the right ones); the spectra of the pressures are exact
@@ -21,9 +21,7 @@ Floats = NDArray[np.float64]
 def equivalent_radius(cylinder: Cylinder, indenter_m: float) -> float:
     """Return R = rb rc/(rb + rc) [m] of an indenter of radius rc >= 0, infinite for a flat (2.28)."""
     if not indenter_m >= 0.0:
-        raise ValueError(
-            f"take equivalent radius: indenter radius is {indenter_m} m; need >= 0, infinite if flat"
-        )
+        raise ValueError(f"take equivalent radius: indenter radius is {indenter_m} m; need >= 0, infinite if flat")
     return 1.0 / (1.0 / cylinder.outer_m + 1.0 / indenter_m) if indenter_m > 0.0 else 0.0
 
 
@@ -70,17 +68,15 @@ def wedge_width(cylinder: Cylinder, load: float, half_angle: float) -> float:
         raise ValueError(
             f"take wedge width: half angle is {half_angle} rad; need between 0 and pi/2, measured from its axis"
         )
-    return float(
-        load * (1.0 - cylinder.poisson) * np.tan(half_angle) / (cylinder.shear_pa * cylinder.outer_m)
-    )
+    return float(load * (1.0 - cylinder.poisson) * np.tan(half_angle) / (cylinder.shear_pa * cylinder.outer_m))
 
 
 def rounded_wedge_load(cylinder: Cylinder, half_width: float, half_angle: float, radius_m: float) -> float:
     """Return P [N/m] of a wedge whose edge is rounded with radius rc, at the half width a [rad].
 
-    The half plane's load is E* times the integral of x h'(x)/sqrt(a^2 - x^2) over 0 to a, E* = 2 mu/(1 - nu), with the slope
-    h' = x/rc up to b = rc cot(tp) and cot(tp) beyond. The finger is taken for flat as for the wedge; answers add, so
-    that Hertz's load of R = rb is its own curvature's share.
+    The half plane's load is E* times the integral of x h'(x)/sqrt(a^2 - x^2) over 0 to a, E* = 2 mu/(1 - nu), with the
+    slope h' = x/rc up to b = rc cot(tp) and cot(tp) beyond. The finger is taken for flat as for the wedge; answers add,
+    so that Hertz's load of R = rb is its own curvature's share.
 
     Args:
         cylinder: the finger.
@@ -96,7 +92,8 @@ def rounded_wedge_load(cylinder: Cylinder, half_width: float, half_angle: float,
 def rounded_wedge_pressure(
     cylinder: Cylinder, half_width: float, half_angle: float, radius_m: float, t: ArrayLike
 ) -> Floats:
-    """Return the pressure [Pa], compression positive, at angles t [rad] from the apex; arguments as `rounded_wedge_load`.
+    """Return the pressure [Pa], compression positive, at angles t [rad] from the apex; arguments as
+    `rounded_wedge_load`.
 
     The sum of arccosh(a/|x - s|)-like pressures of kinks spread evenly over the round edge, |s| < b.
     """

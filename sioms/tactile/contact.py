@@ -115,9 +115,7 @@ def frictionless(cylinder: Cylinder, indenter: Indenter, half_width: float, orde
     return slide(cylinder, indenter, half_width, 0.0, order)
 
 
-def slide(
-    cylinder: Cylinder, indenter: Indenter, half_width: float, friction: float, order: int = ORDER
-) -> Contact:
+def slide(cylinder: Cylinder, indenter: Indenter, half_width: float, friction: float, order: int = ORDER) -> Contact:
     """Solve full sliding, q = friction * p (either sign); the apex is where both edges come out free.
 
     Raises:
@@ -171,9 +169,7 @@ def adhere(cylinder: Cylinder, indenter: Indenter, half_width: float, order: int
     return Contact(cylinder, half_width, load, 0.0, normal, 0.0, adhering)
 
 
-def width_for_load(
-    cylinder: Cylinder, indenter: Indenter, load: float, friction: float | None = 0.0
-) -> Contact:
+def width_for_load(cylinder: Cylinder, indenter: Indenter, load: float, friction: float | None = 0.0) -> Contact:
     """Find the strip on which an indenter carries `load` [N/m] > 0; friction None means full adhesion.
 
     Raises:
@@ -195,14 +191,10 @@ def width_for_load(
     while over(low) > 0.0:
         high, low = low, low - 1.5
         if low < math.log(1e-9):
-            raise ValueError(
-                f"find contact width: {load} N/m needs a strip under 1e-9 rad; the load is too small"
-            )
+            raise ValueError(f"find contact width: {load} N/m needs a strip under 1e-9 rad; the load is too small")
     while low == high or over(high) < 0.0:
         if high == math.log(_WIDEST):
-            raise ValueError(
-                f"find contact width: {load} N/m presses a strip over {_WIDEST} rad; the load is too high"
-            )
+            raise ValueError(f"find contact width: {load} N/m presses a strip over {_WIDEST} rad; the load is too high")
         low, high = high, min(high + 0.8, math.log(_WIDEST))
     return solve(math.exp(float(brentq(over, low, high, xtol=1e-10))))
 

@@ -1,4 +1,6 @@
-"""Predict what a finger will be able to tell before it is moulded: resolution, conditioning, errors, classes of indenters."""
+"""Predict what a finger will be able to tell before it is moulded: resolution, conditioning, errors, classes of
+indenters.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +25,7 @@ Floats = NDArray[np.float64]
 CUTOFF = 0.1  # -20 dB
 
 
-def cutoff(
-    cylinder: Cylinder, radius_m: float, level: float = CUTOFF, field: str = "e_rr", traction: int = 0
-) -> float:
+def cutoff(cylinder: Cylinder, radius_m: float, level: float = CUTOFF, field: str = "e_rr", traction: int = 0) -> float:
     """Return the highest frequency [cycles/rad] at which the response is within `level` of its maximum (2.18).
 
     Args:
@@ -71,7 +71,8 @@ class Errors:
 
 
 def predicted_errors(finger: Finger, loads: ArrayLike, radii_m: ArrayLike, places: int = 5) -> Errors:
-    """Return the theoretical deviations (figures 3.27 to 3.29), mean of variances over places about the middle of the arc.
+    """Return the theoretical deviations (figures 3.27 to 3.29), mean of variances over places about the middle of the
+    arc.
 
     Args:
         finger: gives elements and noise.
@@ -91,10 +92,7 @@ def predicted_errors(finger: Finger, loads: ArrayLike, radii_m: ArrayLike, place
         for column, rc in enumerate(radius):
             half = widths.half_width(float(p) * equivalent_radius(finger.cylinder, float(rc)))
             spectrum = spectra(half)
-            frames = [
-                estimator.frame(matrix @ spread(finger.cylinder, -float(p), spectrum, float(t)))
-                for t in spots
-            ]
+            frames = [estimator.frame(matrix @ spread(finger.cylinder, -float(p), spectrum, float(t))) for t in spots]
             good = np.array([f.deviations for f in frames if f.usable])
             out[:, row, column] = np.sqrt(np.mean(good**2, axis=0)) if good.size else np.nan
     return Errors(*out)
@@ -121,16 +119,15 @@ def exact_equivalent_wedge(
     # the wedge's own slope must carry what the finger's curvature leaves over
     cotangent = (load - flat.load) / edge_load
     half_angle = float(np.arctan2(1.0, cotangent))
-    scaled = Contact(
-        cylinder, half, load, 0.0, flat.normal * (cylinder.outer_m / radius) * base, 0.0, flat.adhering
-    )
+    scaled = Contact(cylinder, half, load, 0.0, flat.normal * (cylinder.outer_m / radius) * base, 0.0, flat.adhering)
     return half_angle, scaled, frictionless(cylinder, Wedge(half_angle), half)
 
 
 def class_difference(
     cylinder: Cylinder, radius_m: float, load: float, indenter_m: float, widths: WidthTable | None = None
 ) -> float:
-    """Return the root mean square strain between a round indenter and its equivalent wedge over the peak strain (fig 2.25).
+    """Return the root mean square strain between a round indenter and its equivalent wedge over the peak strain (fig
+    2.25).
 
     Taken over the part of the finger where the peak's hundredth is passed.
     """

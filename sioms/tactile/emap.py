@@ -53,7 +53,8 @@ def e_map(
 def felt(highest: int, extent_rad: float) -> Floats:
     """Return the share of each wave number that an element feels as it averages over an arc, shape (nc + 1,).
 
-    A strip of copper is no line: over t - extent to t + extent cos kt has the mean cos kt times sin(k extent)/(k extent).
+    A strip of copper is no line: over t - extent to t + extent cos kt has the mean cos kt times sin(k extent)/(k
+        extent).
     """
     share: Floats = np.sinc(np.arange(highest + 1) * extent_rad / np.pi)
     return share

@@ -40,9 +40,7 @@ _PROXIMITY_STARTS = 3
 _APART = math.radians(6.0)
 _HOLD_PASSES = 8
 _SURE = math.radians(2.0) / 4.0  # standard deviation of the place above which IMPRECISE is set
-_RATHER_ROUND = (
-    9.0  # chi square by which a hollow touch beside the last elements must be more likely than a round one
-)
+_RATHER_ROUND = 9.0  # chi square by which a hollow touch beside the last elements must be more likely than a round one
 _HOLLOW = 1.2  # R in units of rb, beyond which noise alone does not make a flat
 _TRIED = 3  # elements without which a poor fit is tried again
 _SHIFTS = 4  # rounds in which a shift of all elements is found
@@ -51,7 +49,9 @@ _ALIKE = 0.05  # of a shift of all elements, by which one may differ from it
 
 @dataclass(slots=True)
 class _Frame:
-    """One frame while it is fitted: strains, their variances, model errors as shares of the peak, squared, and the load."""
+    """One frame while it is fitted: strains, their variances, model errors as shares of the peak, squared, and the
+    load.
+    """
 
     y: Floats
     noise: Floats
@@ -158,8 +158,8 @@ class Estimator:
             usable: which elements to use, shape (ns,); None takes all that are finite and not dead in the
                 finger's file.
             variance: of the strains, shape (ns,), where it is not that of the finger's file.
-            floor: error of the model [share of the peak] beside the finger's misfit, for means over so many frames that it
-                shows.
+            floor: error of the model [share of the peak] beside the finger's misfit, for means over so many frames that
+                it shows.
 
         Raises:
             ValueError: wrong number of strains, or a load that is not finite and pressing.
@@ -167,7 +167,8 @@ class Estimator:
         y = np.asarray(strains, dtype=np.float64)
         if y.shape != self._noise.shape:
             raise ValueError(
-                f"estimate shape: frame has {y.size} strains in shape {y.shape}; the finger has {self._noise.size} elements"
+                f"estimate shape: frame has {y.size} strains in shape {y.shape}; the finger has {self._noise.size} "
+                "elements"
             )
         if load is not None and not (0.0 < load.value < math.inf and 0.0 <= load.deviation < math.inf):
             raise ValueError(
@@ -217,10 +218,7 @@ class Estimator:
         shape = self._describe(*found[1:], value, weight, count, quality)
         if Quality.FLAT_OR_HOLLOW in shape.quality and self._at_end(shape.angle_rad) and not pull.shape[1]:
             other = self._search(frame, 0.0, start=self._narrow_start(y, noise, shape.angle_rad))
-            if (
-                other[0] == Status.FITTED
-                and _chi(other, value, weight) < _chi(found, value, weight) + _RATHER_ROUND
-            ):
+            if other[0] == Status.FITTED and _chi(other, value, weight) < _chi(found, value, weight) + _RATHER_ROUND:
                 convex = self._describe(*other[1:], value, weight, count, quality)
                 shape = shape if Quality.FLAT_OR_HOLLOW in convex.quality else convex
         deviation = self._open(shape)
@@ -231,7 +229,8 @@ class Estimator:
         return count + self._contact_sigma * math.sqrt(2.0 * count)
 
     def _mended(self, frame: _Frame, shape: ShapeEstimate, quality: Quality) -> ShapeEstimate:
-        """Return the fit without one element, or without what all have in common, if that is what one touch does not explain.
+        """Return the fit without one element, or without what all have in common, if that is what one touch does not
+        explain.
 
         Else the poor fit as it is.
         """
@@ -253,7 +252,9 @@ class Estimator:
         return _better(best, self._unshifted(frame, quality | Quality.SUSPECT))
 
     def _blamed(self, frame: _Frame, shape: ShapeEstimate) -> list[int]:
-        """Return the elements without which most of a poor fit would go; of what looks like a pull the most stretched one."""
+        """Return the elements without which most of a poor fit would go; of what looks like a pull the most stretched
+        one.
+        """
         if not shape.usable:
             return [int(np.argmax(frame.y))]
         rest, basis, _ = self._left_over(frame, shape)
@@ -278,7 +279,9 @@ class Estimator:
         return trial
 
     def _left_over(self, frame: _Frame, shape: ShapeEstimate) -> tuple[Floats, Floats, Floats]:
-        """Return residuals in deviations, an orthonormal basis of what place, load and width can take up, and the weights."""
+        """Return residuals in deviations, an orthonormal basis of what place, load and width can take up, and the
+        weights.
+        """
         y = frame.y
         if self._drawn is not None:
             y = self._left(self._pull(self._drawn, y), y, np.array([shape.angle_rad]))[0]
@@ -291,7 +294,8 @@ class Estimator:
     def _open(self, shape: ShapeEstimate) -> float:
         """Return the deviation of the place [rad] over which to average, 0 where the best fit stands.
 
-        A hollow touch beside the last elements may as well be a narrow one within half a pitch, whatever its covariance.
+        A hollow touch beside the last elements may as well be a narrow one within half a pitch, whatever its
+        covariance.
         """
         variance = shape.covariance[0][0]
         if not variance < _SURE**2:
@@ -348,12 +352,12 @@ class Estimator:
         return b
 
     def _pull(self, drawn: Proximity, y: Floats) -> Floats:
-        """Return what the search needs of a frame under a conductor: the pull is an output and acts before the quadratic."""
+        """Return what the search needs of a frame under a conductor: the pull is an output and acts before the
+        quadratic.
+        """
         linear = -y / self._gain
         output = linear + self._quadratic * linear**2
-        return drawn_frame(
-            self._angles, self._gain, self._quadratic, output, drawn.amplitude, drawn.range_rad
-        )
+        return drawn_frame(self._angles, self._gain, self._quadratic, output, drawn.amplitude, drawn.range_rad)
 
     def _left(self, pull: Floats, y: Floats, t: Floats) -> Floats:
         """Return the strains without the pull of a conductor at places t, shape (n, ns); (1, ns) if there is none."""
@@ -393,7 +397,9 @@ class Estimator:
         return best
 
     def _averaged(self, shape: ShapeEstimate, deviation: float, frame: _Frame, pull: Floats) -> ShapeEstimate:
-        """Return the mean over all touches that the frame allows, in place of a best fit whose place is hardly known."""
+        """Return the mean over all touches that the frame allows, in place of a best fit whose
+        place is hardly known.
+        """
         t, arc, y, noise = shape.angle_rad, self._averager.arc, frame.y, frame.noise
         mean = None
         if arc[0] <= t <= arc[1]:

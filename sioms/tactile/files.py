@@ -56,9 +56,7 @@ def read_folder(folder: Path) -> Data:
         except _UNREADABLE as error:
             raise ValueError(f"read {path}: {_words(error)}") from error
     if not touches:
-        raise ValueError(
-            f"read {folder}: no *.npz with touches (cmd_theta, cmd_P, cmd_rc); record some first"
-        )
+        raise ValueError(f"read {folder}: no *.npz with touches (cmd_theta, cmd_P, cmd_rc); record some first")
     return Data(nominal, touches, recordings)
 
 
@@ -93,9 +91,7 @@ def _commanded(file: Any) -> tuple[Floats, Floats, Floats]:
     columns = [np.asarray(file[name], dtype=np.float64) for name in ("cmd_theta", "cmd_P", "cmd_rc")]
     sizes = [column.shape for column in columns]
     if len(set(sizes)) != 1 or columns[0].ndim != 1:
-        raise ValueError(
-            f"cmd_theta, cmd_P and cmd_rc have shapes {sizes}; want one number each for every touch"
-        )
+        raise ValueError(f"cmd_theta, cmd_P and cmd_rc have shapes {sizes}; want one number each for every touch")
     angle, load, radius = np.radians(columns[0]), columns[1], 1e-3 * columns[2]
     if not (np.isfinite(angle).all() and np.isfinite(load).all() and np.all(radius >= 0.0)):
         raise ValueError("cmd_theta, cmd_P or cmd_rc holds a value that is not finite, or a negative radius")
@@ -145,9 +141,7 @@ def read_nominal(folder: Path) -> Finger:
         return from_toml(read_text(text))
     path = folder / "nominal.json"
     if not path.exists():
-        raise ValueError(
-            f"read {folder}: neither nominal.toml nor nominal.json; describe the finger as built"
-        )
+        raise ValueError(f"read {folder}: neither nominal.toml nor nominal.json; describe the finger as built")
     try:
         return _built(json_of(read_bytes(path)), folder.name)
     except KeyError as error:
@@ -163,7 +157,8 @@ def _built(tree: dict[str, Any], name: str) -> Finger:
     angles = np.radians(tree["element_angle_deg"])
     if angles.size and np.degrees(np.ptp(angles)) < 0.5 * (angles.size - 1):
         raise ValueError(
-            f"element_angle_deg puts {angles.size} elements within {np.degrees(np.ptp(angles)):.3g} degrees; give degrees"
+            f"element_angle_deg puts {angles.size} elements within {np.degrees(np.ptp(angles)):.3g} degrees; give "
+            "degrees"
         )
     radii = tuple(1e-3 * r for r in tree["element_radius_mm"])
     gains = tuple(float(g) for g in tree["gain_percent_strain_per_percent_output"])

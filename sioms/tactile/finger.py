@@ -99,8 +99,8 @@ class ContactModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ratio: of P R to Hertz's at these.
         most_load_n_per_m: load beyond which an estimate is flagged as overload.
         pressure: exact, or the ellipse of the dissertation, by which R of wide contacts comes out small.
-        circles: standard deviation of R in units of what finger and indenters being circles, not the model's parabolas, does to
-            it; 0 where they are parabolas.
+        circles: standard deviation of R in units of what finger and indenters being circles, not the model's parabolas,
+            does to it; 0 where they are parabolas.
     """
 
     model: ContactKind = "frictionless"
@@ -119,7 +119,9 @@ class IdentifiedMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Systematic(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Standard deviations of the finger's own errors, beside those of noise and residuals: of the place [rad], and of load and R, relative."""
+    """Standard deviations of the finger's own errors, beside those of noise and residuals: of the place [rad], and of
+    load and R, relative.
+    """
 
     place_rad: float = 0.0
     load: float = 0.0
@@ -151,9 +153,7 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if not 0.0 <= self.geometry.extent_rad <= MOST_EXTENT:
             raise ValueError(f"{what}: extent_rad is {self.geometry.extent_rad}; need 0 to {MOST_EXTENT} rad")
         if not 0.0 <= self.contact.adhesion <= MOST_ADHESION:
-            raise ValueError(
-                f"{what}: share of adhesion is {self.contact.adhesion}; need 0 to {MOST_ADHESION}"
-            )
+            raise ValueError(f"{what}: share of adhesion is {self.contact.adhesion}; need 0 to {MOST_ADHESION}")
         if len(self.contact.half_width_rad) != len(self.contact.ratio):
             raise ValueError(f"{what}: contact table has unequal columns; give as many ratios as half widths")
         for name in self.systematic.__struct_fields__:
@@ -162,9 +162,7 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                     f"{what}: systematic {name} is {getattr(self.systematic, name)}; need 0 or more, finite"
                 )
         if not self.signal.lowest < self.signal.highest:
-            raise ValueError(
-                f"{what}: lowest reading {self.signal.lowest} is not below {self.signal.highest}"
-            )
+            raise ValueError(f"{what}: lowest reading {self.signal.lowest} is not below {self.signal.highest}")
 
     def _check_elements(self, what: str) -> None:
         count, geometry = len(self.elements.angle_rad), self.geometry
@@ -175,13 +173,12 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if len(column) != count:
                 raise ValueError(f"{what}: {len(column)} values of {name} for {count} elements")
             if name != "used" and not all(math.isfinite(x) for x in column):
-                raise ValueError(
-                    f"{what}: {name} holds a value that is not finite; set used = false to leave it out"
-                )
+                raise ValueError(f"{what}: {name} holds a value that is not finite; set used = false to leave it out")
         for place, (radius, gain) in enumerate(zip(self.elements.radius_m, self.elements.gain, strict=True)):
             if not geometry.core_m < radius <= geometry.outer_m:
                 raise ValueError(
-                    f"{what}: element {place} has radius {radius} m; need {geometry.core_m} < radius <= {geometry.outer_m}"
+                    f"{what}: element {place} has radius {radius} m; need {geometry.core_m} < radius <= "
+                    f"{geometry.outer_m}"
                 )
             if not gain > 0.0:
                 raise ValueError(f"{what}: element {place} has gain {gain}; need > 0")
@@ -244,7 +241,9 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return base
 
     def strain_table(self) -> StrainTable:
-        """Tabulate the strains under round contacts; takes about a second, and a tenth for the next finger of that body."""
+        """Tabulate the strains under round contacts; takes about a second, and a tenth for the next finger of that
+        body.
+        """
         angles, outer, spectra = np.asarray(self.angles_rad), self.geometry.outer_m, self.spectra()
         full = self.e_map()
         half = full.shape[1] // 2
@@ -255,12 +254,8 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def width_table(self) -> WidthTable:
         """Return the width table of the file, or compute it."""
         if self.contact.half_width_rad:
-            return WidthTable(
-                self.cylinder, np.asarray(self.contact.half_width_rad), np.asarray(self.contact.ratio)
-            )
-        return (
-            hertz_table(self.cylinder) if self.contact.model == "hertz" else rigid_core_table(self.cylinder)
-        )
+            return WidthTable(self.cylinder, np.asarray(self.contact.half_width_rad), np.asarray(self.contact.ratio))
+        return hertz_table(self.cylinder) if self.contact.model == "hertz" else rigid_core_table(self.cylinder)
 
 
 def nominal_finger(
@@ -292,9 +287,7 @@ def nominal_finger(
             misfit=alike(0.0),
             used=(True,) * count,
         ),
-        contact=ContactModel(
-            half_width_rad=tuple(table.half_widths.tolist()), ratio=tuple(table.ratio.tolist())
-        ),
+        contact=ContactModel(half_width_rad=tuple(table.half_widths.tolist()), ratio=tuple(table.ratio.tolist())),
     )
 
 

@@ -13,9 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float64]
 
 
-def normal_strain(
-    distance_m: ArrayLike, depth_m: float, load: float, poisson: float, shear_pa: float
-) -> Floats:
+def normal_strain(distance_m: ArrayLike, depth_m: float, load: float, poisson: float, shear_pa: float) -> Floats:
     """Return the strain normal to the surface at `depth_m` under a line load [N/m, compression positive].
 
     Args:

@@ -1,8 +1,8 @@
 """Ask a calibration what it is worth: fingers made from halves of the touches estimate the other halves.
 
-What their errors are above the deviations that the estimates state, by noise and residuals, is the finger's own: strips, creep, a
-contact that no model describes, a map that learned its touches by heart. The finger's file carries it (`Systematic`), so that
-stated deviations hold; a finger of which it is too large is not to be believed.
+What their errors are above the deviations that the estimates state, by noise and residuals, is the finger's own:
+strips, creep, a contact that no model describes, a map that learned its touches by heart. The finger's file carries it
+(`Systematic`), so that stated deviations hold; a finger of which it is too large is not to be believed.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Estimates:
     """Hold what a finger estimates of known touches; immutable.
 
     Args:
-        error: of place [rad], load and R, these two relative, shape (n, 3); nan where nothing was estimated, it is doubtful, or
-            the touch has no R.
+        error: of place [rad], load and R, these two relative, shape (n, 3); nan where nothing was estimated, it is
+            doubtful, or the touch has no R.
         stated: standard deviations of the estimates, likewise.
         doubtful: which estimates are doubtful, shape (n,).
         edge: which touches are of an edge, shape (n,).
@@ -88,15 +88,14 @@ def joined(parts: list[Estimates]) -> Estimates:
 
 
 def systematic(found: Estimates) -> Systematic:
-    """Return the least deviations beside the stated ones with which these cover the errors: 95 % within two, 99 % within three.
+    """Return the least deviations beside the stated ones with which these cover the errors: 95 % within two, 99 %
+    within three.
 
-    For edges and for the others alike: many of the one kind must not hide what the finger does to the other. Zero where there are too
-    few errors to tell.
+    For edges and for the others alike: many of the one kind must not hide what the finger does to the other. Zero where
+    there are too few errors to tell.
     """
     kinds = (found.edge, ~found.edge)
-    return Systematic(
-        *(max(_beside(found.error[kind, n], found.stated[kind, n]) for kind in kinds) for n in range(3))
-    )
+    return Systematic(*(max(_beside(found.error[kind, n], found.stated[kind, n]) for kind in kinds) for n in range(3)))
 
 
 def _beside(error: Floats, stated: Floats) -> float:
@@ -114,7 +113,8 @@ def doubts(found: Estimates, beside: Systematic) -> list[str]:
     share = float(found.doubtful.mean()) if found.doubtful.size else 0.0
     if share > MOST_DOUBTFUL:
         out.append(
-            f"{100.0 * share:.0f} % of the touches left out of it are doubtful when it estimates them; of a sound finger "
+            f"{100.0 * share:.0f} % of the touches left out of it are doubtful when it estimates them; of a sound "
+            "finger "
             f"less than {100.0 * MOST_DOUBTFUL:.0f} % are"
         )
     for what, unit, factor, one, most in (
@@ -124,7 +124,8 @@ def doubts(found: Estimates, beside: Systematic) -> list[str]:
     ):
         if one > most:
             out.append(
-                f"it tells the {what} of touches left out of it no better than to {factor * one:.2g} {unit} beside the noise (one standard "
+                f"it tells the {what} of touches left out of it no better than to {factor * one:.2g} {unit} beside the "
+                "noise (one standard "
                 f"deviation); of a sound finger want less than {factor * most:.2g} {unit}"
             )
     return out

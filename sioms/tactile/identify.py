@@ -116,5 +116,6 @@ def _leave_out(pressure: Floats, strain: Floats, solve: Callable[[Floats, Floats
 def _check(pressure: Floats, strain: Floats) -> None:
     if pressure.shape[0] != strain.shape[0] or pressure.shape[0] < 2 * _FOLDS:
         raise ValueError(
-            f"identify E: {pressure.shape[0]} pressures for {strain.shape[0]} touches; need as many of both, at least 10"
+            f"identify E: {pressure.shape[0]} pressures for {strain.shape[0]} touches; need as many of both, at least "
+            "10"
         )

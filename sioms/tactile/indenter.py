@@ -35,7 +35,8 @@ class Round:
     def __post_init__(self) -> None:
         if not self.radius_m > 0.0:
             raise ValueError(
-                f"describe round indenter: radius_m is {self.radius_m} m; need > 0, infinite for a flat, Wedge for an edge"
+                f"describe round indenter: radius_m is {self.radius_m} m; need > 0, infinite for a flat, Wedge for an "
+                "edge"
             )
 
     def slope(self, cylinder: Cylinder, t: Floats) -> Floats:
@@ -87,9 +88,7 @@ class Sampled:
     def __post_init__(self) -> None:
         x, h = np.asarray(self.x_m, dtype=np.float64), np.asarray(self.height_m, dtype=np.float64)
         if x.ndim != 1 or x.shape != h.shape or x.size < 3:
-            raise ValueError(
-                f"describe profile: shapes {x.shape}, {h.shape}; need two equal rows of 3 points or more"
-            )
+            raise ValueError(f"describe profile: shapes {x.shape}, {h.shape}; need two equal rows of 3 points or more")
         if not (np.all(np.diff(x) > 0.0) and np.all(np.isfinite(h))):
             raise ValueError("describe profile: points are not finite and strictly rising in x; sort them")
 

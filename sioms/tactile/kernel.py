@@ -217,9 +217,7 @@ def _build(products: Callable[..., Products]) -> Fit:
             share = min(1.0, room / max(abs(move_t), 1e-30))
             new_t, new_b = t + share * move_t, min(max(b + share * move_b, 0.0), top_b)
             promised = (new_t - t) * gain_t + (new_b - b) * gain_b
-            try_at = products(
-                nodes, first, step, width_step, weights, y, pull, load, load_weight, new_t, new_b
-            )
+            try_at = products(nodes, first, step, width_step, weights, y, pull, load, load_weight, new_t, new_b)
             try_ff, try_fy = try_at[0] + load_weight, try_at[3] + load_weight * load
             try_cost = try_at[9] - max(try_fy, 0.0) ** 2 / try_ff
             gained = cost - try_cost
@@ -250,9 +248,7 @@ def drawn_frame(
         amplitude: A [output].
         reach: over which the pull falls to 1/e [rad].
     """
-    return np.stack(
-        [angle, gain, quadratic, output, np.full(angle.size, amplitude), np.full(angle.size, reach)]
-    )
+    return np.stack([angle, gain, quadratic, output, np.full(angle.size, amplitude), np.full(angle.size, reach)])
 
 
 NOT_DRAWN: Floats = np.zeros((6, 0))

@@ -85,11 +85,7 @@ def _shrink(value: Floats, deviation: Floats, common: float) -> Floats:
     if np.count_nonzero(known) < 2:
         return np.full(value.size, common)
     between = max(float(np.mean((value[known] - common) ** 2 - deviation[known] ** 2)), 0.0)
-    trust = (
-        between / (between + np.where(known, deviation, np.inf) ** 2)
-        if between > 0.0
-        else np.zeros(value.size)
-    )
+    trust = between / (between + np.where(known, deviation, np.inf) ** 2) if between > 0.0 else np.zeros(value.size)
     drawn: Floats = trust * value + (1.0 - trust) * common
     return drawn
 
@@ -126,9 +122,7 @@ def with_ramps(ramps: Floats, series: Quadratic | None) -> Quadratic:
     if series is None:
         common = float(np.nanmedian(ramps))
         nothing = np.zeros(ramps.size, dtype=np.int64)
-        return Quadratic(
-            np.where(np.isfinite(ramps), ramps, common), np.full(ramps.size, np.inf), nothing, common
-        )
+        return Quadratic(np.where(np.isfinite(ramps), ramps, common), np.full(ramps.size, np.inf), nothing, common)
     both = np.isfinite(ramps) & (series.groups > 0)
     if not both.any():
         return series

@@ -135,7 +135,9 @@ class StrainTable:
         return self.first + self.step * float(self.nodes.shape[1] - 1)
 
     def at(self, angle: float, square: float) -> Floats:
-        """Return f, df/dt and df/db at a place [rad] and b = a^2 [rad^2], shape (3, ns); linear between the nodes' slopes."""
+        """Return f, df/dt and df/db at a place [rad] and b = a^2 [rad^2], shape (3, ns); linear between the nodes'
+        slopes.
+        """
         rows, columns = self.nodes.shape[:2]
         x = min(max((angle - self.first) / self.step, 0.0), columns - 1.001)
         column, own = int(x), float(self.half_widths[1]) ** 2
@@ -152,9 +154,7 @@ class StrainTable:
         ])  # fmt: skip
 
 
-def strain_table(
-    outer_m: float, angles: Floats, normal: Floats, shear: Floats, spectra: Spectra
-) -> StrainTable:
+def strain_table(outer_m: float, angles: Floats, normal: Floats, shear: Floats, spectra: Spectra) -> StrainTable:
     """Sum the strains of a finger on the grid.
 
     Args:
@@ -186,10 +186,7 @@ def _hermite(low: Floats, high: Floats, low_slope: Floats, high_slope: Floats, s
     """Return the cubic between two nodes at s, 0 to 1; the slopes per step."""
     r = 1.0 - s
     return np.asarray(
-        (1.0 + 2.0 * s) * r * r * low
-        + s * s * (3.0 - 2.0 * s) * high
-        + s * r * r * low_slope
-        - s * s * r * high_slope
+        (1.0 + 2.0 * s) * r * r * low + s * s * (3.0 - 2.0 * s) * high + s * r * r * low_slope - s * s * r * high_slope
     )
 
 

@@ -1,9 +1,11 @@
-"""Average over all touches that a frame allows, where it hardly tells the place: the mean of what is possible, not its peak.
+"""Average over all touches that a frame allows, where it hardly tells the place: the mean of what is possible, not its
+peak.
 
 Beside the outermost elements a light touch and a heavier one further out look nearly alike: the best fit then runs
 along the valley between them, and a covariance at its end is too small. The mean over the valley errs least
 in the mean square, and its spread is an honest covariance. Taken as known beforehand: the touch lies on the
-covered arc, it presses, all widths of contact up to that of a flat are as likely, and hollows the less the more hollow they are.
+covered arc, it presses, all widths of contact up to that of a flat are as likely, and hollows the less the more hollow
+they are.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ _FARTHEST = np.radians(10.0)
 
 @dataclass(frozen=True, slots=True)
 class Average:
-    """Hold the means of place [rad], load [N/m], R [m] and b = a^2, and the covariance of the first three; immutable."""
+    """Hold the means of place [rad], load [N/m], R [m] and b = a^2, and the covariance of the first
+    three; immutable.
+    """
 
     angle: float
     load: float
@@ -60,7 +64,8 @@ class Averager:
         """Return the average over places within some deviations of the best fit's; None if no touch there presses.
 
         Args:
-            left: returns the strains that are left for a touch at some places, shape (n, ns) or (1, ns) if the same for all.
+            left: returns the strains that are left for a touch at some places, shape (n, ns) or (1, ns) if the same for
+                all.
             weights: inverse variances, shape (ns,).
             load: measured P [N/m], with its inverse variance; 0 and 0 without.
             load_weight: see above.
@@ -105,7 +110,5 @@ class Averager:
         r, nodes = 1.0 - s, self.table.nodes[::_ROWS]
         blend = np.stack([(1.0 + 2.0 * s) * r * r, s * r * r, s * s * (3.0 - 2.0 * s), -s * s * r], axis=1)
         low, high = nodes[:, column, :2], nodes[:, column + 1, :2]
-        strains: Floats = np.einsum("tcn,btcn->btn", blend[:, :2], low) + np.einsum(
-            "tcn,btcn->btn", blend[:, 2:], high
-        )
+        strains: Floats = np.einsum("tcn,btcn->btn", blend[:, :2], low) + np.einsum("tcn,btcn->btn", blend[:, 2:], high)
         return strains

@@ -1,4 +1,6 @@
-"""Prepare recorded touches for calibration: loads from the load cell; proximity, quadratic and strips off the outputs."""
+"""Prepare recorded touches for calibration: loads from the load cell; proximity, quadratic and strips off the
+outputs.
+"""
 
 from __future__ import annotations
 
@@ -46,9 +48,7 @@ class Faults:
     undrawn: Touches
     ramped: _Ramps
 
-    def straightened(
-        self, body: Cylinder, fits: Fits, loads: TouchLoads, adhesion: float
-    ) -> tuple[Touches, Faults]:
+    def straightened(self, body: Cylinder, fits: Fits, loads: TouchLoads, adhesion: float) -> tuple[Touches, Faults]:
         """Return touches and faults with the quadratic found anew, by what is known of elements and contact by now."""
         drawn = self.proximity is not None
         source = self.recorded if drawn else self.undrawn
@@ -81,9 +81,14 @@ def begin_at(nominal: Finger, touches: Touches) -> Fits:
 
 
 def clean_outputs(
-    nominal: Finger, touches: Touches, widths: WidthTable, ramps: list[Ramp], edge_half_angle: float, warnings: list[str],
+    nominal: Finger,
+    touches: Touches,
+    widths: WidthTable,
+    ramps: list[Ramp],
+    edge_half_angle: float,
+    warnings: list[str],
     tick: Callable[[str], None],
-) -> tuple[Touches, TouchLoads, Faults]:  # fmt: skip
+) -> tuple[Touches, TouchLoads, Faults]:
     """Take proximity, quadratic and strips off the outputs; all the model needs for that is each element's depth.
 
     In rounds: how strain grows with load and falls with distance depends on the depth, which the first round
@@ -112,9 +117,7 @@ def clean_outputs(
                 f"{'' if share == 1.0 else f' by {100 * share:.0f} %, the rest is its noise,'} at the commanded level"
             )
         source = recorded if drawn else touches
-        quadratic = ramped.join(
-            fits, find_quadratic(source, _model(body, fits, touches, loads), drawn), drawn
-        )
+        quadratic = ramped.join(fits, find_quadratic(source, _model(body, fits, touches, loads), drawn), drawn)
         if quadratic is not None:
             touches = touches.with_output(linearise(touches.output, quadratic.value))
         if last:
@@ -134,16 +137,17 @@ def clean_outputs(
         touches = faults.evened(uneven)
         loads = touch_loads(body, widths, touches, highest, edge_half_angle, faults.wider(touches))
         warnings.append(
-            f"the finger answers unevenly along the arc, as over strips {math.degrees(strips.period_rad):.2f} deg apart: "
+            f"the finger answers unevenly along the arc, as over strips {math.degrees(strips.period_rad):.2f} deg "
+            "apart: "
             f"strains +-{100 * strips.gain:.1f} %, width +-{100 * strips.width:.1f} %; the finger's file undoes it"
         )
     return touches, loads, faults
 
 
-def _strips(
-    body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, wider: TouchLoads
-) -> Strips | None:
-    """Look for strips in all touches, else in the edges alone: what round indenters leave besides does not hide them then."""
+def _strips(body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, wider: TouchLoads) -> Strips | None:
+    """Look for strips in all touches, else in the edges alone: what round indenters leave besides does not hide them
+    then.
+    """
     found = _strips_in(body, fits, touches, loads, wider)
     edge = touches.radius_m == 0.0
     if found is not None or edge.all() or not edge.any():
@@ -152,9 +156,7 @@ def _strips(
     return _strips_in(body, fits, touches.pick(edge), some, broad)
 
 
-def _strips_in(
-    body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, wider: TouchLoads
-) -> Strips | None:
+def _strips_in(body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, wider: TouchLoads) -> Strips | None:
     """Look for strips in what the elements' fits leave of touches over the elements."""
     known = [element for element, fit in enumerate(fits) if fit is not None]
     gain = np.array([fit.gain for fit in fits if fit is not None])
@@ -181,18 +183,18 @@ def _tell(quadratic: Quadratic | None, proximity: Proximity | None, ramps: bool,
     if proximity is not None:
         warnings.append(
             f"the indenter draws {100 * proximity.amplitude:+.2f} % of output without strain, over "
-            f"{np.degrees(proximity.range_rad):.0f} deg: shield the elements; the finger's file undoes it for conductors"
+            f"{np.degrees(proximity.range_rad):.0f} deg: shield the elements; the finger's file undoes it for "
+            "conductors"
         )
     if quadratic is None:
-        warnings.append(
-            "no place was touched with three loads or more over a factor of two: quadratic not fitted"
-        )
+        warnings.append("no place was touched with three loads or more over a factor of two: quadratic not fitted")
     elif not quadratic.groups.any():
         warnings.append("the quadratic comes from load ramps alone: creep during the ramp is in it")
     elif not ramps and not np.isfinite(quadratic.deviation).all():
         few = int(np.count_nonzero(~np.isfinite(quadratic.deviation)))
         warnings.append(
-            f"{few} of {quadratic.value.size} elements have too few load series for a quadratic of their own: theirs is the "
+            f"{few} of {quadratic.value.size} elements have too few load series for a quadratic of their own: theirs "
+            "is the "
             f"common {quadratic.common / 100.0:.3g} per per cent"
         )
 
@@ -203,17 +205,13 @@ def _model(body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, adhe
     columns = [
         silent
         if fit is None
-        else strain_of(
-            body, fit.angle_rad, fit.radius_m, fit.poisson, touches, loads, adhesion, fit.extent_rad
-        )
+        else strain_of(body, fit.angle_rad, fit.radius_m, fit.poisson, touches, loads, adhesion, fit.extent_rad)
         for fit in fits
     ]
     return np.stack(columns, axis=1)
 
 
-def _expected(
-    body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, quadratic: Quadratic | None
-) -> Floats:
+def _expected(body: Cylinder, fits: Fits, touches: Touches, loads: TouchLoads, quadratic: Quadratic | None) -> Floats:
     """Return the outputs that strain alone gives, up to each element's scale."""
     strain = _model(body, fits, touches, loads)
     if quadratic is None:
@@ -225,10 +223,11 @@ def _expected(
 
 
 def _cell_share(nominal: Finger, touches: Touches, loads: TouchLoads) -> float:
-    """Return the share of the load cell's variation that the strength of the touches follows, beyond the commanded load.
+    """Return the share of the load cell's variation that the strength of the touches follows, beyond the commanded
+    load.
 
-    It is the best guess of the load from a noisy reading, 0 where it is not evident. More touches make it more evident, whatever
-    else varies in them.
+    It is the best guess of the load from a noisy reading, 0 where it is not evident. More touches make it more evident,
+    whatever else varies in them.
     """
     if not np.isfinite(touches.force).all() or np.any(touches.force <= 0.0):
         return 0.0
@@ -276,9 +275,7 @@ class _Ramps:
         widths = rigid_core_table(body)
         self._loads = touch_loads(body, widths, self._touches, highest, edge_half_angle)
 
-    def join(
-        self, fits: Fits, series: Quadratic | None, drawn: bool, adhesion: float = 0.0
-    ) -> Quadratic | None:
+    def join(self, fits: Fits, series: Quadratic | None, drawn: bool, adhesion: float = 0.0) -> Quadratic | None:
         """Return the quadratic of load series and ramps together; drawn: by a conductor."""
         found = np.full(len(fits), np.nan)
         for ramp in self._ramps:

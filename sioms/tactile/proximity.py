@@ -29,9 +29,7 @@ class Proximity:
 
     def output(self, distance: ArrayLike) -> Floats:
         """Return the output [1] at angles [rad] from the touch."""
-        value: Floats = self.amplitude * np.exp(
-            -np.abs(np.asarray(distance, dtype=np.float64)) / self.range_rad
-        )
+        value: Floats = self.amplitude * np.exp(-np.abs(np.asarray(distance, dtype=np.float64)) / self.range_rad)
         return value
 
 

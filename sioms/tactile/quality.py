@@ -14,26 +14,18 @@ class Quality(Flag):
     NO_CONTACT = auto()  # the strains do not rise above the noise: nothing is estimated
     BAD_ELEMENTS = auto()  # some elements are dead, saturated or not finite and were left out
     TOO_FEW_ELEMENTS = auto()  # fewer than four usable elements near the touch: nothing is estimated
-    POOR_FIT = (
-        auto()
-    )  # one round contact does not explain the strains: two contacts, a strange shape, a drifted finger
+    POOR_FIT = auto()  # one round contact does not explain the strains: two contacts, a strange shape, a drifted finger
     OUT_OF_ARC = auto()  # beyond the outermost elements
     OVERLOAD = auto()  # wider or heavier than the model covers
     SHARP = auto()  # the width is at its lower bound: an edge, or a load too small to tell
     FLAT_OR_HOLLOW = auto()  # R is not below rb: no convex indenter does that
     NOT_CONVERGED = auto()
     WRONG_SIGN = auto()  # the strains are those of a pull
-    IMPRECISE = (
-        auto()
-    )  # four standard deviations of the best fit's place are over 2 degrees: means are given instead
+    IMPRECISE = auto()  # four standard deviations of the best fit's place are over 2 degrees: means are given instead
     NO_BASELINE = auto()  # the readings without touch are not known yet: nothing is estimated
-    WITHOUT_LOAD = (
-        auto()
-    )  # the force sensor's load was not there, too old, or did not press: fitted without it
+    WITHOUT_LOAD = auto()  # the force sensor's load was not there, too old, or did not press: fitted without it
     BLIND = auto()  # whether anything touches is not known: the elements that are left cannot say
-    SUSPECT = (
-        auto()
-    )  # one touch explains the strains only without one element, or without a shift of all: fitted so
+    SUSPECT = auto()  # one touch explains the strains only without one element, or without a shift of all: fitted so
 
 
 _UNKNOWN = Quality.TOO_FEW_ELEMENTS | Quality.NO_BASELINE | Quality.BLIND

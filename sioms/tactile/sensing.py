@@ -139,14 +139,17 @@ class ShapeSensor:
         self._last = nothing(Quality.NO_BASELINE)
 
     def zero(self) -> None:
-        """Forget the baseline and take a new one from the next frames, whatever they show; the finger must be untouched."""
+        """Forget the baseline and take a new one from the next frames, whatever they show; the finger must be
+        untouched.
+        """
         self._chain.zero()
         self._rebasing = None
         if self._tare is not None:
             self._tare.zero()
 
     def rebase(self, frames: int = 0, since_ns: int = 0) -> Rebase:
-        """Take a new baseline, and what the force sensor reads untouched, from the next frames; the old one holds until then.
+        """Take a new baseline, and what the force sensor reads untouched, from the next frames; the old one holds until
+        then.
 
         A pull is no hindrance: it is what a finger shows that got its baseline under a touch.
 
@@ -155,7 +158,8 @@ class ShapeSensor:
             since_ns: frames with older stamps do not count.
 
         Returns:
-            How it goes: done, or refused where something touches meanwhile, or the elements fail, with one of the next `frame` calls.
+            How it goes: done, or refused where something touches meanwhile, or the elements fail, with one of the next
+                `frame` calls.
 
         Raises:
             ValueError: something touches, or the finger is blind.
@@ -168,7 +172,8 @@ class ShapeSensor:
             )
         if state in (State.TOUCHED, State.DOUBTFUL) and Quality.WRONG_SIGN not in quality:
             raise ValueError(
-                f"{_told(self._last)}: lift that off and zero it again; if nothing touches, load the finger's file anew, which "
+                f"{_told(self._last)}: lift that off and zero it again; if nothing touches, load the finger's file "
+                "anew, which "
                 "takes what is there for untouched"
             )
         self._rebasing = self._chain.rebase(frames, since_ns)
@@ -202,9 +207,7 @@ class ShapeSensor:
         self._last = self.shape(strain, load)
         return Sensed(strain, self._last)
 
-    def strain(
-        self, raw: ArrayLike, stamp_ns: int, reading: float | None = None
-    ) -> tuple[StrainFrame, Load | None]:
+    def strain(self, raw: ArrayLike, stamp_ns: int, reading: float | None = None) -> tuple[StrainFrame, Load | None]:
         """Do the part of `frame` that needs the frames in order: return the strains, and the load under a touch."""
         strain = self._chain.frame(raw, stamp_ns)
         elapsed_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
@@ -218,7 +221,9 @@ class ShapeSensor:
         return strain, self._tare.load(reading, strain.touched, elapsed_s)
 
     def shape(self, strain: StrainFrame, load: Load | None = None) -> ShapeEstimate:
-        """Do the rest of `frame`: estimate; depends on nothing but its arguments, so another sensor of the same finger may do it."""
+        """Do the rest of `frame`: estimate; depends on nothing but its arguments, so another sensor of the same finger
+        may do it.
+        """
         if not strain.settled:
             return nothing(Quality.NO_BASELINE)
         bad = Quality.GOOD if strain.usable.all() else Quality.BAD_ELEMENTS
@@ -240,7 +245,9 @@ class ShapeSensor:
         return dataclasses.replace(shape, quality=shape.quality | more) if more else shape
 
     def _judged(self, strain: StrainFrame, load: float) -> Quality:
-        """Return POOR_FIT if the mean over a steady touch shows that it is not one touch; its noise is that much less."""
+        """Return POOR_FIT if the mean over a steady touch shows that it is not one touch; its noise is that much
+        less.
+        """
         held = strain.held
         if held is None:
             return Quality.GOOD

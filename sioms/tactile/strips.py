@@ -1,8 +1,9 @@
 """Find and describe what copper strips in the layer do: they stand at even distances, and the finger answers unevenly.
 
 Where the contact lies over copper the layer is stiffer: all strains are smaller in one proportion and the contact is
-narrower. To first order both go as a sine of the place of touch t: strains times 1 + G sin(2 pi t/T + phase), half width
-times 1 + W sin(2 pi t/T + turn). The dissertation shows the ripple in its estimates (figure 3.34); the form is fitted.
+narrower. To first order both go as a sine of the place of touch t: strains times 1 + G sin(2 pi t/T + phase), half
+width times 1 + W sin(2 pi t/T + turn). The dissertation shows the ripple in its estimates (figure 3.34); the form is
+fitted.
 A strain map cannot hold it: it acts on the touch as a whole, not on each piece of its pressure.
 """
 
@@ -65,7 +66,9 @@ class Strips(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return wave
 
     def applied(self, table: StrainTable) -> StrainTable:
-        """Return the table of an even layer as that of one with strips: g(t, b) = c(t) f(t, m(t) b), m the width's square."""
+        """Return the table of an even layer as that of one with strips: g(t, b) = c(t) f(t, m(t) b), m the width's
+        square.
+        """
         k, b = 2.0 * np.pi / self.period_rad, table.half_widths**2
         nodes = np.empty_like(table.nodes)
         for column in range(nodes.shape[1]):
@@ -122,6 +125,4 @@ def find_strips(rest: Floats, model: Floats, widening: Floats, place: Floats) ->
     by_chance = 1.0 - (_CHANCE / count) ** (2.0 / (count - 5))
     if explained < max(_LEAST, by_chance) * float(np.sum(rest**2)):
         return None
-    return Strips(
-        2.0 * np.pi / float(found.x), math.hypot(a, b), math.atan2(b, a), math.hypot(c, d), math.atan2(d, c)
-    )
+    return Strips(2.0 * np.pi / float(found.x), math.hypot(a, b), math.atan2(b, a), math.hypot(c, d), math.atan2(d, c))

@@ -108,7 +108,9 @@ class _Problem:
         return self._at(self._each(x))
 
     def _slopes(self, x: Floats) -> Floats:
-        """Return d misses/dx: an element's residuals move with its own parameters alone, so one step moves all elements."""
+        """Return d misses/dx: an element's residuals move with its own parameters alone, so one step moves all
+        elements.
+        """
         each, every = self._each(x), np.arange(self._rows.size)
         at, out = self._at(each), np.zeros((every.size, x.size))
         for column in np.unique(self._column):

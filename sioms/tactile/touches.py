@@ -56,9 +56,7 @@ class Recording:
         frames = self.raw.shape[0] if self.raw.ndim == 2 else -1
         for name in ("time_s", "touch", "phase", "force", "temperature_c"):
             if getattr(self, name).shape != (frames,):
-                raise ValueError(
-                    f"read recording: {name} has shape {getattr(self, name).shape}; need ({frames},)"
-                )
+                raise ValueError(f"read recording: {name} has shape {getattr(self, name).shape}; need ({frames},)")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,15 +132,14 @@ def average(recording: Recording, angle_rad: Floats, load: Floats, radius_m: Flo
         before, under = mine & (recording.phase == BASELINE), mine & (recording.phase == LOADED)
         if not (before.any() and under.any()):
             raise ValueError(
-                f"average touch {number} of {count}: {int(before.sum())} baseline and {int(under.sum())} loaded frames; "
+                f"average touch {number} of {count}: {int(before.sum())} baseline and {int(under.sum())} loaded "
+                "frames; "
                 "need at least one of each"
             )
         shares[number] = 1.0 / before.sum() + 1.0 / under.sum()
         output[number] = _mean(recording.raw[under]) - _mean(recording.raw[before])
         if under.sum() >= _ALIKE_FRAMES:
-            stuck_at[number] = np.where(
-                np.ptp(recording.raw[under], axis=0) == 0.0, recording.raw[under][0], np.nan
-            )
+            stuck_at[number] = np.where(np.ptp(recording.raw[under], axis=0) == 0.0, recording.raw[under][0], np.nan)
         force[number] = recording.force[under].mean() - recording.force[before].mean()
         if before.sum() > 2 and np.isfinite(recording.raw[before][:, living]).all():
             spread.append(recording.raw[before].var(0, ddof=1))
@@ -170,7 +167,8 @@ def _check_range(raw: Floats, stuck_at: Floats) -> None:
         full = int(np.count_nonzero(stuck_at[:, element] == top))
         if full >= _FULL and top > np.nanmin(raw[:, element]):
             raise ValueError(
-                f"average touches: element {element} reads exactly {top:g} in all frames of {full} touches, and never more: "
+                f"average touches: element {element} reads exactly {top:g} in all frames of {full} touches, and never "
+                "more: "
                 "it is at the end of its range; press less hard, or lower the gain of the electronics"
             )
 
@@ -213,9 +211,7 @@ def ramps_of(recording: Recording, scale: float) -> list[Ramp]:
         if under.sum() < 20 or not before.any() or number >= recording.raw.shape[1]:
             continue
         clock = recording.time_s[under] - recording.time_s[under][0]
-        load = np.polyval(
-            np.polyfit(clock, recording.force[under] - recording.force[before].mean(), 1), clock
-        )
+        load = np.polyval(np.polyfit(clock, recording.force[under] - recording.force[before].mean(), 1), clock)
         output = scale * (recording.raw[under, number] - recording.raw[before, number].mean())
         pressed = load > 0.02 * load.max()
         if np.isfinite(output).all() and np.isfinite(load).all() and load.max() > 0.0:
@@ -240,9 +236,9 @@ def touch_loads(
     cylinder: Cylinder, widths: WidthTable, touches: Touches, highest: int, edge_half_angle: float = np.pi / 4,
     wider: Floats | float = 1.0,
 ) -> TouchLoads:  # fmt: skip
-    """Return the tractions of the touches: an edge as a wedge with the rigid core, the others with the table's width, times
-    `wider` of each touch, with the tangential traction of full adhesion beside them (scale it by the share of adhesion).
-    Hertz's table brings elliptic pressures, another the exact ones.
+    """Return the tractions of the touches: an edge as a wedge with the rigid core, the others with the table's width,
+    times `wider` of each touch, with the tangential traction of full adhesion beside them (scale it by the share of
+    adhesion). Hertz's table brings elliptic pressures, another the exact ones.
     """
     k, line = np.arange(highest + 1), 1.0 / (np.pi * cylinder.outer_m)
     shape = None if widths.is_hertz else pressed(cylinder, highest)
@@ -278,9 +274,7 @@ class _Edges:
         half = np.array([one.half_width for one in solved])
         # without width a half plane's
         first = 2.0 / closedform.wedge_width(cylinder, 1.0, half_angle)
-        self._load = CubicSpline(
-            np.concatenate([[0.0], half]), [first, *(one.load / one.half_width for one in solved)]
-        )
+        self._load = CubicSpline(np.concatenate([[0.0], half]), [first, *(one.load / one.half_width for one in solved)])
         self._shape = CubicSpline(half, [one.normal * one.half_width / one.load for one in solved])
         self._widest = solved[-1]
 

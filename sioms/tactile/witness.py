@@ -1,7 +1,9 @@
-"""Tell what a touch must do to all elements together: whether a lone reading can be one, and whether one could go unseen.
+"""Tell what a touch must do to all elements together: whether a lone reading can be one, and whether one could go
+unseen.
 
 A touch moves the neighbours of the element that it moves most, by a share that the contact's mechanics gives. So an
-element that moves alone is at fault; and elements that are left beside a hole of bad ones still feel what happens in it, from some load on.
+element that moves alone is at fault; and elements that are left beside a hole of bad ones still feel what happens in
+it, from some load on.
 """
 
 from __future__ import annotations
@@ -30,8 +32,10 @@ class Sight:
     """Hold what some elements can tell; immutable.
 
     Args:
-        blind: a touch of several times the load that the whole finger notices could go unseen, or they are fewer than four.
-        followed: least share of an element's chi square that the others have in a touch which moves it most, shape (ns,).
+        blind: a touch of several times the load that the whole finger notices could go unseen, or they are fewer than
+            four.
+        followed: least share of an element's chi square that the others have in a touch which moves it most, shape
+            (ns,).
     """
 
     blind: bool

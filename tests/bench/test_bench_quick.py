@@ -36,9 +36,7 @@ def test_a_quick_bench_gives_ordered_percentiles_and_honest_bars(tmp_path: Path)
             values = [figure["percentiles"][name] for name in NAMES]
             assert figure["count"] > 0 and values == sorted(values) and values[0] > 0
         for bar in figure["bars"]:
-            assert bar["met"] == (
-                bar["found"] >= bar["limit"] if bar["at_least"] else bar["found"] <= bar["limit"]
-            )
+            assert bar["met"] == (bar["found"] >= bar["limit"] if bar["at_least"] else bar["found"] <= bar["limit"])
     found = {f["name"]: f for f in figures}
     assert found["read of 4 axes"]["baseline"] == "bare round trip" and found["read of 4 axes"]["ratio"] > 0
     assert found["client SIGKILL to its 4 axes halting"]["count"] == 2
@@ -57,9 +55,7 @@ def test_two_writers_never_both_win(tmp_path: Path) -> None:
 
 
 def test_an_unknown_name_is_refused_with_those_that_there_are() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "sioms.bench", "raed"], capture_output=True, text=True, timeout=60
-    )
+    done = subprocess.run([sys.executable, "-m", "sioms.bench", "raed"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
     assert "raed" in done.stderr and "read" in done.stderr
 
@@ -79,9 +75,7 @@ def test_a_ratio_is_that_of_medians_whatever_the_units(capsys: pytest.CaptureFix
     report = Report()
     report.begin("some", "thing")
     base = report.samples("base", [2_000_000] * 3, "ms")
-    ours = report.samples(
-        "ours", [1_000_000, 3_000_000, 9_000_000], "us", baseline=base, bars=[Bar("ratio", 1.0)]
-    )
+    ours = report.samples("ours", [1_000_000, 3_000_000, 9_000_000], "us", baseline=base, bars=[Bar("ratio", 1.0)])
     assert ours.ratio == pytest.approx(1.5)
     report.summary()
     assert "MISSED" in capsys.readouterr().out

@@ -27,7 +27,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the drivers' check, which takes longer than all else and mostly waits; put the tests of one workcell together."""
+    """Begin with the drivers' check, which takes longer than all else and mostly waits; put the tests of one workcell
+    together.
+    """
 
     def place(item: pytest.Item) -> int:
         if "shipped" in getattr(item, "fixturenames", ()):

@@ -62,9 +62,7 @@ def test_what_it_cannot_do_is_refused_and_moves_nothing(cell: sioms.Workcell, ax
             with raises(errno.ERANGE, f"{axis.beyond:g}"):
                 node.move(axis.beyond)
         fast: dict[str, Any] = (
-            {"velocity": 1e6}
-            if has_velocity(node)
-            else {"position": 0.0, "max_velocity": 1e6, "max_acceleration": 0.1}
+            {"velocity": 1e6} if has_velocity(node) else {"position": 0.0, "max_velocity": 1e6, "max_acceleration": 0.1}
         )
         for word, value in (("position", math.nan), ("velocity", math.inf), ("velocity", 1e6)):
             if word == "velocity" and not has_velocity(node):
@@ -155,9 +153,7 @@ def test_markers_hold_and_signal(cell: sioms.Workcell, axis: Axis) -> None:
         first.signal()
         second.wait(20.0)
         node.wait_until_idle(5.0)
-        assert node.wait_new(node.read().number, 5.0).position[0] == pytest.approx(
-            axis.reach, abs=axis.tolerance
-        )
+        assert node.wait_new(node.read().number, 5.0).position[0] == pytest.approx(axis.reach, abs=axis.tolerance)
         home(node)
 
 
@@ -171,9 +167,7 @@ def test_a_synch_releases(cell: sioms.Workcell, axis: Axis) -> None:
             node.wait_until_idle(0.05)
         node.synch()
         node.wait_until_idle(20.0)
-        assert node.wait_new(node.read().number, 5.0).position[0] == pytest.approx(
-            axis.reach, abs=axis.tolerance
-        )
+        assert node.wait_new(node.read().number, 5.0).position[0] == pytest.approx(axis.reach, abs=axis.tolerance)
         home(node)
 
 
@@ -184,8 +178,9 @@ def test_commands_run_in_order_and_flush_leaves_the_first(cell: sioms.Workcell, 
         markers = cell.reserve_markers(3)
         order: list[int] = []
         threads = [
-            threading.Thread(target=lambda i=i, m=m: (m.wait(30.0), order.append(i)), daemon=True) for i, m in enumerate(markers)
-        ]  # fmt: skip
+            threading.Thread(target=lambda i=i, m=m: (m.wait(30.0), order.append(i)), daemon=True)
+            for i, m in enumerate(markers)
+        ]
         for thread in threads:
             thread.start()
         places = (axis.reach, axis.reach / 2, 0.0)
@@ -200,9 +195,7 @@ def test_commands_run_in_order_and_flush_leaves_the_first(cell: sioms.Workcell, 
         wait_for(lambda: node.read().in_motion[0], "moving")
         node.flush()
         node.wait_until_idle(20.0)
-        assert node.wait_new(node.read().number, 5.0).position[0] == pytest.approx(
-            axis.reach, abs=axis.tolerance
-        )
+        assert node.wait_new(node.read().number, 5.0).position[0] == pytest.approx(axis.reach, abs=axis.tolerance)
         home(node)
         for marker in markers:
             marker.free()
@@ -213,9 +206,7 @@ def test_calibration_moves_nothing(cell: sioms.Workcell, axis: Axis) -> None:
     with cell.open(axis.node, "rw", timeout=2.0) as node:
         home(node)
         node.calibrate(axis.reach)
-        wait_for(
-            lambda: node.read().position[0] == pytest.approx(axis.reach, abs=axis.tolerance), "calibrated"
-        )
+        wait_for(lambda: node.read().position[0] == pytest.approx(axis.reach, abs=axis.tolerance), "calibrated")
         assert not node.read().in_motion[0]
         node.zero()
         wait_for(lambda: node.read().position[0] == pytest.approx(0.0, abs=axis.tolerance), "zeroed")

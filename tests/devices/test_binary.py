@@ -17,9 +17,7 @@ every_output = pytest.mark.parametrize("output", OUTPUTS, ids=lambda output: out
 
 
 def shows(node: sioms.BinaryNode, value: int) -> None:
-    wait_for(
-        lambda: node.read().data[0] == value, f"{node.name} shows {value:#x}, not {node.read().data[0]:#x}"
-    )
+    wait_for(lambda: node.read().data[0] == value, f"{node.name} shows {value:#x}, not {node.read().data[0]:#x}")
 
 
 @every_output
@@ -77,9 +75,7 @@ def test_outputs_become_safe_with_their_writer(cell: sioms.Workcell, output: Out
 
 
 @every_output
-def test_outputs_become_safe_with_an_emergency_stop(
-    workcell: Daemon, cell: sioms.Workcell, output: Output
-) -> None:
+def test_outputs_become_safe_with_an_emergency_stop(workcell: Daemon, cell: sioms.Workcell, output: Output) -> None:
     other = 0b10 if output.safe != 0b10 else 0b01
     with cell.open(output.node, "rw", timeout=2.0) as node:
         node.set(other)

@@ -77,16 +77,12 @@ def test_a_driver_that_does_not_stop_fails() -> None:
 def test_a_driver_that_trusts_its_module_fails() -> None:
     status, trials, said = broken()["trusting"]
     assert status == 1, said
-    assert trials["shoved"]["verdict"] == "FAILED" and "motion by itself" in trials["shoved"]["expected"], (
-        said
-    )
+    assert trials["shoved"]["verdict"] == "FAILED" and "motion by itself" in trials["shoved"]["expected"], said
     assert trials["restart"]["verdict"] == "FAILED", said
 
 
 @pytest.mark.parametrize(("times", "verdict"), [(1, Verdict.PASSED), (9, Verdict.FAILED)])
-def test_a_trial_whose_device_faults_by_itself_is_tried_again_and_says_so(
-    times: int, verdict: Verdict
-) -> None:
+def test_a_trial_whose_device_faults_by_itself_is_tried_again_and_says_so(times: int, verdict: Verdict) -> None:
     (rig,) = (rig for rig in MAP_RIGS if rig.title == "oriental_az")
     alarms = iter(range(times))
 

@@ -17,15 +17,11 @@ def sioms(*words: object) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
-def test_a_recorded_line_is_replayed_and_a_changed_one_is_not(
-    start: Callable[..., Any], short_folder: Path
-) -> None:
+def test_a_recorded_line_is_replayed_and_a_changed_one_is_not(start: Callable[..., Any], short_folder: Path) -> None:
     device = start([sys.executable, AUTHORS / "scale_device.py", "--link", short_folder / "port"])
     device.wait_line("^ready ")
     config, trace = short_folder / "cell.toml", short_folder / "scale.trace"
-    table = (
-        f'driver = "{AUTHORS / "scale.py"}"\nline = {{ serial = "{short_folder / "port"}", baud = 9600 }}\n'
-    )
+    table = f'driver = "{AUTHORS / "scale.py"}"\nline = {{ serial = "{short_folder / "port"}", baud = 9600 }}\n'
     config.write_text(f'[workcell]\nname = "t"\n[device.scale]\n{table}')
     status, said = sioms("trace", config, "scale", "-o", trace, "--seconds", "1")
     assert status == 0, said
@@ -39,9 +35,7 @@ def test_a_recorded_line_is_replayed_and_a_changed_one_is_not(
     other = short_folder / "other.trace"
     other.write_text(trace.read_text().replace('"b":"570d"', '"b":"580d"'))
     status, said = sioms("replay", other)
-    assert status == 1 and "the trace has 58 0d, the driver asks 57 0d; they differ from byte 0 on" in said, (
-        said
-    )
+    assert status == 1 and "the trace has 58 0d, the driver asks 57 0d; they differ from byte 0 on" in said, said
 
 
 def test_no_trace_is_a_sentence(tmp_path: Path) -> None:

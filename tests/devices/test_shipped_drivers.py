@@ -22,9 +22,7 @@ SHIPPED = [name for name in WIRED if name not in BY_MAP] + [rig.title for rig in
 def shipped(request: pytest.FixtureRequest) -> tuple[dict[str, dict[str, Any]], str]:
     """The drivers that the chosen tests are about, checked side by side: all, or those that failed before."""
     names = [
-        item.callspec.params["name"]
-        for item in request.session.items
-        if "shipped" in getattr(item, "fixturenames", ())
+        item.callspec.params["name"] for item in request.session.items if "shipped" in getattr(item, "fixturenames", ())
     ]
     _, reports, said = run(*names, "-j", "4")
     return {report["driver"]: report for report in reports}, said
@@ -35,9 +33,7 @@ def test_a_shipped_driver_passes(name: str, shipped: tuple[dict[str, dict[str, A
     reports, said = shipped
     assert name in reports, said
     trials = reports[name]["trials"]
-    failed = [
-        f"{t['name']}: expected {t['expected']}; saw {t['seen']}" for t in trials if t["verdict"] == "FAILED"
-    ]
+    failed = [f"{t['name']}: expected {t['expected']}; saw {t['seen']}" for t in trials if t["verdict"] == "FAILED"]
     assert not failed, "\n".join(failed)
     passed = {t["name"] for t in trials if t["verdict"] == "passed"}
     assert {"random", "kill driver", "kill daemon"} <= passed
@@ -49,6 +45,4 @@ def test_a_driver_without_a_line_passes(name: str, shipped: tuple[dict[str, dict
     reports, said = shipped
     verdicts = {t["name"]: t["verdict"] for t in reports[name]["trials"]}
     assert "FAILED" not in verdicts.values(), said
-    assert {verdicts[name] for name in ("golden", "timing", "unplugged", "kill driver", "kill daemon")} == {
-        "passed"
-    }
+    assert {verdicts[name] for name in ("golden", "timing", "unplugged", "kill driver", "kill daemon")} == {"passed"}

@@ -3,9 +3,9 @@
 
     .venv/bin/python tests/kernel/run.py [--source DIR-OR-TAR] [--build DIR] [--timeout S] [PYTEST-ARGUMENT ...]
 
-The kernel is a User Mode Linux: a process without any rights, without a virtual machine, that sees the files of this computer
-read-only. It is built once, from the sources of a distribution (5 minutes on two processors), and kept; a run takes three
-minutes.
+The kernel is a User Mode Linux: a process without any rights, without a virtual machine, that sees the files of this
+computer read-only. It is built once, from the sources of a distribution (5 minutes on two processors), and kept; a run
+takes three minutes.
 """
 
 from __future__ import annotations

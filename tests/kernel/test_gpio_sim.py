@@ -1,7 +1,7 @@
 """GPIO lines of a chip that the kernel simulates, under the real daemon: what holds of the character device itself.
 
-gpio-sim tells of a changed level by an interrupt that may come as late as the next tick of the kernel (10 ms); changes that
-follow each other sooner are one edge. So they are paced here.
+gpio-sim tells of a changed level by an interrupt that may come as late as the next tick of the kernel (10 ms); changes
+that follow each other sooner are one edge. So they are paced here.
 """
 
 from __future__ import annotations
@@ -24,9 +24,7 @@ from gpiod.line import Direction, Drive
 from sioms.drivers.gpio.simulator import CONFIGFS, SimulatedChip
 
 if not CONFIGFS.is_dir() or os.geteuid() != 0:
-    pytest.skip(
-        "needs root and gpio-sim; tests/kernel/run.py starts a kernel that has it", allow_module_level=True
-    )
+    pytest.skip("needs root and gpio-sim; tests/kernel/run.py starts a kernel that has it", allow_module_level=True)
 
 NAMES = ["", "", "", "", "key", "", "door", ""]
 PACE_S = 0.03
@@ -61,7 +59,9 @@ bias = "pull_up"
 line = 7
 debounce_s = 0.15
 """
-ONLY_OUTPUT = '[workcell]\nname = "gpio"\n[device.io0]\ndriver = "gpio"\nchip = "{chip}"\n[[device.io0.output]]\nline = 0\n'
+ONLY_OUTPUT = (
+    '[workcell]\nname = "gpio"\n[device.io0]\ndriver = "gpio"\nchip = "{chip}"\n[[device.io0.output]]\nline = 0\n'
+)
 
 
 @pytest.fixture
@@ -118,9 +118,7 @@ def test_edges_and_when_they_came(chip: SimulatedChip, daemon: Daemon) -> None:
         stamps = sorted({s.changed_ns[0] for s in changes})
         assert len(stamps) == 3
         for stamp_ns, (began_ns, ended_ns) in zip(stamps, times, strict=True):
-            assert began_ns <= stamp_ns <= ended_ns + 20e6, (
-                "stamped by the kernel's interrupt, at its next tick"
-            )
+            assert began_ns <= stamp_ns <= ended_ns + 20e6, "stamped by the kernel's interrupt, at its next tick"
         chip.pull(5, 1)
         chip.pull(6, 0)
         wait_for(lambda: node.read().data[0] == 0b0001, "active-low, and a button against the pull-up")
@@ -184,9 +182,7 @@ def test_lines_that_are_not_there(chip: SimulatedChip, old: str, new: str, words
 
 
 @pytest.mark.parametrize("config", [CONFIG, ONLY_OUTPUT], ids=["inputs and outputs", "outputs alone"])
-def test_a_chip_that_is_unplugged_while_it_is_held(
-    chip: SimulatedChip, short_folder: Path, config: str
-) -> None:
+def test_a_chip_that_is_unplugged_while_it_is_held(chip: SimulatedChip, short_folder: Path, config: str) -> None:
     link = short_folder / "chip"  # as a rule of udev makes one: the number of a chip may change
     link.symlink_to(chip.path)
     with daemons() as start:

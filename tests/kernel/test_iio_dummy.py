@@ -1,6 +1,7 @@
 """Linux IIO on the kernel's dummy device under the real daemon, compared with what libiio's programs say of it.
 
-The dummy's single readings are 73, 33, -34, 34, those of its buffer 7, -33, -2, 344 (iio_simple_dummy.c, iio_simple_dummy_buffer.c).
+The dummy's single readings are 73, 33, -34, 34, those of its buffer 7, -33, -2, 344 (iio_simple_dummy.c,
+iio_simple_dummy_buffer.c).
 """
 
 from __future__ import annotations
@@ -27,9 +28,7 @@ from sioms.drivers.iio.kernel_dummy import CONFIGFS, NAME, TRIGGER, DummyDevice
 from sioms.protocol.flags import AnalogStatus
 
 if not CONFIGFS.is_dir() or os.geteuid() != 0:
-    pytest.skip(
-        "needs root and iio_dummy; tests/kernel/run.py starts a kernel that has it", allow_module_level=True
-    )
+    pytest.skip("needs root and iio_dummy; tests/kernel/run.py starts a kernel that has it", allow_module_level=True)
 
 SYSFS = Path("/sys/bus/iio/devices")
 CHANNELS = ["voltage1-voltage2", "voltage0", "accel_x", "voltage3-voltage4"]
@@ -189,9 +188,7 @@ def test_libiio_reads_the_same(dummy: DummyDevice) -> None:
         elements = [Element(e.name, e.index, e.type) for e in layout.elements if e.name in chosen]
         raw = Layout(elements).decode(data)
         known = {"voltage0": 7, "voltage1-voltage2": -33, "voltage3-voltage4": -2, "accel_x": 344}
-        assert {name: list(values) for name, values in raw.items()} == {
-            name: [known[name]] * 8 for name in chosen
-        }
+        assert {name: list(values) for name, values in raw.items()} == {name: [known[name]] * 8 for name in chosen}
 
 
 def test_the_driver_check() -> None:

@@ -52,9 +52,7 @@ def run_tests(tree: Path, tests: list[str]) -> int:
     """Run tests in a copy of the tree, up to the first that fails; return the exit status of pytest."""
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--timeout=120", *tests]
     try:
-        return subprocess.run(
-            command, cwd=tree, capture_output=True, timeout=LONGEST_S, check=False
-        ).returncode
+        return subprocess.run(command, cwd=tree, capture_output=True, timeout=LONGEST_S, check=False).returncode
     except subprocess.TimeoutExpired:
         return 1
 
@@ -71,9 +69,7 @@ def try_mutant(mutant: Mutant, trees: queue.Queue[Path]) -> bool:
         path.write_text(text, encoding="utf-8")
         trees.put(tree)
     found = status == 1  # of pytest: tests have failed; 2 and more: they could not be run
-    print(
-        f"{'killed' if found else 'LIVES'} {time.perf_counter() - began_s:6.1f} s  {mutant.name}", flush=True
-    )
+    print(f"{'killed' if found else 'LIVES'} {time.perf_counter() - began_s:6.1f} s  {mutant.name}", flush=True)
     return found
 
 

@@ -19,9 +19,7 @@ def move(distance, v, a, j=math.inf, state=REST, **fields):
     return Planner().plan(command, state, Bounds(v, a, j, -math.inf, math.inf))
 
 
-@pytest.mark.parametrize(
-    ("d", "v", "a"), [(1.0, 0.5, 2.0), (1.0, 5.0, 2.0), (1e-4, 1.0, 10.0), (30.0, 0.1, 0.5)]
-)
+@pytest.mark.parametrize(("d", "v", "a"), [(1.0, 0.5, 2.0), (1.0, 5.0, 2.0), (1e-4, 1.0, 10.0), (30.0, 0.1, 0.5)])
 def test_trapezoid_durations(d, v, a):
     """Time-optimal under v and a: d/v + v/a when v is reached, else 2 sqrt(d/a)."""
     expected = d / v + v / a if d >= v * v / a else 2 * math.sqrt(d / a)
@@ -83,9 +81,7 @@ def test_thousand_pieces_of_a_third_of_a_tick_do_not_drift():
     t = piece * np.arange(1, n + 1)
     w = 2 * np.pi * 2.0
     passing = MODE.POSITION | MODE.VELOCITY | MODE.SPECIFIED_TIME
-    rig.write(
-        mode=[passing] * n, position=0.1 * (1 - np.cos(w * t)), velocity=0.1 * w * np.sin(w * t), time=piece
-    )
+    rig.write(mode=[passing] * n, position=0.1 * (1 - np.cos(w * t)), velocity=0.1 * w * np.sin(w * t), time=piece)
     begin = rig.now_ns
     while not rig.bank.is_idle([0]) and rig.now_ns - begin < 2 * 10**9:
         rig.tick()
@@ -101,8 +97,12 @@ def test_passes_of_a_sampled_curve_keep_its_acceleration():
     n, piece, w, amplitude = 100, 0.02, 3.0, 0.2
     t = piece * np.arange(1, n + 1)
     passing = MODE.POSITION | MODE.VELOCITY | MODE.SPECIFIED_TIME
-    rig.write(mode=[passing] * n, position=amplitude * (t - np.sin(w * t) / w), velocity=amplitude * (1 - np.cos(w * t)),
-              time=piece)  # fmt: skip
+    rig.write(
+        mode=[passing] * n,
+        position=amplitude * (t - np.sin(w * t) / w),
+        velocity=amplitude * (1 - np.cos(w * t)),
+        time=piece,
+    )
     rig.tick(1900)
     p = rig.trace("commanded_position")[1:]
     s = 1e-3 * np.arange(1, len(p) + 1)

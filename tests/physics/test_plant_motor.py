@@ -30,9 +30,7 @@ def one(effects=None, substeps=4, tick_s=TICK_S, **parameters):
 def test_moving_motor_agrees_with_quadrature():
     bank = one(mass=2.0, viscous=3.0, coulomb=1.0)
     run(bank, 8.0, 500)
-    solution = solve_ivp(
-        lambda t, y: [y[1], (8 - 3 * y[1] - 1) / 2], (0, 0.5), [0, 0], rtol=1e-11, atol=1e-13
-    )
+    solution = solve_ivp(lambda t, y: [y[1], (8 - 3 * y[1] - 1) / 2], (0, 0.5), [0, 0], rtol=1e-11, atol=1e-13)
     assert bank.position[0] == pytest.approx(solution.y[0, -1], rel=1e-9)
     assert bank.velocity[0] == pytest.approx(solution.y[1, -1], rel=1e-9)
 
@@ -252,7 +250,9 @@ def test_presliding_springs_back():
 
 @pytest.mark.parametrize(("yielding", "within"), [(0.0, 1e-6), (1.5, 2e-4)])
 def test_all_dry_friction_varies_and_drag_does_not(yielding, within):
-    """Pushed one way over a varying floor, against quadrature: Coulomb, Stribeck and Dahl friction with the factor, drag without."""
+    """Pushed one way over a varying floor, against quadrature: Coulomb, Stribeck and Dahl friction with the factor,
+    drag without.
+    """
     depth, pitch, phase = 0.4, 0.03, 0.7
     effects = {
         "friction_variation": {"depth": depth, "pitch": pitch, "phase": phase},
@@ -308,12 +308,8 @@ def test_a_stop_and_a_return_over_a_varying_floor_agree_with_quadrature():
 
     stopped.terminal = True
     ask = {"rtol": 1e-11, "atol": 1e-14}
-    there = solve_ivp(
-        lambda t, y: [y[1], (-3 - level(y[0])) / 0.5], (0, 0.2), [0, 0.5], events=stopped, **ask
-    )
-    back = solve_ivp(
-        lambda t, y: [y[1], (-3 + level(y[0])) / 0.5], (there.t[-1], 0.2), [there.y[0, -1], 0.0], **ask
-    )
+    there = solve_ivp(lambda t, y: [y[1], (-3 - level(y[0])) / 0.5], (0, 0.2), [0, 0.5], events=stopped, **ask)
+    back = solve_ivp(lambda t, y: [y[1], (-3 + level(y[0])) / 0.5], (there.t[-1], 0.2), [there.y[0, -1], 0.0], **ask)
     assert back.y[0, -1] < 0.8 * there.y[0, -1]
     assert bank.position[0] == pytest.approx(back.y[0, -1], abs=1e-5)
     assert bank.velocity[0] == pytest.approx(back.y[1, -1], abs=1e-4)
@@ -338,9 +334,7 @@ def test_stop_under_viscous_friction_agrees_with_quadrature():
         events=stopped,
     )
     rest = [there.y[0, -1], 0.0]
-    back = solve_ivp(
-        lambda t, y: [y[1], (-3 + 1 - 20 * y[1]) / 0.5], (there.t[-1], 0.1), rest, rtol=1e-11, atol=1e-14
-    )
+    back = solve_ivp(lambda t, y: [y[1], (-3 + 1 - 20 * y[1]) / 0.5], (there.t[-1], 0.1), rest, rtol=1e-11, atol=1e-14)
     assert bank.position[0] == pytest.approx(back.y[0, -1], rel=1e-8)
     assert bank.velocity[0] == pytest.approx(back.y[1, -1], rel=1e-8)
 

@@ -1,4 +1,5 @@
-"""A geared arm as a user would record it: its servo a cascade of its own, its force the current, its friction LuGre's with damping.
+"""A geared arm as a user would record it: its servo a cascade of its own, its force the current, its friction LuGre's
+with damping.
 
 The arm is made here, in plain steps of 62 us, by equations that share nothing with the solver.
 """
@@ -27,17 +28,13 @@ rated_force = 60.0
 max_speed = 2.5
 refine = ["inertia", "viscous"]
 """
-COLUMNS = (
-    '[columns]\ntime = { name = "t [s]" }\nposition = { name = "q [deg]" }\nforce = { name = "tau [Nm]" }\n'
-)
+COLUMNS = '[columns]\ntime = { name = "t [s]" }\nposition = { name = "q [deg]" }\nforce = { name = "tau [Nm]" }\n'
 
 
 def path(t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Swings over nearly four radians, ever slower, and small ones that hardly slide."""
     turned = 2 * pi * 0.9 * (1.0 - np.exp(-t / 2.0))
-    swing = 1.7 * np.sin(1.5 * turned + rng.uniform(0, 2 * pi)) + 0.25 * np.sin(
-        4.0 * turned + rng.uniform(0, 2 * pi)
-    )
+    swing = 1.7 * np.sin(1.5 * turned + rng.uniform(0, 2 * pi)) + 0.25 * np.sin(4.0 * turned + rng.uniform(0, 2 * pi))
     return swing + 0.03 * np.sin(2 * pi * 2.3 * t)
 
 

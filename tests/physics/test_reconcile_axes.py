@@ -60,9 +60,7 @@ def test_one_cruising_speed_leaves_coulomb_and_viscous_friction_open(tmp_path: P
     assert {"coulomb"} in sets
     assert {"viscous"} in sets
     (other,) = found["alternative_parameters"]  # type: ignore[misc]
-    assert other["viscous"]["b_extra"] == pytest.approx(
-        0.24027 / 9.78, rel=0.05
-    )  # the level over the one speed
+    assert other["viscous"]["b_extra"] == pytest.approx(0.24027 / 9.78, rel=0.05)  # the level over the one speed
     assert found["separation_in_noise"] > 10.0  # type: ignore[operator]
     assert (tmp_path / "experiment.csv").exists()
 

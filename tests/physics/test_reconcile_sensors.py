@@ -66,10 +66,7 @@ def test_a_corrected_model_is_right_and_taken_as_nominal_leaves_nothing(tmp_path
     assert score_sensor(hidden, found).right, (hidden.named, found["effects"], found["verdict"])
     model = tmp_path / "s" / "report" / "model.toml"
     out = tmp_path / "again"
-    assert (
-        reconcile.main(["force", str(tmp_path / "s"), "--model", str(model), "--out", str(out), "--quiet"])
-        == 0
-    )
+    assert reconcile.main(["force", str(tmp_path / "s"), "--model", str(model), "--out", str(out), "--quiet"]) == 0
     answer = json.loads((out / "verdict.json").read_text())
     assert answer["ladder"][0]["ratio"] < 1.2
 

@@ -100,9 +100,7 @@ def test_a_test_signal_and_a_push_from_outside_are_in_the_loop() -> None:
         u = float(np.clip(own + more, -1.8, 1.8))
         ys.append(y)
         us.append(u)
-        state = solve_ivp(
-            gravity, (0, DT), state, args=(u + outer,), method="DOP853", rtol=1e-11, atol=1e-13
-        ).y[:, -1]
+        state = solve_ivp(gravity, (0, DT), state, args=(u + outer,), method="DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
     model = AXIS
     for name, values in CASES["gravity and cogging"][2].items():
         model = model.with_effect(name, values)
@@ -138,9 +136,7 @@ def test_coulomb_friction_stops_where_energy_says_and_holds() -> None:
 
 @pytest.mark.parametrize("force", [0.11, -0.11])
 def test_stribeck_friction_holds_up_to_breakaway_and_then_runs_away(force: float) -> None:
-    model = replace(AXIS, viscous=0.0, controller=None).with_effect(
-        "stribeck", {"Fc": 0.05, "Fs": 0.1, "vs": 0.1}
-    )
+    model = replace(AXIS, viscous=0.0, controller=None).with_effect("stribeck", {"Fc": 0.05, "Fs": 0.1, "vs": 0.1})
     held = track(model, np.zeros(200), np.full(200, 0.9 * force), None)
     assert np.all(held.x == 0.0)
     free = track(model, np.zeros(200), np.full(200, force), None)
@@ -161,7 +157,9 @@ def test_dahl_friction_builds_up_exponentially_over_its_length() -> None:
 @pytest.mark.parametrize("depth", [0.0, 0.3])
 @pytest.mark.parametrize("speed", [0.02, 0.4])
 def test_lugre_friction_agrees_with_an_ordinary_solver(speed: float, depth: float) -> None:
-    """Driven to and fro so that it yields, breaks away and drops, over a level that varies or not: LuGre's equation by scipy."""
+    """Driven to and fro so that it yields, breaks away and drops, over a level that varies or not: LuGre's equation by
+    scipy.
+    """
     fc, fs, vs, xs, b, j = 0.05, 0.08, 0.15, 1e-2, 1e-3, 2e-3
     values = {"Fc": fc, "xs": xs, "Fs": fs, "vs": vs}
     model = replace(AXIS, viscous=b, controller=None).with_effect("lugre", values)
@@ -188,7 +186,9 @@ def test_lugre_friction_agrees_with_an_ordinary_solver(speed: float, depth: floa
 
 @pytest.mark.parametrize("law", ["presliding", "stribeck"])
 def test_friction_that_varies_over_the_turn_agrees_with_an_ordinary_solver(law: str) -> None:
-    """Pushed one way by a force that swings, over three waves: level and hysteresis times the factor, solved by scipy."""
+    """Pushed one way by a force that swings, over three waves: level and hysteresis times the factor, solved by
+    scipy.
+    """
     fc, fs, vs, xs, b, j = 0.05, 0.09, 2.0, 5e-2, 1e-3, 2e-3
     values = {"Fc": fc, "Fs": fs, "vs": vs} if law == "stribeck" else {"Fc": fc, "xs": xs}
     model = replace(AXIS, viscous=b, controller=None).with_effect(law, values)
@@ -214,9 +214,7 @@ def test_friction_that_varies_over_the_turn_agrees_with_an_ordinary_solver(law: 
 
 @pytest.mark.parametrize("place", [np.pi / 6, np.pi / 2])
 def test_friction_that_varies_holds_as_it_is_at_that_place(place: float) -> None:
-    model = replace(AXIS, viscous=0.0, controller=None).with_effect(
-        "stribeck", {"Fc": 0.03, "Fs": 0.06, "vs": 0.1}
-    )
+    model = replace(AXIS, viscous=0.0, controller=None).with_effect("stribeck", {"Fc": 0.03, "Fs": 0.06, "vs": 0.1})
     model = model.with_effect("friction_variation", {"depth": 0.5, "phase": 0.0, "n": 3.0})
     most, there = 0.06 * (1.0 + 0.5 * np.sin(3.0 * place)), np.full(100, place)
     for way in (1.0, -1.0):
@@ -267,9 +265,7 @@ def test_the_linear_filter_is_the_answer_of_the_observer_to_a_missing_force() ->
     run = track(replace(AXIS, controller=None), np.array(y), known_force, noise)
     expected = response(AXIS, noise, extra)
     forgotten = slice(100, None)  # the first speed is read off the motion, not known to be none
-    np.testing.assert_allclose(
-        run.innovation[forgotten], expected[forgotten], atol=2e-4 * np.max(np.abs(expected))
-    )
+    np.testing.assert_allclose(run.innovation[forgotten], expected[forgotten], atol=2e-4 * np.max(np.abs(expected)))
 
 
 def test_the_expected_innovation_is_what_a_right_model_leaves() -> None:
@@ -324,9 +320,7 @@ def test_the_observer_of_a_transmission_that_rings_leaves_no_tone() -> None:
     y, force = shaken_pair(3, 20000)
     noise = observer(AXIS, 1e-4, 2e-3)
     zeta = PAIR.damping / (2.0 * np.sqrt(PAIR.stiffness * 2e-3 * 0.55 * 0.45))
-    model = replace(AXIS, controller=None).with_effect(
-        "elastic", {"f_res": 18.0, "load_fraction": 0.55, "zeta": zeta}
-    )
+    model = replace(AXIS, controller=None).with_effect("elastic", {"f_res": 18.0, "load_fraction": 0.55, "zeta": zeta})
     e = track(model, y, force, noise).innovation[500:]
     alike = innovations(y, force, np.array([*noise.gain, *noise.gain]))[500:]
     own = innovations(y, force, np.array(corrections(noise, PAIR, DT)[:4]))[500:]
@@ -359,7 +353,9 @@ def test_a_missing_force_on_a_pair_leaves_what_the_linear_filter_says() -> None:
 
 
 def test_out_of_contact_nothing_moves_the_load() -> None:
-    """A motor in the middle of its gap is measured elsewhere than expected: it is moved, as one of its own mass, and the load is not."""
+    """A motor in the middle of its gap is measured elsewhere than expected: it is moved, as one of its own mass, and
+    the load is not.
+    """
     noise = observer(AXIS, 1e-4, 2e-3)
     model = replace(AXIS, controller=None).with_effect(
         "backlash", {"gap": 0.1, "load_fraction": 0.6, "f_contact": 120.0, "zeta": 0.2}

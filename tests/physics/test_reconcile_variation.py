@@ -1,4 +1,6 @@
-"""A ball-screw stage whose preload varies once per turn, made here by a bristle equation in steps of 50 us, and what is said of it."""
+"""A ball-screw stage whose preload varies once per turn, made here by a bristle equation in steps of 50 us, and what is
+said of it.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +25,7 @@ def record(name: str, seed: int, depth: float, ripple: float, seconds: float = 2
     rng = np.random.default_rng(seed)
     count, h = int(seconds / DT), DT / FINE
     t = np.arange(count + 1) * DT
-    aim = 0.03 * np.sin(2 * pi * rng.uniform(0.5, 0.6) * t * (1.0 - 0.12 * t)) + 0.004 * np.sin(
-        2 * pi * 2.3 * t
-    )
+    aim = 0.03 * np.sin(2 * pi * rng.uniform(0.5, 0.6) * t * (1.0 - 0.12 * t)) + 0.004 * np.sin(2 * pi * 2.3 * t)
     x, v, z, held, last = 0.0, 0.0, 0.0, 0.0, 0.0
     place, force = np.empty(count), np.empty(count)
     for k in range(count):
@@ -45,9 +45,7 @@ def record(name: str, seed: int, depth: float, ripple: float, seconds: float = 2
 
 
 @pytest.mark.parametrize(("depth", "ripple"), [(0.2, 0.0), (0.0, 0.06)])
-def test_friction_that_varies_and_a_force_constant_that_does_are_told_apart(
-    depth: float, ripple: float
-) -> None:
+def test_friction_that_varies_and_a_force_constant_that_does_are_told_apart(depth: float, ripple: float) -> None:
     session = Session(tuple(record(f"r{k}", k, depth, ripple) for k in range(2)))
     verdict = analyse(session, NOMINAL, Options(pictures=False))
     assert verdict.outcome is Outcome.NAMED
@@ -55,9 +53,7 @@ def test_friction_that_varies_and_a_force_constant_that_does_are_told_apart(
     assert found["lugre"]["Fc"] == pytest.approx(FC, rel=0.02)
     if depth:
         assert set(found) == {"lugre", "friction_variation"}
-        assert found["friction_variation"] == pytest.approx(
-            {"depth": depth, "phase": 0.9, "n": 1.0}, rel=0.05
-        )
+        assert found["friction_variation"] == pytest.approx({"depth": depth, "phase": 0.9, "n": 1.0}, rel=0.05)
     else:
         assert set(found) == {"lugre", "torque_ripple"}
         assert found["torque_ripple"] == pytest.approx({"depth": ripple, "phase": -0.4, "n": 4.0}, rel=0.05)

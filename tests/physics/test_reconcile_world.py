@@ -69,9 +69,7 @@ def test_a_free_axis_keeps_its_energy_and_its_period() -> None:
 )
 def test_friction_takes_energy(hidden: dict[str, dict[str, float]]) -> None:
     command = np.where(np.arange(1200) < 2, 0.0, 0.01)
-    free, rubbed = (
-        float(np.max(np.abs(run(command, **h).counts[-400:] * 1e-9 - 0.01))) for h in ({}, hidden)
-    )
+    free, rubbed = (float(np.max(np.abs(run(command, **h).counts[-400:] * 1e-9 - 0.01))) for h in ({}, hidden))
     assert rubbed < 0.8 * free
 
 
@@ -90,9 +88,9 @@ def test_presliding_is_a_spring_until_it_slides() -> None:
 def test_the_current_lags_by_its_time_constant() -> None:
     stiff = replace(BARE, inertia=1e6)
     seen = run(np.where(np.arange(100) < 20, 0.0, 0.01), stiff, lag={"tau": 5e-3})
-    assert np.interp(
-        1.0 - np.exp(-1.0), seen.force_measured[20:40] / seen.force[40], np.arange(20)
-    ) + 0.5 == (pytest.approx(5.0, rel=0.02))
+    assert np.interp(1.0 - np.exp(-1.0), seen.force_measured[20:40] / seen.force[40], np.arange(20)) + 0.5 == (
+        pytest.approx(5.0, rel=0.02)
+    )
 
 
 def test_an_eccentric_encoder_is_right_at_every_mark() -> None:

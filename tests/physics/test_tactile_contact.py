@@ -1,4 +1,6 @@
-"""Solved contacts against facts that the solver does not use: plain Fourier sums, quadrature, closed forms of the half plane."""
+"""Solved contacts against facts that the solver does not use: plain Fourier sums, quadrature, closed forms of the half
+plane.
+"""
 
 from __future__ import annotations
 
@@ -56,9 +58,7 @@ def test_sliding_frees_both_edges_and_keeps_the_slope(finger: Cylinder, half: fl
     wanted = Round(6e-3).slope(finger, t - solved.offset)
     assert slope == pytest.approx(wanted, abs=0.01 * np.abs(wanted).max())
     assert abs(solved.offset) > 1e-4
-    assert contact.slide(finger, Round(6e-3), half, friction, order=100).load == pytest.approx(
-        solved.load, rel=1e-3
-    )
+    assert contact.slide(finger, Round(6e-3), half, friction, order=100).load == pytest.approx(solved.load, rel=1e-3)
     mirrored = contact.slide(finger, Round(6e-3), half, -friction)
     assert mirrored.offset == pytest.approx(-solved.offset, rel=1e-9)
     assert mirrored.load == pytest.approx(solved.load, rel=1e-9)
@@ -87,9 +87,7 @@ def test_load_and_spectrum_are_integrals_of_the_pressure(indenter: Indenter) -> 
     coefficients = solved.series(0.4, 12)
     for k in (1, 5, 12):
         assert -coefficients[2 * k] == pytest.approx(np.sum(weight * np.cos(k * (t + 0.4))) / np.pi, rel=1e-5)
-        assert -coefficients[2 * k - 1] == pytest.approx(
-            np.sum(weight * np.sin(k * (t + 0.4))) / np.pi, rel=1e-5
-        )
+        assert -coefficients[2 * k - 1] == pytest.approx(np.sum(weight * np.sin(k * (t + 0.4))) / np.pi, rel=1e-5)
 
 
 def test_pressure_is_bounded_positive_and_ends_as_a_square_root() -> None:
@@ -202,9 +200,7 @@ def test_tables() -> None:
     step = 1e-6
     numeric = (table.product(0.04 + step) - table.product(0.04 - step)) / (2 * step)
     assert table.slope(0.04) == pytest.approx(numeric, rel=1e-6)
-    assert hertz_table(FINGER_B).half_width(2.0) == pytest.approx(
-        closedform.hertz_width(FINGER_B, 2.0, 1.0) / 2
-    )
+    assert hertz_table(FINGER_B).half_width(2.0) == pytest.approx(closedform.hertz_width(FINGER_B, 2.0, 1.0) / 2)
     with pytest.raises(ValueError, match=r"P R is -1\.0 N; the table covers 0 to"):
         table.half_width(-1.0)
 

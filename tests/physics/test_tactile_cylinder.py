@@ -46,9 +46,7 @@ def test_strains_are_gradients_of_displacements(ratio: float, poisson: float) ->
         here, below, above = respond(layer, k, r), respond(layer, k, r - step), respond(layer, k, r + step)
         stretch = (above.u_r - below.u_r)[0] / (2 * step)
         assert stretch == pytest.approx(here.e_rr[0], rel=1e-5, abs=1e-6 * np.abs(here.e_rt).max() + 1e-13)
-        turn = (
-            (above.u_t - below.u_t)[0] / (2 * step) - here.u_t[0] / r[:, None] + k * here.u_r[0] / r[:, None]
-        )
+        turn = (above.u_t - below.u_t)[0] / (2 * step) - here.u_t[0] / r[:, None] + k * here.u_r[0] / r[:, None]
         assert turn / 2 == pytest.approx(here.e_rt[0], rel=1e-5, abs=1e-6 * np.abs(here.e_rt).max() + 1e-13)
 
 
@@ -112,9 +110,7 @@ def test_core_carries_the_net_force() -> None:
 def test_thick_and_shallow_is_flamant() -> None:
     layer = Cylinder(1e-3, 1.0, 0.4)
     depth, theta = 2e-3, np.array([0.0, 1e-3, 3e-3, 8e-3])
-    strain = emap.e_map(layer, theta, 1.0 - depth, 9000)[:, :18001] @ series.line_load(
-        layer, -50.0, 0.0, 9000
-    )
+    strain = emap.e_map(layer, theta, 1.0 - depth, 9000)[:, :18001] @ series.line_load(layer, -50.0, 0.0, 9000)
     expected = halfplane.normal_strain(theta * 1.0, depth, 50.0, layer.poisson, layer.shear_pa)
     assert strain == pytest.approx(expected, abs=0.01 * np.abs(expected).max())
 
@@ -124,18 +120,13 @@ def test_truncation_rule() -> None:
     exact = emap.e_map(FINGER_B, 0.0, 10.3e-3, 200)[:, :401] @ series.line_load(FINGER_B, -1.0, 0.0, 200)
     for highest, fine in ((needed, True), (needed - 1, False)):
         count = 2 * highest + 1
-        cut = emap.e_map(FINGER_B, 0.0, 10.3e-3, highest)[:, :count] @ series.line_load(
-            FINGER_B, -1.0, 0.0, highest
-        )
+        cut = emap.e_map(FINGER_B, 0.0, 10.3e-3, highest)[:, :count] @ series.line_load(FINGER_B, -1.0, 0.0, highest)
         assert bool(abs(cut[0] / exact[0] - 1) < 2e-3) is fine
 
 
 def test_an_element_of_some_width_feels_the_mean_over_it() -> None:
     points, weights = np.polynomial.legendre.leggauss(12)
-    mean = sum(
-        w / 2 * emap.e_map(FINGER_B, 1.0 + 0.08 * x, 10.3e-3, 60)
-        for x, w in zip(points, weights, strict=True)
-    )
+    mean = sum(w / 2 * emap.e_map(FINGER_B, 1.0 + 0.08 * x, 10.3e-3, 60) for x, w in zip(points, weights, strict=True))
     wide = emap.e_map(FINGER_B, 1.0, 10.3e-3, 60, extent_rad=0.08)
     assert wide == pytest.approx(mean, abs=1e-6 * np.abs(wide).max())
 

@@ -1,4 +1,6 @@
-"""Known answers of the tactile model, computed elsewhere by shooting integration, 80-digit arithmetic and boundary elements."""
+"""Known answers of the tactile model, computed elsewhere by shooting integration, 80-digit arithmetic and boundary
+elements.
+"""
 
 from __future__ import annotations
 
@@ -59,9 +61,7 @@ def test_coefficient(finger: Cylinder, field: str, traction: str, k: int, value:
 
 
 @pytest.mark.parametrize(("finger", "angle", "normal", "tangential", "value"), LINE_LOADS)
-def test_strain_under_line_load(
-    finger: Cylinder, angle: float, normal: float, tangential: float, value: float
-) -> None:
+def test_strain_under_line_load(finger: Cylinder, angle: float, normal: float, tangential: float, value: float) -> None:
     matrix = emap.e_map(finger, angle, DEPTH[finger], 150)
     loads = [series.line_load(finger, total, 0.0, 150) for total in (normal, tangential)]
     assert (matrix @ np.concatenate(loads))[0] == pytest.approx(value, rel=1e-5)
@@ -77,16 +77,10 @@ def test_hertz() -> None:
 def test_wedge_and_punch() -> None:
     width = closedform.wedge_width(FINGER_B, 150.0, np.radians(60.0))
     assert width == pytest.approx(0.133096, rel=1e-5)
-    assert 150.0 / (np.pi * RB) * closedform.wedge_spectrum(20 * width / 2) == pytest.approx(
-        3240.18, rel=1e-5
-    )
-    assert 100.0 / (np.pi * RB) * closedform.punch_spectrum(15 * 2e-3 / RB) == pytest.approx(
-        55.9377, rel=1e-5
-    )
+    assert 150.0 / (np.pi * RB) * closedform.wedge_spectrum(20 * width / 2) == pytest.approx(3240.18, rel=1e-5)
+    assert 100.0 / (np.pi * RB) * closedform.punch_spectrum(15 * 2e-3 / RB) == pytest.approx(55.9377, rel=1e-5)
     radius = closedform.equivalent_radius(FINGER_B, 3e-3)
-    assert np.degrees(closedform.equivalent_wedge(FINGER_B, 100.0, radius)) == pytest.approx(
-        72.0233, rel=1e-5
-    )
+    assert np.degrees(closedform.equivalent_wedge(FINGER_B, 100.0, radius)) == pytest.approx(72.0233, rel=1e-5)
 
 
 @pytest.mark.parametrize(("width", "product"), [(0.10, 0.100366), (0.20, 0.43556), (0.40, 2.24323)])

@@ -99,7 +99,8 @@ def test_a_finger_that_prints_its_elements_is_felt(start: Callable[..., Any], sh
     )
     columns, finger = [f"e{i}" for i in range(16)], Path(__file__).parents[2] / "etc" / "finger.toml"
     cell = wire.serve(
-        f'[device.finger0]\ndriver = "ascii-stream"\nline = {{ serial = "{{port}}" }}\ncolumns = {columns}\nunit = "%"\n'
+        f'[device.finger0]\ndriver = "ascii-stream"\nline = {{ serial = "{{port}}" }}\ncolumns = {columns}\nunit = '
+        '"%"\n'
         f'offset = 200.0\nscale = 0.01\nrate_hz = 80.0\nshape = {{ finger_file = "{finger}" }}\n'
     )
     wire.wait_up("finger0")

@@ -51,9 +51,7 @@ class Bench:
     def __init__(self, start: Callable[..., Daemon], folder: Path) -> None:
         self.drive = Simulator("modbus.simulated.leadshine", "--link", folder / "drive", "--units", "1")
         self.finger = Simulator("framed_adc.simulator", "--link", folder / "finger", "--channels", "16")
-        self.block = Simulator(
-            "modbus.simulated.moxa", "--model", "E1212", "--port", "0", "--watchdog-s", "0.6"
-        )
+        self.block = Simulator("modbus.simulated.moxa", "--model", "E1212", "--port", "0", "--watchdog-s", "0.6")
         text = CONFIG.read_text()
         for name, device in (
             ("/dev/ttyUSB0", self.drive), ("/dev/ttyACM0", self.finger), ("192.168.127.254:502", self.block),
@@ -125,9 +123,7 @@ def test_limits_hold_and_a_refused_move_moves_nothing(bench: Bench, cell: sioms.
         axis.move(0.29)
         axis.wait_until_idle(10.0)
         axis.command(velocity=0.05)
-        wait_for(
-            lambda: axis.read().status[0] & AxisStatus.LIMIT_PLUS or not axis.read().in_motion[0], "the limit"
-        )
+        wait_for(lambda: axis.read().status[0] & AxisStatus.LIMIT_PLUS or not axis.read().in_motion[0], "the limit")
         at_rest(axis)
         assert bench.drive.tell("state")["position"] <= 0.30 * PULSES_PER_M + 1
 
@@ -207,9 +203,7 @@ def test_a_killed_driver_leaves_the_jogging_drive_to_its_dead_man(bench: Bench, 
     os.kill(before["pid"], signal.SIGSTOP)  # a driver that hangs is no better than a dead one
     wait_for(lambda: bench.velocity() == 0, "the drive stopped itself", 3.0)
     os.kill(before["pid"], signal.SIGKILL)
-    assert "device slide0" in wait_for(
-        lambda: cell.status()["stop_source"], "the workcell stopped, as configured"
-    )
+    assert "device slide0" in wait_for(lambda: cell.status()["stop_source"], "the workcell stopped, as configured")
     after = bench.daemon.wait_up("slide0", before["generation"] + 1)
     assert after["pid"] != before["pid"] and bench.velocity() == 0
     assert [bench.daemon.device(name)["pid"] for name in ("tactile0", "io0")] == others
@@ -230,9 +224,7 @@ def test_a_port_that_vanishes_stops_the_workcell_and_comes_back(bench: Bench, ce
         bench.drive.tell("plug")
         bench.daemon.wait_up("slide0")
         cell.reset()
-        wait_for(
-            lambda: not axis.read().status[0] & (AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP), "the reset"
-        )
+        wait_for(lambda: not axis.read().status[0] & (AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP), "the reset")
         assert bench.velocity() == 0, "nothing resumes"
         axis.move(0.01)
         axis.wait_until_idle(10.0)
@@ -257,9 +249,7 @@ def test_a_noisy_stream_publishes_nothing_wrong(bench: Bench, cell: sioms.Workce
         finger.read()
 
 
-def test_outputs_are_confirmed_by_the_block_and_safe_after_their_writer(
-    bench: Bench, cell: sioms.Workcell
-) -> None:
+def test_outputs_are_confirmed_by_the_block_and_safe_after_their_writer(bench: Bench, cell: sioms.Workcell) -> None:
     victim = Client(bench.daemon, "io = cell.open('io0.do', 'rw')\nio.set(0b1101)\nsay('ready')\nhold()")
     assert bench.block.tell("state")["do"][:4] == [1, 0, 1, 1], "set when the write is acknowledged"
     victim.kill()
@@ -272,7 +262,9 @@ def test_outputs_are_confirmed_by_the_block_and_safe_after_their_writer(
 
 
 def test_a_block_whose_watchdog_has_acted_is_opened_again(bench: Bench, cell: sioms.Workcell) -> None:
-    """Its outputs fell while the driver was silent: they stay off until somebody writes, and the watchdog watches again."""
+    """Its outputs fell while the driver was silent: they stay off until somebody writes, and the watchdog watches
+    again.
+    """
     driver = bench.daemon.device("io0")["pid"]
     with cell.open("io0.do", "rw", timeout=3.0) as io:
         io.set(0b1)

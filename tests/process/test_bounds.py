@@ -72,9 +72,7 @@ def test_a_client_for_whom_there_is_no_descriptor_is_told_so_and_others_can_stop
 
 
 def test_persisting_markers_are_bounded(daemon: Daemon, cell: sioms.Workcell) -> None:
-    markers = cell.reserve_markers(
-        512, persist=True
-    )  # four times as many as the quota, for the daemon's own user
+    markers = cell.reserve_markers(512, persist=True)  # four times as many as the quota, for the daemon's own user
     try:
         with sioms.Workcell(daemon.socket) as other, raises(errno.EBUSY, "has 512 markers"):
             other.reserve_markers(1, persist=True)

@@ -1,4 +1,6 @@
-"""What dies or hangs in mid-motion: client, driver, daemon, nursery. Motion ends, nodes reopen, nobody reads old data as new."""
+"""What dies or hangs in mid-motion: client, driver, daemon, nursery. Motion ends, nodes reopen, nobody reads old data
+as new.
+"""
 
 from __future__ import annotations
 
@@ -88,9 +90,7 @@ def test_hung_client_with_a_lease_loses_its_axes(
         victim.wait_line("TimeoutError|silent for longer than its lease of 0.2 s|process behind it has gone")
 
 
-def test_killed_driver_gives_eio_with_reason_and_comes_back_at_rest(
-    daemon: Daemon, cell: sioms.Workcell
-) -> None:
+def test_killed_driver_gives_eio_with_reason_and_comes_back_at_rest(daemon: Daemon, cell: sioms.Workcell) -> None:
     before = daemon.device("mod0")
     others = {name: daemon.device(name)["pid"] for name in ("mod1", "io0", "force0")}
     axis = cell.open("mod0.xaxis", "rw")
@@ -145,9 +145,7 @@ def test_the_lease_of_readings_can_be_configured(start_daemon: Callable[..., Dae
         long.read()
 
 
-def test_killed_nursery_harms_no_driver_and_a_new_one_restarts_them(
-    daemon: Daemon, cell: sioms.Workcell
-) -> None:
+def test_killed_nursery_harms_no_driver_and_a_new_one_restarts_them(daemon: Daemon, cell: sioms.Workcell) -> None:
     with cell.open("mod1", "rw") as axis:
         axis.command(velocity=0.05)
         os.kill(daemon.nursery(), signal.SIGKILL)
@@ -178,9 +176,7 @@ def test_five_deaths_in_a_minute_are_a_fault_until_reset(start_daemon: Callable[
         cell.open("io0").close()
 
 
-def test_killed_daemon_stops_all_drivers(
-    start_daemon: Callable[..., Daemon], client: Callable[..., Client]
-) -> None:
+def test_killed_daemon_stops_all_drivers(start_daemon: Callable[..., Daemon], client: Callable[..., Client]) -> None:
     daemon = start_daemon()
     pids = [daemon.device(name)["pid"] for name in ("mod0", "mod1", "io0", "force0")]
     cell = daemon.cell()

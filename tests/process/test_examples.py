@@ -76,9 +76,7 @@ def test_the_damper_in_the_shell_acts_on_each_sample_as_it_comes(socket_path: st
                 before = reading.commanded_velocity[0]
                 moved.append(time.monotonic())
         assert damper.returncode == 0
-    assert len(moved) > 20 and moved[-1] - moved[0] > 1.0, (
-        f"{len(moved)} changes of velocity; want some 100 in 2 s"
-    )
+    assert len(moved) > 20 and moved[-1] - moved[0] > 1.0, f"{len(moved)} changes of velocity; want some 100 in 2 s"
 
 
 def test_slider_moves_with_the_arrow_keys(socket_path: str) -> None:

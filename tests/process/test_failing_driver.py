@@ -75,9 +75,7 @@ DRIVER = Careless
 '''
 
 
-def test_an_exception_in_a_write_is_told_as_the_drivers_with_its_place(
-    start: Any, short_folder: Path
-) -> None:
+def test_an_exception_in_a_write_is_told_as_the_drivers_with_its_place(start: Any, short_folder: Path) -> None:
     (short_folder / "careless.py").write_text(WRITER)
     wire = Wire(start, short_folder, "modbus.simulated.leadshine")
     wire.serve('[device.io0]\ndriver = "./careless.py"\noutputs = 4\nsafe = 0\n')

@@ -30,11 +30,15 @@ from sioms.protocol.flags import AnalogStatus, Request
 LOAD = (10.0, -20.0, 30.0, 1.0, -2.0, 3.0)
 PUT = "load " + " ".join(map(str, LOAD))
 FT300 = 'driver = "ft300"\nline = { serial = "{port}", baud = 19200 }\n'
-ATI = '[device.f0]\ndriver = "ati-rdt"\nline = { udp = "{port}" }\npage = "{port}"\nfull_scale = [400, 400, 400, 20, 20, 20]\n'
+ATI = (
+    '[device.f0]\ndriver = "ati-rdt"\nline = { udp = "{port}" }\npage = "{port}"\nfull_scale = [400, 400, 400, 20, 20, '
+    "20]\n"
+)
 ADC = 'driver = "framed-adc"\nchannels = 4\nrate_hz = 200\nline = { serial = "{port}", baud = 921600 }\n'
 LINES = 'driver = "ascii-stream"\ncolumns = ["a", "b"]\nrate_hz = 200.0\ntime = "ms"\nline = { serial = "{port}" }\n'
 IIO = (
-    'driver = "iio"\ndevice = "iio_dummy_part_no"\nmode = "buffer"\ntrigger = "instance1"\nchannels = ["voltage0"]\nrate_hz = 200.0\n'
+    'driver = "iio"\ndevice = "iio_dummy_part_no"\nmode = "buffer"\ntrigger = "instance1"\nchannels = '
+    '["voltage0"]\nrate_hz = 200.0\n'
     'sysfs = "{port}/sysfs"\ndev = "{port}/dev"\n'
 )
 SCHUNK = '[device.f0]\ndriver = "schunk-ft"\nline = { tcp = "{port}" }\ndata = "{port}"\n'
@@ -134,8 +138,7 @@ def test_an_outside_master_agrees_on_the_ft300_and_the_driver_polls(
     master = minimalmodbus.Instrument(wire.port, 9)
     master.serial.baudrate, master.serial.timeout = 19200, 0.3
     assert (
-        master.read_string(500, 3) == "FT3-21"
-        and master.read_register(513) << 16 | master.read_register(512) == 123456
+        master.read_string(500, 3) == "FT3-21" and master.read_register(513) << 16 | master.read_register(512) == 123456
     )
     words = [master.read_register(180 + i, signed=True) for i in range(6)]
     assert words == pytest.approx([1000, -2000, 3000, 1000, -2000, 3000], abs=40)
@@ -203,9 +206,7 @@ def test_ati_through_a_bad_network_stalls_and_deaths(start: Callable[..., Any], 
         node.wait_new(number + 200, 5.0)
         history = node.history(number)
         stamps = [snapshot.stamp_ns for snapshot in history]
-        assert (stamps[-1] - stamps[0]) / (history[-1].number - history[0].number) == pytest.approx(
-            1e6, rel=0.02
-        )
+        assert (stamps[-1] - stamps[0]) / (history[-1].number - history[0].number) == pytest.approx(1e6, rel=0.02)
         before = stream(node)
         wire.tell("mute 5")
         wait_for(lambda: stream(node)["lost"] >= before["lost"] + 5, "losses counted")
@@ -254,11 +255,7 @@ def test_ati_through_a_bad_network_stalls_and_deaths(start: Callable[..., Any], 
 
 def forge(node: Any, pid: int) -> None:
     """Send the driver datagrams from elsewhere: they are counted and change nothing."""
-    inodes = {
-        os.readlink(f"/proc/{pid}/fd/{fd}")[8:-1]
-        for fd in os.listdir(f"/proc/{pid}/fd")
-        if _is_socket(pid, fd)
-    }
+    inodes = {os.readlink(f"/proc/{pid}/fd/{fd}")[8:-1] for fd in os.listdir(f"/proc/{pid}/fd") if _is_socket(pid, fd)}
     rows = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
     (port,) = {int(row[1].split(":")[1], 16) for row in rows if row[9] in inodes}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
@@ -322,10 +319,19 @@ OK = b"HTTP/1.0 200 OK\r\n\r\n"
 BAD_PAGES: dict[str, tuple[bytes, str]] = {
     "mute": (b"HTTP/1.0 200 OK\r\nContent-Length: 999999999\r\n\r\n", "no reply within its time-out"),
     "endless": (OK + b"x" * 100_000, "the page is longer than 65536 bytes"),
-    "other": (b"HTTP/1.0 200 OK\r\nContent-Length: 5\r\n\r\nhello", "no element prodname; is this a Net F/T or an Ethernet Axia"),
-    "absent": (b"HTTP/1.0 404 Not Found\r\nContent-Length: 0\r\n\r\n", "the web server answers 404; is it another device"),
-    "number": (b"HTTP/1.0 200 OK\r\nContent-Length: %d\r\n\r\n" % len(PAGE) + PAGE.replace(b"1e6", b"NaN", 1), "cfgcpf is 'NaN'"),
-}  # fmt: skip
+    "other": (
+        b"HTTP/1.0 200 OK\r\nContent-Length: 5\r\n\r\nhello",
+        "no element prodname; is this a Net F/T or an Ethernet Axia",
+    ),
+    "absent": (
+        b"HTTP/1.0 404 Not Found\r\nContent-Length: 0\r\n\r\n",
+        "the web server answers 404; is it another device",
+    ),
+    "number": (
+        b"HTTP/1.0 200 OK\r\nContent-Length: %d\r\n\r\n" % len(PAGE) + PAGE.replace(b"1e6", b"NaN", 1),
+        "cfgcpf is 'NaN'",
+    ),
+}
 """What a web server says, bytes at a time, and the words of the sentence; it keeps the connection open."""
 
 
@@ -367,9 +373,7 @@ def test_ati_with_a_page_that_is_none(start: Callable[..., Any], short_folder: P
         wire.wait_up("mute")
 
 
-def test_schunk_through_a_bad_network_stalls_and_deaths(
-    start: Callable[..., Any], short_folder: Path
-) -> None:
+def test_schunk_through_a_bad_network_stalls_and_deaths(start: Callable[..., Any], short_folder: Path) -> None:
     wire = Sensor(start, short_folder, "schunk_ft.simulator", "--port", "0", "--data-port", "0")
     cell = wire.serve(SCHUNK + "tool = 1\nnoise_filter = 2\n")
     wire.wait_up("f0")
@@ -385,9 +389,7 @@ def test_schunk_through_a_bad_network_stalls_and_deaths(
             ("cut 2 10", "malformed", 2),
         ):
             wire.tell(fault)
-            wait_for(
-                lambda k=counter, n=count: stream(node)[k] >= before[k] + n, f"{fault} counted as {counter}"
-            )
+            wait_for(lambda k=counter, n=count: stream(node)[k] >= before[k] + n, f"{fault} counted as {counter}")
         node.ioctl(Request.CALIBRATE_DEVICE, timeout=5.0)
         shows(node, (0.0,) * 6, "tared by the sensor")
         node.ioctl(Request.CALIBRATE_DEVICE, 0, timeout=5.0)
@@ -423,11 +425,13 @@ STOP = 'on_loss = "stop"\n'
 @pytest.mark.parametrize(
     ("name", "options", "table", "words"),
     [
-        ("schunk_ft.simulator", ("--port", "0", "--data-port", "0"), SCHUNK, "their number stands still at .*: the sensor is frozen"),
+        ("schunk_ft.simulator", ("--port", "0", "--data-port", "0"), SCHUNK, "their number stands still at .*: the "
+                                                                             "sensor is frozen"),
         ("ati_rdt.simulator", ("--port", "0"), ATI, "their number stands still at .*: the sensor is frozen"),
         ("ft300.simulator", ("--baud", "19200"), "[device.f0]\n" + FT300, "the last [0-9]+ records were all the same"),
-        ("framed_adc.simulator", ("--channels", "4"), "[device.f0]\n" + ADC, "their number stands still at .*: the device is frozen"),
-        ("ascii_stream.simulator", ("--rate", "200", "--time", "ms"), "[device.f0]\n" + LINES, "their time stands still at .* ms: the device is frozen"),
+        ("framed_adc.simulator", ("--channels", "4"), "[device.f0]\n" + ADC, "their number stands still at .*: the "
+                                                                             "device is frozen"),
+        ("ascii_stream.simulator", ("--rate", "200", "--time", "ms"), "[device.f0]\n" + LINES, "their time stands still at .* ms: the device is frozen"),  # noqa: E501
         ("iio.simulator", (), "[device.f0]\n" + IIO, "the time at which they were taken stands still"),
     ],
 )  # fmt: skip
@@ -458,7 +462,9 @@ def test_a_frozen_stream_is_a_lost_link_and_stops_the_workcell(
 
 
 def test_schunk_connection_lost_and_box_restarted(start: Callable[..., Any], short_folder: Path) -> None:
-    """Replies are numbered from 1 on each connection; a supply that is off for 0.3 s leaves the host's connection dead, without a word."""
+    """Replies are numbered from 1 on each connection; a supply that is off for 0.3 s leaves the host's connection dead,
+    without a word.
+    """
     wire = Sensor(start, short_folder, "schunk_ft.simulator", "--port", "0", "--data-port", "0")
     cell = wire.serve(SCHUNK + "noise_filter = 3\n")
     wire.wait_up("f0")
@@ -472,10 +478,7 @@ def test_schunk_connection_lost_and_box_restarted(start: Callable[..., Any], sho
         wire.wait_up("f0")
         state = wire.tell("state")
         assert state["noise_filter"] == 3 and not state["tared"]
-        assert (
-            flags(node) == AnalogStatus.INVALID
-            and "zero lost: its tare may be gone" in stream(node)["status"]
-        )
+        assert flags(node) == AnalogStatus.INVALID and "zero lost: its tare may be gone" in stream(node)["status"]
         wire.tell("refuse 1")
         with raises(errno.EBUSY, "tare: the sensor answers error 04, busy"):
             node.ioctl(Request.CALIBRATE_DEVICE, timeout=5.0)

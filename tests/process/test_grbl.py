@@ -210,9 +210,7 @@ def test_line_faults_and_deaths_on_tcp(start: Callable[..., Any], short_folder: 
 
         wait_for(place_is_lost, "the loss", 5.0)
         wait_for(lambda: wire.state("velocity") == 0, "rest")
-        assert (
-            abs(wire.state("position")[0]) < 5.0
-        )  # a jog that had left before the greeting came is cancelled
+        assert abs(wire.state("position")[0]) < 5.0  # a jog that had left before the greeting came is cancelled
         x.reset()
         with raises(1, "HOME it"):
             x.move(0.01)

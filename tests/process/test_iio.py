@@ -1,4 +1,6 @@
-"""Linux IIO: the driver under the real daemon on files that behave like the kernel's dummy device as far as files can."""
+"""Linux IIO: the driver under the real daemon on files that behave like the kernel's dummy device as far as files
+can.
+"""
 
 from __future__ import annotations
 

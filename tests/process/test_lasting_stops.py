@@ -209,12 +209,8 @@ def test_a_reset_does_not_swallow_a_stop_that_nobody_has_heard_yet(
     raise AssertionError("no reset was refused")
 
 
-@pytest.mark.parametrize(
-    ("tick_hz", "by"), [(100.0, "file"), (20.0, "daemon"), (20.0, "file"), (20.0, "death")]
-)
-def test_a_stop_does_not_wait_for_the_tick(
-    start_daemon: Callable[..., Daemon], tick_hz: float, by: str
-) -> None:
+@pytest.mark.parametrize(("tick_hz", "by"), [(100.0, "file"), (20.0, "daemon"), (20.0, "file"), (20.0, "death")])
+def test_a_stop_does_not_wait_for_the_tick(start_daemon: Callable[..., Daemon], tick_hz: float, by: str) -> None:
     slow = axes("mod0", "xaxis", extra=f"tick_hz = {tick_hz}").replace(
         "position_min", "bandwidth_hz = 1.0\nposition_min"
     )

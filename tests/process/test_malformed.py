@@ -1,4 +1,6 @@
-"""Truncated, oversized and senseless messages on both sockets: they end that connection, and nothing else; nothing moves."""
+"""Truncated, oversized and senseless messages on both sockets: they end that connection, and nothing else; nothing
+moves.
+"""
 
 from __future__ import annotations
 
@@ -179,9 +181,7 @@ BAD_HANDLE = [
 
 
 @pytest.mark.parametrize("packet", BAD_SESSION, ids=lambda p: p[:12].hex() or "empty")
-def test_bad_message_ends_its_session_only(
-    bystander: Bystander, raw: Callable[[], Raw], packet: bytes
-) -> None:
+def test_bad_message_ends_its_session_only(bystander: Bystander, raw: Callable[[], Raw], packet: bytes) -> None:
     session = raw()
     session.sock.send(packet)
     assert session.is_ended()
@@ -231,9 +231,7 @@ def test_bad_message_ends_its_handle_only(
 
 
 def test_end_of_a_session_is_told_in_the_log(start_daemon: Callable[..., Daemon]) -> None:
-    daemon = (
-        start_daemon()
-    )  # of its own: what many sessions do at once is counted in the log, not told one by one
+    daemon = start_daemon()  # of its own: what many sessions do at once is counted in the log, not told one by one
     session = Raw(daemon.socket)
     session.sock.send(encode(250, 1, "oddity"))
     assert session.is_ended()
@@ -313,9 +311,7 @@ def test_parts_of_a_write_that_never_came_are_dropped(handle: Callable[..., tupl
     assert decode(node.sock.recv(MAX_PACKET))[2] == 0
 
 
-@pytest.mark.parametrize(
-    "arguments", [(), (1,), (1, "text"), ("1", b""), (1, bytes(MAX_INLINE + 1)), (1, b"", 2)]
-)
+@pytest.mark.parametrize("arguments", [(), (1,), (1, "text"), ("1", b""), (1, bytes(MAX_INLINE + 1)), (1, b"", 2)])
 def test_a_malformed_part_ends_the_connection(
     handle: Callable[..., tuple[Raw, Raw]], arguments: tuple[object, ...]
 ) -> None:
@@ -325,9 +321,7 @@ def test_a_malformed_part_ends_the_connection(
     assert node.is_ended()
 
 
-def test_descriptors_sent_along_do_not_pile_up(
-    daemon: Daemon, handle: Callable[..., tuple[Raw, Raw]]
-) -> None:
+def test_descriptors_sent_along_do_not_pile_up(daemon: Daemon, handle: Callable[..., tuple[Raw, Raw]]) -> None:
     pid = daemon.device("mod0")["pid"]
     _descriptors = lambda: len(os.listdir(f"/proc/{pid}/fd"))  # noqa: E731
     before = _descriptors()
@@ -348,11 +342,53 @@ def test_descriptors_sent_along_do_not_pile_up(
 
 
 WORDS: list[object] = [
-    None, True, False, 0, 1, -1, 2, 3, 64, 1 << 31, 1 << 32, (1 << 63) - 1, 1 << 63, -(1 << 63), 0.0, -0.0, 1e308, -1e308,
-    math.inf, -math.inf, math.nan, 5e-324, "", "mod0", "mod0.xaxis", "io0", "force0", "\0", "x" * 5000, b"", b"\0" * 144,
-    b"\xff" * 144, b"\xff" * 1008, [], [0], [[]], [math.nan], [1e308], list(range(50)), {}, {"position_max": 0.1},
-    {"position_max": math.nan}, {"": None}, {"velocity_max": "fast"}, msgpack.Timestamp(0), msgpack.ExtType(5, b"x"),
-]  # fmt: skip
+    None,
+    True,
+    False,
+    0,
+    1,
+    -1,
+    2,
+    3,
+    64,
+    1 << 31,
+    1 << 32,
+    (1 << 63) - 1,
+    1 << 63,
+    -(1 << 63),
+    0.0,
+    -0.0,
+    1e308,
+    -1e308,
+    math.inf,
+    -math.inf,
+    math.nan,
+    5e-324,
+    "",
+    "mod0",
+    "mod0.xaxis",
+    "io0",
+    "force0",
+    "\0",
+    "x" * 5000,
+    b"",
+    b"\0" * 144,
+    b"\xff" * 144,
+    b"\xff" * 1008,
+    [],
+    [0],
+    [[]],
+    [math.nan],
+    [1e308],
+    list(range(50)),
+    {},
+    {"position_max": 0.1},
+    {"position_max": math.nan},
+    {"": None},
+    {"velocity_max": "fast"},
+    msgpack.Timestamp(0),
+    msgpack.ExtType(5, b"x"),
+]
 
 
 def _fuzz(chance: random.Random, verbs: list[int], number: int) -> bytes:
@@ -454,12 +490,22 @@ def _without_stop(packet: bytes) -> bytes:
 def test_no_field_of_a_record_takes_what_is_not_finite(cell: sioms.Workcell, bits: bytes) -> None:
     """Every double of the record, with every flag that makes it hold: refused, and nothing moves."""
     words = {
-        "position": {}, "velocity": {}, "acceleration": {}, "jerk": {}, "force": {}, "force_velocity": {},
-        "time": {"position": 0.0}, "max_velocity": {"position": 0.0, "max_acceleration": 1.0},
-        "max_acceleration": {"position": 0.0, "max_velocity": 1.0}, "k": {"position": 0.0, "kz": 0, "kp": 0, "kb": 0},
-        "kz": {"position": 0.0, "k": 1, "kp": 0, "kb": 0}, "kp": {"position": 0.0, "k": 1, "kz": 0, "kb": 0},
-        "kb": {"position": 0.0, "k": 1, "kz": 0, "kp": 0}, "force_offset": {"position": 0.0}, "max_force": {"position": 0.0},
-    }  # fmt: skip
+        "position": {},
+        "velocity": {},
+        "acceleration": {},
+        "jerk": {},
+        "force": {},
+        "force_velocity": {},
+        "time": {"position": 0.0},
+        "max_velocity": {"position": 0.0, "max_acceleration": 1.0},
+        "max_acceleration": {"position": 0.0, "max_velocity": 1.0},
+        "k": {"position": 0.0, "kz": 0, "kp": 0, "kb": 0},
+        "kz": {"position": 0.0, "k": 1, "kp": 0, "kb": 0},
+        "kp": {"position": 0.0, "k": 1, "kz": 0, "kb": 0},
+        "kb": {"position": 0.0, "k": 1, "kz": 0, "kp": 0},
+        "force_offset": {"position": 0.0},
+        "max_force": {"position": 0.0},
+    }
     value = struct.unpack("<d", bits)[0]
     with cell.open("mod0.xaxis", "rw", timeout=3.0) as axis:
         for name, others in words.items():

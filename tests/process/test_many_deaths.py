@@ -46,9 +46,7 @@ def test_some_hundred_deaths_of_clients_leave_nothing(
         killer = start([sys.executable, "-c", DEATHS, daemon.socket, str(count)])
         assert killer.wait_exit(100.0) == 0, killer.lines  # type: ignore[attr-defined]
         with daemon.cell("who looks") as cell:
-            wait_for(
-                lambda: len(cell.status()["sessions"]) == 1 and not cell.status()["holders"], "all have gone"
-            )
+            wait_for(lambda: len(cell.status()["sessions"]) == 1 and not cell.status()["holders"], "all have gone")
             with cell.open("mod0.readonly") as watch:
                 wait_for(lambda: watch.statistics(1)["handles"] == 1, "all handles have ended")
         return [left_of(pid) for pid in (driver, daemon.pid)]

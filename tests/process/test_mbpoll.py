@@ -14,9 +14,7 @@ from daemon_rig import wait_for
 from wire_rig import Wire
 
 MBPOLL = shutil.which("mbpoll")
-pytestmark = pytest.mark.skipif(
-    MBPOLL is None, reason="no mbpoll here; Debian and Ubuntu have the package mbpoll"
-)
+pytestmark = pytest.mark.skipif(MBPOLL is None, reason="no mbpoll here; Debian and Ubuntu have the package mbpoll")
 
 
 def ask(where: list[str], table: str, address: int, count: int = 1, *values: int) -> list[int]:
@@ -24,7 +22,8 @@ def ask(where: list[str], table: str, address: int, count: int = 1, *values: int
 
     Args:
         where: options of the line and, last, its port.
-        table: mbpoll's type: 0 coils, 1 discrete inputs, 3 input registers, 4 holding registers, with ``:int`` of 32 bits.
+        table: mbpoll's type: 0 coils, 1 discrete inputs, 3 input registers, 4 holding registers, with ``:int`` of 32
+            bits.
         address: as on the wire.
     """
     *options, port = where
@@ -61,8 +60,6 @@ def test_the_moxa(start: Callable[..., Any], short_folder: Path) -> None:
     where = ["-m", "tcp", "-a", "1", "-p", port, host]
     wire.tell("loop on")
     ask(where, "0", 0, 1, 1, 0, 1, 1, 0, 0, 0, 1)
-    assert (
-        ask(where, "0", 0, 8) == [1, 0, 1, 1, 0, 0, 0, 1] == ask(where, "1", 0, 8) == wire.tell("state")["do"]
-    )
+    assert ask(where, "0", 0, 8) == [1, 0, 1, 1, 0, 0, 0, 1] == ask(where, "1", 0, 8) == wire.tell("state")["do"]
     words = ask(where, "3", 5000, 3)
     assert b"".join(word.to_bytes(2, "big") for word in words) == b"E1212\0"

@@ -49,10 +49,10 @@ def status(axis: Any) -> int:
         return 0
 
 
-def test_a_cut_cable_drops_the_outputs_behind_each_opening(
-    start: Callable[..., Any], short_folder: Path
-) -> None:
-    """The coupler's watchdog starts when its trigger is modified: the first opening of its life proves nothing for the others."""
+def test_a_cut_cable_drops_the_outputs_behind_each_opening(start: Callable[..., Any], short_folder: Path) -> None:
+    """The coupler's watchdog starts when its trigger is modified: the first opening of its life proves nothing for the
+    others.
+    """
     wire = Wire(start, short_folder, "modbus.simulated.wago", "--port", "0")
     cell = wire.serve(WAGO)
     for opening in range(4):

@@ -217,9 +217,7 @@ def test_synch_starts_two_processes_at_one_instant(cell: sioms.Workcell) -> None
     with cell.open("mod0.xaxis", "rw") as first, cell.open("mod1", "rw") as second:
         for axis in (first, second):
             axis.move(0.02, synch=True)
-            wait_for(
-                lambda axis=axis: axis.read().status[0] & AxisStatus.WAITING_SYNCH, "waiting for the synch"
-            )
+            wait_for(lambda axis=axis: axis.read().status[0] & AxisStatus.WAITING_SYNCH, "waiting for the synch")
         number = first.read().number
         first.wait_new(number + 50, 2.0)
         assert not first.read().in_motion[0] or first.read().commanded_velocity[0] == 0.0
@@ -227,13 +225,15 @@ def test_synch_starts_two_processes_at_one_instant(cell: sioms.Workcell) -> None
         for axis in (first, second):
             axis.wait_until_idle(5.0)
         started = [
-            next(s.stamp_ns for s in axis.history(0) if s.stamp_ns >= start_ns - 20_000_000 and s.commanded_velocity[0] > 0)
+            next(
+                s.stamp_ns
+                for s in axis.history(0)
+                if s.stamp_ns >= start_ns - 20_000_000 and s.commanded_velocity[0] > 0
+            )
             for axis in (first, second)
-        ]  # fmt: skip
+        ]
         skew_ms = abs(started[0] - started[1]) / 1e6
-        print(
-            f"first motion {[(s - start_ns) / 1e6 for s in started]} ms after the instant, skew {skew_ms:.3f} ms"
-        )
+        print(f"first motion {[(s - start_ns) / 1e6 for s in started]} ms after the instant, skew {skew_ms:.3f} ms")
         assert skew_ms <= 1.0 and all(0 <= s - start_ns <= 3_000_000 for s in started)
         with raises(errno.ETIME, "ms ago", "lead"):
             first.synch(time.monotonic_ns() - 50_000_000)

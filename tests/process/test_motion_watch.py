@@ -1,4 +1,6 @@
-"""The motion watch under the real daemon: what a drive does by itself ends in a stop and a fault, what clients do does not."""
+"""The motion watch under the real daemon: what a drive does by itself ends in a stop and a fault, what clients do does
+not.
+"""
 
 from __future__ import annotations
 
@@ -57,9 +59,7 @@ def clear(axis: Any) -> None:
     wait_for(lambda: not axis.read().status[0] & AxisStatus.FAULT, "the reset")
 
 
-def test_motion_that_nobody_commanded_is_stopped_and_told(
-    start: Callable[..., Any], short_folder: Path
-) -> None:
+def test_motion_that_nobody_commanded_is_stopped_and_told(start: Callable[..., Any], short_folder: Path) -> None:
     wire = Wire(start, short_folder, "tmcl.simulator", "--motors", "1", "--baud", "115200")
     cell = wire.serve(MODULE)
     wire.wait_up("mod0")

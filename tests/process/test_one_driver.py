@@ -8,7 +8,10 @@ from collections.abc import Callable
 
 from daemon_rig import Daemon, wait_for
 
-SCALE = '[device.scale0]\ndriver = "ascii-stream"\nline = {{ tcp = "127.0.0.1:{port}" }}\ncolumns = ["a"]\nrate_hz = 100.0\n'
+SCALE = (
+    '[device.scale0]\ndriver = "ascii-stream"\nline = {{ tcp = "127.0.0.1:{port}" }}\ncolumns = ["a"]\nrate_hz = '
+    "100.0\n"
+)
 
 
 def why(daemon: Daemon) -> str:
@@ -16,9 +19,7 @@ def why(daemon: Daemon) -> str:
     return str(daemon.device("scale0").get("link_reason", ""))
 
 
-def test_two_daemons_do_not_drive_one_device(
-    start_daemon: Callable[..., Daemon], free_port: Callable[[], int]
-) -> None:
+def test_two_daemons_do_not_drive_one_device(start_daemon: Callable[..., Daemon], free_port: Callable[[], int]) -> None:
     text = SCALE.format(port=free_port())
     first = start_daemon(text)
     wait_for(lambda: "refused" in why(first), "the first has tried to connect")

@@ -67,9 +67,7 @@ def test_the_power_supply(start: Callable[..., Any], short_folder: Path) -> None
     with cell.open("supply0.meas") as meas, cell.open("supply0.cc") as limiting:
         with cell.open("supply0", "rw") as volts:
             volts.set(12.0, 5.0)
-            wait_for(
-                lambda: meas.read().data == pytest.approx([12.0, 1.2, 5.0, 0.0], abs=0.01), "the voltages"
-            )
+            wait_for(lambda: meas.read().data == pytest.approx([12.0, 1.2, 5.0, 0.0], abs=0.01), "the voltages")
             wire.tell("load 1 2")
             wait_for(
                 lambda: limiting.read().data[0] == 1 and meas.read().data[1] == pytest.approx(2.0, abs=0.01),

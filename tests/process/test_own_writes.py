@@ -1,4 +1,6 @@
-"""No reading is older than what the same process has been acknowledged: each request, through each node, twenty times."""
+"""No reading is older than what the same process has been acknowledged: each request, through each node, twenty
+times.
+"""
 
 from __future__ import annotations
 
@@ -209,7 +211,9 @@ def test_in_an_event_loop(daemon: Daemon) -> None:
 
 
 def test_two_clients_on_bits_of_one_port_at_once(daemon: Daemon) -> None:
-    """Each sees its own bit as it was acknowledged, through its own node and through the port, while the other writes beside it."""
+    """Each sees its own bit as it was acknowledged, through its own node and through the port, while the other writes
+    beside it.
+    """
     stale: list[tuple[int, str]] = []
 
     def turn(number: int, barrier: threading.Barrier) -> None:

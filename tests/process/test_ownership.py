@@ -204,8 +204,7 @@ def test_bounds_and_quotas(start_daemon: Callable[..., Daemon]) -> None:
         ):
             second.reserve_markers(3)
         waiters = [
-            threading.Thread(target=lambda: _quiet(lambda: markers[0].wait(20.0)), daemon=True)
-            for _ in range(4)
+            threading.Thread(target=lambda: _quiet(lambda: markers[0].wait(20.0)), daemon=True) for _ in range(4)
         ]
         for waiter in waiters:
             waiter.start()
@@ -237,9 +236,7 @@ def test_silent_connections_are_few_and_end(start_daemon: Callable[..., Daemon])
         assert b"4 connections that have not said a word" in silent[4].recv(1000)
         assert b"nothing was said within 0.5 s" in silent[0].recv(1000)
         assert silent[0].recv(1000) == b""
-        wait_for(
-            lambda: len(cell.status()["sessions"]) == 1, "the silent ones are gone, who has spoken is not"
-        )
+        wait_for(lambda: len(cell.status()["sessions"]) == 1, "the silent ones are gone, who has spoken is not")
         for sock in silent:
             sock.close()
 
@@ -351,9 +348,7 @@ def test_foreign_user_with_a_grant_to_stop_needs_no_daemon(
 
 
 @pytest.mark.root
-def test_foreign_user_may_what_is_granted(
-    start_daemon: Callable[..., Daemon], start: Callable[..., object]
-) -> None:
+def test_foreign_user_may_what_is_granted(start_daemon: Callable[..., Daemon], start: Callable[..., object]) -> None:
     daemon = start_daemon(WORKCELL.replace('name = "test"', 'name = "test"\nsocket_mode = "0666"') + GRANTS)
     os.chmod(daemon.folder.parent, 0o755)
     said = _foreign(daemon, start)
@@ -364,9 +359,7 @@ def test_foreign_user_may_what_is_granted(
     assert allowed == {"list", "nodes", "read mod0", "write io0", "page"}
     assert said["page"][1] is False, "who may not stop gets no stop-request file"
     assert said["stop file"][0] == errno.EACCES, "and cannot open it either"
-    assert said["write mod0"][0] == errno.EACCES and "nobody has no right to write it" in str(
-        said["write mod0"][1]
-    )
+    assert said["write mod0"][0] == errno.EACCES and "nobody has no right to write it" in str(said["write mod0"][1])
     assert said["read force0"][0] == errno.EACCES
     for name in ("stop", "stop mod0", "reset", "reload", "ioctl stop mod0"):
         assert said[name][0] == errno.EPERM, (name, said[name])
@@ -424,9 +417,7 @@ def test_a_right_that_a_reload_takes_away_ends_what_was_open(
         cell.reload()
         at_rest(watch)
         assert client.wait_exit() == 0, client.lines
-        assert any(f"{errno.EACCES} mod0.xaxis: the right to write it" in line for line in client.lines), (
-            client.lines
-        )
+        assert any(f"{errno.EACCES} mod0.xaxis: the right to write it" in line for line in client.lines), client.lines
         assert client.lines[-1] == "still reads"
         assert daemon.device("mod0")["pid"] == pid, "the device was not touched"
 

@@ -68,9 +68,7 @@ high = 5.0
 def port(tmp_path: Path) -> Iterator[str]:
     """A drive that lives on when its driver dies."""
     link = ["--link", str(tmp_path / "port")]
-    drive = Running(
-        [sys.executable, "-m", "sioms.drivers.modbus.simulated.leadshine", *link, "--units", "1"], {}, None
-    )
+    drive = Running([sys.executable, "-m", "sioms.drivers.modbus.simulated.leadshine", *link, "--units", "1"], {}, None)
     try:
         yield drive.wait_line(r"^ready (\S+)$").group(1)
     finally:
@@ -80,9 +78,7 @@ def port(tmp_path: Path) -> Iterator[str]:
 def kept_at_rest(folder: Path, device: str) -> None:
     """Wait until the file of a device says that it is at rest."""
     path = folder / f"{device}.positions"
-    wait_for(
-        lambda: all(e.state & AT_REST for e in decode(path.read_bytes()).entries.values()), "noted at rest"
-    )
+    wait_for(lambda: all(e.state & AT_REST for e in decode(path.read_bytes()).entries.values()), "noted at rest")
 
 
 def kill(daemon: Daemon, device: str) -> None:

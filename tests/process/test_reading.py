@@ -243,9 +243,7 @@ def test_a_bit_node_shows_and_waits_for_its_own_bit(cell: sioms.Workcell) -> Non
         assert (event.initial, event.final) == (0, 1)
 
 
-def test_edges_wake_a_waiting_client(
-    daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client]
-) -> None:
+def test_edges_wake_a_waiting_client(daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client]) -> None:
     waiter = client(
         daemon,
         "node = cell.open('io0.in.bit0')\nsay('ready')\n"
@@ -344,8 +342,11 @@ def test_many_threads_wait_for_one_node(cell: sioms.Workcell) -> None:
         start = inputs.read()
         woken: list[int] = []
         threads = [
-            threading.Thread(target=lambda: woken.append(inputs.wait_event(last=start, timeout=10.0).final), daemon=True) for _ in range(5)
-        ]  # fmt: skip
+            threading.Thread(
+                target=lambda: woken.append(inputs.wait_event(last=start, timeout=10.0).final), daemon=True
+            )
+            for _ in range(5)
+        ]
         for thread in threads:
             thread.start()
         out.set(1)
@@ -376,22 +377,20 @@ def test_a_node_of_many_axes_and_a_workcell_of_many_nodes(start_daemon: Callable
             assert len(big.read()) == 800 and len(big.limits()["velocity_max"]) == 800
             big.write([sioms.command(i, position=0.001) for i in range(800)])
             big.wait_until_idle(20.0)
-            wait_for(
-                lambda: big.read().position == pytest.approx([0.001] * 800, abs=5e-4), "settled, at 5 Hz"
-            )
+            wait_for(lambda: big.read().position == pytest.approx([0.001] * 800, abs=5e-4), "settled, at 5 Hz")
 
 
 def test_edges_that_are_not_kept_are_counted_and_told(start_daemon: Callable[..., Daemon]) -> None:
-    """Twenty edges within half a second, of which the page keeps a quarter of a second: all, or a sentence with their number."""
+    """Twenty edges within half a second, of which the page keeps a quarter of a second: all, or a sentence with their
+    number.
+    """
     daemon = start_daemon('[workcell]\nname = "edges"\n[device.io0]\ndriver = "sim-io"\noutputs = 4\n')
     with daemon.cell() as cell, cell.open("io0", "rw") as port:
         start: sioms.Event | sioms.client.snapshot.BinarySnapshot = port.read()
         for i in range(20):
             port.set(i % 2 + 1)
             time.sleep(0.03)
-        with pytest.raises(
-            sioms.EdgesLost, match=r"\d+ edges of its port .* 256 publications are kept"
-        ) as gap:
+        with pytest.raises(sioms.EdgesLost, match=r"\d+ edges of its port .* 256 publications are kept") as gap:
             port.wait_event(last=start, timeout=1.0)
         last, told, lost = gap.value.event, 1, gap.value.lost
         assert gap.value.errno == errno.EOVERFLOW

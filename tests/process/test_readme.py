@@ -50,9 +50,7 @@ def test_the_first_session_works_when_it_is_pasted(tmp_path: Path) -> None:
 @pytest.mark.timeout(90)
 def test_the_script_runs_on_the_demo(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(block("python", "A control script"))
-    script = (
-        "siomsd --config etc/demo.toml & sioms wait; python3 -P $S; status=$?; kill %1; wait %1; exit $status"
-    )
+    script = "siomsd --config etc/demo.toml & sioms wait; python3 -P $S; status=$?; kill %1; wait %1; exit $status"
     environment = {
         **os.environ, "SIOMS_SOCKET": str(tmp_path / "d.sock"), "PATH": f"{BIN}:{os.environ['PATH']}",
         "S": str(tmp_path / "script.py"), "XDG_RUNTIME_DIR": str(tmp_path),

@@ -89,9 +89,7 @@ def daemon(start_daemon: Callable[..., Daemon], tmp_path: Path) -> Iterator[Daem
     yield start_daemon(cell(hidden), files={"twin.toml": MODEL})
 
 
-def workflow(
-    daemon: Daemon, folder: Path, *options: str, node: str = "mod0.xaxis", model: str = MODEL
-) -> Running:
+def workflow(daemon: Daemon, folder: Path, *options: str, node: str = "mod0.xaxis", model: str = MODEL) -> Running:
     """Start the workflow as a user does."""
     file = folder / "nominal.toml"
     file.write_text(model)
@@ -120,8 +118,7 @@ def test_a_hidden_friction_is_named_and_the_twin_takes_the_model(daemon: Daemon,
     assert any(name.startswith("one_speed") for name in records)
     for name in records:  # the axis stayed well within its limits
         positions = [
-            float(line.split(",")[1])
-            for line in (tmp_path / "report" / "records" / name).read_text().splitlines()[1:]
+            float(line.split(",")[1]) for line in (tmp_path / "report" / "records" / name).read_text().splitlines()[1:]
         ]
         assert max(map(abs, positions)) < 0.19
 
@@ -160,9 +157,7 @@ def test_two_effects_that_look_alike_are_told_apart_by_the_experiment_it_designs
     hidden.chmod(0o600)
     head = HEAD.format(device="mod0", more=f'effects_file = "{hidden}"')
     daemon = start_daemon('[workcell]\nname = "test"\n' + head + ARM)
-    run = workflow(
-        daemon, tmp_path, "--yes", "--first", "one_speed", "--lap", "2", node="mod0.arm", model=ARM_MODEL
-    )
+    run = workflow(daemon, tmp_path, "--yes", "--first", "one_speed", "--lap", "2", node="mod0.arm", model=ARM_MODEL)
     assert run.wait_exit(200.0) == NAMED, said(run)
     asked = next(line for line in run.lines if "not told apart" in line)
     assert "gravity" in asked
@@ -205,16 +200,28 @@ def test_an_interrupted_experiment_leaves_the_axis_halted_and_free(daemon: Daemo
             pass
 
 
-def test_nothing_moves_without_consent_and_a_node_of_another_kind_is_refused(
-    daemon: Daemon, tmp_path: Path
-) -> None:
+def test_nothing_moves_without_consent_and_a_node_of_another_kind_is_refused(daemon: Daemon, tmp_path: Path) -> None:
     run = workflow(daemon, tmp_path)
     assert run.wait_exit(120.0) == 2
     assert "--yes" in said(run)
     with daemon.cell() as session:
         assert session.open("mod0.xaxis.readonly").read().position[0] == 0.0
     (tmp_path / "nominal.toml").write_text(MODEL.replace("linear", "rotary"))
-    wrong = Running([sys.executable, "-m", "sioms.reconcile", "axis", "mod0.xaxis", "--model", str(tmp_path / "nominal.toml"),
-                     "--socket", daemon.socket, "--yes"], {}, None)  # fmt: skip
+    wrong = Running(
+        [
+            sys.executable,
+            "-m",
+            "sioms.reconcile",
+            "axis",
+            "mod0.xaxis",
+            "--model",
+            str(tmp_path / "nominal.toml"),
+            "--socket",
+            daemon.socket,
+            "--yes",
+        ],
+        {},
+        None,
+    )
     assert wrong.wait_exit(120.0) == 2
     assert "it is in m, the model in rad" in said(wrong)

@@ -1,4 +1,5 @@
-"""Reconcile a force/torque sensor behind the real daemon, loaded by axes, by a process that knows nothing of what it hides.
+"""Reconcile a force/torque sensor behind the real daemon, loaded by axes, by a process that knows nothing of what it
+hides.
 
 What the simulated sensor hides is in a file that only its driver has read; the file is gone before the workflow begins.
 """
@@ -27,7 +28,7 @@ force_max = 60.0
 following_error_max = 0.02
 bandwidth_hz = 60.0
 motor = {{ mass = 0.5, viscous = 5.0, coulomb = 0.02, stiction = 0.025, encoder_step = 1e-7, stop_minus = -0.02, stop_plus = 0.02, wall = {{ position = 0.002, stiffness = 40000.0, damping = 40.0 }} }}
-"""
+"""  # noqa: E501
 SENSOR = """
 [device.{name}]
 driver = "sim-force"
@@ -87,8 +88,22 @@ def workflow(daemon: Daemon, folder: Path, *options: str, stand: str = STAND) ->
     """Start the workflow as a user does."""
     for name, text in (("nominal.toml", MODEL), ("stand.toml", stand)):
         (folder / name).write_text(text)
-    command = [sys.executable, "-m", "sioms.reconcile", "force", "force0", "--model", str(folder / "nominal.toml"),
-               "--stand", str(folder / "stand.toml"), "--socket", daemon.socket, "--out", str(folder / "report"), *options]  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "sioms.reconcile",
+        "force",
+        "force0",
+        "--model",
+        str(folder / "nominal.toml"),
+        "--stand",
+        str(folder / "stand.toml"),
+        "--socket",
+        daemon.socket,
+        "--out",
+        str(folder / "report"),
+        *options,
+    ]
     return Running(command, {"OPENBLAS_NUM_THREADS": "1"}, None)
 
 
@@ -101,7 +116,9 @@ def said(run: Running) -> str:
 def test_two_effects_that_look_alike_are_told_apart_by_the_other_load_and_the_twin_takes_the_model(
     daemon: Daemon, tmp_path: Path
 ) -> None:
-    """With one lever arm the torque is always in one proportion to the force: its gain passes for cross-talk from the force."""
+    """With one lever arm the torque is always in one proportion to the force: its gain passes for cross-talk from the
+    force.
+    """
     twin = daemon.folder / "twin.toml"
     run = workflow(daemon, tmp_path, "--yes", "--first", "one", "--install", str(twin))
     assert run.wait_exit(200.0) == NAMED, said(run)

@@ -1,4 +1,5 @@
-"""Reconcile a finger behind its serial stream, probed through the real daemon, by a process that knows nothing of what it hides.
+"""Reconcile a finger behind its serial stream, probed through the real daemon, by a process that knows nothing of what
+it hides.
 
 What the simulated finger hides is in a file that only it has read; the file is gone before the workflow begins.
 """
@@ -30,9 +31,7 @@ ELEMENTS = 6  # a short finger: half a minute of touches
 ANGLES = np.radians(90.0 - 9.22 * np.arange(ELEMENTS))
 PUBLIC = f"gain = 3.0; length_m = 0.012; angles_rad = {ANGLES.tolist()}"
 HIDDEN = "gain_scatter = 0.12\nseed = 5\n"
-SHAPE = (
-    '\n[device.tactile0.shape]\nfinger_file = "finger.toml"\nload_node = "force0.fz"\nload_scale = 83.333\n'
-)
+SHAPE = '\n[device.tactile0.shape]\nfinger_file = "finger.toml"\nload_node = "force0.fz"\nload_scale = 83.333\n'
 MODEL = f"""[finger]
 name = "left"
 core_m = 0.0096
@@ -124,9 +123,7 @@ def test_the_emergency_stop_ends_the_probing_and_nothing_resumes(cell: Path, tmp
     assert not (tmp_path / "report" / "verdict.json").exists()
 
 
-def test_an_interrupted_probing_leaves_the_indenter_clear_at_rest_and_free(
-    cell: Path, tmp_path: Path
-) -> None:
+def test_an_interrupted_probing_leaves_the_indenter_clear_at_rest_and_free(cell: Path, tmp_path: Path) -> None:
     run = workflow(cell, tmp_path, "--yes")
     with sioms.Workcell(str(cell / "prober.sock"), "test") as session:
         with session.open("prober.radial.readonly") as axis:

@@ -74,9 +74,7 @@ def test_reloads_wait_their_turn_and_see_the_newest_file(daemon: Daemon) -> None
 
 
 @pytest.mark.parametrize("how", ["deadly", "wrong", "pipe", "folder", "empty", "date", "alias"])
-def test_a_reload_with_anything_wrong_changes_nothing_and_the_next_one_works(
-    daemon: Daemon, how: str
-) -> None:
+def test_a_reload_with_anything_wrong_changes_nothing_and_the_next_one_works(daemon: Daemon, how: str) -> None:
     if how in ("deadly", "wrong"):
         (daemon.folder / how).touch()
         daemon.configure(TEXT.replace("outputs = 4", "outputs = 8").replace("xaxis", "zaxis"))
@@ -84,9 +82,7 @@ def test_a_reload_with_anything_wrong_changes_nothing_and_the_next_one_works(
         daemon.config.unlink()
         os.mkfifo(daemon.config) if how == "pipe" else daemon.config.mkdir()
     else:
-        more = {"empty": "", "date": OWN + "when = 2026-01-01\n", "alias": OWN + '[node.no]\nof = "mod9"\n'}[
-            how
-        ]
+        more = {"empty": "", "date": OWN + "when = 2026-01-01\n", "alias": OWN + '[node.no]\nof = "mod9"\n'}[how]
         daemon.configure(axes("mod0", "zaxis") + more if more else "")
     try:
         with daemon.cell() as cell, cell.open("mod0.xaxis", "rw") as axis:
@@ -115,12 +111,8 @@ def test_what_has_not_changed_does_not_notice(daemon: Daemon) -> None:
             return bool(axis.statistics(1)["skipped"] == before)
 
         grants = [f'[[grant]]\nusers = ["*"]\nrights = ["{right}"]\n' for right in ("read", "stop", "write")]
-        assert any(loses_no_tick(grant) for grant in grants), (
-            "on a machine with too much to do it may, by itself"
-        )
-        assert daemon.device("mod0")["pid"] == pid and axis.read().tick > page.tick, (
-            "the same process and page"
-        )
+        assert any(loses_no_tick(grant) for grant in grants), "on a machine with too much to do it may, by itself"
+        assert daemon.device("mod0")["pid"] == pid and axis.read().tick > page.tick, "the same process and page"
         axis.command(velocity=0.0)
         with pytest.raises(OSError):
             own.statistics(1)
@@ -148,9 +140,7 @@ def test_nothing_is_left_of_reloads(daemon: Daemon) -> None:
         for _ in range(3):
             cell.reload()
         wait_for(lambda: len(children(daemon.pid)) == 1, "one nursery is the only child, dead or alive")
-        wait_for(
-            lambda: len(os.listdir(f"/proc/{daemon.pid}/fd")) <= descriptors, "as many descriptors as before"
-        )
+        wait_for(lambda: len(os.listdir(f"/proc/{daemon.pid}/fd")) <= descriptors, "as many descriptors as before")
 
 
 def test_what_holds_from_the_next_start_on_is_told(daemon: Daemon) -> None:

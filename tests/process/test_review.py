@@ -143,7 +143,10 @@ class Device:
 def port(start_daemon: Callable[..., Daemon]) -> Iterator[tuple[Daemon, Device]]:
     """A daemon with one port, and the device behind it."""
     device = Device()
-    text = f'[workcell]\nname = "test"\n[device.port0]\ndriver = "./port.py"\nline = {{ udp = "127.0.0.1:{device.port}" }}\n'
+    text = (
+        f'[workcell]\nname = "test"\n[device.port0]\ndriver = "./port.py"\nline = '
+        f'{{ udp = "127.0.0.1:{device.port}" }}\n'
+    )
     daemon = start_daemon(text, files={"port.py": UDP})
     daemon.wait_up("port0")
     yield daemon, device
@@ -281,9 +284,7 @@ def test_a_client_cannot_block_its_driver_by_the_wake_pipe(daemon: Daemon, cell:
         )
         assert daemon.device("mod0")["generation"] == 1
         statistics = node.statistics(5000)
-        assert statistics["skipped"] - skipped < 500, (
-            f"a driver that waits for a wake skips nearly all: {statistics}"
-        )
+        assert statistics["skipped"] - skipped < 500, f"a driver that waits for a wake skips nearly all: {statistics}"
         assert len(os.read(wake, 1 << 16)) == 4096
 
 
@@ -307,7 +308,10 @@ def test_a_driver_without_descriptors_left_lives_on(port: tuple[Daemon, Device])
 def test_a_closed_contact_stops_nothing_before_it_has_been_read(start_daemon: Callable[..., Daemon]) -> None:
     device = Device()
     device.value = 1
-    text = f'[workcell]\nname = "test"\n[device.port0]\ndriver = "./port.py"\nline = {{ udp = "127.0.0.1:{device.port}" }}\n'
+    text = (
+        f'[workcell]\nname = "test"\n[device.port0]\ndriver = "./port.py"\nline = '
+        f'{{ udp = "127.0.0.1:{device.port}" }}\n'
+    )
     text += '[[emergency_stop]]\nnode = "port0.bit0"\nactive = 0\n'
     daemon = start_daemon(text, files={"port.py": UDP.replace("safe=(0,)", "safe=(None,)")})
     daemon.wait_up("port0")

@@ -164,9 +164,7 @@ def make(start: Callable[..., Any], short_folder: Path) -> Iterator[Callable[...
 
 @pytest.mark.parametrize("cause", ["stop", "close"])
 @pytest.mark.parametrize("trouble", ["silent", "silent for long", "refused", "reply lost"])
-def test_a_safe_value_is_sent_until_the_device_has_it(
-    make: Callable[..., Cell], cause: str, trouble: str
-) -> None:
+def test_a_safe_value_is_sent_until_the_device_has_it(make: Callable[..., Cell], cause: str, trouble: str) -> None:
     cell = make()
     block = cell.block
     node = cell.client.open("io0", "rw")

@@ -72,9 +72,7 @@ def test_commands_import_nothing_from_where_they_are_started(trap: Path, command
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
-def test_modules_import_nothing_from_where_they_are_run(
-    trap: Path, path: str | None, arguments: list[str]
-) -> None:
+def test_modules_import_nothing_from_where_they_are_run(trap: Path, path: str | None, arguments: list[str]) -> None:
     done = run(trap, sys.executable, "-m", *arguments, path=path)
     assert done.returncode == 0, done.stderr
 

@@ -135,9 +135,7 @@ def test_a_missing_configuration_is_said(tmp_path: Path) -> None:
         [sys.executable, "-m", "sioms.daemon.main", "--config", tmp_path / "none.toml", "--socket", tmp_path / "s"],
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
-    assert (
-        done.returncode == 2 and "no such file or directory" in done.stderr and "Traceback" not in done.stderr
-    )
+    assert done.returncode == 2 and "no such file or directory" in done.stderr and "Traceback" not in done.stderr
 
 
 def pids(daemon: Daemon) -> dict[str, int]:
@@ -155,9 +153,7 @@ def test_reload_takes_up_changes_and_touches_nothing_else(start_daemon: Callable
         # force0 removed, mod1 changed, mod2 and a name added
         changed = axes("mod1", "xaxis").replace("velocity_max = 1.0", "velocity_max = 0.5")
         added = axes("mod2", "zaxis") + '[node.lift]\nof = "mod2"\n'
-        daemon.configure(
-            '[workcell]\nname = "test"\n' + axes("mod0", "xaxis", "yaxis") + changed + IO + added
-        )
+        daemon.configure('[workcell]\nname = "test"\n' + axes("mod0", "xaxis", "yaxis") + changed + IO + added)
         cell.reload()
         for name in ("mod1", "mod2"):
             daemon.wait_up(name)
@@ -187,9 +183,7 @@ def test_reload_with_errors_keeps_everything(start_daemon: Callable[..., Daemon]
     with daemon.cell() as cell, cell.open("mod0.xaxis", "rw") as axis:
         axis.command(velocity=0.05)
         daemon.configure(WORKCELL.replace("velocity_max", "velocity_maxi") + "[nodes]\n")
-        with raises(
-            errno.EINVAL, "nothing taken up", "velocity_maxi", "[nodes]: unknown section", "device.mod1"
-        ):
+        with raises(errno.EINVAL, "nothing taken up", "velocity_maxi", "[nodes]: unknown section", "device.mod1"):
             cell.reload()
         daemon.config.unlink()
         with raises(errno.EINVAL, "nothing taken up", "no such file"):
@@ -204,9 +198,7 @@ def test_reload_with_errors_keeps_everything(start_daemon: Callable[..., Daemon]
 
 def test_sighup_reloads(start_daemon: Callable[..., Daemon]) -> None:
     daemon = start_daemon('[device.io0]\ndriver = "sim-io"\ninputs = 1\n')
-    daemon.configure(
-        '[device.io0]\ndriver = "sim-io"\ninputs = 1\n[device.io1]\ndriver = "sim-io"\ninputs = 2\n'
-    )
+    daemon.configure('[device.io0]\ndriver = "sim-io"\ninputs = 1\n[device.io1]\ndriver = "sim-io"\ninputs = 2\n')
     daemon.running.signal(signal.SIGHUP)
     daemon.said("event=reload errors=0")
     daemon.wait_up("io1")
@@ -363,9 +355,7 @@ def test_a_driver_file_is_found_beside_the_configuration_and_its_faults_are_said
     head = '\n[device.{0}]\ndriver = "./{0}.py"\ninputs = 1\n'
     status, said = check(tmp_path / "cell.toml", head.format("mine"))
     assert status == 0, said
-    status, said = check(
-        tmp_path / "cell.toml", "".join(head.format(n) for n in ("mine", "syntax", "none", "gone"))
-    )
+    status, said = check(tmp_path / "cell.toml", "".join(head.format(n) for n in ("mine", "syntax", "none", "gone")))
     assert status == 2 and len(said) == 3
     assert "SyntaxError" in said[0] and "defines no DRIVER" in said[1] and "no such file" in said[2]
 

@@ -173,9 +173,7 @@ def test_unplugging_and_replugging(simulator: Callable[..., Simulator], link: Pa
         assert ask(port, DRIVE.read_holding(0x1003, 1)) == (2,)
 
 
-def test_a_port_takes_masters_with_parity_one_after_the_other(
-    simulator: Callable[..., Simulator], link: Path
-) -> None:
+def test_a_port_takes_masters_with_parity_one_after_the_other(simulator: Callable[..., Simulator], link: Path) -> None:
     simulator("modbus.simulated.oriental_az", "--link", link)
     for _ in range(3):
         with serial.Serial(str(link), 230400, parity="E", timeout=0.005, exclusive=True) as port:

@@ -28,9 +28,7 @@ def _fill(axis: sioms.AxisNode) -> None:
     axis.move(0.0, time=2.0)
 
 
-def test_stop_of_the_workcell_overtakes_full_buffers_and_ends_waits(
-    daemon: Daemon, cell: sioms.Workcell
-) -> None:
+def test_stop_of_the_workcell_overtakes_full_buffers_and_ends_waits(daemon: Daemon, cell: sioms.Workcell) -> None:
     with (
         cell.open("mod0.xaxis", "rw") as first,
         cell.open("mod1", "rw") as second,
@@ -51,9 +49,7 @@ def test_stop_of_the_workcell_overtakes_full_buffers_and_ends_waits(
             print(f"stop to rest of two processes: {took * 1e3:.1f} ms")
             assert time.monotonic() - began < 1.0
         assert [wait.errno() for wait in (*idle, room)] == [errno.ECANCELED] * 3
-        assert "emergency stop by pid" in str(idle[0].error), (
-            "who stopped, as far as the drivers know by then"
-        )
+        assert "emergency stop by pid" in str(idle[0].error), "who stopped, as far as the drivers know by then"
         for axis in (first, second):
             reading = axis.read()
             assert reading.buffered[0] == 0 and reading.status[0] & AxisStatus.EMERGENCY_STOP
@@ -221,9 +217,7 @@ def test_input_configured_as_stop_source(start_daemon: Callable[..., Daemon]) ->
 def test_stop_source_that_is_still_active_stops_again_after_a_reset(
     start_daemon: Callable[..., Daemon],
 ) -> None:
-    daemon = start_daemon(
-        WORKCELL + '\n[[emergency_stop]]\nnode = "io0.in.bit0"\n'
-    )  # active 0: a broken wire stops
+    daemon = start_daemon(WORKCELL + '\n[[emergency_stop]]\nnode = "io0.in.bit0"\n')  # active 0: a broken wire stops
     with daemon.cell() as cell:
         for _ in range(3):
             wait_for(lambda: cell.status()["stopped_ns"], "stopped, since the input reads 0")

@@ -1,4 +1,6 @@
-"""A finger behind the real framed stream, probed by axes, with a force sensor: shape in the driver, and the recordings."""
+"""A finger behind the real framed stream, probed by axes, with a force sensor: shape in the driver, and the
+recordings.
+"""
 
 from __future__ import annotations
 

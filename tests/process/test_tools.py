@@ -222,9 +222,7 @@ def test_a_killed_devout_leaves_its_axes_halted(
     cell.open("mod0.xaxis", "w", timeout=5.0).close()
 
 
-def test_a_bad_number_halts_and_is_named(
-    devout: Callable[..., subprocess.Popen[bytes]], cell: sioms.Workcell
-) -> None:
+def test_a_bad_number_halts_and_is_named(devout: Callable[..., subprocess.Popen[bytes]], cell: sioms.Workcell) -> None:
     process = devout("-rv", "-L-1", "mod0.xaxis")
     feed(process, b"0.1\n0.1\n")
     moving(cell, 0.1)
@@ -290,9 +288,7 @@ def test_a_devout_that_lives_keeps_all_its_axes(
     feed(process, b" 0\n")
     process.communicate(timeout=10)
     assert process.returncode == 0
-    timed = devout(
-        "-pt", "mod0.xaxis", "-pt", "mod0.yaxis", "0.01", str(1.3 * FROZEN_S), "0.01", str(1.4 * FROZEN_S)
-    )
+    timed = devout("-pt", "mod0.xaxis", "-pt", "mod0.yaxis", "0.01", str(1.3 * FROZEN_S), "0.01", str(1.4 * FROZEN_S))
     assert timed.wait(20) == 0
 
 
@@ -327,9 +323,7 @@ def test_pieces_with_times_queue_up_and_none_is_lost(shell: Shell, cell: sioms.W
 
 
 def test_input_that_ends_within_an_iteration(shell: Shell) -> None:
-    refused(
-        shell("devout -r -L-1 mod0", "0 0 0 0\n0 0\n"), "line 2", "2 of the 4 numbers", "after 1 complete"
-    )
+    refused(shell("devout -r -L-1 mod0", "0 0 0 0\n0 0\n"), "line 2", "2 of the 4 numbers", "after 1 complete")
 
 
 def test_one_iteration_without_r_and_as_many_as_said(shell: Shell) -> None:
@@ -349,9 +343,7 @@ def test_no_daemon(shell: Shell) -> None:
         "sioms list",
         "sioms monitor",
     ):
-        refused(
-            shell(line, socket="/tmp/there-is-no-such.sock"), "no daemon listens there", "siomsd --config"
-        )
+        refused(shell(line, socket="/tmp/there-is-no-such.sock"), "no daemon listens there", "siomsd --config")
 
 
 def test_unknown_node(shell: Shell) -> None:
@@ -433,9 +425,7 @@ def test_sdev_zeroes_a_sensor_and_sets_gains(shell: Shell) -> None:
     refused(shell("sdev -g tactile0", "1 2 3"), "wants 256 numbers: there are 3")
 
 
-def test_sdev_stops_the_workcell_and_writes_stay_refused_until_reset(
-    shell: Shell, cell: sioms.Workcell
-) -> None:
+def test_sdev_stops_the_workcell_and_writes_stay_refused_until_reset(shell: Shell, cell: sioms.Workcell) -> None:
     node = cell.open("mod0.xaxis", "rw")
     node.command(velocity=0.1)
     good(shell("sdev -e"))
@@ -469,9 +459,7 @@ def test_sdev_synchronises_two_devices(shell: Shell, cell: sioms.Workcell) -> No
     for node, after in zip(nodes, before, strict=True):
         moved = wait_for(lambda n=node, a=after: [s for s in n.history(a) if s.in_motion[0]], "the start")
         starts.append(moved[0].stamp_ns)
-    assert (
-        abs(starts[0] - starts[1]) < 20e6
-    )  # one instant; the ticks of two processes may be late on a busy machine
+    assert abs(starts[0] - starts[1]) < 20e6  # one instant; the ticks of two processes may be late on a busy machine
     good(shell("sdev -w mod0.xaxis -w mod1"))
     for node in nodes:
         assert not node.read().in_motion[0]
@@ -480,12 +468,7 @@ def test_sdev_synchronises_two_devices(shell: Shell, cell: sioms.Workcell) -> No
 
 def test_markers_by_shell(shell: Shell) -> None:
     assert (
-        good(
-            shell(
-                "M=$(smarkers -r); (sleep 0.1; smarkers -s $M) & smarkers -w $((M % 1024)) && smarkers -f $M"
-            )
-        )
-        == ""
+        good(shell("M=$(smarkers -r); (sleep 0.1; smarkers -s $M) & smarkers -w $((M % 1024)) && smarkers -f $M")) == ""
     )
     tokens = good(shell("smarkers -r 3")).split()
     assert len(set(tokens)) == 3
@@ -496,7 +479,8 @@ def test_markers_by_shell(shell: Shell) -> None:
 def test_an_axis_signals_a_marker_of_the_shell(shell: Shell) -> None:
     good(
         shell(
-            "M=$(smarkers -r); devout -ps -W mod0.taxis 0.01 $M; devout -ps mod0.taxis 0 $M; smarkers -w $M; smarkers -f $M"
+            "M=$(smarkers -r); devout -ps -W mod0.taxis 0.01 $M; devout -ps mod0.taxis 0 $M; smarkers -w $M; smarkers "
+            "-f $M"
         )
     )
 
@@ -548,9 +532,7 @@ class MonitorTerminal:
     def __init__(self, socket: str) -> None:
         self.pid, self.terminal = pty.fork()
         if self.pid == 0:
-            os.execve(
-                BIN / "sioms", ["sioms", "monitor"], {**environment(socket), "TERM": "xterm", "LINES": "40"}
-            )
+            os.execve(BIN / "sioms", ["sioms", "monitor"], {**environment(socket), "TERM": "xterm", "LINES": "40"})
         self.seen = bytearray()
 
     def shows(self, text: bytes) -> None:
@@ -582,9 +564,7 @@ def monitor(daemon: Daemon) -> Iterator[MonitorTerminal]:
         os.close(one.terminal)
 
 
-def test_monitor_in_a_terminal_stops_and_resets_by_key(
-    monitor: MonitorTerminal, cell: sioms.Workcell
-) -> None:
+def test_monitor_in_a_terminal_stops_and_resets_by_key(monitor: MonitorTerminal, cell: sioms.Workcell) -> None:
     monitor.shows(b"mod0")
     monitor.shows(b"taxis")
     monitor.press(b" ")
@@ -603,9 +583,7 @@ def test_monitor_in_a_terminal_stops_and_resets_by_key(
     assert monitor.end() == 0
 
 
-def test_monitor_jogs_while_a_key_repeats_and_no_longer(
-    monitor: MonitorTerminal, cell: sioms.Workcell
-) -> None:
+def test_monitor_jogs_while_a_key_repeats_and_no_longer(monitor: MonitorTerminal, cell: sioms.Workcell) -> None:
     monitor.shows(b"mod0")
     monitor.press(b"\t")
     monitor.shows(b"chosen: mod0 xaxis")
@@ -719,9 +697,7 @@ def test_a_stopped_monitor_gives_the_terminal_back(shell: Shell, no_color: str) 
     socket = shell("echo $SIOMS_SOCKET").stdout.strip()
     pid, terminal = pty.fork()
     if pid == 0:
-        os.execvpe(
-            "sioms", ["sioms", "monitor"], {**environment(socket), "TERM": "xterm", "NO_COLOR": no_color}
-        )
+        os.execvpe("sioms", ["sioms", "monitor"], {**environment(socket), "TERM": "xterm", "NO_COLOR": no_color})
     seen = b""
 
     def read(until: bytes) -> None:

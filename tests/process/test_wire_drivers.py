@@ -64,9 +64,7 @@ class Cell:
 
     def __init__(self, start: Callable[..., Any], folder: Path) -> None:
         self._start = start
-        self.drives = self._simulator(
-            "modbus.simulated.leadshine", "--link", folder / "drives", "--units", "1"
-        )
+        self.drives = self._simulator("modbus.simulated.leadshine", "--link", folder / "drives", "--units", "1")
         self.finger = self._simulator("framed_adc.simulator", "--link", folder / "finger")
         self.io = self._simulator("modbus.simulated.moxa", "--model", "E1212")
         config = folder / "wire.toml"
@@ -208,9 +206,7 @@ def test_faults_of_the_serial_line(cell: Cell, wait_until: Callable[..., None]) 
         wait_until(lambda: not x.read().status[0] & AxisStatus.FAULT, what="the reset")
 
 
-def test_the_stream_and_the_outputs(
-    cell: Cell, start: Callable[..., Any], wait_until: Callable[..., None]
-) -> None:
+def test_the_stream_and_the_outputs(cell: Cell, start: Callable[..., Any], wait_until: Callable[..., None]) -> None:
     with cell.client.open("finger0") as finger:
         cell.tell(cell.finger, "touch 2 1 1")
         wait_until(lambda: sum(finger.read().data) == pytest.approx(2.0, abs=0.1), what="the touch")
@@ -252,7 +248,8 @@ time.sleep(60)
 def test_the_driver_watches_over_moves_for_which_the_drive_has_no_dead_man(
     start: Callable[..., Any], short_folder: Path
 ) -> None:
-    """A position move of a Leadshine drive goes on to its target by itself: each death must end it by a stop that is sent.
+    """A position move of a Leadshine drive goes on to its target by itself: each death must end it by a stop that is
+    sent.
 
     The line has polls on it back to back, which must not keep the driver from ending.
     """

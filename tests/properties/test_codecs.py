@@ -90,9 +90,7 @@ def test_a_damaged_byte_never_gives_a_wrong_frame(value: int, where: int, payloa
 ROWS = st.lists(st.tuples(*[st.floats(-1e6, 1e6)] * 3), max_size=10)
 
 
-@given(
-    ROWS, CUTS, st.sampled_from([",", ";", "\t", "  ", ", "]), st.sampled_from(["\n", "\r\n"]), st.booleans()
-)
+@given(ROWS, CUTS, st.sampled_from([",", ";", "\t", "  ", ", "]), st.sampled_from(["\n", "\r\n"]), st.booleans())
 def test_any_cut_gives_the_same_rows(
     rows: list[tuple[float, ...]], sizes: list[int], separator: str, end: str, checked: bool
 ) -> None:
@@ -152,9 +150,7 @@ def receive(exchange: Exchange, pieces: list[bytes]) -> object:
 
 @pytest.mark.parametrize("framing", [rtu, tcp])
 @given(st.data(), REQUESTS, CUTS)
-def test_modbus_reply_in_any_cut(
-    framing: Framing, data: st.DataObject, pdu: modbus_pdu.Pdu, sizes: list[int]
-) -> None:
+def test_modbus_reply_in_any_cut(framing: Framing, data: st.DataObject, pdu: modbus_pdu.Pdu, sizes: list[int]) -> None:
     body = data.draw(st.binary(min_size=pdu.size - len(pdu.head), max_size=pdu.size - len(pdu.head)))
     exchange = exchange_of(framing, pdu)
     reply = framing(5, pdu.head + body)

@@ -110,7 +110,9 @@ RATE_HZ, MS = 1000.0, 1_000_000
     st.integers(0, 0xFFFF), st.lists(st.sampled_from(["good", "good", "good", "lost", "doubled", "late"]), max_size=120)
 )  # fmt: skip
 def test_a_bad_network_is_counted_exactly(first: int, fates: list[str]) -> None:
-    """Each number is sent once; some are lost, doubled, or overtaken by the next that arrives: the counts tell which."""
+    """Each number is sent once; some are lost, doubled, or overtaken by the next that arrives: the
+    counts tell which.
+    """
     watch = SequenceWatch(1 << 16, RATE_HZ)
     assert watch.accept(first, 0) is None, "nothing shows that the first one is not old"
     held: list[int] = []
@@ -171,7 +173,9 @@ def test_a_frozen_stream_is_never_fresh(last: int, window: int) -> None:
 
 @given(st.integers(0, 0xFFFF), st.integers(0, 0xFFFF), st.integers(0, 200))
 def test_a_restart_is_told_and_never_fresh(last: int, first: int, pause_ms: int) -> None:
-    """A 16-bit counter that begins elsewhere within the time in which a link is lost: told, unless it passes for a gap."""
+    """A 16-bit counter that begins elsewhere within the time in which a link is lost: told, unless it passes for a
+    gap.
+    """
     watch = SequenceWatch(1 << 16, RATE_HZ)
     for i in range(10):
         watch.accept((last - 9 + i) & 0xFFFF, i * MS)
@@ -215,9 +219,7 @@ def test_a_host_that_was_held_up_loses_records_and_no_more() -> None:
         watch.accept(number, number * MS)
     fresh = [watch.accept(number, 2100 * MS) for number in range(100, 400)]
     assert fresh == [0] * 300
-    assert watch.accept(2100, 2101 * MS) is None, (
-        "more than the second that is kept: taken up after a restart"
-    )
+    assert watch.accept(2100, 2101 * MS) is None, "more than the second that is kept: taken up after a restart"
     watch = SequenceWatch(1 << 16, RATE_HZ)
     for number in range(100):
         watch.accept(number, number * MS)

@@ -35,9 +35,7 @@ def test_what_was_put_in_comes_out(types: list[ElementType], data: Any, junk: in
     layout = Layout([Element(str(i), 10 * i, kind) for i, kind in enumerate(types)])
     rows = []
     for _ in range(data.draw(st.integers(1, 4))):
-        bounds = [
-            (-(1 << k.bits - 1), (1 << k.bits - 1) - 1) if k.signed else (0, (1 << k.bits) - 1) for k in types
-        ]
+        bounds = [(-(1 << k.bits - 1), (1 << k.bits - 1) - 1) if k.signed else (0, (1 << k.bits) - 1) for k in types]
         rows.append([data.draw(st.integers(low, high)) for low, high in bounds])
     wire = b"".join(encode(row, types, junk) for row in rows)
     assert len(wire) == layout.size * len(rows)

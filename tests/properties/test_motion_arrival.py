@@ -1,4 +1,5 @@
-"""Any history of moves, jogs, replacements and stops: a place is reached from its side, inside the limits, or not at all.
+"""Any history of moves, jogs, replacements and stops: a place is reached from its side, inside the limits, or not at
+all.
 
 The independent fact is a load with play behind the motor: it follows only when the play is used up, so where it
 stands tells from which side the motor came last, and that it came far enough.

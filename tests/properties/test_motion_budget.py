@@ -19,9 +19,7 @@ at_rest = st.one_of(
 )
 in_motion = st.one_of(
     no_op,
-    st.builds(
-        lambda v, t: {"mode": MODE.VELOCITY | TIMED, "velocity": v, "time": t}, st.floats(-0.1, 0.1), brief
-    ),
+    st.builds(lambda v, t: {"mode": MODE.VELOCITY | TIMED, "velocity": v, "time": t}, st.floats(-0.1, 0.1), brief),
     st.builds(lambda f, t: {"mode": MODE.FORCE | TIMED, "force": f, "time": t}, st.floats(-1, 1), brief),
 )
 mixes = st.one_of(st.lists(at_rest, min_size=1, max_size=6), st.lists(in_motion, min_size=1, max_size=6))
@@ -91,9 +89,7 @@ def test_nobody_elses_motion_is_another_for_it():
         if flooded:
             rig.bank.append(records(mode=MODE.POSITION, position=[0.0] * 3000), [1], rig.now_ns)
         for i in range(400):
-            rig.bank.append(
-                records(mode=MODE.VELOCITY, velocity=0.1 + 1e-4 * i), [2], rig.now_ns, replace=True
-            )
+            rig.bank.append(records(mode=MODE.VELOCITY, velocity=0.1 + 1e-4 * i), [2], rig.now_ns, replace=True)
             if flooded:
                 rig.bank.is_idle([1])
             rig.tick()

@@ -62,9 +62,7 @@ class Chaos(Rig):
         super().__init__(settings, plant=self.move)
         self.tokens = {n: self.markers.reserve(n) for n in (1, 2)}
         self.switches = lambda raw: (
-            (raw < -3.2) * SWITCH_MINUS
-            | (raw > 3.2) * SWITCH_PLUS
-            | ((raw < -0.5) & (raw > -0.7)) * SWITCH_HOME
+            (raw < -3.2) * SWITCH_MINUS | (raw > 3.2) * SWITCH_PLUS | ((raw < -0.5) & (raw > -0.7)) * SWITCH_HOME
         )
 
     def move(self, output, dt):
@@ -124,9 +122,7 @@ def test_any_verbs_in_any_order(steps):
     cell.tick(900)
     assert cell.bank.is_idle(cell.axes)
     assert all(cell.field("status", i) & S.EMERGENCY_STOP for i in cell.axes)
-    assert not any(
-        cell.field("status", i) & (S.MOVING | S.WAITING_MARKER | S.WAITING_SYNCH) for i in cell.axes
-    )
+    assert not any(cell.field("status", i) & (S.MOVING | S.WAITING_MARKER | S.WAITING_SYNCH) for i in cell.axes)
     still = cell.bank.rows["commanded_velocity"].copy()
     held = [i for i in cell.axes if not cell.field("status", i) & S.FAULT]
     assert np.abs(still[2]) == 0.0 or 2 not in held

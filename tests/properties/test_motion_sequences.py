@@ -21,18 +21,25 @@ command = st.one_of(
     st.builds(lambda p: {"mode": MODE.POSITION | MODE.RELATIVE, "position": p}, st.floats(-0.5, 0.5)),
     st.builds(lambda p, t: {"mode": MODE.POSITION | TIMED, "position": p, "time": t}, position, time_s),
     st.builds(lambda p, v: {"mode": PASS, "position": p, "velocity": v}, position, velocity),
-    st.builds(lambda p, v, t: {"mode": PASS | TIMED, "position": p, "velocity": v, "time": t}, position, velocity, time_s),
+    st.builds(
+        lambda p, v, t: {"mode": PASS | TIMED, "position": p, "velocity": v, "time": t}, position, velocity, time_s
+    ),
     st.builds(lambda v, t: {"mode": MODE.VELOCITY | TIMED, "velocity": v, "time": t}, velocity, time_s),
     st.builds(lambda v: {"mode": MODE.VELOCITY, "velocity": v}, velocity),
     st.builds(lambda a, t: {"mode": MODE.ACCELERATION | TIMED, "acceleration": a, "time": t}, st.floats(-A, A), time_s),
     st.builds(lambda j, t: {"mode": MODE.JERK | TIMED, "jerk": j, "time": t}, st.floats(-J, J), time_s),
     st.builds(
         lambda p, v, a: {
-            "mode": MODE.POSITION | MODE.SPECIFIED_MAX_VEL_ACC, "position": p, "max_velocity": v, "max_acceleration": a
+            "mode": MODE.POSITION | MODE.SPECIFIED_MAX_VEL_ACC,
+            "position": p,
+            "max_velocity": v,
+            "max_acceleration": a,
         },
-        position, st.floats(0.1, V), st.floats(0.5, A),
+        position,
+        st.floats(0.1, V),
+        st.floats(0.5, A),
     ),
-)  # fmt: skip
+)
 step = st.one_of(
     st.tuples(st.just("append"), command, st.integers(1, 400)),
     st.tuples(st.just("replace"), command, st.integers(1, 400)),
@@ -106,9 +113,7 @@ def test_an_array_is_taken_whole_or_not_at_all(commands, data):
     written = np.concatenate([records(**c, axis=data.draw(st.integers(0, 1))) for c in commands])
     bad = data.draw(st.none() | st.integers(0, len(commands) - 1))
     if bad is not None:
-        field, value = data.draw(
-            st.sampled_from([("axis", 2), ("control_mode", 0x30), ("control_mode", 0x80000008)])
-        )
+        field, value = data.draw(st.sampled_from([("axis", 2), ("control_mode", 0x30), ("control_mode", 0x80000008)]))
         written[field][bad] = value
     before = rig.bank.room([0]) + rig.bank.room([1])
     try:
@@ -119,9 +124,7 @@ def test_an_array_is_taken_whole_or_not_at_all(commands, data):
     assert not (taken and bad is not None)
     started = sum(len(e.axes) for e in rig.bank.take_events() if e.kind is EventKind.STARTED)
     gone = before - rig.bank.room([0]) - rig.bank.room([1])
-    assert gone + started == (len(commands) if taken else 0) or bool(
-        rig.bank.fault_text(0) or rig.bank.fault_text(1)
-    )
+    assert gone + started == (len(commands) if taken else 0) or bool(rig.bank.fault_text(0) or rig.bank.fault_text(1))
 
 
 @settings(max_examples=60)
@@ -141,9 +144,7 @@ def test_timed_pieces_end_where_and_when_they_say(pieces):
     s = 1e-3 * np.arange(1, len(p) + 1)
     for knot, end in zip(knots, ends, strict=True):
         i = int(np.searchsorted(s, knot))
-        assert (
-            abs(p[i] - end) <= 0.5 * A * 1e-6 * 4 + 1e-7
-        )  # at rest at the knot: at most a h^2 / 2 away a tick later
+        assert abs(p[i] - end) <= 0.5 * A * 1e-6 * 4 + 1e-7  # at rest at the knot: at most a h^2 / 2 away a tick later
     idle = [e.stamp_ns for e in rig.events if e.kind is EventKind.IDLE]
     assert -1 <= idle[-1] - begin - knots[-1] * 1e9 <= 1e6 + 1
 

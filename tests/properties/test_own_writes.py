@@ -1,6 +1,7 @@
 """Whatever the order of requests, readings, ticks and replies: no reading is older than what was acknowledged.
 
-The suite tries a few thousand orders; ``SIOMS_INTERLEAVINGS=1000000 pytest tests/properties/test_own_writes.py`` a million.
+The suite tries a few thousand orders; ``SIOMS_INTERLEAVINGS=1000000 pytest tests/properties/test_own_writes.py`` a
+million.
 """
 
 from __future__ import annotations
@@ -50,9 +51,7 @@ class Promises:
             self._versions[topic] = self._versions.get(topic, 0) + 1
         return {topic: self._versions[topic] for topic in topics}
 
-    def make(
-        self, state: dict[str, int], what: str, **promises: Callable[[Any], bool]
-    ) -> Callable[[Any], None]:
+    def make(self, state: dict[str, int], what: str, **promises: Callable[[Any], bool]) -> Callable[[Any], None]:
         """Return what is done with an answer: the promises hold from then on, unless it is a refusal."""
 
         def done(answer: Any) -> None:
@@ -76,9 +75,7 @@ class Promises:
                 assert promise(snapshot), f"{what}: {topic} is stale on {node.name}: {snapshot}"
 
 
-def _play(
-    world: World, promises: Promises, eyes: list[NodeCore], acts: list[Callable[[], None]], steps: int
-) -> None:
+def _play(world: World, promises: Promises, eyes: list[NodeCore], acts: list[Callable[[], None]], steps: int) -> None:
     chance = world.chance
     for _ in range(steps):
         chance.choice(acts)()
@@ -191,9 +188,7 @@ def _axis_acts(
 
     def stop_node(by_daemon: bool) -> None:
         state = promises.withdraw("motion", "queue", "gate", "place", "gains", "latch")
-        done = promises.make(
-            state, "emergency stop", latch=latched, motion=halting, queue=lambda s: s.buffered[0] == 0
-        )
+        done = promises.make(state, "emergency stop", latch=latched, motion=halting, queue=lambda s: s.buffered[0] == 0)
         if by_daemon:
             world.order(DriverVerb.NODE_STOP, 0, [number], -1, "somebody", world.latch.resets)
             done(None)
@@ -213,9 +208,7 @@ def _axis_acts(
         state = promises.withdraw("motion", "queue", "gate", "place", "gains", "latch")
         world.latch.stop(time.monotonic_ns(), "somebody")
         shown.acknowledged_by_daemon(time.monotonic_ns())
-        promises.make(
-            state, "workcell stop", latch=latched, motion=halting, queue=lambda s: s.buffered[0] == 0
-        )(None)
+        promises.make(state, "workcell stop", latch=latched, motion=halting, queue=lambda s: s.buffered[0] == 0)(None)
 
     def reset_all() -> None:
         state = promises.withdraw("latch", "place")
@@ -262,9 +255,7 @@ def test_a_drive_and_outputs_on_a_line(make_world: Any) -> None:
 
     def tare() -> None:
         state, value = sensor.withdraw("data"), float(next(tares))
-        number.ioctl(
-            Request.CALIBRATE_DEVICE, value, sensor.make(state, "tare", data=lambda s: s.data[0] == value)
-        )
+        number.ioctl(Request.CALIBRATE_DEVICE, value, sensor.make(state, "tare", data=lambda s: s.data[0] == value))
 
     for _ in range(STEPS):
         world.chance.choice([world.chance.choice(acts), write, tare])()
@@ -290,9 +281,7 @@ def test_outputs_that_the_next_tick_sets(make_world: Any) -> None:
     def stop() -> None:
         state = promises.withdraw("data")
         if world.chance.random() < 0.5:
-            owner.ioctl(
-                Request.EMERGENCY_STOP, None, promises.make(state, "stop", data=lambda s: s.data[0] == 0)
-            )
+            owner.ioctl(Request.EMERGENCY_STOP, None, promises.make(state, "stop", data=lambda s: s.data[0] == 0))
         else:
             world.order(DriverVerb.NODE_STOP, 0, [0], -1, "somebody", world.latch.resets)
             promises.make(state, "stop by the daemon", data=lambda s: s.data[0] == 0)(None)

@@ -24,8 +24,13 @@ AXES = BlockInfo("", NodeClass.AXIS, tuple(ChannelInfo(n) for n in "xyz"), True,
 PORT = BlockInfo("io", NodeClass.BINARY, tuple(ChannelInfo(n, width=3) for n in "ab"), True, 64, 0)
 NAMES = NameTable(
     {"d": DeviceInfo("d", "sim", (AXES, PORT), 1e3, (), 0.1)},
-    {"xz": NodeTable("d", ["x", "z"]), "zy": NodeTable("d", ["z", "y"]), "grip": NodeTable("d.io.a.bit1"), "b": NodeTable("d.io", ["b"])},
-)  # fmt: skip
+    {
+        "xz": NodeTable("d", ["x", "z"]),
+        "zy": NodeTable("d", ["z", "y"]),
+        "grip": NodeTable("d.io.a.bit1"),
+        "b": NodeTable("d.io", ["b"]),
+    },
+)
 NODES = sorted(NAMES.nodes)
 OUTPUTS = [n for n in NODES if not NAMES.nodes[n].read_only]
 

@@ -1,4 +1,6 @@
-"""The protocol of ownership and stops, explored: every step of the model, taken by the real daemon and drivers, leads where it should."""
+"""The protocol of ownership and stops, explored: every step of the model, taken by the real daemon and drivers, leads
+where it should.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A zero is the mean of what was measured after it was asked for, answered when it is in force, or refused with all as it was."""
+"""A zero is the mean of what was measured after it was asked for, answered when it is in force, or refused with all as
+it was.
+"""
 
 from __future__ import annotations
 

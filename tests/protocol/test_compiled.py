@@ -20,9 +20,14 @@ PLAIN = Socket(ON_HANDLE.sender, ON_HANDLE.receiver, ON_HANDLE.states)
 PLAIN.update(ON_HANDLE)
 
 VALUES = st.one_of(
-    st.integers(-(2**63), 2**64 - 1), st.floats(), st.booleans(), st.none(), st.binary(max_size=40), st.text(max_size=9),
+    st.integers(-(2**63), 2**64 - 1),
+    st.floats(),
+    st.booleans(),
+    st.none(),
+    st.binary(max_size=40),
+    st.text(max_size=9),
     st.lists(st.integers(0, 300), max_size=3),
-)  # fmt: skip
+)
 
 
 def outcome(packet: bytes, socket: Socket) -> Any:

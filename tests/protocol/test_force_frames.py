@@ -113,7 +113,7 @@ def test_rdt_status(word: int, model: str, text: str, invalid: bool, saturated: 
 
 
 PAGE = """<?xml version="1.0"?><netft><prodname>Net F/T</prodname><setserial>FT12345 </setserial><cfgcpf>1000000</cfgcpf>
-<cfgcpt>500000</cfgcpt><scfgfu>lbf</scfgfu><scfgtu>lbf-in</scfgtu><comrdtrate>7000</comrdtrate></netft>"""
+<cfgcpt>500000</cfgcpt><scfgfu>lbf</scfgfu><scfgtu>lbf-in</scfgtu><comrdtrate>7000</comrdtrate></netft>"""  # noqa: E501
 
 
 def test_the_sensors_page() -> None:
@@ -142,9 +142,17 @@ def test_units_of_sensors() -> None:
     ):
         assert rdt.force_unit(name) == pytest.approx(newton, rel=1e-12)
     torques = {
-        "Nm": 1, "N-m": 1, "N m": 1, "Nmm": 1e-3, "N-mm": 1e-3, "kNm": 1000, "lbf-in": pound * 0.0254, "in-lbf": pound * 0.0254,
-        "lbf-ft": pound * 0.3048, "kgf-cm": 9.80665e-2,
-    }  # fmt: skip
+        "Nm": 1,
+        "N-m": 1,
+        "N m": 1,
+        "Nmm": 1e-3,
+        "N-mm": 1e-3,
+        "kNm": 1000,
+        "lbf-in": pound * 0.0254,
+        "in-lbf": pound * 0.0254,
+        "lbf-ft": pound * 0.3048,
+        "kgf-cm": 9.80665e-2,
+    }
     for name, value in torques.items():
         assert rdt.torque_unit(name) == pytest.approx(value, rel=1e-12), name
     assert rdt.force_unit("furlong") is None and rdt.torque_unit("") is None and rdt.torque_unit("N") is None

@@ -154,9 +154,7 @@ REPLIES = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("exchange", "text"), REQUESTS, ids=lambda x: x.what if isinstance(x, Exchange) else ""
-)
+@pytest.mark.parametrize(("exchange", "text"), REQUESTS, ids=lambda x: x.what if isinstance(x, Exchange) else "")
 def test_request(exchange: Exchange, text: str) -> None:
     assert exchange.data.hex(" ") == text
     assert exchange.repeatable == (exchange.data[1] in (1, 2, 3, 4))

@@ -38,9 +38,7 @@ def test_answers(step: int) -> None:
         feed(grbl.command("$H", 0.5), b"[MSG:x]\r\nerror:79\r\n", step)
     with pytest.raises(StateLost, match="started anew meanwhile"):
         feed(grbl.command("$X", 0.5), b"\r\nGrbl 1.1h ['$' for help]\r\nok\r\n", step)
-    with pytest.raises(
-        StateLost, match="started anew meanwhile"
-    ):  # a "?" is lost on a controller that starts
+    with pytest.raises(StateLost, match="started anew meanwhile"):  # a "?" is lost on a controller that starts
         feed(grbl.status(0.5), b"\r\nGrbl 1.1h ['$' for help]\r\n[MSG:'$H'|'$X' to unlock]\r\n", step)
     with pytest.raises(LinkError, match="incomplete"):  # "ok" inside a line is none
         feed(grbl.command("$X", 0.5), b"[MSG:not ok]\r\n[echo:ok]\r\n", step)
@@ -71,9 +69,7 @@ def test_reports(line: str, report: grbl.Report) -> None:
         assert value == (report, ("ok", "ALARM:1"))
 
 
-@pytest.mark.parametrize(
-    "line", ["<Idle", "<>", "Idle|MPos:1>", "<Jog|MPos:1.2.3,4>", "<Run|MPos:nope>", "<Run|Bf:x>"]
-)
+@pytest.mark.parametrize("line", ["<Idle", "<>", "Idle|MPos:1>", "<Jog|MPos:1.2.3,4>", "<Run|MPos:nope>", "<Run|Bf:x>"])
 def test_damaged_reports(line: str) -> None:
     with pytest.raises(LinkError, match="read the status"):
         grbl.parse_report(line)

@@ -47,9 +47,7 @@ def test_golden_scans(types: tuple[str, ...], scan: str, offsets: list[int], val
         assert (made.offsets, made.size) == (offsets, len(data))
         for copies in (1, 3):
             got = made.decode(data * copies)
-            assert [got[f"c{i}"].tolist() for i in range(len(types))] == [
-                [value] * copies for value in values
-            ]
+            assert [got[f"c{i}"].tolist() for i in range(len(types))] == [[value] * copies for value in values]
         receiver = ScanReceiver(made.size)
         assert b"".join(receiver.feed(bytes([byte])) for byte in data + data[:-1]) == data
 
@@ -61,7 +59,7 @@ def test_a_repeated_element_keeps_its_words() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "le:s12", "le:x12/16", "se:s12/16", "le:s0/16>>0", "le:s12/24>>0", "le:s12/16>>5", "le:s65/64", "le:s16/16X0>>0"]
+    "text", ["", "le:s12", "le:x12/16", "se:s12/16", "le:s0/16>>0", "le:s12/24>>0", "le:s12/16>>5", "le:s65/64", "le:s16/16X0>>0"]  # noqa: E501
 )  # fmt: skip
 def test_what_is_no_type_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="read a scan type"):

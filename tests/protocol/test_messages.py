@@ -126,12 +126,18 @@ RECORDED: list[tuple[Message, str]] = [
     (Reload(), "921605"),
     (Cancel(5), "931e0505"),
     (Write(1, 0.5, b"\x01\x02"), "95010501cb3fe0000000000000c4020102"),
-    (Ioctl(23, {"position_max": [0.2, None]}, 0.0), "9502051781ac706f736974696f6e5f6d617892cb3fc999999999999ac0cb0000000000000000"),
+    (
+        Ioctl(23, {"position_max": [0.2, None]}, 0.0),
+        "9502051781ac706f736974696f6e5f6d617892cb3fc999999999999ac0cb0000000000000000",
+    ),
     (Subscribe(-1), "930305ff"),
     (Keepalive(), "920405"),
     (CancelOnHandle(5), "93050505"),
     (Part(9, b"\x03"), "94060509c40103"),
-    (Attach(7, 0, [0, 1], -1, 3, True, 15, 250000000, "eva (pid 5)", 1001, [64, 16], "mod0"), "9e01050700920001ff03c30fce0ee6b280ab6576612028706964203529cd03e9924010a46d6f6430"),
+    (
+        Attach(7, 0, [0, 1], -1, 3, True, 15, 250000000, "eva (pid 5)", 1001, [64, 16], "mod0"),
+        "9e01050700920001ff03c30fce0ee6b280ab6576612028706964203529cd03e9924010a46d6f6430",
+    ),
     (Detach(7, 110, "late"), "950205076ea46c617465"),
     (StopChanged(), "920305"),
     (Shutdown(), "920405"),
@@ -144,9 +150,12 @@ RECORDED: list[tuple[Message, str]] = [
     (Stopped("io0.bit3"), "931705a8696f302e62697433"),
     (LinkChanged(2, "unplugged"), "94180502a9756e706c7567676564"),
     (LogLine("error", "no"), "941905a56572726f72a26e6f"),
-    (Describe("mod0", "sim-axis", {"a": [1, True]}, "/etc"), "960105a46d6f6430a873696d2d6178697381a1619201c3a42f657463"),
+    (
+        Describe("mod0", "sim-axis", {"a": [1, True]}, "/etc"),
+        "960105a46d6f6430a873696d2d6178697381a1619201c3a42f657463",
+    ),
     (Spawn("mod0", "sim-axis", {}, 3, {"user": "eva"}), "970205a46d6f6430a873696d2d61786973800381a475736572a3657661"),
-]  # fmt: skip
+]
 """Every verb with number 5, as it was sent before there was a table of verbs."""
 
 
@@ -163,8 +172,11 @@ def test_no_verb_is_left_out() -> None:
     kinds = [kind for socket in SOCKETS for kind in socket.values()]
     assert {type(message) for message, _ in RECORDED} == {*kinds}
     for verbs, sockets in (
-        (ClientVerb, [FROM_CLIENT]), (HandleVerb, [ON_HANDLE]), (DriverVerb, [TO_DRIVER, FROM_DRIVER]), (NurseryVerb, [TO_NURSERY]),
-    ):  # fmt: skip
+        (ClientVerb, [FROM_CLIENT]),
+        (HandleVerb, [ON_HANDLE]),
+        (DriverVerb, [TO_DRIVER, FROM_DRIVER]),
+        (NurseryVerb, [TO_NURSERY]),
+    ):
         assert sorted(verb for socket in sockets for verb in socket) == sorted(verbs)
 
 
@@ -202,7 +214,7 @@ def test_cut_anywhere_or_followed_by_more_is_no_message(packet: bytes, golden: s
     "packet",
     [
         b"", b"\x90", b"\x91\x01", b"\xc1", b"\x80", b"\x82\x01\x02\x03\x04", b"\xa3abc", b"\xc0", b"\x92\xc0\x01",
-        encode(1.0, 1), encode(True, 1), encode(1, True), encode(-1, 1), encode(256, 1), encode(1, -1), encode(1, 1 << 53),
+        encode(1.0, 1), encode(True, 1), encode(1, True), encode(-1, 1), encode(256, 1), encode(1, -1), encode(1, 1 << 53),  # noqa: E501
         b"\x93\x01\x02\xa2\xff\xfe", b"\x92\x01\xcf\xff\xff\xff\xff\xff\xff\xff\xff", b"\xdc\xff\xff", b"\x91" * 5000,
         b"\x93\x01\x01\x81\x91\x01\x01", b"\x93\x01\x01\x82\xc4\x01a\x01\xc4",
     ],
@@ -277,12 +289,27 @@ def test_numbers_are_never_changed(kind: type) -> None:
 def test_golden_records() -> None:
     axis = AXIS_WRITE.pack(1, 0x2048, 7, 8, *[float(i) for i in range(15)])
     assert axis.hex() == (
-        "01000000" "48200000" "0700000000000000" "0800000000000000" "0000000000000000" "000000000000f03f"
-        "0000000000000040" "0000000000000840" "0000000000001040" "0000000000001440" "0000000000001840" "0000000000001c40"
-        "0000000000002040" "0000000000002240" "0000000000002440" "0000000000002640" "0000000000002840" "0000000000002a40"
+        "01000000"
+        "48200000"
+        "0700000000000000"
+        "0800000000000000"
+        "0000000000000000"
+        "000000000000f03f"
+        "0000000000000040"
+        "0000000000000840"
+        "0000000000001040"
+        "0000000000001440"
+        "0000000000001840"
+        "0000000000001c40"
+        "0000000000002040"
+        "0000000000002240"
+        "0000000000002440"
+        "0000000000002640"
+        "0000000000002840"
+        "0000000000002a40"
         "0000000000002c40"
-    )  # fmt: skip
-    assert BINARY_WRITE.pack(2, 0, 5, 7).hex() == "02000000" "00000000" "0500000000000000" "0700000000000000"  # fmt: skip
+    )
+    assert BINARY_WRITE.pack(2, 0, 5, 7).hex() == "020000000000000005000000000000000700000000000000"
     assert ANALOG_WRITE.pack(3, 0, 0.5).hex() == "03000000" "00000000" "000000000000e03f"  # fmt: skip
 
 
@@ -344,9 +371,7 @@ def test_every_verb_takes_certain_kinds_and_nothing_else() -> None:
             take(encode(99, 1), verbs)
 
 
-@pytest.mark.parametrize(
-    "text", ["a\x1b[2J", "a\r\nb", "\x00", "\u202e", "\ud800", "\x9b1m", "x" * 3000, "\n" * 3000]
-)
+@pytest.mark.parametrize("text", ["a\x1b[2J", "a\r\nb", "\x00", "\u202e", "\ud800", "\x9b1m", "x" * 3000, "\n" * 3000])
 def test_a_text_is_made_fit_for_a_terminal(text: str) -> None:
     shown = decode_reply(refusal(1, 5, text))[3]
     assert shown.isprintable() and 0 < len(shown) <= MAX_TEXT

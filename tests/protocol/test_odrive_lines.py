@@ -24,17 +24,13 @@ def reply(*texts: str) -> bytes:
     return b"".join(odrive.line(text).replace(b"\n", b"\r\n") for text in texts)
 
 
-@pytest.mark.parametrize(
-    ("text", "xor"), [("v 0 1 0", 103), ("f 0", 118), ("c 0 0.1", 124), ("p 0 -2 0 0", 95)]
-)
+@pytest.mark.parametrize(("text", "xor"), [("v 0 1 0", 103), ("f 0", 118), ("c 0 0.1", 124), ("p 0 -2 0 0", 95)])
 def test_documented_checksums(text: str, xor: int) -> None:
     assert odrive.line(text) == f"{text}*{xor}\n".encode()
 
 
 def test_the_documented_reply() -> None:
-    assert odrive.line("r vbus_voltage ").endswith(b"*93\n") and odrive.line("r vbus_voltage").endswith(
-        b"*125\n"
-    )
+    assert odrive.line("r vbus_voltage ").endswith(b"*93\n") and odrive.line("r vbus_voltage").endswith(b"*125\n")
     data = b"24.087744*32\r\n" + reply("0.0 0.0")
     for step in (1, 4, 100):
         assert feed(odrive.read(["vbus_voltage"], 0.1), data + b"1*49\r\n", step) == [[24.087744]]
@@ -60,9 +56,7 @@ def test_the_documented_reply() -> None:
 def test_sets_and_what_is_read_behind_them(step: int) -> None:
     back = [("axis0.controller.input_pos", 1.25)]
     move = odrive.confirmed(["t 0 1.25"], back, 0.1)
-    assert move.data == odrive.line("t 0 1.25") + odrive.line("r axis0.controller.input_pos") + odrive.line(
-        "f 0"
-    )
+    assert move.data == odrive.line("t 0 1.25") + odrive.line("r axis0.controller.input_pos") + odrive.line("f 0")
     assert not move.repeatable and odrive.read(["x"], 0.1).repeatable
     assert feed(move, reply("1.25", "0 0"), step) == [[1.25]]
     with pytest.raises(LinkError, match="reads 0 afterwards"):

@@ -62,9 +62,7 @@ def test_reply(exchange: Exchange, text: str, value: int) -> None:
 
 @pytest.mark.parametrize(("exchange", "text", "value"), REPLIES)
 @pytest.mark.parametrize("before", [b"\0", b"\xff\0\0", b"echo", b"echo\0"])
-def test_a_reply_behind_an_echo_or_stray_bytes(
-    exchange: Exchange, text: str, value: int, before: bytes
-) -> None:
+def test_a_reply_behind_an_echo_or_stray_bytes(exchange: Exchange, text: str, value: int, before: bytes) -> None:
     before = before.replace(b"echo", exchange.data)
     data = before + bytes.fromhex(text)
     for cut in range(len(data)):
@@ -108,12 +106,7 @@ def test_values_that_do_not_fit() -> None:
 def every_request(address: int = 1) -> list[bytes]:
     """Return what a driver may send, with values that give all checksums."""
     values = [*range(-140, 140, 3), 1019, 260864, 0x01010000, 0x0201, -(2**31), 2**31 - 1, 0x01040000]
-    heads = [
-        (op, kind, motor)
-        for op in (1, 2, 3, 4, 5, 6, 9, 10, 13, 128, 136)
-        for kind in (0, 4)
-        for motor in (0, 3)
-    ]
+    heads = [(op, kind, motor) for op in (1, 2, 3, 4, 5, 6, 9, 10, 13, 128, 136) for kind in (0, 4) for motor in (0, 3)]
     return [request(address, *head, value) for head in heads for value in values]
 
 
@@ -145,19 +138,13 @@ def test_the_simulated_module_answers_as_the_manual_says() -> None:
     now = 5.0
     module = simulator.Module(clock=lambda: now)
     module.motors[0].mover.position = 10000.0
-    assert (
-        module.take(bytes.fromhex("01 06 01 00 00 00 00 00 08"))[0].hex(" ") == "02 01 64 06 00 00 27 10 a4"
-    )
-    assert (
-        module.take(bytes.fromhex("01 04 00 00 00 00 27 10 3c"))[0].hex(" ") == "02 01 64 04 00 00 27 10 a2"
-    )
+    assert module.take(bytes.fromhex("01 06 01 00 00 00 00 00 08"))[0].hex(" ") == "02 01 64 06 00 00 27 10 a4"
+    assert module.take(bytes.fromhex("01 04 00 00 00 00 27 10 3c"))[0].hex(" ") == "02 01 64 04 00 00 27 10 a2"
     # cut anywhere, another address, a wrong checksum with the stale command byte, an unknown axis
     assert module.take(bytes.fromhex("01 06 01")) == []
     assert module.take(bytes.fromhex("00 00 00 00 00 08"))[0][2] == 100
     assert module.take(bytes.fromhex("07 06 01 00 00 00 00 00 0e")) == []
-    assert (
-        module.take(bytes.fromhex("01 03 00 00 00 00 00 00 05"))[0].hex(" ") == "02 07 01 06 00 00 00 00 10"
-    )
+    assert module.take(bytes.fromhex("01 03 00 00 00 00 00 00 05"))[0].hex(" ") == "02 07 01 06 00 00 00 00 10"
     # nine bytes however long they take, and out of step for ever
     assert module.take(b"\0" + bytes.fromhex("01 06 01 00 00 00 00 00 08"))[0][2] == 1
     now += 3600.0

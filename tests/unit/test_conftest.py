@@ -11,9 +11,7 @@ from daemon_rig import has_ended
 
 
 def test_wait_line_finds_old_and_new_lines_and_collects_stderr(start):
-    code = (
-        "import sys; print('ready on 5'); print('more', file=sys.stderr); sys.stdin.readline(); print('late')"
-    )
+    code = "import sys; print('ready on 5'); print('more', file=sys.stderr); sys.stdin.readline(); print('late')"
     child = start([sys.executable, "-c", code])
     assert child.wait_line(r"ready on (\d+)")[1] == "5"
     child.wait_line("more")
@@ -63,8 +61,13 @@ def test_names_are_free_and_fit_a_socket_address(free_name):
 def test_a_suite_that_is_started_with_interrupts_ignored_has_children_that_obey_them(tmp_path):
     """As in the background of a shell that is not interactive."""
     tests = Path(__file__).parents[1]
-    inner = f"import sys; sys.path.insert(0, {str(tests)!r}); import conftest, signal; print(signal.getsignal(signal.SIGINT))"
-    outer = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); os.execv(sys.executable, sys.argv[1:])"
+    inner = (
+        f"import sys; sys.path.insert(0, {str(tests)!r}); import conftest, signal; "
+        "print(signal.getsignal(signal.SIGINT))"
+    )
+    outer = (
+        "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); os.execv(sys.executable, sys.argv[1:])"
+    )
     done = subprocess.run(
         [sys.executable, "-c", outer, sys.executable, "-c", inner], capture_output=True, text=True, check=True
     )

@@ -33,9 +33,7 @@ def installed(dev):
 
 
 def said(dev, name):
-    return subprocess.run(
-        [dev.VENV / "bin" / name], capture_output=True, text=True, check=True
-    ).stdout.strip()
+    return subprocess.run([dev.VENV / "bin" / name], capture_output=True, text=True, check=True).stdout.strip()
 
 
 def test_launchers_run_in_a_folder_with_blanks(dev):

@@ -17,18 +17,16 @@ WITHOUT = "import sys\nfor name in ('gpiod', 'matplotlib', 'numba'): sys.modules
 
 
 def python(script: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False
-    )
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
 
 
 def test_the_core_imports_little() -> None:
     """Daemon, client, kit and simulated axes: what a small computer has to hold."""
     done = python(
-        WITHOUT
-        + "import os, sioms, sioms.aio, sioms.daemon.main, sioms.daemon.server, sioms.sdk, sioms.sdk.nursery\n"
+        WITHOUT + "import os, sioms, sioms.aio, sioms.daemon.main, sioms.daemon.server, sioms.sdk, sioms.sdk.nursery\n"
         "import sioms.sdk.runtime, sioms.drivers.sim.axes, sioms.drivers.sim.io, sioms.drivers.tmcl.driver\n"
-        "roots = {name.partition('.')[0] for name, m in sys.modules.items() if 'site-packages' in str(getattr(m, '__file__', ''))}\n"
+        "roots = {name.partition('.')[0] for name, m in sys.modules.items() if 'site-packages' in str(getattr(m, "
+        "'__file__', ''))}\n"
         "print(*sorted(roots))"
     )
     assert done.returncode == 0, done.stderr
@@ -51,9 +49,7 @@ def test_every_driver_but_gpio_can_be_described_without_extras() -> None:
         (["reconcile", "selftest", "--axes", "1"], "fast"),
     ],
 )
-def test_what_is_missing_is_named(
-    arguments: list[str], extra: str, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_what_is_missing_is_named(arguments: list[str], extra: str, tmp_path_factory: pytest.TempPathFactory) -> None:
     done = python(WITHOUT + f"from sioms.tools.front import main\nsys.exit(main({arguments!r}))")
     assert done.returncode == 1
     assert f"is not installed; run: pip install 'sioms[{extra}]'" in done.stderr

@@ -1,4 +1,6 @@
-"""The locked packages: all that pyproject.toml asks for, with hashes, the same everywhere, and what is installed here."""
+"""The locked packages: all that pyproject.toml asks for, with hashes, the same everywhere, and what is installed
+here.
+"""
 
 from __future__ import annotations
 
@@ -32,9 +34,7 @@ def pinned(profile: str) -> Pins:
         line = Requirement(entry.partition("\\")[0])
         (only,) = line.specifier
         assert only.operator == "=="
-        pins[canonicalize_name(line.name)].append(
-            (Version(only.version), line.marker, entry.count("--hash=sha256:"))
-        )
+        pins[canonicalize_name(line.name)].append((Version(only.version), line.marker, entry.count("--hash=sha256:")))
     return pins
 
 
@@ -49,11 +49,7 @@ def wanted(profile: str) -> list[Requirement]:
 
 def fits(need: Requirement, pins: Pins) -> bool:
     """Tell whether the line for this interpreter is such as is needed."""
-    here = [
-        version
-        for version, marker, _ in pins[canonicalize_name(need.name)]
-        if not marker or marker.evaluate()
-    ]
+    here = [version for version, marker, _ in pins[canonicalize_name(need.name)] if not marker or marker.evaluate()]
     return len(here) == 1 and need.specifier.contains(here[0], prereleases=True)
 
 

@@ -111,9 +111,7 @@ def test_wheel_holds_every_module_and_tool(built):
     with zipfile.ZipFile(built[0]) as wheel:
         names = set(wheel.namelist())
         modes = {
-            Path(one.filename).name: one.external_attr >> 16
-            for one in wheel.infolist()
-            if "/scripts/" in one.filename
+            Path(one.filename).name: one.external_attr >> 16 for one in wheel.infolist() if "/scripts/" in one.filename
         }
     assert modules_in_tree() <= names
     assert "sioms/py.typed" in names
@@ -137,9 +135,7 @@ def test_wheel_and_sdist_hold_manual_pages_service_files_and_examples(built):
     for path in built:
         with zipfile.ZipFile(path) as wheel:
             shared = {
-                name.partition(".data/data/share/")[2]
-                for name in wheel.namelist()
-                if ".data/data/share/" in name
+                name.partition(".data/data/share/")[2] for name in wheel.namelist() if ".data/data/share/" in name
             }
         assert files_beside_modules() == shared
 
@@ -153,7 +149,9 @@ def test_an_installed_wheel_finds_the_files_of_its_service(built, tmp_path):
     (libraries / "others.pth").write_text("\n".join(p for p in sys.path if p.endswith("site-packages")))
     root = tmp_path / "root"
     root.mkdir()
-    code = f"from sioms.tools.front import main; raise SystemExit(main(['service', 'install', '--root', {str(root)!r}]))"
+    code = (
+        f"from sioms.tools.front import main; raise SystemExit(main(['service', 'install', '--root', {str(root)!r}]))"
+    )
     done = subprocess.run(
         [tmp_path / "venv" / "bin" / "python3", "-P", "-c", code], cwd="/", capture_output=True, text=True
     )
@@ -166,9 +164,7 @@ def test_sdist_gives_the_same_wheel(built):
     contents = []
     for path in built:
         with zipfile.ZipFile(path) as wheel:
-            contents.append(
-                {one.filename: one.CRC for one in wheel.infolist() if "dist-info" not in one.filename}
-            )
+            contents.append({one.filename: one.CRC for one in wheel.infolist() if "dist-info" not in one.filename})
     assert contents[0] == contents[1]
 
 
@@ -188,6 +184,4 @@ def test_pipe_tool_of_a_wheel_starts_on_a_bare_interpreter(built, tmp_path):
     for name in (tool, tmp_path / "linked"):
         done = subprocess.run([name, "a b", "-t0.1"], capture_output=True, text=True, cwd="/")
         assert done.returncode == 7, done.stderr
-        assert (
-            done.stdout.split() == f"['devin', 'a b', '-t0.1'] False {libraries}/sioms/tools/devin.py".split()
-        )
+        assert done.stdout.split() == f"['devin', 'a b', '-t0.1'] False {libraries}/sioms/tools/devin.py".split()

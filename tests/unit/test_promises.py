@@ -20,11 +20,7 @@ def test_a_named_test_exists(name: str) -> None:
 
 
 def test_each_promise_names_a_test() -> None:
-    rows = [
-        line
-        for line in PAGE.splitlines()
-        if line.startswith("| ") and not line.startswith(("| ---", "| promise"))
-    ]
+    rows = [line for line in PAGE.splitlines() if line.startswith("| ") and not line.startswith(("| ---", "| promise"))]
     assert len(rows) > 20
     assert all("`tests/" in row.split("|")[2] for row in rows)
 

@@ -12,9 +12,7 @@ from typing import Any
 def add_parser(subparsers: Any) -> None:
     """Add the subcommand."""
     parser = subparsers.add_parser("demo", help="show the simulated workcell at work")
-    parser.add_argument(
-        "--out", default="out", metavar="FOLDER", help="where the picture goes (default: out)"
-    )
+    parser.add_argument("--out", default="out", metavar="FOLDER", help="where the picture goes (default: out)")
     parser.add_argument("--quick", action="store_true", help="fewer trials of the latency measurements")
     parser.add_argument("--no-wire", action="store_true", help="leave out the devices on pty and TCP ports")
     parser.set_defaults(run=run)

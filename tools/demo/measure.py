@@ -65,9 +65,7 @@ def writing(cell: sioms.Workcell, trials: int) -> Row:
     """Write a command and have it acknowledged."""
     with cell.open("mod0.taxis", "rw", timeout=PATIENCE_S) as node:
         record = sioms.command(velocity=0.01)
-        return row(
-            "write, acknowledged by the driver", _timed(lambda: node.write(record, replace=True), trials)
-        )
+        return row("write, acknowledged by the driver", _timed(lambda: node.write(record, replace=True), trials))
 
 
 def edge_to_client(cell: sioms.Workcell, trials: int) -> Row:
@@ -124,9 +122,7 @@ def _running_victim(watch: Any) -> Process:
 def _run_together(*nodes: Any) -> None:
     """Run two axes of each node, and see them run together."""
     while True:
-        velocities = [
-            [0.05 if place < MIDDLE else -0.05 for place in node.read().position[:2]] for node in nodes
-        ]
+        velocities = [[0.05 if place < MIDDLE else -0.05 for place in node.read().position[:2]] for node in nodes]
         for node, chosen in zip(nodes, velocities, strict=True):
             node.write([sioms.command(axis, velocity=v) for axis, v in enumerate(chosen)])
         if _seen_running(nodes, velocities):

@@ -1,7 +1,7 @@
 """How fast the demo's devices tick: as fast as this machine, with all that it has to do, can carry.
 
-A simulated drive that gets less of a processor than its ticks take falls behind further and further, and answers nobody. At a
-lower rate the same motions are shown, a little less exactly.
+A simulated drive that gets less of a processor than its ticks take falls behind further and further, and answers
+nobody. At a lower rate the same motions are shown, a little less exactly.
 """
 
 from __future__ import annotations
@@ -31,11 +31,7 @@ def rate_for(share_: float) -> float:
 
 def paced(config: str, rate_hz: float) -> str:
     """Return the configuration with all devices but the tactile array, which is slow, at a rate."""
-    text = re.sub(
-        r'^(driver = "sim-(?:axes|force|io)")$', rf"\1\ntick_hz = {rate_hz:.1f}", config, flags=re.MULTILINE
-    )
+    text = re.sub(r'^(driver = "sim-(?:axes|force|io)")$', rf"\1\ntick_hz = {rate_hz:.1f}", config, flags=re.MULTILINE)
     if rate_hz < SLOW_HZ:
-        text = re.sub(
-            r"^(motor = )", rf"bandwidth_hz = {SLOW_BANDWIDTH_HZ:.1f}\n\1", text, flags=re.MULTILINE
-        )
+        text = re.sub(r"^(motor = )", rf"bandwidth_hz = {SLOW_BANDWIDTH_HZ:.1f}\n\1", text, flags=re.MULTILINE)
     return text

@@ -39,9 +39,7 @@ def draw(
         axis.set_ylabel(label)
         axis.grid(alpha=0.25)
         axis.legend(loc="upper right", fontsize=8, ncols=3, framealpha=0.85)
-        for number, ((begin_s, _), nxt) in enumerate(
-            zip(chapters, [*chapters[1:], (end_s, "")], strict=True)
-        ):
+        for number, ((begin_s, _), nxt) in enumerate(zip(chapters, [*chapters[1:], (end_s, "")], strict=True)):
             axis.axvspan(begin_s, nxt[0], color="#eef2f6" if number % 2 else "#ffffff", zorder=0)
         for at_s, _ in events:
             axis.axvline(at_s, color="#cf222e", linewidth=0.7, alpha=0.6)

@@ -50,9 +50,7 @@ def _paced(config: str, folder: str) -> str:
     if rate_hz == RATES[0][1]:
         return config
     _say(f"this machine is busy: the simulated devices tick at {rate_hz:.0f} Hz instead of {RATES[0][1]:.0f}")
-    shutil.copytree(
-        os.path.dirname(config), f"{folder}/config", ignore=shutil.ignore_patterns("*.py", "__pycache__")
-    )
+    shutil.copytree(os.path.dirname(config), f"{folder}/config", ignore=shutil.ignore_patterns("*.py", "__pycache__"))
     slower = f"{folder}/config/demo.toml"
     with open(config, encoding="utf-8") as file:
         text = paced(file.read(), rate_hz)
@@ -75,7 +73,8 @@ def _list_nodes(cell: sioms.Workcell) -> None:
     for node in shown:
         kind = node.node_class.name.lower()
         _say(
-            f"{node.name:10} {kind:7} {node.channels:3} channel{'s' if node.channels > 1 else ' '}  {node.device}: {node.state}"
+            f"{node.name:10} {kind:7} {node.channels:3} channel{'s' if node.channels > 1 else ' '}  {node.device}: "
+            f"{node.state}"
         )
     _say(f"... and {len(cell.nodes()) - len(shown)} more: single axes and bits, groups, read-only companions")
 
@@ -101,9 +100,7 @@ class _Show:
         others_v = recorder.add("mod1.xaxis.readonly", **{"mod1 x": lambda s: s.velocity[0]})
         force = recorder.add("lord1", **{"lord1 fz": lambda s: s.data[2]})
         motor = recorder.add("mod1.zaxis.readonly", **{"mod1 z motor": lambda s: s.force[0]})
-        beams = recorder.add(
-            "beams", **{f"beam{i}": lambda s, i=i: (s.data[0] >> i & 1) + 1.5 * i for i in range(3)}
-        )
+        beams = recorder.add("beams", **{f"beam{i}": lambda s, i=i: (s.data[0] >> i & 1) + 1.5 * i for i in range(3)})
         self._rows = [
             ("position [mm]", positions + others),
             ("velocity [m/s]", velocities + others_v),
@@ -176,7 +173,8 @@ class _Show:
                 command(0, position=0.05),
             ])  # fmt: skip
             _say(
-                f"buffered: mod0 {list(mod0.read().buffered)}, mod1 {list(mod1.read().buffered)} commands; nothing moves yet"
+                f"buffered: mod0 {list(mod0.read().buffered)}, mod1 {list(mod1.read().buffered)} commands; nothing "
+                "moves yet"
             )
             try:
                 return self._cell.synch(mod0, mod1, lead=lead_s)
@@ -206,7 +204,8 @@ class _Show:
             self._note("beam 0 free again: turn back", free.stamp_ns)
             width_mm = (free.stamp_ns - broken.stamp_ns) / 1e9 * 0.25 * 1e3
             _say(
-                f"awake {awake_us:.0f} us after the edge; the edges' stamps make the beam {width_mm:.2f} mm wide (it is 40 mm)"
+                f"awake {awake_us:.0f} us after the edge; the edges' stamps make the beam {width_mm:.2f} mm wide (it "
+                "is 40 mm)"
             )
             axis.wait_until_idle(PATIENCE_S)
 
@@ -236,9 +235,7 @@ class _Show:
             peak = max(abs(v) for v in snapshot.data) or 1.0
             for index, value in enumerate(snapshot.data):
                 _say(f"element {index:2} {value:+7.2f} %  {'#' * round(40 * abs(value) / peak)}")
-            felt = dict(
-                zip((channel.name for channel in shape.info.channels), shape.read().data, strict=True)
-            )
+            felt = dict(zip((channel.name for channel in shape.info.channels), shape.read().data, strict=True))
             _say(
                 f"shape: {math.degrees(felt['angle']):.2f} +- {math.degrees(felt['var_angle'] ** 0.5):.2f} deg, "
                 f"{felt['load']:.0f} N/m, radius {1e3 * felt['radius']:.1f} mm (it is 6 mm)"
@@ -277,9 +274,7 @@ class _Show:
             _say("and free for the next client")
 
     def _stop(self) -> None:
-        self._begin(
-            "Emergency stop", "any client may; latched until somebody entitled resets it", "emergency stop"
-        )
+        self._begin("Emergency stop", "any client may; latched until somebody entitled resets it", "emergency stop")
         cell = self._cell
         with cell.open("mod0", "rw", PATIENCE_S) as mod0, cell.open("mod1", "rw", PATIENCE_S) as mod1:
             for node in (mod0, mod1):
@@ -317,5 +312,6 @@ class _Show:
         _say(f"{'':38} {'median':>11} {'worst':>12} {'trials':>7} {'round trips':>12}")
         for row in rows:
             _say(
-                f"{row.what:38} {row.median_us:8.1f} us {row.worst_us:9.1f} us {row.trials:7} {row.median_us / base:12.2f}"
+                f"{row.what:38} {row.median_us:8.1f} us {row.worst_us:9.1f} us {row.trials:7} "
+                f"{row.median_us / base:12.2f}"
             )

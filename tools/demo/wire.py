@@ -21,12 +21,8 @@ def bench(folder: str, stack: ExitStack) -> str:
     base = "sioms.drivers"
     io = Process([f"{base}.modbus.simulated.moxa", "--model", "E1212", "--port", "0"], "ready")
     stack.callback(io.end)
-    stack.callback(
-        Process([f"{base}.modbus.simulated.leadshine", "--link", drives, "--units", "1"], "ready").end
-    )
-    stack.callback(
-        Process([f"{base}.framed_adc.simulator", "--link", finger, "--channels", "16"], "ready").end
-    )
+    stack.callback(Process([f"{base}.modbus.simulated.leadshine", "--link", drives, "--units", "1"], "ready").end)
+    stack.callback(Process([f"{base}.framed_adc.simulator", "--link", finger, "--channels", "16"], "ready").end)
     text = files("sioms.tools.demo").joinpath("bench-modbus.toml").read_text()
     names = {"drives": drives, "finger": finger, "io": io.ready_line.split()[-1]}
     for port, simulator in PORTS.items():
@@ -40,7 +36,8 @@ def bench(folder: str, stack: ExitStack) -> str:
 def show(folder: str) -> None:
     """Run the bench configuration and use its nodes like any others."""
     print(
-        f"\n{bold('Real protocols')}   the same verbs on a Modbus RTU drive, a framed sample stream and a Modbus TCP block",
+        f"\n{bold('Real protocols')}   the same verbs on a Modbus RTU drive, a framed sample stream and a Modbus TCP "
+        "block",
         flush=True,
     )
     with ExitStack() as stack:
@@ -60,7 +57,8 @@ def show(folder: str) -> None:
             with cell.open("io0.do", "rw") as outputs:
                 outputs.set(0b101)
                 print(
-                    f"  io0.do     outputs written and read back: {outputs.wait_new(outputs.read().number, PATIENCE_S).data[0]:#010b}"
+                    f"  io0.do     outputs written and read back: "
+                    f"{outputs.wait_new(outputs.read().number, PATIENCE_S).data[0]:#010b}"
                 )
 
 
@@ -77,15 +75,11 @@ def _move(cell: sioms.Workcell) -> None:
         began = time.monotonic()
         axis.move(0.02)
         axis.wait_until_idle(PATIENCE_S)
-        print(
-            f"  slide0     moved to {axis.read().position[0] * 1e3:.2f} mm in {time.monotonic() - began:.2f} s"
-        )
+        print(f"  slide0     moved to {axis.read().position[0] * 1e3:.2f} mm in {time.monotonic() - began:.2f} s")
         axis.command(velocity=-0.01)
         time.sleep(0.4)
         cell.emergency_stop(why="demo")
         time.sleep(0.3)
         reading = axis.read()[0]
-        print(
-            f"  slide0     emergency stop: {reading.velocity * 1e3:.2f} mm/s at {reading.position * 1e3:.2f} mm"
-        )
+        print(f"  slide0     emergency stop: {reading.velocity * 1e3:.2f} mm/s at {reading.position * 1e3:.2f} mm")
         cell.reset()

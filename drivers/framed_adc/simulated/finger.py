@@ -1,9 +1,11 @@
-"""A tactile finger behind the framed sample stream: ``python -m sioms.drivers.framed_adc.simulated.finger --link PATH``.
+"""A tactile finger behind the framed sample stream: ``python -m sioms.drivers.framed_adc.simulated.finger --link
+PATH``.
 
-The front end of ``adc`` with a simulated finger (``sioms.plant.finger``) on it. What touches it is told by nodes of a workcell that it
+The front end of ``adc`` with a simulated finger (``sioms.plant.finger``) on it. What touches it is told by nodes of a
+workcell that it
 reads as a client: the force on it, where, and how near. While these are not there nothing touches it. Further
-command on standard input: ``indenter RADIUS`` (m; 0 an edge, inf a flat), as if somebody changed the tool. What the finger hides
-from those who probe it may come in a file (``--finger-file``) that nobody else reads.
+command on standard input: ``indenter RADIUS`` (m; 0 an edge, inf a flat), as if somebody changed the tool. What the
+finger hides from those who probe it may come in a file (``--finger-file``) that nobody else reads.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ UNIT = 0.05
 class World:
     """What the workcell says of the contact.
 
-    One thread; never waits: readings come from shared pages, and a workcell that is not there is looked for again after a while.
+    One thread; never waits: readings come from shared pages, and a workcell that is not there is looked for again after
+    a while.
 
     Args:
         path: socket of the daemon, None for the default.
@@ -97,9 +100,7 @@ class Finger(adc.FrontEnd):
 
     def _forces(self, now_s: float) -> list[float]:
         force, place, clearance_m = self._world.contact()
-        values: list[float] = self._array.read(
-            force, place, self._radius_m, self._out, now_s, clearance_m
-        ).tolist()
+        values: list[float] = self._array.read(force, place, self._radius_m, self._out, now_s, clearance_m).tolist()
         return values
 
 
@@ -158,9 +159,7 @@ def main() -> None:
     except (ValueError, OSError) as error:
         parser.error(str(error))
     options.channels = len(array.shape.angles_rad)
-    world = World(
-        options.socket, (options.force_node, options.place_node, options.depth_node), options.surface
-    )
+    world = World(options.socket, (options.force_node, options.place_node, options.depth_node), options.surface)
     device = Finger(options, array, world)
     asyncio.run(adc.run(device, {"indenter": device.mount}))
 

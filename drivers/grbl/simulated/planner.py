@@ -1,4 +1,5 @@
-"""The planner of a simulated Grbl controller: straight lines one after the other, with look-ahead, holds and jog cancel.
+"""The planner of a simulated Grbl controller: straight lines one after the other, with look-ahead, holds and jog
+cancel.
 
 Lengths in mm, speeds in mm/s; it knows nothing of lines of text.
 """

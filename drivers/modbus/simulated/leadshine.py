@@ -1,10 +1,13 @@
-"""A Leadshine / StepperOnline RS-485 drive on a pty: ``python -m sioms.drivers.modbus.simulated.leadshine --link PATH``.
+"""A Leadshine / StepperOnline RS-485 drive on a pty: ``python -m sioms.drivers.modbus.simulated.leadshine --link
+PATH``.
 
 Behaves as the vendor's manuals say: paths 0 to 15 from 0x6200 on, trigger word 0x6002, jog by the control word
 that must come again within 50 ms, status 0x1003, alarms 0x2203, functions 03, 06 and 10 only, exception 8 for a
-damaged request. Parameters are in RAM until 0x1801 = 0x2211 saves them; the encoder is incremental, so switched off it forgets its
-place, its reference and its alarm; with bit 2 of 0x6000 saved it homes by itself when it is switched on. Commands on standard
-input: those of the line (``mute``, ``noise``, ``unplug``, ``power_cycle`` ...) and of drives (``state``, ``alarm``, ``shove`` ...).
+damaged request. Parameters are in RAM until 0x1801 = 0x2211 saves them; the encoder is incremental, so switched off it
+forgets its place, its reference and its alarm; with bit 2 of 0x6000 saved it homes by itself when it is switched on.
+Commands on standard
+input: those of the line (``mute``, ``noise``, ``unplug``, ``power_cycle`` ...) and of drives (``state``, ``alarm``,
+    ``shove`` ...).
 """
 
 from __future__ import annotations
@@ -234,9 +237,7 @@ async def run() -> None:
     options = parser.parse_args()
     drives = {unit: Drive(pulses_per_turn=options.pulses_per_turn) for unit in unit_list(options.units)}
     devices = [simulated(unit, drive, RANGES) for unit, drive in drives.items()]
-    line = RtuLine(
-        devices, options.link, Faults(), baud=options.baud, answers_damage=True, powered=drives.values()
-    )
+    line = RtuLine(devices, options.link, Faults(), baud=options.baud, answers_damage=True, powered=drives.values())
     for drive in drives.values():
         if options.ends:
             drive.mover.low, drive.mover.high = options.ends

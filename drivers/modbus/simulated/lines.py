@@ -1,9 +1,9 @@
 """What the Modbus simulators share: pymodbus's own servers behind a line that can be disturbed.
 
-Between the line and the server stands the gate: what the device's supply, its refusals and its frozen readings make of a
-request, whatever the device. A serial simulator is the drive's UART and a pymodbus RTU server. The UART takes a frame from the
-line when its CRC is right or the line falls silent, drops damaged ones, and hands good ones to the server
-over a second pty; the server's replies go back through the faults. A TCP simulator is a relay before pymodbus's TCP server.
+Between the line and the server stands the gate: what the device's supply, its refusals and its frozen readings make of
+a request, whatever the device. A serial simulator is the drive's UART and a pymodbus RTU server. The UART takes a frame
+from the line when its CRC is right or the line falls silent, drops damaged ones, and hands good ones to the server over
+a second pty; the server's replies go back through the faults. A TCP simulator is a relay before pymodbus's TCP server.
 """
 
 from __future__ import annotations
@@ -284,13 +284,11 @@ class RtuLine:
 class TcpLine:
     """A relay with faults before pymodbus's TCP server; both listen on the loopback interface.
 
-    A device without supply says nothing, not even that a connection is gone; after booting it resets the connections that
-    it does not know any more when something comes on them.
+    A device without supply says nothing, not even that a connection is gone; after booting it resets the connections
+    that it does not know any more when something comes on them.
     """
 
-    def __init__(
-        self, devices: list[SimDevice], port: int, faults: Faults, powered: Iterable[Powered] = ()
-    ) -> None:
+    def __init__(self, devices: list[SimDevice], port: int, faults: Faults, powered: Iterable[Powered] = ()) -> None:
         self.port = port
         self.gate = Gate(powered)
         self.gate.changed = self._silence
@@ -421,9 +419,7 @@ def serial_parser(description: str, units: str = "1") -> argparse.ArgumentParser
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--link", type=Path, help="fixed path of the port")
     parser.add_argument("--units", default=units, help="addresses on the line, e.g. 1,2,3")
-    parser.add_argument(
-        "--baud", type=int, default=0, help="let replies take the time of a line of this speed"
-    )
+    parser.add_argument("--baud", type=int, default=0, help="let replies take the time of a line of this speed")
     return parser
 
 

@@ -5,9 +5,9 @@ registers hold counters, analog inputs and the device's name. Commands on standa
 line: ``di CHANNEL 0|1``, ``ai CHANNEL VOLTS``, ``loop on|off`` (each output wired to the input of its number),
 ``ramp CHANNEL FROM TO SECONDS``, ``foreign output BITS``, ``state``.
 
-``--watchdog-s``, ``--safe`` and ``--power-on`` are what its web page sets, and non-volatile: when no request came for so long the outputs take the
-safe values, coil 0x1030 reads 1, and writes are refused until 1 was written there. Switched off it forgets outputs, counters,
-alarm and uptime, and comes back with the values of ``--power-on``.
+``--watchdog-s``, ``--safe`` and ``--power-on`` are what its web page sets, and non-volatile: when no request came for
+so long the outputs take the safe values, coil 0x1030 reads 1, and writes are refused until 1 was written there.
+Switched off it forgets outputs, counters, alarm and uptime, and comes back with the values of ``--power-on``.
 """
 
 from __future__ import annotations
@@ -48,9 +48,7 @@ class Block:
         self.inputs, self.outputs, self.analogs, self.first_analog = MODELS[model]
         self.model, self.watchdog_s, self.clock = model, watchdog_s, clock
         self.di = [0] * self.inputs
-        self.safe, self.at_power_on = (
-            [bits >> i & 1 for i in range(self.outputs)] for bits in (safe, at_power_on)
-        )
+        self.safe, self.at_power_on = ([bits >> i & 1 for i in range(self.outputs)] for bits in (safe, at_power_on))
         self.do = [0] * self.outputs
         self.looped = False
         self.power_on()

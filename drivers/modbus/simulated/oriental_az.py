@@ -3,9 +3,9 @@
 Behaves as the manual's facts say: direct data operation from 0x0058 with its trigger, input command word 0x007C
 (levels and edges), output word 0x007E in its default assignment, alarms with those that a reset does not clear, and the
 RS-485 communication time-out that ends motion with alarm 0x85 when it is set (``--communication-timeout-s``, off as
-delivered). What Modbus writes is in RAM; the absolute encoder keeps the place without supply, unless ``alarm 0x33`` says that it has lost
-it; switched on while the motor turns it goes into alarm 0x43. Commands on standard input: those of the line (``power_cycle`` ...) and of
-drives (``state``, ``alarm``, ``shove`` ...).
+delivered). What Modbus writes is in RAM; the absolute encoder keeps the place without supply, unless ``alarm 0x33``
+says that it has lost it; switched on while the motor turns it goes into alarm 0x43. Commands on standard input: those
+of the line (``power_cycle`` ...) and of drives (``state``, ``alarm``, ``shove`` ...).
 """
 
 from __future__ import annotations
@@ -46,9 +46,7 @@ TRIGGERS = {-7: 0x58, -6: 0x5A, -5: 0x5C, -4: 0x5E, -3: 0x60, -2: 0x62, -1: 0x64
 class Drive:
     """One driver; times in seconds of the given clock."""
 
-    def __init__(
-        self, clock: Callable[[], float] = time.monotonic, communication_timeout_s: float = 0.0
-    ) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic, communication_timeout_s: float = 0.0) -> None:
         self.mover = Mover()
         # pair address -> 32-bit value
         self.pairs = dict(DEFAULTS)
@@ -250,10 +248,7 @@ async def run() -> None:
     parser = serial_parser("simulated Oriental Motor AZ driver")
     parser.add_argument("--communication-timeout-s", type=float, default=0.0)
     options = parser.parse_args()
-    drives = {
-        unit: Drive(communication_timeout_s=options.communication_timeout_s)
-        for unit in unit_list(options.units)
-    }
+    drives = {unit: Drive(communication_timeout_s=options.communication_timeout_s) for unit in unit_list(options.units)}
     devices = [simulated(unit, drive, RANGES) for unit, drive in drives.items()]
     line = RtuLine(devices, options.link, Faults(), baud=options.baud, bits=11, powered=drives.values())
     await line.start()

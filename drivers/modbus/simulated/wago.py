@@ -1,17 +1,19 @@
 """A WAGO 750 coupler on TCP: ``python -m sioms.drivers.modbus.simulated.wago --inputs 8 --outputs 8 --analogs 2``.
 
-Pymodbus's TCP server behind a relay with faults. The process image lies as the manual's register mapping says: functions 1 and 2 both
-read inputs from 0 and outputs from 0x200, functions 3 and 4 analog words likewise; writes take 0 and 0x200 for outputs. Analog
-words are 0x7FF0 at 10 V; the series code 750 is in 0x2011. The watchdog, by the manual's chapter "Watchdog (Fieldbus failure)":
+Pymodbus's TCP server behind a relay with faults. The process image lies as the manual's register mapping says:
+functions 1 and 2 both read inputs from 0 and outputs from 0x200, functions 3 and 4 analog words likewise; writes take 0
+and 0x200 for outputs. Analog words are 0x7FF0 at 10 V; the series code 750 is in 0x2011. The watchdog, by the manual's
+chapter "Watchdog (Fieldbus failure)":
 
 * time in 0x1000 [100 ms] and functions that keep it alive in 0x1001, both refused (exception 3) while it runs;
 * it starts when 0x1003 is *modified* to a value other than 0 and the time is not 0; the same value again does nothing;
 * 0x1006 reads 1 while it runs; AAAA and 5555 in 0x1005 stop it, 1 in 0x1007 starts its time anew while it runs;
-* when it has expired the outputs are zero, and every request is answered with exception 4, but the write of AA55 or 55AA
-  to 0x1008, which stops it and ends the failure; outputs stay zero until they are written.
+* when it has expired the outputs are zero, and every request is answered with exception 4, but the write of AA55 or
+  55AA to 0x1008, which stops it and ends the failure; outputs stay zero until they are written.
 
-Switched off it forgets the outputs and all of these registers. Commands on standard input, beside those of the line: ``di CHANNEL
-0|1``, ``ai CHANNEL VOLTS``, ``loop on|off`` (each output wired to the input of its number), ``foreign output BITS``, ``state``.
+Switched off it forgets the outputs and all of these registers. Commands on standard input, beside those of the line:
+``di CHANNEL 0|1``, ``ai CHANNEL VOLTS``, ``loop on|off`` (each output wired to the input of its number), ``foreign
+output BITS``, ``state``.
 """
 
 from __future__ import annotations
@@ -43,9 +45,7 @@ TEN_VOLTS = 0x7FF0
 class Coupler:
     """The coupler and its modules; times in seconds of the given clock."""
 
-    def __init__(
-        self, inputs: int, outputs: int, analogs: int, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, inputs: int, outputs: int, analogs: int, clock: Callable[[], float] = time.monotonic) -> None:
         self.clock = clock
         self.di, self.do = [0] * inputs, [0] * outputs
         self.ai, self.ao = [0] * analogs, [0] * analogs
@@ -77,7 +77,9 @@ class Coupler:
             self._kept_s = self.clock()
 
     def fails(self, address: int, values: Sequence[int] | None) -> bool:
-        """Tell whether a request is answered with a device failure: all are when the watchdog has expired, but its stop."""
+        """Tell whether a request is answered with a device failure: all are when the watchdog has expired, but its
+        stop.
+        """
         ends = address == SIMPLE_STOP and values and int(values[0]) in SIMPLE_STOPS
         return self.status == EXPIRED and not ends
 
@@ -116,9 +118,7 @@ class Coupler:
         if runs and address in (TIME, FUNCTIONS, FUNCTIONS + 1):
             return ExcCodes.ILLEGAL_VALUE
         if address == STOP:
-            self._stops = (
-                1 if value == 0xAAAA else self._stops + 1 if value == 0x5555 and self._stops == 1 else 0
-            )
+            self._stops = 1 if value == 0xAAAA else self._stops + 1 if value == 0x5555 and self._stops == 1 else 0
             self.status = OFF if runs and self._stops == 2 else self.status
         elif address == SIMPLE_STOP and value in SIMPLE_STOPS:
             self.status = OFF

@@ -1,9 +1,10 @@
 """One axis of a simulated ODrive board with its rotor, after the firmware's own sources (fw-v0.5.6, a308314e).
 
 What is ported, function by function, from ``Firmware/MotorControl``: ``Controller::update``, ``reset`` and
-``control_mode_updated`` (controller.cpp), ``planTrapezoidal`` and ``eval`` (trapTraj.cpp), the state machine, homing and
-watchdog (axis.cpp), the order of the control loop (main.cpp). The loop runs at 1 kHz here, at 8 kHz there. Left out:
-calibration, step/direction, circular set-points, anticogging, the filter, ramp and mirror modes of the input, currents.
+``control_mode_updated`` (controller.cpp), ``planTrapezoidal`` and ``eval`` (trapTraj.cpp), the state machine, homing
+and watchdog (axis.cpp), the order of the control loop (main.cpp). The loop runs at 1 kHz here, at 8 kHz there. Left
+out: calibration, step/direction, circular set-points, anticogging, the filter, ramp and mirror modes of the input,
+currents.
 
 Units: turns, seconds, Nm.
 """
@@ -21,12 +22,26 @@ INERTIA, FRICTION = 0.02, 0.1
 """Of the rotor [kg m^2] and of its bearings [Nm s/turn]."""
 
 VOLATILE: dict[str, float] = {
-    "error": 0, "current_state": IDLE, "requested_state": UNDEFINED, "is_homed": 0, "motor.error": 0, "motor.is_armed": 0,
-    "motor.is_calibrated": 1, "encoder.error": 0, "encoder.pos_estimate": 0, "encoder.vel_estimate": 0, "controller.error": 0,
-    "controller.input_pos": 0, "controller.input_vel": 0, "controller.input_torque": 0, "controller.pos_setpoint": 0,
-    "controller.vel_setpoint": 0, "controller.torque_setpoint": 0, "controller.vel_integrator_torque": 0,
+    "error": 0,
+    "current_state": IDLE,
+    "requested_state": UNDEFINED,
+    "is_homed": 0,
+    "motor.error": 0,
+    "motor.is_armed": 0,
+    "motor.is_calibrated": 1,
+    "encoder.error": 0,
+    "encoder.pos_estimate": 0,
+    "encoder.vel_estimate": 0,
+    "controller.error": 0,
+    "controller.input_pos": 0,
+    "controller.input_vel": 0,
+    "controller.input_torque": 0,
+    "controller.pos_setpoint": 0,
+    "controller.vel_setpoint": 0,
+    "controller.torque_setpoint": 0,
+    "controller.vel_integrator_torque": 0,
     "controller.trajectory_done": 1,
-}  # fmt: skip
+}
 STORED: dict[str, float] = {
     "controller.config.control_mode": POSITION, "controller.config.input_mode": PASSTHROUGH,
     "controller.config.vel_limit": 20, "controller.config.vel_limit_tolerance": 1.2,
@@ -44,10 +59,17 @@ UNSIGNED = (
     "controller.config.control_mode", "controller.config.input_mode",
 )  # fmt: skip
 FLAGS = (
-    "is_homed", "motor.is_armed", "motor.is_calibrated", "controller.trajectory_done", "controller.config.enable_vel_limit",
-    "controller.config.enable_overspeed_error", "controller.config.enable_torque_mode_vel_limit", "config.enable_watchdog",
-    "config.startup_closed_loop_control", "min_endstop.config.enabled",
-)  # fmt: skip
+    "is_homed",
+    "motor.is_armed",
+    "motor.is_calibrated",
+    "controller.trajectory_done",
+    "controller.config.enable_vel_limit",
+    "controller.config.enable_overspeed_error",
+    "controller.config.enable_torque_mode_vel_limit",
+    "config.enable_watchdog",
+    "config.startup_closed_loop_control",
+    "min_endstop.config.enabled",
+)
 READ_ONLY = (
     "current_state", "motor.is_armed", "motor.is_calibrated", "encoder.pos_estimate", "encoder.vel_estimate",
     "controller.pos_setpoint", "controller.vel_setpoint", "controller.torque_setpoint", "controller.trajectory_done",
@@ -62,9 +84,7 @@ class Trapezoid:
         top, rate, brake: its speed, acceleration and deceleration.
     """
 
-    def __init__(
-        self, goal: float, begin: float, speed: float, top: float, rate: float, brake: float
-    ) -> None:
+    def __init__(self, goal: float, begin: float, speed: float, top: float, rate: float, brake: float) -> None:
         way = goal - begin
         side = math.copysign(1.0, way - math.copysign(speed * speed / (2 * brake), speed))
         self._up, self._down, self._top = side * rate, -side * brake, side * top
@@ -107,7 +127,8 @@ class Axis:
     Attributes:
         p: its properties in the board's memory, by path behind ``axisN.``.
         stored: those of them that the board keeps without supply.
-        place: where the rotor is; the encoder counts from ``origin``, which is where it was when the board got its supply.
+        place: where the rotor is; the encoder counts from ``origin``, which is where it was when the board got its
+            supply.
         velocity: of the rotor.
         shoved: speed at which something else turns the rotor, 0 for none.
         switch: place of the end switch, None without.

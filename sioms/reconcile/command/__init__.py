@@ -29,9 +29,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     for name, subject in SUBJECTS.items():
         of = kinds.add_parser(name, help=subject.text)
         group = subject.arguments(of)
-        of.add_argument(
-            "--out", type=Path, default=Path("report"), metavar="DIR", help="where the report goes"
-        )
+        of.add_argument("--out", type=Path, default=Path("report"), metavar="DIR", help="where the report goes")
         of.add_argument("--seed", type=whole(), default=1, help="of permutations and bootstrap")
         of.add_argument("--quiet", action="store_true", help="no progress")
         group.add_argument("--yes", action="store_true", help="move without asking")
@@ -52,9 +50,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     test.add_argument(
         "--out", type=Path, default=None, metavar="DIR", help="keep what was generated and the answers here"
     )
-    test.add_argument(
-        "--jobs", type=whole(), default=0, help="solvers at a time (default: one for each core)"
-    )
+    test.add_argument("--jobs", type=whole(), default=0, help="solvers at a time (default: one for each core)")
     test.add_argument(
         "--replicates",
         type=whole(),
@@ -62,12 +58,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="solve each so many times more with its blocks drawn anew",
     )
     effects = kinds.add_parser("effects", help="print the library of effects")
-    effects.add_argument(
-        "of", nargs="?", choices=("axis", "sensors"), default="axis", help="whose (default axis)"
-    )
-    effects.add_argument(
-        "--out", type=Path, default=None, metavar="DIR", help="write page and pictures there instead"
-    )
+    effects.add_argument("of", nargs="?", choices=("axis", "sensors"), default="axis", help="whose (default axis)")
+    effects.add_argument("--out", type=Path, default=None, metavar="DIR", help="write page and pictures there instead")
     parser.set_defaults(run=run)
     return parser
 

@@ -1,4 +1,6 @@
-"""What the blind tests of axes and of sensors share: kinds in turn, a solver that sees the public part alone, the table."""
+"""What the blind tests of axes and of sensors share: kinds in turn, a solver that sees the public part alone, the
+table.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def in_turn(
     effects: Mapping[str, Iterable[str]],
     kinds: Sequence[str] = MIXTURE,
 ) -> Iterator[tuple[int, str, str]]:
-    """Yield number, kind and the one effect that is to be drawn, "" for any; every effect of a kind comes up in turn."""
+    """Yield number, kind and the one effect that is to be drawn, "" for any; every effect of a kind
+    comes up in turn.
+    """
     turns = {kind: [str(name) for name in rng.permutation(list(names))] for kind, names in effects.items()}
     for i in range(count):
         kind, only = kinds[i % len(kinds)], ""
@@ -69,9 +73,7 @@ def solve(folder: Path, subject: str, *options: str, report: str = "report") -> 
     return found
 
 
-def judge_all(
-    hidden: Sequence[H], judge: Callable[[H, Path], Scored], out: Path | None = None, jobs: int = 0
-) -> int:
+def judge_all(hidden: Sequence[H], judge: Callable[[H, Path], Scored], out: Path | None = None, jobs: int = 0) -> int:
     """Judge them all, several at a time, and print a line each and the table.
 
     Args:
@@ -89,7 +91,8 @@ def judge_all(
             rows.append(row)
             truth = ", ".join((*row.axis.named, *row.axis.nameless)) or "nothing"
             print(
-                f"{row.axis.name} {row.axis.kind:10s} {'right' if row.right else 'WRONG'}  hidden {truth} | {row.verdict}: "
+                f"{row.axis.name} {row.axis.kind:10s} {'right' if row.right else 'WRONG'}  hidden {truth} | "
+                f"{row.verdict}: "
                 f"{', '.join(row.got) or '-'} ({row.seconds:.0f} s)",
                 flush=True,
             )

@@ -28,8 +28,11 @@ SIZES: dict[str, tuple[str, Callable[[Mapping[str, float]], float]]] = {
     "strip_inhomogeneity": ("strip_gain", lambda p: p["G"]),
     "quadratic": ("quad", lambda p: 0.01 * float(np.mean([v for k, v in p.items() if k.startswith("q[")]))),
 }  # fmt: skip
-EACH = {"gain_scatter": ("gain", "g", "gain_percent_strain_per_percent_output", True),
-        "depth_scatter": ("rs_mm", "dr", "element_radius_mm", False), "angle_scatter": ("theta_deg", "dt", "element_angle_deg", False)}  # fmt: skip
+EACH = {
+    "gain_scatter": ("gain", "g", "gain_percent_strain_per_percent_output", True),
+    "depth_scatter": ("rs_mm", "dr", "element_radius_mm", False),
+    "angle_scatter": ("theta_deg", "dt", "element_angle_deg", False),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +71,13 @@ def score(public: Path, truth: Path) -> int:
         row = compare(folder, json.loads((truth / f"{folder.name}.json").read_text()), verdict, seconds)
         rows.append(row)
         errors = ", ".join(f"{k} {100 * v:.1f} %" for k, v in row.errors.items())
-        print(f"{row.name}  {'right' if row.right else 'WRONG'}  hidden {', '.join(row.hidden) or 'nothing'} | {row.verdict}: "
-              f"{', '.join(row.named) or '-'} | errors {errors or '-'} | gap closed {row.closed:.3f} ({row.seconds:.0f} s)", flush=True)  # fmt: skip
+        print(
+            f"{row.name}  {'right' if row.right else 'WRONG'}  hidden {', '.join(row.hidden) or 'nothing'} | "
+            f"{row.verdict}: "
+            f"{', '.join(row.named) or '-'} | errors {errors or '-'} | gap closed {row.closed:.3f} ({row.seconds:.0f} "
+            "s)",
+            flush=True,
+        )
     print(table(rows))
     return 0 if rows and sum(r.right for r in rows) >= 0.9 * len(rows) else 1
 
@@ -115,17 +123,17 @@ def table(rows: list[Row]) -> str:
     named, hidden = sum(len(r.named) for r in rows), sum(len(r.hidden) for r in rows)
     hits = sum(len(set(r.named) & set(r.hidden)) for r in rows)
     seconds = sorted(r.seconds for r in rows)
-    lines = [("nothing hidden: silent", share(0, 0)), ("one hidden effect: named exactly", share(1, 1)),
-             ("two or three: named exactly", share(2, 99)), ("precision, recall over effects", f"{hits}/{named}, {hits}/{hidden}"),
-             ("gap closed: median, tenth percentile", _quantiles(closed, 0.5, 0.1)),
-             ("parameter error: median, ninetieth percentile", _quantiles(errors, 0.5, 0.9)),
-             ("seconds a finger, median", _quantiles(seconds, 0.5))]  # fmt: skip
+    lines = [
+        ("nothing hidden: silent", share(0, 0)),
+        ("one hidden effect: named exactly", share(1, 1)),
+        ("two or three: named exactly", share(2, 99)),
+        ("precision, recall over effects", f"{hits}/{named}, {hits}/{hidden}"),
+        ("gap closed: median, tenth percentile", _quantiles(closed, 0.5, 0.1)),
+        ("parameter error: median, ninetieth percentile", _quantiles(errors, 0.5, 0.9)),
+        ("seconds a finger, median", _quantiles(seconds, 0.5)),
+    ]
     return "\n".join(f"{a:50s} {b}" for a, b in lines)
 
 
 def _quantiles(values: list[float], *shares: float) -> str:
-    return (
-        ", ".join(f"{values[min(int(s * len(values)), len(values) - 1)]:.3f}" for s in shares)
-        if values
-        else "-"
-    )
+    return ", ".join(f"{values[min(int(s * len(values)), len(values) - 1)]:.3f}" for s in shares) if values else "-"

@@ -64,8 +64,8 @@ def closed(folder: Path, records: list[Recording]) -> float | None:
     """Measure the share of the gap in force that the model of an answer closes on the held-out command.
 
     Returns:
-        (nominal - model)/(nominal - truth), the truth being the generator itself without noise; None where the gap is hardly larger
-        than what that leaves.
+        (nominal - model)/(nominal - truth), the truth being the generator itself without noise; None where the gap is
+        hardly larger than what that leaves.
     """
     models = [read_model(folder / f) for f in ("nominal.toml", "report/model.toml")]
     settled = round(SETTLED_S / models[0].sample_time_s)
@@ -130,8 +130,6 @@ def selftest(count: int, seed: int, out: Path | None = None, jobs: int = 0, repl
 def _judge(axis: Axis, records: list[Recording], folder: Path, replicates: int) -> Scored:
     options = ("--jobs", "1")
     answer = solve(folder, "axis", *options)
-    again = [
-        solve(folder, "axis", *options, "--resample", str(i), report=f"again{i}") for i in range(replicates)
-    ]
+    again = [solve(folder, "axis", *options, "--resample", str(i), report=f"again{i}") for i in range(replicates)]
     share = closed(folder, records) if (folder / "report" / "model.toml").exists() else None
     return score(axis, answer, share, again)

@@ -1,4 +1,5 @@
-"""``sioms reconcile selftest tactile|force``: generate sensors with hidden effects, solve them blind, print the figures.
+"""``sioms reconcile selftest tactile|force``: generate sensors with hidden effects, solve them blind, print the
+figures.
 
 The generator and the truth live in this process; every sensor is solved by a process of its own that is given a
 folder with recordings, column description and nominal model.
@@ -37,9 +38,7 @@ COLUMNS = (
 )
 
 
-def generate(
-    subject: str, count: int, seed: int, kinds: Sequence[str] = MIXTURE
-) -> list[HiddenFinger | HiddenSensor]:
+def generate(subject: str, count: int, seed: int, kinds: Sequence[str] = MIXTURE) -> list[HiddenFinger | HiddenSensor]:
     """Draw the sensors of a test; every effect comes up in turn."""
     rng = np.random.default_rng(seed)
     source = finger_draw if subject == "tactile" else force_world
@@ -47,9 +46,7 @@ def generate(
     if subject == "force":
         effects["confounded"] = tuple(force_world.CONFOUNDED)
     draw: Any = draw_finger if subject == "tactile" else draw_sensor
-    return [
-        draw(f"{subject}{i:03d}", kind, rng, only) for i, kind, only in in_turn(count, rng, effects, kinds)
-    ]
+    return [draw(f"{subject}{i:03d}", kind, rng, only) for i, kind, only in in_turn(count, rng, effects, kinds)]
 
 
 def write_public(hidden: HiddenFinger | HiddenSensor, folder: Path, seed: int) -> None:

@@ -1,4 +1,6 @@
-"""The subjects of ``sioms reconcile``: what each asks on the command line, how it is analysed, live too, and what is written of it."""
+"""The subjects of ``sioms reconcile``: what each asks on the command line, how it is analysed, live too, and what is
+written of it.
+"""
 
 from __future__ import annotations
 
@@ -41,12 +43,8 @@ class Subject:
 
 
 def _axis_arguments(parser: argparse.ArgumentParser) -> Any:
-    parser.add_argument(
-        "data", type=Path, metavar="DATA", help="file or folder of recordings, or the node of an axis"
-    )
-    parser.add_argument(
-        "--model", type=Path, metavar="FILE", help="nominal model (TOML; default: DATA/nominal.json)"
-    )
+    parser.add_argument("data", type=Path, metavar="DATA", help="file or folder of recordings, or the node of an axis")
+    parser.add_argument("--model", type=Path, metavar="FILE", help="nominal model (TOML; default: DATA/nominal.json)")
     parser.add_argument(
         "--columns", type=Path, metavar="FILE", help="column description (default: columns.toml beside DATA)"
     )
@@ -127,9 +125,7 @@ def _tactile_arguments(parser: argparse.ArgumentParser) -> Any:
         "--model", type=Path, metavar="FILE", help="nominal finger (TOML; default: nominal.json in DATA)"
     )
     group = parser.add_argument_group("with a node")
-    group.add_argument(
-        "--place", default="prober.place", metavar="NODE", help="axis round the finger (prober.place)"
-    )
+    group.add_argument("--place", default="prober.place", metavar="NODE", help="axis round the finger (prober.place)")
     group.add_argument(
         "--press",
         default="prober.radial",
@@ -254,14 +250,29 @@ def _write_force(args: Args, verdict: Any) -> None:
 SUBJECTS = {
     "axis": Subject(
         "a motor axis, from recordings or live",
-        _axis_arguments, _analyse_axis, _live_axis, _write_axis, _install_model, "the axis is halted",
+        _axis_arguments,
+        _analyse_axis,
+        _live_axis,
+        _write_axis,
+        _install_model,
+        "the axis is halted",
     ),
     "tactile": Subject(
         "a tactile finger, from recorded touches or live",
-        _tactile_arguments, _analyse_tactile, _live_tactile, _write_tactile, _install_finger, "what pressed is clear or halted",
+        _tactile_arguments,
+        _analyse_tactile,
+        _live_tactile,
+        _write_tactile,
+        _install_finger,
+        "what pressed is clear or halted",
     ),
     "force": Subject(
         "a force/torque sensor, from recorded known loads or live",
-        _force_arguments, _analyse_force, _live_force, _write_force, _install_model, "what pressed is clear or halted",
+        _force_arguments,
+        _analyse_force,
+        _live_force,
+        _write_force,
+        _install_model,
+        "what pressed is clear or halted",
     ),
-}  # fmt: skip
+}

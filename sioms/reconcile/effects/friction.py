@@ -2,9 +2,9 @@
 
 Sources: B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit, "A survey of models, analysis tools and
 compensation methods for the control of machines with friction", Automatica 30 (1994) 1083-1138,
-for viscous, Coulomb, Stribeck; P. R. Dahl, "A solid friction model", 1968, for presliding; C. Canudas de Wit, H. Olsson,
-K. J. Astrom, P. Lischinsky, "A new model for control of systems with friction", IEEE Trans. Automatic Control 40 (1995)
-419-425, for both at once.
+for viscous, Coulomb, Stribeck; P. R. Dahl, "A solid friction model", 1968, for presliding; C. Canudas de Wit, H.
+Olsson, K. J. Astrom, P. Lischinsky, "A new model for control of systems with friction", IEEE Trans. Automatic Control
+40 (1995) 419-425, for both at once.
 """
 
 from __future__ import annotations
@@ -72,19 +72,20 @@ def load_level(x: Number, v: Number, u: Number, temperature: Number, p: Array) -
     return p[0] * np.abs(u)
 
 
-#: Steps from one trial of a length to the next; speeds of a drop, of the largest. Within so many steps of the encoder no path is seen.
+#: Steps from one trial of a length to the next; speeds of a drop, of the largest. Within so many steps of the encoder
+#: no path is seen.
 STEP_LENGTH = 3.5
 GRID_DROP = (0.003, 0.01, 0.03, 0.1)
 UNSEEN_STEPS = 2.0
 
 
 def lengths(seen: Seen, lower: float, upper: float) -> list[float]:
-    """List first guesses of the path over which friction builds up, bounds over the pitch: up to half of what was travelled."""
+    """List first guesses of the path over which friction builds up, bounds over the pitch: up to half of what was
+    travelled.
+    """
     low = 10.0 * lower * seen.pitch
     high = max(min(0.8 * upper * seen.pitch, 0.5 * seen.travel), low)
-    return [
-        float(g) for g in np.geomspace(low, high, 1 + int(np.ceil(np.log(high / low) / np.log(STEP_LENGTH))))
-    ]
+    return [float(g) for g in np.geomspace(low, high, 1 + int(np.ceil(np.log(high / low) / np.log(STEP_LENGTH))))]
 
 
 def _lugre(seen: Seen) -> Iterator[dict[str, float]]:
@@ -263,9 +264,7 @@ LUGRE = Effect(
             steps=UNSEEN_STEPS,
         ),
         Parameter("Fs", "{F}", Ref.FORCE, 0.0, 3.0, 0.08, "breakaway level"),
-        Parameter(
-            "vs", "{x}/s", Ref.SPEED, 2e-4, 0.5, 0.02, "speed over which the level drops", vanishes=True
-        ),
+        Parameter("vs", "{x}/s", Ref.SPEED, 2e-4, 0.5, 0.02, "speed over which the level drops", vanishes=True),
     ),
     signature="friction force builds up over a displacement after every reversal and drops with the speed",
     lookalikes=("stribeck", "presliding", "coulomb", "backlash"),
@@ -286,7 +285,8 @@ FRICTION_VARIATION = Effect(
         Parameter("phase", "rad", Ref.ANGLE, -np.pi, np.pi, 0.0, "phase at position zero", phase=True),
         Parameter("n", "1/pitch", Ref.ONE, 1.0, 60.0, 1.0, "periods in a pitch", fixed=True),
     ),
-    signature="periodic force residual whose sign follows the direction of motion, as large as the dry friction is at that speed",
+    signature="periodic force residual whose sign follows the direction of motion, as large as the dry friction is at "
+    "that speed",
     lookalikes=("torque_ripple", "cogging", "coulomb_position"),
     separate="one full turn both ways, at constant speed and with acceleration",
     beside=("stribeck", "presliding", "lugre"),

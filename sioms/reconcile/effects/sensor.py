@@ -82,9 +82,7 @@ ENCODER_QUANTISATION = Effect(
     mechanism=Mechanism(_coarse, lambda p, pitch: {"encoder_quantisation": {"factor": p[0]}}),
     trials=Trials(lambda seen: ({},)),
     equation="counts come in multiples of factor",
-    parameters=(
-        Parameter("factor", "1", Ref.ONE, 1.0, 4096.0, 1.0, "true over stated resolution", fixed=True),
-    ),
+    parameters=(Parameter("factor", "1", Ref.ONE, 1.0, 4096.0, 1.0, "true over stated resolution", fixed=True),),
     signature="only multiples of a number in the counts",
     lookalikes=("backlash",),
     separate="slow motion in one direction",

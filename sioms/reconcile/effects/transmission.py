@@ -12,11 +12,9 @@ from sioms.reconcile.effect import Array, Channel, Effect, Mechanism, Parameter,
 GRID_RESONANCE = (7.0, 11.0, 16.0, 24.0, 36.0, 55.0)
 GRID_LOAD = (0.3, 0.6)
 GRID_GAP = tuple(float(g) for g in np.geomspace(3e-4, 0.18, 24))
-#: A contact that bounces makes a cost of many minima; started with one that does not, it would not find all that do. The best
-#: few gaps of the first contact are tried with the others.
-CONTACTS = tuple(
-    {"load_fraction": f, "zeta": z} for f, z in ((0.4, 0.3), (0.6, 0.3), (0.4, 0.05), (0.6, 0.05))
-)
+#: A contact that bounces makes a cost of many minima; started with one that does not, it would not find all that do.
+#: The best few gaps of the first contact are tried with the others.
+CONTACTS = tuple({"load_fraction": f, "zeta": z} for f, z in ((0.4, 0.3), (0.6, 0.3), (0.4, 0.05), (0.6, 0.05)))
 
 
 def _elastic(row: Any, p: Array) -> None:
@@ -64,7 +62,8 @@ ELASTIC = Effect(
     parameters=(
         Parameter("f_res", "Hz", Ref.FREQUENCY, 2.0, 300.0, 20.0, "resonance of the free pair"),
         Parameter("load_fraction", "1", Ref.ONE, 0.03, 0.97, 0.5, "share of the inertia behind the spring"),
-        # what does not ring is no elastic transmission: a bristle's damping, or a lead in time, passes for one of 0.3 to 1
+        # what does not ring is no elastic transmission: a bristle's damping, or a lead in time, passes for one of 0.3
+        # to 1
         Parameter("zeta", "1", Ref.ONE, 0.0, 0.3, 0.05, "damping ratio"),
     ),
     signature="force residual concentrated around one frequency, whatever the position",
@@ -86,9 +85,7 @@ BACKLASH = Effect(
     equation="the load moves freely within +-gap/2 of the motor and follows in contact",
     parameters=(
         Parameter("gap", "{x}", Ref.PITCH, 1e-5, 0.2, 3e-3, "free play", steps=1.0),
-        Parameter(
-            "load_fraction", "1", Ref.ONE, 0.03, 0.97, 0.5, "share of the inertia behind the gap", soft=True
-        ),
+        Parameter("load_fraction", "1", Ref.ONE, 0.03, 0.97, 0.5, "share of the inertia behind the gap", soft=True),
         Parameter(
             "f_contact",
             "Hz",

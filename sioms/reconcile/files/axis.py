@@ -14,12 +14,12 @@ Column description (``columns.toml`` beside the data, or ``--columns``)::
     force          = { name = "vir",  unit = "V", scale = 35.15 }  # N mN kN, N m, mN m ...; value * scale
     force_measured = { name = "cur",  unit = "N" }
     index          = { name = "idx" }
-    feedforward    = { name = "ff",   unit = "N" }       # the part of force that is no feedback, a test signal for instance
-    external       = { name = "push", unit = "N" }       # known force on the axis beside the drive's
+    feedforward    = { name = "ff",   unit = "N" }       # the part of force that is no feedback, a test signal for
+    instance external       = { name = "push", unit = "N" }       # known force on the axis beside the drive's
 
-Files whose heads are these very names, each with its unit (``position [m]``), need no description; ``devin --record`` writes
-such. A column that the data do not have, or a key that nobody reads, is an error; a file may be without the last two when another
-has them.
+Files whose heads are these very names, each with its unit (``position [m]``), need no description; ``devin --record``
+writes such. A column that the data do not have, or a key that nobody reads, is an error; a file may be without the last
+two when another has them.
 """
 
 from __future__ import annotations
@@ -109,9 +109,7 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
             raise BadInputError(f"read {data}: no data files; expects one of {', '.join(SUFFIXES)}")
         if columns is None and (plain := _plain(files)) is not None:
             return Session(tuple(_record(f, plain, model) for f in files), True, (), None)
-        raise BadInputError(
-            f"read {data}: no column description (or give --columns): {_draft(files, description)}"
-        )
+        raise BadInputError(f"read {data}: no column description (or give --columns): {_draft(files, description)}")
     where = f"read {description}"
     table = parsed(read_bytes(description), where)
     only(table, ("sample_time_s", "loop_time_s", "files", "continuous", "final", "columns"), where)
@@ -124,7 +122,8 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
     loop = number(table, "loop_time_s", where, None) if "loop_time_s" in table else None
     if loop is not None and not 0.0 < loop <= 1.02 * model.sample_time_s:
         raise BadInputError(
-            f"{where}: loop_time_s is {loop:g}; needs the period of the loop that makes the force, more than 0 and at most the "
+            f"{where}: loop_time_s is {loop:g}; needs the period of the loop that makes the force, more than 0 and at "
+            "most the "
             f"{model.sample_time_s:g} between two rows"
         )
     continuous = truth(table, "continuous", where, True)
@@ -136,9 +135,7 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
     records, final = (tuple(_record(f, columns_of, model) for f in some) for some in (files, last))
     for quantity in SOMETIMES:
         if quantity in columns_of and all(getattr(r, quantity) is None for r in records + final):
-            raise BadInputError(
-                f"read {data}: no file has a column {columns_of[quantity]['name']!r} for {quantity}"
-            )
+            raise BadInputError(f"read {data}: no file has a column {columns_of[quantity]['name']!r} for {quantity}")
     return Session(records, continuous, final, loop)
 
 
@@ -158,7 +155,8 @@ def _record(path: Path, columns: Mapping[str, Any], model: AxisModel) -> Record:
             continue
         if head is None:
             raise BadInputError(
-                f"read {path.name}: no column {spec.get('name')!r} for {quantity}; has {', '.join(sorted(table.columns))}"
+                f"read {path.name}: no column {spec.get('name')!r} for {quantity}; has "
+                f"{', '.join(sorted(table.columns))}"
             )
         found[quantity] = _convert(quantity, table.columns[head], spec, table.units.get(head), model)
     index = found.get("index")
@@ -175,9 +173,7 @@ def _record(path: Path, columns: Mapping[str, Any], model: AxisModel) -> Record:
     )
 
 
-def _convert(
-    quantity: str, raw: Array, spec: Mapping[str, Any], stated: str | None, model: AxisModel
-) -> Array:
+def _convert(quantity: str, raw: Array, spec: Mapping[str, Any], stated: str | None, model: AxisModel) -> Array:
     """Bring a column to SI; its unit is what the description says, else what the head of the column states."""
     where = f"read column {quantity}"
     unit = unit_of(str(spec.get("unit", stated or "1")))
@@ -196,7 +192,8 @@ def _convert(
             else f"needs one of {', '.join(UNITS[right])}"
         )
         raise BadInputError(
-            f"{where}: {unit} is a unit of {kind}, the {quantity} of a {'rotary' if model.rotary else 'linear'} axis is "
+            f"{where}: {unit} is a unit of {kind}, the {quantity} of a {'rotary' if model.rotary else 'linear'} axis "
+            "is "
             f"{'an' if right == 'angle' else 'a'} {right}; {hint}"
         )
     scale, offset = (float(spec.get(key, instead)) for key, instead in (("scale", 1.0), ("offset", 0.0)))
@@ -215,7 +212,8 @@ def _per_count(where: str, spec: Mapping[str, Any], scale: float, model: AxisMod
 
 
 def _plain(files: Sequence[Path]) -> dict[str, Any] | None:
-    """Return the columns of files that need no description: each quantity under its own name, with its unit in the head.
+    """Return the columns of files that need no description: each quantity under its own name, with its unit in the
+    head.
 
     ``devin --record`` writes such files. None where the first is none.
     """
@@ -239,7 +237,8 @@ def _draft(files: Sequence[Path], description: Path) -> str:
         )
         lines.append(f'{guess} = {{ name = "{head}", unit = "{unit or "UNIT"}" }}')
     return (
-        f"write {description} with what each column is ({', '.join(QUANTITIES)}; position and force are needed, leave out the "
+        f"write {description} with what each column is ({', '.join(QUANTITIES)}; position and force are needed, leave "
+        "out the "
         "others), for instance\n    " + "\n    ".join(lines)
     )
 

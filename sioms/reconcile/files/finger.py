@@ -146,9 +146,7 @@ def _named(arrays: Mapping[str, Any], columns: Mapping[str, Any], where: str) ->
         given, factors = spec.get("name", name), ARRAYS[name][1]
         unit = spec.get("unit", ARRAYS[name][0])
         if unit not in factors:
-            raise BadInputError(
-                f"read {where}: unit {unit!r} of {name} is not known; known are {', '.join(factors)}"
-            )
+            raise BadInputError(f"read {where}: unit {unit!r} of {name} is not known; known are {', '.join(factors)}")
         if given in arrays:
             out[name] = arrays[given] * factors[unit]
     return out
@@ -157,9 +155,7 @@ def _named(arrays: Mapping[str, Any], columns: Mapping[str, Any], where: str) ->
 def _recording(got: Mapping[str, Any], where: str) -> Recording:
     for name in ("raw", "time"):
         if name not in got:
-            raise BadInputError(
-                f"read {where}: no array {name}; has {', '.join(sorted(got)) or 'none that is known'}"
-            )
+            raise BadInputError(f"read {where}: no array {name}; has {', '.join(sorted(got)) or 'none that is known'}")
     raw = got["raw"]
     frames = len(raw)
 

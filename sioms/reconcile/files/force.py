@@ -146,9 +146,7 @@ def _column(raw: Mapping[str, Any], specs: Specs, name: str, path: Path, count: 
             f"read {path.name}: no column {spec.get('name')!r} for {name}; has {', '.join(sorted(raw))}"
         )
     unit = spec.get("unit", "1")
-    allowed = (
-        tuple(UNITS) if name in ("time", "temperature") else TORQUES if unit_of(name) == "N m" else FORCES
-    )
+    allowed = tuple(UNITS) if name in ("time", "temperature") else TORQUES if unit_of(name) == "N m" else FORCES
     if unit not in allowed:
         raise BadInputError(f"read column {name}: unit {unit!r} is not known; known are {', '.join(allowed)}")
     values = raw[spec["name"]]

@@ -1,8 +1,8 @@
 """Read tables as instruments and spreadsheets write them: CSV of any dialect, NPZ, MAT.
 
-A CSV may part its columns by comma, semicolon, tab or blanks, write 1,5 for 1.5, carry lines of remarks before its head, a
-unit in each name (``pos [deg]``, ``pos (deg)``, ``pos/deg``, ``pos_deg``) or a line of units below the head. A time of day,
-with or without a date before it (``2024-02-01 12:30:00.125``), is read as seconds since midnight.
+A CSV may part its columns by comma, semicolon, tab or blanks, write 1,5 for 1.5, carry lines of remarks before its
+head, a unit in each name (``pos [deg]``, ``pos (deg)``, ``pos/deg``, ``pos_deg``) or a line of units below the head. A
+time of day, with or without a date before it (``2024-02-01 12:30:00.125``), is read as seconds since midnight.
 """
 
 from __future__ import annotations
@@ -163,9 +163,7 @@ def _text(path: Path) -> Table:
             f"read {path}: no numbers in the first {REMARKS} lines; needs one head line of names and numbers below"
         )
     if first == 0:
-        raise BadInputError(
-            f"read {path}: the first line has numbers, no names; needs one head line of names"
-        )
+        raise BadInputError(f"read {path}: the first line has numbers, no names; needs one head line of names")
     rows = _numbers(lines[first:])
     if rows is None:
         bad = next(
@@ -198,7 +196,9 @@ def _sign(line: str) -> str | None:
 
 
 def _numbers(lines: Sequence[str]) -> Array | None:
-    """Read rows of numbers, all alike; None where they are none. A comma is a decimal point where it does not part the columns."""
+    """Read rows of numbers, all alike; None where they are none. A comma is a decimal point where it does not part the
+    columns.
+    """
     sign = _sign(lines[0])
     text = [line.replace(",", ".") for line in lines] if sign != "," else lines
     try:

@@ -1,8 +1,8 @@
 """What the simulation believes about a finger and its rig, and the outputs that follow.
 
-Chain: place and load of a touch, tractions (``pressures``), strain at the elements by the layer's response, linear output
-``-strain / gain``, quadratic, creep, then responses that effects add. Outputs are fractions of the untouched output,
-compression positive.
+Chain: place and load of a touch, tractions (``pressures``), strain at the elements by the layer's response, linear
+output ``-strain / gain``, quadratic, creep, then responses that effects add. Outputs are fractions of the untouched
+output, compression positive.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ class Belief:
     Attributes:
         core, outer, shear: radii [m] and shear modulus [Pa]; poisson: Poisson's ratio.
         angle, radius, gain: of the elements [rad, m, strain per output], shape (ns,).
-        blur: square of the half angle that an element averages over [rad^2]: outputs change in proportion to it, from 0 on.
+        blur: square of the half angle that an element averages over [rad^2]: outputs change in proportion to it, from 0
+            on.
         quadratic: per element [1/output], shape (ns,).
         offset: angle by which every touch is further on than commanded [rad].
         hertz, adhesion: shares of Hertz's widths and of full adhesion.
@@ -154,9 +155,7 @@ def _tractions_at(c: _Contact, scene: Scene) -> tuple[Complex, Complex]:
     p = np.empty((len(scene.place), len(WAVES)), dtype=np.complex128)
     q = np.zeros_like(p)
     half = np.empty(len(scene.place))
-    argument = np.where(
-        edge, scene.load, scene.load / (1.0 / c.outer + 1.0 / np.where(edge, 1.0, scene.radius))
-    )
+    argument = np.where(edge, scene.load, scene.load / (1.0 / c.outer + 1.0 / np.where(edge, 1.0, scene.radius)))
     depth, phase, period = c.strip
     if depth:
         wider = 1.0 + depth * np.sin(2.0 * np.pi * scene.place / period + phase)
@@ -198,9 +197,7 @@ def strains(b: Belief, scene: Scene) -> Floats:
     """Return the strain of every element under every touch, shape (nt, ns)."""
     # what acts on nothing is left out of the key
     apex, strip = b.apex if b.friction else 0.0, b.strip if b.strip[0] else (0.0, 0.0, 1.0)
-    contact = _Contact(
-        b.core, b.outer, b.shear, b.poisson, b.hertz, b.adhesion, b.friction, apex, b.around, strip
-    )
+    contact = _Contact(b.core, b.outer, b.shear, b.poisson, b.hertz, b.adhesion, b.friction, apex, b.around, strip)
     return _strains(contact, scene, b.angle.tobytes(), tuple(np.round(b.radius, 10)), b.extent, b.offset)
 
 

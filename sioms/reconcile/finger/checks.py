@@ -12,9 +12,7 @@ from sioms.reconcile.finger.records import Touched
 
 LEAST_LIKE = 0.35  # correlation of measured and simulated touches below which it is another finger
 FACTOR = 8.0  # outputs, loads or radii off by more are in another unit
-SATURATED = (
-    0.25  # share of the frames in which an element is at an end of its range from which on little is learnt
-)
+SATURATED = 0.25  # share of the frames in which an element is at an end of its range from which on little is learnt
 PILE, FEW = (
     5.0,
     20,
@@ -35,14 +33,13 @@ def check_raw(raw: Floats, elements: int, name: str) -> None:
         raise BadInputError(f"read {name}: raw holds no number; needs readings of {elements} elements")
     finite = np.where(np.isfinite(raw), raw, 0.0)
     if np.all(np.ptp(finite, axis=0) == 0.0):
-        raise BadInputError(
-            f"read {name}: all {elements} elements are constant; needs frames of a living finger"
-        )
+        raise BadInputError(f"read {name}: all {elements} elements are constant; needs frames of a living finger")
     ended = np.any([_at_the_end(column) for column in finite.T], axis=0)
     if ended.mean() > SATURATED:
         raise BadInputError(
             f"read {name}: an element is at an end of its range ({float(np.abs(finite[ended]).max()):.4g} %) in "
-            f"{100 * float(ended.mean()):.0f} % of the frames: the electronics is saturated; press more gently, or widen the range"
+            f"{100 * float(ended.mean()):.0f} % of the frames: the electronics is saturated; press more gently, or "
+            "widen the range"
         )
 
 

@@ -1,7 +1,8 @@
 """Lay touches, courses, untouched frames, ramps and the load cell out as rows for the fit.
 
-Views: ``touch`` (what every element has of every touch, the profile), ``course`` (how the touch develops while the load stays),
-``drift`` (level of untouched outputs over temperature), ``ramp``, ``cell``, ``strength`` (how strong every touch is in all, within
+Views: ``touch`` (what every element has of every touch, the profile), ``course`` (how the touch develops while the load
+stays), ``drift`` (level of untouched outputs over temperature), ``ramp``, ``cell``, ``strength`` (how strong every
+touch is in all, within
 what is known of its load: a view of its own, or the many elements would hide it). Nuisances are projected out: zero and
 scale of a ramp, the level at power-up.
 """
@@ -28,9 +29,7 @@ OWN_LEVEL = 1e-3  # of all simulated touches alike: finite elements of another's
 LATEST = 0.95  # of the time without frames before the load: when the load came on at the latest
 _LOAD_STEP = 0.01  # of a load, for a difference
 LEAST_RUNS = 12  # of three like touches one after the other, of which the scatter of loads is told
-_CONTRASTS = np.array([[-3, -1, 1, 3], [1, -1, -1, 1], [-1, 3, -3, 1]]) / np.array(
-    [[20**0.5], [2.0], [20**0.5]]
-)
+_CONTRASTS = np.array([[-3, -1, 1, 3], [1, -1, -1, 1], [-1, 3, -3, 1]]) / np.array([[20**0.5], [2.0], [20**0.5]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +80,9 @@ class FingerData:
         return self.whiten(predicted - self.measured())
 
     def doubts(self, model: SensorModel) -> Floats:
-        """See ``sensors.fit.Data``: the level of all touches, when the load came on between two frames, when gains were stated."""
+        """See ``sensors.fit.Data``: the level of all touches, when the load came on between two frames, when gains were
+        stated.
+        """
         said, t = self.predict(model), self.touched
         touch = np.where(self.view == TOUCH, said, 0.0)
         later = replace(t, since=t.since + LATEST * t.unseen[:, None])  # creep is less than it seems then
@@ -93,7 +94,9 @@ class FingerData:
         return np.stack(columns, axis=1)
 
     def _growth(self, model: SensorModel, name: str) -> float:
-        """Return half the range over the touches of what a term multiplies by: gains may have been stated at its beginning."""
+        """Return half the range over the touches of what a term multiplies by: gains may have been stated at its
+        beginning.
+        """
         grown = model.with_effect(name, {**model.effects[name], "c": np.zeros(1)})
         own, without = (outputs(m.belief(), self.scene) for m in (grown, model.without_effect(name)))
         return 0.5 * float(np.ptp(np.sum(own * without, axis=1) / np.sum(without**2, axis=1)))
@@ -137,7 +140,9 @@ class FingerData:
         return out
 
     def loaded(self, model: SensorModel) -> FingerData:
-        """Return the rows with what the load does to outputs as a model has it: what a quadratic or proximity adds is not in proportion."""
+        """Return the rows with what the load does to outputs as a model has it: what a quadratic or proximity adds is
+        not in proportion.
+        """
         b: Belief = model.belief()
         more = replace(self.scene, load=(1.0 + _LOAD_STEP) * self.scene.load)
         now, then = (outputs(b, scene)[:, self.alive] for scene in (self.scene, more))
@@ -145,25 +150,29 @@ class FingerData:
         return replace(self, beyond=late(b, self.touched.since).mean(1)[:, None] * grown)
 
     def turned(self, other: FingerData) -> float:
-        """Return how far an uncertain load changes profiles less or more than in other rows, in units of their noise (rms of touches)."""
+        """Return how far an uncertain load changes profiles less or more than in other rows, in units of their noise
+        (rms of touches).
+        """
         off = (np.asarray(self.beyond) - other.beyond) / self._sigma
         u, size = self._profile
         off = off - u * np.einsum("ji,ji->j", u, off)[:, None]
         return float(
-            np.sqrt(
-                np.mean(np.sum(off**2, axis=1) * self.load_share**2 / (1.0 + (size * self.load_share) ** 2))
-            )
+            np.sqrt(np.mean(np.sum(off**2, axis=1) * self.load_share**2 / (1.0 + (size * self.load_share) ** 2)))
         )
 
     @cached_property
     def _profile(self) -> tuple[Floats, Floats]:
-        """What the load changes in outputs in units of their noise, as a direction, shape (nt, alive), and its length, shape (nt,)."""
+        """What the load changes in outputs in units of their noise, as a direction, shape (nt, alive), and its length,
+        shape (nt,).
+        """
         u = (self.touched.output[:, self.alive] + self.beyond) / self._sigma
         size = np.maximum(np.sqrt(np.einsum("ji,ji->j", u, u)), 1e-9)
         return u / size[:, None], size
 
     def scatter(self, predicted: Floats) -> float:
-        """Return by how much loads scatter from touch to touch, in units of ``load_share``, as strengths beside a prediction tell; inf of few."""
+        """Return by how much loads scatter from touch to touch, in units of ``load_share``, as strengths beside a
+        prediction tell; inf of few.
+        """
         t = self.touched
         size = self._profile[1]
         unit = size * self.load_share
@@ -220,9 +229,7 @@ class FingerData:
     def _ramps(self, b: Belief) -> Floats:
         if self.ramp_scene is None:
             return np.empty(0)
-        told = (
-            b.cell if np.isfinite(self.cell_spread).all() else 0.0
-        )  # else nothing but the ramps would tell it
+        told = b.cell if np.isfinite(self.cell_spread).all() else 0.0  # else nothing but the ramps would tell it
         full, at, out = outputs(b, _true_loads(self.ramp_scene, told)), 0, []
         for r in self.ramps:
             n = len(r.load)
@@ -297,14 +304,8 @@ def lay_out(
         cell_spread: spread of the cell about the commanded load by touch [N/m], nan without a cell.
         unsure: relative standard deviation of the level of all loads.
     """
-    warm = (
-        np.nan_to_num(touched.temperature - np.nanmean(touched.temperature))
-        if warm_known(touched)
-        else 0.0 * load
-    )
-    scene = Scene(
-        touched.place, load, touched.radius, touched.since, touched.time - touched.time.mean(), warm
-    )
+    warm = np.nan_to_num(touched.temperature - np.nanmean(touched.temperature)) if warm_known(touched) else 0.0 * load
+    scene = Scene(touched.place, load, touched.radius, touched.since, touched.time - touched.time.mean(), warm)
     ramp_scene = None
     if ramps:
         place = np.concatenate([np.full(len(r.load), elements[r.element]) for r in ramps])

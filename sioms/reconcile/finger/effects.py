@@ -152,9 +152,7 @@ QUADRATIC = SensorEffect(
     change=_added("quadratic", "q"),
     equation="d = l + q l^2, l the linear output",
     parameters=(
-        Quantity(
-            "q", "1", -20.0, 20.0, 2.0, "quadratic coefficient of each element, per unit of output", each=True
-        ),
+        Quantity("q", "1", -20.0, 20.0, 2.0, "quadratic coefficient of each element, per unit of output", each=True),
     ),
     signature="residual with the square of the output",
     lookalikes=("hertz", "gain_scatter", "creep"),
@@ -208,9 +206,7 @@ PROXIMITY = SensorEffect(
     equation="d_i = d_i + A exp(-|t_i - t_c| / range), A < 0",
     parameters=(
         Quantity("A", "1", -0.5, 0.0, 5e-3, "output that the indenter draws at its own place"),
-        Quantity(
-            "range", "rad", 0.03, 2.0, 0.05, "angle over which it falls to 1/e", starts=(0.12, 0.25, 0.6)
-        ),
+        Quantity("range", "rad", 0.03, 2.0, 0.05, "angle over which it falls to 1/e", starts=(0.12, 0.25, 0.6)),
     ),
     signature="output lowered wherever the indenter is near, whatever the load",
     lookalikes=("adhesion", "poisson"),

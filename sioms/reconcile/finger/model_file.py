@@ -71,9 +71,7 @@ def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, bool]
     )
     extent = float(numbers(t, "extent_rad", where, 1)[0]) if "extent_rad" in t else 0.0
     if not 0.0 <= extent < 1.0:
-        raise BadInputError(
-            f"read model {where}: extent_rad is {extent:g}; needs the half angle of an element, 0 to 1"
-        )
+        raise BadInputError(f"read model {where}: extent_rad is {extent:g}; needs the half angle of an element, 0 to 1")
     b = Belief(
         core=core,
         outer=outer,
@@ -159,9 +157,7 @@ def corrected(model: SensorModel, nominal: Finger | None, dead: tuple[int, ...] 
     signal = nominal.signal
     if "proximity" in model.effects:
         v = model.effects["proximity"]
-        signal = msgspec.structs.replace(
-            signal, proximity=float(v["A"][0]), proximity_range_rad=float(v["range"][0])
-        )
+        signal = msgspec.structs.replace(signal, proximity=float(v["A"][0]), proximity_range_rad=float(v["range"][0]))
     contact = ContactModel(
         "adhering" if b.adhesion > 0.0 else "hertz" if b.hertz > 0.5 else "frictionless",
         min(b.adhesion, MOST_ADHESION),

@@ -50,9 +50,7 @@ def indenter(radius: float) -> str:
 
 def _at(places: Floats, loads: Floats | float, radii: Floats | float) -> Scene:
     p, q, r = np.broadcast_arrays(places, np.asarray(loads), np.asarray(radii))
-    return scene_of(
-        np.array(p, dtype=np.float64), np.array(q, dtype=np.float64), np.array(r, dtype=np.float64)
-    )
+    return scene_of(np.array(p, dtype=np.float64), np.array(q, dtype=np.float64), np.array(r, dtype=np.float64))
 
 
 def first(b: Belief, bench: Bench, step: float = np.radians(2.0)) -> Iterator[Plan]:

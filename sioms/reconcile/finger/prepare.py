@@ -74,9 +74,7 @@ def prepare(
     count = len(nominal.angle)
     touches = [e for e in experiments if e.touches is not None]
     if not touches:
-        raise BadInputError(
-            "read recordings: none holds touches (cmd_theta, cmd_P, cmd_rc); record some first"
-        )
+        raise BadInputError("read recordings: none holds touches (cmd_theta, cmd_P, cmd_rc); record some first")
     for e in experiments:
         check_raw(e.recording.raw, count, e.name)
         if e.touches is not None:
@@ -92,9 +90,7 @@ def prepare(
     touched, notes = reduce_touches(told, scale, dead, lines)
     alive = check_match(touched, nominal, ~dead)
     after = max(float(e.recording.time_s[-1]) for e in experiments if e.name not in ("thermal", "noise"))
-    still = (
-        reduce_untouched(by_name["thermal"], scale, lines, after_s=after) if "thermal" in by_name else None
-    )
+    still = reduce_untouched(by_name["thermal"], scale, lines, after_s=after) if "thermal" in by_name else None
     ramps = tuple(reduce_ramps(by_name["ramp"], scale, ~alive, lines)) if "ramp" in by_name else ()
     blur = nominal.blur or ((START_EXTENT * _pitch(nominal.angle)) ** 2 if refine_extent else 0.0)
     base = replace(nominal, angle=np.ascontiguousarray(nominal.angle), around=nominal.poisson, blur=blur)
@@ -127,9 +123,7 @@ def _settle(
     if lines:
         line = lines[0]
         effect = model.library["mains_line"]
-        model = model.with_effect(
-            "mains_line", {"a": np.array([line.amplitude]), "f": np.array([line.frequency])}
-        )
+        model = model.with_effect("mains_line", {"a": np.array([line.amplitude]), "f": np.array([line.frequency])})
         e = float(student.ppf(0.975, np.count_nonzero(alive) - 1)) * line.deviation
         w = 1.96 * line.frequency_deviation
         told = [f"{100 * q.amplitude:.3g} % at {q.frequency:.3f} Hz" for q in lines]
@@ -189,7 +183,9 @@ def _rows(
     base: Belief,
     notes: list[str],
 ) -> FingerData:
-    """Lay out the rows with the best guess of each touch's load: the load cell at the commanded level if outputs follow it."""
+    """Lay out the rows with the best guess of each touch's load: the load cell at the commanded level if outputs follow
+    it.
+    """
     count = len(t)
     told = bool(np.isfinite(t.cell).all() and np.ptp(t.cell) > 0.0 and np.all(t.cell > 0.0))
     load, share, spread = t.load.copy(), np.full(count, LOAD_SPREAD), np.full(count, np.nan)
@@ -203,16 +199,13 @@ def _rows(
         if _follows(t, ratio, base, alive):
             load, share, unsure = t.cell / level, LOAD_MARGIN * t.cell_noise / t.cell, deviation / level
         else:
-            # no load was further from its command than the cell, with its noise, says; light ones are further, for their size
+            # no load was further from its command than the cell, with its noise, says; light ones are further, for
+            # their size
             share = LOAD_MARGIN * spread / t.cell
             share *= min(1.0, LOAD_SPREAD / float(np.median(share)))
-            notes.append(
-                "the outputs do not follow the load cell from touch to touch: the commanded load was used"
-            )
+            notes.append("the outputs do not follow the load cell from touch to touch: the commanded load was used")
     else:
-        notes.append(
-            f"no load cell: the commanded load was used, {100 * LOAD_SPREAD:.0f} % of it taken as uncertain"
-        )
+        notes.append(f"no load cell: the commanded load was used, {100 * LOAD_SPREAD:.0f} % of it taken as uncertain")
     return lay_out(t, alive, still, ramps, base.angle, share, load, spread, unsure)
 
 
@@ -230,7 +223,8 @@ def cell_level(t: Touched) -> tuple[float, float, Floats]:
 
 
 def cell_spread(t: Touched, level: float) -> Floats:
-    """Return how far the load cell scatters about the commanded loads [N/m]: beyond its own noise alike, or in proportion to them.
+    """Return how far the load cell scatters about the commanded loads [N/m]: beyond its own noise alike, or in
+    proportion to them.
 
     The likelier of the two; touches far off count no more than at three standard deviations.
     """
@@ -248,8 +242,8 @@ def cell_spread(t: Touched, level: float) -> Floats:
 def _follows(t: Touched, ratio: Floats, base: Belief, alive: NDArray[np.intp]) -> bool:
     """Say whether the strength of touches goes with the load cell beyond the commanded load.
 
-    Every element gets its own gain first, and what repeats from element to element is taken off, or scatter and width of
-    the elements hide the loads.
+    Every element gets its own gain first, and what repeats from element to element is taken off, or scatter and width
+    of the elements hide the loads.
     """
     expected = outputs(base, scene_of(t.place, t.load, t.radius))[:, alive]
     own = t.output[:, alive]

@@ -1,8 +1,9 @@
 """Tractions under an indenter as Fourier series, tabulated so that a fit may ask for thousands of touches.
 
 A table belongs to one body (core, outer radius, Poisson's ratio, shear modulus) and one coefficient of friction. Round
-indenters are looked up by the product P R (their shape depends on the half width alone), edges by their load. Everything
-is per unit load. Series are complex, ``z_k = c_k + i s_k`` of ``sum c_k cos kt + s_k sin kt``, t from the indenter's apex.
+indenters are looked up by the product P R (their shape depends on the half width alone), edges by their load.
+Everything is per unit load. Series are complex, ``z_k = c_k + i s_k`` of ``sum c_k cos kt + s_k sin kt``, t from the
+indenter's apex.
 """
 
 from __future__ import annotations
@@ -47,9 +48,7 @@ class Sheet:
     def series(self, argument: Floats) -> tuple[Complex, Complex]:
         """Return normal and shear series, shape (n, HIGHEST + 1); the last contact solved beyond the table."""
         root = np.sqrt(np.clip(argument, 0.0, self.top))
-        return np.asarray(self.normal(root), dtype=np.complex128), np.asarray(
-            self.shear(root), dtype=np.complex128
-        )
+        return np.asarray(self.normal(root), dtype=np.complex128), np.asarray(self.shear(root), dtype=np.complex128)
 
     def width(self, argument: Floats) -> Floats:
         """Return half widths [rad]."""
@@ -92,9 +91,7 @@ def sheet(body: Cylinder, edge: bool, friction: float = 0.0) -> Sheet:
     for a in np.maximum(widths, 1e-9):
         c = shape(a)
         unit = 0.5 * np.pi * a * body.outer_m * float(c[0])
-        rows.append(
-            pack(Contact(body, float(a), 1.0, float(offset(a) * a), c / unit, friction, np.zeros(order + 1)))
-        )
+        rows.append(pack(Contact(body, float(a), 1.0, float(offset(a) * a), c / unit, friction, np.zeros(order + 1))))
     root = np.sqrt(argument)
     return Sheet(
         float(argument[-1]),
@@ -108,9 +105,7 @@ def sheet(body: Cylinder, edge: bool, friction: float = 0.0) -> Sheet:
 def hertz(body: Cylinder) -> Sheet:
     """Tabulate Hertz's round contact: the half plane's width, without the core."""
     widths = np.linspace(0.0, _ROUND_AT[-1], _FINE)
-    normal = (
-        -ellipse_spectrum(WAVES * widths[:, None]) / (np.pi * body.outer_m) * np.where(WAVES == 0, 0.5, 1.0)
-    )
+    normal = -ellipse_spectrum(WAVES * widths[:, None]) / (np.pi * body.outer_m) * np.where(WAVES == 0, 0.5, 1.0)
     root = np.sqrt(hertz_product(body, widths))
     return Sheet(
         float(root[-1] ** 2),

@@ -29,10 +29,12 @@ class Touched:
         cell: load cell, loaded less baseline [N/m], nan without; cell_noise: its standard deviation.
         output: mean under load less baseline; part: the same for ``PARTS`` parts, shape (nt, PARTS, ns).
         since: middle of each part after the load came on [s], shape (nt, PARTS).
-        level: baseline; temperature, temperature_noise: [deg C] of the baseline, nan without; time: [s] of the baseline.
+        level: baseline; temperature, temperature_noise: [deg C] of the baseline, nan without; time: [s] of the
+            baseline.
         warmed: temperature of each part less that of the baseline [K], 0 without, shape (nt, PARTS).
         unseen: time before the first frame under load of which nothing was recorded [s], shape (nt,).
-        share: 1/frames under load + 1/frames of baseline, shape (nt,): variance of a touch's output over that of a frame.
+        share: 1/frames under load + 1/frames of baseline, shape (nt,): variance of a touch's output over that of a
+            frame.
         noise: standard deviation of one frame, shape (ns,).
     """
 
@@ -79,7 +81,9 @@ class Untouched:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ramped:
-    """One load ramp of an edge over one element, in bins: output (n,), load [N/m] (n,), time since its start [s] (n,)."""
+    """One load ramp of an edge over one element, in bins: output (n,), load [N/m] (n,), time since its start [s]
+    (n,).
+    """
 
     element: int
     output: Floats
@@ -170,7 +174,9 @@ def reduce_touches(
 
 
 def _warming(r: Recording, count: int) -> Floats:
-    """Return how fast the temperature rises at each touch [K/s], of its neighbours as well: one touch tells little; 0 without."""
+    """Return how fast the temperature rises at each touch [K/s], of its neighbours as well: one touch tells little; 0
+    without.
+    """
     out = np.zeros(count)
     told = np.isfinite(r.temperature_c) & (r.touch >= 0)
     for number in range(count):
@@ -191,9 +197,7 @@ def _onset(r: Recording, mine: NDArray[np.intp], before: NDArray[np.intp], under
     return float(r.time_s[before[-1]])
 
 
-def without_lines(
-    frames: Floats, time: Floats, lines: Sequence[Line], order: int = 0
-) -> tuple[Floats, int, float]:
+def without_lines(frames: Floats, time: Floats, lines: Sequence[Line], order: int = 0) -> tuple[Floats, int, float]:
     """Take sines of known frequencies off a run of frames; amplitudes and phases are free.
 
     What these frames cannot tell from their course (a line that their rate folds to nothing) is left in.
@@ -202,8 +206,8 @@ def without_lines(
         order: of the polynomial that the course of the frames may follow.
 
     Returns:
-        The frames without lines, how many of their degrees of freedom that took, and what it adds to the variance of their
-        mean, in variances of one frame.
+        The frames without lines, how many of their degrees of freedom that took, and what it adds to the variance of
+        their mean, in variances of one frame.
     """
     if not lines or len(frames) < 2 * len(lines) + order + 4:
         return frames, 0, 0.0
@@ -221,11 +225,11 @@ def without_lines(
 def reduce_untouched(
     r: Recording, scale: float, lines: Sequence[Line] = (), skip_s: float = 10.0, after_s: float = -np.inf
 ) -> Untouched | None:
-    """Return untouched frames with their temperature, without lines; those whose time reaches back to a touch are left out."""
+    """Return untouched frames with their temperature, without lines; those whose time reaches back to a touch are left
+    out.
+    """
     step = float(np.median(np.diff(r.time_s))) if len(r.time_s) > 1 else 0.0
-    good = (
-        np.isfinite(r.temperature_c) & np.isfinite(r.raw).all(axis=1) & (r.time_s - step > after_s + skip_s)
-    )
+    good = np.isfinite(r.temperature_c) & np.isfinite(r.raw).all(axis=1) & (r.time_s - step > after_s + skip_s)
     if np.count_nonzero(good) < 8:
         return None
     output = r.raw[good] * scale
@@ -240,7 +244,8 @@ def reduce_untouched(
 
 
 def _folded(output: Floats, time: Floats, own: Floats, line: Line) -> Floats:
-    """Return what a line leaves in slow frames beside what is their own, at the likeliest frequency of those that it may have.
+    """Return what a line leaves in slow frames beside what is their own, at the likeliest frequency of those that it
+    may have.
 
     Args:
         own: orthonormal columns that are no line, shape (n, k).
@@ -260,9 +265,7 @@ def _folded(output: Floats, time: Floats, own: Floats, line: Line) -> Floats:
     return found
 
 
-def reduce_ramps(
-    r: Recording, scale: float, dead: NDArray[np.bool_], lines: Sequence[Line] = ()
-) -> list[Ramped]:
+def reduce_ramps(r: Recording, scale: float, dead: NDArray[np.bool_], lines: Sequence[Line] = ()) -> list[Ramped]:
     """Return load ramps in bins; touch n lies over element n; the load is the line through the load cell's readings."""
     out = []
     for number in np.unique(r.touch[r.touch >= 0]):
@@ -323,7 +326,8 @@ def find_lines(r: Recording, scale: float, outstanding: float = 60.0) -> list[Li
         fine = _peak(raw, float(place))
         amplitude = _amplitudes(raw, fine)
         size = float(np.sqrt(np.mean(amplitude**2)))
-        # the least that noise of one bin's power, ``floor``, allows: Rife & Boorstyn 1974, IEEE Trans. Inf. Theory 20, eq. 12
+        # the least that noise of one bin's power, ``floor``, allows: Rife & Boorstyn 1974, IEEE Trans. Inf. Theory 20,
+        # eq. 12
         noise = floor[place] / (window @ window)
         unsure = np.sqrt(24.0 * noise / raw.size) / (2.0 * np.pi * size * frames / r.rate_hz)
         own = float(np.std(amplitude, ddof=1) / np.sqrt(raw.shape[1]))
@@ -332,7 +336,9 @@ def find_lines(r: Recording, scale: float, outstanding: float = 60.0) -> list[Li
 
 
 def _peak(raw: Floats, place: float) -> float:
-    """Return where between bins the spectrum of all columns has its top, beginning at one: parabolas through three places."""
+    """Return where between bins the spectrum of all columns has its top, beginning at one: parabolas through three
+    places.
+    """
     for step in (0.5, 0.2, 0.1):
         low, mid, high = (float(np.sum(_amplitudes(raw, place + k * step) ** 2)) for k in (-1, 0, 1))
         bend = min(low - 2.0 * mid + high, -1e-300)

@@ -46,9 +46,7 @@ class FingerSubject:
     model: SensorModel
     settled: tuple[NamedEffect, ...]
     notes: tuple[str, ...]
-    names: tuple[str, ...] = field(
-        default_factory=lambda: tuple(n for n, e in library().items() if e.rankable)
-    )
+    names: tuple[str, ...] = field(default_factory=lambda: tuple(n for n, e in library().items() if e.rankable))
     terms: tuple[str, ...] = tuple(t.name for t in TERMS)
     bench: Bench = field(default_factory=Bench)
 
@@ -58,9 +56,7 @@ class FingerSubject:
         noise = float(np.sqrt(np.mean(d.touched.noise[d.alive] ** 2)))
         share = float(np.median(d.touched.share))
         drift = (
-            float(np.median(d.untouched.noise[d.alive]))
-            if d.untouched is not None
-            else noise * np.sqrt(0.5 * share)
+            float(np.median(d.untouched.noise[d.alive])) if d.untouched is not None else noise * np.sqrt(0.5 * share)
         )
         ramp = float(np.median([r.noise for r in d.ramps])) if d.ramps else noise
         return dict(
@@ -119,7 +115,9 @@ class FingerSubject:
         return found
 
     def sharpened(self, model: SensorModel, shares: Mapping[int, float]) -> FingerSubject | None:
-        """Return the finger with loads as certain as touches beside a model show, and what they do as it says; None for nothing new."""
+        """Return the finger with loads as certain as touches beside a model show, and what they do as it says; None for
+        nothing new.
+        """
         d = self.training.loaded(model)
         seen = d.scatter(d.predict(model)) * by_chance(len(d.touched))
         if seen > SHARPER and d.turned(self.training) < TURNED:
@@ -222,9 +220,7 @@ def _drift_features(d: FingerData, count: int) -> Floats:
         )
     if d.untouched is not None:
         t = d.untouched.temperature
-        own = np.concatenate(
-            [np.zeros((len(t), rows[0].shape[1] - 6 if rows else 0)), hats(t, knots(t, 6))], axis=1
-        )
+        own = np.concatenate([np.zeros((len(t), rows[0].shape[1] - 6 if rows else 0)), hats(t, knots(t, 6))], axis=1)
         rows.append(np.repeat(own, len(d.alive), axis=0))
     widest = max(r.shape[1] for r in rows)
     return np.concatenate([np.pad(r, ((0, 0), (0, widest - r.shape[1]))) for r in rows])

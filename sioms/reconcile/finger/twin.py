@@ -1,4 +1,6 @@
-"""A finger as its model has it: what a simulated device answers in the place of the finger that the model was found for."""
+"""A finger as its model has it: what a simulated device answers in the place of the finger that the model was found
+for.
+"""
 
 from __future__ import annotations
 
@@ -56,9 +58,7 @@ class FingerTwin:
             force: at most 0 is no contact.
             time_s: of this reading, for creep and the mains.
         """
-        steady = (
-            self._steady(force, angle_rad, indenter_radius_m) if force > 0.0 else np.zeros(len(self._late))
-        )
+        steady = self._steady(force, angle_rad, indenter_radius_m) if force > 0.0 else np.zeros(len(self._late))
         np.multiply(100.0, self._crept(steady, time_s), out=out)
         amplitude, frequency = self._line
         if amplitude:
@@ -88,7 +88,8 @@ class FingerTwin:
 def twin(
     table: Mapping[str, Any], path: str, length_m: float, noise: float, resolution: float, seed: int
 ) -> FingerTwin:
-    """Return the twin of the finger in a model file (the entry point ``finger`` of ``sioms.twins``); see ``FingerTwin``.
+    """Return the twin of the finger in a model file (the entry point ``finger`` of ``sioms.twins``); see
+    ``FingerTwin``.
 
     Raises:
         ValueError: the file makes no sense.

@@ -74,7 +74,8 @@ def readings(b: ForceBelief, loads: Loads) -> Floats:
 
 @lru_cache(maxsize=32)
 def late(loads: Loads, tau: float) -> Floats:
-    """Return how far every load is ahead of itself seen through a lag of first order, zero at the first row of a record.
+    """Return how far every load is ahead of itself seen through a lag of first order, zero at the first row of a
+    record.
 
     Args:
         tau: time constant [s]. A load is taken to have come right after the row before, as weights do.
@@ -110,11 +111,13 @@ def lag(loads: Loads, reach: Floats, power: float, forgets: float) -> Floats:
 class Loops:
     """Loops about each of some loads: of plays, which remember where they turned round, and of one law that forgets it.
 
-    A play follows the load once that has moved its width. They weigh with a power of their width; even weights make loops of
-    parabolas, as metal under loads well below yield has them (Rayleigh's law). The other law is that of Bouc and Wen: straight
-    back to the middle, and from there on as an exponential of a third of the reach. A full loop of either has height one. One caller at a time.
-    Source: M. A. Krasnosel'skii, A. V. Pokrovskii, "Systems with Hysteresis", 1989, sec. 2 and 34 (play, Prandtl-Ishlinskii);
-    Y. K. Wen, "Method for random vibration of hysteretic systems", J. Eng. Mech. Div. ASCE 102 (1976), eq. 3 (n = 1, beta = gamma).
+    A play follows the load once that has moved its width. They weigh with a power of their width; even weights make
+    loops of parabolas, as metal under loads well below yield has them (Rayleigh's law). The other law is that of Bouc
+    and Wen: straight back to the middle, and from there on as an exponential of a third of the reach. A full loop of
+    either has height one. One caller at a time.
+    Source: M. A. Krasnosel'skii, A. V. Pokrovskii, "Systems with Hysteresis", 1989, sec. 2 and 34 (play,
+    Prandtl-Ishlinskii); Y. K. Wen, "Method for random vibration of hysteretic systems", J. Eng. Mech. Div. ASCE 102
+    (1976), eq. 3 (n = 1, beta = gamma).
 
     Args:
         reach: largest width, shape (n,); power: of the weights; forgets: share of the law that does.
@@ -129,7 +132,9 @@ class Loops:
         self._load, self._ahead = load, np.zeros(len(load))
 
     def follow(self, load: Floats) -> Floats:
-        """Move on through loads, shape (t, n); return how far the loops lag behind each in their height, -1 to 1, shape (t, n)."""
+        """Move on through loads, shape (t, n); return how far the loops lag behind each in their height, -1 to 1, shape
+        (t, n).
+        """
         out = (1.0 - self._forgets) * self._follow_plays(load)
         if self._forgets:
             out -= self._forgets * self._follow_forgetful(load)
@@ -160,7 +165,9 @@ def play(plays: Floats, width: Floats, weight: Floats, load: Floats, out: Floats
 
 
 def forget(ahead: Floats, steps: Floats) -> None:
-    """Put how far ahead the loops are, -1 to 1, in the place of steps of the load in units of their slope, shape (t, n)."""
+    """Put how far ahead the loops are, -1 to 1, in the place of steps of the load in units of their slope, shape (t,
+    n).
+    """
     for j in range(steps.shape[1]):
         here = ahead[j]
         for i in range(steps.shape[0]):
@@ -181,9 +188,7 @@ def _of_rows(load: Floats, loop: Callable[..., None]) -> Callable[..., None]:
     return _compiled(loop) if len(load) > 1 else loop
 
 
-def lagged(
-    load: Floats, reach: Floats, power: float, record: NDArray[np.int64], forgets: float = 0.0
-) -> Floats:
+def lagged(load: Floats, reach: Floats, power: float, record: NDArray[np.int64], forgets: float = 0.0) -> Floats:
     """Return how far every column lags behind itself, see ``Loops``; at rest in every record's first row."""
     parts = np.split(load, np.flatnonzero(np.diff(record)) + 1)
     return np.concatenate([Loops(reach, power, forgets, p[0]).follow(p) for p in parts])

@@ -57,9 +57,7 @@ GAIN = SensorEffect(
     channel=SENSOR,
     change=_gain,
     equation="reading_i = (1 + g_i) (stated reading_i)",
-    parameters=(
-        Quantity("g", "1", -0.9, 9.0, 0.02, "relative departure of each component's gain", each=True),
-    ),
+    parameters=(Quantity("g", "1", -0.9, 9.0, 0.02, "relative departure of each component's gain", each=True),),
     signature="reading off in proportion to its own load",
     lookalikes=("cross_talk", "quadratic", "hysteresis"),
     separate="load each component alone, in both directions",
@@ -117,7 +115,8 @@ HYSTERESIS = SensorEffect(
     channel=MECHANICS,
     change=responding(lagging, "b", "r", "a", "m"),
     equation=(
-        "reading_i = l_i + b_i ((1 - m) mean over w of (z_w - l_i)/w weighed with w^a - m y_i), z_w the play of width w about l_i, "
+        "reading_i = l_i + b_i ((1 - m) mean over w of (z_w - l_i)/w weighed with w^a - m y_i), z_w the play of width "
+        "w about l_i, "
         "w up to r_i, y' = 3/r_i l_i' where it falls to 0, 3/r_i l_i' (1 - |y|) beyond"
     ),
     parameters=(
@@ -156,9 +155,7 @@ def _cross(names: tuple[str, ...]) -> SensorEffect:
         change=change,
         equation="reading_i = l_i + sum over j of x_ij l_j, j not i",
         parameters=tuple(
-            Quantity(
-                f"from_{n}", "1", -2.0, 2.0, 0.01, f"reading of each component per load of {n}", each=True
-            )
+            Quantity(f"from_{n}", "1", -2.0, 2.0, 0.01, f"reading of each component per load of {n}", each=True)
             for n in names
         ),
         signature="off in proportion to the load of another component",

@@ -44,9 +44,7 @@ def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, tuple
     count = len(names)
     full = numbers(t, "full_range", where, count)
     if not np.all(full > 0.0):
-        raise BadInputError(
-            f"read model {where}: full_range holds {float(full.min()):g}; needs N and N m, > 0"
-        )
+        raise BadInputError(f"read model {where}: full_range holds {float(full.min()):g}; needs N and N m, > 0")
     matrix = np.eye(count)
     if "matrix" in t:
         try:

@@ -1,4 +1,6 @@
-"""Recorded known loads and readings of a force/torque sensor; what cannot be used is refused before anything is fitted."""
+"""Recorded known loads and readings of a force/torque sensor; what cannot be used is refused before anything is
+fitted.
+"""
 
 from __future__ import annotations
 
@@ -59,12 +61,8 @@ def whole_rows(r: ForceRecords) -> tuple[ForceRecords, list[str]]:
         notes.append("no time was recorded: rows are taken for seconds, and what is per second is per row")
     good = np.isfinite(r.load).all(1) & np.isfinite(r.reading).all(1) & np.isfinite(r.time)
     if LEAST_WHOLE <= good.mean() < 1.0:
-        notes.append(
-            f"{int(np.sum(~good))} of {len(good)} rows hold values that are no numbers and are left out"
-        )
-        r = ForceRecords(
-            r.names, r.load[good], r.reading[good], r.time[good], r.temperature[good], r.record[good]
-        )
+        notes.append(f"{int(np.sum(~good))} of {len(good)} rows hold values that are no numbers and are left out")
+        r = ForceRecords(r.names, r.load[good], r.reading[good], r.time[good], r.temperature[good], r.record[good])
     return r, notes
 
 
@@ -82,7 +80,8 @@ def check(r: ForceRecords, model: SensorModel) -> list[str]:
             column = int(np.flatnonzero(bad.any(0))[0])
             name = what if what == "time" else f"{what} {r.names[column]}"
             raise BadInputError(
-                f"read loads: {name} has {int(bad[:, column].sum())} of {len(bad)} values that are no numbers; needs numbers "
+                f"read loads: {name} has {int(bad[:, column].sum())} of {len(bad)} values that are no numbers; needs "
+                "numbers "
                 f"in {100 * LEAST_WHOLE:.0f} % of the rows"
             )
     if np.any(np.diff(r.time)[np.diff(r.record) == 0] < 0.0):
@@ -91,7 +90,8 @@ def check(r: ForceRecords, model: SensorModel) -> list[str]:
     step = np.where(np.diff(r.record) == 0, np.diff(r.time), 0.0)
     if step.max() > max(LONG_REST * float(np.median(step)), REST_S):
         notes.append(
-            f"time jumps by {step.max():.4g} s after row {int(step.argmax()) + 1}: what follows a long rest may have another zero; "
+            f"time jumps by {step.max():.4g} s after row {int(step.argmax()) + 1}: what follows a long rest may have "
+            "another zero; "
             "give it as a file of its own"
         )
     moved = np.ptp(r.load, axis=0) > 1e-3 * model.base.full
@@ -101,8 +101,10 @@ def check(r: ForceRecords, model: SensorModel) -> list[str]:
     if not LEAST_RANGE < share.max() < MOST_RANGE:
         i = int(share.argmax())
         raise BadInputError(
-            f"compare loads with the full range: {r.names[i]} is loaded up to {np.max(np.abs(r.load[:, i])):.4g}, {share[i]:.3g} times "
-            f"its full_range of {model.base.full[i]:.4g} {unit_of(r.names[i])}; needs {LEAST_RANGE:g} to {MOST_RANGE:g} times, in one unit"
+            f"compare loads with the full range: {r.names[i]} is loaded up to {np.max(np.abs(r.load[:, i])):.4g}, "
+            f"{share[i]:.3g} times "
+            f"its full_range of {model.base.full[i]:.4g} {unit_of(r.names[i])}; needs {LEAST_RANGE:g} to "
+            f"{MOST_RANGE:g} times, in one unit"
         )
     for n, here in zip(r.names, moved, strict=True):
         if not here:

@@ -142,7 +142,9 @@ class ForceSubject:
         return {i: full / s for i, s in enumerate(d.sigma)}
 
     def sharpened(self, model: SensorModel, shares: Mapping[int, float]) -> ForceSubject | None:
-        """Return the sensor with the noise told beside a model; a loop of another form would then be no noise: the same."""
+        """Return the sensor with the noise told beside a model; a loop of another form would then be no noise: the
+        same.
+        """
         d = self.whole
         seen = floor_of(d.measured, d.measured - readings(model.belief(), d.loads)) / d.sigma
         quiet = ratios(d, model) * np.sqrt([1.0 - shares.get(i, 0.0) for i in range(len(d.views))])
@@ -216,9 +218,7 @@ def prepare(records: ForceRecords, model: SensorModel, plans: Sequence[Plan] = (
     t = records.temperature
     known = bool(np.isfinite(t).all() and np.ptp(t) > 0.0)
     if not known:
-        notes.append(
-            "temperature was not recorded, or is constant: what follows the temperature is not judged"
-        )
+        notes.append("temperature was not recorded, or is constant: what follows the temperature is not judged")
     loads = Loads(
         records.load / full,
         records.time - records.time[0],
@@ -233,13 +233,13 @@ def prepare(records: ForceRecords, model: SensorModel, plans: Sequence[Plan] = (
     data = [ForceData(loads, measured, sigma, w, records.names) for w in (everything, ~mine, mine)]
     names = tuple(n for n, e in model.library.items() if e.rankable and not n.startswith(TERM_PREFIX))
     terms = tuple(n for n in model.library if n.startswith(TERM_PREFIX))
-    return ForceSubject(
-        data[0], data[1], data[2], model, records, tuple(notes), names, terms, plans=tuple(plans)
-    )
+    return ForceSubject(data[0], data[1], data[2], model, records, tuple(notes), names, terms, plans=tuple(plans))
 
 
 def noise_of(loads: Loads, measured: Floats) -> Floats:
-    """Return the noise of each component: what no smooth function of load, time and temperature explains, row to row."""
+    """Return the noise of each component: what no smooth function of load, time and temperature
+    explains, row to row.
+    """
     n = len(measured)
     columns = [
         np.ones((n, 1)),

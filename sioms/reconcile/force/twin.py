@@ -1,4 +1,6 @@
-"""A force/torque sensor as its model has it: what a simulated device reads in the place of the sensor the model was found for."""
+"""A force/torque sensor as its model has it: what a simulated device reads in the place of the sensor the model was
+found for.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ class ForceTwin:
         self._began_s: float | None = None
 
     def read(self, load: Floats, time_s: float) -> Floats:
-        """Return the readings [N, N m] under a load [N, N m], shape (components,), at a time [s]; call it with rising times."""
+        """Return the readings [N, N m] under a load [N, N m], shape (components,), at a time [s]; call it with rising
+        times.
+        """
         b = self._belief
         if self._began_s is None:
             self._began_s = time_s
@@ -43,11 +47,7 @@ class ForceTwin:
         row = Loads(share[None], np.array([time_s - self._began_s]), np.zeros(1), _ONE)
         out = row.load @ b.total.T
         for i, (response, p) in enumerate(b.responses):
-            out = (
-                out + p[: len(share)] * self._loops[i].follow(row.load)
-                if i in self._loops
-                else response(out, row, p)
-            )
+            out = out + p[: len(share)] * self._loops[i].follow(row.load) if i in self._loops else response(out, row, p)
         return np.asarray(out[0] * b.full)
 
 

@@ -106,9 +106,7 @@ def _channel(info: NodeInfo, model: AxisModel) -> ChannelInfo:
     if channel.unit != model.position_unit:
         raise BadInputError(f"{where}: it is in {channel.unit}, the model in {model.position_unit}")
     if abs(info.tick_hz * model.sample_time_s - 1.0) > 1e-6:
-        raise BadInputError(
-            f"{where}: it ticks at {info.tick_hz:g} Hz, the model at {1 / model.sample_time_s:g} Hz"
-        )
+        raise BadInputError(f"{where}: it ticks at {info.tick_hz:g} Hz, the model at {1 / model.sample_time_s:g} Hz")
     if "force" not in channel.limits:
         raise BadInputError(f"{where}: it commands no force; the force is what the workflow judges by")
     return channel
@@ -119,9 +117,7 @@ def _with_controller(model: AxisModel, reading: AxisReading, channel: ChannelInf
     given = model.controller
     offset, filter_hz = (given.offset, given.velocity_filter_hz) if given is not None else (0.0, 0.0)
     k, kz, kp, kb = (float(getattr(reading, gain)) for gain in ("k", "kz", "kp", "kb"))
-    return replace(
-        model, controller=Controller(k, kz, kp, kb, offset, float(channel.limits["force"]), filter_hz)
-    )
+    return replace(model, controller=Controller(k, kz, kp, kb, offset, float(channel.limits["force"]), filter_hz))
 
 
 def _envelope(channel: ChannelInfo, model: AxisModel, here: float, travel: float | None) -> Envelope:
@@ -138,7 +134,8 @@ def _envelope(channel: ChannelInfo, model: AxisModel, here: float, travel: float
     reach = 0.5 * RANGE_SHARE * (high - low)
     if reach < 100.0 * model.resolution:
         raise BadInputError(
-            f"plan experiments on {channel.name}: {2.0 * reach:.3g} {channel.unit} to move in; needs hundreds of counts "
+            f"plan experiments on {channel.name}: {2.0 * reach:.3g} {channel.unit} to move in; needs hundreds of "
+            "counts "
             f"({model.resolution:.3g} {channel.unit} each)"
         )
     limits = channel.limits
@@ -157,17 +154,13 @@ def _gentle(model: AxisModel, plan: Sequence[Experiment], channel: ChannelInfo) 
     """Shrink what would need more force than there is, by the nominal model."""
     out = []
     for e in plan:
-        peak = float(
-            np.max(np.abs(simulate(replace(model, start_position=float(e.command[0])), e.command).force))
-        )
+        peak = float(np.max(np.abs(simulate(replace(model, start_position=float(e.command[0])), e.command).force)))
         share = min(1.0, FORCE_SHARE * channel.limits["force"] / max(peak, 1e-300))
         out.append(replace(e, command=e.command[0] + share * (e.command - e.command[0])))
     return out
 
 
-def _agree(
-    node: str, model: AxisModel, envelope: Envelope, plan: Sequence[Experiment], settings: Live
-) -> None:
+def _agree(node: str, model: AxisModel, envelope: Envelope, plan: Sequence[Experiment], settings: Live) -> None:
     """Say what will be done and ask.
 
     Raises:
@@ -175,7 +168,8 @@ def _agree(
     """
     unit, seconds = model.position_unit, sum(len(e.command) for e in plan) * model.sample_time_s
     told = [
-        f"{node} will move between {envelope.centre - envelope.reach:.4g} and {envelope.centre + envelope.reach:.4g} {unit}, "
+        f"{node} will move between {envelope.centre - envelope.reach:.4g} and {envelope.centre + envelope.reach:.4g} "
+        f"{unit}, "
         f"up to {envelope.speed:.3g} {unit}/s and {envelope.acceleration:.3g} {unit}/s^2, for some {seconds:.0f} s:",
         *(f"  {e.name}: {e.text}" for e in plan),
     ]
@@ -193,7 +187,5 @@ def save(session: Session, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for r in session.records:
         table = np.column_stack([r.time_s, r.position, r.force, r.command])  # type: ignore[list-item]
-        np.savetxt(
-            folder / f"{r.name}.csv", table, "%.12g", ",", header="time,position,force,command", comments=""
-        )
+        np.savetxt(folder / f"{r.name}.csv", table, "%.12g", ",", header="time,position,force,command", comments="")
     (folder / "columns.toml").write_text("\n".join(lines) + "\n")

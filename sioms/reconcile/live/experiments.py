@@ -1,4 +1,6 @@
-"""What live runs have in common: ask before anything moves, keep records aside until a run is over, decide by rounds, install."""
+"""What live runs have in common: ask before anything moves, keep records aside until a run is over, decide by rounds,
+install.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +66,9 @@ def have_done(text: str, without: str) -> None:
 
 @contextmanager
 def kept(folder: Path) -> Iterator[Path]:
-    """Give an empty folder beside ``folder`` that takes its place at the end; what was there before stays until then."""
+    """Give an empty folder beside ``folder`` that takes its place at the end; what was there before
+    stays until then.
+    """
     fresh = folder.with_name(folder.name + ".new")
     shutil.rmtree(fresh, ignore_errors=True)
     fresh.mkdir(parents=True)
@@ -105,9 +109,7 @@ def decide(
         run(best)
 
 
-def able(
-    names: Collection[str], effort: Callable[[str], float]
-) -> Callable[[SensorVerdict], Proposal | None]:
+def able(names: Collection[str], effort: Callable[[str], float]) -> Callable[[SensorVerdict], Proposal | None]:
     """Return the choice of the experiment that decides best, of those that can be made and were not made yet.
 
     Args:
@@ -116,9 +118,7 @@ def able(
     made: set[str] = set()
 
     def deciding(verdict: SensorVerdict) -> Proposal | None:
-        open_ = [
-            p for p in verdict.experiments if p.name in names and p.name not in made and p.separation > LEAST
-        ]
+        open_ = [p for p in verdict.experiments if p.name in names and p.name not in made and p.separation > LEAST]
         near = [p for p in open_ if p.separation > NEARLY * open_[0].separation]
         best = min(near, key=lambda p: effort(p.name), default=None)
         if best is not None:
@@ -128,9 +128,7 @@ def able(
     return deciding
 
 
-def install(
-    text: str, path: Path, socket: str | None, what: str, take_up: Callable[[sioms.Workcell], str]
-) -> str:
+def install(text: str, path: Path, socket: str | None, what: str, take_up: Callable[[sioms.Workcell], str]) -> str:
     """Write a corrected model where its reader finds it, and have that take it up.
 
     Args:

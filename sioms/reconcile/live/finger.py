@@ -1,7 +1,8 @@
-"""``sioms reconcile tactile NODE``: design the touches, ask, probe the finger through the daemon, decide, put the model to work.
+"""``sioms reconcile tactile NODE``: design the touches, ask, probe the finger through the daemon, decide, put the model
+to work.
 
-The workflow sees what any client sees: readings of the finger and of a force sensor, and axes that it moves by their own
-commands. It knows nothing of what the finger hides.
+The workflow sees what any client sees: readings of the finger and of a force sensor, and axes that it moves by their
+own commands. It knows nothing of what the finger hides.
 """
 
 from __future__ import annotations
@@ -110,19 +111,13 @@ class Hand:
 
     def run(self, plan: Iterable[Plan]) -> None:
         """Make the touches of a plan, indenter by indenter, and keep them by the plan's names."""
-        work = [
-            (radius, name, scene)
-            for name, _, scene in plan
-            for radius in dict.fromkeys(scene.radius.tolist())
-        ]
+        work = [(radius, name, scene) for name, _, scene in plan for radius in dict.fromkeys(scene.radius.tolist())]
         order = list(dict.fromkeys(radius for radius, _, _ in work))
         for radius in sorted(order, key=lambda r: r != self._mounted):
             self._mount(radius)
             with self._prober() as prober:
                 for _, name, scene in [w for w in work if w[0] == radius]:
-                    self._say(
-                        f"{name}: {int(np.sum(scene.radius == radius))} touches with {indenter(radius)}"
-                    )
+                    self._say(f"{name}: {int(np.sum(scene.radius == radius))} touches with {indenter(radius)}")
                     kept = _recorded(prober, scene, radius, name)
                     kept.take_felt_loads()
                     kept.save(self.folder / f"{name}_{1e3 * radius:g}mm.npz")
@@ -133,9 +128,7 @@ class Hand:
     def _mount(self, radius: float) -> None:
         if radius == self._mounted:
             return
-        have_done(
-            f"mount the {indenter(radius)}, clear of the finger", "give --indenters only what is mounted"
-        )
+        have_done(f"mount the {indenter(radius)}, clear of the finger", "give --indenters only what is mounted")
         self._mounted = radius
 
 
@@ -194,7 +187,8 @@ def _agree(asked: Probe, bench: Bench, plan: list[Plan]) -> None:
     most_n = bench.most * rig.length_m
     told = [
         f"{rig.place} will go from {places.min():.3g} to {places.max():.3g} rad and {rig.press} press the "
-        f"{indenter(bench.radii[0])} on {rig.finger} with up to {bench.most:g} N/m ({most_n:.3g} N on {rig.force}), for some "
+        f"{indenter(bench.radii[0])} on {rig.finger} with up to {bench.most:g} N/m ({most_n:.3g} N on {rig.force}), "
+        "for some "
         f"{TOUCH_S * len(places):.0f} s:",
         *(f"  {name}: {text}, {len(scene.place)} touches" for name, text, scene in plan),
     ]

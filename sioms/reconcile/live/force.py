@@ -1,4 +1,5 @@
-"""``sioms reconcile force NODE``: design the loads, ask, apply and record them through the daemon, decide, put the model to work.
+"""``sioms reconcile force NODE``: design the loads, ask, apply and record them through the daemon, decide, put the
+model to work.
 
 A *stand* says how the sensor can be loaded (``--stand``): axes that press, each with a force that tells how hard, and
 weights that somebody hangs on::
@@ -156,9 +157,7 @@ def read_stand(path: Path, count: int) -> Stand:
     items += [(h.name, h.wrench, min(h.loads, default=0.0)) for h in stand.hang]
     names = [name for name, *_ in items]
     if not items or len(set(names)) != len(names):
-        raise BadInputError(
-            f"read stand {path}: names are {names}; needs one push or hang, each of its own name"
-        )
+        raise BadInputError(f"read stand {path}: names are {names}; needs one push or hang, each of its own name")
     for name, wrench, load_n in items:
         if len(wrench) != count or not any(wrench) or load_n <= 0.0:
             raise BadInputError(
@@ -174,23 +173,17 @@ def _pushes(stand: Stand) -> Iterator[Push]:
         yield Push(p.name, text, p.wrench, tuple(p.most * np.tile(UP_AND_DOWN, LAPS)))
     for h in stand.hang:
         up = (0.0, *sorted(h.loads), *sorted(h.loads)[-2::-1], 0.0)
-        yield Push(
-            h.name, f"weights of {', '.join(f'{v:g}' for v in h.loads)} N hung on and off", h.wrench, up
-        )
+        yield Push(h.name, f"weights of {', '.join(f'{v:g}' for v in h.loads)} N hung on and off", h.wrench, up)
 
 
 def _check_nodes(cell: sioms.Workcell, node: str, names: Sequence[str], full: Any, stand: Stand) -> None:
     info = cell.info(node)
     have = tuple(c.name for c in info.channels)
     if info.node_class is not NodeClass.ANALOG or have != tuple(names):
-        raise BadInputError(
-            f"reconcile {node}: its channels are {', '.join(have)}; the model has {', '.join(names)}"
-        )
+        raise BadInputError(f"reconcile {node}: its channels are {', '.join(have)}; the model has {', '.join(names)}")
     for channel in info.channels:
         if channel.unit.replace("*", " ") != unit_of(channel.name):
-            raise BadInputError(
-                f"reconcile {node}: {channel.name} is in {channel.unit}; needs {unit_of(channel.name)}"
-            )
+            raise BadInputError(f"reconcile {node}: {channel.name} is in {channel.unit}; needs {unit_of(channel.name)}")
     for p in stand.push:
         _check_axis(cell.info(p.axis), p)
         told = cell.info(p.reference).channels
@@ -204,9 +197,7 @@ def _check_nodes(cell: sioms.Workcell, node: str, names: Sequence[str], full: An
 def _check_axis(info: NodeInfo, p: PushTable) -> None:
     single = info.node_class is NodeClass.AXIS and len(info.channels) == 1 and info.channels[0].unit == "m"
     if not single or info.channels[0].maximum is None:
-        raise BadInputError(
-            f"press with {p.axis}: it is no single axis in m with an upper end that the sensor bears"
-        )
+        raise BadInputError(f"press with {p.axis}: it is no single axis in m with an upper end that the sensor bears")
 
 
 def _within(node: str, name: str, most: float, wrench: Sequence[float], full: Any) -> None:
@@ -296,9 +287,7 @@ class Bench:
                 last = seen[-1].number
                 check()
             if any(flag & (AnalogStatus.SATURATED | AnalogStatus.INVALID) for s in seen for flag in s.flags):
-                raise ExperimentStopped(
-                    f"load {sensor.name}: it is saturated, or reads nothing, during {push.name}"
-                )
+                raise ExperimentStopped(f"load {sensor.name}: it is saturated, or reads nothing, during {push.name}")
             reading = np.mean([s.data for s in seen], axis=0)
             self._rows.append(np.concatenate([[time.monotonic() - self._began], load() * wrench, reading]))
 

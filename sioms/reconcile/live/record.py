@@ -33,8 +33,8 @@ POLL_S = 0.02
 SETTLE_S, LEAD_S = 0.4, 0.1
 #: Commands written ahead of the motion.
 AHEAD = 400
-#: So many periods without a tick are filled in; where more were lost, one record ends and another begins. The run is made again,
-#: so many times, unless this share of it is left in records that are long enough.
+#: So many periods without a tick are filled in; where more were lost, one record ends and another begins. The run is
+#: made again, so many times, unless this share of it is left in records that are long enough.
 MOST_FILLED = 4
 ENOUGH, TRIES = 0.6, 6
 
@@ -76,7 +76,8 @@ class Recorder:
         """Run one experiment from rest at its first position.
 
         Returns:
-            Position, force and command at the rate of the axis, without a gap; several records where the machine lost ticks.
+            Position, force and command at the rate of the axis, without a gap; several records where the machine lost
+            ticks.
 
         Raises:
             ExperimentStopped: by a stop, a fault, a refusal, or because the machine loses ticks.
@@ -95,7 +96,8 @@ class Recorder:
                 return records
             lost += 1
         raise ExperimentStopped(
-            f"record {experiment.name} on {self.node.name}: ticks were missing in {lost} runs; the machine is too busy to "
+            f"record {experiment.name} on {self.node.name}: ticks were missing in {lost} runs; the machine is too busy "
+            "to "
             "record at the rate of the axis"
         )
 
@@ -134,13 +136,7 @@ class Recorder:
                 taken = self.node.write(records[:room])
                 records = records[room:]
                 continue
-            if (
-                not records
-                and new
-                and new[-1].tick > taken
-                and not new[-1].in_motion[0]
-                and not new[-1].buffered[0]
-            ):
+            if not records and new and new[-1].tick > taken and not new[-1].in_motion[0] and not new[-1].buffered[0]:
                 return seen
             if time.monotonic() > deadline:
                 raise ExperimentStopped(f"run an experiment on {self.node.name}: it did not end in time")
@@ -168,9 +164,10 @@ def knots(command: Array, dt: float, max_velocity: float, max_acceleration: floa
 def uniform(name: str, seen: Sequence[AxisSnapshot], dt: float) -> list[Record]:
     """Lay snapshots on the grid of the axis's rate, by their time stamps, from one long hole to the next.
 
-    On a busy machine a tick comes late and the next one early. Of two in one period the later counts, and a period without one
-    is filled in: its force is the one that was held, its position lies on a cubic spline, since a straight line would end in
-    jumps of the speed that no force has made.
+    On a busy machine a tick comes late and the next one early. Of two in one period the later counts, and a period
+    without one
+    is filled in: its force is the one that was held, its position lies on a cubic spline, since a straight line would
+    end in jumps of the speed that no force has made.
     """
     periods = np.rint(np.diff([s.stamp_ns for s in seen]) * 1e-9 / dt).astype(np.int64)
     edges = [0, *(np.flatnonzero(periods > MOST_FILLED) + 1).tolist(), len(seen)]

@@ -29,13 +29,20 @@ same axis in closed loop under the same commands (reversals, cruises, sines): ag
 """
 PICTURES = "pictures/effects"
 #: The axis of the pictures: 2 g m^2, 0.7 N m, with a loop of 10 Hz.
-AXIS = AxisModel(
-    True, 1e-3, 2e-3, 1e-3, 1e-9, 2 * np.pi, 0.7, 20.0, Controller(17.5, -0.979, -0.8, 0.0, 0.0, 1.8, 0.0)
-)
+AXIS = AxisModel(True, 1e-3, 2e-3, 1e-3, 1e-9, 2 * np.pi, 0.7, 20.0, Controller(17.5, -0.979, -0.8, 0.0, 0.0, 1.8, 0.0))
 #: Values that show better than the typical ones.
-SHOWN = {"encoder_scale": {"gain": 1.02}, "encoder_quantisation": {"factor": 4e5}, "saturation": {"limit": 0.25},
-         "cogging": {"n": 5.0}, "torque_ripple": {"n": 5.0}, "coulomb_position": {"n": 2.0}, "friction_variation": {"depth": 0.4, "n": 2.0}, "thermal_gain": {"loss": 1.0, "tau": 3.0},
-         "backlash": {"gap": 0.02}, "eccentricity": {"amp": 0.02}}  # fmt: skip
+SHOWN = {
+    "encoder_scale": {"gain": 1.02},
+    "encoder_quantisation": {"factor": 4e5},
+    "saturation": {"limit": 0.25},
+    "cogging": {"n": 5.0},
+    "torque_ripple": {"n": 5.0},
+    "coulomb_position": {"n": 2.0},
+    "friction_variation": {"depth": 0.4, "n": 2.0},
+    "thermal_gain": {"loss": 1.0, "tau": 3.0},
+    "backlash": {"gap": 0.02},
+    "eccentricity": {"amp": 0.02},
+}
 
 
 def page() -> str:
@@ -102,10 +109,7 @@ def trace(effect: Effect) -> tuple[Array, Array, Array, Array]:
     laps = {e.name: e.command for e in catalogue(AXIS, Envelope.of(AXIS, 0.0, 4.0), 3.0)}
     command = np.concatenate([laps[n] for n in ("slow_reversals", "cruises", "multi_sine")])
     shown = [library()[n] for n in effect.beside[:1]] + [effect]
-    effects = {
-        e.name: {p.symbol: p.start * AXIS.scale(p) for p in e.parameters} | SHOWN.get(e.name, {})
-        for e in shown
-    }
+    effects = {e.name: {p.symbol: p.start * AXIS.scale(p) for p in e.parameters} | SHOWN.get(e.name, {}) for e in shown}
     run = simulate(replace(AXIS, effects=effects), command, substeps=8)
     dt = AXIS.sample_time_s
     v: Array = np.gradient(run.position, dt)
@@ -122,9 +126,7 @@ def picture(effect: Effect) -> Figure:
     t, v, x, f = trace(effect)
     figure = Figure(figsize=(11, 2.3), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True, width_ratios=(2, 1, 1))
-    for a, against, label in zip(
-        axes, (t, v, x), ("time / s", "speed / rad/s", "position / rad"), strict=True
-    ):
+    for a, against, label in zip(axes, (t, v, x), ("time / s", "speed / rad/s", "position / rad"), strict=True):
         a.plot(against, f, "-" if against is t else ".", ms=1, lw=0.6, color="#1f5f8b")
         a.set_xlabel(label)
         a.grid(visible=True, lw=0.3)

@@ -22,7 +22,7 @@ are shares of each component's full range. Outside its bounds it is not that eff
 
 A picture shows what an effect of typical size changes: on a finger in all outputs, that of the element under the edge dark; on a force
 sensor in two components, fx dark.
-"""
+"""  # noqa: E501
 
 
 def page() -> str:

@@ -83,7 +83,8 @@ def _where(v: Verdict) -> str:
         return "No variable orders the residual of the old model (permutation p > 0.05)."
     text = "; ".join(f"{q.variable} {100 * q.explained:.0f} % (p = {q.p:.2f})" for q in shown)
     return (
-        "What the residual of the old model goes with, as the share of its squares that lies in its means over the values "
+        "What the residual of the old model goes with, as the share of its squares that lies in its means over the "
+        "values "
         f"of one variable (bars: spread about them; p: how often chance does as well): {text}."
     )
 
@@ -100,8 +101,7 @@ def _what(p: Page, v: Verdict) -> None:
     p.table(("effect", "equation", "parameter", "value", "95 % interval", "unit", ""), rows)
     if every:
         numbers = [
-            (q.symbol, Cell(number(q.value)), Cell(f"{number(q.low)} to {number(q.high)}"), q.unit)
-            for q in every
+            (q.symbol, Cell(number(q.value)), Cell(f"{number(q.low)} to {number(q.high)}"), q.unit) for q in every
         ]
         p.table(("parameter", "value", "95 % interval", "unit"), numbers, folded="every one of the numbers")
 
@@ -126,7 +126,8 @@ def _gaps(p: Page, v: Verdict) -> None:
     p.text(
         "Root mean square on samples that took no part in any choice."
         if of_axis
-        else "Root mean square on touches or loads that took no part in any choice (every fifth). The numbers of the model are frozen; "
+        else "Root mean square on touches or loads that took no part in any choice (every fifth). The numbers of the "
+        "model are frozen; "
         "zero, true load of a touch and level of a ramp are the session's own and are free in all columns."
     )
     head = ["channel", "before", "after", "noise floor", "unit", "floor from", "closed"]
@@ -140,7 +141,8 @@ def _gaps(p: Page, v: Verdict) -> None:
     p.table([*head, "later half, frozen", "later half, session re-estimated"] if of_axis else head, rows)
     if of_axis:
         p.text(
-            "Table and pictures are of the model to which the untouched samples have contributed nothing. The numbers of the "
+            "Table and pictures are of the model to which the untouched samples have contributed nothing. The numbers "
+            "of the "
             "effects and model.toml come from a last fit to all records after that."
         )
 
@@ -195,7 +197,8 @@ def _session(p: Page, v: AxisVerdict) -> None:
     units = {"offset": v.model.force_unit, "zero": v.model.position_unit}
     shown = knobs(v.model)
     p.text(
-        "Session parameters, estimated on the first half of what is untouched of each record (no property of the axis, and no part "
+        "Session parameters, estimated on the first half of what is untouched of each record (no property of the axis, "
+        "and no part "
         "of the model):"
     )
     rows = [
@@ -211,10 +214,12 @@ def _footing(v: Verdict) -> str:
     if isinstance(v, SensorVerdict):
         floors = ", ".join(f"{n} {r:.2f}" for n, r in v.floors.items() if r > 0.0)
         return (
-            f"{v.samples} numbers (the main view's count as {v.effective_samples:.0f} independent ones); residual of the final "
+            f"{v.samples} numbers (the main view's count as {v.effective_samples:.0f} independent ones); residual of "
+            "the final "
             f"model in units of the floor: {floors}; {smoother}."
         )
     return (
         f"{v.samples} samples count as {v.effective_samples:.0f} independent ones; the residual of the final model is "
-        f"{v.ratio:.2f} of the expected innovation; {smoother}; {100 * v.burst_share:.0f} % of the residual lies in the loudest tenth."
+        f"{v.ratio:.2f} of the expected innovation; {smoother}; {100 * v.burst_share:.0f} % of the residual lies in "
+        "the loudest tenth."
     )

@@ -1,4 +1,6 @@
-"""The pictures of a report: the gaps, where it disagreed, what was found for every element, the curves before and after."""
+"""The pictures of a report: the gaps, where it disagreed, what was found for every element, the curves before and
+after.
+"""
 
 from __future__ import annotations
 
@@ -89,9 +91,7 @@ def _trace_picture(figure: Figure, v: AxisVerdict) -> Figure:
         )
         ax.plot(t.time_s[::step], (t.after - t.measured)[::step], color="#08a", lw=0.7, label="after")
         for side in (-1.0, 1.0):
-            ax.axhline(
-                side * floor, color="#1c2733", lw=0.6, ls="--", label="noise floor" if side > 0 else None
-            )
+            ax.axhline(side * floor, color="#1c2733", lw=0.6, ls="--", label="noise floor" if side > 0 else None)
         settled = np.abs(t.before - t.measured)[len(t.measured) // 10 :]  # a record may begin in motion
         reach = float(np.quantile(settled, 0.998)) * 1.4 or 1.0
         ax.set_ylim(-reach, reach)
@@ -106,9 +106,7 @@ def _force_place_picture(figure: Figure, v: AxisVerdict) -> Figure:
     shown = v.places[:4]
     for ax, p in zip(figure.subplots(1, len(shown), sharey=True, squeeze=False)[0], shown, strict=True):
         order = np.argsort(p.centres)
-        ax.errorbar(
-            p.centres[order], p.means[order], p.spread[order], fmt=".-", color="#c50", ecolor="#e9c5ae", lw=1
-        )
+        ax.errorbar(p.centres[order], p.means[order], p.spread[order], fmt=".-", color="#c50", ecolor="#e9c5ae", lw=1)
         ax.axhline(0.0, color="#888", lw=0.6)
         ax.set_xlabel(f"{p.variable}, {p.unit}".removesuffix(", 1"))
         ax.set_title(f"orders {100 * p.explained:.0f} %", fontsize=9)
@@ -171,9 +169,7 @@ def _curve_picture(figure: Figure, v: SensorVerdict) -> Figure:
         upper.plot(c.at, c.after, color="#08a", lw=1, label="simulated, after")
         used = ~c.apart
         upper.plot(c.at[used], c.measured[used], ".", color="#9aa6b1", ms=3, label="measured, used")
-        upper.plot(
-            c.at[c.apart], c.measured[c.apart], ".", color="#1c2733", ms=5, label="measured, took no part"
-        )
+        upper.plot(c.at[c.apart], c.measured[c.apart], ".", color="#1c2733", ms=5, label="measured, took no part")
         upper.set_title(c.title, fontsize=8, loc="left")
         lower.plot(c.at, c.before - c.measured, color="#c50", lw=0.8)
         lower.plot(c.at, c.after - c.measured, color="#08a", lw=0.8)
@@ -189,9 +185,7 @@ def _place_picture(figure: Figure, v: SensorVerdict) -> Figure:
     shown = v.places[:4]
     for ax, p in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
         order = np.argsort(p.centres)
-        ax.errorbar(
-            p.centres[order], p.means[order], p.spread[order], fmt=".-", color="#c50", ecolor="#e9c5ae", lw=1
-        )
+        ax.errorbar(p.centres[order], p.means[order], p.spread[order], fmt=".-", color="#c50", ecolor="#e9c5ae", lw=1)
         ax.axhline(0.0, color="#888", lw=0.6)
         name, view = p.variable.removesuffix(")").split(" (")
         ax.set_xlabel(f"{name}, {p.unit}".removesuffix(", 1"), fontsize=8)

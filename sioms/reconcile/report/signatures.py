@@ -24,9 +24,16 @@ COMPONENTS = ("fx", "fy")
 #: A finger of 16 elements, 19 mm wide under 1.6 mm of elastomer; the element that is shown, and loads [N/m].
 ELEMENTS, SHOWN, LOAD, MOST = 16, 8, 150.0, 400.0
 FINGER = Belief(
-    0.0096, 0.0127, 83e3, 0.46, np.radians(np.linspace(-70.0, 70.0, ELEMENTS)), np.full(ELEMENTS, 0.0103), np.full(ELEMENTS, 3.0),
-    np.zeros(ELEMENTS), np.zeros(ELEMENTS),
-)  # fmt: skip
+    0.0096,
+    0.0127,
+    83e3,
+    0.46,
+    np.radians(np.linspace(-70.0, 70.0, ELEMENTS)),
+    np.full(ELEMENTS, 0.0103),
+    np.full(ELEMENTS, 3.0),
+    np.zeros(ELEMENTS),
+    np.zeros(ELEMENTS),
+)
 #: Radius of an indenter [m], and the effects that change widths of contact, which an edge has not.
 ROUND, OF_WIDTH = 6e-3, ("hertz", "adhesion")
 #: Values that show better than the typical ones.
@@ -68,9 +75,7 @@ def panels_of_finger(effect: SensorEffect) -> list[Panel]:
 
     def change(where: Array, strength: Array, clock: Array) -> Array:
         """Change of every output in per cent under an indenter, held, while it warms by 2 K in 30 s."""
-        scene = replace(
-            scene_of(where, strength, np.full(len(where), radius)), time=clock, temperature=clock / 15.0
-        )
+        scene = replace(scene_of(where, strength, np.full(len(where), radius)), time=clock, temperature=clock / 15.0)
         warm = scene.temperature[:, None]
         said = [outputs(b, scene) * late(b, clock)[:, None] + b.temperature * warm for b in (FINGER, after)]
         return np.asarray(100.0 * (said[1] - said[0]))
@@ -104,13 +109,9 @@ def _of_force(effect: SensorEffect) -> list[Panel]:
     count = len(COMPONENTS)
     base = ForceBelief(COMPONENTS, np.ones(count), np.eye(count))
     after = (
-        SensorModel(base, count, of_force_sensors(COMPONENTS))
-        .with_effect(effect.name, _values(effect, count))
-        .belief()
+        SensorModel(base, count, of_force_sensors(COMPONENTS)).with_effect(effect.name, _values(effect, count)).belief()
     )
-    turn = np.concatenate(
-        [np.linspace(a, b, 40) for a, b in ((0.0, 0.9), (0.9, -0.9), (-0.9, 0.9), (0.9, 0.0))]
-    )
+    turn = np.concatenate([np.linspace(a, b, 40) for a, b in ((0.0, 0.9), (0.9, -0.9), (-0.9, 0.9), (0.9, 0.0))])
     load = np.concatenate([np.outer(turn, own) for own in np.eye(count)])
     time = 2.0 * np.arange(float(len(load)))
     loads = Loads(load, time, 4.0 * time / time[-1] - 2.0, np.zeros(len(load), dtype=np.int64))

@@ -38,9 +38,7 @@ def span(p: Estimate) -> tuple[str, str, str]:
     """Value and interval of a number, with as many digits as tell the ends apart, four at least."""
     width = abs(p.high - p.low)
     size = max(abs(p.low), abs(p.high))
-    digits = (
-        4 if not 0.0 < width < size < math.inf else min(max(4, 2 + math.ceil(math.log10(size / width))), 9)
-    )
+    digits = 4 if not 0.0 < width < size < math.inf else min(max(4, 2 + math.ceil(math.log10(size / width))), 9)
     return f"{p.value:.{digits}g}", f"{p.low:.{digits}g}", f"{p.high:.{digits}g}"
 
 
@@ -68,7 +66,9 @@ def summary(v: Verdict, out: str) -> list[str]:
 
 def shrunk(gap: Gap) -> str:
     """Say how far a gap shrank."""
-    return f"{gap.channel}: {number(gap.before)} before, {number(gap.after)} after, floor {number(gap.floor)} {gap.unit}"
+    return (
+        f"{gap.channel}: {number(gap.before)} before, {number(gap.after)} after, floor {number(gap.floor)} {gap.unit}"
+    )
 
 
 def places(v: Verdict, most: int) -> str:
@@ -97,7 +97,9 @@ def _with_unit(text: str, unit: str) -> str:
 
 
 def groups(e: NamedEffect) -> dict[str, list[Estimate]]:
-    """Return the estimates by quantity; one that every element has of its own comes with all its numbers, a matrix as one."""
+    """Return the estimates by quantity; one that every element has of its own comes with all its numbers, a matrix as
+    one.
+    """
     out: dict[str, list[Estimate]] = {}
     for p in e.parameters:
         name, each, _ = p.symbol.partition("[")

@@ -23,9 +23,7 @@ PATIENCE = 30  # steps of a look-alike's fit: one that stopped short would be ru
 ELSEWHERE = (-3.0, -1.0, 1.0, 3.0)  # natural sizes at which numbers of the elements' own begin again
 
 
-def settle(
-    searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]]
-) -> tuple[Found, list[Rival]]:
+def settle(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]]) -> tuple[Found, list[Rival]]:
     """Find the rivals; where one of no more numbers does better than what is named, search on from it."""
     lib, count = found.fit.model.library, found.fit.model.count
 
@@ -51,9 +49,7 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
     out = []
     same = {frozenset(p[:2]) for p in pairs}
     lib, count = found.fit.model.library, found.fit.model.count
-    for name in [
-        n for n in found.fit.model.effects if n not in searcher.frozen and not n.startswith(TERM_PREFIX)
-    ]:
+    for name in [n for n in found.fit.model.effects if n not in searcher.frozen and not n.startswith(TERM_PREFIX)]:
         bare = searcher.fit(found.fit.model.without_effect(name), 4)
         contribution = bare.cost - found.fit.cost
         if contribution <= 0.0:
@@ -70,9 +66,7 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
                     _, errors = better(found.losses, searcher.loss(fit))
                     missed = (fit.cost - found.fit.cost) / contribution
                     if one_trace and lib[name].primary.each and lib[other].primary.each:
-                        missed = min(
-                            missed, max(_missed_by_most(searcher, found.fit, bare, fit, name, other), 0.0)
-                        )
+                        missed = min(missed, max(_missed_by_most(searcher, found.fit, bare, fit, name, other), 0.0))
                     out.append(
                         Rival(
                             name,
@@ -88,10 +82,11 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
 
 
 def _missed_by_most(searcher: Searcher, good: Fit, bare: Fit, rival: Fit, name: str, other: str) -> float:
-    """Return the share that a rival misses at the middle one of the elements: one that tells its kind does not for the others.
+    """Return the share that a rival misses at the middle one of the elements: one that tells its kind does not for the
+    others.
 
-    What one element misses spoils the fit of its neighbours: while the middle one misses much, the worst keeps the number it was named
-    with, and the others are fitted again.
+    What one element misses spoils the fit of its neighbours: while the middle one misses much, the worst keeps the
+    number it was named with, and the others are fitted again.
     """
     least, own = searcher.squares(good), searcher.squares(bare) - searcher.squares(good)
     felt = own > FELT**2

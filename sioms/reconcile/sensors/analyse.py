@@ -48,14 +48,8 @@ def analyse(subject: Subject, options: Options | None = None) -> SensorVerdict:
     share, where = _smoothed(subject, searcher, found)
     bursts = _bursts(subject, searcher, found)
     before = tuple(found.fit.model.effects)
-    if (
-        _odd(searcher, found, share, where)
-        or displaced(searcher, found)
-        or _stand_ins(subject, searcher, found, names)
-    ):
-        o.progress(
-            f"what remains has no name (a smoother explains {100 * share:.0f} %): searching for a term"
-        )
+    if _odd(searcher, found, share, where) or displaced(searcher, found) or _stand_ins(subject, searcher, found, names):
+        o.progress(f"what remains has no name (a smoother explains {100 * share:.0f} %): searching for a term")
         searcher.names = names + subject.terms
         subject, found = _search(subject, searcher, subject.model)
         found, names = _without_stand_ins(subject, searcher, found, names)
@@ -85,7 +79,9 @@ def _search(subject: Subject, searcher: Searcher, start: SensorModel) -> tuple[S
 
 
 def _smoothed(subject: Subject, searcher: Searcher, found: Found) -> tuple[float, str]:
-    """Return the largest share of a view that a smoother explains, and the name of that view; one above its floor first."""
+    """Return the largest share of a view that a smoother explains, and the name of that view; one above its floor
+    first.
+    """
     shares = smoother_shares(subject.training, found.fit, searcher.weights, subject.features())
     ratios = searcher.ratios(found.fit.model)
     view = max(shares, key=lambda v: (bool(ratios[v] > SENSOR.odd and shares[v] > UNEXPLAINED), shares[v]))
@@ -131,7 +127,9 @@ def _unsteady(subject: Subject, searcher: Searcher, found: Found, names: Sequenc
 
 
 def _odd(searcher: Searcher, found: Found, share: float, view: str) -> bool:
-    """Say whether something is left: a view above its floor that the state explains, or one far above it whatever explains it."""
+    """Say whether something is left: a view above its floor that the state explains, or one far above it whatever
+    explains it.
+    """
     ratios = searcher.ratios(found.fit.model)
     if view and share > UNEXPLAINED and ratios[searcher.data.views.index(view)] > SENSOR.odd:
         return True
@@ -180,14 +178,13 @@ def _conclude(
     alternatives: tuple[tuple[str, ...], ...] = ()
     plan: tuple[Proposal, ...] = ()
     if outcome is Outcome.AMBIGUOUS:
-        alternatives = tuple(
-            tuple(r.rival if n == r.effect else n for n in fit.model.effects) for r in open_rivals
-        )
+        alternatives = tuple(tuple(r.rival if n == r.effect else n for n in fit.model.effects) for r in open_rivals)
         plan = subject.propose([fit.model, *(r.fit.model for r in open_rivals)])
     notes = list(subject.notes)
     if disturbed:
         notes.append(
-            f"the residual comes in bursts ({100 * bursts:.0f} % of its energy in a tenth of the touches) that no state "
+            f"the residual comes in bursts ({100 * bursts:.0f} % of its energy in a tenth of the touches) that no "
+            "state "
             "orders: a disturbance from outside, not an effect"
         )
     places: tuple[Place, ...] = ()
@@ -259,7 +256,8 @@ def _describe(
         estimates = _estimates(subject, effect, fit.model, spread)
         title = subject.views()[gap.view].title
         evidence = [
-            f"without it the squared residual of the {title} would be {1.0 / max(1.0 - gap.share, 1e-3):.3g} times as large "
+            f"without it the squared residual of the {title} would be {1.0 / max(1.0 - gap.share, 1e-3):.3g} times as "
+            "large "
             f"({gap.errors:.1f} standard errors, on blocks held out)"
         ]
         ruled, still = told_apart(name, effect.lookalikes, others, found.ladder, fit.model.effects)

@@ -78,9 +78,7 @@ class SensorEffect(AnyEffect):
             value = np.atleast_1d(np.asarray(values[q.symbol], dtype=np.float64))
             need = count if q.each else 1
             if value.shape != (need,):
-                raise ValueError(
-                    f"read effect {self.name}: {q.symbol} holds {value.size} numbers; needs {need}"
-                )
+                raise ValueError(f"read effect {self.name}: {q.symbol} holds {value.size} numbers; needs {need}")
             out[q.symbol] = value
         return out
 

@@ -15,8 +15,8 @@ def gate(subject: Subject) -> tuple[dict[str, str], tuple[tuple[str, str, float]
     """Score the records before fitting.
 
     Returns:
-        Effects that are not excited, pairs that these records cannot tell apart, and what is worth a try: an effect that would
-        not show at its natural size may be larger.
+        Effects that are not excited, pairs that these records cannot tell apart, and what is worth a try: an effect
+        that would not show at its natural size may be larger.
     """
     model, data = subject.model, subject.training
     columns = {n: screening_columns(data, model, model.library[n]) for n in subject.names}
@@ -28,11 +28,7 @@ def gate(subject: Subject) -> tuple[dict[str, str], tuple[tuple[str, str, float]
     for i, a in enumerate(shown):
         for b in shown[i + 1 :]:
             own, other = model.library[a], model.library[b]
-            alike = (
-                (b in own.lookalikes or a in other.lookalikes)
-                and b not in own.replaces
-                and a not in other.replaces
-            )
+            alike = (b in own.lookalikes or a in other.lookalikes) and b not in own.replaces and a not in other.replaces
             if alike and columns[a].shape[1] == columns[b].shape[1]:
                 each = own.primary.each and other.primary.each
                 same = _common(data, columns[a], columns[b], model.count if each else 0)
@@ -48,7 +44,8 @@ def _largest(effect: SensorEffect) -> float:
 
 
 def _common(data: Data, a: Array, b: Array, elements: int) -> float:
-    """Share that two traces have in common; of numbers of the elements' own that of the middle one of the elements that feel both.
+    """Share that two traces have in common; of numbers of the elements' own that of the middle one of the elements that
+    feel both.
 
     What tells the kind of one element does not tell that of the others.
 
@@ -67,6 +64,8 @@ def _common(data: Data, a: Array, b: Array, elements: int) -> float:
 
 
 def _shared(a: Array, b: Array) -> float:
-    """Share of the energy of a's columns that lies in the span of b's; of elements that hardly feel either, hardly any."""
+    """Share of the energy of a's columns that lies in the span of b's; of elements that hardly feel either, hardly
+    any.
+    """
     q = np.linalg.qr(b[:, np.linalg.norm(b, axis=0) > 0.0])[0]
     return float(np.sum((q.T @ a) ** 2) / np.sum(a**2))

@@ -25,7 +25,8 @@ class Data(Protocol):
         views: names of the views.
         block: block of each row, rising from 0, shape (n,); blocks are what is held out.
         element: element that a row belongs to, -1 for rows that mix elements, shape (n,).
-        footing: first view of the group of each view; those of one group are brought to the floor and reported together.
+        footing: first view of the group of each view; those of one group are brought to the floor and reported
+            together.
     """
 
     @property
@@ -49,7 +50,9 @@ class Data(Protocol):
         ...
 
     def doubts(self, model: SensorModel) -> Array:
-        """Return changes of the prediction by a standard deviation of what is not known but systematic, shape (n, k)."""
+        """Return changes of the prediction by a standard deviation of what is not known but
+        systematic, shape (n, k).
+        """
         ...
 
     def whiten(self, change: Array) -> Array:

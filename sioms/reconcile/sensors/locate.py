@@ -1,4 +1,6 @@
-"""Where the disagreement of a sensor lives: its residual over the bins of what it may go with, with permutation p-values."""
+"""Where the disagreement of a sensor lives: its residual over the bins of what it may go with, with permutation
+p-values.
+"""
 
 from __future__ import annotations
 
@@ -41,13 +43,14 @@ def locate(subject: Subject, model: SensorModel, rng: np.random.Generator, shift
                 spread * floor,
             )
         )
-    # whatever else changed meanwhile goes with the time: it comes first only where nothing else explains a third as much
+    # whatever else changed meanwhile goes with the time: it comes first only where nothing else explains a third as
+    # much
     return sorted(out, key=lambda q: -q.explained / (3.0 if q.variable.startswith("time (") else 1.0))
 
 
 def _shuffled(r: Array, block: NDArray[np.int64], rng: np.random.Generator) -> Array:
-    """Lay the blocks in another order, each turned within itself: neighbours stay neighbours, and nothing keeps its place."""
+    """Lay the blocks in another order, each turned within itself: neighbours stay neighbours, and nothing keeps its
+    place.
+    """
     parts = np.split(r, np.flatnonzero(np.diff(block)) + 1)
-    return np.concatenate(
-        [np.roll(parts[i], int(rng.integers(len(parts[i])))) for i in rng.permutation(len(parts))]
-    )
+    return np.concatenate([np.roll(parts[i], int(rng.integers(len(parts[i])))) for i in rng.permutation(len(parts))])

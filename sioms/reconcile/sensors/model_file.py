@@ -48,9 +48,7 @@ def effects_from(model: SensorModel, table: Mapping[str, Any], where: str) -> Se
 
 def number_or_list(values: np.ndarray[Any, np.dtype[np.float64]]) -> str:
     """Write one number plainly, several as a list; exact."""
-    return (
-        repr(float(values[0])) if len(values) == 1 else "[" + ", ".join(repr(float(v)) for v in values) + "]"
-    )
+    return repr(float(values[0])) if len(values) == 1 else "[" + ", ".join(repr(float(v)) for v in values) + "]"
 
 
 def numbers(
@@ -66,9 +64,7 @@ def numbers(
     try:
         out = np.atleast_1d(np.asarray(table[key], dtype=np.float64))
     except (TypeError, ValueError) as e:
-        raise BadInputError(
-            f"read model {where}: {key} is {table[key]!r}; needs a number or a list of numbers"
-        ) from e
+        raise BadInputError(f"read model {where}: {key} is {table[key]!r}; needs a number or a list of numbers") from e
     if count is not None and out.size == 1:
         out = np.full(count, out[0])
     if (count is not None and out.shape != (count,)) or not np.isfinite(out).all():

@@ -20,11 +20,7 @@ def alike(lib: Mapping[str, SensorEffect], name: str, count: int) -> list[str]:
     """Look-alikes in either direction that are not much richer, and the twins whatever their size."""
     own = lib[name]
     both = [n for n in lib if n in own.lookalikes or name in lib[n].lookalikes]
-    return [
-        n
-        for n in both
-        if n not in own.replaces and (lib[n].size(count) <= own.size(count) + 1 or n in own.twins)
-    ]
+    return [n for n in both if n not in own.replaces and (lib[n].size(count) <= own.size(count) + 1 or n in own.twins)]
 
 
 def family(model: SensorModel, name: str) -> set[str]:

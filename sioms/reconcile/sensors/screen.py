@@ -14,7 +14,9 @@ from sioms.reconcile.sensors.fit import Data, Fit, Free, slopes
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """A screened candidate: values to start from, the share of the view's squares it would save, and that of all squares."""
+    """A screened candidate: values to start from, the share of the view's squares it would save, and that of all
+    squares.
+    """
 
     effect: str
     values: Values
@@ -22,10 +24,10 @@ class Start:
     total: float
 
 
-def screen(
-    data: Data, fit: Fit, weights: Array, effect: SensorEffect, frozen: tuple[str, ...] = ()
-) -> list[Start]:
-    """Regress the residual on what a little of the effect would change; one start per trial shape, the best of all views first."""
+def screen(data: Data, fit: Fit, weights: Array, effect: SensorEffect, frozen: tuple[str, ...] = ()) -> list[Start]:
+    """Regress the residual on what a little of the effect would change; one start per trial shape, the best of all
+    views first.
+    """
     out, lefts = [], []
     known, r = fit.jacobian, fit.residual
     gram, pull = known.T @ known, known.T @ r
@@ -47,17 +49,13 @@ def screen(
         if values is not None:
             left = r + known @ d[: len(gram)] + columns @ d[len(gram) :]
             lefts.append(left)
-            out.append(
-                Start(effect.name, values, _gain(data, r, left), 1.0 - float(left @ left) / float(r @ r))
-            )
+            out.append(Start(effect.name, values, _gain(data, r, left), 1.0 - float(left @ left) / float(r @ r)))
     if len(out) > 1 and any(q.each and len(q.starts) > 1 for q in effect.parameters):
         out.append(_elementwise(data, effect, out, lefts, r))
     return sorted(out, key=lambda s: -s.total)
 
 
-def _elementwise(
-    data: Data, effect: SensorEffect, starts: list[Start], lefts: list[Array], before: Array
-) -> Start:
+def _elementwise(data: Data, effect: SensorEffect, starts: list[Start], lefts: list[Array], before: Array) -> Start:
     """Put the best shape of every element together, where elements have shapes of their own."""
     count = int(data.element.max()) + 1
     squares = np.array([np.bincount(data.element, weights=e**2, minlength=count) for e in lefts])
@@ -67,9 +65,7 @@ def _elementwise(
         if q.each:
             values[q.symbol] = np.array([starts[k].values[q.symbol][i] for i, k in enumerate(which)])
     left = np.stack(lefts)[which[data.element], np.arange(len(before))]
-    return Start(
-        effect.name, values, _gain(data, before, left), 1.0 - float(left @ left) / float(before @ before)
-    )
+    return Start(effect.name, values, _gain(data, before, left), 1.0 - float(left @ left) / float(before @ before))
 
 
 def _gain(data: Data, before: Array, after: Array) -> float:
@@ -95,7 +91,9 @@ def _shapes(model: SensorModel, effect: SensorEffect) -> Iterator[list[dict[str,
 
 
 def screening_columns(data: Data, model: SensorModel, effect: SensorEffect, tries: int = 5) -> Array:
-    """Return what a natural size of the effect changes at most, of a few of its shapes, in units of the floor, shape (n, k)."""
+    """Return what a natural size of the effect changes at most, of a few of its shapes, in units of the floor, shape
+    (n, k).
+    """
     shapes = list(_shapes(model, effect))
     step = max(len(shapes) // tries, 1)
     found = [_columns(data, model, effect, shape[0]) for shape in shapes[::step]]
@@ -122,9 +120,7 @@ def _amounts(effect: SensorEffect, count: int) -> tuple[Free, ...]:
     return tuple(Free(effect.name, q, i) for q in _amplitudes(effect) for i in range(count if q.each else 1))
 
 
-def _settled(
-    effect: SensorEffect, shape: list[dict[str, Array]], amount: Array, count: int
-) -> dict[str, Array] | None:
+def _settled(effect: SensorEffect, shape: list[dict[str, Array]], amount: Array, count: int) -> dict[str, Array] | None:
     """Turn regression coefficients into values to start from; None where the sign is not the effect's."""
     q = effect.primary
     values = {symbol: v.copy() for symbol, v in shape[0].items()}

@@ -25,7 +25,9 @@ from sioms.reconcile.thresholds import DEEP, GAIN, NEARLY, PAIRS, SENSOR, SPECIF
 
 @dataclass(frozen=True, slots=True)
 class Saving:
-    """What one model saves against another: share and standard errors in its best view, and those of all views together."""
+    """What one model saves against another: share and standard errors in its best view, and those of all views
+    together.
+    """
 
     share: float
     errors: float
@@ -99,7 +101,9 @@ class Searcher:
     # -- search
 
     def run(self, start: SensorModel) -> Found:
-        """Search from a model; where the floor is not reached, again without the first step, which led astray if that reaches it."""
+        """Search from a model; where the floor is not reached, again without the first step, which led astray if that
+        reaches it.
+        """
         found = self._run(start)
         steps = [r for r in found.ladder if r.action == "add"]
         if len(steps) < 2 or not self.loud(found.fit) or set(self.terms) & set(self.names):
@@ -139,11 +143,7 @@ class Searcher:
 
     def loud(self, fit: Fit) -> list[str]:
         """Views that are above their floor."""
-        return [
-            v
-            for v, ratio in zip(self.data.views, self.ratios(fit.model), strict=True)
-            if ratio > SENSOR.floor
-        ]
+        return [v for v, ratio in zip(self.data.views, self.ratios(fit.model), strict=True) if ratio > SENSOR.floor]
 
     def ratio(self, fit: Fit) -> float:
         """Root mean square over all rows, in units of the floor."""
@@ -178,7 +178,8 @@ class Searcher:
     def _may_be_another(
         self, fit: Fit, losses: Array, name: str, tried: Mapping[str, tuple[Fit, Array, Saving]]
     ) -> bool:
-        """Say whether what an effect saves may be a part of what another saves, of what a term does not fit, or of what has no name.
+        """Say whether what an effect saves may be a part of what another saves, of what a term does not fit, or of what
+        has no name.
 
         Effects are compared on what they count by: their share of one view, below the floor that of everything.
         """
@@ -187,9 +188,7 @@ class Searcher:
             return termed(fit.model) or not beyond_noise(saved)
         below, alike = not self.loud(fit), family(new.model, name)
         for n, (_, _, other) in tried.items():
-            nearly = (
-                other.total / saved.total if below else (other.view == saved.view) * other.share / saved.share
-            )
+            nearly = other.total / saved.total if below else (other.view == saved.view) * other.share / saved.share
             if n not in alike and nearly > NEARLY:
                 return True
         return self._nameless(fit, losses, saved)
@@ -259,9 +258,7 @@ class Searcher:
     def squares(self, fit: Fit) -> Array:
         """Sum of squares of each element, shape (count,)."""
         own = self.data.element >= 0
-        out: Array = np.bincount(self.data.element[own], fit.residual[own] ** 2, fit.model.count).astype(
-            np.float64
-        )
+        out: Array = np.bincount(self.data.element[own], fit.residual[own] ** 2, fit.model.count).astype(np.float64)
         return out
 
     def switched_on(self, fit: Fit, start: Start) -> SensorModel:
@@ -270,13 +267,11 @@ class Searcher:
         return model.with_effect(start.effect, start.values)
 
     def _nameless(self, fit: Fit, losses: Array, saved: Saving) -> bool:
-        """Say whether a term without a name saves far more than the best name does: then the residual has no name yet."""
+        """Say whether a term without a name saves far more than the best name does: then the residual has no name
+        yet.
+        """
         free = [n for n in self.terms if n not in self.names and n not in fit.model.effects]
-        starts = [
-            s
-            for n in free
-            for s in screen(self.data, fit, self.weights, fit.model.library[n], self.frozen)[:1]
-        ]
+        starts = [s for n in free for s in screen(self.data, fit, self.weights, fit.model.library[n], self.frozen)[:1]]
         best = max(starts, key=lambda s: s.gain, default=None)
         if best is None or NEARLY * best.gain < saved.share:
             return False
@@ -313,15 +308,13 @@ class Searcher:
         return fit, losses
 
     def _simplify(self, fit: Fit, losses: Array, steps: list[Step]) -> tuple[Fit, Array]:
-        """Put a look-alike of fewer numbers in the place of an effect, or of all that it is like, where it does as well."""
+        """Put a look-alike of fewer numbers in the place of an effect, or of all that it is like, where it does as
+        well.
+        """
         for name in [n for n in fit.model.effects if n not in self.frozen]:
             for other, gone in self._simpler(fit.model, name):
-                bare = self.fit(
-                    without(fit.model, gone), 0
-                )  # the others stay where they are, or they make up for it
-                start = next(
-                    iter(screen(self.data, bare, self.weights, fit.model.library[other], self.frozen)), None
-                )
+                bare = self.fit(without(fit.model, gone), 0)  # the others stay where they are, or they make up for it
+                start = next(iter(screen(self.data, bare, self.weights, fit.model.library[other], self.frozen)), None)
                 if start is None:
                     continue
                 new = self.fit(bare.model.with_effect(other, start.values))

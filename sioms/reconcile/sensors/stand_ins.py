@@ -52,7 +52,9 @@ def ruled(searcher: Searcher, found: Found, names: Sequence[str]) -> tuple[str, 
 def _nameless_alike(
     searcher: Searcher, found: Found, names: Sequence[str]
 ) -> Iterator[tuple[tuple[str, ...], Fit, str]]:
-    """Yield names of a model, one or all that a nameless look-alike could take the place of, the fit without, and that."""
+    """Yield names of a model, one or all that a nameless look-alike could take the place of, the fit without, and
+    that.
+    """
     model, lib = found.fit.model, found.fit.model.library
     held = [n for n in model.effects if n in names and n not in searcher.frozen]
     for term in [n for n in searcher.terms if n not in model.effects]:
@@ -62,7 +64,9 @@ def _nameless_alike(
 
 
 def _tried(searcher: Searcher, fit: Fit, name: str, least: float = 0.0) -> Fit | None:
-    """Switch an effect on from its best start, and refit; None where there is none that saves the least, or it is on."""
+    """Switch an effect on from its best start, and refit; None where there is none that saves the
+    least, or it is on.
+    """
     starts = (
         []
         if name in fit.model.effects
@@ -87,9 +91,7 @@ def credible(searcher: Searcher, found: Found) -> Found:
     model, views, group = found.fit.model, searcher.data.views, searcher.data.footing
     odd = {group[views.index(view)] for view in searcher.loud(found.fit)}
     for name in [n for n in model.effects if n in searcher.names and n not in searcher.frozen]:
-        gap = searcher.lost(
-            searcher.loss(searcher.fit(found.fit.model.without_effect(name), 4)), found.losses
-        )
+        gap = searcher.lost(searcher.loss(searcher.fit(found.fit.model.without_effect(name), 4)), found.losses)
         if gap.share < (WHOLLY if group[views.index(gap.view)] in odd else SPECIFIC):
             model = model.without_effect(name)
     if model is found.fit.model:

@@ -1,6 +1,8 @@
-"""Is a named effect as large everywhere? A true one has the same numbers at all loads, places and times; a stand-in has not.
+"""Is a named effect as large everywhere? A true one has the same numbers at all loads, places and times; a stand-in has
+not.
 
-What an effect contributes is let grow along each variable that a disagreement may go with, all numbers of the model free.
+What an effect contributes is let grow along each variable that a disagreement may go with, all numbers of the model
+free.
 """
 
 from __future__ import annotations
@@ -28,9 +30,7 @@ class Change:
     half: float
 
 
-def changes(
-    data: Data, fit: Fit, weights: Array, names: Iterable[str], variables: Sequence[Variable]
-) -> list[Change]:
+def changes(data: Data, fit: Fit, weights: Array, names: Iterable[str], variables: Sequence[Variable]) -> list[Change]:
     """Return how effects of a fitted model change along variables."""
     out = []
     full, known = data.predict(fit.model), np.linalg.qr(fit.jacobian)[0]

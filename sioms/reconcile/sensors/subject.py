@@ -84,7 +84,8 @@ class Subject(Protocol):
         ...
 
     def sharpened(self, model: SensorModel, shares: Mapping[int, float]) -> Subject | None:
-        """Return the subject with its floor told beside a model that explains more than the nominal one; None for the same.
+        """Return the subject with its floor told beside a model that explains more than the nominal one; None for the
+        same.
 
         Args:
             shares: of what the model leaves in each view, that which a smoother explains: it is no noise.

@@ -7,14 +7,14 @@ nearest to them in the mean is the edge of their lower convex hull over the mean
 and Towsley, "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999).
 What remains unknown is the least delay itself, which a one-way stream cannot show.
 
-The window is kept as the point of least delay of each of the last quarter seconds, so memory and work are bounded: a few
-operations a sample, one hull a quarter second.
+The window is kept as the point of least delay of each of the last quarter seconds, so memory and work are bounded: a
+few operations a sample, one hull a quarter second.
 
-**The rate that is stated may be wrong.** It is measured, as the median slope over all pairs of these points (Theil and Sen: a few
-that were held up do not matter), and replaces the stated one where it differs by more than delays explain. Until it has been
-measured (RATE_SPAN_NS) no stamp is more than LATE_NS before the sample's arrival. Later, a sample may be mapped further back,
-for a host that was held up gets old samples; but only for BURST_NS, and when all samples of GIVE_UP_NS came late, the fit
-no longer holds and begins anew with them.
+**The rate that is stated may be wrong.** It is measured, as the median slope over all pairs of these points (Theil and
+Sen: a few that were held up do not matter), and replaces the stated one where it differs by more than delays explain.
+Until it has been measured (RATE_SPAN_NS) no stamp is more than LATE_NS before the sample's arrival. Later, a sample may
+be mapped further back, for a host that was held up gets old samples; but only for BURST_NS, and when all samples of
+GIVE_UP_NS came late, the fit no longer holds and begins anew with them.
 """
 
 from __future__ import annotations

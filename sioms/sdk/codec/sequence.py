@@ -1,8 +1,10 @@
 """Judges the numbers of records that a network may lose, double or deliver late. Pure.
 
 A record is fresh when its number is ahead of all before it, by no more than can have been sent meanwhile. A number that
-stands still, or a window of old records that is sent again and again, is never fresh: the stream behind it is frozen. Numbers
-that begin anew are never fresh either, for a sender that restarted may have lost its settings: ``SequenceRestart`` is raised.
+stands still, or a window of old records that is sent again and again, is never fresh: the stream behind it is frozen.
+    Numbers
+that begin anew are never fresh either, for a sender that restarted may have lost its settings: ``SequenceRestart`` is
+    raised.
 """
 
 from __future__ import annotations
@@ -15,9 +17,12 @@ from sioms.sdk.exchange import LinkError
 REMEMBERED = 256
 """So many missing numbers are remembered, to tell what comes late from what comes twice."""
 RESTART_AFTER = 8
-"""So many records in a row that follow each other, but nothing before them, mean that the sender began to count anew."""
+"""So many records in a row that follow each other, but nothing before them, mean that the sender began to count anew.
+"""
 SLACK_S = 1.0
-"""A record's number may be ahead by this much more than its sender can have counted since the last one, or by SLACK records."""
+"""A record's number may be ahead by this much more than its sender can have counted since the last one, or by SLACK
+records.
+"""
 SLACK = 16
 RATE_TOLERANCE = 1.05
 
@@ -102,7 +107,9 @@ class SequenceWatch:
         return None
 
     def _is_possible(self, step: int, now_ns: int) -> bool:
-        """Tell whether so many records can have been sent since the last one; what is not used up is kept for SLACK_S."""
+        """Tell whether so many records can have been sent since the last one; what is not used up is kept for
+        SLACK_S.
+        """
         elapsed_s = (now_ns - self._last_ns) * 1e-9
         ahead = min(self._ahead, self._slack) + elapsed_s * self._rate_hz * RATE_TOLERANCE
         if step > ahead:
@@ -137,6 +144,4 @@ class SequenceWatch:
         last = self._last
         self.restarts += 1
         self.expect_anew()
-        raise SequenceRestart(
-            f"the numbers of its records {what} after {last}: it has restarted, or sends otherwise"
-        )
+        raise SequenceRestart(f"the numbers of its records {what} after {last}: it has restarted, or sends otherwise")

@@ -12,8 +12,8 @@ DRIFT = 0.01
 class Uptime:
     """Compares a device's time since its start with the host's clock.
 
-    A device that has started anew, and one whose answers stand still, show less time than has passed. The figure was valid at some
-    instant between the request and its reply, so that a host that is late is never taken for a restart.
+    A device that has started anew, and one whose answers stand still, show less time than has passed. The figure was
+    valid at some instant between the request and its reply, so that a host that is late is never taken for a restart.
 
     Args:
         unit_s: of the figure [s].

@@ -1,4 +1,5 @@
-"""`sioms tactile design|reproduce|calibrate|score|shape|experiment`: work with elastic cylindrical fingers from the shell.
+"""`sioms tactile design|reproduce|calibrate|score|shape|experiment`: work with elastic cylindrical fingers from the
+shell.
 
 Long work tells on stderr what it is doing; reports are single HTML pages.  Numerical and drawing libraries
 are imported when a subcommand runs, not before.
@@ -20,43 +21,27 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     design = commands.add_parser("design", help="predict what a finger will be able to tell")
     design.add_argument("--core-mm", type=float, default=9.6, help="core radius (default 9.6)")
     design.add_argument("--outer-mm", type=float, default=12.7, help="outer radius (default 12.7)")
-    design.add_argument(
-        "--depth-mm", type=float, default=2.4, help="effective depth of the elements (default 2.4)"
-    )
+    design.add_argument("--depth-mm", type=float, default=2.4, help="effective depth of the elements (default 2.4)")
     design.add_argument("--elements", type=int, default=16, help="number of elements (default 16)")
     design.add_argument("--pitch-deg", type=float, default=9.22, help="angle between elements (default 9.22)")
     design.add_argument("--poisson", type=float, default=0.46, help="Poisson's ratio (default 0.46)")
     design.add_argument("--shear-pa", type=float, default=8.3e4, help="shear modulus in Pa (default 8.3e4)")
-    design.add_argument(
-        "--noise-percent", type=float, default=0.1, help="strain noise in per cent (default 0.1)"
-    )
-    design.add_argument(
-        "-o", "--output", type=Path, default=Path("design.html"), help="report (default design.html)"
-    )
+    design.add_argument("--noise-percent", type=float, default=0.1, help="strain noise in per cent (default 0.1)")
+    design.add_argument("-o", "--output", type=Path, default=Path("design.html"), help="report (default design.html)")
 
-    reproduce = commands.add_parser(
-        "reproduce", help="recompute the published figures and tables beside their values"
-    )
+    reproduce = commands.add_parser("reproduce", help="recompute the published figures and tables beside their values")
     reproduce.add_argument("-o", "--output", type=Path, default=Path("reproduce.html"), help="report")
     reproduce.add_argument("--quick", action="store_true", help="a tenth of the Monte Carlo frames")
 
     calibrate = commands.add_parser("calibrate", help="calibrate a finger from recorded touches")
-    calibrate.add_argument(
-        "data", type=Path, help="folder with recordings (*.npz) and nominal.json or nominal.toml"
-    )
+    calibrate.add_argument("data", type=Path, help="folder with recordings (*.npz) and nominal.json or nominal.toml")
     calibrate.add_argument("-o", "--output", type=Path, default=Path("finger.toml"), help="calibrated finger")
     calibrate.add_argument("-r", "--report", type=Path, help="report (default: the output's name with .html)")
-    calibrate.add_argument(
-        "--contact", choices=("frictionless", "adhering", "hertz"), help="contact model, not chosen"
-    )
+    calibrate.add_argument("--contact", choices=("frictionless", "adhering", "hertz"), help="contact model, not chosen")
     calibrate.add_argument("--no-map", action="store_true", help="do not identify the E map directly")
-    calibrate.add_argument(
-        "--edge-deg", type=float, default=45.0, help="half angle of the edge indenter (default 45)"
-    )
+    calibrate.add_argument("--edge-deg", type=float, default=45.0, help="half angle of the edge indenter (default 45)")
 
-    calibrate.add_argument(
-        "--doubtful", action="store_true", help="write the finger even if it is not to be believed"
-    )
+    calibrate.add_argument("--doubtful", action="store_true", help="write the finger even if it is not to be believed")
 
     score = commands.add_parser(
         "score", help="calibrate on part of the touches, fit the rest, tabulate what is reached"
@@ -64,47 +49,33 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     score.add_argument("data", type=Path, nargs="+", help="folders of recordings, or folders of such folders")
     score.add_argument("--truth", type=Path, help="folder with the truth of generated data, NAME.json")
     score.add_argument("--jobs", type=int, help="processes (default: one for each core)")
-    score.add_argument(
-        "--edge-deg", type=float, default=45.0, help="half angle of the edge indenter (default 45)"
-    )
+    score.add_argument("--edge-deg", type=float, default=45.0, help="half angle of the edge indenter (default 45)")
 
     shape = commands.add_parser("shape", help="fit recorded frames on all cores: a table of what touched")
-    shape.add_argument(
-        "data", type=Path, nargs="+", help="recordings (*.npz with raw and time), or folders of them"
-    )
+    shape.add_argument("data", type=Path, nargs="+", help="recordings (*.npz with raw and time), or folders of them")
     shape.add_argument("--finger", type=Path, required=True, help="calibrated finger (from calibrate)")
-    shape.add_argument(
-        "-o", "--output", type=Path, default=Path("shapes.csv"), help="table (default shapes.csv)"
-    )
+    shape.add_argument("-o", "--output", type=Path, default=Path("shapes.csv"), help="table (default shapes.csv)")
     shape.add_argument("--jobs", type=int, help="processes (default: one for each core)")
-    shape.add_argument(
-        "--settle", type=int, default=20, help="untouched frames averaged for the baseline (default 20)"
-    )
+    shape.add_argument("--settle", type=int, default=20, help="untouched frames averaged for the baseline (default 20)")
     shape.add_argument(
         "--load-deviation",
         type=float,
         metavar="N/M",
         help="use the recorded force, known to this deviation in N/m",
     )
-    shape.add_argument(
-        "--plain", action="store_true", help="fit in plain numpy even where numba is installed"
-    )
+    shape.add_argument("--plain", action="store_true", help="fit in plain numpy even where numba is installed")
 
     experiment = commands.add_parser(
         "experiment",
         help="probe a simulated finger through the daemon, calibrate it, tabulate it beside the published one",
     )
-    experiment.add_argument(
-        "-o", "--output", type=Path, default=Path("finger"), help="folder (default finger)"
-    )
+    experiment.add_argument("-o", "--output", type=Path, default=Path("finger"), help="folder (default finger)")
     experiment.add_argument("--quick", action="store_true", help="about a fifth of the touches")
     experiment.add_argument(
         "--finger",
         help='fields of the simulated finger, "gain = 3.0; creep = 0.1" (default: faults as published)',
     )
-    experiment.add_argument(
-        "--recorded", action="store_true", help="tabulate what is in the folder; probe nothing"
-    )
+    experiment.add_argument("--recorded", action="store_true", help="tabulate what is in the folder; probe nothing")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -49,7 +49,8 @@ def calibrate(args: argparse.Namespace) -> int:
             write_report(data, result, report, progress)
             progress.close()
             raise ValueError(
-                f"calibrate {args.data}: not to be believed, no finger was written: {'; '.join(result.doubts)}. See {report}; record "
+                f"calibrate {args.data}: not to be believed, no finger was written: {'; '.join(result.doubts)}. See "
+                f"{report}; record "
                 "again, or write it all the same with --doubtful"
             )
         finger = msgspec.structs.replace(finger, notes={**finger.notes, "doubts": "; ".join(result.doubts)})
@@ -59,9 +60,7 @@ def calibrate(args: argparse.Namespace) -> int:
     progress.close()
     for warning in (*result.doubts, *result.warnings):
         print(f"warning: {warning}")
-    print(
-        f"wrote {args.output} ({result.finger.contact.model}, map: {result.finger.notes['map']}) and {report}"
-    )
+    print(f"wrote {args.output} ({result.finger.contact.model}, map: {result.finger.notes['map']}) and {report}")
     return 0
 
 
@@ -88,9 +87,11 @@ def _summary(page: Page, result: Calibration) -> None:
             for name, r in result.residuals.items()]  # fmt: skip
     page.text(
         f"Contact model {finger.contact.model}, share of adhesion {finger.contact.adhesion:.2f}; Poisson's ratio "
-        f"{finger.geometry.poisson:.3f}; an element averages over +-{math.degrees(finger.geometry.extent_rad):.2f} deg; map in "
+        f"{finger.geometry.poisson:.3f}; an element averages over +-{math.degrees(finger.geometry.extent_rad):.2f} "
+        "deg; map in "
         f"use: {finger.notes['map']}. Residuals are root mean squares over touches "
-        f"that were left out of the fit, in per cent of the peak strain of a 200 N/m edge ({100 * result.peak:.2f} %); those "
+        f"that were left out of the fit, in per cent of the peak strain of a 200 N/m edge ({100 * result.peak:.2f} %); "
+        "those "
         "of the model within 25 degrees of the element, those of identified maps over all touches."
     )
     page.table(("method", "least", "mean", "most"), rows)
@@ -106,17 +107,27 @@ def _elements(page: Page, result: Calibration) -> None:
     rows = []
     for number in range(len(e.angle_rad)):
         deviation = "" if quadratic is None else _deviation(quadratic.deviation[number])
-        rows.append((
-            number, f"{math.degrees(e.angle_rad[number]):.2f}", f"{1e3 * e.radius_m[number]:.2f}", f"{e.gain[number]:.3f}",
-            f"{e.quadratic[number] / 100:.4f}", deviation, f"{100 * e.noise[number]:.3f}",
-            f"{100 * e.gain[number] * e.noise[number] / result.peak:.2f}",
-            *(f"{100 * r[number]:.2f}" for r in result.residuals.values()),
-        ))  # fmt: skip
+        rows.append(
+            (
+                number,
+                f"{math.degrees(e.angle_rad[number]):.2f}",
+                f"{1e3 * e.radius_m[number]:.2f}",
+                f"{e.gain[number]:.3f}",
+                f"{e.quadratic[number] / 100:.4f}",
+                deviation,
+                f"{100 * e.noise[number]:.3f}",
+                f"{100 * e.gain[number] * e.noise[number] / result.peak:.2f}",
+                *(f"{100 * r[number]:.2f}" for r in result.residuals.values()),
+            )
+        )
     head = ("element", "angle, deg", "depth radius, mm", "gain, % strain / % output", "quadratic, 1/%", "its deviation",
             "noise, % output", "noise, % of peak")  # fmt: skip
     page.table((*head, *(f"{name}, % of peak" for name in result.residuals)), rows)
-    page.figure(poisson_responses(result.finger.cylinder, float(np.mean(e.radius_m))), "Frequency response at the mean depth "
-                "for several Poisson's ratios: what it takes to tell the ratio from the depth (figure 3.18)")  # fmt: skip
+    page.figure(
+        poisson_responses(result.finger.cylinder, float(np.mean(e.radius_m))),
+        "Frequency response at the mean depth "
+        "for several Poisson's ratios: what it takes to tell the ratio from the depth (figure 3.18)",
+    )
 
 
 def _deviation(value: float) -> str:
@@ -144,9 +155,7 @@ def _pictures(page: Page, result: Calibration) -> None:
     axes = figure.subplots()
     axes.plot(np.degrees(touches.angle_rad), 100 * touches.output * gain, lw=1)
     axes.set(xlabel="edge at, deg", ylabel="compression, % strain")
-    page.figure(
-        figure, "Overlapping impulse responses of all elements, calibrated (in the manner of figure 3.3)"
-    )
+    page.figure(figure, "Overlapping impulse responses of all elements, calibrated (in the manner of figure 3.3)")
     _array_response(page, result, touches)
     figure, axes_list = _grid(gain.size)
     predicted = _predictions(result, chosen)
@@ -160,8 +169,11 @@ def _pictures(page: Page, result: Calibration) -> None:
             ax.plot(x, measured + 100 * strain[near, element], lw=0.8, ls=":", color=colour)
         ax.set_title(f"element {element}", fontsize=8)
     axes_list[0].legend(fontsize=7)
-    page.figure(figure, "Touches (dots), predictions (lines) and errors (dotted), % strain over the edge's place in degrees "
-                "(figures 3.16, 3.17, 3.22)")  # fmt: skip
+    page.figure(
+        figure,
+        "Touches (dots), predictions (lines) and errors (dotted), % strain over the edge's place in degrees "
+        "(figures 3.16, 3.17, 3.22)",
+    )
     _flat_and_edge(page, result)
 
 
@@ -258,20 +270,18 @@ def _indenters(page: Page, data: Data, result: Calibration) -> None:
     page.table(
         ("rc, mm", "R, mm", "mean R", "deviation of R", "rc from mean R", "place: mean error, deg", "deviation, deg",
          "load: mean error, N/m", "deviation, N/m", "mean R with load cell", "deviation"), rows)  # fmt: skip
-    page.text("The touches took part in the calibration; deviations are over places. The published finger: place 0.043 deg, "
-              "load 6.4 N/m, R 0.60 mm by place.")  # fmt: skip
+    page.text(
+        "The touches took part in the calibration; deviations are over places. The published finger: place 0.043 deg, "
+        "load 6.4 N/m, R 0.60 mm by place."
+    )
     figure = Figure(figsize=(11, 4), layout="constrained")
     axes = figure.subplots()
     for rc in radii:
         mine = np.flatnonzero(touches.radius_m == rc)
         x = np.degrees(touches.angle_rad[mine])
         order = np.argsort(x)
-        line = axes.plot(
-            x[order], [1e3 * free[m].equivalent_radius_m for m in mine[order]], ".-", ms=3, lw=0.7
-        )
-        axes.axhline(
-            1e3 * equivalent_radius(finger.cylinder, float(rc)), color=line[0].get_color(), lw=0.5, ls="--"
-        )
+        line = axes.plot(x[order], [1e3 * free[m].equivalent_radius_m for m in mine[order]], ".-", ms=3, lw=0.7)
+        axes.axhline(1e3 * equivalent_radius(finger.cylinder, float(rc)), color=line[0].get_color(), lw=0.5, ls="--")
     axes.set(xlabel="place, deg", ylabel="R, mm")
     page.figure(figure, "Fitted equivalent radius over the place, true values dashed (figures 3.32, 3.33)")
 
@@ -308,8 +318,11 @@ def _characters(page: Page, recordings: dict[str, Recording], result: Calibratio
     if "noise" in recordings:
         noise = noise_of(recordings["noise"])
         lines = ", ".join(f"{a:.3g} at {f:.4g} Hz" for f, a in noise.lines[:5]) or "none"
-        rows += [("noise of one frame, raw units", f"{noise.deviation.mean():.4f}"), ("converter step", f"{noise.step:.3g}"),
-                 ("lines in the spectrum", lines)]  # fmt: skip
+        rows += [
+            ("noise of one frame, raw units", f"{noise.deviation.mean():.4f}"),
+            ("converter step", f"{noise.step:.3g}"),
+            ("lines in the spectrum", lines),
+        ]
         figure = Figure(figsize=(8, 3), layout="constrained")
         axes = figure.subplots()
         axes.semilogy(noise.frequency_hz, noise.density)
@@ -326,9 +339,7 @@ def _characters(page: Page, recordings: dict[str, Recording], result: Calibratio
             if late is not None:
                 time = "" if math.isnan(late.time_s) else f", time constant {late.time_s:.2f} s"
                 rows.append((what, f"{100 * late.share:+.1f} +- {100 * late.deviation:.1f} %{time}"))
-        rows.append(
-            ("far elements under a touch (proximity), raw units", _spread(proximity_of(held), "+.4f")[0])
-        )
+        rows.append(("far elements under a touch (proximity), raw units", _spread(proximity_of(held), "+.4f")[0]))
     ramp = recordings.get("ramp")
     if ramp is not None:
         _ramp(page, ramp, result)
@@ -368,5 +379,8 @@ def _ramp(page: Page, ramp: Recording, result: Calibration) -> None:
             ax.plot(force[order], scale * (base @ answer)[order], style, lw=1)
         ax.plot(force, scale * d, "+", ms=3, color="black")
         ax.set_title(f"element {number}", fontsize=8)
-    page.figure(figure, "Output, %, against load, N/m: linear (solid) and quadratic fit (dashed) (figure 3.12). The curvature "
-                "mixes the electronics' quadratic with the growth of the contact and creep; the table above does not")  # fmt: skip
+    page.figure(
+        figure,
+        "Output, %, against load, N/m: linear (solid) and quadratic fit (dashed) (figure 3.12). The curvature "
+        "mixes the electronics' quadratic with the growth of the contact and creep; the table above does not",
+    )

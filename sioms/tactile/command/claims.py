@@ -57,10 +57,7 @@ def chapter_2() -> Iterator[Claim]:
     ratio = [float(abs(f[20]) / np.abs(f).max()) for f in (inside.e_rr[:, 0, 0], inside.e_rt[:, 0, 0])]
     yield Claim("fig 2.4", "e_rr and e_rt below 10 % of their maximum by the 20th coefficient",
                 f"{100 * ratio[0]:.1f} % and {100 * ratio[1]:.1f} %", max(ratio) < 0.10)  # fmt: skip
-    fall = [
-        20 * math.log10(abs(f[20] / f[60])) / math.log10(3.0)
-        for f in (inside.e_rr[:, 0, 0], surface.u_r[:, 0, 0])
-    ]
+    fall = [20 * math.log10(abs(f[20] / f[60])) / math.log10(3.0) for f in (inside.e_rr[:, 0, 0], surface.u_r[:, 0, 0])]
     yield Claim("fig 2.6", "strain falls by more than 100 dB/decade, displacement by about 20",
                 f"{fall[0]:.0f} and {fall[1]:.0f} dB/decade", fall[0] > 100 and _near(fall[1], 20, 0.15))  # fmt: skip
     theta = np.array([0.0])
@@ -71,8 +68,12 @@ def chapter_2() -> Iterator[Claim]:
                 _near(plane / mine, 1.25, 0.03))  # fmt: skip
     shear = np.abs(inside.e_rt[1:, 0, 1]).max() / np.abs(inside.e_rt[1:, 0, 0]).max()
     normal = np.abs(inside.e_rr[:, 0, 0]).max() / np.abs(inside.e_rr[:, 0, 1]).max()
-    yield Claim("fig 2.4", "shear strain is affected a factor 3 more by the tangential load; normal strain differs by 2",
-                f"{shear:.1f}; {normal:.1f}", _near(shear, 3, 0.1) and _near(normal, 2, 0.25))  # fmt: skip
+    yield Claim(
+        "fig 2.4",
+        "shear strain is affected a factor 3 more by the tangential load; normal strain differs by 2",
+        f"{shear:.1f}; {normal:.1f}",
+        _near(shear, 3, 0.1) and _near(normal, 2, 0.25),
+    )
     alpha = np.linspace(0.6, 0.9, 13)
     bodies = [Cylinder(a * 12.7e-3, 12.7e-3, 0.5) for a in alpha]
     found = np.array([cutoff(b, b.core_m + 0.5e-3) for b in bodies])
@@ -85,16 +86,28 @@ def chapter_2() -> Iterator[Claim]:
     )
     bench = Cylinder(0.756 * 12.7e-3, 12.7e-3, 0.5)
     pitch = spacing_needed(bench, bench.core_m + 0.5e-3)
-    yield Claim("3.1.1", "spacing at most 0.13 rad = 1.6 mm at alpha = 0.75", f"{pitch:.3f} rad = {12.7 * pitch:.2f} mm",
-                _near(pitch, 0.13, 0.05))  # fmt: skip
+    yield Claim(
+        "3.1.1",
+        "spacing at most 0.13 rad = 1.6 mm at alpha = 0.75",
+        f"{pitch:.3f} rad = {12.7 * pitch:.2f} mm",
+        _near(pitch, 0.13, 0.05),
+    )
     thin = Cylinder(0.85 * 12.7e-3, 12.7e-3, 0.5)
     drag = cutoff(thin, thin.core_m + 0.5e-3, field="e_rt", traction=1)
-    yield Claim("2.2", "shear strain under tangential load is filtered to 1.6 cycles/rad at alpha = 0.85", f"{drag:.2f}",
-                _near(drag, 1.6, 0.15))  # fmt: skip
+    yield Claim(
+        "2.2",
+        "shear strain under tangential load is filtered to 1.6 cycles/rad at alpha = 0.85",
+        f"{drag:.2f}",
+        _near(drag, 1.6, 0.15),
+    )
     shallow = Cylinder(0.90 * 12.7e-3, 12.7e-3, 0.5)
     forty, twenty = cutoff(shallow, shallow.core_m + 0.5e-3, 0.01), cutoff(shallow, shallow.core_m + 0.5e-3)
-    yield Claim("2.5.2", "the -40 dB frequency at alpha = 0.90 is 12 cycles/rad", f"{forty:.1f}; the -20 dB value is {twenty:.1f}",
-                _near(forty, 12.0, 0.05))  # fmt: skip
+    yield Claim(
+        "2.5.2",
+        "the -40 dB frequency at alpha = 0.90 is 12 cycles/rad",
+        f"{forty:.1f}; the -20 dB value is {twenty:.1f}",
+        _near(forty, 12.0, 0.05),
+    )
     yield from _contacts()
     yield from _classes()
 
@@ -120,8 +133,12 @@ def _contacts() -> Iterator[Claim]:
     for solved in (free, stuck):
         strain = matrix @ solved.series(0.0, 120)
         wide.append(float(np.ptp(theta[strain < 0.5 * strain.min()])))
-    yield Claim("fig 2.13", "adhesion narrows the strain profile", f"half-value width {wide[1]:.4f} against {wide[0]:.4f} rad",
-                wide[1] < wide[0])  # fmt: skip
+    yield Claim(
+        "fig 2.13",
+        "adhesion narrows the strain profile",
+        f"half-value width {wide[1]:.4f} against {wide[0]:.4f} rad",
+        wide[1] < wide[0],
+    )
     cut = {c: _odd_over_even(c) for c in (0.3, 0.1, 0.03, 0.01)}
     yield Claim("2.5.1", "the odd shape has 0.11 of the even shape's singular value",
                 "; ".join(f"{v:.2f} with cut {c:g}" for c, v in cut.items()),
@@ -150,8 +167,12 @@ def _odd_over_even(cut: float, half: float = 2e-3 / 12.7e-3, highest: int = 150)
 def _classes() -> Iterator[Claim]:
     sharp = math.degrees(exact_equivalent_wedge(FINGER_A, 200.0, 0.5e-3)[0])
     larger = math.degrees(exact_equivalent_wedge(FINGER_A, 200.0, 2.7e-3)[0])
-    yield Claim("fig 2.24", "rc = 0.5 mm has an equivalent wedge of 70 deg half angle at 200 N/m",
-                f"{sharp:.0f} deg; 70 deg belongs to rc = 2.7 mm ({larger:.0f} deg)", _near(sharp, 70, 0.1))  # fmt: skip
+    yield Claim(
+        "fig 2.24",
+        "rc = 0.5 mm has an equivalent wedge of 70 deg half angle at 200 N/m",
+        f"{sharp:.0f} deg; 70 deg belongs to rc = 2.7 mm ({larger:.0f} deg)",
+        _near(sharp, 70, 0.1),
+    )
     ratios = (0.70, 0.75, 0.80, 0.85, 0.90)
     share = [_class_share(ratio) for ratio in ratios]
     needed = float(np.interp(CLASS_NOISE, share, ratios))
@@ -220,7 +241,8 @@ def _elliptic(finger: Finger) -> Finger:
 
 
 def radii_fitted(finger: Finger, adhesion: float) -> dict[float, tuple[float, float]]:
-    """Return rc [mm] fitted with Hertz's and the approximate frictionless model to exact touches at 200 N/m, by rc [mm].
+    """Return rc [mm] fitted with Hertz's and the approximate frictionless model to exact touches at 200 N/m, by rc
+    [mm].
 
     Touches: the bounded solution, with `adhesion` of the tangential traction of full adhesion, mean over
         places in one pitch.
@@ -256,9 +278,13 @@ def _bias(finger: Finger) -> Iterator[Claim]:
                 all(_near(v, rc, 0.08) for rc, v in small.items()))  # fmt: skip
     sticky = radii_fitted(finger, 0.5)
     large = {rc: sticky[rc][1] for rc in (18.71, 25.25)}
-    yield Claim("table 3.10", "above 13 mm rc is underestimated, probably by friction (18.7 -> 15.5, 25.25 -> 19.4)",
-                ", ".join(f"{rc} -> {v:.1f}, {free[rc][1]:.1f}" for rc, v in large.items()) + " with half of full adhesion, without",
-                all(_near(v, PUBLISHED_RC[rc][1], 0.1) and v < 0.95 * free[rc][1] for rc, v in large.items()))  # fmt: skip
+    yield Claim(
+        "table 3.10",
+        "above 13 mm rc is underestimated, probably by friction (18.7 -> 15.5, 25.25 -> 19.4)",
+        ", ".join(f"{rc} -> {v:.1f}, {free[rc][1]:.1f}" for rc, v in large.items())
+        + " with half of full adhesion, without",
+        all(_near(v, PUBLISHED_RC[rc][1], 0.1) and v < 0.95 * free[rc][1] for rc, v in large.items()),
+    )
 
 
 def _touch(finger: Finger, load: float, rc: float, place: float) -> Floats:
@@ -278,9 +304,7 @@ def _scatter(
     estimator, clean = Estimator(finger), _touch(finger, load, rc, math.radians(75.0))
     rows = []
     for _ in range(frames):
-        told = (
-            None if known is None else Load(max(known.value + miss * random.normal(), 1.0), known.deviation)
-        )
+        told = None if known is None else Load(max(known.value + miss * random.normal(), 1.0), known.deviation)
         e = estimator.frame(clean + 1e-3 * random.normal(size=clean.size), told)
         rows.append(
             (
@@ -294,18 +318,24 @@ def _scatter(
 
 
 def _deviations(finger: Finger, frames: int, tick: Callable[[str], None]) -> Iterator[Claim]:
-    found = {
-        (p, rc): _scatter(finger, p, rc, frames).std(0) for p in (50.0, 200.0) for rc in (3.9e-3, 12.3e-3)
-    }
+    found = {(p, rc): _scatter(finger, p, rc, frames).std(0) for p in (50.0, 200.0) for rc in (3.9e-3, 12.3e-3)}
     tick("Monte Carlo")
     at, weak = found[200.0, 3.9e-3], found[50.0, 3.9e-3]
     yield Claim("fig 3.27", "location improves with load and hardly depends on curvature",
                 f"{weak[0]:.3f} deg at 50, {at[0]:.3f} at 200 N/m; rc 12.3 mm: {found[200.0, 12.3e-3][0]:.3f}",
                 at[0] < 0.5 * weak[0] and _near(found[200.0, 12.3e-3][0], at[0], 0.3))  # fmt: skip
-    yield Claim("fig 3.28", "standard deviation of R in the tenths of a millimetre at 200 N/m",
-                f"{at[2]:.2f} mm (rc 3.9), {found[200.0, 12.3e-3][2]:.2f} mm (rc 12.3)", 0.1 <= at[2] <= 1.0)  # fmt: skip
-    yield Claim("fig 3.29", "load deviation about 3 N/m, the same over load and radius",
-                f"{at[1]:.2f} N/m at 200, {weak[1]:.2f} at 50 N/m", 1.5 < at[1] < 4.5 and _near(weak[1], at[1], 0.2))  # fmt: skip
+    yield Claim(
+        "fig 3.28",
+        "standard deviation of R in the tenths of a millimetre at 200 N/m",
+        f"{at[2]:.2f} mm (rc 3.9), {found[200.0, 12.3e-3][2]:.2f} mm (rc 12.3)",
+        0.1 <= at[2] <= 1.0,
+    )
+    yield Claim(
+        "fig 3.29",
+        "load deviation about 3 N/m, the same over load and radius",
+        f"{at[1]:.2f} N/m at 200, {weak[1]:.2f} at 50 N/m",
+        1.5 < at[1] < 4.5 and _near(weak[1], at[1], 0.2),
+    )
     pitch = 9.22
     yield Claim(
         "3.6",
@@ -316,9 +346,13 @@ def _deviations(finger: Finger, frames: int, tick: Callable[[str], None]) -> Ite
     many = _scatter(finger, 200.0, 5e-3, frames).std(0)
     growth = (1 + 5.0 / 12.7) ** 2
     flat_growth = 4.0
-    yield Claim("3.5.2", "for rc = rb the deviation of rc is twice that of R",
-                f"(1 + rc/rb)² = {flat_growth:g}; Monte Carlo at rc = 5 mm: {many[3] / many[2]:.2f}, formula {growth:.2f}, "
-                f"linear law {1 + 5 / 12.7:.2f}", not _near(many[3] / many[2], growth, 0.1))  # fmt: skip
+    yield Claim(
+        "3.5.2",
+        "for rc = rb the deviation of rc is twice that of R",
+        f"(1 + rc/rb)² = {flat_growth:g}; Monte Carlo at rc = 5 mm: {many[3] / many[2]:.2f}, formula {growth:.2f}, "
+        f"linear law {1 + 5 / 12.7:.2f}",
+        not _near(many[3] / many[2], growth, 0.1),
+    )
     exact = _scatter(finger, 200.0, 3.9e-3, frames, Load(200.0, 0.0)).std(0)
     noisy = _scatter(finger, 200.0, 3.9e-3, frames, Load(200.0, 0.0), 10.0).std(0)
     honest = _scatter(finger, 200.0, 3.9e-3, frames, Load(200.0, 10.0), 10.0).std(0)

@@ -37,7 +37,8 @@ def design(args: argparse.Namespace) -> int:
         raise ValueError(f"design finger: {args.elements} elements; need at least 4")
     if not 0.0 < args.pitch_deg * (args.elements - 1) < 360.0:
         raise ValueError(
-            f"design finger: {args.elements} elements {args.pitch_deg:g} deg apart; need a positive pitch and less than a turn"
+            f"design finger: {args.elements} elements {args.pitch_deg:g} deg apart; need a positive pitch and less "
+            "than a turn"
         )
     if not 0.0 < args.noise_percent < math.inf:
         raise ValueError(f"design finger: noise of {args.noise_percent:g} %; need a positive number")
@@ -50,7 +51,8 @@ def design(args: argparse.Namespace) -> int:
     rows = _figures(body, radius, finger, args)
     limit = math.degrees(spacing_needed(body, radius))
     coarse = (
-        f"elements {args.pitch_deg:g} deg apart are too coarse: {limit:.2f} deg are needed, half a wavelength of the cut-off; "
+        f"elements {args.pitch_deg:g} deg apart are too coarse: {limit:.2f} deg are needed, half a wavelength of the "
+        "cut-off; "
         "between two of them touches are told less well, and two touches pass for one"
     )
     if args.pitch_deg > limit:
@@ -78,16 +80,26 @@ def _figures(body: Cylinder, radius: float, finger: Finger, args: Any) -> list[t
     peak = float(np.abs(finger.strain_table().nodes[0, :, 0]).max())
     return [
         ("cut-off of normal strain (-20 dB)", f"{cutoff(body, radius):.2f} cycles/rad", "finer detail is filtered out"),
-        ("cut-off of shear strain, tangential", f"{cutoff(body, radius, field='e_rt', traction=1):.2f} cycles/rad",
-         "shear sensing tells the tangential load, not the shape"),
-        ("element spacing needed", f"{math.degrees(limit):.2f} deg = {1e3 * body.outer_m * limit:.2f} mm", "half a wavelength"),
+        (
+            "cut-off of shear strain, tangential",
+            f"{cutoff(body, radius, field='e_rt', traction=1):.2f} cycles/rad",
+            "shear sensing tells the tangential load, not the shape",
+        ),
+        (
+            "element spacing needed",
+            f"{math.degrees(limit):.2f} deg = {1e3 * body.outer_m * limit:.2f} mm",
+            "half a wavelength",
+        ),
         ("element spacing given", f"{args.pitch_deg:.2f} deg = {1e3 * body.outer_m * pitch:.2f} mm", verdict),
         ("wave numbers needed", f"{highest_needed(body, radius)}", "for 0.2 % of a line load's peak"),
         ("peak strain per load", f"{100 * peak * 100:.2f} % at 100 N/m", "of an edge"),
-        ("condition of E", ", ".join(f"{c:.2f} at nu {n:g}" for n, c in zip(nu, condition, strict=True)),
-         "noise amplification when pressures are asked for"),
+        (
+            "condition of E",
+            ", ".join(f"{c:.2f} at nu {n:g}" for n, c in zip(nu, condition, strict=True)),
+            "noise amplification when pressures are asked for",
+        ),
         ("covered arc", f"{math.degrees(np.ptp(finger.angles_rad)):.0f} deg", ""),
-    ]  # fmt: skip
+    ]
 
 
 def _errors(page: Page, finger: Finger) -> None:
@@ -117,13 +129,13 @@ def _classes(page: Page, body: Cylinder, radius: float, noise: float, progress: 
         table = widths.half_width(200.0 * equivalent_radius(body, rc))
         peak = _peak(body, radius, table)
         seen = share * peak / noise
-        verdict = (
-            "ok: from one frame" if seen > 2.0 else f"no: {math.ceil((2.0 / seen) ** 2)} frames averaged"
-        )
+        verdict = "ok: from one frame" if seen > 2.0 else f"no: {math.ceil((2.0 / seen) ** 2)} frames averaged"
         rows.append((f"{1e3 * rc:g}", f"{100 * share:.2f}", f"{seen:.2f}", verdict))
         progress(f"classes, rc {1e3 * rc:g} mm")
-    page.text("Round indenter against the wedge of the same width and load, 200 N/m: root mean square difference of the "
-              "strain, and the same in standard deviations of the noise (two are called distinguishable).")  # fmt: skip
+    page.text(
+        "Round indenter against the wedge of the same width and load, 200 N/m: root mean square difference of the "
+        "strain, and the same in standard deviations of the noise (two are called distinguishable)."
+    )
     page.table(("rc, mm", "difference, % of peak", "over noise", "class told"), rows)
 
 
@@ -145,9 +157,18 @@ def _pictures(page: Page, body: Cylinder, radius: float, finger: Finger, progres
     noise = float(np.median(finger.strain_noise)) / peak
     angles = np.array(finger.angles_rad)
     pictures: list[tuple[str, Callable[[], Figure]]] = [
-        ("Displacements under an edge of 200 N/m pressed at 45 degrees (as figure 2.3)", lambda: draw.displacement_field(body)),
-        ("Frequency response of strain and displacement (as figures 2.4, 2.6)", lambda: draw.frequency_response(body, radius)),
-        ("Strain around an edge; half plane for comparison (as figure 2.5)", lambda: draw.impulse_response(body, radius)),
+        (
+            "Displacements under an edge of 200 N/m pressed at 45 degrees (as figure 2.3)",
+            lambda: draw.displacement_field(body),
+        ),
+        (
+            "Frequency response of strain and displacement (as figures 2.4, 2.6)",
+            lambda: draw.frequency_response(body, radius),
+        ),
+        (
+            "Strain around an edge; half plane for comparison (as figure 2.5)",
+            lambda: draw.impulse_response(body, radius),
+        ),
         ("Cut-off over the core's size (as figure 2.7)", lambda: draw.cutoffs(body.poisson, body.outer_m, depth)),
         ("Pressure under flats (as figure 2.12)", lambda: draw.pressures(body)),
         ("Full adhesion against no friction (as figure 2.13)", lambda: draw.adhesion(body, radius)),
@@ -155,11 +176,13 @@ def _pictures(page: Page, body: Cylinder, radius: float, finger: Finger, progres
         ("Radii at one load (as figures 2.21, 2.22)", lambda: draw.radius_study(body, radius)),
         ("Sliding", lambda: draw.sliding(body, radius)),
         ("Equivalent wedge (as figure 2.24)", lambda: draw.equivalent_wedges(body)),
-        ("Difference of classes over depth and radius (as figure 2.25)",
-         lambda: draw.class_differences(body.outer_m, body.poisson, depth, noise, tick=progress)),
+        (
+            "Difference of classes over depth and radius (as figure 2.25)",
+            lambda: draw.class_differences(body.outer_m, body.poisson, depth, noise, tick=progress),
+        ),
         ("Conditioning (as figure 3.24)", lambda: draw.conditions(body, angles, radius)),
         ("Theoretical deviations (as figures 3.27 to 3.29)", lambda: draw.error_maps(finger)),
-    ]  # fmt: skip
+    ]
     for caption, make in pictures:
         page.figure(make(), caption)
         progress(caption)

@@ -69,9 +69,7 @@ def experiment(args: argparse.Namespace) -> int:
     data, result = calibrated(args.output, progress)
     (args.output / "finger.toml").write_text(to_toml(result.finger), encoding="utf-8")
     page = Page("Experiments on a finger, beside the published ones")
-    page.text(
-        f"The finger: {args.finger or FINGER}." if not args.recorded else f"Recordings in {args.output}."
-    )
+    page.text(f"The finger: {args.finger or FINGER}." if not args.recorded else f"Recordings in {args.output}.")
     for warning in result.warnings:
         page.warn(warning)
         print(f"warning: {warning}")

@@ -43,9 +43,7 @@ def displacement_field(body: Cylinder, load: float = 200.0) -> Figure:
     figure, axes = _axes(7.0, 7.0)
     component = load / np.sqrt(2.0)
     highest = 80
-    smooth = np.sinc(
-        np.arange(highest + 1) / (highest + 1)
-    )  # a line load's own point has no finite displacement
+    smooth = np.sinc(np.arange(highest + 1) / (highest + 1))  # a line load's own point has no finite displacement
     k = np.arange(highest + 1)
     even, odd = (total / (np.pi * body.outer_m) * smooth for total in (-component, component))
     theta = np.linspace(-0.25, 0.25, 41)
@@ -78,9 +76,7 @@ def frequency_response(body: Cylinder, radius_m: float) -> Figure:
     for field, which, label in names:
         value = getattr(inside, field)[:, 0, which]
         left.plot(k[:41], value[:41], ".-", label=label)
-        right.loglog(
-            k[1:] / (2 * np.pi), np.maximum(np.abs(value[1:]) / np.abs(value).max(), 1e-12), label=label
-        )
+        right.loglog(k[1:] / (2 * np.pi), np.maximum(np.abs(value[1:]) / np.abs(value).max(), 1e-12), label=label)
     shift = np.abs(surface.u_r[1:, 0, 0])
     right.loglog(k[1:] / (2 * np.pi), shift / shift.max(), "k--", label="surface displacement from p")
     left.set(xlabel="k", ylabel="1/Pa")
@@ -224,7 +220,9 @@ def class_differences(
 
 
 def poisson_responses(body: Cylinder, radius_m: float) -> Figure:
-    """Draw the frequency response of the strain for several Poisson's ratios, the body's own among them (figure 3.18)."""
+    """Draw the frequency response of the strain for several Poisson's ratios, the body's own among them (figure
+    3.18).
+    """
     figure, axes = _axes()
     k = np.arange(41)
     for nu in sorted({0.40, 0.45, 0.48, 0.5, body.poisson}):

@@ -35,8 +35,11 @@ def reproduce(args: argparse.Namespace) -> int:
         claims.append(claim)
         progress(claim.where)
     page = Page("Elastic tactile fingers: published results, recomputed")
-    page.text("Finger A: core 8.9, outer 12.7, elements at 9.4 mm, nu 0.5. Finger B: core 9.6, elements at 10.3 mm, nu 0.46, 16 "
-              "elements at 9.22 degrees. Each verdict is computed from the numbers beside it.")  # fmt: skip
+    page.text(
+        "Finger A: core 8.9, outer 12.7, elements at 9.4 mm, nu 0.5. Finger B: core 9.6, elements at 10.3 mm, nu 0.46, "
+        "16 "
+        "elements at 9.22 degrees. Each verdict is computed from the numbers beside it."
+    )
     page.table(
         ("where", "published", "computed", "verdict"),
         [(c.where, c.statement, c.computed, "ok: reproduces" if c.holds else "no: does not") for c in claims],
@@ -47,9 +50,7 @@ def reproduce(args: argparse.Namespace) -> int:
     page.write(args.output)
     progress.close()
     for claim in claims:
-        print(
-            f"{'reproduces' if claim.holds else 'DOES NOT  '}  {claim.where:10s} {claim.statement}: {claim.computed}"
-        )
+        print(f"{'reproduces' if claim.holds else 'DOES NOT  '}  {claim.where:10s} {claim.statement}: {claim.computed}")
     print(f"wrote {args.output}")
     return 0
 
@@ -59,11 +60,20 @@ def _table_3_10(page: Page) -> None:
     finger = nominal_finger(FINGER_B, ANGLES, RS_B, 1.0, 1e-3)
     free, half = radii_fitted(finger, 0.0), radii_fitted(finger, 0.5)
     page.table(
-        ("rc", "Hertz, published", "Hertz, frictionless touches", "Hertz, half adhesion", "approx. frictionless, published",
-         "on frictionless touches", "on half adhesion"),
-        [(rc, h, f"{free[rc][0]:.2f}", f"{half[rc][0]:.2f}", a, f"{free[rc][1]:.2f}", f"{half[rc][1]:.2f}")
-         for rc, (h, a) in PUBLISHED_RC.items()],
-    )  # fmt: skip
+        (
+            "rc",
+            "Hertz, published",
+            "Hertz, frictionless touches",
+            "Hertz, half adhesion",
+            "approx. frictionless, published",
+            "on frictionless touches",
+            "on half adhesion",
+        ),
+        [
+            (rc, h, f"{free[rc][0]:.2f}", f"{half[rc][0]:.2f}", a, f"{free[rc][1]:.2f}", f"{half[rc][1]:.2f}")
+            for rc, (h, a) in PUBLISHED_RC.items()
+        ],
+    )
 
 
 def _shallow(body: Cylinder) -> float:

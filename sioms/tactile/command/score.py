@@ -1,4 +1,5 @@
-"""Score calibration and estimation on folders of recordings: every fourth touch is kept from the calibration and fitted.
+"""Score calibration and estimation on folders of recordings: every fourth touch is kept from the calibration and
+fitted.
 
 One row for each finger.  A finger whose truth is known (``--truth FOLDER`` with NAME.json, as a generator of
 such data writes it) also gets the errors of its parameters.
@@ -73,7 +74,8 @@ def score_folder(folder: Path, truth: Path | None, edge_half_angle: float) -> Sc
     errors, flagged = fit_errors(result.finger, touches.pick(kept))
     if not np.isfinite(errors).any():
         raise ValueError(
-            f"score {folder}: none of the {len(errors)} touches kept back could be fitted; see what calibrate says of it"
+            f"score {folder}: none of the {len(errors)} touches kept back could be fitted; see what calibrate says of "
+            "it"
         )
     spread, mean = np.nanstd(errors, axis=0), np.nanmean(errors, axis=0)
     mapped = result.residuals.get("corrected", np.array([np.nan]))
@@ -92,7 +94,9 @@ def score_folder(folder: Path, truth: Path | None, edge_half_angle: float) -> Sc
 
 
 def fit_errors(finger: Finger, touches: Touches) -> tuple[Floats, NDArray[np.bool_]]:
-    """Fit touches over the elements; return errors of place [deg], load [N/m], R [mm], shape (n, 3), and who is doubted."""
+    """Fit touches over the elements; return errors of place [deg], load [N/m], R [mm], shape (n, 3), and who is
+    doubted.
+    """
     angles = np.array(finger.angles_rad)[np.array(finger.elements.used)]
     inside = (touches.angle_rad > angles.min()) & (touches.angle_rad < angles.max())
     touches = touches.pick(inside & (touches.load >= LEAST_LOAD))
@@ -136,11 +140,7 @@ def _found(result: Calibration, truth: dict[str, Any] | None) -> str:
 
 def score(args: argparse.Namespace) -> int:
     """Score the folders on all cores and print the table."""
-    folders = [
-        child
-        for folder in args.data
-        for child in ([folder] if _is_data(folder) else sorted(folder.iterdir()))
-    ]
+    folders = [child for folder in args.data for child in ([folder] if _is_data(folder) else sorted(folder.iterdir()))]
     if not folders:
         raise ValueError(f"score fingers: {args.data[0]} is empty; give folders of recordings")
     if bad := [str(folder) for folder in folders if not _is_data(folder)]:

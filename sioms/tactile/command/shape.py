@@ -1,4 +1,6 @@
-"""Fit recorded frames of a finger on all cores: a row of numbers for each frame, as the finger's driver would have published it."""
+"""Fit recorded frames of a finger on all cores: a row of numbers for each frame, as the finger's driver would have
+published it.
+"""
 
 from __future__ import annotations
 
@@ -89,9 +91,7 @@ def shape(args: argparse.Namespace) -> int:
 
 
 def _paths(given: list[Path]) -> list[Path]:
-    paths = [
-        path for entry in given for path in ([entry] if entry.is_file() else sorted(entry.glob("*.npz")))
-    ]
+    paths = [path for entry in given for path in ([entry] if entry.is_file() else sorted(entry.glob("*.npz")))]
     if not paths:
         raise ValueError(f"fit frames: {given[0]} holds no *.npz; give recordings, or folders of them")
     return paths
@@ -115,7 +115,9 @@ def _read(path: Path, setting: Setting) -> Recording:
 def rows(
     recording: Recording, setting: Setting, pool: ProcessPoolExecutor, ahead: int
 ) -> Iterator[list[tuple[float, ...]]]:
-    """Return the numbers of a recording's frames, block by block in order; `ahead` blocks are being fitted meanwhile."""
+    """Return the numbers of a recording's frames, block by block in order; `ahead` blocks are being
+    fitted meanwhile.
+    """
     waiting: deque[Future[list[tuple[float, ...]]]] = deque()
     for block in _blocks(recording, setting):
         waiting.append(pool.submit(_fit, block))

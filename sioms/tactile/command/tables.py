@@ -37,9 +37,13 @@ PUBLISHED_3_10 = {  # rc: Hertz by model and map, approximate frictionless by mo
     12.3: (7.60, 7.81, 12.94, 11.89), 18.71: (8.58, 8.64, 15.51, 13.77), 25.25: (9.90, 9.91, 19.36, 16.50),
 }  # fmt: skip
 PUBLISHED_3_11 = {  # model, map: place deg, load N/m, R mm
-    ("model", "total"): (0.24, 13.1, 1.26), ("model", "by place"): (0.20, 9.1, 1.00), ("model", "noise"): (0.14, 9.6, 0.79),
-    ("map", "total"): (0.24, 11.7, 0.96), ("map", "by place"): (0.19, 6.4, 0.60), ("map", "noise"): (0.14, 9.8, 0.77),
-}  # fmt: skip
+    ("model", "total"): (0.24, 13.1, 1.26),
+    ("model", "by place"): (0.20, 9.1, 1.00),
+    ("model", "noise"): (0.14, 9.6, 0.79),
+    ("map", "total"): (0.24, 11.7, 0.96),
+    ("map", "by place"): (0.19, 6.4, 0.60),
+    ("map", "noise"): (0.14, 9.8, 0.77),
+}
 PUBLISHED_3_12 = {  # rc: mean without and with load, deviation without and with load, mm
     0.5: (0.99, 0.36, 0.60, 0.14), 1.59: (2.53, 2.29, 0.77, 1.04), 3.9: (3.33, 6.17, 0.58, 1.52),
     6.01: (6.01, 6.69, 0.98, 1.49), 7.55: (7.92, 6.30, 1.32, 1.18), 9.3: (9.03, 9.09, 1.73, 1.64),
@@ -68,9 +72,19 @@ def tables(data: Data, result: Calibration, tell: Tell) -> Iterator[Table]:
     """Compute the tables in order."""
     work = Tables(data, result)
     for number, make in enumerate(
-        (work.table_3_4, work.table_3_5, work.table_3_6, work.table_3_7, work.table_3_8, work.table_3_9, work.table_3_10,
-         work.table_3_11, work.table_3_12), 4,
-    ):  # fmt: skip
+        (
+            work.table_3_4,
+            work.table_3_5,
+            work.table_3_6,
+            work.table_3_7,
+            work.table_3_8,
+            work.table_3_9,
+            work.table_3_10,
+            work.table_3_11,
+            work.table_3_12,
+        ),
+        4,
+    ):
         yield make()
         tell(f"table 3.{number}")
 
@@ -86,18 +100,14 @@ class Tables:
         self.both = self.edge | (usual & np.isinf(result.touches.radius_m))
         e = result.finger.elements
         self.extent = result.finger.geometry.extent_rad
-        self.begin = starts(
-            self.body, np.array(e.angle_rad), np.array(e.radius_m), result.touches, self.extent
-        )
+        self.begin = starts(self.body, np.array(e.angle_rad), np.array(e.radius_m), result.touches, self.extent)
 
     def part(self, which: NDArray[np.bool_], loads: TouchLoads | None = None) -> tuple[Touches, TouchLoads]:
         """Return some touches with their tractions."""
         loads = loads or self.result.loads
         return self.result.touches.pick(which), TouchLoads(loads.normal[which], loads.shear[which])
 
-    def fits(
-        self, which: NDArray[np.bool_], share: float, loads: TouchLoads | None = None
-    ) -> dict[int, ElementFit]:
+    def fits(self, which: NDArray[np.bool_], share: float, loads: TouchLoads | None = None) -> dict[int, ElementFit]:
         """Fit place, depth, Poisson's ratio and gain of every element with touches enough; by its number."""
         found = fit_elements(self.body, self.begin, *self.part(which, loads), share, Freedom(True, True))
         return {number: one for number, one in enumerate(found) if one is not None}
@@ -172,20 +182,25 @@ class Tables:
         )
         fits = {number: one for number, one in enumerate(places) if one is not None}
         one = next(iter(fits.values()))
-        rows = [("this finger", f"{one.poisson:.2f}", f"{1e3 * one.radius_m:.1f}", _three([self.error(o) for o in fits.values()], 2),
-                 _three(self.noise(fits), 2)),
-                ("published 0", "0.45", "10.3", "1.86 3.18 5.07", "0.95 1.73 2.80"),
-                ("published 4", "0.43", "10.1", "3.17 5.61 8.13", "0.39 0.96 1.50"),
-                ("published 6", "0.45", "10.9", "2.91 4.38 6.96", "0.86 2.36 4.28")]  # fmt: skip
+        rows = [
+            (
+                "this finger",
+                f"{one.poisson:.2f}",
+                f"{1e3 * one.radius_m:.1f}",
+                _three([self.error(o) for o in fits.values()], 2),
+                _three(self.noise(fits), 2),
+            ),
+            ("published 0", "0.45", "10.3", "1.86 3.18 5.07", "0.95 1.73 2.80"),
+            ("published 4", "0.43", "10.1", "3.17 5.61 8.13", "0.39 0.96 1.50"),
+            ("published 6", "0.45", "10.9", "2.91 4.38 6.96", "0.86 2.36 4.28"),
+        ]
         return Table(
             "Table 3.7: uniform fits to edges",
             ("finger", "nu", "rs, mm", "error, % peak", "noise, % peak"),
             rows,
         )
 
-    def identified(
-        self, which: NDArray[np.bool_], share: float, loads: TouchLoads | None = None
-    ) -> list[float]:
+    def identified(self, which: NDArray[np.bool_], share: float, loads: TouchLoads | None = None) -> list[float]:
         """Return the residual of a directly identified map per element, % peak."""
         touches, tractions = self.part(which, loads)
         e = self.result.finger.elements
@@ -249,11 +264,12 @@ class Tables:
         for rc, published in PUBLISHED_3_10.items():
             if np.any(np.isclose(touches.radius_m, 1e-3 * rc, atol=1e-9)):
                 mine = [self.mean_rc(one, touches, 1e-3 * rc)[0] for one in fingers]
-                rows.append(
-                    (f"{rc:g}", *(f"{a:.2f} ({b:.2f})" for a, b in zip(mine, published, strict=True)))
-                )
-        return Table("Table 3.10: mean rc, mm; published in brackets",
-                     ("rc", "Hertz, model", "Hertz, map", "approximate frictionless, model", "the same, map"), rows)  # fmt: skip
+                rows.append((f"{rc:g}", *(f"{a:.2f} ({b:.2f})" for a, b in zip(mine, published, strict=True))))
+        return Table(
+            "Table 3.10: mean rc, mm; published in brackets",
+            ("rc", "Hertz, model", "Hertz, map", "approximate frictionless, model", "the same, map"),
+            rows,
+        )
 
     def table_3_11(self) -> Table:
         """Deviations of raw and averaged frames."""
@@ -277,11 +293,12 @@ class Tables:
             if np.any(np.isclose(touches.radius_m, 1e-3 * rc, atol=1e-9)):
                 free, loaded = (self.mean_rc(estimator, touches, 1e-3 * rc, load) for load in (False, True))
                 mine = (free[0], loaded[0], free[1], loaded[1])
-                rows.append(
-                    (f"{rc:g}", *(f"{a:.2f} ({b:.2f})" for a, b in zip(mine, published, strict=True)))
-                )
-        return Table("Table 3.12: rc without and with the force sensor, mm; published in brackets",
-                     ("rc", "mean, no load", "mean, with load", "deviation, no load", "deviation, with load"), rows)  # fmt: skip
+                rows.append((f"{rc:g}", *(f"{a:.2f} ({b:.2f})" for a, b in zip(mine, published, strict=True))))
+        return Table(
+            "Table 3.12: rc without and with the force sensor, mm; published in brackets",
+            ("rc", "mean, no load", "mean, with load", "deviation, no load", "deviation, with load"),
+            rows,
+        )
 
 
 def fitted(estimator: Estimator, touches: Touches, with_load: bool) -> list[tuple[float, float, float]]:
@@ -313,9 +330,7 @@ def scatter(data: Data, result: Calibration, finger: Finger) -> tuple[Floats, Fl
         truth = np.array([math.degrees(touches.angle_rad[number]), touches.load[number],
                           1e3 * equivalent_radius(finger.cylinder, float(touches.radius_m[number]))])  # fmt: skip
         units = np.array([180.0 / math.pi, 1.0, 1e3])
-        by_place.append(
-            np.array(fitted(meant, copies.pick(np.arange(1)).with_output(mean), False))[0] * units - truth
-        )
+        by_place.append(np.array(fitted(meant, copies.pick(np.arange(1)).with_output(mean), False))[0] * units - truth)
         frames.append(np.array(fitted(single, copies, False)) * units - truth)
     means, every = np.array(by_place), np.concatenate(frames)
     about = np.concatenate([part - mean for part, mean in zip(frames, by_place, strict=True)])

@@ -1,8 +1,9 @@
 """Probe a tactile finger with axes, a force sensor and a client program: record touches as calibration wants them.
 
 Four nodes make a prober: an axis round the finger [rad], an axis that presses towards its middle [m, larger is
-deeper], the finger's readings, and one channel of a force sensor [N, larger when pressed]. The surface of the finger and the
-depth that a load needs are found by feeling; the axes' own limits, their guard and the emergency stop hold as ever.
+deeper], the finger's readings, and one channel of a force sensor [N, larger when pressed]. The surface of the finger
+and the depth that a load needs are found by feeling; the axes' own limits, their guard and the emergency stop hold as
+ever.
 """
 
 from __future__ import annotations
@@ -88,17 +89,13 @@ class Recorder:
     """Collects frames with their marks in the form that `sioms tactile calibrate` reads."""
 
     def __init__(self) -> None:
-        self._columns: dict[str, list[Any]] = {
-            name: [] for name in ("raw", "time", "touch", "phase", "force")
-        }
+        self._columns: dict[str, list[Any]] = {name: [] for name in ("raw", "time", "touch", "phase", "force")}
         self.touches: list[Touch] = []
 
     def add(self, frames: Floats, time_s: Floats, force: Floats, touch: int, phase: int) -> None:
         """Append frames, shape (n, ns), with their time [s] and force [N/m]."""
         marks = np.ones(len(time_s), dtype=np.int64)
-        for name, value in zip(
-            self._columns, (frames, time_s, touch * marks, phase * marks, force), strict=True
-        ):
+        for name, value in zip(self._columns, (frames, time_s, touch * marks, phase * marks, force), strict=True):
             self._columns[name].append(value)
 
     def take_felt_loads(self) -> None:

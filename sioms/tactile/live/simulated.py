@@ -1,4 +1,6 @@
-"""A prober's workcell with a simulated finger behind a real framed stream: processes of their own, that of etc/prober.toml."""
+"""A prober's workcell with a simulated finger behind a real framed stream: processes of their own, that of
+etc/prober.toml.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from sioms.children import Process, daemon
 from sioms.tactile.live.prober import wait_links
 
 FINGER = (
-    "length_m = 0.012; gain = 3.0; gain_scatter = 0.1; depth_scatter_m = 2e-4; angle_scatter_rad = 0.007; quadratic = 0.03; "
+    "length_m = 0.012; gain = 3.0; gain_scatter = 0.1; depth_scatter_m = 2e-4; angle_scatter_rad = 0.007; quadratic = "
+    "0.03; "
     "adhesion = 0.3; creep = 0.05; drift = 0.3; drift_s = 300.0; mains = 0.03; strip_gain = 0.02; seed = 1"
 )
 """The finger that is probed if none is described: faults of the sizes that the dissertation reports."""
@@ -37,9 +40,7 @@ def simulated(
         module = "sioms.drivers.framed_adc.simulated.finger"
         words = ["--link", str(port), "--socket", str(socket), "--finger", finger]
         words += [] if hidden is None else ["--finger-file", str(hidden)]
-        device = Process(
-            [module, *words, "--mount", *(str(radius) for radius in radii_m)], "ready", told=True
-        )
+        device = Process([module, *words, "--mount", *(str(radius) for radius in radii_m)], "ready", told=True)
         stack.callback(device.end)
         config = folder / "prober.toml"
         source = text or files("sioms.tactile.live").joinpath("prober.toml").read_text(encoding="utf-8")

@@ -15,9 +15,7 @@ _spec.loader.exec_module(scale)
 
 
 def load() -> Exchange:
-    return Exchange(
-        b"W\r", scale.want, lambda reply: float(reply.partition(b"*")[0]), 0.2, True, "read the load"
-    )
+    return Exchange(b"W\r", scale.want, lambda reply: float(reply.partition(b"*")[0]), 0.2, True, "read the load")
 
 
 scale.load = load

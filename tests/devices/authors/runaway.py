@@ -20,7 +20,8 @@ class Runaway(Tmcl):
         "tables": (
             '[device.runaway]\ndriver = "{driver}"\nmodule = 1140\npoll_hz = 50.0\n'
             'line = { serial = "{port}", baud = 115200 }\n[[device.runaway.axis]]\nname = "x"\nmotor = 0\n'
-            "travel_per_turn = 0.01\nvelocity_max = 0.1\nacceleration_max = 2.0\nposition_min = -1.0\nposition_max = 1.0\n"
+            "travel_per_turn = 0.01\nvelocity_max = 0.1\nacceleration_max = 2.0\nposition_min = -1.0\nposition_max = "
+            "1.0\n"
         ),
     }
 

@@ -34,9 +34,7 @@ class Peer:
 
         def run() -> None:
             try:
-                self.results[word] = self.channel.call(
-                    Call("ask", Ioctl(1, word, None), limit_s=limit_s)
-                ).value
+                self.results[word] = self.channel.call(Call("ask", Ioctl(1, word, None), limit_s=limit_s)).value
             except OSError as error:
                 self.results[word] = error
 

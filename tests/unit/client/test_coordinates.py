@@ -56,9 +56,7 @@ def test_what_has_a_direction_turns_and_what_is_a_size_does_not() -> None:
     axis = UserAxis(node, 1, 0.5, -1)
     axis.move(0.2, velocity=0.1, max_velocity=1.0, max_acceleration=2.0, time=3.0)
     wanted = {"axis": 1, "velocity": -0.1, "max_velocity": 1.0, "max_acceleration": 2.0, "time": 3.0}
-    assert {name: node.record[name] for name in wanted} == wanted and node.record[
-        "position"
-    ] == pytest.approx(0.3)
+    assert {name: node.record[name] for name in wanted} == wanted and node.record["position"] == pytest.approx(0.3)
     axis.move(0.2, relative=True)
     assert node.record["position"] == -0.2
     with pytest.raises(ValueError, match="direction 0"):

@@ -34,9 +34,7 @@ OF_OLD = {"subscribed"}
 
 
 def _public(kind: type) -> dict[str, Any]:
-    return {
-        name: getattr(kind, name) for name in dir(kind) if not name.startswith("_") and not hasattr(int, name)
-    }
+    return {name: getattr(kind, name) for name in dir(kind) if not name.startswith("_") and not hasattr(int, name)}
 
 
 def _waits(function: object) -> bool:

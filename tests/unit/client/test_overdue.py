@@ -79,9 +79,7 @@ def child() -> Iterator[Callable[[str], int]]:
     children = []
 
     def start(text: str) -> int:
-        process = subprocess.Popen(
-            [sys.executable, "-c", f"print(flush=True)\n{text}"], stdout=subprocess.PIPE
-        )
+        process = subprocess.Popen([sys.executable, "-c", f"print(flush=True)\n{text}"], stdout=subprocess.PIPE)
         children.append(process)
         assert process.stdout is not None
         process.stdout.readline()

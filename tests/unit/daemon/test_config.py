@@ -42,7 +42,8 @@ def test_a_good_configuration() -> None:
 
 def test_all_errors_at_once_in_the_order_of_the_sections() -> None:
     found = errors(
-        '[workcel]\n[workcell]\nnam = "x"\n[device.a]\n[device.b]\ndriver = 3\n[node.n]\n[[grant]]\nrights = []\nuser = ["x"]\n'
+        '[workcel]\n[workcell]\nnam = "x"\n[device.a]\n[device.b]\ndriver = 3\n[node.n]\n[[grant]]\nrights = []\nuser '
+        '= ["x"]\n'
     )
     assert [line.split(":")[0].split(";")[0] for line in found] == [
         "[workcel]", "[workcell]", "[device.a]", "[device.b].driver", "[node.n]", "[[grant]] number 1",
@@ -90,7 +91,10 @@ def test_errors(text: str, words: str) -> None:
 
 
 def test_values_at_their_ends_are_taken() -> None:
-    text = "[quota]\nmarkers = 1023\n[workcell]\nmax_sessions = 1\nsocket_mode = '660'\n[device.a-b_1]\ndriver = 'd'\nrealtime_priority = 0\n"
+    text = (
+        "[quota]\nmarkers = 1023\n[workcell]\nmax_sessions = 1\nsocket_mode = '660'\n[device.a-b_1]\ndriver = "
+        "'d'\nrealtime_priority = 0\n"
+    )
     assert errors(text) == []
 
 

@@ -32,18 +32,16 @@ def test_every_wrong_value_is_told_with_its_line() -> None:
     config, errors = parse(TEXT, "")
     with_lines(TEXT, errors)
     assert [error.split(": ")[0] for error in errors] == ["line 2", "line 3", "line 11", "line 12", "line 8"]
-    assert config is not None and "a" in config.devices, (
-        "its driver is asked all the same, and tells its own errors"
-    )
+    assert config is not None and "a" in config.devices, "its driver is asked all the same, and tells its own errors"
     told = [
         "[device.a].axis[1].mass: wrong",
         "[device.a].axis[0]: key unit is missing",
         "[device.z]: not there",
     ]
     with_lines(TEXT, told)
-    assert [each.partition(" ")[2][:3].strip(": ") for each in told[:2]] == ["16", "13"] and told[
-        2
-    ].startswith("[device.z]")
+    assert [each.partition(" ")[2][:3].strip(": ") for each in told[:2]] == ["16", "13"] and told[2].startswith(
+        "[device.z]"
+    )
 
 
 class Axis(msgspec.Struct, forbid_unknown_fields=True):

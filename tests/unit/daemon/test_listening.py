@@ -1,4 +1,6 @@
-"""Where clients connect: one daemon each, in a folder where nobody can put another, and only what is a daemon is believed."""
+"""Where clients connect: one daemon each, in a folder where nobody can put another, and only what is a daemon is
+believed.
+"""
 
 from __future__ import annotations
 
@@ -49,22 +51,16 @@ def test_the_socket_is_there_when_it_listens_and_gone_afterwards(path: str) -> N
 
 def test_who_comes_second_is_refused_and_told_who_is_first(path: str) -> None:
     first = Listening(path, 0o660, "")
-    refused(
-        path, errno.EADDRINUSE, rf"another daemon \(pid {os.getpid()}\) serves {re.escape(path)}; stop it"
-    )
+    refused(path, errno.EADDRINUSE, rf"another daemon \(pid {os.getpid()}\) serves {re.escape(path)}; stop it")
     os.unlink(path)  # the lock holds without the socket
     refused(path, errno.EADDRINUSE, "another daemon")
     first.close()
     Listening(path, 0o660, "").close()
 
 
-def test_a_folder_that_somebody_has_mistyped_is_not_made(
-    short_folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_that_somebody_has_mistyped_is_not_made(short_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     missing = short_folder / "missing"
-    with pytest.raises(
-        OSError, match=f"there is no folder {missing}; make it or choose another path"
-    ) as caught:
+    with pytest.raises(OSError, match=f"there is no folder {missing}; make it or choose another path") as caught:
         Listening(f"{missing}/d.sock", 0o660, "")
     assert caught.value.errno == errno.ENOENT and not missing.exists()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(missing))
@@ -89,9 +85,7 @@ def test_of_many_that_start_together_one_goes_on(path: str) -> None:
         "else: print('listens', flush=True)\nsys.stdin.readline()\nos._exit(0)"
     )
     pipe = subprocess.PIPE
-    them = [
-        subprocess.Popen([sys.executable, "-c", script], stdin=pipe, stdout=pipe, text=True) for _ in range(6)
-    ]
+    them = [subprocess.Popen([sys.executable, "-c", script], stdin=pipe, stdout=pipe, text=True) for _ in range(6)]
     said = []
     for phase in range(2):
         for one in them:
@@ -125,9 +119,7 @@ def test_a_daemon_without_a_lock_is_left_alone(path: str) -> None:
 def test_a_folder_that_others_may_write_to_is_refused(path: str) -> None:
     folder = os.path.dirname(path)
     os.chmod(folder, 0o777)
-    refused(
-        path, errno.EPERM, f"{re.escape(folder)}: others may write to it, who could put another socket in"
-    )
+    refused(path, errno.EPERM, f"{re.escape(folder)}: others may write to it, who could put another socket in")
     if os.geteuid() == 0:
         os.chown(folder, -1, 4242)  # the group of who knows whom
         os.chmod(folder, 0o775)

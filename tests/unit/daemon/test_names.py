@@ -52,16 +52,15 @@ def test_an_input_has_no_companion_and_is_read_only() -> None:
 
 def test_aliases_and_their_parts() -> None:
     names = table(
-        mod0__xz=NodeTable("mod0", ["x", "z"]), grip=NodeTable("io0.bit2"), again=NodeTable("grip"), zx=NodeTable("mod0", ["z", "x"])
-    )  # fmt: skip
+        mod0__xz=NodeTable("mod0", ["x", "z"]),
+        grip=NodeTable("io0.bit2"),
+        again=NodeTable("grip"),
+        zx=NodeTable("mod0", ["z", "x"]),
+    )
     assert names.errors == []
     assert names.nodes["mod0.xz"].channels == (0, 2) and names.nodes["zx"].channels == (2, 0)
     assert names.nodes["mod0.xz.z"].channels == (2,) and "mod0.xz.readonly" in names.nodes
-    assert (
-        names.nodes["grip"].bit == 2
-        and names.nodes["again"].bit == 2
-        and names.nodes["grip.readonly"].read_only
-    )
+    assert names.nodes["grip"].bit == 2 and names.nodes["again"].bit == 2 and names.nodes["grip.readonly"].read_only
 
 
 @pytest.mark.parametrize(
@@ -114,9 +113,7 @@ AGREE = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("first", "second", "free"), [(*p, False) for p in EXCLUDE] + [(*p, True) for p in AGREE]
-)
+@pytest.mark.parametrize(("first", "second", "free"), [(*p, False) for p in EXCLUDE] + [(*p, True) for p in AGREE])
 def test_who_excludes_whom(first: str, second: str, free: bool) -> None:
     names = table(mod0__xz=NodeTable("mod0", ["x", "z"]), grip=NodeTable("io0.bit2")).nodes
     claims: Claims[str] = Claims()

@@ -4,9 +4,7 @@ from sioms.daemon.config import QuotaTable
 from sioms.daemon.quotas import Quotas, why_full
 from sioms.daemon.rights import Peer
 
-EVA, ROOT, OWNER = (
-    Peer(1, uid, name, frozenset()) for uid, name in ((1000, "eva"), (0, "root"), (7, "sioms"))
-)
+EVA, ROOT, OWNER = (Peer(1, uid, name, frozenset()) for uid, name in ((1000, "eva"), (0, "root"), (7, "sioms")))
 
 
 def test_a_quota_is_named_with_its_setting_and_some_may_have_more():

@@ -29,7 +29,8 @@ def test_the_greediest_yields_when_together_they_take_too_much() -> None:
     yielded = [look(second, a=0.5, b=0.9, c=0.3) for second in range(12, 15)]
     assert yielded == [None, None, ("b", 101)]
     assert said == [
-        "b: drivers in real-time classes use 1.70 of 2 processors, this one 0.90; at most 0.7 of the machine may be theirs"
+        "b: drivers in real-time classes use 1.70 of 2 processors, this one 0.90; at most 0.7 of the machine may be "
+        "theirs"
     ]
 
 

@@ -1,4 +1,6 @@
-"""A driver process that cannot be started: the nursery has just died, no descriptor is left, or the one before lives."""
+"""A driver process that cannot be started: the nursery has just died, no descriptor is left, or the
+one before lives.
+"""
 
 from __future__ import annotations
 

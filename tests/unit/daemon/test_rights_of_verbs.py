@@ -190,9 +190,7 @@ def test_no_verb_is_left_out() -> None:
 
 @pytest.mark.parametrize("rights", SUBSETS, ids="+".join)
 @pytest.mark.parametrize("pattern", ["io0.bit0*", "io0", "grip*", "*"])
-def test_a_verb_on_a_node_takes_its_right_on_that_node(
-    cell: Workcell, rights: list[str], pattern: str
-) -> None:
+def test_a_verb_on_a_node_takes_its_right_on_that_node(cell: Workcell, rights: list[str], pattern: str) -> None:
     granted = Right(sum(RIGHTS[name] for name in rights))
     cell.grant((rights, "eva", pattern))
     for name, (ask, needs) in ON_NODES.items():
@@ -208,9 +206,7 @@ def test_a_verb_on_a_node_takes_its_right_on_that_node(
 
 @pytest.mark.parametrize("rights", SUBSETS, ids="+".join)
 @pytest.mark.parametrize("pattern", ["io0.bit0", "*"])
-def test_a_verb_on_the_workcell_takes_its_right_on_every_node(
-    cell: Workcell, rights: list[str], pattern: str
-) -> None:
+def test_a_verb_on_the_workcell_takes_its_right_on_every_node(cell: Workcell, rights: list[str], pattern: str) -> None:
     granted = Right(sum(RIGHTS[name] for name in rights))
     cell.grant((rights, "eva", pattern))
     for name, (ask, need) in ON_ALL.items():
@@ -372,9 +368,7 @@ def test_markers_persist_for_users_with_a_right(cell: Workcell) -> None:
 
     cell.grant((["read"], "eva", "*"), (["read"], "tom", "*"))
     assert (
-        cell.ask("eva", ClientVerb.RESERVE_MARKER, 2, True)
-        == 0
-        == cell.ask("tom", ClientVerb.RESERVE_MARKER, 1, True)
+        cell.ask("eva", ClientVerb.RESERVE_MARKER, 2, True) == 0 == cell.ask("tom", ClientVerb.RESERVE_MARKER, 1, True)
     )
     cell.grant((["read"], "eva", "io0"), (["read"], "tom", "*"))
     assert reserved() == 3

@@ -34,9 +34,7 @@ def test_a_group_that_a_user_has_left_counts_no_more_until_it_is_joined_again(li
     assert users.look_again() and users.remaining(0, HIS) == HIS
 
 
-def test_a_user_who_is_no_more_has_left_all_groups(
-    listed: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_user_who_is_no_more_has_left_all_groups(listed: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     users = Users(answer_s=10.0)
     users.name(0)
 

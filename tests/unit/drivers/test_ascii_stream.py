@@ -264,9 +264,7 @@ def test_a_finger_that_prints_its_elements_is_felt() -> None:
     random = np.random.default_rng(1)
 
     def line(strain: Any) -> bytes:
-        return (
-            ",".join(f"{r:.3f}" for r in -100.0 * strain / 3.0 + 0.02 * random.normal(size=16)) + "\n"
-        ).encode()
+        return (",".join(f"{r:.3f}" for r in -100.0 * strain / 3.0 + 0.02 * random.normal(size=16)) + "\n").encode()
 
     rig.driver.feed(b"cut\n", 10**9)
     for number in range(30):
@@ -276,9 +274,7 @@ def test_a_finger_that_prints_its_elements_is_felt() -> None:
     assert dict(zip(names, shape.data, strict=True))["quality"] == Quality.NO_CONTACT.value
     rig.driver.feed(line(edge), 33 * 10**9)
     felt = dict(zip(names, shape.data, strict=True))
-    assert np.degrees(felt["angle"]) == pytest.approx(60.0, abs=0.3) and felt["load"] == pytest.approx(
-        150.0, rel=0.05
-    )
+    assert np.degrees(felt["angle"]) == pytest.approx(60.0, abs=0.3) and felt["load"] == pytest.approx(150.0, rel=0.05)
     np.testing.assert_allclose(strain.data, edge, atol=3e-3)
     assert {block.stamp_ns for block in (raw, strain, shape)} == {33 * 10**9}
     assert len(rig.driver.ioctl(strain.spec, Request.GET_GAINS, [], None)) == 256

@@ -75,9 +75,7 @@ def test_streams_in_si_units() -> None:
         "--counts-per-force", "10000", "--counts-per-torque", "20000",
     )  # fmt: skip
     rig.do(rig.driver.open())
-    assert rig.said == [
-        "info: identified f0 on 192.168.1.1:49152: Net F/T, serial number FT12345, 1000 records/s"
-    ]
+    assert rig.said == ["info: identified f0 on 192.168.1.1:49152: Net F/T, serial number FT12345, 1000 records/s"]
     rig.device.load.put(rig.now_s, LOAD)
     rig.go(4.0)
     assert rig.data == pytest.approx(LOAD, rel=1e-4) and rig.flags == 0
@@ -133,10 +131,7 @@ def test_status_and_overload() -> None:
     axia.do(axia.driver.open())
     axia.device.load.put(axia.now_s, (150, 0, 0, 0, 0, 0))
     axia.go(0.01)
-    assert (
-        axia.flags == SATURATED | INVALID
-        and axia.driver.counters()["status"] == "force or torque out of range"
-    )
+    assert axia.flags == SATURATED | INVALID and axia.driver.counters()["status"] == "force or torque out of range"
 
 
 def test_buffered_and_bias() -> None:
@@ -190,9 +185,7 @@ def test_the_internal_rate_is_read_from_the_page(internal_hz: str) -> None:
     rig.do(rig.driver.open())
     rig.go(3.0)
     assert -1e-6 <= rig.now_s + rig.delay_s - rig.published[-1][0] * 1e-9 < 3e-3
-    assert steps_of(rig.published)[200:].max() < 4e6 and not [
-        text for text in rig.said if "sample_hz" in text
-    ]
+    assert steps_of(rig.published)[200:].max() < 4e6 and not [text for text in rig.said if "sample_hz" in text]
 
 
 @pytest.mark.parametrize("internal_hz", [488, 976, 4000, 7812])
@@ -218,7 +211,9 @@ def test_a_clock_of_another_rate_is_told_and_measured(internal_hz: int) -> None:
 
 @pytest.mark.parametrize("buffered", [False, True])
 def test_a_frozen_stream_is_none(buffered: bool) -> None:
-    """The last datagram again and again; a sample that stands still under numbers that go on; in both cases also after an opening."""
+    """The last datagram again and again; a sample that stands still under numbers that go on; in both cases also after
+    an opening.
+    """
     for cause in ("freeze", "hold"):
         rig = AtiRig(buffered=buffered)
         rig.do(rig.driver.open())
@@ -299,7 +294,9 @@ def test_a_bias_is_kept_over_a_stall_and_repeated_until_the_page_shows_it() -> N
 
 
 def test_another_master_is_noticed_by_the_page() -> None:
-    """Its zero: readings INVALID. Its units: not one reading of them once it is known, the new ones after an opening."""
+    """Its zero: readings INVALID. Its units: not one reading of them once it is known, the new ones
+    after an opening.
+    """
     rig = zeroed()
     rig.do(rig.driver.heartbeat())
     assert rig.flags == 0
@@ -371,15 +368,11 @@ def test_without_a_page_and_without_an_answer() -> None:
     rig.go(0.05)
     assert rig.pages == 0 and rig.data == pytest.approx(LOAD)
     rig.on_line = lambda data: b""
-    with pytest.raises(
-        LinkError, match=r"f0 on 192.168.1.1:49152: .*; look at host and port, and that RDT is enabled"
-    ):
+    with pytest.raises(LinkError, match=r"f0 on 192.168.1.1:49152: .*; look at host and port, and that RDT is enabled"):
         rig.do(rig.driver.open())
     other = AtiRig()
     other.aside = lambda data: b"HTTP/1.0 404 Not Found\r\n\r\n"
-    with pytest.raises(
-        LinkError, match=r"identify f0: get http://192.168.1.1/netftapi2.xml: .*404; is it another"
-    ):
+    with pytest.raises(LinkError, match=r"identify f0: get http://192.168.1.1/netftapi2.xml: .*404; is it another"):
         other.do(other.driver.open())
 
 

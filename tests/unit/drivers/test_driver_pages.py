@@ -1,4 +1,6 @@
-"""The pages of drivers: every configuration in them is read by the driver that it names, and every driver has a page."""
+"""The pages of drivers: every configuration in them is read by the driver that it names, and every
+driver has a page.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +23,7 @@ def examples(path: Path) -> list[str]:
     return [textwrap.dedent(block) for block in blocks if "[device." in block]
 
 
-TEXTS = [
-    (str(path.relative_to(PAGES)), text) for path in sorted(PAGES.glob("*/*.md")) for text in examples(path)
-]
+TEXTS = [(str(path.relative_to(PAGES)), text) for path in sorted(PAGES.glob("*/*.md")) for text in examples(path)]
 
 
 @pytest.mark.parametrize(("page", "text"), TEXTS, ids=[page for page, _ in TEXTS])

@@ -53,9 +53,7 @@ def test_nothing_that_another_master_left_moves_a_servo_that_is_switched_on(mode
     look = lambda: seen.append(abs(one.mover.velocity))  # noqa: E731
     rig.do(rig.unit.open(), look)
     rig.wait(0.5, look)
-    assert one.table[64] == 1 and one.table[11] == {"velocity": 1, "position": 3, "extended_position": 4}.get(
-        mode, 0
-    )
+    assert one.table[64] == 1 and one.table[11] == {"velocity": 1, "position": 3, "extended_position": 4}.get(mode, 0)
     assert max(seen) < 10
 
 
@@ -255,12 +253,8 @@ def test_a_shutdown_is_cleared_by_reset_and_loses_turns_only() -> None:
 def test_a_start_that_follows_a_reset_is_not_made_void_by_it() -> None:
     rig, one = opened()
     reset = rig.unit.act(DriveAction(ActionKind.RESET, 0, None, 0.07, 1.0))
-    command = Command(*[0] * len(Command._fields))._replace(
-        control_mode=int(ControlMode.POSITION), position=0.03
-    )
-    start = rig.unit.act(
-        DriveAction(ActionKind.START, 0, command, 0.07, 1.0)
-    )  # handed out while the reset runs
+    command = Command(*[0] * len(Command._fields))._replace(control_mode=int(ControlMode.POSITION), position=0.03)
+    start = rig.unit.act(DriveAction(ActionKind.START, 0, command, 0.07, 1.0))  # handed out while the reset runs
     rig.do(reset)
     rig.do(start)
     assert one.get(116, 4) == round(0.03 * STEPS_PER_M)
@@ -297,9 +291,7 @@ def test_a_line_that_loses_half_of_all_does_not_lose_a_stop() -> None:
         rig.device.take = take
         rig.do(rig.unit.start_velocity(0, 0.05, ACTION))
         rig.wait(0.05)
-        rig.device.take = lambda data: take(
-            data[: chance.randrange(len(data) + 1)] if chance.random() < 0.5 else data
-        )
+        rig.device.take = lambda data: take(data[: chance.randrange(len(data) + 1)] if chance.random() < 0.5 else data)
         for _ in range(20):
             try:
                 rig.do(rig.unit.halt(0, fastest=True))

@@ -170,9 +170,7 @@ def test_a_refused_start_and_a_power_cycle() -> None:
     assert rig.go(1.0) == pytest.approx(100, abs=2) and rig.driver.counters()["lost_blocks"] == 0
 
 
-@given(
-    st.lists(st.binary(max_size=40), max_size=30), st.lists(st.binary(min_size=1, max_size=60), max_size=10)
-)
+@given(st.lists(st.binary(max_size=40), max_size=30), st.lists(st.binary(min_size=1, max_size=60), max_size=10))
 def test_any_bytes_and_any_payloads_are_taken(noise: list[bytes], payloads: list[bytes]) -> None:
     """Noise is counted; so are well-framed messages of other streams, lengths and kinds."""
     rig = Rig(channels=2)

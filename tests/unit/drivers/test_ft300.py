@@ -102,9 +102,7 @@ def test_a_sensor_that_repeats_itself_is_none() -> None:
         rig.do(rig.driver.open())
         rig.go(1.0)
         assert len(rig.published) == before
-        assert (
-            "records were all the same, which no measurement is: the sensor is frozen" in rig.driver.trouble
-        )
+        assert "records were all the same, which no measurement is: the sensor is frozen" in rig.driver.trouble
     handlers["freeze"]("0")
     rig.go(0.2)
     assert len(rig.published) > before + 15 and rig.driver.trouble == ""

@@ -101,17 +101,13 @@ def test_a_full_event_buffer_is_counted_said_and_made_good() -> None:
     assert rig.said == ["io0: 6 edges lost; want a higher tick_hz, a longer debounce_s, or a calmer line"]
     assert rig.published[-1][0] == 0b11, "the level of the line whose only edge was lost is read"
     counts = [count for _, _, count in rig.published]
-    assert counts[0] == 7 and counts[-1] == 10, (
-        "the first reading behind the loss counts the six that nobody saw"
-    )
+    assert counts[0] == 7 and counts[-1] == 10, "the first reading behind the loss counts the six that nobody saw"
     rig.tick()
     assert len(rig.said) == 1
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.booleans()), max_size=60), st.data())
-def test_any_cut_and_any_loss_of_the_oldest_gives_the_same_end(
-    events: list[tuple[int, bool]], data: Any
-) -> None:
+def test_any_cut_and_any_loss_of_the_oldest_gives_the_same_end(events: list[tuple[int, bool]], data: Any) -> None:
     """The port agrees with a plain record of the levels, whatever the kernel dropped; and nothing is counted twice."""
     edges = [Edge(bit, rising, 10 * i, i + 1) for i, (bit, rising) in enumerate(events)]
     whole, pieces = EdgePort(0), EdgePort(0)
@@ -174,9 +170,7 @@ class TestRealBinding:
         driver = self.driver(str(folder / "gpiochip0"))
         os.seteuid(65534)
         try:
-            with pytest.raises(
-                LinkError, match="gpiochip0: no permission; put the daemon's user into the group"
-            ):
+            with pytest.raises(LinkError, match="gpiochip0: no permission; put the daemon's user into the group"):
                 driver.open()
         finally:
             os.seteuid(0)
@@ -205,9 +199,7 @@ class TestRealBinding:
 
 
 @pytest.mark.parametrize(("there", "words"), [(None, "is missing; install"), ("v1", "is version 1; install")])
-def test_without_the_binding_the_extra_is_named(
-    monkeypatch: pytest.MonkeyPatch, there: str | None, words: str
-) -> None:
+def test_without_the_binding_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, there: str | None, words: str) -> None:
     monkeypatch.setitem(sys.modules, "gpiod", None if there is None else type(sys)("gpiod"))
     settings = msgspec.convert({"chip": "/dev/gpiochip0", "input": [{"line": 0}]}, Gpio.Settings)
     with pytest.raises(ValueError, match=rf"{words} sioms\[gpio\]"):

@@ -71,18 +71,14 @@ def attributes(folder: Path, **values: object) -> IioDevice:
 def test_a_name_that_ends_by_a_zero(sysfs: Path) -> None:
     """As the kernel tells its clocks: sizeof("monotonic\\n") bytes."""
     assert (
-        attributes(sysfs / "iio:device0", current_timestamp_clock="monotonic\n\0").read(
-            "current_timestamp_clock"
-        )
+        attributes(sysfs / "iio:device0", current_timestamp_clock="monotonic\n\0").read("current_timestamp_clock")
         == "monotonic"
     )
 
 
 def test_a_trigger_with_a_rate_takes_the_place_of_the_devices_own(sysfs: Path) -> None:
     device = attributes(sysfs / "iio:device0", trigger__current_trigger="", sampling_frequency=860)
-    with pytest.raises(
-        LinkError, match=r"set trigger 'timer' of iio:device0: there is none; mkdir .*hrtimer/NAME"
-    ):
+    with pytest.raises(LinkError, match=r"set trigger 'timer' of iio:device0: there is none; mkdir .*hrtimer/NAME"):
         device.set_trigger("timer")
     attributes(sysfs / "trigger0", name="timer", sampling_frequency=100)
     attributes(sysfs / "trigger1", name="adc-ready")
@@ -102,9 +98,7 @@ def test_a_rate_that_only_is_told(sysfs: Path) -> None:
     rate = device.folder / "in_voltage0_sampling_frequency"
     assert not device.set_rate(None, ["voltage0"], 100.0), "nothing tells a rate"
     rate.symlink_to("/proc/sys/kernel/ngroups_max")  # may be read and not written, by root neither
-    with pytest.raises(
-        LinkError, match="rate_hz = 100, but iio:device0 samples at 65536 Hz; want one of 128 250 860"
-    ):
+    with pytest.raises(LinkError, match="rate_hz = 100, but iio:device0 samples at 65536 Hz; want one of 128 250 860"):
         device.set_rate(None, ["voltage0"], 100.0)
     assert device.set_rate(None, ["voltage0"], 65536.0)
 
@@ -230,10 +224,7 @@ def test_bad_configurations(table: dict[str, Any], words: str) -> None:
 
 def test_the_mode_chooses_the_class() -> None:
     for mode, kind in (("raw", IioRaw), ("buffer", Iio)):
-        assert (
-            Iio.variant(msgspec.convert({"device": "adc", "channels": ["temp"], "mode": mode}, Iio.Settings))
-            is kind
-        )
+        assert Iio.variant(msgspec.convert({"device": "adc", "channels": ["temp"], "mode": mode}, Iio.Settings)) is kind
 
 
 def test_channels_of_a_converter_are_a_finger(sysfs: Path, bench: Any) -> None:

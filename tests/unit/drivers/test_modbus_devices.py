@@ -260,7 +260,9 @@ def test_a_stop_between_the_messages_of_a_jog(make: Callable[..., Rig] = leadshi
 
 
 def test_a_stop_between_the_messages_of_a_move_by_a_map_of_ones_own() -> None:
-    """A drive whose target, speed and start are registers of their own: what is told in three messages is stopped in between."""
+    """A drive whose target, speed and start are registers of their own: what is told in three messages is stopped in
+    between.
+    """
     whole = named_map("leadshine", MAPS).commands["position"].writes[0]
     parts = [
         {
@@ -529,17 +531,13 @@ def test_a_drive_that_does_not_come_to_rest_is_not_opened(make: Callable[..., Ri
         rig.drive.foreign("velocity", 3000.0)
 
     rig.bus.broken = insists
-    with pytest.raises(
-        DeviceError, match="still moves 5 s after it was told to stop; look for another master"
-    ):
+    with pytest.raises(DeviceError, match="still moves 5 s after it was told to stop; look for another master"):
         rig.bus.run(rig.unit.open())
 
 
 @RIGS
 @pytest.mark.parametrize("verb", ["stop", "emergency_stop"])
-def test_a_stop_that_the_drive_is_too_busy_for_is_sent_until_it_rests(
-    make: Callable[..., Rig], verb: str
-) -> None:
+def test_a_stop_that_the_drive_is_too_busy_for_is_sent_until_it_rests(make: Callable[..., Rig], verb: str) -> None:
     rig = make(velocity_by="path") if make is leadshine_rig else make()
     rig.write(ControlMode.VELOCITY, velocity=0.1)
     rig.go(0.5)
@@ -748,9 +746,7 @@ class TestIo:
     def test_analog(self) -> None:
         unit, block = self.make(model="E1240")
         (values,) = unit.blocks
-        assert [c.name for c in values.spec.channels][:2] == ["ai0", "ai1"] and values.spec.channels[
-            0
-        ].unit == "V"
+        assert [c.name for c in values.spec.channels][:2] == ["ai0", "ai1"] and values.spec.channels[0].unit == "V"
         block.ramps[2] = (0.0, 0.0, 5.0, 0.0)
         block.ramps[3] = (0.0, 0.0, 12.0, 0.0)
         self.run(block, unit.open())

@@ -1,4 +1,6 @@
-"""Dead-men of I/O blocks: set, read back, proved by the polls, and set again by each opening, against the register models."""
+"""Dead-men of I/O blocks: set, read back, proved by the polls, and set again by each opening, against the register
+models.
+"""
 
 from __future__ import annotations
 
@@ -95,9 +97,7 @@ def test_a_watchdog_that_others_stopped_is_noticed(behind_our_back: Callable[[An
     joined.open()
     joined.poll(1.0)
     behind_our_back(joined.device)
-    with pytest.raises(
-        StateLost, match=r"its watchdog is not as it was set: watchdog_(status is 0|time is 60)"
-    ):
+    with pytest.raises(StateLost, match=r"its watchdog is not as it was set: watchdog_(status is 0|time is 60)"):
         joined.poll(0.3)
     joined.open()
     assert joined.device.state()["armed"]
@@ -195,13 +195,12 @@ class TestMoxa:
         assert [text.split(",")[0] for text in joined.kit.said] == [
             "io0: has no uptime",
             "io0: has no watchdog_alarm",
-            "io0: its own watchdog: whether it is set cannot be read; set on the device's web page: communication watchdog and safe values",
-        ]  # fmt: skip
+            "io0: its own watchdog: whether it is set cannot be read; set on the device's web page: communication "
+            "watchdog and safe values",
+        ]
 
 
 @pytest.mark.parametrize(("turnaround_s", "misses"), [(0.05, 5), (0.2, 1), (0.5, 1)])
-def test_silence_is_a_lost_block_within_half_a_second_or_one_exchange(
-    turnaround_s: float, misses: int
-) -> None:
+def test_silence_is_a_lost_block_within_half_a_second_or_one_exchange(turnaround_s: float, misses: int) -> None:
     joined = coupler(override={"turnaround_s": turnaround_s})
     assert joined.unit.misses == misses

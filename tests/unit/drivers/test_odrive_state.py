@@ -268,7 +268,9 @@ def test_a_lost_line_of_the_setter_is_seen_before_the_axis_has_run_back() -> Non
     run(rig, 1.5)
     place, heard = axis.place, rig.device.take
     watch = Farthest(axis)
-    rig.device.take = lambda data: heard(b"".join(line + b"\n" for line in data.split(b"\n")[:-1] if b"control_mode 3" not in line))  # fmt: skip
+    rig.device.take = lambda data: heard(
+        b"".join(line + b"\n" for line in data.split(b"\n")[:-1] if b"control_mode 3" not in line)
+    )
     with pytest.raises(DeviceError, match=r"pos_setpoint reads .* while the axis is at"):
         rig.do(rig.unit.start_position(0, (place + 3) * TURN, 0.05, ACTION), watch)
     rig.wait(0.2, watch)

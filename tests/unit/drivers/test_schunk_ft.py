@@ -123,7 +123,9 @@ def test_the_vendors_simulator_is_taken() -> None:
 
 @pytest.mark.parametrize("window", [1, 3, 8, 20])
 def test_a_frozen_stream_is_none(window: int) -> None:
-    """One record again and again, or some in a ring: not one of them is good, for as long as it lasts; then it is read again."""
+    """One record again and again, or some in a ring: not one of them is good, for as long as it lasts; then it is read
+    again.
+    """
     rig = SchunkRig()
     rig.do(rig.driver.open())
     rig.go(0.5)
@@ -171,10 +173,7 @@ def test_a_restart_within_the_time_of_a_lost_link_is_told() -> None:
     assert rig.device.selected[0x31] == 2
     rig.go(0.1)
     assert rig.data == pytest.approx(LOAD) and rig.flags == INVALID
-    assert (
-        "zero lost: its tare may be gone: the sensor restarted; zero it again"
-        in rig.driver.counters()["status"]
-    )
+    assert "zero lost: its tare may be gone: the sensor restarted; zero it again" in rig.driver.counters()["status"]
     rig.do(rig.driver.ioctl(block.spec, Request.CALIBRATE_DEVICE, range(6), None))
     rig.go(0.1)
     assert rig.data == pytest.approx([0.0] * 6, abs=1e-5) and rig.flags == 0

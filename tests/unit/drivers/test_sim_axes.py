@@ -187,9 +187,7 @@ def test_hidden_effects_file(bench, tmp_path):
     file = tmp_path / "hidden.toml"
     file.write_text('[x]\ncoulomb = { level = 9.0 }\n["*"]\noffset = { force = 5.0 }\n')
     hidden = bench.make(SimAxes, "mod0", {"axis": [SERVO | {"k": 0.0}], "effects_file": str(file)})
-    plain = bench.make(
-        SimAxes, "mod1", {"axis": [SERVO | {"k": 0.0}], "effects": {"x": {"offset": {"force": 5.0}}}}
-    )
+    plain = bench.make(SimAxes, "mod1", {"axis": [SERVO | {"k": 0.0}], "effects": {"x": {"offset": {"force": 5.0}}}})
     bench.run(0.2)
     # 5 N do not overcome 4 + 9 N of stiction, but 4 N alone.
     assert hidden.blocks[1].data[0] == 0.0
@@ -258,9 +256,7 @@ def test_bad_settings_are_told_by_describe(table, words):
         SimAxes.describe("mod0", msgspec.convert(table, SimAxes.Settings))
 
 
-@pytest.mark.parametrize(
-    "change", [{"masss": 1.0}, {"motor": {"mass": 1.0, "coulumb": 1.0}}, {"homing": {"velo": 1}}]
-)
+@pytest.mark.parametrize("change", [{"masss": 1.0}, {"motor": {"mass": 1.0, "coulumb": 1.0}}, {"homing": {"velo": 1}}])
 def test_unknown_keys_are_errors_at_every_depth(change):
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert({"axis": [SERVO | change]}, SimAxes.Settings)

@@ -1,4 +1,6 @@
-"""Stops of drives that move, brake or coast already, by the driver that moved them and by one that comes after its death."""
+"""Stops of drives that move, brake or coast already, by the driver that moved them and by one that comes after its
+death.
+"""
 
 from __future__ import annotations
 
@@ -120,10 +122,7 @@ def test_a_search_of_a_driver_that_died_is_ended() -> None:
 
 
 def test_a_motor_that_does_not_obey_keeps_no_other_from_being_stopped() -> None:
-    axes = [
-        {"name": name, "motor": motor, "travel_per_turn": 0.01, **LIMITS}
-        for name, motor in (("x", 5), ("y", 0))
-    ]
+    axes = [{"name": name, "motor": motor, "travel_per_turn": 0.01, **LIMITS} for name, motor in (("x", 5), ("y", 0))]
     rig = Joined(Tmcl, {"axis": axes, "heartbeat_s": 0.0}, lambda clock: tmcl.Module(clock=clock))
     rig.device.take(bytes((1, 1, 0, 0, 0, 0, 0x40, 0, 0x42)))  # rotate motor 0 at 0x4000
     rig.wait(0.5)

@@ -1,4 +1,6 @@
-"""The nodes of a tactile finger: the simulated finger senses what presses it, with a force sensor's help and without."""
+"""The nodes of a tactile finger: the simulated finger senses what presses it, with a force sensor's
+help and without.
+"""
 
 from __future__ import annotations
 
@@ -66,9 +68,7 @@ def test_shape_is_published_beside_raw_and_strain(bench, hand):
     raw, strain, shape = finger.blocks
     assert [block.spec.name for block in finger.blocks] == ["", "strain", "shape"]
     bench.run(0.05)
-    assert sense(finger)["quality"] == Quality.NO_BASELINE.value and shape.flags[1] == int(
-        AnalogStatus.INVALID
-    )
+    assert sense(finger)["quality"] == Quality.NO_BASELINE.value and shape.flags[1] == int(AnalogStatus.INVALID)
     bench.run(0.1)
     assert sense(finger)["quality"] == Quality.NO_CONTACT.value and sense(finger)["load"] == 0.0
     hand.force = 4.0  # on 20 mm: 200 N/m
@@ -82,9 +82,7 @@ def test_shape_is_published_beside_raw_and_strain(bench, hand):
 
 
 def test_load_of_a_force_sensor_is_used_while_it_is_there(bench, hand):
-    finger = bench.make(
-        SimTactile, "tactile0", table(load_node="hand.force", load_scale=50.0, load_deviation=0.5)
-    )
+    finger = bench.make(SimTactile, "tactile0", table(load_node="hand.force", load_scale=50.0, load_deviation=0.5))
     bench.run(0.15)
     hand.force = 4.0
     bench.run(0.05)
@@ -103,9 +101,7 @@ def test_requests_rebase_load_fingers_and_hold_gains(bench, hand):
     bench.run(0.15)
     zero = finger.ioctl(shape, Request.ZERO_DEVICE, [], 20)
     bench.run(0.05)
-    assert (
-        zero.ready() is None and sense(finger)["quality"] == Quality.NO_CONTACT.value
-    )  # by the old baseline
+    assert zero.ready() is None and sense(finger)["quality"] == Quality.NO_CONTACT.value  # by the old baseline
     bench.run(0.15)
     assert zero.ready() == ([0.0] * len(CHANNELS),)
     finger.ioctl(strain, Request.SET_GAINS, [], [6.0] * 16)

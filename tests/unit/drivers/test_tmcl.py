@@ -140,9 +140,7 @@ def test_whatever_the_line_loses_the_module_obeys_nothing_that_was_not_sent(sile
         ({"keeps_heartbeat": True}, 1, "clock"),
     ],
 )
-def test_a_restart_within_the_lost_link_time_is_noticed(
-    given: dict[str, Any], polls: int, words: str
-) -> None:
+def test_a_restart_within_the_lost_link_time_is_noticed(given: dict[str, Any], polls: int, words: str) -> None:
     rig = opened(**given)
     rig.do(rig.unit.start_position(0, 0.03, 0.05, ACTION))
     rig.wait(1.5)

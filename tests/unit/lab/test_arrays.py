@@ -71,9 +71,7 @@ def test_damage_anywhere_is_a_sentence_or_an_array(
 
 @settings(max_examples=100, deadline=None)
 @given(junk=st.binary(max_size=400), kind=st.sampled_from([".npz", ".mat"]))
-def test_bytes_of_any_kind_are_a_sentence(
-    tmp_path_factory: pytest.TempPathFactory, junk: bytes, kind: str
-) -> None:
+def test_bytes_of_any_kind_are_a_sentence(tmp_path_factory: pytest.TempPathFactory, junk: bytes, kind: str) -> None:
     path = tmp_path_factory.getbasetemp() / f"junk{kind}"
     path.write_bytes(junk)
     with pytest.raises(BadInputError, match="or damaged"):
@@ -127,9 +125,7 @@ def test_what_a_mat_file_inflates_to_is_measured_before_it_is_loaded(
 
 
 def test_objects_strings_and_cells_are_no_columns_and_no_code(tmp_path: Path) -> None:
-    np.savez(
-        tmp_path / "a.npz", x=COLUMNS["x"], words=np.array(["a", "b"]), objects=np.array([{}, []], object)
-    )
+    np.savez(tmp_path / "a.npz", x=COLUMNS["x"], words=np.array(["a", "b"]), objects=np.array([{}, []], object))
     cells = np.empty(2, dtype=object)
     cells[:] = ["a", np.zeros(3)]
     savemat(tmp_path / "a.mat", {"x": COLUMNS["x"], "words": "text", "cells": cells})
@@ -144,9 +140,7 @@ def test_version_7_3_is_told(tmp_path: Path) -> None:
         read_mat(path)
 
 
-@pytest.mark.parametrize(
-    "text", ["[" * 3000 + "]" * 3000, "a = " + "[" * 3000 + "]" * 3000, "a = " + "9" * 6000]
-)
+@pytest.mark.parametrize("text", ["[" * 3000 + "]" * 3000, "a = " + "[" * 3000 + "]" * 3000, "a = " + "9" * 6000])
 def test_deep_and_long_model_files_are_sentences(tmp_path: Path, text: str) -> None:
     from sioms.reconcile.files.axis import read_model
 

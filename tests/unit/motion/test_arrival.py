@@ -104,7 +104,7 @@ def test_small_steps_onwards_do_not_go_back():
 
 
 @pytest.mark.parametrize("way", [{"mode": MODE.VELOCITY | MODE.SPECIFIED_TIME, "velocity": 0.5, "time": 0.2},
-                                 {"mode": MODE.POSITION | MODE.SPECIFIED_TIME, "position": 0.05, "time": 1.0}])  # fmt: skip
+                                 {"mode": MODE.POSITION | MODE.SPECIFIED_TIME, "position": 0.05, "time": 1.0}])  # fmt: skip  # noqa: E501
 def test_after_any_other_motion_a_small_step_takes_up_again(way):
     rig = Rig([PLUS])
     rig.write(mode=MODE.POSITION, position=0.2)
@@ -205,9 +205,7 @@ def test_retries_are_bounded_and_a_miss_is_told(retries):
 
 def test_the_same_target_again_corrects_what_has_slipped_at_rest():
     slip = [0.0]
-    rig = Rig(
-        [stepper(arrival=Arrival(0.0, TOLERANCE, retries=1))], plant=lambda output, dt: output - slip[0]
-    )
+    rig = Rig([stepper(arrival=Arrival(0.0, TOLERANCE, retries=1))], plant=lambda output, dt: output - slip[0])
     rig.write(mode=MODE.POSITION, position=0.5)
     rig.run()
     slip[0] = 0.05
@@ -307,9 +305,7 @@ def test_a_stepper_takes_its_start_velocity_at_once_and_no_more():
     assert v.max() == pytest.approx(top, rel=1e-2)
     steps = np.abs(np.diff(v))
     assert steps.max() <= jump + 2 * 5.0 * 1e-3
-    assert (np.minimum(np.abs(v[1:]), np.abs(v[:-1]))[steps > 0.02] <= jump + 0.02).all(), (
-        "jumps only from or to slow"
-    )
+    assert (np.minimum(np.abs(v[1:]), np.abs(v[:-1]))[steps > 0.02] <= jump + 0.02).all(), "jumps only from or to slow"
     assert not any(int(h["status"][0]) & S.SATURATED for h in quick.history)
 
 

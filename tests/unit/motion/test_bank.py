@@ -201,7 +201,7 @@ def test_emergency_stop_latches_and_nothing_resumes():
     rig.write(mode=MODE.POSITION, position=rest)
 
 
-@pytest.mark.parametrize("mode", [{"mode": MODE.VELOCITY, "velocity": 1.7}, {"mode": MODE.ACCELERATION, "acceleration": 5.0},
+@pytest.mark.parametrize("mode", [{"mode": MODE.VELOCITY, "velocity": 1.7}, {"mode": MODE.ACCELERATION, "acceleration": 5.0},  # noqa: E501
                                   {"mode": MODE.JERK, "jerk": 80.0}])  # fmt: skip
 @pytest.mark.parametrize("tick_ns", [TICK_NS, 13_000_000])
 def test_soft_limit_is_reached_and_not_passed(mode, tick_ns):
@@ -234,9 +234,7 @@ def test_following_error_is_a_fault_with_zero_force():
 
 
 def test_stepper_that_loses_steps_is_stalled_and_stops():
-    rig = Rig(
-        [axis(kind=AxisKind.STEPPER, k=None, following_error_max=0.01)], plant=lambda output, dt: np.zeros(1)
-    )
+    rig = Rig([axis(kind=AxisKind.STEPPER, k=None, following_error_max=0.01)], plant=lambda output, dt: np.zeros(1))
     rig.write(mode=MODE.POSITION, position=1.0)
     rig.tick(1500)
     assert rig.field("status") & S.STALLED
@@ -246,9 +244,7 @@ def test_stepper_that_loses_steps_is_stalled_and_stops():
     rig.tick(5)
     assert not rig.field("status") & (S.STALLED | S.FAULT)
     assert rig.field("commanded_position") == rig.field("position") == 0.0
-    assert rig.bank.tick(rig.now_ns + TICK_NS, rig.raw)[0] == pytest.approx(output), (
-        "the motor stays where it is"
-    )
+    assert rig.bank.tick(rig.now_ns + TICK_NS, rig.raw)[0] == pytest.approx(output), "the motor stays where it is"
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
@@ -278,9 +274,7 @@ def test_late_tick_stops_from_where_it_was():
 def test_infeasible_at_planning_stops_with_a_latched_fault():
     rig = Rig([axis()])
     rig.write(mode=MODE.VELOCITY | MODE.SPECIFIED_TIME, velocity=1.0, time=0.5)
-    rig.write(
-        mode=[TIMED, MODE.POSITION], position=[-2.0, 0.0], time=0.3
-    )  # begins in a state not known at the write
+    rig.write(mode=[TIMED, MODE.POSITION], position=[-2.0, 0.0], time=0.3)  # begins in a state not known at the write
     rig.run()
     assert rig.field("status") & S.FAULT
     assert "too short" in rig.bank.fault_text(0)
@@ -437,9 +431,7 @@ def test_flush_of_a_waiting_axis_is_idle_at_once():
 class Wall:
     """A mass with friction before a wall that is a spring; ``force`` is that on the wall."""
 
-    def __init__(
-        self, place: float, *, mass: float = 1.0, stiffness: float = 2e4, viscous: float = 2.0
-    ) -> None:
+    def __init__(self, place: float, *, mass: float = 1.0, stiffness: float = 2e4, viscous: float = 2.0) -> None:
         self.place, self.mass, self.stiffness, self.viscous = place, mass, stiffness, viscous
         self.velocity = self.force = 0.0
 
@@ -486,9 +478,7 @@ def test_what_follows_a_force_presses_no_harder_than_the_force(force: float, way
                 assert presses.pop() <= 5.0 + 1e-6, "thrown back it is braked with a tenth of its force"
     assert max(presses) <= abs(force) + 1e-6, "the actuator, in the direction of the force"
     assert wall.force <= abs(force) + 0.05, "the wall, when all has come to rest"
-    ended = (
-        any(e.kind is EventKind.DROPPED and e.errno == errno.ERANGE for e in rig.events) and end != "switch"
-    )
+    ended = any(e.kind is EventKind.DROPPED and e.errno == errno.ERANGE for e in rig.events) and end != "switch"
     assert bool(rig.field("status") & S.FORCE_ENDED) == ended
     if ended:
         assert S(rig.field("status")).severity >= 1 and not rig.field("status") & S.FORCE_MODE

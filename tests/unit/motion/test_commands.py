@@ -35,16 +35,24 @@ BAD = [
     ({"mode": MODE.FORCE, "force": 1.0, "axis": 1}, errno.EINVAL, "cannot do FORCE"),
     ({"mode": MODE.POSITION | MODE.SPECIFIED_MAX_FORCE, "max_force": 1.0, "axis": 1}, errno.EINVAL, "cannot do"),
     ({"mode": MODE.POSITION | MODE.SPECIFIED_MAX_FORCE, "max_force": 0.0}, errno.ERANGE, "above 0 to 10 N"),
-    ({"mode": MODE.POSITION | MODE.SPECIFIED_MAX_VEL_ACC, "max_velocity": 3.0, "max_acceleration": 1.0}, errno.ERANGE, "2"),
+    (
+        {"mode": MODE.POSITION | MODE.SPECIFIED_MAX_VEL_ACC, "max_velocity": 3.0, "max_acceleration": 1.0},
+        errno.ERANGE,
+        "2",
+    ),
     ({"mode": MODE.POSITION | MODE.SPECIFIED_GAINS, "k": NAN}, errno.EINVAL, "k is nan"),
     ({"mode": MODE.POSITION | MODE.SPECIFIED_GAINS, "kp": 1.0}, errno.ERANGE, "unstable"),
     ({"mode": MODE.POSITION | MODE.SPECIFIED_TIME, "time": 0.0}, errno.EINVAL, "more than 0"),
     ({"mode": MODE.POSITION | MODE.SPECIFIED_TIME, "time": NAN}, errno.EINVAL, "time"),
     ({"mode": MODE.POSITION | MODE.VELOCITY | MODE.SPECIFIED_TIME, "time": -1.0}, errno.EINVAL, "not with"),
     ({"mode": MODE.POSITION | MODE.SPECIFIED_TIME, "position": 1.0, "time": 0.1}, errno.ERANGE, "at least"),
-    ({"mode": MODE.POSITION | MODE.VELOCITY | MODE.SPECIFIED_TIME, "position": 1.0, "time": 0.1}, errno.ERANGE, "needs"),
+    (
+        {"mode": MODE.POSITION | MODE.VELOCITY | MODE.SPECIFIED_TIME, "position": 1.0, "time": 0.1},
+        errno.ERANGE,
+        "needs",
+    ),
     ({"mode": MODE.POSITION | MODE.SPECIFIED_WAIT_MARKER, "wait_marker_number": 7}, errno.EINVAL, "not reserved"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("fields", "code", "words"), BAD)
@@ -109,9 +117,7 @@ def test_limits_in_force_count_for_feasibility(rig):
     rig.run()
     slow = MODE.POSITION | MODE.SPECIFIED_MAX_VEL_ACC
     with pytest.raises(CommandError, match="too short"):
-        rig.write(
-            mode=[slow, timed], position=[0.9, 0.0], max_velocity=0.1, max_acceleration=1.0, time=[0, 1.2]
-        )
+        rig.write(mode=[slow, timed], position=[0.9, 0.0], max_velocity=0.1, max_acceleration=1.0, time=[0, 1.2])
 
 
 def test_not_before_the_first_measurement():

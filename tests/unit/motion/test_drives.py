@@ -145,9 +145,7 @@ def test_homing_is_the_drives_own():
     from sioms.motion import Homing
 
     cell = Cell(1)
-    cell.bank = DriveBank(
-        [axis(modes=DRIVE_MODES, homing=Homing(0.1, 0.01, required=True))], markers=cell.markers
-    )
+    cell.bank = DriveBank([axis(modes=DRIVE_MODES, homing=Homing(0.1, 0.01, required=True))], markers=cell.markers)
     cell.poll()
     with pytest.raises(CommandError, match="home required"):
         cell.write(mode=MODE.POSITION, position=0.1)
@@ -179,9 +177,7 @@ def test_a_report_that_was_asked_for_before_the_start_does_not_end_the_move():
 
 def test_a_soft_limit_that_ends_a_run_or_a_force_is_told():
     for mode, bits in ((MODE.VELOCITY, 0), (MODE.FORCE, S.FORCE_ENDED)):
-        bank = DriveBank(
-            [axis(modes=MODE.VELOCITY | MODE.FORCE | MODE.POSITION)], markers=Markers(), settle_s=0.0
-        )
+        bank = DriveBank([axis(modes=MODE.VELOCITY | MODE.FORCE | MODE.POSITION)], markers=Markers(), settle_s=0.0)
         still, moves = np.zeros(1), np.array([0.5])
         no, yes = np.array([False]), np.array([True])
         now = 1_000_000_000

@@ -40,9 +40,7 @@ class Watched(Cell):
 
     @property
     def starts_to(self):
-        return [
-            (round(a.command.position, 9), a.velocity_max) for a in self.actions if a.kind is ActionKind.START
-        ]
+        return [(round(a.command.position, 9), a.velocity_max) for a in self.actions if a.kind is ActionKind.START]
 
 
 def test_from_the_wrong_side_it_takes_two_moves_and_ends_once():

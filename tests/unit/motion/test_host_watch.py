@@ -25,8 +25,7 @@ class Shoved(Rig):
         self.shoved += self.shove * dt
         bank = self.bank
         return (
-            self.turned * np.where(bank.stepper, output, bank.rows["commanded_position"] - bank._offset)
-            + self.shoved
+            self.turned * np.where(bank.stepper, output, bank.rows["commanded_position"] - bank._offset) + self.shoved
         )
 
     def ticks_to_fault(self, most=200):

@@ -39,9 +39,7 @@ def test_the_clipped_torque_is_fed_back_not_the_wish():
 
 def test_force_mode_is_force_plus_damping_plus_offset():
     law = law_of(*[AxisSettings("x", k=100.0, kb=-2.0, force_offset=0.25, force_max=10.0)] * 2)
-    law.step(
-        np.array([3.0, 1.0]), np.zeros(2), np.zeros(2), np.array([0.5, 0.0]), 1e-3, np.array([True, False])
-    )
+    law.step(np.array([3.0, 1.0]), np.zeros(2), np.zeros(2), np.array([0.5, 0.0]), 1e-3, np.array([True, False]))
     assert law.output.tolist() == [3.0 - 2.0 * 0.5 + 0.25, 10.0]
 
 
@@ -49,9 +47,7 @@ def test_stepper_is_dead_beat_by_default():
     law = law_of(AxisSettings("x", kind=AxisKind.STEPPER, velocity_max=1.0, acceleration_max=10.0))
     t = np.arange(1, 300) * 1e-3
     velocity = 9.0 * np.minimum(t, 0.1)
-    for position, v in zip(
-        0.5 * velocity * np.minimum(t, 0.1) + 0.9 * np.maximum(t - 0.1, 0), velocity, strict=True
-    ):
+    for position, v in zip(0.5 * velocity * np.minimum(t, 0.1) + 0.9 * np.maximum(t - 0.1, 0), velocity, strict=True):
         law.step(np.array([position]), np.array([v]), np.zeros(1), np.zeros(1), 1e-3)
         assert law.slewed[0] == pytest.approx(position, abs=1e-12)
 

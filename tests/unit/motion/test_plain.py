@@ -14,12 +14,8 @@ from sioms.motion import CommandError
 from sioms.motion import plain as plain_module
 
 VALUES = st.sampled_from([0.0, 1e-3, -0.05, 0.19, 0.21, 5.0, 1e9, np.inf, -np.inf, np.nan, -0.0])
-PLAIN = st.sampled_from(
-    [MODE.POSITION, MODE.VELOCITY, MODE.ACCELERATION, MODE.JERK, MODE.FORCE, MODE.FORCE_VELOCITY]
-)
-BESIDE = st.sampled_from(
-    [MODE(0), MODE.SPECIFIED_MAX_VEL_ACC, MODE.SPECIFIED_MAX_FORCE, MODE.SPECIFIED_FORCE_OFFSET]
-)
+PLAIN = st.sampled_from([MODE.POSITION, MODE.VELOCITY, MODE.ACCELERATION, MODE.JERK, MODE.FORCE, MODE.FORCE_VELOCITY])
+BESIDE = st.sampled_from([MODE(0), MODE.SPECIFIED_MAX_VEL_ACC, MODE.SPECIFIED_MAX_FORCE, MODE.SPECIFIED_FORCE_OFFSET])
 FIELDS = ("position", "velocity", "acceleration", "jerk", "force", "force_velocity", "max_velocity", "max_acceleration",
           "max_force", "force_offset")  # fmt: skip
 
@@ -39,7 +35,7 @@ def general(rig: Rig) -> None:
 
 
 @settings(max_examples=300)
-@given(st.lists(st.tuples(PLAIN, BESIDE, st.lists(VALUES, min_size=10, max_size=10), st.integers(-1, 2)), min_size=1, max_size=3),
+@given(st.lists(st.tuples(PLAIN, BESIDE, st.lists(VALUES, min_size=10, max_size=10), st.integers(-1, 2)), min_size=1, max_size=3),  # noqa: E501
        st.booleans())  # fmt: skip
 def test_a_short_write_is_accepted_and_refused_as_the_general_way_does(commands, replace):
     rigs = [Rig([axis(), axis(jerk_max=None)]) for _ in range(2)]

@@ -66,9 +66,7 @@ def test_a_verb_after_a_short_write_is_as_after_a_long_one(name: str, replace: b
         rig.tick(2)
         for index in (0, 1):
             rig.now_ns += 200_000
-            rig.bank.append(
-                records(mode=MODE.POSITION, position=0.1, axis=index), [0, 1], rig.now_ns, replace=replace
-            )
+            rig.bank.append(records(mode=MODE.POSITION, position=0.1, axis=index), [0, 1], rig.now_ns, replace=replace)
         rig.now_ns += 200_000
         try:
             said.append(VERBS[name](rig.bank, rig.now_ns))

@@ -87,8 +87,7 @@ def test_every_effect_changes_its_axis_and_no_other(name):
     """Axis 0 has the effect, axis 1 does not: 1 moves as in a bank without effects, 0 does not."""
     motors = [Motor(mass=1.0, viscous=1.0, coulomb=0.1, encoder_step=1e-5, start=0.003)] * 2
     plain, changed = (
-        MotorBank(motors, 1e-3, build_effects(table, ["a", "b"]))
-        for table in ({}, {"a": {name: _numbers(name)}})
+        MotorBank(motors, 1e-3, build_effects(table, ["a", "b"])) for table in ({}, {"a": {name: _numbers(name)}})
     )
     for tick in range(400):
         force = np.full(2, 2.0 * math.sin(tick / 40))

@@ -14,9 +14,7 @@ def test_statics_of_a_lever():
 
 def test_couple_has_torque_only():
     sensor = ForceSensor([Contact((0, 1, 0), (0.2, 0, 0)), Contact((0, -1, 0), (-0.2, 0, 0))])
-    np.testing.assert_allclose(
-        sensor.read(np.array([3.0, 3.0]), np.zeros(6)), [0, 0, 0, 0, 0, 1.2], atol=1e-12
-    )
+    np.testing.assert_allclose(sensor.read(np.array([3.0, 3.0]), np.zeros(6)), [0, 0, 0, 0, 0, 1.2], atol=1e-12)
 
 
 def test_noise_bias_resolution_and_limit():

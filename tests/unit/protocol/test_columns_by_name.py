@@ -1,4 +1,5 @@
-"""Columns are known by name: with further columns in every table of the records, all who read or write still find theirs.
+"""Columns are known by name: with further columns in every table of the records, all who read or write still find
+theirs.
 
 The tables are changed in a copy of ``records.py`` in a process of its own, before anything else is imported.
 """
@@ -106,7 +107,7 @@ port = BinaryBlock(BlockSpec("", NodeClass.BINARY, (ChannelInfo("a", "", width=8
 port.set(0, 5, 77)
 shown = seen(NodeClass.BINARY, 1, port.payload())
 assert shown.data == (5,) and shown[0].changed_ns == 77 and shown.edges == (1,)
-"""
+"""  # noqa: E501
 
 
 def test_a_further_column_shifts_nothing():

@@ -23,9 +23,7 @@ def pair(kind: str, members: dict[str, int]) -> tuple[Any, Any]:
 
 
 NAMES = st.sampled_from(["A", "B", "C", "D", "E_F"])
-CODES = st.dictionaries(NAMES, st.integers(0, 300), min_size=1).filter(
-    lambda d: len(set(d.values())) == len(d)
-)
+CODES = st.dictionaries(NAMES, st.integers(0, 300), min_size=1).filter(lambda d: len(set(d.values())) == len(d))
 BITS = st.dictionaries(NAMES, st.sampled_from([1 << n for n in range(9)]), min_size=1).filter(
     lambda d: len(set(d.values())) == len(d)
 )
@@ -93,9 +91,7 @@ def test_members_cannot_be_changed_and_copy_to_themselves():
 def test_the_protocol_uses_them():
     for module, least in ((flags, 8), (messages, 2), (driver_verbs, 2)):
         made = [
-            v
-            for v in vars(module).values()
-            if isinstance(v, enumeration._Members) and v.__module__ == module.__name__
+            v for v in vars(module).values() if isinstance(v, enumeration._Members) and v.__module__ == module.__name__
         ]
         assert len(made) >= least
         assert all(len(cls) > 0 for cls in made)

@@ -74,10 +74,7 @@ def test_every_form_of_length(size):
         assert same(wire.unpack(packed), theirs(packed))
 
 
-@given(
-    st.binary(max_size=40)
-    | VALUES.map(wire.pack).flatmap(lambda b: st.integers(0, len(b)).map(lambda n: b[:n]))
-)
+@given(st.binary(max_size=40) | VALUES.map(wire.pack).flatmap(lambda b: st.integers(0, len(b)).map(lambda n: b[:n])))
 def test_nonsense_is_refused_and_sense_is_taken_like_the_package_does(data):
     try:
         expected = theirs(data)

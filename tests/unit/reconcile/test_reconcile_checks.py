@@ -26,9 +26,7 @@ def recorded(model: AxisModel = AXIS, seconds: float = 3.0) -> Record:
     command = 1.5 * np.sin(2 * np.pi * 0.7 * t) + 0.5 * np.sin(2 * np.pi * 2.3 * t)
     run = simulate(model, command)
     rng = np.random.default_rng(1)
-    return Record(
-        "run", run.position, run.force, command, run.force + 2e-3 * rng.standard_normal(len(t)), None, t
-    )
+    return Record("run", run.position, run.force, command, run.force + 2e-3 * rng.standard_normal(len(t)), None, t)
 
 
 GOOD = recorded()
@@ -111,9 +109,9 @@ def test_data_of_another_axis_get_no_name() -> None:
     """Position of one motion, force of another: no library can explain that, and none is claimed to."""
     rng = np.random.default_rng(5)
     t = GOOD.time_s if GOOD.time_s is not None else np.zeros(0)
-    force = 0.3 * np.sin(2 * np.pi * 3.7 * t + 1.0) * np.sign(
-        np.sin(2 * np.pi * 1.1 * t)
-    ) + 2e-3 * rng.standard_normal(len(t))
+    force = 0.3 * np.sin(2 * np.pi * 3.7 * t + 1.0) * np.sign(np.sin(2 * np.pi * 1.1 * t)) + 2e-3 * rng.standard_normal(
+        len(t)
+    )
     other = replace(GOOD, force=force, force_measured=force + 2e-3 * rng.standard_normal(len(t)))
     try:
         verdict = analyse(Session((other,)), AXIS, Options(pictures=False))

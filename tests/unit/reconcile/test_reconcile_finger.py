@@ -43,9 +43,16 @@ ANGLES = np.radians(143.0 - 9.22 * np.arange(16))
 def believed(**change: object) -> Belief:
     b = FINGER_B
     given = {
-        "core": b.core_m, "outer": b.outer_m, "shear": b.shear_pa, "poisson": b.poisson, "angle": ANGLES,
-        "radius": np.full(16, 10.3e-3), "gain": np.full(16, 3.0), "quadratic": np.zeros(16), "temperature": np.zeros(16),
-    }  # fmt: skip
+        "core": b.core_m,
+        "outer": b.outer_m,
+        "shear": b.shear_pa,
+        "poisson": b.poisson,
+        "angle": ANGLES,
+        "radius": np.full(16, 10.3e-3),
+        "gain": np.full(16, 3.0),
+        "quadratic": np.zeros(16),
+        "temperature": np.zeros(16),
+    }
     return Belief(**{**given, **change})  # type: ignore[arg-type]
 
 
@@ -288,9 +295,7 @@ def test_a_model_that_makes_no_sense_is_refused(
     assert said in run(folder, capsys)
 
 
-def test_an_empty_folder_and_a_missing_model_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_empty_folder_and_a_missing_model_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "data").mkdir()
     assert "no such file" in run(tmp_path / "data", capsys)
 
@@ -347,9 +352,7 @@ def test_the_nominal_finger_may_be_a_calibrated_one(folder: Path) -> None:
 def test_a_twin_answers_as_the_finger_of_another_mechanics_with_the_same_gains_and_creep() -> None:
     """The simulated finger of ``sioms.plant`` solves its contacts in quite another way."""
     creep, tau = 0.2, 0.5
-    finger = TactileArray(
-        FingerShape(gain=3.0, gain_scatter=0.1, seed=3, creep=creep, creep_s=tau, length_m=0.012)
-    )
+    finger = TactileArray(FingerShape(gain=3.0, gain_scatter=0.1, seed=3, creep=creep, creep_s=tau, length_m=0.012))
     model = SensorModel(believed(), 16, library())
     model = model.with_effect("gain_scatter", {"g": finger.truth.gains / 3.0 - 1.0})
     model = model.with_effect("creep", {"c": np.array([creep]), "tau": np.array([tau])})
@@ -383,8 +386,7 @@ def test_loads_told_by_the_load_cell_alone_do_not_judge_its_scale(folder: Path) 
         if "cmd_P" in arrays:
             mine = [(arrays["touch"] == i) for i in range(len(arrays["cmd_P"]))]
             felt = [
-                arrays["force"][m & (arrays["phase"] == 1)].mean()
-                - arrays["force"][m & (arrays["phase"] == 0)].mean()
+                arrays["force"][m & (arrays["phase"] == 1)].mean() - arrays["force"][m & (arrays["phase"] == 0)].mean()
                 for m in mine
             ]
             arrays["cmd_P"] = np.array(felt)
@@ -475,9 +477,7 @@ def test_the_level_of_the_load_cell_is_as_uncertain_as_it_says(folder: Path) -> 
     for seed in range(60):
         rng = np.random.default_rng(seed)
         cell = 1.1 * (load + 4.0 * rng.standard_normal(len(load)))
-        level, deviation, _ = cell_level(
-            replace(touched, load=load, cell=cell, cell_noise=np.full(len(load), 0.1))
-        )
+        level, deviation, _ = cell_level(replace(touched, load=load, cell=cell, cell_noise=np.full(len(load), 0.1)))
         off.append((level - 1.1) / deviation)
         median.append((float(np.median(cell / load)) - 1.1) / deviation)
     assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.4
@@ -535,9 +535,7 @@ def test_the_fit_finds_the_bottom_of_a_bent_valley_within_its_bounds() -> None:
     none, one = np.full(2, np.inf), np.ones(2)
     at, r, _ = descend(residual, slopes, np.array([-1.2, 1.0]), one, -none, none, 200, 1e-12)
     assert at == pytest.approx(one, abs=1e-4) and r @ r < 1e-8
-    at, _, _ = descend(
-        residual, slopes, np.array([-1.2, 1.0]), one, -none, np.array([0.5, np.inf]), 200, 1e-12
-    )
+    at, _, _ = descend(residual, slopes, np.array([-1.2, 1.0]), one, -none, np.array([0.5, np.inf]), 200, 1e-12)
     assert at == pytest.approx([0.5, 0.25], abs=1e-3)
 
 
@@ -559,7 +557,9 @@ def test_a_line_that_slow_frames_fold_is_taken_off_and_the_temperature_left() ->
 
 
 def test_what_a_load_changes_beyond_proportion_is_told_beside_a_model(folder: Path) -> None:
-    """A pull that no load makes larger, and outputs that saturate: an uncertain load changes less, and in another profile."""
+    """A pull that no load makes larger, and outputs that saturate: an uncertain load changes less, and in another
+    profile.
+    """
     nominal, name, stated = read_model(folder / "nominal.toml", folder)
     subject = prepare(read_experiments(folder), nominal, name, refine_extent=not stated)
     data, model = subject.whole, subject.model

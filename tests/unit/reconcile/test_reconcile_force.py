@@ -176,8 +176,7 @@ def test_a_stand_in_is_larger_at_some_loads_and_a_true_gain_is_not(power: int) -
     searcher = Searcher(subject.whole, ())
     fit = searcher.fit(subject.model.with_effect("gain", {"g": np.zeros(1)}))
     seen = {
-        c.variable: c
-        for c in changes(subject.whole, fit, searcher.weights, ["gain"], subject.variables(subject.whole))
+        c.variable: c for c in changes(subject.whole, fit, searcher.weights, ["gain"], subject.variables(subject.whole))
     }
     size = seen["size of its load"]
     assert (abs(size.share) > 0.3 and abs(size.share) > 5 * size.half) == (power == 3)
@@ -185,15 +184,15 @@ def test_a_stand_in_is_larger_at_some_loads_and_a_true_gain_is_not(power: int) -
 
 
 def test_a_look_alike_too_weak_by_nature_to_be_searched_is_not_ruled_out_by_that() -> None:
-    """A zero that runs off within a minute is no drift of the usual size; the temperature that rose meanwhile must not be named alone."""
+    """A zero that runs off within a minute is no drift of the usual size; the temperature that rose meanwhile must not
+    be named alone.
+    """
     records = staircase(1)
     time = np.linspace(0.0, 60.0, 63)
     load = np.tile(records.load, (3, 1))
     noise = np.random.default_rng(6).normal(0.0, 0.05, load.shape)
     warm = 20.0 + time / 20.0 + 0.02 * np.sin(time)
-    one = ForceRecords(
-        ("fx",), load, load + 0.02 * time[:, None] + noise, time, warm, np.zeros(63, dtype=np.int64)
-    )
+    one = ForceRecords(("fx",), load, load + 0.02 * time[:, None] + noise, time, warm, np.zeros(63, dtype=np.int64))
     table = {"sensor": {"components": ["fx"], "full_range": [100.0]}}
     found = analyse(prepare(one, from_table(table, "x")[0]), Options(pictures=False))
     assert found.outcome.value == "ambiguous"
@@ -206,17 +205,13 @@ def test_a_look_alike_too_weak_by_nature_to_be_searched_is_not_ruled_out_by_that
 def test_every_effect_does_nothing_at_its_neutral_value_and_something_beside_it() -> None:
     model, _ = from_table(SENSOR, "x")
     rng = np.random.default_rng(1)
-    loads = Loads(
-        rng.uniform(-1, 1, (30, 2)), np.arange(30.0), rng.uniform(-1, 1, 30), np.zeros(30, dtype=np.int64)
-    )
+    loads = Loads(rng.uniform(-1, 1, (30, 2)), np.arange(30.0), rng.uniform(-1, 1, 30), np.zeros(30, dtype=np.int64))
     before = readings(model.belief(), loads)
     for name, effect in model.library.items():
         plain = model.plain(name)
         assert np.allclose(readings(model.with_effect(name, plain).belief(), loads), before), name
         moved = {**plain, effect.primary.symbol: plain[effect.primary.symbol] + effect.primary.size}
-        assert not np.allclose(readings(model.with_effect(name, moved).belief(), loads), before, atol=1e-9), (
-            name
-        )
+        assert not np.allclose(readings(model.with_effect(name, moved).belief(), loads), before, atol=1e-9), name
 
 
 def test_a_matrix_is_in_newtons_and_reads_back() -> None:

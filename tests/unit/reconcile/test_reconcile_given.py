@@ -23,7 +23,10 @@ FINGER = {
     "radius_m": 10.3e-3,
     "gain": 3.0,
 }
-LOADS = '[columns]\ntime = { name = "t" }\n[load]\nfz = { name = "w", unit = "N" }\n[reading]\nfz = { name = "c", unit = "N" }\n'
+LOADS = (
+    '[columns]\ntime = { name = "t" }\n[load]\nfz = { name = "w", unit = "N" }\n[reading]\nfz = { name = "c", unit = '
+    '"N" }\n'
+)
 
 
 @pytest.mark.parametrize(

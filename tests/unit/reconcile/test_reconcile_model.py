@@ -105,9 +105,7 @@ def test_every_effect_is_screened_fitted_and_carried_out_by_what_it_says_itself(
     for name, effect in known().items():
         assert effect.slot is not None or effect.mechanism is not NONE, name
         assert (effect.slot is None) == (effect.function is None), name
-        assert effect.slot is not None or effect.trials is not None or effect.mechanism.column is not None, (
-            name
-        )
+        assert effect.slot is not None or effect.trials is not None or effect.mechanism.column is not None, name
         assert effect.neutral == 0.0 or effect.primary.lower < effect.neutral < effect.primary.upper, name
 
 
@@ -218,9 +216,7 @@ def test_a_controller_is_checked_and_may_have_no_limit() -> None:
 
 
 @pytest.mark.parametrize(("marks", "first"), [(1, 2.0), (100, 1.0)])
-def test_cogging_of_one_period_in_a_turn_of_the_axis_is_gravity_and_not_tried(
-    marks: int, first: float
-) -> None:
+def test_cogging_of_one_period_in_a_turn_of_the_axis_is_gravity_and_not_tried(marks: int, first: float) -> None:
     model = replace(AXIS, pitch=2.0 * np.pi / marks)
     tried = [s["n"] for s in shapes(known()["cogging"], model, (0.0, 7.0))]
     assert tried[0] == first
@@ -236,9 +232,7 @@ def test_cogging_of_one_period_in_a_turn_of_the_axis_is_gravity_and_not_tried(
         ({"max_acceleration": None}, "has no max_acceleration"),
     ],
 )
-def test_a_nominal_json_is_checked_as_a_model_file_is(
-    tmp_path: Path, change: dict[str, object], says: str
-) -> None:
+def test_a_nominal_json_is_checked_as_a_model_file_is(tmp_path: Path, change: dict[str, object], says: str) -> None:
     given = json.loads((AXES / "s05" / "nominal.json").read_text())
     path = tmp_path / "nominal.json"
     path.write_text(json.dumps(given))

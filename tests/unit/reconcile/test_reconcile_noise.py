@@ -97,8 +97,6 @@ def test_a_motion_without_noise_is_found_without_a_loop() -> None:
     ("thermal_gain", {"loss": 0.3, "tau": 10000.0}, True),
     ("backlash", {"gap": 0.01, "load_fraction": 0.4, "f_contact": 400.0, "zeta": 2.0}, True),
 ])  # fmt: skip
-def test_a_number_that_leans_on_its_bound_is_another_effect(
-    name: str, values: dict[str, float], is_one: bool
-) -> None:
+def test_a_number_that_leans_on_its_bound_is_another_effect(name: str, values: dict[str, float], is_one: bool) -> None:
     fit = Fit(AXIS.with_effect(name, values), (), np.zeros(1), np.empty((1, 0)))
     assert physical(fit, name) is is_one

@@ -55,7 +55,9 @@ def problem(s: Session) -> Problem:
 
 @pytest.mark.parametrize("at_turns", [True, False])
 def test_bursts_at_turns_of_the_motion_are_told_from_those_at_any_time(at_turns: bool) -> None:
-    """Pushes nobody recorded, 10 ms long: just after the command turns (every second), or at times that keep away from it."""
+    """Pushes nobody recorded, 10 ms long: just after the command turns (every second), or at times that keep away from
+    it.
+    """
     command = 3.5 * np.sin(np.pi * np.arange(8000) * 1e-3)
     push = np.zeros(8000)
     for second in range(8):
@@ -119,9 +121,7 @@ def test_a_slow_drive_of_a_restless_command_is_not_limited_and_known_as_well_as_
 def test_the_drive_model_is_that_of_the_simulation() -> None:
     model = AXIS.with_effect("delay", {"delay": 2.7e-3}).with_effect("lag", {"tau": 2e-3})
     run = simulate(model, COMMAND)
-    np.testing.assert_allclose(
-        drive_output(run.force, 2.7e-3, 2e-3, np.inf, 1e-3)[5:], run.applied[5:], atol=4e-3
-    )
+    np.testing.assert_allclose(drive_output(run.force, 2.7e-3, 2e-3, np.inf, 1e-3)[5:], run.applied[5:], atol=4e-3)
 
 
 def test_screening_puts_the_hidden_effect_first_and_starts_near_it() -> None:
@@ -156,13 +156,7 @@ def test_a_number_that_can_only_be_positive_does_not_vanish_in_one_step(left: fl
     noise = 0.02 * rng.standard_normal(len(speed))
 
     def residual(p: np.ndarray) -> np.ndarray:
-        return (
-            p[0]
-            + p[1] * np.exp(-((speed / p[2]) ** 2))
-            - 0.79
-            - 0.53 * np.exp(-((speed / width) ** 2))
-            + noise
-        )
+        return p[0] + p[1] * np.exp(-((speed / p[2]) ** 2)) - 0.79 - 0.53 * np.exp(-((speed / width) ** 2)) + noise
 
     size = np.array([0.75, 0.1, 0.05])
 
@@ -192,9 +186,7 @@ def test_an_effect_that_is_not_needed_leaves() -> None:
 
 
 def test_a_look_alike_that_does_better_takes_the_place_of_what_was_named() -> None:
-    s = Searcher(
-        problem(session(AXIS.with_effect("viscous", {"b_extra": 8e-3}))), names=("viscous", "quadratic_drag")
-    )
+    s = Searcher(problem(session(AXIS.with_effect("viscous", {"b_extra": 8e-3}))), names=("viscous", "quadratic_drag"))
     fit = s.fit(AXIS.with_effect("quadratic_drag", {"c": 1e-4}))
     found, others = settle(s, Found(fit, s.loss(fit), ()), ())
     assert set(found.fit.model.effects) == {"viscous"}
@@ -216,7 +208,9 @@ def test_a_record_that_begins_in_motion_begins_with_the_transmission_wound_up() 
 
 
 def test_a_coarse_encoder_does_not_set_a_record_in_motion() -> None:
-    """One count of 0.1 rad within the first 20 ms is no speed of 10 rad/s, which the slow observer of such an encoder would keep."""
+    """One count of 0.1 rad within the first 20 ms is no speed of 10 rad/s, which the slow observer of such an encoder
+    would keep.
+    """
     coarse = replace(AXIS, resolution=0.1)
     whole = session(coarse).records[0]
     at = int(np.flatnonzero(np.diff(whole.position[200:]))[3]) + 200
@@ -331,7 +325,9 @@ def test_blocks_agree_with_refitting() -> None:
 
 
 def test_a_fold_that_tells_a_parameter_is_tried_without_it() -> None:
-    """Straight at the fit, level away from it: without the only block that tells it, the parameter is thrown a long way."""
+    """Straight at the fit, level away from it: without the only block that tells it, the parameter is thrown a long
+    way.
+    """
     ids = np.repeat(np.arange(10), 50)
     noise = np.random.default_rng(5).standard_normal(500)
     alone = np.where(ids == 3, 40.0, 0.02)
@@ -384,7 +380,9 @@ def test_formal_intervals_cover_nineteen_of_twenty_under_white_noise() -> None:
 
 
 def test_intervals_cover_where_few_blocks_tell_a_parameter() -> None:
-    """Four hundred linear fits to correlated noise; of two parameters the second acts in three of thirty blocks only."""
+    """Four hundred linear fits to correlated noise; of two parameters the second acts in three of
+    thirty blocks only.
+    """
     rng, blocks, size = np.random.default_rng(2), 30, 20
     ids = np.repeat(np.arange(blocks), size)
     columns = np.stack([np.sin(0.3 * np.arange(len(ids))), np.where(ids % 10 == 0, 1.0, 0.0)], axis=1)
@@ -399,7 +397,9 @@ def test_intervals_cover_where_few_blocks_tell_a_parameter() -> None:
 
 
 def test_intervals_are_not_wild_where_two_blocks_tell_each_of_many() -> None:
-    """Eight elements, each touched in two blocks of sixteen: 95 % cover, and no interval is far wider than the others."""
+    """Eight elements, each touched in two blocks of sixteen: 95 % cover, and no interval is far wider than the
+    others.
+    """
     rng, blocks, size = np.random.default_rng(4), 16, 20
     ids = np.repeat(np.arange(blocks), size)
     columns = (ids[:, None] % 8 == np.arange(8)).astype(np.float64)
@@ -479,9 +479,11 @@ def test_the_plain_path_gives_the_same_numbers() -> None:
     code = (
         "import numpy as np; from sioms.reconcile.jit import numba; from sioms.reconcile.model import *; "
         "from sioms.reconcile.simulate import simulate; "
-        "m = AxisModel(True, 1e-3, 2e-3, 1e-3, 2e-4, 6.28, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)); "
+        "m = AxisModel(True, 1e-3, 2e-3, 1e-3, 2e-4, 6.28, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, "
+        "100.0)); "
         "m = m.with_effect('stribeck', {'Fc': 0.05, 'Fs': 0.1, 'vs': 0.3}).with_effect('offset', {'off': 0.01}); "
-        "r = simulate(m, np.sin(np.arange(300) * 0.01)); print(numba() is not None, repr(float(r.force.sum())), repr(float(r.position[-1])))"
+        "r = simulate(m, np.sin(np.arange(300) * 0.01)); print(numba() is not None, repr(float(r.force.sum())), "
+        "repr(float(r.position[-1])))"
     )
     out = [
         subprocess.run(

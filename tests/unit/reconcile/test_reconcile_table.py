@@ -77,7 +77,7 @@ def test_counts_need_a_resolution(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("head", "name", "unit"), [
-    ("pos_deg", "pos_deg", "deg"), ("pos_x", "pos_x", None), ("iq / A", "iq", "A"), ("a/b", "a/b", None), ("v [m/s]", "v", "m/s"),
+    ("pos_deg", "pos_deg", "deg"), ("pos_x", "pos_x", None), ("iq / A", "iq", "A"), ("a/b", "a/b", None), ("v [m/s]", "v", "m/s"),  # noqa: E501
 ])  # fmt: skip
 def test_a_head_states_its_unit(head: str, name: str, unit: str | None) -> None:
     assert named(head) == (name, unit)
@@ -88,9 +88,7 @@ def test_a_test_signal_is_in_some_files_only(tmp_path: Path) -> None:
     _folder(tmp_path, "t [ms];pos [deg];M [Nm]\n" + ROWS, more)
     with pytest.raises(BadInputError, match="no file has a column 'extra' for feedforward"):
         read_data(tmp_path, AXIS)
-    (tmp_path / "second.csv").write_text(
-        "t [ms];pos [deg];M [Nm];extra\n0;0;0;0\n1;1,5;0,25;50\n2;3,0;0,5;100\n"
-    )
+    (tmp_path / "second.csv").write_text("t [ms];pos [deg];M [Nm];extra\n0;0;0;0\n1;1,5;0,25;50\n2;3,0;0,5;100\n")
     first, second = read_data(tmp_path, AXIS).records
     assert first.feedforward is None
     np.testing.assert_allclose(second.feedforward, [0.0, 0.05, 0.1])
@@ -110,7 +108,12 @@ def test_a_recording_needs_no_description(tmp_path: Path) -> None:
 
 
 def test_a_program_reads_and_analyses_without_tools_and_client() -> None:
-    modules = "sioms.reconcile.axis, sioms.reconcile.files.axis, sioms.reconcile.files.finger, sioms.reconcile.files.force"
-    script = f"import sys, {modules}\nprint(*(n for n in sys.modules if n.startswith(('sioms.tools', 'sioms.client', 'sioms.sdk'))))"
+    modules = (
+        "sioms.reconcile.axis, sioms.reconcile.files.axis, sioms.reconcile.files.finger, sioms.reconcile.files.force"
+    )
+    script = (
+        f"import sys, {modules}\nprint(*(n for n in sys.modules if n.startswith(('sioms.tools', 'sioms.client', "
+        "'sioms.sdk'))))"
+    )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert not done.stdout.strip()

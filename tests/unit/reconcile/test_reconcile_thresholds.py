@@ -33,7 +33,6 @@ def test_no_module_has_a_threshold_of_its_own_by_a_name_of_the_table() -> None:
         if path.name != "thresholds.py" and not {"report", "live", "command", "files"} & set(path.parts)
         for node in ast.parse(path.read_text()).body
         for name in _names(node)
-        if name in table
-        and not (isinstance(node, ast.Assign) and isinstance(node.value, ast.Call | ast.Attribute))
+        if name in table and not (isinstance(node, ast.Assign) and isinstance(node.value, ast.Call | ast.Attribute))
     }
     assert not elsewhere

@@ -18,9 +18,7 @@ N = 6000
 def _record(time: Array, kept: Array) -> Record:
     t = np.arange(N) * DT
     x = np.sin(7.0 * t)
-    return Record(
-        "r", x[kept], np.cos(7.0 * t)[kept], index=(np.arange(N) % 1000 == 7)[kept], time_s=time[kept]
-    )
+    return Record("r", x[kept], np.cos(7.0 * t)[kept], index=(np.arange(N) % 1000 == 7)[kept], time_s=time[kept])
 
 
 def test_stamps_that_jitter_hide_no_sample_and_make_none() -> None:

@@ -91,9 +91,7 @@ def test_pictures_show_the_records_that_count_and_floor_and_remainder_are_two_nu
         assert gap.floor != gap.after and gap.floor_from
     assert [t.name for t in verdict.traces] == [r.name for r in session.records]
     for trace, record in zip(verdict.traces, session.records, strict=True):
-        assert trace.untouched_s == pytest.approx(
-            (1.0 - UNTOUCHED) * len(record) * model.sample_time_s, abs=2e-3
-        )
+        assert trace.untouched_s == pytest.approx((1.0 - UNTOUCHED) * len(record) * model.sample_time_s, abs=2e-3)
 
 
 def test_a_force_in_time_is_not_looked_for_in_records_that_had_none() -> None:

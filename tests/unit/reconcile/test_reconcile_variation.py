@@ -57,9 +57,7 @@ def test_the_dry_friction_of_a_motion_is_built_up_and_varies() -> None:
     x = np.linspace(0.0, 4.0, 4001)
     v, zero, one = np.full_like(x, 0.1), np.zeros_like(x), np.ones_like(x)
     dahl = AXIS.with_effect("presliding", {"Fc": 0.04, "xs": 2e-2})
-    np.testing.assert_allclose(
-        dry_friction(dahl, x, v, zero, zero, one), -0.04 * (1 - np.exp(-x / 2e-2)), atol=1e-12
-    )
+    np.testing.assert_allclose(dry_friction(dahl, x, v, zero, zero, one), -0.04 * (1 - np.exp(-x / 2e-2)), atol=1e-12)
     share = 1.0 + 0.25 * np.sin(3.0 * x + 0.4)
     level = AXIS.with_effect("stribeck", STRIBECK).with_effect(FACTOR, FACTORS)
     law = 0.03 + 0.03 * np.exp(-0.25)

@@ -10,9 +10,15 @@ import pytest
 from sioms.sdk.finding import describe, find_driver, read_settings
 
 AXIS: dict[str, Any] = {
-    "position_min": -1.0, "position_max": 1.0, "velocity_max": 1.0, "acceleration_max": 10.0, "jerk_max": 2000.0, "force_max": 9.0,
-    "following_error_max": 0.05, "motor": {"mass": 1.0, "viscous": 2.0, "coulomb": 0.5, "stiction": 0.6, "encoder_step": 1e-6},
-}  # fmt: skip
+    "position_min": -1.0,
+    "position_max": 1.0,
+    "velocity_max": 1.0,
+    "acceleration_max": 10.0,
+    "jerk_max": 2000.0,
+    "force_max": 9.0,
+    "following_error_max": 0.05,
+    "motor": {"mass": 1.0, "viscous": 2.0, "coulomb": 0.5, "stiction": 0.6, "encoder_step": 1e-6},
+}
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,7 @@ from sioms.sdk.codec.clock_fit import ClockFit
 MS = 1_000_000
 
 
-def run(
-    drift: float, seconds: float, start_us: int = 0, burst_ms: float = 0.0
-) -> tuple[ClockFit, list[float]]:
+def run(drift: float, seconds: float, start_us: int = 0, burst_ms: float = 0.0) -> tuple[ClockFit, list[float]]:
     """Feed 200 stamps a second with random delays; return the errors of the last half [ns].
 
     Truth: host = 5e12 + device * (1 + drift); least delay 0.2 ms, exponential tail of 2 ms.
@@ -88,7 +86,8 @@ def test_a_restarted_device_begins_a_new_fit() -> None:
 def misstated(
     ratio: float, seconds: float, hz: float = 500.0, jitter_ms: float = 1.0, stalls: bool = False, after_s: float = 0.0
 ) -> tuple[ClockFit, list[tuple[float, float]]]:  # fmt: skip
-    """Feed stamps of a clock whose counts last ``ratio`` times the stated microsecond; return (second, error in ms) of each.
+    """Feed stamps of a clock whose counts last ``ratio`` times the stated microsecond; return (second, error in ms) of
+    each.
 
     Args:
         ratio: real duration of a count over the stated one.

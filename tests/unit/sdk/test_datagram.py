@@ -100,9 +100,7 @@ def test_a_closed_port_a_taken_port_and_an_unknown_host() -> None:
     line = Connection(LineSettings(udp=closed))
     line.write(b"anybody")
     readable(line.fd)
-    with pytest.raises(
-        OSError, match=f"{closed}: nothing takes datagrams at this port; look at host"
-    ) as caught:
+    with pytest.raises(OSError, match=f"{closed}: nothing takes datagrams at this port; look at host") as caught:
         line.read()
     assert caught.value.errno == errno.ECONNREFUSED
     line.close()
@@ -151,21 +149,15 @@ class Beside:
 
     def __init__(self, settings: LineSettings, line: str) -> None:
         self.counters = Counters()
-        self.line = Line(
-            Connection(LineSettings(udp=line)), 0.0, 0.1, self.counters, None, SideConnection(settings)
-        )
+        self.line = Line(Connection(LineSettings(udp=line)), 0.0, 0.1, self.counters, None, SideConnection(settings))
         self.now_ns = 10**9
         self.results: list[Any] = []
 
-    def run(
-        self, exchange: Exchange, meanwhile: Callable[[], None] = lambda: None, anew: bool = False
-    ) -> Any:
+    def run(self, exchange: Exchange, meanwhile: Callable[[], None] = lambda: None, anew: bool = False) -> Any:
         def steps() -> Steps:
             return (yield Aside(exchange, anew))
 
-        self.line.submit(
-            steps(), Priority.POLL, lambda value, error: self.results.append(error or value), self.now_ns
-        )
+        self.line.submit(steps(), Priority.POLL, lambda value, error: self.results.append(error or value), self.now_ns)
         self.advance()
         meanwhile()
         until = time.monotonic() + 5

@@ -83,11 +83,7 @@ def test_positions_of_any_form_of_report() -> None:
 def test_limits_are_compared() -> None:
     found = {110: 6000.0, 120: 500.0}
     assert compare_limits(found, 0, 1000.0, 0.1, 0.5) and not compare_limits(found, 1, 1000.0, 0.1, 0.5)
-    with pytest.raises(
-        DeviceError, match=r"velocity_max = 0.2, but \$110 of the controller is 0.1; want at most"
-    ):
+    with pytest.raises(DeviceError, match=r"velocity_max = 0.2, but \$110 of the controller is 0.1; want at most"):
         compare_limits(found, 0, 1000.0, 0.2, 0.5)
-    with pytest.raises(
-        DeviceError, match=r"acceleration_max = 0.4, but \$120 of the controller is 0.5; want that"
-    ):
+    with pytest.raises(DeviceError, match=r"acceleration_max = 0.4, but \$120 of the controller is 0.5; want that"):
         compare_limits(found, 0, 1000.0, 0.1, 0.4)

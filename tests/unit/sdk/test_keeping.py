@@ -35,9 +35,7 @@ class Kept:
 
     def __init__(self, path, given, start=0.0, boot=BOOT):
         self.said = []
-        self.file = PositionFile(
-            str(path), [given], boot, lambda level, text: self.said.append(f"{level} {text}")
-        )
+        self.file = PositionFile(str(path), [given], boot, lambda level, text: self.said.append(f"{level} {text}"))
         self.rig = Rig([given], start=[start], keeper=self.file)
 
 
@@ -59,9 +57,7 @@ def moved_to(path, position, rule, *, offset=0.25, homed=True, close=False, tick
     return cell
 
 
-@pytest.mark.parametrize(
-    ("rule", "reads"), [(ALWAYS, 0.0), (ALWAYS, 7.0), (MATCHING, 0.5), (MATCHING, 0.5009)]
-)
+@pytest.mark.parametrize(("rule", "reads"), [(ALWAYS, 0.0), (ALWAYS, 7.0), (MATCHING, 0.5), (MATCHING, 0.5009)])
 @pytest.mark.parametrize("homed", [True, False])
 def test_a_position_at_rest_comes_back_and_homed_as_it_was(tmp_path, rule, reads, homed):
     moved_to(tmp_path / "x", 0.75, rule, homed=homed)  # the device reads 0.5
@@ -130,9 +126,7 @@ def test_a_process_on_its_way_out_cannot_write_into_its_successor(tmp_path):
     after.rig.tick(102)
     before.file.close()
     held = decode((tmp_path / "x").read_bytes())
-    assert (
-        held.entries["x"].position == pytest.approx(0.75) == after.rig.field("position") and not held.closed
-    )
+    assert held.entries["x"].position == pytest.approx(0.75) == after.rig.field("position") and not held.closed
 
 
 def test_after_another_boot_only_an_orderly_end_is_believed(tmp_path):
@@ -140,9 +134,7 @@ def test_after_another_boot_only_an_orderly_end_is_believed(tmp_path):
     fallen = Kept(tmp_path / "x", axis(restore=ALWAYS), boot="other")
     assert fallen.rig.field("position") == 0.0 and "orderly end" in fallen.said[-1]
     moved_to(tmp_path / "x", 0.75, ALWAYS, close=True)
-    assert Kept(tmp_path / "x", axis(restore=ALWAYS), boot="other").rig.field("position") == pytest.approx(
-        0.75
-    )
+    assert Kept(tmp_path / "x", axis(restore=ALWAYS), boot="other").rig.field("position") == pytest.approx(0.75)
     moved_to(tmp_path / "x", 0.75, ALWAYS)
     unknown = Kept(tmp_path / "x", axis(restore=ALWAYS), boot="")
     assert unknown.rig.field("position") == 0.0, "a system that does not tell its boot"
@@ -219,16 +211,12 @@ class Column(np.ndarray):
 
 
 @settings(max_examples=100)
-@given(
-    st.lists(st.tuples(st.booleans(), st.floats(-2, 2), st.floats(-2, 2)), min_size=1, max_size=8), st.data()
-)
+@given(st.lists(st.tuples(st.booleans(), st.floats(-2, 2), st.floats(-2, 2)), min_size=1, max_size=8), st.data())
 def test_wherever_a_process_is_killed_no_entry_is_wrong(tmp_path_factory, history, data):
     """What is marked at rest is, whole, the place noted last or, before that note is done, the one before it."""
     path = tmp_path_factory.mktemp("kept") / "x"
     file = PositionFile(str(path), [axis(restore=ALWAYS)], BOOT, lambda *_: None)
-    file._state, file._raw, file._position = (
-        c.view(Column) for c in (file._state, file._raw, file._position)
-    )
+    file._state, file._raw, file._position = (c.view(Column) for c in (file._state, file._raw, file._position))
     Column.left = data.draw(st.integers(0, 4 * len(history)))
     noted = [(False, 0.0, 0.0)]
     complete = False
@@ -250,14 +238,10 @@ def test_wherever_a_process_is_killed_no_entry_is_wrong(tmp_path_factory, histor
 
 def test_only_banks_that_ask_for_it_get_a_file_and_a_missing_folder_is_told(tmp_path):
     said = []
-    block = AxisBlock(
-        BlockSpec("", NodeClass.AXIS, (ChannelInfo("x", "m"),)), Rig([axis(restore=ALWAYS)]).bank
-    )
+    block = AxisBlock(BlockSpec("", NodeClass.AXIS, (ChannelInfo("x", "m"),)), Rig([axis(restore=ALWAYS)]).bank)
     plain = AxisBlock(BlockSpec("plain", NodeClass.AXIS, (ChannelInfo("x", "m"),)), Rig([axis()]).bank)
     log = lambda level, text: said.append(text)  # noqa: E731
-    assert (
-        keep_positions("", "mod0", [block, plain], log) == [] and "give [workcell] a state_folder" in said[0]
-    )
+    assert keep_positions("", "mod0", [block, plain], log) == [] and "give [workcell] a state_folder" in said[0]
     (tmp_path / "file").write_text("")
     assert keep_positions(str(tmp_path / "file"), "mod0", [block], log) == [] and "not kept" in said[1]
     assert block.bank.keeper is None
@@ -267,9 +251,7 @@ def test_only_banks_that_ask_for_it_get_a_file_and_a_missing_folder_is_told(tmp_
 
 
 def test_where_the_disk_is_full_no_place_of_an_earlier_run_is_left_to_be_believed(tmp_path):
-    block = AxisBlock(
-        BlockSpec("", NodeClass.AXIS, (ChannelInfo("x", "m"),)), Rig([axis(restore=ALWAYS)]).bank
-    )
+    block = AxisBlock(BlockSpec("", NodeClass.AXIS, (ChannelInfo("x", "m"),)), Rig([axis(restore=ALWAYS)]).bank)
     (file,) = keep_positions(str(tmp_path), "mod0", [block], lambda *_: None)
     file.close()
     block.bank.keeper = None

@@ -33,7 +33,10 @@ def test_a_network_device_has_one_driver_until_that_ends() -> None:
 
 
 def test_the_lock_of_a_process_ends_with_it_however_that_ends() -> None:
-    script = f"from sioms.sdk.locks import NameLocks; mine = NameLocks([{NAME!r}], print); mine.take(); input(print('held', flush=True))"
+    script = (
+        f"from sioms.sdk.locks import NameLocks; mine = NameLocks([{NAME!r}], print); mine.take(); input(print('held', "
+        "flush=True))"
+    )
     holder = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert holder.stdout and holder.stdin
     holder.stdout.readline()
@@ -116,9 +119,7 @@ def info(name: str, *claims: str) -> DeviceInfo:
 )
 def test_two_devices_do_not_share_what_only_one_may_have(first: str, second: str, clash: bool) -> None:
     errors = shared_claims([info("a", first), info("b", second), info("c")])
-    assert errors == (
-        [f"[device.b]: {second} is that of device a already; want one of its own"] if clash else []
-    )
+    assert errors == ([f"[device.b]: {second} is that of device a already; want one of its own"] if clash else [])
 
 
 def test_a_line_is_claimed_by_what_it_is(tmp_path: Path) -> None:

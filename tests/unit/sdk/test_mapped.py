@@ -148,9 +148,7 @@ def test_readings_are_si() -> None:
         (LEADSHINE, {"position": float("nan"), "speed": 0.1, **RAMP}, "position nan"),
     ],
 )
-def test_a_quantity_that_does_not_fit_is_refused(
-    device: MappedUnit, quantities: dict[str, float], words: str
-) -> None:
+def test_a_quantity_that_does_not_fit_is_refused(device: MappedUnit, quantities: dict[str, float], words: str) -> None:
     with pytest.raises(DeviceError, match=words) as caught:
         drive(device.command("position", **quantities), echo)
     assert caught.value.errno == errno.EINVAL
@@ -161,9 +159,7 @@ def test_identity() -> None:
         return lambda exchange: frame_rtu(1, bytes((3, 2)) + value.to_bytes(2, "big"))
 
     drive(LEADSHINE.identify({"pulses_per_turn": 10000}), answer(10000))
-    with pytest.raises(
-        DeviceError, match="pulses_per_turn is 1600; the configuration says pulses_per_turn = 10000"
-    ):
+    with pytest.raises(DeviceError, match="pulses_per_turn is 1600; the configuration says pulses_per_turn = 10000"):
         drive(LEADSHINE.identify({"pulses_per_turn": 10000}), answer(1600))
 
     def model(exchange: Exchange) -> bytes:

@@ -15,14 +15,10 @@ def imports(package: Path) -> dict[str, set[str]]:
     found: dict[str, set[str]] = {module: set() for module in modules}
     for module in modules:
         for node in ast.walk(ast.parse((package / f"{module}.py").read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and (
-                node.level == 1 or node.module == f"sioms.{package.name}"
-            ):
+            if isinstance(node, ast.ImportFrom) and (node.level == 1 or node.module == f"sioms.{package.name}"):
                 names = [node.module.split(".")[0]] if node.level and node.module else []
                 found[module] |= {*names, *(alias.name for alias in node.names)} & modules
-            elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
-                f"sioms.{package.name}."
-            ):
+            elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"sioms.{package.name}."):
                 found[module].add(str(node.module).split(".")[2])
     return found
 

@@ -31,9 +31,7 @@ def test_text_ends_at_zero() -> None:
     assert to_raw((0x4531, 0x3231, 0x3200, 0x5858), "text", "big") == "E1212"
 
 
-@pytest.mark.parametrize(
-    ("raw", "kind"), [(65536, "u16"), (-1, "u16"), (32768, "i16"), (2**31, "i32"), (-1, "u32")]
-)
+@pytest.mark.parametrize(("raw", "kind"), [(65536, "u16"), (-1, "u16"), (32768, "i16"), (2**31, "i32"), (-1, "u32")])
 def test_what_does_not_fit_is_refused(raw: float, kind: str) -> None:
     with pytest.raises(ValueError, match=f"does not fit a register of type {kind}"):
         to_words(raw, kind, "big")  # type: ignore[arg-type]

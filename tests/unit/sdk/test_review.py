@@ -102,9 +102,7 @@ def _to(position: float) -> np.ndarray[Any, Any]:
 @pytest.mark.parametrize("gap_ms", [60, 400])
 def test_no_verb_lets_the_set_point_run_on_before_a_late_tick(verb: str, gap_ms: int) -> None:
     settings = [
-        AxisSettings(
-            name, "m", velocity_max=1.0, acceleration_max=10.0, position_min=-1.0, position_max=1.0, k=100.0
-        )
+        AxisSettings(name, "m", velocity_max=1.0, acceleration_max=10.0, position_min=-1.0, position_max=1.0, k=100.0)
         for name in "xy"
     ]
     bank = AxisBank(settings, tick_s=1e-3, markers=_NoMarkers())

@@ -30,8 +30,15 @@ def test_a_request_takes_its_right(request_: Request) -> None:
     needs = OTHERS.get(request_, Right.READ if request_ in READS else Right.WRITE)
     for bits in range(16):
         handle: Any = SimpleNamespace(
-            node="io0", who="eva", uid=1000, exclusive=True, rights=Right(bits), block=MagicMock(), channels=np.array([0]), bit=0
-        )  # fmt: skip
+            node="io0",
+            who="eva",
+            uid=1000,
+            exclusive=True,
+            rights=Right(bits),
+            block=MagicMock(),
+            channels=np.array([0]),
+            bit=0,
+        )
         runtime: Any = MagicMock()
         try:
             requests.ioctl(runtime, handle, 1, int(request_), None, None)

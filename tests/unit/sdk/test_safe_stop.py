@@ -39,8 +39,20 @@ class Device:
         latch: Any = SimpleNamespace(resets=0, orders=0)
         nothing: Any = SimpleNamespace(mark=0)
         self.stops = Stops(
-            "dev", [self.axes, self.port], outputs, Effects(), waits, nothing, {}, nothing, nothing, latch, nothing, nothing, []
-        )  # fmt: skip
+            "dev",
+            [self.axes, self.port],
+            outputs,
+            Effects(),
+            waits,
+            nothing,
+            {},
+            nothing,
+            nothing,
+            latch,
+            nothing,
+            nothing,
+            [],
+        )
         self.stops.engine = engine
 
     def note(self, what: str) -> Any:
@@ -90,8 +102,6 @@ def test_of_an_output_only_what_is_asked_for_is_stopped() -> None:
 
 def test_nothing_stops_past_it() -> None:
     """In the kit, only safe_stop tells banks and engines to stop."""
-    call = re.compile(
-        r"bank\.(stop|emergency_stop|fault)\(\W*(axes|np\.arange|owned)|engine\.(stop|recover)\b"
-    )
+    call = re.compile(r"bank\.(stop|emergency_stop|fault)\(\W*(axes|np\.arange|owned)|engine\.(stop|recover)\b")
     found = {path.name for path in KIT.glob("*.py") if call.search(path.read_text(encoding="utf-8"))}
     assert found == {"stops.py"}

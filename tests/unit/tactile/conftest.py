@@ -26,7 +26,8 @@ def nominal() -> Finger:
 
 
 def exact_strains(angles: Floats, radii: Floats | float, extent: float = 0.0) -> Strains:
-    """Return a function (place [rad], load [N/m], rc [m]; 0 an edge) -> strains by the bounded contact, 100 wave numbers.
+    """Return a function (place [rad], load [N/m], rc [m]; 0 an edge) -> strains by the bounded contact, 100 wave
+    numbers.
 
     Means over elements of a half angle `extent`, by Gauss's rule.
     """

@@ -27,9 +27,7 @@ from sioms.tactile.touches import Recording, Touches, average, join, touch_loads
 
 @pytest.fixture(scope="module")
 def start(nominal: Finger) -> Finger:
-    return msgspec.structs.replace(
-        nominal, elements=msgspec.structs.replace(nominal.elements, gain=(3.0,) * 16)
-    )
+    return msgspec.structs.replace(nominal, elements=msgspec.structs.replace(nominal.elements, gain=(3.0,) * 16))
 
 
 @pytest.fixture(scope="module")
@@ -94,14 +92,14 @@ def test_half_a_finger_is_left_out_and_said(start: Finger, made) -> None:  # typ
 
 
 def test_what_is_not_supported_is_said_and_a_dead_element_left_out(start: Finger, made) -> None:  # type: ignore[no-untyped-def]
-    """Edges only, a load cell that reads a tenth too little, fractions taken for per cent, an element that is torn off."""
+    """Edges only, a load cell that reads a tenth too little, fractions taken for per cent, an element that is torn
+    off.
+    """
     touches = made.touches()
     edges = touches.pick(touches.radius_m == 0.0)
     output = 0.01 * edges.output
     output[:, 6] = 0.0
-    scaled = Touches(
-        output, edges.angle_rad, edges.load, edges.radius_m, 0.9 * edges.load, 0.01 * edges.noise
-    )
+    scaled = Touches(output, edges.angle_rad, edges.load, edges.radius_m, 0.9 * edges.load, 0.01 * edges.noise)
     found = calibrate(start, scaled, Options(contact="frictionless"))
     assert found.quadratic is None
     assert [n for n, used in enumerate(found.finger.elements.used) if not used] == [6]
@@ -171,9 +169,7 @@ def test_average_subtracts_each_touchs_baseline() -> None:
     with pytest.raises(ValueError, match="average touch 2 of 3: 0 baseline and 0 loaded frames"):
         average(recording, np.zeros(3), np.full(3, 10.0), np.zeros(3), 0.01)
     raw[7, 1] = np.nan  # one of five
-    assert average(recording, np.zeros(2), np.full(2, 10.0), np.zeros(2), 0.01).output == pytest.approx(
-        found.output
-    )
+    assert average(recording, np.zeros(2), np.full(2, 10.0), np.zeros(2), 0.01).output == pytest.approx(found.output)
     raw[5:10, 1] = np.nan
     with pytest.raises(ValueError, match="touch 0: element 1 holds a reading that is not finite"):
         average(recording, np.zeros(2), np.full(2, 10.0), np.zeros(2), 0.01)
@@ -236,9 +232,7 @@ def test_load_cell_is_believed_where_touches_follow_it(start: Finger, made) -> N
         touches.load * share,
         touches.noise,
     )
-    blind = Touches(
-        real.output, real.angle_rad, real.load, real.radius_m, np.full(len(real), np.nan), real.noise
-    )
+    blind = Touches(real.output, real.angle_rad, real.load, real.radius_m, np.full(len(real), np.nan), real.noise)
     edges = [t.pick(t.radius_m == 0.0) for t in (real, blind)]
     with_cell, without = (calibrate(start, t, Options(identify=False, contact="frictionless")) for t in edges)
     assert any("follow the load cell" in warning for warning in with_cell.warnings)
@@ -292,9 +286,7 @@ def test_what_no_model_explains_is_doubted(start: Finger, made) -> None:  # type
     wrong = _placed(touches, touches.angle_rad + turned)
     (doubt,) = [d for d in calibrate(start, wrong, options).doubts if "unexplained" in d]
     assert "a sound finger leaves less than 2 %" in doubt
-    cell = Touches(
-        touches.output, touches.angle_rad, touches.load, touches.radius_m, 3.0 * touches.load, touches.noise
-    )
+    cell = Touches(touches.output, touches.angle_rad, touches.load, touches.radius_m, 3.0 * touches.load, touches.noise)
     assert any("3.00 times the commanded load" in d for d in calibrate(start, cell, options).doubts)
 
 
@@ -361,9 +353,7 @@ def test_a_noisy_cell_is_believed_by_its_share_and_more_touches_lose_nothing(nom
         touches.output * (share * scatter)[:, None], touches.angle_rad, touches.load, touches.radius_m,
         touches.load * told, touches.noise,
     )  # fmt: skip
-    start = msgspec.structs.replace(
-        nominal, elements=msgspec.structs.replace(nominal.elements, gain=(3.0,) * 16)
-    )
+    start = msgspec.structs.replace(nominal, elements=msgspec.structs.replace(nominal.elements, gain=(3.0,) * 16))
     widths = nominal.width_table()
     found = []
     for part in (real.pick(real.radius_m == 0.0), real):

@@ -14,9 +14,7 @@ PERIOD_NS = 8_333_333
 
 @pytest.fixture
 def finger(nominal: Finger) -> Finger:
-    elements = msgspec.structs.replace(
-        nominal.elements, gain=(3.0,) * 16, quadratic=(4.0,) * 16, noise=(5e-4,) * 16
-    )
+    elements = msgspec.structs.replace(nominal.elements, gain=(3.0,) * 16, quadratic=(4.0,) * 16, noise=(5e-4,) * 16)
     return msgspec.structs.replace(nominal, elements=elements)
 
 
@@ -72,9 +70,7 @@ def test_drift_is_followed_untouched_and_kept_out_of_touches(finger: Finger) -> 
     before = bench.chain.baseline
     bench.feed(600, output=5.0, drift_per_s=0.005)
     assert bench.chain.baseline == pytest.approx(before)
-    bench.feed(
-        10
-    )  # after the release the others catch up with their drift, the element that was touched hardly
+    bench.feed(10)  # after the release the others catch up with their drift, the element that was touched hardly
     moved = (bench.chain.baseline - before) / (bench.offset - before)
     assert np.mean(np.delete(moved, 8)) > 0.5 and moved[8] < 0.2
     bench.feed(1200)
@@ -142,9 +138,7 @@ def test_gains_are_replaced(finger: Finger) -> None:
     bench = Bench(finger)
     bench.feed(100)
     bench.chain.set_gain(np.full(16, 6.0))
-    assert np.mean([bench.feed(1, 1.0).strains[8] for _ in range(50)]) == pytest.approx(
-        -6.0 * 0.00963, rel=0.05
-    )
+    assert np.mean([bench.feed(1, 1.0).strains[8] for _ in range(50)]) == pytest.approx(-6.0 * 0.00963, rel=0.05)
     for bad in (np.ones(3), np.zeros(16), np.full(16, np.nan)):
         with pytest.raises(ValueError, match="set gain"):
             bench.chain.set_gain(bad)

@@ -97,12 +97,8 @@ def test_no_gross_errors_of_place(nominal: Finger, estimator: Estimator) -> None
         assert not shape.quality & Quality.NOT_CONVERGED
 
 
-def test_load_cell_sharpens_the_radius_and_an_exact_one_fixes_the_load(
-    nominal: Finger, estimator: Estimator
-) -> None:
-    frame = strains(nominal, math.radians(70.0), 200.0, 6e-3) + 1e-3 * np.random.default_rng(1).normal(
-        size=16
-    )
+def test_load_cell_sharpens_the_radius_and_an_exact_one_fixes_the_load(nominal: Finger, estimator: Estimator) -> None:
+    frame = strains(nominal, math.radians(70.0), 200.0, 6e-3) + 1e-3 * np.random.default_rng(1).normal(size=16)
     free, weak, exact = (
         estimator.frame(frame),
         estimator.frame(frame, Load(200.0, 1e6)),
@@ -122,9 +118,7 @@ def test_both_ways_agree(nominal: Finger, estimator: Estimator, compiled: bool) 
     if compiled:
         pytest.importorskip("numba")
     other = Estimator(nominal, compiled=compiled)
-    frame = strains(nominal, math.radians(100.0), 120.0, 4e-3) + 1e-3 * np.random.default_rng(2).normal(
-        size=16
-    )
+    frame = strains(nominal, math.radians(100.0), 120.0, 4e-3) + 1e-3 * np.random.default_rng(2).normal(size=16)
     one, two = estimator.frame(frame), other.frame(frame)
     assert two.angle_rad == pytest.approx(one.angle_rad, rel=1e-10)
     assert two.load_n_per_m == pytest.approx(one.load_n_per_m, rel=1e-9)
@@ -140,9 +134,7 @@ def test_quality_flags(nominal: Finger, estimator: Estimator) -> None:
     quiet = estimator.frame(noise)
     assert quiet.quality is Quality.NO_CONTACT
     assert math.isnan(quiet.angle_rad)
-    two = strains(nominal, math.radians(40.0), 150.0, 6e-3) + strains(
-        nominal, math.radians(110.0), 150.0, 6e-3
-    )
+    two = strains(nominal, math.radians(40.0), 150.0, 6e-3) + strains(nominal, math.radians(110.0), 150.0, 6e-3)
     assert estimator.frame(two).quality & Quality.POOR_FIT
     pull = estimator.frame(0.1 * np.ones(16))
     assert pull.quality & (Quality.WRONG_SIGN | Quality.POOR_FIT)
@@ -193,9 +185,7 @@ def test_calibrated_misfit_widens_the_deviations(nominal: Finger, estimator: Est
 
 
 def test_bad_input_is_refused(estimator: Estimator) -> None:
-    with pytest.raises(
-        ValueError, match=r"frame has 15 strains in shape \(15,\); the finger has 16 elements"
-    ):
+    with pytest.raises(ValueError, match=r"frame has 15 strains in shape \(15,\); the finger has 16 elements"):
         estimator.frame(np.zeros(15))
     with pytest.raises(ValueError, match=r"load is -3\.0 \+- 1\.0 N/m; need a finite pressing load"):
         estimator.frame(np.zeros(16), Load(-3.0, 1.0))

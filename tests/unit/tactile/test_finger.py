@@ -23,9 +23,7 @@ def test_file_comes_back_exactly(nominal: Finger) -> None:
 
 def test_identified_map_replaces_the_model(nominal: Finger) -> None:
     rows = 2.0 * nominal.e_map()[:, : 2 * nominal.highest() + 1]
-    twice = msgspec.structs.replace(
-        nominal, identified=IdentifiedMap(tuple(tuple(row) for row in rows.tolist()))
-    )
+    twice = msgspec.structs.replace(nominal, identified=IdentifiedMap(tuple(tuple(row) for row in rows.tolist())))
     assert twice.strain_table().nodes == pytest.approx(2.0 * nominal.strain_table().nodes)
 
 
@@ -36,9 +34,7 @@ def test_adhering_model_narrows_the_response(nominal: Finger) -> None:
     row = 16
     middle = int(np.abs(free.nodes[row, :, 0, 8]).argmax())
     peak = slice(middle - 6, middle + 7)
-    wide, narrow = (
-        np.abs(t.nodes[row, peak, 0, 8] / t.nodes[row, middle, 0, 8]).sum() for t in (free, stuck)
-    )
+    wide, narrow = (np.abs(t.nodes[row, peak, 0, 8] / t.nodes[row, middle, 0, 8]).sum() for t in (free, stuck))
     assert narrow < wide
     step = 1e-6
     for table in (free, stuck):  # derivatives of the table against its own neighbours

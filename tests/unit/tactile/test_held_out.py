@@ -1,4 +1,6 @@
-"""What touches left out of a calibration tell: deviations that cover their errors, and doubts where these are too large."""
+"""What touches left out of a calibration tell: deviations that cover their errors, and doubts where these are too
+large.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +65,9 @@ def test_a_finger_that_does_not_find_them_is_doubted(own: list[float], words: st
 
 
 def test_estimates_are_those_of_heavy_touches_inside(nominal: Finger, touch) -> None:  # type: ignore[no-untyped-def]
-    """Errors and stated deviations relative to the truth; an edge has no R, a light touch and one outside do not count."""
+    """Errors and stated deviations relative to the truth; an edge has no R, a light touch and one outside do not
+    count.
+    """
     places = np.radians([60.0, 75.3, 90.0, 100.0, 2.0])
     loads, radii = np.array([200.0, 150.0, 50.0, 200.0, 200.0]), np.array([6e-3, 12e-3, 6e-3, 0.0, 6e-3])
     strains = np.array([touch(*one) for one in zip(places, loads, radii, strict=True)])
@@ -83,8 +87,6 @@ def test_what_a_finger_carries_is_in_its_estimates(nominal: Finger, touch) -> No
     plain, carrying = (Estimator(f).frame(strains) for f in (nominal, finger))
     assert carrying.angle_rad == plain.angle_rad and carrying.load_n_per_m == plain.load_n_per_m
     added = np.sqrt(np.array(carrying.deviations) ** 2 - np.array(plain.deviations) ** 2)
-    assert added == pytest.approx(
-        [2e-3, 0.03 * plain.load_n_per_m, 0.1 * plain.equivalent_radius_m], rel=1e-6
-    )
+    assert added == pytest.approx([2e-3, 0.03 * plain.load_n_per_m, 0.1 * plain.equivalent_radius_m], rel=1e-6)
     with pytest.raises(ValueError, match=r"systematic load is -0\.1; need 0 or more"):
         msgspec.structs.replace(nominal, systematic=Systematic(load=-0.1))

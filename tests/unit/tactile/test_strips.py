@@ -86,9 +86,7 @@ def test_ripple_is_found_under_scattered_loads_and_none_where_there_is_none() ->
     found = find_strips(even + change - model, model, widening, place)
     assert found is not None
     assert found.period_rad == pytest.approx(STRIPS.period_rad, rel=2e-3)
-    assert found.gain == pytest.approx(STRIPS.gain, abs=0.005) and found.width == pytest.approx(
-        STRIPS.width, abs=0.02
-    )
+    assert found.gain == pytest.approx(STRIPS.gain, abs=0.005) and found.width == pytest.approx(STRIPS.width, abs=0.02)
     assert found.strain_factor(place) == pytest.approx(STRIPS.strain_factor(place), abs=0.01)
     assert found.width_factor(place) == pytest.approx(STRIPS.width_factor(place), abs=0.03)
     assert find_strips(even[:8] - model[:8], model[:8], widening[:8], place[:8]) is None

@@ -56,13 +56,18 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
             phase += [part] * 10
     frames = np.concatenate(raw)
     np.savez(
-        tmp_path / "edges.npz", raw=frames, time=np.arange(len(frames)) / 33.0, touch=touch, phase=phase, fs=33.0,
-        force=200.0 * np.array(phase), cmd_theta=places, cmd_P=np.full(places.size, 200.0), cmd_rc=np.zeros(places.size),
-    )  # fmt: skip
-    quiet = (
-        0.05 * random.normal(size=(4096, 16))
-        + 0.1 * np.sin(2 * np.pi * 60.0 * np.arange(4096) / 432.0)[:, None]
+        tmp_path / "edges.npz",
+        raw=frames,
+        time=np.arange(len(frames)) / 33.0,
+        touch=touch,
+        phase=phase,
+        fs=33.0,
+        force=200.0 * np.array(phase),
+        cmd_theta=places,
+        cmd_P=np.full(places.size, 200.0),
+        cmd_rc=np.zeros(places.size),
     )
+    quiet = 0.05 * random.normal(size=(4096, 16)) + 0.1 * np.sin(2 * np.pi * 60.0 * np.arange(4096) / 432.0)[:, None]
     np.savez(tmp_path / "noise.npz", raw=quiet, time=np.arange(4096) / 432.0, fs=432.0)
     warm = 21.0 + np.sin(np.arange(100) / 8.0)
     drift = -0.8 * warm[:, None] + 0.02 * random.normal(size=(100, 16))
@@ -119,9 +124,7 @@ def test_a_doubtful_calibration_writes_its_report_but_no_finger(
     page = out.with_suffix(".html")
     told = capsys.readouterr()
     assert not out.exists() and "times the nominal ones" in page.read_text()
-    assert (
-        "no finger was written" in told.err and "times the nominal ones" in told.err and str(page) in told.err
-    )
+    assert "no finger was written" in told.err and "times the nominal ones" in told.err and str(page) in told.err
     page.unlink()
     assert command(*words, "--doubtful") == 0
     finger = from_toml(out.read_text())
@@ -129,9 +132,7 @@ def test_a_doubtful_calibration_writes_its_report_but_no_finger(
     assert "times the nominal ones" in capsys.readouterr().out
 
 
-def test_score_fits_touches_that_calibration_has_not_seen(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_score_fits_touches_that_calibration_has_not_seen(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / f"{folder.name}.json").write_text(
         json.dumps({"parameters": {"creep": 0.0}, "elements": {"theta_deg": ANGLES.tolist()}})
     )
@@ -176,9 +177,7 @@ def test_experiment_plans_edges_flats_all_indenters_and_loads() -> None:
     assert {touch.load for touch in series} == {50.0, 100.0, 150.0, 250.0}
 
 
-def test_calibrate_names_what_is_wrong(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_calibrate_names_what_is_wrong(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
     assert command("calibrate", str(empty)) == 1
@@ -211,7 +210,8 @@ def test_calibrate_names_what_is_wrong(
         ({"cmd_P": lambda a: -a}, "pressing loads are positive"),
         ({"raw": lambda a: -a}, "compression must be positive: change its sign"),
         ({"raw": lambda a: a[:, :15]}, "touches have 15 elements; the finger has 16"),
-        ({"raw": lambda a: np.where(np.arange(len(a))[:, None] < len(a) // 4, np.nan, a)}, "touch 0: element 0 holds a reading"),
+        ({"raw": lambda a: np.where(np.arange(len(a))[:, None] < len(a) // 4, np.nan, a)}, "touch 0: element 0 holds a "
+                                                                                           "reading"),
         ({"time": lambda a: a[::-1]}, "time falls or is no number after frame 0"),
         ({"touch": lambda a: a + 0.5}, "touch holds a value that is no whole number"),
     ],
@@ -235,9 +235,7 @@ def test_design_refuses_what_cannot_be_built(tmp_path: Path, capsys: pytest.Capt
     assert command("design", "--core-mm", "13", "-o", str(tmp_path / "d.html")) == 1
     assert "need 0 < core < outer" in capsys.readouterr().err
     assert command("design", "--depth-mm", "4", "-o", str(tmp_path / "d.html")) == 1
-    assert (
-        "elements 4.0 mm deep are at radius 8.7 mm; need between 9.6 and 12.7 mm" in capsys.readouterr().err
-    )
+    assert "elements 4.0 mm deep are at radius 8.7 mm; need between 9.6 and 12.7 mm" in capsys.readouterr().err
     for words, answer in (
         (("--pitch-deg", "-9"), "16 elements -9 deg apart; need a positive pitch"),
         (("--pitch-deg", "30"), "less than a turn"),
@@ -319,7 +317,9 @@ def test_page_escapes_and_colours(tmp_path: Path) -> None:
 
 
 def moving_touch(path: Path, frames: int = 2500) -> tuple[np.ndarray, np.ndarray]:
-    """Record frames at 400 Hz: untouched, then an edge of 150 N/m that slides from 40 to 110 degrees; return its places."""
+    """Record frames at 400 Hz: untouched, then an edge of 150 N/m that slides from 40 to 110 degrees; return its
+    places.
+    """
     random = np.random.default_rng(8)
     place = np.radians(np.linspace(40.0, 110.0, frames))
     touched = np.arange(frames) >= 200
@@ -363,9 +363,7 @@ def test_shape_fits_frames_on_many_processes_as_one_sensor_would(
     sensor = ShapeSensor(from_toml(finger.read_text()), tare=LoadTare(1.0, 3.0, 2.0))
     with np.load(recording) as file:
         for number in range(1300):
-            row = numbers(
-                sensor.frame(file["raw"][number], round(file["time"][number] * 1e9), file["force"][number])
-            )
+            row = numbers(sensor.frame(file["raw"][number], round(file["time"][number] * 1e9), file["force"][number]))
     found = [table[name][1299] for name, _, _ in CHANNELS]
     np.testing.assert_allclose(found, row, rtol=1e-6)
 
@@ -378,14 +376,9 @@ def test_shape_takes_marked_baselines_for_what_they_say(tmp_path: Path) -> None:
     drift = np.linspace(0.0, 1.0, touch.size)[:, None] * np.sin(np.arange(16))
     raw = -100.0 * edge / 3.0 * under[:, None] + drift
     raw += 0.02 * np.random.default_rng(3).normal(size=raw.shape)
-    np.savez(
-        tmp_path / "x.npz", raw=raw, time=touch * 0.5 + part * 0.01, touch=touch, phase=1 * under, fs=100.0
-    )
+    np.savez(tmp_path / "x.npz", raw=raw, time=touch * 0.5 + part * 0.01, touch=touch, phase=1 * under, fs=100.0)
     finger, out = Path(__file__).parents[3] / "etc" / "finger.toml", tmp_path / "s.csv"
-    assert (
-        command("shape", str(tmp_path), "--finger", str(finger), "--jobs", "1", "--plain", "-o", str(out))
-        == 0
-    )
+    assert command("shape", str(tmp_path), "--finger", str(finger), "--jobs", "1", "--plain", "-o", str(out)) == 0
     table = np.genfromtxt(out, delimiter=",", names=True, dtype=None, encoding="utf-8")
     np.testing.assert_array_equal(table["touched"] == 1.0, under)
     assert np.abs(table["angle"][under] - 1.2).max() < np.radians(1.0)

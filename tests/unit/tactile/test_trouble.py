@@ -1,7 +1,8 @@
-"""What goes wrong on a finger, at 400 Hz through the driver of framed samples: each case ends in the state that is true, and goes by.
+"""What goes wrong on a finger, at 400 Hz through the driver of framed samples: each case ends in the state that is
+true, and goes by.
 
-The frames come from the plant (`sioms.plant.finger`: finite elements, indenters and contact point by point), whose mechanics
-share nothing with the estimator's, in counts of the converter, with noise and steps.
+The frames come from the plant (`sioms.plant.finger`: finite elements, indenters and contact point by point), whose
+mechanics share nothing with the estimator's, in counts of the converter, with noise and steps.
 """
 
 from __future__ import annotations
@@ -37,9 +38,7 @@ NONE = np.zeros(16)
 
 def touch(degrees: float, load: float, rc: float = 6e-3) -> np.ndarray:
     """Return the outputs [%] under a touch, a pull where the load is negative."""
-    output: np.ndarray = (
-        -100.0 / 3.0 * math.copysign(1.0, load) * PLANT.strain(abs(load), math.radians(degrees), rc)
-    )
+    output: np.ndarray = -100.0 / 3.0 * math.copysign(1.0, load) * PLANT.strain(abs(load), math.radians(degrees), rc)
     return output
 
 
@@ -119,13 +118,7 @@ def cases(*values: Any) -> Any:
     return pytest.mark.parametrize("case", values, ids=str)
 
 
-@cases(
-    *(
-        (holes, load)
-        for holes in (range(16), range(2, 15), range(3, 16), range(4, 11))
-        for load in (0.0, 150.0)
-    )
-)
+@cases(*((holes, load) for holes in (range(16), range(2, 15), range(3, 16), range(4, 11)) for load in (0.0, 150.0)))
 def test_blind_is_not_untouched(case: tuple[range, float]) -> None:
     """All or most elements read nothing, in the midst of them what is touched: 8 cases."""
     holes, load = case
@@ -142,9 +135,7 @@ def test_blind_is_not_untouched(case: tuple[range, float]) -> None:
     finger.works()
 
 
-@cases(
-    *((step, load, rc) for step in (0.25, 0.5) for load in (100.0, 200.0, 300.0) for rc in (6e-3, 12.3e-3))
-)
+@cases(*((step, load, rc) for step in (0.25, 0.5) for load in (100.0, 200.0, 300.0) for rc in (6e-3, 12.3e-3)))
 def test_a_held_touch_of_a_coarse_quiet_converter_stays(case: tuple[float, float, float]) -> None:
     """Every frame of a second and a half is equal, thrice as many as a dead element's: 12 cases."""
     step, load, rc = case
@@ -224,7 +215,7 @@ def test_a_pull_is_called_one(case: tuple[float, float]) -> None:
 
 
 @cases(*((apart, load, rc) for apart, load, rc in (
-    (12.0, 100.0, 6e-3), (12.0, 200.0, 0.5e-3), (10.0, 100.0, 1e-3), (10.0, 150.0, 3e-3), (9.0, 150.0, 1e-3), (8.0, 150.0, 1e-3), (7.0, 200.0, 0.5e-3),
+    (12.0, 100.0, 6e-3), (12.0, 200.0, 0.5e-3), (10.0, 100.0, 1e-3), (10.0, 150.0, 3e-3), (9.0, 150.0, 1e-3), (8.0, 150.0, 1e-3), (7.0, 200.0, 0.5e-3),  # noqa: E501
     (7.0, 200.0, 6e-3), (10.0, 200.0, math.inf), (8.0, 100.0, math.inf))))  # fmt: skip
 def test_two_touches_are_not_one_good_one(case: tuple[float, float, float]) -> None:
     """Five to twelve degrees apart, once they have been held for up to 2.7 seconds: 10 cases."""

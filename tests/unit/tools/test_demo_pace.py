@@ -21,9 +21,7 @@ def test_every_rate_makes_a_configuration_that_the_driver_takes(rate_hz: float) 
     for name, table in devices.items():
         if table["driver"] != "sim-axes":
             continue
-        settings = {
-            key: value for key, value in table.items() if key not in ("driver", "lease_s", "description")
-        }
+        settings = {key: value for key, value in table.items() if key not in ("driver", "lease_s", "description")}
         described = SimAxes.describe(name, msgspec.convert(settings, SimAxes.Settings))
         assert described.tick_hz == rate_hz
         assert [axis["name"] for axis in table["axis"]] == [axis["name"] for axis in before[name]["axis"]]

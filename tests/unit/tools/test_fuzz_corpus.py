@@ -1,4 +1,6 @@
-"""Each decoder takes its seeds, what was once found, and random changes of both, without anything but what it may raise."""
+"""Each decoder takes its seeds, what was once found, and random changes of both, without anything but what it may
+raise.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +13,20 @@ from sioms.bench.decoders import TARGETS, feed
 from sioms.bench.search import changed
 
 FOUND: dict[str, list[bytes]] = {
-    "message": [b"\x91" * 30_000, b"\xdd\xff\xff\xff\xff", b"\xc7\x00\x05", b"\x93\x01\x01\xa3\xed\xa0\x80", b"\x92\x01" + b"\x91" * 1015],
+    "message": [
+        b"\x91" * 30_000,
+        b"\xdd\xff\xff\xff\xff",
+        b"\xc7\x00\x05",
+        b"\x93\x01\x01\xa3\xed\xa0\x80",
+        b"\x92\x01" + b"\x91" * 1015,
+    ],
     "toml": [b"x = " + b"[" * 2000, b"x = " + b"9" * 5000, b"\xff"],
     "json": [b"[" * 100_000, b'{"a":' * 2000],
-    "config": [b"[device.a]\ndriver = 'b'\nx = " + b"[" * 2000 + b"]" * 2000, b"device = 1979-05-27\n", b"[device]\n[[node]]\n"],
+    "config": [
+        b"[device.a]\ndriver = 'b'\nx = " + b"[" * 2000 + b"]" * 2000,
+        b"device = 1979-05-27\n",
+        b"[device]\n[[node]]\n",
+    ],
     "trace": [b"\xff\n\n", b'{"sioms_trace": 1}\n{"t": "1", "n": [], "b": "", "d": "<"}\n', b"[" * 100_000],
     "journal of stops": [
         b'{"at":1,"node":"n","device":"d","block":"b","parts":[[0,1000000000000,1]],"stop":true,"by":"a"}\n',
@@ -22,7 +34,7 @@ FOUND: dict[str, list[bytes]] = {
         b'{"at":' + b"9" * 400 + b',"workcell":"","stop":true,"by":"a"}\n',
         b'{"checkpoint":[],"from":1e999}\n',
     ],
-}  # fmt: skip
+}
 """What broke a decoder, or would have."""
 SPAN_S, MOST = 0.3, 500
 

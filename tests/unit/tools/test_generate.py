@@ -35,9 +35,7 @@ def test_every_option_is_in_help_manual_and_completions(tool):
 def test_every_command_is_in_manual_and_completions():
     for name in COMMANDS:
         assert f".B {name}\n" in FILES["docs/man/sioms.1"]
-        assert all(
-            name in FILES[f"etc/completion/{shell}"] for shell in ("sioms.bash", "_sioms", "sioms.fish")
-        )
+        assert all(name in FILES[f"etc/completion/{shell}"] for shell in ("sioms.bash", "_sioms", "sioms.fish"))
 
 
 def test_the_options_of_the_daemon_are_those_that_it_takes():
@@ -50,9 +48,7 @@ def test_the_options_of_the_daemon_are_those_that_it_takes():
 @pytest.mark.skipif(shutil.which("groff") is None, reason="no groff here")
 @pytest.mark.parametrize("path", [path for path in FILES if path.startswith("docs/man")])
 def test_groff_has_nothing_to_say(path):
-    done = subprocess.run(
-        ["groff", "-man", "-ww", "-Tutf8", "-z", TREE / path], capture_output=True, text=True
-    )
+    done = subprocess.run(["groff", "-man", "-ww", "-Tutf8", "-z", TREE / path], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
 
 

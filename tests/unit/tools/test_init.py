@@ -82,9 +82,7 @@ def test_what_is_plugged_in_is_a_device_when_it_is_recognised_and_a_comment_othe
         (["--port", "/dev/x"], "--port goes with --driver"),
     ],
 )
-def test_what_cannot_be_is_a_sentence(
-    words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_is_a_sentence(words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["init", *words]) == 1
     assert sentence in capsys.readouterr().err
     assert not Path("workcell.toml").exists()

@@ -30,8 +30,13 @@ def status(stopped_ns: int = 0, **device: Any) -> dict[str, Any]:
         **device,
     }
     return {
-        "workcell": "demo", "pid": 42, "stopped_ns": stopped_ns, "stop_source": "eva: hand", "devices": [one], "sessions": [],
-    }  # fmt: skip
+        "workcell": "demo",
+        "pid": 42,
+        "stopped_ns": stopped_ns,
+        "stop_source": "eva: hand",
+        "devices": [one],
+        "sessions": [],
+    }
 
 
 def node(node_class: NodeClass, names: list[str], reading: Any, **rest: Any) -> NodeView:

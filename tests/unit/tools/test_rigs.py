@@ -11,7 +11,8 @@ from sioms.check.rigs import MAP_RIGS, RIGS, Axis, Rig, find_rig, rig_of
 
 KEYS = {
     "driver": "scale.py",
-    "tables": '[device.scale]\ndriver = "{driver}"\nline = { serial = "{port}", baud = 9600, parity = "E", stop_bits = 2 }\n',
+    "tables": '[device.scale]\ndriver = "{driver}"\nline = { serial = "{port}", baud = 9600, parity = "E", stop_bits = '
+    "2 }\n",
     "simulator": ["scale_device.py", "--fast"],
     "axes": [{"node": "scale.x", "reach": 0.5}],
 }
@@ -55,9 +56,7 @@ def test_every_rig_is_whole(rig: Rig) -> None:
 def test_the_bench_finds_its_drivers_and_makes_them_faster(case: Case) -> None:
     rig = find_rig(case.rig)
     assert rig is not None
-    device = tomllib.loads(faster(rig, case.baud, case.poll_hz).configured("/dev/x", ""))["device"][
-        rig.device
-    ]
+    device = tomllib.loads(faster(rig, case.baud, case.poll_hz).configured("/dev/x", ""))["device"][rig.device]
     assert device["line"]["baud"] == case.baud and device["poll_hz"] == case.poll_hz
 
 

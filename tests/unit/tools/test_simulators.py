@@ -134,9 +134,7 @@ class TestOrientalAz:
         clock = Clock()
         return clock, oriental_az.Drive(clock, timeout_s)
 
-    def operate(
-        self, drive: oriental_az.Drive, kind: int, position: int, speed: int, trigger: int = 1
-    ) -> None:
+    def operate(self, drive: oriental_az.Drive, kind: int, position: int, speed: int, trigger: int = 1) -> None:
         values = [0, kind, position, speed, 100000, 100000, 1000, trigger]
         drive.write(16, 0x58, [word for v in values for word in (v >> 16 & 0xFFFF, v & 0xFFFF)])
 
@@ -337,9 +335,7 @@ def test_the_schunk_box_takes_one_segment_for_one_command_and_loses_all_with_its
 
 def test_the_ati_sensor_serves_the_last_client_and_its_bias_goes_with_its_power() -> None:
     clock = Clock()
-    sensor = ati_rdt.Sensor(
-        ati_rdt.options_parser().parse_args(["--model", "axia", "--internal-hz", "488"]), clock
-    )
+    sensor = ati_rdt.Sensor(ati_rdt.options_parser().parse_args(["--model", "axia", "--internal-hz", "488"]), clock)
     sensor.load.put(clock(), (1, 2, 3, 0, 0, 0))
     start = bytes.fromhex("1234000200000000")
     sent: list[tuple[bytes, ati_rdt.Address]] = []

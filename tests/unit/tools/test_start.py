@@ -27,8 +27,6 @@ HEAVY = {
 @pytest.mark.parametrize("tool", ["devin", "devout", "sdev", "smarkers"])
 def test_nothing_heavy_is_loaded(tool):
     script = f"import sys; sys.path.append({str(TREE)!r}); import sioms.tools.{tool}; print(*sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-I", "-S", "-c", script], capture_output=True, text=True, check=True
-    )
+    done = subprocess.run([sys.executable, "-I", "-S", "-c", script], capture_output=True, text=True, check=True)
     assert f"sioms.tools.{tool}" in done.stdout.split()
     assert HEAVY.isdisjoint(done.stdout.split())

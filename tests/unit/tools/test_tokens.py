@@ -25,9 +25,7 @@ def test_a_word_without_its_end_waits_for_it():
     assert tokens.numbers == [(1, 1), (25, 1)]
 
 
-@pytest.mark.parametrize(
-    "word", ["foo", "nan", "inf", "-infinity", "1_0", "0x10", "1,5", "\u0663", "\ufeff1"]
-)
+@pytest.mark.parametrize("word", ["foo", "nan", "inf", "-infinity", "1_0", "0x10", "1,5", "\u0663", "\ufeff1"])
 def test_a_wrong_word_ends_the_stream_behind_the_numbers_before_it(word):
     tokens = fed(b"1 2\n3 ", word.encode() + b" 4\n5\n")
     assert [value for value, _ in tokens.numbers] == [1, 2, 3]

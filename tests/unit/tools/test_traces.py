@@ -11,9 +11,15 @@ from sioms.check.trace_command import configuration
 from sioms.check.traces import BadTrace, Message, Replay, Trace, read_trace
 
 HEADER = {
-    "sioms_trace": 1, "device": "mod0", "driver": "tmcl",
-    "table": {"module": 1140, "line": {"serial": "/dev/ttyUSB0", "baud": 9600}, "axis": [{"name": "x", "homing": True}]},
-}  # fmt: skip
+    "sioms_trace": 1,
+    "device": "mod0",
+    "driver": "tmcl",
+    "table": {
+        "module": 1140,
+        "line": {"serial": "/dev/ttyUSB0", "baud": 9600},
+        "axis": [{"name": "x", "homing": True}],
+    },
+}
 MS = 1_000_000
 
 
@@ -22,9 +28,16 @@ def trace(*messages: tuple[int, str, bytes]) -> Trace:
 
 
 EXCHANGES = trace(
-    (0, ">", b"id"), (2, "<", b"1140"), (10, ">", b"pos"), (12, "<", b"1"), (13, "<", b"0"), (20, ">", b"go"), (22, "<", b"ok"),
-    (30, ">", b"pos"), (33, "<", b"20"),
-)  # fmt: skip
+    (0, ">", b"id"),
+    (2, "<", b"1140"),
+    (10, ">", b"pos"),
+    (12, "<", b"1"),
+    (13, "<", b"0"),
+    (20, ">", b"go"),
+    (22, "<", b"ok"),
+    (30, ">", b"pos"),
+    (33, "<", b"20"),
+)
 
 
 def test_requests_draw_the_replies_of_their_time() -> None:
@@ -84,13 +97,14 @@ def test_a_device_that_pushes_goes_on() -> None:
 def test_a_file_is_read_up_to_where_it_was_cut(tmp_path: Path) -> None:
     path = tmp_path / "x.trace"
     lines = [
-        json.dumps(HEADER), '{"t":1,"n":0,"e":"open","text":"/dev/ttyUSB0"}', '{"t":2,"n":0,"d":">","b":"0102"}', '{"t":3,"n":0',
-    ]  # fmt: skip
+        json.dumps(HEADER),
+        '{"t":1,"n":0,"e":"open","text":"/dev/ttyUSB0"}',
+        '{"t":2,"n":0,"d":">","b":"0102"}',
+        '{"t":3,"n":0',
+    ]
     path.write_text("\n".join(lines))
     found = read_trace(path)
-    assert found.messages == (Message(2, 0, ">", b"\1\2"),) and found.events == (
-        (1, 0, "open", "/dev/ttyUSB0"),
-    )
+    assert found.messages == (Message(2, 0, ">", b"\1\2"),) and found.events == ((1, 0, "open", "/dev/ttyUSB0"),)
 
 
 @pytest.mark.parametrize(
