@@ -23,6 +23,10 @@ SHORTEST_S = 1e-11
 POSITION_INTERFACE = ruckig.ControlInterface.Position
 VELOCITY_INTERFACE = ruckig.ControlInterface.Velocity
 DONE = (ruckig.Result.Working, ruckig.Result.Finished)
+BESIDE_EDGES = (0.0, 1e-10, 1e-8, 1e-6)
+"""Parts by which the acceleration is reduced where no profile is found. At the border between two forms of profile, as
+for a move of 2 a^3/j^2 from rest to rest, ruckig 0.19 finds neither for some limits, round ones among them.
+"""
 TIME_TOLERANCE_S = 1e-9
 
 Segment = tuple[float, float, float, float, float, float, float]
@@ -188,14 +192,20 @@ class Planner:
         given.current_velocity = [state[1]]
         given.current_acceleration = [state[2]]
         given.max_velocity = [bounds.velocity]
-        given.max_acceleration = [bounds.acceleration]
         given.max_jerk = [bounds.jerk]
-        try:
-            result = self._otg.calculate(given, self._trajectory)
-        except ruckig.RuckigError as e:
-            raise InfeasibleError(str(e).replace("\n", " ").replace("[ruckig] ", "").strip()) from e
-        if result not in DONE:
-            raise InfeasibleError(f"no profile from velocity {state[1]:g} within the limits ({result.name})")
+        reason = ""
+        for less in BESIDE_EDGES:
+            given.max_acceleration = [bounds.acceleration * (1.0 - less)]
+            try:
+                result = self._otg.calculate(given, self._trajectory)
+            except ruckig.RuckigError as error:
+                reason = reason or str(error).replace("\n", " ").replace("[ruckig] ", "").strip()
+            else:
+                if result in DONE:
+                    break
+                reason = reason or f"no profile from velocity {state[1]:g} within the limits ({result.name})"
+        else:
+            raise InfeasibleError(reason)
         return _segments(self._trajectory.profiles[0][0])
 
 

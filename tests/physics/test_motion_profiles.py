@@ -40,6 +40,17 @@ def test_s_curve_durations(d):
     assert move(d, v, a, j).duration == pytest.approx(expected, rel=1e-7)
 
 
+@pytest.mark.parametrize("a", [0.1, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0])
+@pytest.mark.parametrize("j", [10.0, 20.0, 50.0, 100.0, 1000.0])
+@pytest.mark.parametrize("start", [0.0, 0.25])
+def test_the_longest_move_that_only_jerk_bounds(a, j, start):
+    """2 a^3/j^2 from rest to rest takes 4 a/j: there the phase of constant acceleration has just no length."""
+    d = 2 * a**3 / j**2
+    for by in (d, -d):
+        plan = move(start + by, 2.0 * a * a / j, a, j, state=(start, 0.0, 0.0))
+        assert plan.duration == pytest.approx(4 * a / j, rel=1e-5)
+
+
 def test_faster_is_not_possible():
     """A timed move in the closed shortest time is accepted, 0.1 % less is refused."""
     shortest = 1.0 / 2.0 + 2.0 / 5.0 + 5.0 / 100.0
