@@ -105,8 +105,9 @@ def stanza(example: str, port: Port | None, device: str) -> str:
         device: name of the device.
 
     Example:
-        >>> stanza('[device.a]\\ndriver = "x"\\nline = { serial = "/dev/ttyUSB0", baud = 9600 }', Port("/dev/p", "",
-        ()), "b") '[device.b]\\ndriver = "x"\\nline = { serial = "/dev/p", baud = 9600 }'
+        >>> example = '[device.a]\\ndriver = "x"\\nline = { serial = "/dev/ttyUSB0", baud = 9600 }'
+        >>> stanza(example, Port("/dev/p", "", ()), "b")
+        '[device.b]\\ndriver = "x"\\nline = { serial = "/dev/p", baud = 9600 }'
     """
     lines: Sequence[str] = example.splitlines()
     first = next(line for line in lines if line.startswith("[device."))
