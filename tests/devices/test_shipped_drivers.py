@@ -24,7 +24,7 @@ def shipped(request: pytest.FixtureRequest) -> tuple[dict[str, dict[str, Any]], 
     names = [
         item.callspec.params["name"] for item in request.session.items if "shipped" in getattr(item, "fixturenames", ())
     ]
-    _, reports, said = run(*names, "-j", "4")
+    _, reports, said = run(*names, "-j", "3")
     return {report["driver"]: report for report in reports}, said
 
 
