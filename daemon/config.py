@@ -1,7 +1,7 @@
 """The daemon's configuration: TOML text in, validated structs or a list of errors out. Pure.
 
 The daemon validates what it reads itself; the rest of a device's table belongs to the driver and is
-validated by the driver's ``Settings`` in the nursery, so that every device reports its own errors.
+validated by the driver's ``Settings`` in the fork server, so that every device reports its own errors.
 """
 
 from __future__ import annotations

@@ -23,9 +23,9 @@ from sioms.protocol.page import NotReadable, PageReader, set_daemon_state
 from sioms.protocol.verbs import Message, take
 
 from .config import Device
+from .fork_server import ForkServer
 from .loop import Loop, Timer
 from .names import DeviceInfo
-from .nursery import Nursery
 from .patience import Patience
 from .restarts import Restarts
 
@@ -70,7 +70,7 @@ class DriverProcess:
 
     Args:
         loop: the daemon's loop.
-        nursery: returns the nursery of the day.
+        fork_server: returns the fork server of the day.
         device: its configuration.
         info: its description.
         shared: descriptors of latch, request page and marker table, passed to each process.
@@ -80,7 +80,7 @@ class DriverProcess:
     """
 
     def __init__(
-        self, loop: Loop, nursery: Callable[[], Nursery], device: Device, info: DeviceInfo,
+        self, loop: Loop, fork_server: Callable[[], ForkServer], device: Device, info: DeviceInfo,
         shared: Sequence[int], owner: Owner, log: Callable[..., None], options: dict[str, Any],
     ) -> None:  # fmt: skip
         self.device = device
@@ -99,7 +99,7 @@ class DriverProcess:
         self._maps: list[mmap.mmap] = []
         self._readers: list[PageReader] = []
         self._loop = loop
-        self._nursery = nursery
+        self._fork_server = fork_server
         self._ended: Callable[[], None] | None = None
         self._shared = shared
         self._owner = owner
@@ -154,7 +154,7 @@ class DriverProcess:
         self._loop.watch(ours.fileno(), self._receive)  # first, because a spawn may be refused at once
         with theirs:
             try:
-                self._nursery().spawn(
+                self._fork_server().spawn(
                     self.name, self.device.common.driver, self.device.settings, self.generation, options,
                     [theirs.fileno(), *self._shared], partial(self._spawned, self.generation),
                 )  # fmt: skip
@@ -162,7 +162,7 @@ class DriverProcess:
                 self._end(f"its process could not be started: {error.strerror}")
 
     def _spawned(self, generation: int, pid: Any, errno_: int, text: str, fds: list[int]) -> None:
-        if self._sock is None or generation != self.generation:  # ended while the nursery was forking
+        if self._sock is None or generation != self.generation:  # ended while the fork server was forking
             for fd in fds:
                 self._bury(fd)
         elif errno_:

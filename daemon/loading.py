@@ -1,4 +1,4 @@
-"""Loading a configuration: parse it, let a fresh nursery describe every device, check all names.
+"""Loading a configuration: parse it, let a fresh fork server describe every device, check all names.
 
 Everything is checked before anything is touched, and all errors of all devices come together.
 """
@@ -22,17 +22,17 @@ from sioms.protocol.messages import MalformedMessage, unpack_compressed
 from sioms.protocol.text import printable
 
 from .config import Config, parse
+from .fork_server import DIED, ForkServer
+from .fork_server_process import ForkServerProcess
 from .lines import with_lines
 from .loop import Loop, Timer
 from .names import DeviceInfo, NameTable, shared_claims
-from .nursery import DIED, Nursery
-from .nursery_process import NurseryProcess
 from .patience import Patience
 
 LARGEST = 16 << 20
 """Of a configuration [bytes]."""
 LOOK_S = 1.0
-"""How often the nursery that describes is looked at [s]."""
+"""How often the fork server that describes is looked at [s]."""
 TELL_S = 5.0
 """How often it is told that describing takes long [s]."""
 
@@ -60,7 +60,7 @@ class Plan:
 
     config: Config
     names: NameTable
-    nursery: Nursery
+    fork_server: ForkServer
     stop_sources: dict[str, list[list[int]]]
     watched_inputs: dict[str, dict[int, str]]
     alarms: dict[str, list[list[Any]]]
@@ -73,14 +73,14 @@ class Loader:
         loop: the daemon's loop.
         path: of the configuration.
         done: called with the plan (None when there are errors) and the errors.
-        nursery_died: passed on to the nursery.
-        process: for the nursery, already started; None: start one.
+        fork_server_died: passed on to the fork server.
+        process: for the fork server, already started; None: start one.
         slow: told every few seconds how far it has come, from TELL_S on.
     """
 
     def __init__(
         self, loop: Loop, path: str, done: Callable[[Plan | None, list[str]], None],
-        nursery_died: Callable[[Nursery], None], process: NurseryProcess | None = None,
+        fork_server_died: Callable[[ForkServer], None], process: ForkServerProcess | None = None,
         slow: Callable[[str], None] = lambda text: None,
     ) -> None:  # fmt: skip
         self._slow = slow
@@ -90,12 +90,12 @@ class Loader:
         self._loop = loop
         self._path = path
         self._done = partial(_tell, done)
-        self._died = nursery_died
+        self._died = fork_server_died
         self._process = process
         self._text = ""
         self._infos: dict[str, DeviceInfo] = {}
         self._errors: list[str] = []
-        self._nursery: Nursery | None = None
+        self._fork_server: ForkServer | None = None
         self._timer: Timer | None = None
         self._ended = False
 
@@ -117,13 +117,13 @@ class Loader:
         self._config = config
         self._waiting = set(config.devices)
         self._count = len(self._waiting)
-        self._nursery = nursery = Nursery(self._loop, self._died, self._process)
-        self._patience = Patience(nursery.pid)
+        self._fork_server = fork_server = ForkServer(self._loop, self._died, self._process)
+        self._patience = Patience(fork_server.pid)
         self._patience.renew(time.monotonic())
         self._told_s = self._began_s
         self._timer = self._loop.after(LOOK_S, self._look)
         for name, device in config.devices.items():
-            nursery.describe(
+            fork_server.describe(
                 name, device.common.driver, device.settings, config.folder,
                 partial(self._described, name),
             )  # fmt: skip
@@ -146,8 +146,8 @@ class Loader:
         if self._timer is not None:
             self._timer.cancel()
         if plan is None:
-            if self._nursery is not None:
-                self._nursery.close()
+            if self._fork_server is not None:
+                self._fork_server.close()
             with suppress(Exception):  # better an error without its line than none
                 with_lines(self._text, errors)
         self._done(plan, errors)
@@ -167,7 +167,7 @@ class Loader:
             try:
                 self._take(name, *unpack_compressed(value))
             except (MalformedMessage, ValueError, TypeError, LookupError) as error:
-                # A nursery of another version: the software was changed under the running daemon.
+                # A fork server of another version: the software was changed under the running daemon.
                 self._errors.append(f"[device.{name}]: its description is not understood ({error}); restart the daemon")
         if not self._waiting:
             self._guarded(self._finish)
@@ -208,7 +208,7 @@ class Loader:
         sources, alarms = self._stop_sources(names), self._alarms(names)
         if not self._errors:
             self._errors += names.errors
-        if self._errors or self._nursery is None:
+        if self._errors or self._fork_server is None:
             self._end(None, self._errors)
             return
         watched: dict[str, dict[int, str]] = {}
@@ -216,7 +216,7 @@ class Loader:
             if source.on_loss == "stop":
                 node = names.nodes[source.node]
                 watched.setdefault(node.device, {}).setdefault(node.block, source.node)
-        self._end(Plan(self._config, names, self._nursery, sources, watched, alarms), [])
+        self._end(Plan(self._config, names, self._fork_server, sources, watched, alarms), [])
 
     def _stop_sources(self, names: NameTable) -> dict[str, list[list[int]]]:
         found: dict[str, list[list[int]]] = {}

@@ -6,13 +6,13 @@ import sys
 
 from sioms.safe_path import leave_working_directory
 
-from .nursery_process import start_nursery
+from .fork_server_process import start_fork_server
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the daemon, or check a configuration; return the exit status."""
     leave_working_directory()
-    nursery = start_nursery()  # it imports numpy and the motion core while we import; it ends when we do
+    fork_server = start_fork_server()  # it imports numpy and the motion core while we import; it ends when we do
     import argparse
     import signal
 
@@ -30,8 +30,8 @@ def main(argv: list[str] | None = None) -> int:
     from .service import check, serve
 
     if options.check:
-        return check(options.config, nursery)
-    return serve(options.config, options.socket, options.log_level, nursery)
+        return check(options.config, fork_server)
+    return serve(options.config, options.socket, options.log_level, fork_server)
 
 
 if __name__ == "__main__":

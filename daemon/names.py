@@ -18,7 +18,7 @@ from .config import NodeTable
 
 @dataclass(frozen=True, slots=True)
 class BlockInfo:
-    """A block as the nursery described it."""
+    """A block as the fork server described it."""
 
     name: str
     node_class: NodeClass
@@ -30,7 +30,7 @@ class BlockInfo:
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """A device as the nursery described it."""
+    """A device as the fork server described it."""
 
     name: str
     driver: str
@@ -59,7 +59,7 @@ class DeviceInfo:
 
     @classmethod
     def unpack(cls, name: str, driver: str, packed: list) -> DeviceInfo:  # type: ignore[type-arg]
-        """Make it from the nursery's reply."""
+        """Make it from the fork server's reply."""
         blocks, tick_hz, inputs, lease_s, claims, made_of = packed
         return cls(
             name,

@@ -22,14 +22,14 @@ from . import suspended
 from .clients import Clients
 from .config import Config
 from .devices import DriverProcess, State
+from .fork_server import ForkServer
+from .fork_server_process import ForkServerProcess
 from .listening import Listening
 from .loading import Loader, Plan, mistake
 from .log import Log
 from .loop import Loop
 from .names import NameTable, Node
 from .notify import ServiceManager
-from .nursery import Nursery
-from .nursery_process import NurseryProcess
 from .realtime import LOOK_S, Budget, make_ordinary, realtime_use
 from .rights import Rights
 from .shared import Shared
@@ -47,12 +47,12 @@ class Server:
         config_path: where the configuration is read from, again at every reload.
         log: its log.
         record: what has been stopped before it, and is so still.
-        process: the nursery for the first configuration, already started; None: start one.
+        process: the fork server for the first configuration, already started; None: start one.
     """
 
     def __init__(
         self, loop: Loop, listening: Listening, config_path: str, log: Log,
-        record: StopRecord, process: NurseryProcess | None = None,
+        record: StopRecord, process: ForkServerProcess | None = None,
     ) -> None:  # fmt: skip
         self.loop = loop
         self.log = log
@@ -63,7 +63,7 @@ class Server:
         self.clients = Clients(self, listening.sock, listening.path)
         self.exit_status = 0
         self._path = config_path
-        self._nursery: Nursery | None = None
+        self._fork_server: ForkServer | None = None
         self._first_process = process
         self._options: dict[str, dict[str, Any]] = {}
         self._watched_inputs: dict[str, dict[int, str]] = {}
@@ -122,7 +122,7 @@ class Server:
                 self._load()
 
         process, self._first_process = self._first_process, None
-        self._loader = Loader(self.loop, self._path, loaded, self._nursery_died, process, self._slow)
+        self._loader = Loader(self.loop, self._path, loaded, self._fork_server_died, process, self._slow)
         self._loader.start()
 
     def _slow(self, progress: str) -> None:
@@ -337,8 +337,8 @@ class Server:
                         key=key,
                         why="it holds from the next start of the daemon on",
                     )
-        names, old = self.names, self._nursery
-        self.config, self.names, self._nursery = plan.config, plan.names, plan.nursery
+        names, old = self.names, self._fork_server
+        self.config, self.names, self._fork_server = plan.config, plan.names, plan.fork_server
         self._watched_inputs = plan.watched_inputs
         self._options = {name: self._options_of(name, plan) for name in plan.config.devices}
         self.clients.take_up_rights(rights)
@@ -384,7 +384,7 @@ class Server:
         if self.config is None or self._ending or name in self.devices or name in self._leaving:
             return
         device = DriverProcess(
-            self.loop, self._current_nursery, self.config.devices[name], self.names.devices[name],
+            self.loop, self._current_fork_server, self.config.devices[name], self.names.devices[name],
             self.shared.fds, self, self.log, self._options[name],
         )  # fmt: skip
         self.devices[name] = device
@@ -405,15 +405,15 @@ class Server:
             self._start(device.name)
         self._maybe_end()
 
-    def _current_nursery(self) -> Nursery:
-        if self._nursery is None:
-            self._nursery = Nursery(self.loop, self._nursery_died)
-        return self._nursery
+    def _current_fork_server(self) -> ForkServer:
+        if self._fork_server is None:
+            self._fork_server = ForkServer(self.loop, self._fork_server_died)
+        return self._fork_server
 
-    def _nursery_died(self, nursery: Nursery) -> None:
-        if nursery is self._nursery and not self._ending:
-            self.log("error", "nursery died")
-            self._nursery = None
+    def _fork_server_died(self, fork_server: ForkServer) -> None:
+        if fork_server is self._fork_server and not self._ending:
+            self.log("error", "fork server died")
+            self._fork_server = None
 
     def _send_input(self, reader: DriverProcess, name: str) -> None:
         node = self.names.nodes[name]
@@ -441,8 +441,8 @@ class Server:
 
     def _maybe_end(self) -> None:
         if self._ending and not self._leaving:
-            if self._nursery is not None:
-                self._nursery.close()
+            if self._fork_server is not None:
+                self._fork_server.close()
             self.loop.running = False
 
     def _alive(self) -> None:
@@ -454,8 +454,8 @@ class Server:
             self.stop_workcell(source)  # a driver could not keep a stop
         for device in list(self.devices.values()):
             device.check(now)
-        if self._nursery is not None and (why := self._nursery.check(now / 1e9)):
-            self.log("error", "nursery killed", why=why)
+        if self._fork_server is not None and (why := self._fork_server.check(now / 1e9)):
+            self.log("error", "fork server killed", why=why)
         self.loop.after(ALIVE_S, self._alive)
 
     def _look_at_budget(self) -> None:

@@ -14,12 +14,12 @@ from contextlib import suppress
 from sioms.protocol.socketpath import socket_path
 
 from .config import Config, parse
+from .fork_server import ForkServer
+from .fork_server_process import ForkServerProcess
 from .listening import Listening
 from .loading import Loader, NotDescribed, Plan
 from .log import Log
 from .loop import Loop
-from .nursery import Nursery
-from .nursery_process import NurseryProcess
 from .realtime import end_promptly
 from .server import Server
 from .stop_record import StopRecord
@@ -30,14 +30,14 @@ MOST_FILES = 65536
 """Descriptors that the daemon asks for, as far as it may: some three for each session and handle."""
 
 
-def serve(config_path: str, given_path: str | None, level: str, process: NurseryProcess) -> int:
+def serve(config_path: str, given_path: str | None, level: str, process: ForkServerProcess) -> int:
     """Run the daemon; return the exit status.
 
     Args:
         config_path: of the configuration.
         given_path: where to listen; None: the configured or default path.
         level: least level that is logged.
-        process: the nursery for the first configuration, just started.
+        process: the fork server for the first configuration, just started.
     """
     log = Log(journal="JOURNAL_STREAM" in os.environ and "NOTIFY_SOCKET" in os.environ, level=level)
     loop = Loop()
@@ -98,7 +98,7 @@ def _become_prompt(log: Log) -> None:
         log("debug", "runs without SCHED_FIFO", why=error.strerror)
 
 
-def check(path: str, process: NurseryProcess) -> int:
+def check(path: str, process: ForkServerProcess) -> int:
     """Check a configuration and say what is wrong with it; return the exit status."""
     loop = Loop()
     result: list[str] = []
@@ -107,11 +107,11 @@ def check(path: str, process: NurseryProcess) -> int:
         result.extend(errors)
         loop.running = False
         if plan is not None:
-            plan.nursery.close()
+            plan.fork_server.close()
             kinds = len(plan.names.nodes)
             print(f"{path}: good; {len(plan.config.devices)} devices, {kinds} nodes")
 
-    def died(nursery: Nursery) -> None:
+    def died(fork_server: ForkServer) -> None:
         """Nothing to do: the loader's requests have been answered with the death."""
 
     def slow(progress: str) -> None:

@@ -158,10 +158,10 @@ class Daemon:
 
         return wait_for(up, f"device {name} up", timeout_s)
 
-    def nursery(self) -> int:
-        """Return the pid of the nursery: the daemon's child."""
+    def fork_server(self) -> int:
+        """Return the pid of the fork server: the daemon's child."""
         children = Path(f"/proc/{self.pid}/task/{self.pid}/children").read_text().split()
-        return next(int(c) for c in children if "nursery" in Path(f"/proc/{c}/cmdline").read_text())
+        return next(int(c) for c in children if "fork_server" in Path(f"/proc/{c}/cmdline").read_text())
 
     def said(self, pattern: str, timeout_s: float = 20.0) -> str:
         """Wait for a line of its log; return it."""

@@ -22,7 +22,7 @@ __all__ = ["GROUPS", "RIGS", "Axis", "Output", "Rig", "at_work", "group_of"]
 
 LIMITS = "position_min = -1.0\nposition_max = 1.0\n"
 
-GPIO = Path(__file__).with_name("gpio_stand_in.py")
+GPIO = Path(__file__).with_name("fake_gpio.py")
 
 # Rigs of the shipped drivers stand in sioms.check.rigs; that of the GPIO lines on a kernel without simulated ones here.
 RIGS = (

@@ -12,7 +12,7 @@ from steps_rig import carry_out
 
 from sioms.protocol.flags import AnalogStatus
 from sioms.sdk.driver import Driver
-from sioms.sdk.exchange import Aside, Exchange, LinkError, Pause, Send, Step, Steps
+from sioms.sdk.exchange import Exchange, LinkError, Pause, Send, SideExchange, Step, Steps
 
 SATURATED, INVALID, OVERRUN = (int(AnalogStatus[name]) for name in ("SATURATED", "INVALID", "OVERRUN"))
 LOAD = (10.0, -20.0, 30.0, 1.0, -2.0, 3.0)
@@ -29,7 +29,7 @@ class Rig:
         driver.describe("f0", settings)
         self.driver: Any = driver.variant(settings)("f0", settings, self)
         self.on_line: Callable[[bytes], bytes] = lambda data: b""
-        self.aside: Callable[[bytes], bytes] = lambda data: b""
+        self.side_line: Callable[[bytes], bytes] = lambda data: b""
         self.delay_s = 0.0002
         self.rest = b""
 
@@ -60,8 +60,8 @@ class Rig:
             case Send(data):
                 self.now_s += len(data) * 10 / 19200
                 self.on_line(data)
-            case Aside():
-                return self._ask(step.exchange, self.aside)
+            case SideExchange():
+                return self._ask(step.exchange, self.side_line)
             case Exchange():
                 return self._ask(step, self.on_line)
         return None

@@ -21,6 +21,24 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from ownership_fakes import (
+    CLOCK,
+    CONFIG,
+    DAEMON_LEASE_S,
+    DRIVERS,
+    FIRST_UID,
+    LEASE_S,
+    NAMES,
+    PROCESSES,
+    Client,
+    Flusher,
+    ForkServer,
+    Listener,
+    Patience,
+    Process,
+    Timer,
+    Users,
+)
 from ownership_model import (
     ABSENT,
     CLIENTS,
@@ -39,24 +57,6 @@ from ownership_model import (
     Action,
     State,
 )
-from ownership_stand_ins import (
-    CLOCK,
-    CONFIG,
-    DAEMON_LEASE_S,
-    DRIVERS,
-    FIRST_UID,
-    LEASE_S,
-    NAMES,
-    PROCESSES,
-    Client,
-    Flusher,
-    Listener,
-    Nursery,
-    Patience,
-    Process,
-    Timer,
-    Users,
-)
 
 import sioms.daemon.clients
 import sioms.daemon.devices
@@ -64,7 +64,7 @@ import sioms.daemon.loading
 import sioms.daemon.server
 import sioms.daemon.stop_record
 import sioms.daemon.suspended
-import sioms.sdk.nursery
+import sioms.sdk.fork_server
 from sioms import command
 from sioms.daemon.devices import DriverProcess
 from sioms.daemon.log import Log
@@ -553,12 +553,12 @@ def cells() -> Iterator[Callable[[], Cell]]:
         patch.setattr(sioms.daemon.clients, "Users", Users)
         patch.setattr(sioms.daemon.clients, "peer_of", _peer_of)
         patch.setattr(sioms.daemon.clients, "pidfd_of", _pidfd_of)
-        patch.setattr(sioms.daemon.loading, "Nursery", Nursery)
-        patch.setattr(sioms.daemon.server, "Nursery", Nursery)
+        patch.setattr(sioms.daemon.loading, "ForkServer", ForkServer)
+        patch.setattr(sioms.daemon.server, "ForkServer", ForkServer)
         patch.setattr(sioms.daemon.stop_record, "_Flusher", Flusher)
         patch.setattr(sioms.daemon.devices, "Patience", Patience)
         patch.setattr(sioms.daemon.suspended, "is_stopped", SUSPENDED.__contains__)
-        patch.setattr(sioms.sdk.nursery, "find_driver", lambda name, folder: DRIVERS[name])
+        patch.setattr(sioms.sdk.fork_server, "find_driver", lambda name, folder: DRIVERS[name])
         patch.setattr(signal, "pidfd_send_signal", _send_signal)
         try:
             yield make

@@ -20,7 +20,7 @@ FIRST_NS, AGAIN_NS = 600_000_000, 200_000_000
 second.
 """
 LEASE_S = 0.5
-LADDER = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+SPEEDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Speeds, as shares of the axis' limit."""
 STEP_S = 0.1
 """A step is as long as the jog's way in this time."""
@@ -37,7 +37,7 @@ class Jogger:
     def __init__(self) -> None:
         self._which: tuple[str, int] | None = None
         self._node: Any = None
-        self._rung = LADDER.index(0.1)
+        self._index = SPEEDS.index(0.1)
         self._way = 0
         self._until_ns = 0
         self._limit = 1.0
@@ -51,7 +51,7 @@ class Jogger:
 
     @property
     def _speed(self) -> float:
-        return LADDER[self._rung] * self._limit
+        return SPEEDS[self._index] * self._limit
 
     def choose(self, nodes: Sequence[NodeView]) -> str:
         """Go on to the next axis of the workcell; let go of the one before; return what to tell."""
@@ -103,7 +103,7 @@ class Jogger:
     def press(self, key: str, now_ns: int) -> str:
         """Obey one of KEYS; return what to tell."""
         if key in ("+", "-"):
-            self._rung = max(0, min(len(LADDER) - 1, self._rung + (1 if key == "+" else -1)))
+            self._index = max(0, min(len(SPEEDS) - 1, self._index + (1 if key == "+" else -1)))
             return self._go(self._way) if self._way else ""
         if self._node is None:
             return "take the axis first: c"

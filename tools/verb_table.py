@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 
-from sioms.protocol.driver_verbs import FROM_DRIVER, TO_DRIVER, TO_NURSERY
+from sioms.protocol.driver_verbs import FROM_DRIVER, TO_DRIVER, TO_FORK_SERVER
 from sioms.protocol.flags import REQUESTS, Request, Right
 from sioms.protocol.verbs import FROM_CLIENT, ON_HANDLE, Message, Socket
 
@@ -12,7 +12,7 @@ SOCKETS = {
     "Session: a client's connection to the daemon": (FROM_CLIENT,),
     "Handle: an open node, from the client to its driver": (ON_HANDLE,),
     "Control socket of a driver": (TO_DRIVER, FROM_DRIVER),
-    "Control socket of the fork server": (TO_NURSERY,),
+    "Control socket of the fork server": (TO_FORK_SERVER,),
 }
 HEAD = """# Messages
 

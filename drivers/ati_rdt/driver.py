@@ -23,7 +23,7 @@ from sioms.sdk.codec.sequence import SequenceWatch
 from sioms.sdk.datagram import split_address
 from sioms.sdk.device_clock import DeviceClock
 from sioms.sdk.driver import Kit, StreamDriver
-from sioms.sdk.exchange import Aside, DeviceError, Exchange, LinkError, Pause, Send, Step, Steps
+from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Pause, Send, SideExchange, Step, Steps
 from sioms.sdk.force_torque import ForceBlock, ForceSettings, check_whole, force_spec
 from sioms.sdk.golden import Golden
 from sioms.sdk.settings import LineSettings
@@ -117,7 +117,7 @@ class AtiRdt(StreamDriver):
         super().__init__(name, settings, kit)
         self.line = settings.line
         self._page_host = "" if settings.page == "none" else _page_host(settings)
-        self.aside = LineSettings(tcp=self._page_host) if self._page_host else None
+        self.side_line = LineSettings(tcp=self._page_host) if self._page_host else None
         self.silence_s = 3 / settings.rate_hz + MARGIN_S
         self._block = ForceBlock(self.describe(name, settings).blocks[0], name, kit)
         self._model = rdt.Model(settings.model or "net")
@@ -198,7 +198,7 @@ class AtiRdt(StreamDriver):
             return
         self._skipped_pages = 0
         try:
-            page: rdt.SensorPage = yield Aside(self._get_page())
+            page: rdt.SensorPage = yield SideExchange(self._get_page())
         except (LinkError, DeviceError):
             self._failed_pages = min(2 * self._failed_pages + 1, 11)  # once a minute in the end
             return
@@ -296,7 +296,7 @@ class AtiRdt(StreamDriver):
                 break
             yield Pause(BIAS_PAUSE_S)
             try:
-                page: rdt.SensorPage = yield Aside(self._get_page())
+                page: rdt.SensorPage = yield SideExchange(self._get_page())
             except LinkError as error:
                 self.kit.log("warning", f"{self.name}: the bias could not be looked up: {error}")
                 break
@@ -314,7 +314,7 @@ class AtiRdt(StreamDriver):
         """Read the sensor's page, and take from it what is needed."""
         self._changed = self._known = ""
         try:
-            page: rdt.SensorPage = yield Aside(self._get_page())
+            page: rdt.SensorPage = yield SideExchange(self._get_page())
         except LinkError as error:
             raise LinkError(f"identify {self.name}: {error}") from None
         before, self._page = self._page, page

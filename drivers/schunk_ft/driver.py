@@ -18,7 +18,7 @@ from sioms.sdk.codec.sequence import SequenceRestart, SequenceWatch
 from sioms.sdk.datagram import split_address
 from sioms.sdk.device_clock import DeviceClock
 from sioms.sdk.driver import Kit, Refusal, StreamDriver
-from sioms.sdk.exchange import Aside, DeviceError, Exchange, LinkError, Steps
+from sioms.sdk.exchange import DeviceError, Exchange, LinkError, SideExchange, Steps
 from sioms.sdk.force_torque import ForceBlock, ForceSettings, check_whole, force_spec
 from sioms.sdk.golden import Golden, Incomplete
 from sioms.sdk.settings import LineSettings
@@ -103,7 +103,7 @@ class SchunkFt(StreamDriver):
 
     def __init__(self, name: str, settings: SchunkFtSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
-        self.aside = settings.line
+        self.side_line = settings.line
         host = (settings.line.tcp or "").rpartition(":")[0]
         self.line = LineSettings(udp=f"{host}:0", local=settings.data)
         self.advice = f"look whether a firewall keeps UDP from {host} to {settings.data} away"
@@ -127,13 +127,13 @@ class SchunkFt(StreamDriver):
             yield from self._tolerated(ifb.act(Command.STOP), anew=True)
             yield from self._identify()
             if settings.tool is not None:
-                yield Aside(ifb.act(Command.TOOL, settings.tool))
+                yield SideExchange(ifb.act(Command.TOOL, settings.tool))
             if settings.noise_filter is not None:
-                yield Aside(ifb.act(Command.NOISE_FILTER, settings.noise_filter))
+                yield SideExchange(ifb.act(Command.NOISE_FILTER, settings.noise_filter))
             self._sequence.expect_anew(goes_on=True)
             self._clock.expect_anew()
             self.trouble = ""
-            yield Aside(ifb.act(Command.START))
+            yield SideExchange(ifb.act(Command.START))
         except LinkError as error:
             raise LinkError(f"open {self.name}: {error}") from None
         except DeviceError as error:
@@ -193,12 +193,12 @@ class SchunkFt(StreamDriver):
     def _tolerated(self, exchange: Exchange, *, anew: bool = False) -> Steps:
         """Do what the sensor may refuse: a stop when nothing streams."""
         try:
-            yield Aside(exchange, anew)
+            yield SideExchange(exchange, anew)
         except DeviceError:
             return
 
     def _tare(self, command: Command) -> Steps:
-        yield Aside(ifb.act(command))
+        yield SideExchange(ifb.act(command))
         if command is Command.TARE:
             self._block.take_zero()
         else:
@@ -221,9 +221,9 @@ class SchunkFt(StreamDriver):
             self._block.lose_zero(f"its tare may be gone: {why}")
 
     def _identify(self) -> Steps:
-        product: str = (yield Aside(ifb.get(ifb.PRODUCT))).rstrip(b"\0").decode("ascii", "replace")
-        unit: bytes = yield Aside(ifb.get(ifb.UNIT))
-        firmware: str = (yield Aside(ifb.get(ifb.FIRMWARE))).rstrip(b"\0").decode("ascii", "replace")
+        product: str = (yield SideExchange(ifb.get(ifb.PRODUCT))).rstrip(b"\0").decode("ascii", "replace")
+        unit: bytes = yield SideExchange(ifb.get(ifb.UNIT))
+        firmware: str = (yield SideExchange(ifb.get(ifb.FIRMWARE))).rstrip(b"\0").decode("ascii", "replace")
         if self.settings.product and product != self.settings.product:
             raise _not_this(f"calls itself {product!r}; the configuration says {self.settings.product!r}")
         known = f"{product}, firmware {firmware}"

@@ -35,7 +35,7 @@ from sioms.drivers.schunk_ft.codec import parse as parse_schunk
 from sioms.lab.arrays import UnreadableError, read_mat, read_npz
 from sioms.plant.effects import EffectsError, parse_effects
 from sioms.protocol import wire
-from sioms.protocol.driver_verbs import FROM_DRIVER, TO_DRIVER, TO_NURSERY, DriverVerb, NurseryVerb
+from sioms.protocol.driver_verbs import FROM_DRIVER, TO_DRIVER, TO_FORK_SERVER, DriverVerb, ForkServerVerb
 from sioms.protocol.messages import (
     MAX_PACKET,
     ClientVerb,
@@ -58,9 +58,9 @@ from sioms.reconcile.files.table import load_table
 from sioms.reconcile.live.force import read_stand
 from sioms.sdk.exchange import DeviceError, LinkError
 from sioms.sdk.golden import Golden, Incomplete, read_reply
-from sioms.sdk.keeping import Contents, Entry
-from sioms.sdk.keeping import decode as decode_positions
-from sioms.sdk.keeping import encode as encode_positions
+from sioms.sdk.persistence import Contents, Entry
+from sioms.sdk.persistence import decode as decode_positions
+from sioms.sdk.persistence import encode as encode_positions
 from sioms.tactile.cylinder import Cylinder
 from sioms.tactile.files import read_recording
 from sioms.tactile.finger import from_toml, nominal_finger, to_toml
@@ -100,7 +100,7 @@ def _message(data: bytes) -> None:
     assert repr(message) == repr(plain) or len(data) > MAX_PACKET
     assert shown(message).isprintable()
     assert repr(decode(encode(*message))) == repr(message)
-    verbs = (FROM_CLIENT, ON_HANDLE, TO_DRIVER, FROM_DRIVER, TO_NURSERY)[len(data) % 5]
+    verbs = (FROM_CLIENT, ON_HANDLE, TO_DRIVER, FROM_DRIVER, TO_FORK_SERVER)[len(data) % 5]
     try:
         _, taken = take(data, verbs)
     except MalformedMessage as error:
@@ -263,7 +263,7 @@ TARGETS = {
             encode(HandleVerb.IOCTL, 2, 23, {"position_max": [0.2, None]}, 0.0),
             encode(HandleVerb.WRITE, 1, 0, None, bytes(144)),
             encode(DriverVerb.LOG, 0, "error", "no"),
-            encode(NurseryVerb.DESCRIBE, 1, "a", "b", {"c": [1, -5, True]}, "/"),
+            encode(ForkServerVerb.DESCRIBE, 1, "a", "b", {"c": [1, -5, True]}, "/"),
             b"\x95\x02\x01\x1b" + b"\x91" * 40 + b"\xc0\x00",
             msgpack.packb([1, 1, msgpack.ExtType(5, b"x"), 1 << 63]),
         ],

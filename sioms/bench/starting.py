@@ -35,7 +35,7 @@ def bench_start(options: Options, report: Report) -> None:
             starts.append(daemon.ready_ns - daemon.start_ns)
             if not sizes:
                 pids = {"daemon": daemon.pid, **daemon.device_pids()}
-                pids["nursery"] = _nursery(daemon.pid, set(pids.values()))
+                pids["fork server"] = _fork_server(daemon.pid, set(pids.values()))
                 cpu = CpuTimes(pids)
                 time.sleep(options.count(1, 10))
                 shares = cpu.shares()
@@ -52,14 +52,14 @@ def bench_start(options: Options, report: Report) -> None:
         bar = Bar("value", 25 * 1024) if who == "daemon" else Bar("value", 12 * 1024)
         kind = "rss" if who == "daemon" else "private"
         notes = f"rss {size['rss']} pss {size['pss']} private {size['private']}"
-        bars = [] if who == "nursery" else [bar]
+        bars = [] if who == "fork server" else [bar]
         report.value(f"{kind} memory of {who}", size[kind], "KiB", bars=bars, notes=notes)
     for who, share in shares.items():
         report.value(f"processor share of idle {who}", 100 * share, "%")
 
 
-def _nursery(daemon_pid: int, others: set[int]) -> int:
-    """Return the pid of the nursery: the child of the daemon."""
+def _fork_server(daemon_pid: int, others: set[int]) -> int:
+    """Return the pid of the fork server: the child of the daemon."""
     children = Path(f"/proc/{daemon_pid}/task/{daemon_pid}/children").read_text().split()
     return next(int(pid) for pid in children if int(pid) not in others)
 

@@ -273,13 +273,13 @@ class AxisVerbs(NodeVerbs[AxisSnapshot]):
         return await AxisVerbs.command(self, axis, position=step, relative=True, **words)
 
     @verb
-    async def particulars(self) -> dict[str, list[float]]:
+    async def diagnostics(self) -> dict[str, list[float]]:
         """Return what readings do not tell, one value an axis: raw and offset [unit], retries and misses.
 
         ``raw`` is what the device counts; ``raw + offset`` is the position; ``retries`` are those of the last
         point move, ``misses`` all since the driver started.
         """
-        value: dict[str, list[float]] = await self._ask(Request.GET_PARTICULARS)
+        value: dict[str, list[float]] = await self._ask(Request.GET_DIAGNOSTICS)
         return value
 
     @verb

@@ -346,7 +346,7 @@ class Bank(ABC):
         self._settle()
         return bool(self._idle(np.asarray(axes, dtype=np.int64)).all())
 
-    def particulars(self, axes: AxesLike) -> dict[str, list[float]]:
+    def diagnostics(self, axes: AxesLike) -> dict[str, list[float]]:
         """Return what the readings do not tell of these axes, by name.
 
         Raw is what the device counts, offset what makes a position of it; retries belong to the last point

@@ -31,7 +31,7 @@ class DriverVerb(IntEnum):
     LOG = 25
 
 
-class NurseryVerb(IntEnum):
+class ForkServerVerb(IntEnum):
     """Between the daemon and the fork server."""
 
     DESCRIBE = 1
@@ -154,10 +154,10 @@ class LogLine(Message, on=FROM_DRIVER, verb=DriverVerb.LOG, notice=True):
 
 # --- from the daemon to the fork server ----------------------------------------------------------
 
-TO_NURSERY = Socket("daemon", "fork server", ("serving",))
+TO_FORK_SERVER = Socket("daemon", "fork server", ("serving",))
 
 
-class Describe(Message, on=TO_NURSERY, verb=NurseryVerb.DESCRIBE, query=True):
+class Describe(Message, on=TO_FORK_SERVER, verb=ForkServerVerb.DESCRIBE, query=True):
     """Check the settings of a device and describe it. Answer: [errors, description], packed and compressed by zlib."""
 
     device: Text
@@ -166,7 +166,7 @@ class Describe(Message, on=TO_NURSERY, verb=NurseryVerb.DESCRIBE, query=True):
     folder: Text
 
 
-class Spawn(Message, on=TO_NURSERY, verb=NurseryVerb.SPAWN):
+class Spawn(Message, on=TO_FORK_SERVER, verb=ForkServerVerb.SPAWN):
     """Fork a driver; descriptors: control socket, latch, stop-request file, file of the requests taken, markers,
     journal.
 

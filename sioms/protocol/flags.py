@@ -128,7 +128,7 @@ class Request(IntEnum):
     FLUSH = 25
     CANCEL_WAITS = 26
     GET_STATISTICS = 27
-    GET_PARTICULARS = 28
+    GET_DIAGNOSTICS = 28
 
 
 class Access(IntFlag):
@@ -175,7 +175,7 @@ REQUESTS: dict[int, tuple[Right, bool, bool, str]] = {
     Request.FLUSH: (Right.WRITE, True, False, "empty the buffers; the running command goes on"),
     Request.CANCEL_WAITS: (Right.WRITE | Right.ADMINISTER, False, False, "end the waits of all sessions on the node"),
     Request.GET_STATISTICS: (Right.READ, False, True, "tell tick times and link counters"),
-    Request.GET_PARTICULARS: (Right.READ, False, True, "tell what readings do not"),
+    Request.GET_DIAGNOSTICS: (Right.READ, False, True, "tell what readings do not"),
 }
 """The table of requests: any of which rights it takes; whether it needs the output node itself, not its read-only
 companion; whether it only looks (else a reading after the answer shows its effect); what it does.

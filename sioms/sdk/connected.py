@@ -69,10 +69,10 @@ class Connected:
             self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
             return False
         connection, self._connecting = self._connecting, None
-        aside = self._base.aside
+        side_line = self._base.side_line
         self.line = Line(
             connection, self._gap_s, self._recovery_s, self.counters, self.unsolicited(),
-            None if aside is None else SideConnection(aside), partial(self._log, "warning"),
+            None if side_line is None else SideConnection(side_line), partial(self._log, "warning"),
         )  # fmt: skip
         self._loop.watch(connection.fd, self._readable)
         self.connected(now_ns)

@@ -279,7 +279,7 @@ class LineDriver(Driver):
 
     Attributes:
         line: the line's settings.
-        aside: as of StreamDriver.
+        side_line: as of StreamDriver.
         overheard: takes bytes that no exchange waits for, and the time [ns]: for devices that also speak unasked
             (alarms); None counts them as noise.
         gap_s: silence on the line before each request [s].
@@ -288,7 +288,7 @@ class LineDriver(Driver):
     """
 
     line: LineSettings
-    aside: LineSettings | None = None
+    side_line: LineSettings | None = None
     overheard: Callable[[bytes, int], None] | None = None
     gap_s: float = 0.0
     recovery_s: float = 0.05
@@ -309,7 +309,7 @@ class StreamDriver(Driver):
 
     Attributes:
         line: the line's settings; the samples come on it.
-        aside: a TCP connection beside it, for steps that are :class:`~sioms.sdk.exchange.Aside`.
+        side_line: a TCP connection beside it, for steps that are :class:`~sioms.sdk.exchange.SideExchange`.
         heartbeat_s: period of ``heartbeat`` [s], 0 = never.
         silence_s: without a good frame for this long the link is lost [s].
         advice: what to look at when a stream was started and nothing comes.
@@ -318,7 +318,7 @@ class StreamDriver(Driver):
     """
 
     line: LineSettings
-    aside: LineSettings | None = None
+    side_line: LineSettings | None = None
     heartbeat_s: float = 0.0
     silence_s: float = 0.5
     advice: str = ""

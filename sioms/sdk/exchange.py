@@ -1,7 +1,7 @@
 """What a driver says to its line: exchanges, as values. Pure; the kit does the I/O.
 
 A driver's hooks are generators: they yield an :class:`Exchange` (or a :class:`Send`, a :class:`Pause`, an
-:class:`Aside`) and are resumed with the decoded reply. The kit owns time-outs, silence, draining,
+:class:`SideExchange`) and are resumed with the decoded reply. The kit owns time-outs, silence, draining,
 repetition, reconnection and the serving of clients in between, so a driver has no sleeps, no
 retries and no threads, and its tests need no line: they resume the generator themselves.
 
@@ -111,8 +111,8 @@ class Pause:
 
 
 @dataclass(frozen=True, slots=True)
-class Aside:
-    """An exchange on the driver's connection beside its line (``StreamDriver.aside``): a web page, a command port.
+class SideExchange:
+    """An exchange on the driver's connection beside its line (``StreamDriver.side_line``): a web page, a command port.
 
     The reply may end with the connection: ``decode`` then gets what has come.
 
@@ -125,7 +125,7 @@ class Aside:
     anew: bool = False
 
 
-Step = Exchange | Send | Pause | Aside
+Step = Exchange | Send | Pause | SideExchange
 Steps = Generator[Step, Any, None]
 """What a hook returns: a generator of steps."""
 

@@ -17,12 +17,12 @@ from itertools import count
 from typing import Any
 
 from .connection import Connection
-from .exchange import Aside, DeviceError, Exchange, HookError, LinkError, Pause, Send, Step, Steps
+from .exchange import DeviceError, Exchange, HookError, LinkError, Pause, Send, SideExchange, Step, Steps
 from .side_connection import SideConnection
 
 ATTEMPTS = 2
 """Times a repeatable request is sent before its exchange counts as failed."""
-LOOK_ASIDE_NS = 1_000_000
+SIDE_POLL_NS = 1_000_000
 """How often the connection beside the line is looked at while something is asked there, which is at opening."""
 STRAY = 8
 """Bytes in front of a reply that may be skipped where a checksum says that the rest is one: an adapter that switches
@@ -81,7 +81,7 @@ class _State(Enum):
     """Waiting until ``_until_ns``: silence before a request, or a Pause."""
     EXPECTING = auto()
     RECOVERING = auto()
-    ASIDE = auto()
+    SIDE_LINE = auto()
 
 
 @dataclass(slots=True)
@@ -103,13 +103,13 @@ class Line:
         recovery_s: silence after a bad or missing reply [s].
         counters: kept over reconnections.
         unsolicited: takes bytes that no exchange waits for; None counts them as noise.
-        aside: the connection beside the line, for a driver that has one.
+        side_line: the connection beside the line, for a driver that has one.
         told: takes what is worth a line in the log.
     """
 
     def __init__(
         self, connection: Connection, gap_s: float, recovery_s: float, counters: Counters,
-        unsolicited: Callable[[bytes, int], None] | None = None, aside: SideConnection | None = None,
+        unsolicited: Callable[[bytes, int], None] | None = None, side_line: SideConnection | None = None,
         told: Callable[[str], None] = lambda text: None,
     ) -> None:  # fmt: skip
         self.connection = connection
@@ -119,7 +119,7 @@ class Line:
         self._gap_ns = int(gap_s * 1e9)
         self._recovery_ns = int(recovery_s * 1e9)
         self._unsolicited = unsolicited
-        self._aside = aside
+        self._side_line = side_line
         self._queue: list[tuple[int, int, Job]] = []
         self._order = count()
         self._running: _Running | None = None
@@ -154,8 +154,8 @@ class Line:
     def close(self) -> None:
         """Release the connections."""
         self.connection.close()
-        if self._aside is not None:
-            self._aside.close()
+        if self._side_line is not None:
+            self._side_line.close()
 
     def abandon(self, reason: str) -> None:
         """End all jobs with a LinkError; the connection is gone."""
@@ -280,8 +280,8 @@ class Line:
                     self._until_ns = min(quiet_ns, self._babble_ns)
                     return
                 self._after_recovery(now_ns)
-            case _State.ASIDE:
-                self._look_aside(now_ns)
+            case _State.SIDE_LINE:
+                self._poll_side_line(now_ns)
 
     # --- inside ----------------------------------------------------------------------------------
 
@@ -332,8 +332,8 @@ class Line:
     def _begin(self, step: Step, now_ns: int) -> None:
         if isinstance(step, Pause):
             self._rest_until(now_ns + int(step.duration_s * 1e9))
-        elif isinstance(step, Aside):
-            self._ask_aside(step, now_ns)
+        elif isinstance(step, SideExchange):
+            self._ask_side_line(step, now_ns)
         elif now_ns < self._quiet_since_ns + self._gap_ns:
             self._rest_until(self._quiet_since_ns + self._gap_ns)
         else:
@@ -372,26 +372,26 @@ class Line:
         self._state = _State.EXPECTING
         self._until_ns = now_ns + on_line_ns + int(step.timeout_s * 1e9)
 
-    def _ask_aside(self, step: Aside, now_ns: int) -> None:
-        if self._aside is None:
-            raise RuntimeError(f"{step.exchange.what}: the driver names no connection aside")
+    def _ask_side_line(self, step: SideExchange, now_ns: int) -> None:
+        if self._side_line is None:
+            raise RuntimeError(f"{step.exchange.what}: the driver has no side line")
         self.counters.requests += 1
         if step.anew:
-            self._aside.close()
-        self._aside.begin(step.exchange, now_ns)
-        self._state, self._until_ns = _State.ASIDE, now_ns
+            self._side_line.close()
+        self._side_line.begin(step.exchange, now_ns)
+        self._state, self._until_ns = _State.SIDE_LINE, now_ns
 
-    def _look_aside(self, now_ns: int) -> None:
-        if self._aside is None:
+    def _poll_side_line(self, now_ns: int) -> None:
+        if self._side_line is None:
             return
         try:
-            found = self._aside.advance(now_ns)
+            found = self._side_line.advance(now_ns)
         except (LinkError, DeviceError) as error:
             self.counters.refused += isinstance(error, DeviceError)
             self._resume(error, now_ns)
             return
         if found is None:
-            self._until_ns = now_ns + LOOK_ASIDE_NS
+            self._until_ns = now_ns + SIDE_POLL_NS
         else:
             self.counters.replies += 1
             self._resume(found[0], now_ns)

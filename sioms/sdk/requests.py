@@ -177,8 +177,8 @@ def _axis_request(
             bank.set_limits(axes, **_limits(argument, what))
         case Request.GET_LIMITS:
             return bank.get_limits(axes)
-        case Request.GET_PARTICULARS:
-            return bank.particulars(axes)
+        case Request.GET_DIAGNOSTICS:
+            return bank.diagnostics(axes)
         case _:
             raise _refuse(errno.ENOTTY, f"{what}: not a request an axis knows")
     service.engine.commands_written(handle.block)

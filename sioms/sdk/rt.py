@@ -134,7 +134,7 @@ def become_realtime(priority: int, gave_up: Callable[[float], None]) -> list[str
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
         except (PermissionError, OSError) as error:
             refused.append(f"SCHED_FIFO priority {priority} ({errno.errorcode.get(error.errno or 0, '?')})")
-    # ONFAULT: the pages shared with the nursery stay shared until they are written.
+    # ONFAULT: the pages shared with the fork server stay shared until they are written.
     if _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
         refused.append(f"mlockall ({errno.errorcode.get(ctypes.get_errno(), '?')})")
     gc.collect()

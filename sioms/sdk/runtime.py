@@ -42,12 +42,12 @@ from .engine import Engine
 from .exchange import HookError
 from .handles import LOOKS_A_MS, Handle, Waits
 from .inputs import Input
-from .keeping import keep_positions
 from .line_engine import LineEngine
 from .markers import Markers
 from .outputs import Outputs
 from .pages import Pages
 from .parts import Parts, Service
+from .persistence import keep_positions
 from .rt import ChangeWatch, TimerFd, become_realtime, name_process
 from .statistics import TickStatistics
 from .stops import Reason, Stop, Stops

@@ -1,5 +1,5 @@
-"""What dies or hangs in mid-motion: client, driver, daemon, nursery. Motion ends, nodes reopen, nobody reads old data
-as new.
+"""What dies or hangs in mid-motion: client, driver, daemon, fork server. Motion ends, nodes reopen, nobody reads old
+data as new.
 """
 
 from __future__ import annotations
@@ -145,10 +145,10 @@ def test_the_lease_of_readings_can_be_configured(start_daemon: Callable[..., Dae
         long.read()
 
 
-def test_killed_nursery_harms_no_driver_and_a_new_one_restarts_them(daemon: Daemon, cell: sioms.Workcell) -> None:
+def test_killed_fork_server_harms_no_driver_and_a_new_one_restarts_them(daemon: Daemon, cell: sioms.Workcell) -> None:
     with cell.open("mod1", "rw") as axis:
         axis.command(velocity=0.05)
-        os.kill(daemon.nursery(), signal.SIGKILL)
+        os.kill(daemon.fork_server(), signal.SIGKILL)
         number = axis.read().number
         axis.wait_new(number + 300, 3.0)
         assert axis.read().in_motion[0]
@@ -285,7 +285,7 @@ def test_sigterm_is_obeyed_on_a_full_core(start_daemon: Callable[..., Daemon]) -
     daemon = start_daemon(text, ready=False)
     os.sched_setaffinity(daemon.pid, {0})
     for child in Path(f"/proc/{daemon.pid}/task/{daemon.pid}/children").read_text().split():
-        os.sched_setaffinity(int(child), {0})  # the nursery: drivers inherit it
+        os.sched_setaffinity(int(child), {0})  # the fork server: drivers inherit it
     daemon.running.wait_line("event=ready", 60.0)
     with daemon.cell() as cell:
         pids = [d["pid"] for d in cell.status()["devices"]]

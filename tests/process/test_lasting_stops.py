@@ -28,8 +28,8 @@ STOPPED = AxisStatus.EMERGENCY_STOP | AxisStatus.STOPPING
 
 
 def kill(daemon: Daemon) -> None:
-    """SIGKILL to the daemon and, at the same time, to all its drivers and its nursery."""
-    pids = [device["pid"] for device in status(daemon)["devices"]] + [daemon.nursery(), daemon.pid]
+    """SIGKILL to the daemon and, at the same time, to all its drivers and its fork server."""
+    pids = [device["pid"] for device in status(daemon)["devices"]] + [daemon.fork_server(), daemon.pid]
     for pid in pids:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -69,7 +69,7 @@ def works(daemon: Daemon) -> None:
 @pytest.mark.parametrize("through", ["daemon", "handle"])
 def test_the_stop_of_a_node_outlives_its_driver(start_daemon: Callable[..., Daemon], through: str) -> None:
     daemon = start_daemon(CELL)
-    with daemon.cell("presser") as cell:
+    with daemon.cell("loader") as cell:
         for node in ("mod0.xaxis", "io0.bit1"):
             if through == "daemon":
                 cell.emergency_stop(node, why="hand in there")
@@ -101,13 +101,13 @@ def test_the_stop_of_a_node_outlives_its_driver(start_daemon: Callable[..., Daem
 
 def test_all_stops_outlive_the_daemon_and_its_drivers(start_daemon: Callable[..., Daemon]) -> None:
     daemon = start_daemon(CELL)
-    with daemon.cell("presser") as cell:
+    with daemon.cell("loader") as cell:
         cell.emergency_stop("mod0.yaxis")
         cell.emergency_stop(why="smoke")
     kill(daemon)
     again = start_daemon(CELL, at=daemon.folder)
     found = status(again)
-    assert found["stopped_ns"] and re.search(r"presser: smoke \(since 20\d\d-", found["stop_source"])
+    assert found["stopped_ns"] and re.search(r"loader: smoke \(since 20\d\d-", found["stop_source"])
     assert [node for node, _ in found["node_stops"]] == ["mod0.yaxis"]
     is_refused(again, "mod0.xaxis")
     is_refused(again, "io0")
@@ -163,7 +163,7 @@ def test_a_node_whose_driver_is_away_is_stopped_when_it_comes(start_daemon: Call
     daemon = start_daemon(CELL)
     with daemon.cell() as cell:
         before = daemon.device("mod0")
-        with daemon.frozen(daemon.nursery()):
+        with daemon.frozen(daemon.fork_server()):
             os.kill(before["pid"], signal.SIGKILL)
             wait_for(lambda: daemon.device("mod0")["state"] != "up", "noticed")
             cell.emergency_stop("mod0.xaxis")

@@ -15,7 +15,7 @@ from daemon_rig import FORCE, Daemon, raises, wait_for
 
 import sioms
 from sioms.protocol.flags import AxisStatus
-from sioms.sdk.keeping import AT_REST, decode
+from sioms.sdk.persistence import AT_REST, decode
 
 SIM = """
 [workcell]
@@ -147,8 +147,8 @@ def test_a_drive_that_counts_on_keeps_its_coordinates_and_takes_up_its_play(
             lowest, most = min(lowest, snapshot.position[0]), most + 1
         assert axis.read().position[0] == pytest.approx(0.49, abs=1e-5)
         assert lowest == pytest.approx(0.486, abs=2e-4), "comes from below"
-        assert axis.particulars()["offset"] == [pytest.approx(0.5)]
-        assert axis.particulars()["retries"] == [0]
+        assert axis.diagnostics()["offset"] == [pytest.approx(0.5)]
+        assert axis.diagnostics()["retries"] == [0]
         before = axis.read().position[0]
     kept_at_rest(tmp_path / "state", "slide0")
     kill(daemon, "slide0")

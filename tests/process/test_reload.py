@@ -139,7 +139,7 @@ def test_nothing_is_left_of_reloads(daemon: Daemon) -> None:
         descriptors = len(os.listdir(f"/proc/{daemon.pid}/fd"))
         for _ in range(3):
             cell.reload()
-        wait_for(lambda: len(children(daemon.pid)) == 1, "one nursery is the only child, dead or alive")
+        wait_for(lambda: len(children(daemon.pid)) == 1, "one fork server is the only child, dead or alive")
         wait_for(lambda: len(os.listdir(f"/proc/{daemon.pid}/fd")) <= descriptors, "as many descriptors as before")
 
 

@@ -133,7 +133,7 @@ def test_a_stepper_is_where_its_encoder_says_or_says_that_it_is_not(losses, retr
         rig.run()
         missed = bool(rig.field("status") & S.MISSED_TARGET)
         assert missed == (abs(rig.field("position") - place) > 1e-3)
-        assert rig.bank.particulars([0])["retries"][0] <= retries
+        assert rig.bank.diagnostics([0])["retries"][0] <= retries
     assert rig.kinds().count(EventKind.ENDED) == len(places)
 
 

@@ -13,19 +13,19 @@ import pytest
 from sioms.protocol.driver_verbs import (
     FROM_DRIVER,
     TO_DRIVER,
-    TO_NURSERY,
+    TO_FORK_SERVER,
     Attach,
     Describe,
     Detach,
     Detached,
     DriverVerb,
+    ForkServerVerb,
     Input,
     LinkChanged,
     LogLine,
     MarkerSignalled,
     NodeReset,
     NodeStop,
-    NurseryVerb,
     Ready,
     Shutdown,
     Spawn,
@@ -109,7 +109,7 @@ GOLDEN = [
     (refusal(9, 16, "held", 1 << 40), "96000910a468656c64c2cf0000010000000000"),
 ]  # fmt: skip
 
-SOCKETS = (FROM_CLIENT, ON_HANDLE, TO_DRIVER, FROM_DRIVER, TO_NURSERY)
+SOCKETS = (FROM_CLIENT, ON_HANDLE, TO_DRIVER, FROM_DRIVER, TO_FORK_SERVER)
 RECORDED: list[tuple[Message, str]] = [
     (Hello(2, "eva"), "94010502a3657661"),
     (Open("mod0", 3, None, 0.25), "960205a46d6f643003c0cb3fd0000000000000"),
@@ -175,7 +175,7 @@ def test_no_verb_is_left_out() -> None:
         (ClientVerb, [FROM_CLIENT]),
         (HandleVerb, [ON_HANDLE]),
         (DriverVerb, [TO_DRIVER, FROM_DRIVER]),
-        (NurseryVerb, [TO_NURSERY]),
+        (ForkServerVerb, [TO_FORK_SERVER]),
     ):
         assert sorted(verb for socket in sockets for verb in socket) == sorted(verbs)
 
@@ -259,7 +259,7 @@ NUMBERS = {
     HandleVerb: "WRITE=1 IOCTL=2 SUBSCRIBE=3 KEEPALIVE=4 CANCEL=5",
     DriverVerb: "ATTACH=1 DETACH=2 STOP_CHANGED=3 SHUTDOWN=4 INPUT=5 NODE_STOP=6 NODE_RESET=7 READY=20 DETACHED=21 "
     "MARKER_SIGNALLED=22 STOPPED=23 LINK=24 LOG=25",
-    NurseryVerb: "DESCRIBE=1 SPAWN=2",
+    ForkServerVerb: "DESCRIBE=1 SPAWN=2",
     NodeClass: "BINARY=1 ANALOG=2 AXIS=3",
     Access: "READ=1 WRITE=2",
     Right: "READ=1 WRITE=2 STOP=4 ADMINISTER=8 ALL=15",

@@ -23,7 +23,8 @@ def python(script: str) -> subprocess.CompletedProcess[str]:
 def test_the_core_imports_little() -> None:
     """Daemon, client, kit and simulated axes: what a small computer has to hold."""
     done = python(
-        WITHOUT + "import os, sioms, sioms.aio, sioms.daemon.main, sioms.daemon.server, sioms.sdk, sioms.sdk.nursery\n"
+        WITHOUT
+        + "import os, sioms, sioms.aio, sioms.daemon.main, sioms.daemon.server, sioms.sdk, sioms.sdk.fork_server\n"
         "import sioms.sdk.runtime, sioms.drivers.sim.axes, sioms.drivers.sim.io, sioms.drivers.tmcl.driver\n"
         "roots = {name.partition('.')[0] for name, m in sys.modules.items() if 'site-packages' in str(getattr(m, "
         "'__file__', ''))}\n"

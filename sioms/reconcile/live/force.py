@@ -33,7 +33,7 @@ import numpy as np
 
 import sioms
 from sioms.documents import read_bytes, toml_of
-from sioms.lab.presser import Presser
+from sioms.lab.loading_axis import LoadingAxis
 from sioms.lab.stopping import ExperimentStopped
 from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import NodeInfo
@@ -259,20 +259,20 @@ class Bench:
             self._cell.open(table.axis, "rw", lease=LEASE_S) as axis,
             self._cell.open(table.reference) as reference,
         ):
-            presser = Presser(axis, reference, table.most, table.clear_m)
+            loading = LoadingAxis(axis, reference, table.most, table.clear_m)
             try:
-                presser.tare()
-                presser.take(push.name)
-                presser.learn()
+                loading.tare()
+                loading.take(push.name)
+                loading.learn()
                 for level in push.levels:
                     if level > 0.0:
-                        presser.press(level)
+                        loading.press(level)
                     else:
-                        presser.clear()
-                    self._hold(sensor, push, _told(presser), presser.check)
+                        loading.clear()
+                    self._hold(sensor, push, _told(loading), loading.check)
             finally:
                 with suppress(OSError, ExperimentStopped):  # stopped: it stays where it is
-                    presser.clear()
+                    loading.clear()
 
     def _hold(self, sensor: Any, push: Push, load: Callable[[], float], check: Callable[[], None]) -> None:
         """Keep the rows of one load."""
@@ -308,13 +308,13 @@ class Bench:
         (self._folder / "columns.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _told(presser: Presser) -> Callable[[], float]:
+def _told(loading: LoadingAxis) -> Callable[[], float]:
     """Return what tells the mean force [N] since it was asked last."""
-    seen = [presser.force.read()]
+    seen = [loading.force.read()]
 
     def told() -> float:
         nonlocal seen
-        seen = presser.force.history(seen[-1].number) or seen[-1:]  # a slow one may have nothing new
-        return presser.net(seen)
+        seen = loading.force.history(seen[-1].number) or seen[-1:]  # a slow one may have nothing new
+        return loading.net(seen)
 
     return told

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sioms
-from sioms.lab.presser import Presser
+from sioms.lab.loading_axis import LoadingAxis
 from sioms.lab.stopping import ExperimentStopped
 
 Floats = NDArray[np.float64]
@@ -135,7 +135,7 @@ class Prober:
         self._finger: Any = cell.open(self._rig.finger)
         self._force: Any = cell.open(self._rig.force)
         most_n = self._rig.most_load * self._rig.length_m
-        self._presser = Presser(self._axis, self._force, most_n, self._rig.clear_m, (self._place,))
+        self._loading = LoadingAxis(self._axis, self._force, most_n, self._rig.clear_m, (self._place,))
         self._began_ns = time.monotonic_ns()
 
     def __enter__(self) -> Self:
@@ -155,7 +155,7 @@ class Prober:
 
         def learn() -> None:
             self.go(middle, radius_m)
-            self._presser.learn()
+            self._loading.learn()
 
         self._again(learn, lambda what: None)
 
@@ -163,7 +163,7 @@ class Prober:
         """Carry out a plan, touch by touch; an indenter is learnt when it is first used."""
         out = Recorder()
         for number, touch in enumerate(plan):
-            if not self._presser.take(touch.radius_m):
+            if not self._loading.take(touch.radius_m):
                 self.prepare(touch.radius_m, touch.place)
             before, under = self._again(lambda: self._touch(touch), tell)  # noqa: B023 - called at once
             out.add(*before, number, 0)
@@ -190,20 +190,20 @@ class Prober:
 
     def press(self, load: float) -> None:
         """Press with a load [N/m], at most the rig's largest, and let the force settle."""
-        self._presser.press(load * self._rig.length_m)
+        self._loading.press(load * self._rig.length_m)
 
     def clear(self) -> None:
         """Take the indenter off the finger, whatever it feels."""
-        self._presser.clear()
+        self._loading.clear()
 
     def go(self, place: float, radius_m: float) -> None:
         """Turn to a place [rad] with an indenter mounted, and take the force there for none."""
         if radius_m != self._mounted:
             self._mount(radius_m)
             self._mounted = radius_m
-        self._presser.take(radius_m)
-        self._presser.move(self._place, place)
-        self._presser.tare()
+        self._loading.take(radius_m)
+        self._loading.move(self._place, place)
+        self._loading.tare()
 
     def close(self) -> None:
         """Go clear, if that can be, and let the nodes go; their axes halt."""
@@ -228,9 +228,9 @@ class Prober:
     def _ramp(self, place: float, load: float, seconds: float) -> tuple[Frames, Frames]:
         self.go(place, 0.0)
         before = self._frames(FRAMES)
-        bottom = self._presser.depth(load * self._rig.length_m)
-        begin = self._presser.depth(0.0) - 0.1e-3
-        self._presser.move(self._axis, begin)
+        bottom = self._loading.depth(load * self._rig.length_m)
+        begin = self._loading.depth(0.0) - 0.1e-3
+        self._loading.move(self._axis, begin)
         self._axis.command(velocity=(bottom - begin) / seconds, replace=True)
         frames, stamps, force = self._frames(round(RATE_HZ * seconds))
         self.clear()
@@ -248,7 +248,7 @@ class Prober:
                     raise
                 tell(f"{error.strerror}: once more")
                 devices = (n.split(".")[0] for n in (self._rig.finger, self._rig.force))
-                wait_links(self._cell, *devices, meanwhile=self._presser.keep_alive)
+                wait_links(self._cell, *devices, meanwhile=self._loading.keep_alive)
                 self.clear()
         raise AssertionError("unreachable")
 
@@ -265,11 +265,11 @@ class Prober:
             snaps += [snap for snap in news if snap.stamp_ns >= begin_ns]
             forces += self._force.history(force_last)
             last, force_last = news[-1].number, forces[-1].number if forces else force_last
-            self._presser.check()
+            self._loading.check()
         snaps = snaps[:count]
         stamps = np.array([s.stamp_ns for s in snaps])
         at = np.searchsorted([s.stamp_ns for s in forces], stamps, side="right") - 1
-        tare = 0.0 if math.isnan(self._presser.tare_n) else self._presser.tare_n
+        tare = 0.0 if math.isnan(self._loading.tare_n) else self._loading.tare_n
         force = np.array([forces[max(int(i), 0)].data[0] for i in at]) - tare
         raw = np.array([s.data for s in snaps])
         return raw, (stamps - self._began_ns) * 1e-9, force / self._rig.length_m

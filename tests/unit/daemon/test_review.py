@@ -1,4 +1,4 @@
-"""A driver process that cannot be started: the nursery has just died, no descriptor is left, or the
+"""A driver process that cannot be started: the fork server has just died, no descriptor is left, or the
 one before lives.
 """
 
@@ -17,9 +17,9 @@ import pytest
 
 from sioms.daemon.config import Device, DeviceTable
 from sioms.daemon.devices import DriverProcess, State
+from sioms.daemon.fork_server import ForkServer
 from sioms.daemon.loop import Loop
 from sioms.daemon.names import DeviceInfo
-from sioms.daemon.nursery import Nursery
 from sioms.daemon.patience import Patience
 
 
@@ -39,23 +39,23 @@ class _Owner:
         raise AssertionError(f"{name} is not to be called")
 
 
-def _device(loop: Loop, nursery: Any, owner: Any) -> DriverProcess:
+def _device(loop: Loop, fork_server: Any, owner: Any) -> DriverProcess:
     common = msgspec.convert({"driver": "sim-io"}, DeviceTable)
     info = DeviceInfo("io0", "sim-io", (), 100.0, (), 0.1)
     return DriverProcess(
-        loop, lambda: nursery, Device("io0", common, {}), info, [], owner, lambda *_args, **_fields: None, {}
+        loop, lambda: fork_server, Device("io0", common, {}), info, [], owner, lambda *_args, **_fields: None, {}
     )
 
 
 def test_a_start_that_is_refused_at_once_is_a_death_like_any_other() -> None:
     loop = Loop()
     owner: Any = _Owner()
-    nursery = Nursery(loop, lambda _: None)
-    os.kill(nursery.pid, signal.SIGKILL)
-    os.waitpid(nursery.pid, 0)
-    device = _device(loop, nursery, owner)
+    fork_server = ForkServer(loop, lambda _: None)
+    os.kill(fork_server.pid, signal.SIGKILL)
+    os.waitpid(fork_server.pid, 0)
+    device = _device(loop, fork_server, owner)
     device.start()
-    assert device.state is State.RESTARTING and "nursery" in owner.gone[0]
+    assert device.state is State.RESTARTING and "fork server" in owner.gone[0]
     loop.close()
 
 

@@ -38,7 +38,7 @@ class AtiRig(Rig):
         self.device = ati_rdt.Sensor(ati_rdt.options_parser().parse_args(options), self.now)
         self.device.load.noise_n = self.device.load.noise_nm = 0.0
         self.pages = 0
-        self.aside, self.on_line = self._page, self._request
+        self.side_line, self.on_line = self._page, self._request
 
     def _page(self, data: bytes) -> bytes:
         if not self.device.supply.is_on:
@@ -315,7 +315,7 @@ def test_another_master_is_noticed_by_the_page() -> None:
     rig.do(rig.driver.open())
     rig.go(0.1)
     assert rig.data == pytest.approx(LOAD, rel=1e-4) and rig.flags == 0
-    rig.aside = lambda data: b""
+    rig.side_line = lambda data: b""
     for _ in range(30):  # a web server that is gone is asked less and less often, and nothing comes of it
         rig.do(rig.driver.heartbeat())
     rig.go(0.1)
@@ -362,7 +362,7 @@ def test_another_sensor_is_refused(options: list[str], table: dict[str, Any], wo
 
 def test_without_a_page_and_without_an_answer() -> None:
     rig = AtiRig(page="none", model="net", counts_per_force=1e6, counts_per_torque=1e6)
-    assert rig.driver.aside is None
+    assert rig.driver.side_line is None
     rig.do(rig.driver.open())
     rig.device.load.put(rig.now_s, LOAD)
     rig.go(0.05)
@@ -371,7 +371,7 @@ def test_without_a_page_and_without_an_answer() -> None:
     with pytest.raises(LinkError, match=r"f0 on 192.168.1.1:49152: .*; look at host and port, and that RDT is enabled"):
         rig.do(rig.driver.open())
     other = AtiRig()
-    other.aside = lambda data: b"HTTP/1.0 404 Not Found\r\n\r\n"
+    other.side_line = lambda data: b"HTTP/1.0 404 Not Found\r\n\r\n"
     with pytest.raises(LinkError, match=r"identify f0: get http://192.168.1.1/netftapi2.xml: .*404; is it another"):
         other.do(other.driver.open())
 

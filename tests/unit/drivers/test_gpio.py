@@ -1,6 +1,6 @@
-"""The driver of GPIO lines: its pure core, and all that stands above the binding on a stand-in for the chip.
+"""The driver of GPIO lines: its pure core, and all that stands above the binding on a fake chip.
 
-No GPIO chip and no gpio-sim is needed here; that the kernel does what the stand-in does is what ``tests/kernel``
+No GPIO chip and no gpio-sim is needed here; that the kernel does what the fake does is what ``tests/kernel``
 looks at on a simulated chip.
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import gpio_stand_in as chip
+import fake_gpio as chip
 import msgspec
 import pytest
 from hypothesis import given
@@ -33,13 +33,13 @@ INPUTS = [
 
 
 class Rig:
-    """A driver on the stand-in; keeps what is published and said."""
+    """A driver on the fake; keeps what is published and said."""
 
     def __init__(self, **table: Any) -> None:
         table = {"chip": "/dev/gpiochip0", "input": INPUTS, "output": OUTPUTS, **table}
         self.published: list[tuple[int, int, int]] = []
         self.said: list[str] = []
-        self.driver = chip.GpioOnStandIn("io0", msgspec.convert(table, Gpio.Settings), self)
+        self.driver = chip.GpioOnFakeChip("io0", msgspec.convert(table, Gpio.Settings), self)
 
     def publish(self, block: Any, stamp_ns: int) -> None:
         self.published.append((int(block.data[0]), int(block.rows["changed_ns"][0]), int(block.edges[0])))

@@ -22,7 +22,7 @@ class SchunkRig(Rig):
         self.device = schunk_ifb.Sensor(schunk_ifb.options_parser().parse_args(options), self.now)
         self.device.load.noise_n = self.device.load.noise_nm = 0.0
         self.replies = 0
-        self.aside = self._reply
+        self.side_line = self._reply
 
     def _reply(self, data: bytes) -> bytes:
         self.replies += 1
@@ -107,7 +107,7 @@ def test_replies_are_numbered_by_the_box() -> None:
         rig.do(rig.driver.open())
         rig.go(0.01)
     assert len(rig.published) > 20
-    rig.aside = lambda data: b"\xff\xff\x07\x00\x02\x00\x12\x00"
+    rig.side_line = lambda data: b"\xff\xff\x07\x00\x02\x00\x12\x00"
     with pytest.raises(LinkError, match="stop: the reply 12 00 is none to command 41"):
         rig.do(rig.driver.open())
 
@@ -237,7 +237,7 @@ def test_another_sensor_is_refused() -> None:
         match=r"open f0 at 192.168.0.100:82: read parameter 0x0001/0: .*error 14, unknown subindex",
     ):
         rig.do(rig.driver.open())
-    rig.aside = lambda data: b"HTTP/1.0 400 Bad Request"
+    rig.side_line = lambda data: b"HTTP/1.0 400 Bad Request"
     with pytest.raises(LinkError, match=r"open f0: stop: 48 54 54 50 2f 31 begins no reply of this sensor"):
         rig.do(rig.driver.open())
 

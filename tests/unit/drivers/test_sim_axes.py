@@ -81,7 +81,7 @@ def test_stepper_with_an_encoder_finds_its_lost_steps_again(bench):
     bench.run(0.01)
     bench.write(mod, control_mode=ControlMode.POSITION, position=0.03)
     bench.run(3.0, until=lambda: mod.bank.is_idle([0]))
-    tried = mod.bank.particulars([0])["retries"][0]
+    tried = mod.bank.diagnostics([0])["retries"][0]
     assert 0 < tried < 10 and not status(mod) & AxisStatus.MISSED_TARGET
     assert mod.blocks[1].data[0] == pytest.approx(0.03, abs=1e-4 + 1e-6), "the load is there"
     assert mod.bank.rows["position"][0] == pytest.approx(0.03, abs=1e-4)
@@ -96,7 +96,7 @@ def test_stepper_that_slips_every_time_says_so(bench):
     bench.run(0.01)
     bench.write(mod, control_mode=ControlMode.POSITION, position=0.05)
     bench.run(4.0, until=lambda: mod.bank.is_idle([0]))
-    assert mod.bank.particulars([0])["retries"] == [3] and mod.bank.particulars([0])["misses"] == [1]
+    assert mod.bank.diagnostics([0])["retries"] == [3] and mod.bank.diagnostics([0])["misses"] == [1]
     assert status(mod) & AxisStatus.MISSED_TARGET
     assert (
         mod.blocks[1].data[0] == pytest.approx(mod.bank.rows["position"][0], abs=1e-5)

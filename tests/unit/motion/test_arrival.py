@@ -35,7 +35,7 @@ def slipping(*losses):
 
 def tries(rig):
     """Return how often axis 0 tried its last point move again."""
-    return rig.bank.particulars([0])["retries"][0]
+    return rig.bank.diagnostics([0])["retries"][0]
 
 
 def last_turn(p, v):
@@ -243,7 +243,7 @@ def test_a_servo_that_is_held_off_says_so_and_goes_on():
     rig.write(mode=[MODE.POSITION, MODE.POSITION], position=[0.31, 0.3])
     rig.run()
     assert not rig.field("status") & S.MISSED_TARGET, "the last one has arrived"
-    assert rig.bank.particulars([0])["misses"] == [1]
+    assert rig.bank.diagnostics([0])["misses"] == [1]
     rig.write(mode=MODE.POSITION, position=0.31)
     rig.run()
     assert rig.field("status") & S.MISSED_TARGET and not rig.field("status") & S.FAULT
@@ -261,7 +261,7 @@ def test_many_axes_settle_and_try_again_each_for_itself():
     rig.write(mode=[MODE.POSITION] * n, axis=list(range(n)), position=np.linspace(-1, 1, n))
     rig.run()
     assert np.abs(rig.bank.rows["position"] - np.linspace(-1, 1, n)).max() < TOLERANCE
-    assert rig.bank.particulars(range(n))["retries"] == [int(i % missing == 0) for i in range(n)]
+    assert rig.bank.diagnostics(range(n))["retries"] == [int(i % missing == 0) for i in range(n)]
 
 
 def test_a_step_below_the_deadband_is_not_carried_out_and_ends_at_once():

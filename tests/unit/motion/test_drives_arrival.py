@@ -148,8 +148,8 @@ def test_a_miss_is_tried_again_so_often_and_told(slips, retries):
     missed = slips > retries
     assert bool(cell.status() & S.MISSED_TARGET) == missed
     assert cell.drives[0].position == pytest.approx(0.48 if missed else 0.5)
-    assert cell.bank.particulars([0])["retries"] == [min(slips, retries)]
-    assert cell.bank.particulars([0])["misses"] == [int(missed)]
+    assert cell.bank.diagnostics([0])["retries"] == [min(slips, retries)]
+    assert cell.bank.diagnostics([0])["misses"] == [int(missed)]
 
 
 def test_a_take_up_outside_the_soft_limits_is_refused():

@@ -36,7 +36,7 @@ VERBS: dict[str, Verb] = {
     "home": lambda bank, now: bank.home([0], now),
     "set_homed": lambda bank, now: bank.set_homed([1]),
     "is_idle": lambda bank, now: bank.is_idle([0, 1]),
-    "particulars": lambda bank, now: bank.particulars([0, 1]),
+    "diagnostics": lambda bank, now: bank.diagnostics([0, 1]),
     "take_events": lambda bank, now: bank.take_events() and None,
 }
 

@@ -58,7 +58,7 @@ def test_a_port_that_accepts_and_closes_is_tried_less_and_less_often(port: socke
     if not accepts:
         port.close()
     runtime = Runtime()
-    driver: Any = SimpleNamespace(line=line, aside=None, blocks=(), settings=None, claims=lambda _: ())
+    driver: Any = SimpleNamespace(line=line, side_line=None, blocks=(), settings=None, claims=lambda _: ())
     parts: Any = SimpleNamespace(
         loop=runtime, pages=runtime, stops=runtime, outputs=None, effects=None, log=runtime.log
     )

@@ -14,7 +14,7 @@ import pytest
 
 from sioms.sdk.connection import Connection
 from sioms.sdk.datagram import Datagrams
-from sioms.sdk.exchange import Aside, DeviceError, Exchange, LinkError, Steps
+from sioms.sdk.exchange import DeviceError, Exchange, LinkError, SideExchange, Steps
 from sioms.sdk.line import Counters, Line, Priority
 from sioms.sdk.settings import LineSettings
 from sioms.sdk.side_connection import SideConnection
@@ -155,7 +155,7 @@ class Beside:
 
     def run(self, exchange: Exchange, meanwhile: Callable[[], None] = lambda: None, anew: bool = False) -> Any:
         def steps() -> Steps:
-            return (yield Aside(exchange, anew))
+            return (yield SideExchange(exchange, anew))
 
         self.line.submit(steps(), Priority.POLL, lambda value, error: self.results.append(error or value), self.now_ns)
         self.advance()

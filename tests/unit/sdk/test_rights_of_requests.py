@@ -14,7 +14,7 @@ from sioms.protocol.flags import Request, Right
 from sioms.sdk import requests
 
 READS = {
-    Request.WAIT_UNTIL_IDLE, Request.GET_LIMITS, Request.GET_GAINS, Request.GET_STATISTICS, Request.GET_PARTICULARS,
+    Request.WAIT_UNTIL_IDLE, Request.GET_LIMITS, Request.GET_GAINS, Request.GET_STATISTICS, Request.GET_DIAGNOSTICS,
     Request.WAIT_UNTIL_EVENT,
 }  # fmt: skip
 OTHERS = {

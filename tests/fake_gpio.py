@@ -1,7 +1,6 @@
-"""The driver of GPIO lines on a stand-in for the chip, where there is none: everything above the binding is the real
-one.
+"""The driver of GPIO lines on a fake chip, where there is none: everything above the binding is the real one.
 
-The stand-in takes the place of ``gpiod.Chip`` and of what it requests; settings, values and events are the binding's
+The fake takes the place of ``gpiod.Chip`` and of what it requests; settings, values and events are the binding's
 own classes. It does what the kernel's documents say of requests, active-low, sequence numbers and the event buffer (the
 newest stay). Lines 0 to 7 drive lines 8 to 15, as wires would; ``LINES`` bears their names.
 """
@@ -112,10 +111,10 @@ class Chip:
 BINDING: Any = SimpleNamespace(Chip=Chip, LineSettings=gpiod.LineSettings, line=gpiod.line)
 
 
-class GpioOnStandIn(Gpio):
-    """The driver with the stand-in below it."""
+class GpioOnFakeChip(Gpio):
+    """The driver with the fake below it."""
 
     binding = staticmethod(lambda: BINDING)
 
 
-DRIVER = GpioOnStandIn
+DRIVER = GpioOnFakeChip

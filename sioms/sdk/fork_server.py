@@ -1,7 +1,7 @@
-"""The nursery: imports drivers once, validates their settings, and forks a process for each device.
+"""The fork server: imports drivers once, validates their settings, and forks a process for each device.
 
-Started by the daemon as ``python -m sioms.sdk.nursery FD``. Forking shares the memory of the
-libraries among all drivers, and makes a restart a matter of milliseconds. The nursery has one thread
+Started by the daemon as ``python -m sioms.sdk.fork_server FD``. Forking shares the memory of the
+libraries among all drivers, and makes a restart a matter of milliseconds. The fork server has one thread
 and no state but imported modules; drivers live on when it dies, and it ends when the daemon does.
 """
 
@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from sioms.descriptors import receive
-from sioms.protocol.driver_verbs import TO_NURSERY, Describe, Spawn
+from sioms.protocol.driver_verbs import TO_FORK_SERVER, Describe, Spawn
 from sioms.protocol.messages import MAX_UNPACKED, encode, pack_compressed, refusal, reply
 from sioms.protocol.verbs import take
 
@@ -41,7 +41,7 @@ def main(fd: int) -> None:
         packet, fds = receive(sock, 1 << 20, 8)
         if not packet:
             return
-        number, message = take(packet, TO_NURSERY, values=MAX_UNPACKED)
+        number, message = take(packet, TO_FORK_SERVER, values=MAX_UNPACKED)
         try:
             match message:
                 case Describe():
@@ -59,7 +59,7 @@ def main(fd: int) -> None:
 
 
 def _tell(sock: socket.socket, packet: bytes, fds: Sequence[int] = ()) -> None:
-    """Answer the daemon; when it has ended meanwhile, so does the nursery, and every driver sees it by itself."""
+    """Answer the daemon; when it has ended meanwhile, so does the fork server, and every driver sees it by itself."""
     try:
         socket.send_fds(sock, [packet], fds)
     except ConnectionError:
@@ -102,7 +102,7 @@ def _spawn(
 
                 trace.begin(wanted, device, driver, table)
             status = run(found, device, settings, generation, options, fds)
-        except BaseException:  # the process ends here whatever happened, and must not run the nursery's code
+        except BaseException:  # the process ends here whatever happened, and must not run the fork server's code
             traceback.print_exc()
         finally:
             sys.stderr.flush()

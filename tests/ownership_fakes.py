@@ -12,7 +12,7 @@ from typing import Any
 import msgpack
 import msgspec
 
-import sioms.sdk.nursery
+import sioms.sdk.fork_server
 from sioms.daemon.loop import Loop
 from sioms.motion import AxisBank, AxisSettings
 from sioms.protocol.flags import NodeClass
@@ -186,7 +186,7 @@ class Users:
         return True
 
 
-class Nursery:
+class ForkServer:
     """Forks drivers: into this process."""
 
     pid = os.getpid()
@@ -195,7 +195,7 @@ class Nursery:
         pass
 
     def describe(self, device: str, driver: str, table: dict[str, Any], folder: str, answer: Any) -> None:
-        value = zlib.compress(msgpack.packb(sioms.sdk.nursery._describe(device, driver, table, folder)), 1)
+        value = zlib.compress(msgpack.packb(sioms.sdk.fork_server._describe(device, driver, table, folder)), 1)
         answer(value, 0, "", [])
 
     def spawn(

@@ -14,7 +14,7 @@ from sioms.protocol.flags import AxisStatus as S
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AxisBlock, BlockSpec
-from sioms.sdk.keeping import (
+from sioms.sdk.persistence import (
     AT_REST,
     HOMED,
     Contents,
@@ -275,7 +275,7 @@ def test_offsets_are_those_of_the_rule():
     assert offset_of(entry._replace(state=HOMED), axis(restore=ALWAYS), 0.5)[0] is None
 
 
-def test_keeping_has_no_say_in_the_motion(tmp_path):
+def test_persistence_has_no_say_in_the_motion(tmp_path):
     """The same commands give the same set-points with a file and without."""
     plain, kept = Rig([axis()]), Kept(tmp_path / "x", axis(restore=ALWAYS)).rig
     for rig in (plain, kept):

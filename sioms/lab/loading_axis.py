@@ -1,6 +1,6 @@
 """Press on something with an axis until a force is felt: feel for the surface, learn the way in, press with a force.
 
-Two nodes make a presser: an axis that presses [m, larger is further in] and one channel of a force [N, larger when
+Two nodes make a loading axis: an axis that presses [m, larger is further in] and one channel of a force [N, larger when
 pressed]. The axis' own limits, its guard and the emergency stop hold as ever; whatever it does is watched.
 """
 
@@ -27,8 +27,8 @@ LEARNT, OVER = 1.08, 1.3  # of the largest force: the way in is known up to ther
 SETTLED, TARED = 60, 50  # samples of the force after a move; in a tare
 
 
-class Presser:
-    """Presses with one axis and is told by one force. One thread.
+class LoadingAxis:
+    """Loads a sensor with one axis and measures with one force channel. One thread.
 
     Args:
         axis, force: open nodes; the axis for writing.

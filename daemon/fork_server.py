@@ -1,8 +1,8 @@
-"""The daemon's side of the nursery, the process that knows the drivers.
+"""The daemon's side of the fork server, the process that knows the drivers.
 
-The daemon imports no driver. The nursery imports them once, validates their settings, and forks one
+The daemon imports no driver. The fork server imports them once, validates their settings, and forks one
 process a device, so a driver process starts in milliseconds and shares the pages of its libraries.
-A reload starts a fresh nursery, which sees changed driver files.
+A reload starts a fresh fork server, which sees changed driver files.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from sioms.protocol.driver_verbs import Describe, Spawn
 from sioms.protocol.messages import MAX_PACKET, MalformedMessage, decode_reply
 from sioms.protocol.verbs import Message
 
+from .fork_server_process import ForkServerProcess, start_fork_server
 from .loop import Loop
-from .nursery_process import NurseryProcess, start_nursery
 from .patience import Patience
 
 MAX_ANSWER = 1 << 20
-"""Bytes of an answer of the nursery: the description of a device of many thousands of channels is long, even
+"""Bytes of an answer of the fork server: the description of a device of many thousands of channels is long, even
 compressed.
 """
 _END_S = 2.0
-"""A nursery that has been told to end is killed after so long [s]."""
+"""A fork server that has been told to end is killed after so long [s]."""
 DIED = -1
 """In the place of the errno of an answer: there is nobody to answer."""
 Answer = Callable[[Any, int, str, list[int]], None]
 """Called with (value, errno, text, descriptors)."""
 
 
-class Nursery:
-    """A nursery process and the requests it has not answered.
+class ForkServer:
+    """A fork server process and the requests it has not answered.
 
     Args:
         loop: the daemon's loop.
@@ -44,10 +44,12 @@ class Nursery:
         process: one that has just been started; None: start one.
     """
 
-    def __init__(self, loop: Loop, died: Callable[[Nursery], None], process: NurseryProcess | None = None) -> None:
+    def __init__(
+        self, loop: Loop, died: Callable[[ForkServer], None], process: ForkServerProcess | None = None
+    ) -> None:
         self._loop = loop
         self._died = died
-        self._sock, self.pid = process or start_nursery()
+        self._sock, self.pid = process or start_fork_server()
         self._pidfd = os.pidfd_open(self.pid)
         self._answers: dict[int, Answer] = {}
         self._patience = Patience(self.pid)
@@ -77,7 +79,7 @@ class Nursery:
         return why
 
     def close(self) -> None:
-        """End the nursery, also one that is stuck; the drivers it forked live on."""
+        """End the fork server, also one that is stuck; the drivers it forked live on."""
         if self._sock.fileno() >= 0:
             self._loop.unwatch(self._sock.fileno())
             self._sock.close()
@@ -107,7 +109,7 @@ class Nursery:
             socket.send_fds(self._sock, [packet], list(fds))
         except OSError as error:
             del self._answers[self._number]
-            answer(None, DIED, f"the nursery does not answer: {error}", [])
+            answer(None, DIED, f"the fork server does not answer: {error}", [])
 
     def _receive(self) -> None:
         try:
@@ -138,5 +140,5 @@ class Nursery:
         self.close()
         pending, self._answers = self._answers, {}
         for answer in pending.values():
-            answer(None, DIED, "the nursery died", [])
+            answer(None, DIED, "the fork server died", [])
         self._died(self)
