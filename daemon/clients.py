@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 STATUS_NS = 20_000_000
 """How old what STATUS tells may be while nobody asks for anything else."""
+FIRST_KEY = 1 << 32
+"""Number of the first key that a gateway has spoken for."""
 LONGEST_WAIT_S = 7 * 24 * 3600.0
 
 
@@ -55,6 +57,7 @@ class Clients:
         self._spare = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
         self.sessions: set[Session] = set()
         self._status: tuple[int, dict[str, object]] | None = None
+        self._keys: dict[str, int] = {}
         self.nodes = NodeVerbs(server, self)
         self.markers = MarkerVerbs(server.shared.markers, self)
         self._workcell = WorkcellVerbs(server, self)
@@ -144,6 +147,17 @@ class Clients:
         """Return how much of something a user has over all his sessions."""
         return sum(what(session) for session in self.sessions if session.peer.uid == peer.uid)
 
+    def may_represent(self, peer: Peer) -> bool:
+        """Tell whether a user may speak for the holders of keys: a gateway's, who has no say beyond that, the daemon's
+        own and root, who have every right themselves.
+        """
+        name = self.bounds.gateway_user
+        return not peer.key and (peer.uid in (0, os.getuid()) or (name != "" and peer.uid == self.users.uid(name)))
+
+    def number_of(self, key: str) -> int:
+        """Return the number that a key has instead of a user's: beyond those of all users."""
+        return self._keys.setdefault(key, FIRST_KEY + len(self._keys))
+
     def handles_of(self, peer: Peer) -> int:
         """Return how many handles a user has open."""
         return self._has(peer, lambda session: len(session.handles))
@@ -198,6 +212,12 @@ class Clients:
             what = f"{message.somewhere}: {session.peer.user}"
             raise Refused(errno.EPERM, f"{what} has no right on any node; ask for a [[grant]]")
         match message:
+            case verbs.Represent():
+                self._workcell.represent(session, message)
+                turns, fd = self._server.loop.turns, session.sock.fileno()
+                if turns.remove(fd):  # what comes from now on is served as the key's, in turn with that of users
+                    turns.add(fd, session.peer.uid, 0, lambda: self._receive(session))
+                return None
             case verbs.Hello():
                 return self._workcell.hello(session, number, message)
             case verbs.Open():
@@ -270,7 +290,11 @@ class Clients:
         """Let new names and grants hold, also for what is open already, and for who has left a group."""
         self.rights = rights
         for session in list(self.sessions):
-            session.peer = peer_of(session.sock, self.users)
+            peer = peer_of(session.sock, self.users)
+            if session.peer.key and not self.may_represent(peer):
+                self._end_session(session, f"user {peer.user} is no gateway any more")
+                continue
+            session.peer = session.peer if session.peer.key else peer
             if not rights.anywhere(session.peer):
                 self.markers.end_session(session)
         self.markers.take_up_rights()

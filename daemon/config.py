@@ -30,6 +30,7 @@ class WorkcellTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     socket: str = ""
     socket_mode: Annotated[str, Meta(pattern="^0?[0-7]{3}$")] = "0660"
     socket_group: str = ""
+    gateway_user: str = ""
     start_stopped: bool = False
     daemon_lease_s: Seconds = 0.5
     max_sessions: Count = 256
@@ -49,12 +50,13 @@ class QuotaTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class GrantTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[[grant]]``: rights of users and groups on nodes; patterns as in the shell."""
+    """``[[grant]]``: rights of users, groups and keys on nodes; patterns as in the shell."""
 
     rights: list[RightName]
     users: list[str] = []
     groups: list[str] = []
     nodes: list[str] = msgspec.field(default_factory=lambda: ["*"])
+    keys: list[str] = []
 
 
 class DeviceTable(msgspec.Struct, frozen=True):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import errno
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.markers import MARKERS, MarkerTable
@@ -26,11 +26,10 @@ class Persisting:
     """Owner of markers that outlive their sessions: a user."""
 
     uid: int
-    user: str
-    gids: frozenset[int] = field(compare=False)
+    peer: Peer = field(compare=False)
 
     def __str__(self) -> str:
-        return f"{self.user} (markers that persist)"
+        return f"{self.peer.user} (markers that persist)"
 
 
 def _uid_of(owner: object) -> int:
@@ -63,7 +62,7 @@ class MarkerVerbs:
         has = self._owners.count_where(lambda owner: _uid_of(owner) == peer.uid)
         if why := self._clients.quotas.over(peer, "markers", has, "markers", count):
             raise Refused(errno.EBUSY, f"reserve markers: {why}; free some")
-        owner = Persisting(peer.uid, peer.user, peer.gids) if persist else session
+        owner = Persisting(peer.uid, peer) if persist else session
         tokens: list[int] = []
         try:
             for _ in range(count):
@@ -112,8 +111,8 @@ class MarkerVerbs:
         """Free the markers that persist for users who have lost their last right."""
         rights, users = self._clients.rights, self._clients.users
         for owner in {each for each in self._owners.owners() if isinstance(each, Persisting)}:
-            peer = Peer(0, owner.uid, owner.user, users.remaining(owner.uid, owner.gids))
-            if not rights.anywhere(peer):
+            gids = users.remaining(owner.uid, owner.peer.gids)
+            if not rights.anywhere(replace(owner.peer, gids=gids)):
                 for reservation in self._owners.owned_by(owner):
                     self._release(reservation)
 

@@ -1,7 +1,7 @@
 """Who may do what: grants of the configuration against the credentials of the peer. Pure.
 
 The owner of the daemon and root may do everything. Without any ``[[grant]]`` everybody who can
-connect (the socket has an owner, a group and a mode) may read, write and stop.
+connect (the socket has an owner, a group and a mode, a gateway its list of keys) may read, write and stop.
 """
 
 from __future__ import annotations
@@ -30,15 +30,25 @@ def in_words(rights: Right, between: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """Credentials of a connected process, as the kernel vouches for them; ``user`` is for messages."""
+    """Credentials of a connected process, as the kernel vouches for them; ``user`` is for messages.
+
+    Attributes:
+        key: of a session through a gateway, the name of the key that its client has proved to hold; its ``uid`` is then
+            a number of that key alone, which no user of this machine has, and ``gids`` is empty.
+        host: where that client is.
+        groups: those of the key.
+    """
 
     pid: int
     uid: int
     user: str
     gids: frozenset[int]
+    key: str = ""
+    host: str = ""
+    groups: frozenset[str] = frozenset()
 
     def __str__(self) -> str:
-        return f"pid {self.pid} ({self.user})"
+        return f"{self.key}@{self.host} through sioms serve" if self.key else f"pid {self.pid} ({self.user})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +60,7 @@ class Grant:
         uids, gids: whom it is for.
         nodes: patterns of node names.
         rights: what it allows.
+        keys, groups: which keys it is for, ``*`` for all, and the keys of which groups.
     """
 
     everybody: bool
@@ -57,9 +68,13 @@ class Grant:
     gids: frozenset[int]
     nodes: tuple[str, ...]
     rights: Right
+    keys: frozenset[str] = frozenset()
+    groups: frozenset[str] = frozenset()
 
     def concerns(self, peer: Peer) -> bool:
-        """Tell whether it is for this peer."""
+        """Tell whether it is for this peer; users and keys are told apart."""
+        if peer.key:
+            return not self.keys.isdisjoint(("*", peer.key)) or not self.groups.isdisjoint(peer.groups)
         return self.everybody or peer.uid in self.uids or not self.gids.isdisjoint(peer.gids)
 
 
@@ -108,6 +123,8 @@ class Rights:
             frozenset(gid for gid in gids.values() if gid is not None),
             tuple(grant.nodes),
             rights,
+            frozenset(grant.keys),
+            frozenset(grant.groups),
         )
 
     def on_node(self, peer: Peer, node: str) -> Right:

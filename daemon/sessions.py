@@ -94,6 +94,7 @@ class Session:
         handles: by number.
         waits: unanswered requests by message number.
         greeting: ends it if it says nothing; None once it has.
+        greeted: whether it has said hello.
     """
 
     sock: socket.socket
@@ -103,6 +104,7 @@ class Session:
     handles: dict[int, Handle] = field(default_factory=dict)
     waits: dict[int, Wait] = field(default_factory=dict)
     greeting: Timer | None = None
+    greeted: bool = False
 
     @property
     def user(self) -> str:
@@ -110,7 +112,8 @@ class Session:
         return self.peer.user
 
     def __str__(self) -> str:
-        return f"{self.peer}" + (f" {self.name}" if self.name else "")
+        name = f"({self.name})" if self.name and self.peer.key else self.name
+        return f"{self.peer} {name}".rstrip()
 
 
 def peer_of(sock: socket.socket, users: Users) -> Peer:

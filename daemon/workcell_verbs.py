@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +16,18 @@ from sioms.protocol.messages import refusal, reply
 from sioms.protocol.text import printable
 
 from .devices import State
+from .rights import Peer
 from .sessions import LATER, Refused, Session
 
 if TYPE_CHECKING:
-    from sioms.protocol.verbs import EmergencyStop, Hello, Reload, Reset
+    from sioms.protocol.verbs import EmergencyStop, Hello, Reload, Represent, Reset
 
     from .clients import Clients
     from .server import Server
+
+
+NAMED = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}").fullmatch
+"""The name of a key or of a group of keys."""
 
 
 class WorkcellVerbs:
@@ -36,12 +42,32 @@ class WorkcellVerbs:
         self._server = server
         self._clients = clients
 
+    def represent(self, session: Session, message: Represent) -> None:
+        """Take a session for one of the holder of a key from now on."""
+        key, host, groups = message
+        what = f"represent {printable(key, 80)}"
+        if session.peer.key or session.greeted or session.handles or session.waits:
+            raise Refused(errno.EPERM, f"{what}: this session is somebody's already; it comes once, before hello")
+        if not self._clients.may_represent(session.peer):
+            why = "name it as gateway_user in [workcell], if it is a gateway's"
+            raise Refused(errno.EPERM, f"{what}: user {session.peer.user} may not speak for others; {why}")
+        if not NAMED(key) or not all(isinstance(group, str) and NAMED(group) for group in groups):
+            raise Refused(errno.EINVAL, f"{what}: want a key and groups of 1 to 64 letters, digits, - . and _")
+        peer = Peer(
+            session.peer.pid, self._clients.number_of(key), key, frozenset(), key, printable(host, 64),
+            frozenset(groups),
+        )  # fmt: skip
+        has = sum(other.peer.uid == peer.uid for other in self._clients.sessions)
+        if why := self._clients.quotas.over(peer, "sessions", has, "sessions"):
+            raise Refused(errno.EUSERS, f"{what}: {why}")
+        session.peer = peer
+
     def hello(self, session: Session, number: int, message: Hello) -> Any:
         """Answer a client that says who it is."""
         version, name = message
         if version != PROTOCOL_VERSION:
             raise Refused(errno.EPROTO, f"hello: protocol version {version}; this daemon speaks {PROTOCOL_VERSION}")
-        session.name = printable(name, 80)
+        session.name, session.greeted = printable(name, 80), True
         rights = self._clients.rights.on_workcell(session.peer)
         value = [PROTOCOL_VERSION, self._clients.bounds.name, int(rights)]
         fds = self._server.shared.files.client_fds if rights & Right.STOP else []

@@ -74,6 +74,7 @@ class ClientVerb(IntEnum):
     LIST = 4
     INFO = 5
     STATUS = 6
+    REPRESENT = 7
     RESERVE_MARKER = 10
     FREE_MARKER = 11
     SIGNAL_MARKER = 12

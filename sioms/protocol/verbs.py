@@ -217,6 +217,16 @@ class Hello(Message, on=FROM_CLIENT, verb=ClientVerb.HELLO, query=True):
     name: Text
 
 
+class Represent(Message, on=FROM_CLIENT, verb=ClientVerb.REPRESENT, query=True):
+    """Say on whose behalf this session is, once and before Hello: the holder of a key, on a host, in groups. From a
+    gateway's user only. From then on the session has the rights and the quotas of the key, and no others.
+    """
+
+    key: Name
+    host: Name
+    groups: Array
+
+
 class Open(Message, on=FROM_CLIENT, verb=ClientVerb.OPEN, right=Right.READ):
     """Open a node, which takes the right to write, too, if the node can be written.
 

@@ -76,6 +76,7 @@ from sioms.protocol.verbs import (
     Open,
     Part,
     Reload,
+    Represent,
     ReserveMarker,
     Reset,
     SignalMarker,
@@ -112,6 +113,7 @@ GOLDEN = [
 SOCKETS = (FROM_CLIENT, ON_HANDLE, TO_DRIVER, FROM_DRIVER, TO_FORK_SERVER)
 RECORDED: list[tuple[Message, str]] = [
     (Hello(2, "eva"), "94010502a3657661"),
+    (Represent("kate", "lab2", ["ops"]), "950705a46b617465a46c61623291a36f7073"),
     (Open("mod0", 3, None, 0.25), "960205a46d6f643003c0cb3fd0000000000000"),
     (Close(300), "930305cd012c"),
     (List(), "920405"),
@@ -254,7 +256,7 @@ def test_a_long_reply_is_compressed_and_one_too_long_is_a_refusal() -> None:
 
 
 NUMBERS = {
-    ClientVerb: "HELLO=1 OPEN=2 CLOSE=3 LIST=4 INFO=5 STATUS=6 RESERVE_MARKER=10 FREE_MARKER=11 SIGNAL_MARKER=12 "
+    ClientVerb: "HELLO=1 OPEN=2 CLOSE=3 LIST=4 INFO=5 STATUS=6 REPRESENT=7 RESERVE_MARKER=10 FREE_MARKER=11 SIGNAL_MARKER=12 "
     "WAIT_MARKER=13 EMERGENCY_STOP=20 RESET=21 RELOAD=22 CANCEL=30",
     HandleVerb: "WRITE=1 IOCTL=2 SUBSCRIBE=3 KEEPALIVE=4 CANCEL=5",
     DriverVerb: "ATTACH=1 DETACH=2 STOP_CHANGED=3 SHUTDOWN=4 INPUT=5 NODE_STOP=6 NODE_RESET=7 READY=20 DETACHED=21 "

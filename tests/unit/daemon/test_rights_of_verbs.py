@@ -14,7 +14,7 @@ import pytest
 
 from sioms.daemon import clients as clients_module
 from sioms.daemon.clients import Clients
-from sioms.daemon.config import GrantTable, NodeTable
+from sioms.daemon.config import GrantTable, NodeTable, QuotaTable, WorkcellTable
 from sioms.daemon.devices import State
 from sioms.daemon.loop import Loop
 from sioms.daemon.names import BlockInfo, DeviceInfo, NameTable
@@ -172,6 +172,7 @@ FREE: dict[ClientVerb, tuple[list[object], int]] = {
     ClientVerb.CANCEL: ([77], 0),
     ClientVerb.CLOSE: ([77], errno.EBADF),
     ClientVerb.FREE_MARKER: ([5], errno.EINVAL),
+    ClientVerb.REPRESENT: (["kate", "lab2", []], errno.EPERM),
 }
 """What needs no right: to look whether there is a workcell, and to give back."""
 SUBSETS = [[name for i, name in enumerate(RIGHTS) if bits >> i & 1] for bits in range(16)]
@@ -374,3 +375,63 @@ def test_markers_persist_for_users_with_a_right(cell: Workcell) -> None:
     assert reserved() == 3
     cell.grant((["read"], "tom", "*"))
     assert reserved() == 1
+
+
+# --- keys: on whose behalf a gateway speaks ------------------------------------------------------
+
+
+@pytest.fixture
+def gateway(cell: Workcell) -> Workcell:
+    """The workcell, where Eva is the user of a gateway."""
+    cell.server.config = SimpleNamespace(workcell=WorkcellTable(gateway_user="eva"), quota=QuotaTable(sessions=1))
+    cell.clients.users.uid = {"eva": 1001}.get  # type: ignore[method-assign, assignment]
+    return cell
+
+
+def _keys(*grants: tuple[list[str], list[str], list[str]]) -> Rights:
+    return Rights([GrantTable(rights, [], groups, ["*"], keys) for rights, groups, keys in grants], 0, Users())  # type: ignore[arg-type]
+
+
+def test_a_gateway_has_the_rights_of_the_key_that_it_speaks_for_and_no_others(gateway: Workcell) -> None:
+    gateway.clients.take_up_rights(_keys((["read", "write"], [], ["kate"]), (["read"], ["guests"], [])))
+    assert gateway.open("eva", "io0") == errno.EACCES
+    assert gateway.ask("tom", ClientVerb.REPRESENT, "kate", "lab2", []) == errno.EPERM
+    assert gateway.ask("eva", ClientVerb.REPRESENT, "kate", "lab2", []) == 0
+    assert gateway.ask("eva", ClientVerb.REPRESENT, "root", "lab2", []) == errno.EPERM, "once"
+    assert gateway.ask("eva", ClientVerb.HELLO, PROTOCOL_VERSION, "devout") == 0
+    assert gateway.value[2] == Right.READ | Right.WRITE
+    assert gateway.open("eva", "io0") == 0
+    assert str(gateway.sessions["eva"]) == "kate@lab2 through sioms serve (devout)"
+    assert gateway.sessions["eva"].peer.uid >= 1 << 32
+    gateway.clients.take_up_rights(_keys((["read"], [], ["kate"])))
+    assert [order[1] for order in gateway.device.ended()] == [errno.EACCES]
+
+
+def test_groups_of_a_key_and_all_keys_are_granted_but_everybody_is_no_key(gateway: Workcell) -> None:
+    assert gateway.ask("eva", ClientVerb.REPRESENT, "kate", "lab2", ["ops"]) == 0
+    peer = gateway.sessions["eva"].peer
+    assert _keys((["read"], ["ops"], [])).anywhere(peer) == Right.READ == _keys((["read"], [], ["*"])).anywhere(peer)
+    assert not _keys((["read"], ["guests"], [])).anywhere(peer) and not _keys((["read"], [], ["tom"])).anywhere(peer)
+    assert not Rights([GrantTable(["read"], ["*", "kate"])], 0, Users()).anywhere(peer)
+    assert _keys().anywhere(peer) == Right.READ | Right.WRITE | Right.STOP, "as for users: no grant, no bounds"
+
+
+def test_nobody_is_represented_after_hello_or_by_a_strange_name(gateway: Workcell) -> None:
+    for key, groups in (("", []), ("a b", []), ("kate\n", []), ("x" * 65, []), ("kate", [1]), ("kate", ["a b"])):
+        assert gateway.ask("eva", ClientVerb.REPRESENT, key, "lab2", groups) == errno.EINVAL, key
+    assert gateway.ask("eva", ClientVerb.HELLO, PROTOCOL_VERSION, "test") == 0
+    assert gateway.ask("eva", ClientVerb.REPRESENT, "kate", "lab2", []) == errno.EPERM
+
+
+def test_a_key_has_the_quotas_of_a_user_of_its_own(gateway: Workcell) -> None:
+    kates = Peer(1, gateway.clients.number_of("kate"), "kate", frozenset(), "kate", "lab1")
+    gateway.sessions["tom"].peer = kates
+    assert gateway.ask("eva", ClientVerb.REPRESENT, "kate", "lab2", []) == errno.EUSERS
+    assert gateway.ask("eva", ClientVerb.REPRESENT, "ben", "lab2", []) == 0
+
+
+def test_sessions_of_keys_end_when_their_gateway_is_none_any_more(gateway: Workcell) -> None:
+    assert gateway.ask("eva", ClientVerb.REPRESENT, "kate", "lab2", []) == 0
+    gateway.server.config = SimpleNamespace(workcell=WorkcellTable(), quota=QuotaTable())
+    gateway.clients.take_up_rights(_keys())
+    assert gateway.sessions["eva"] not in gateway.clients.sessions
