@@ -1,0 +1,10 @@
+"""Two-fingered planar hand: pure maps between joints, hand coordinates, contacts and forces.
+
+No process, no clock, no I/O.  SI units: m, rad, N, N m.  Angles are counter-clockwise.
+
+* `kinematics`: joints of two modules and the six hand coordinates;
+* `contacts`: normals, contact points and friction angles of a grasp, and what is said of it;
+* `statics`: grasp matrix, internal force, and its sampled control loop;
+* `regrasp`: where the fingers go for a parallel grasp;
+* `rolling`: rigid fingers rolling on an object without slip.
+"""

@@ -1,0 +1,60 @@
+"""Forces of a planar grasp, and the sampled loop that controls the internal one.
+
+At rest with two contacts the forces are equal and opposite along the line through the contacts: the null space of the
+grasp matrix.  f > 0 squeezes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def grasp_matrix(contact1: Sequence[float], contact2: Sequence[float]) -> Floats:
+    """Return G, shape (3, 4): the wrench (fx, fy, moment about the origin) of the forces (f1x, f1y, f2x, f2y)."""
+    return np.array(
+        [
+            [1.0, 0.0, 1.0, 0.0],
+            [0.0, 1.0, 0.0, 1.0],
+            [-contact1[1], contact1[0], -contact2[1], contact2[0]],
+        ]
+    )
+
+
+def contact_forces(internal: float, eta1: float, eta2: float) -> tuple[float, float, float, float]:
+    """Return (normal 1, tangential 1, normal 2, tangential 2) [N] of an internal force [N] at friction angles [rad].
+
+    Tangential forces of the fingers on the object, counter-clockwise of the normal positive.
+    """
+    return (
+        internal * math.cos(eta1),
+        internal * math.sin(eta1),
+        internal * math.cos(eta2),
+        internal * math.sin(eta2),
+    )
+
+
+def damper_limit(stiffness: float, sample_s: float, late: int = 0) -> float:
+    """Return the gain K_v [m/(s N)] at which the sampled loop d' = -K_v (f_d - f_a) becomes unstable.
+
+    Args:
+        stiffness: of everything in series between the commanded d and the force [N/m].
+        sample_s: T.
+        late: samples by which the force is late: 1 halves the limit, see `damper_factor`.
+    """
+    return 2.0 * math.sin(0.5 * math.pi / (2 * late + 1)) / (stiffness * sample_s)
+
+
+def damper_factor(gain: float, stiffness: float, sample_s: float, late: int = 0) -> float:
+    """Return the largest |z| of the loop z^(n+1) - z^n + K_v k T = 0: below 1 it is stable.
+
+    With nothing late z = 1 - K_v k T: no overshoot up to K_v k T = 1, stable below 2.
+    """
+    polynomial = [1.0, -1.0, *([0.0] * late)]
+    polynomial[-1] += gain * stiffness * sample_s
+    return float(np.abs(np.roots(polynomial)).max())
