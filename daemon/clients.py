@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from sioms.protocol import verbs
 from sioms.protocol.flags import Right
+from sioms.protocol.journal import Note
 from sioms.protocol.messages import MAX_PACKET, MalformedMessage, refusal, reply
 
 from .config import QuotaTable, WorkcellTable
@@ -203,9 +204,22 @@ class Clients:
         except (Refused, MarkerError) as error:
             # Also then: who closes a handle that its driver has ended already shall see the axes halted.
             self.send(session, refusal(number, error.errno, str(error), _as_of_ns(message)))
+            self._note(session, message, error.errno, str(error))
         else:
             if value is not LATER:
                 self.send(session, reply(number, value, _as_of_ns(message)))
+            if not message.query:
+                self._note(session, message, 0, "")
+
+    def _note(self, session: Session, message: verbs.Message, errno_: int, why: str) -> None:
+        """Note a request, after its answer has been sent; keys of markers stay between the daemon and their owners."""
+        values = [
+            value & 1023 if field in ("token", "marker") else value
+            for field, value in zip(message.fields, message, strict=True)
+        ]
+        self._server.shared.journal.note(
+            Note.REQUEST, time.monotonic_ns(), str(session), type(message).__name__, values, errno_, why
+        )
 
     def _serve(self, session: Session, number: int, message: verbs.Message) -> Any:
         if message.somewhere and not self.rights.anywhere(session.peer):
@@ -228,6 +242,8 @@ class Clients:
                 return self.nodes.listing(session)
             case verbs.Info(node, right=right):
                 return self._server.names.pack(self.nodes.find(session, "get information", node, right))
+            case verbs.Journal(device):
+                return self._workcell.journal(session, number, device)
             case verbs.Status():
                 return self._status_now()
             case verbs.ReserveMarker(how_many, persist):

@@ -24,6 +24,7 @@ from sioms.protocol.verbs import Message, take
 
 from .config import Device
 from .fork_server import ForkServer
+from .journals import journal_file
 from .loop import Loop, Timer
 from .names import DeviceInfo
 from .patience import Patience
@@ -94,6 +95,7 @@ class DriverProcess:
         self.started_ns = 0
         self.restarts = Restarts()
         self.page_fds: list[int] = []
+        self.journal_fd = journal_file(f"sioms:{device.name}.journal")
         self.hung = False
         self.options = options
         self._maps: list[mmap.mmap] = []
@@ -156,7 +158,7 @@ class DriverProcess:
             try:
                 self._fork_server().spawn(
                     self.name, self.device.common.driver, self.device.settings, self.generation, options,
-                    [theirs.fileno(), *self._shared], partial(self._spawned, self.generation),
+                    [theirs.fileno(), *self._shared, self.journal_fd], partial(self._spawned, self.generation),
                 )  # fmt: skip
             except OSError as error:
                 self._end(f"its process could not be started: {error.strerror}")

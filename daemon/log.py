@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 
+from sioms.protocol.journal import Note
 from sioms.protocol.text import printable
 
 _SYSTEMD = {"debug": 7, "info": 6, "warning": 4, "error": 3}
@@ -43,9 +44,13 @@ class Log:
         journal: prefix lines with the level number that journald reads, and leave out the time.
         level: least level written: debug, info, warning, error.
         clock: returns the time [s], monotonic.
+
+    Attributes:
+        note: where each line is noted, too: that of a journal.
     """
 
     def __init__(self, journal: bool = False, level: str = "info", clock: Callable[[], float] = time.monotonic) -> None:
+        self.note: Callable[..., None] | None = None
         self._journal = journal
         self._clock = clock
         self._spans: dict[tuple[str, str], _Span] = {}
@@ -86,6 +91,10 @@ class Log:
             self._write(_SYSTEMD[span.level], span.level, event, {**span.values, "more": told})
 
     def _write(self, number: int, level: str, event: str, values: Mapping[str, object]) -> None:
+        if self.note is not None:
+            self.note(
+                Note.LOG, time.monotonic_ns(), level, event, {key: str(value)[:2000] for key, value in values.items()}
+            )
         now = time.time()
         stamp = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(now)) + f".{int(now % 1 * 1000):03d}Z"
         head = f"<{number}>" if self._journal else f"time={stamp} "

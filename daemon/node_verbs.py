@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.driver_verbs import Attach, Detach
 from sioms.protocol.flags import READONLY, Access, Right
+from sioms.protocol.journal import Note
 from sioms.protocol.messages import refusal, reply
 from sioms.wording import did_you_mean
 
@@ -297,6 +298,7 @@ class NodeVerbs:
         if self._handles.pop(handle.number, None) is None:
             return
         handle.session.handles.pop(handle.number, None)
+        self._server.shared.journal.note(Note.CLOSED, time.monotonic_ns(), handle.node.name, str(handle.session))
         self._claims.release(handle.claims)
         wait = handle.session.waits.get(handle.closing)
         if wait is not None:

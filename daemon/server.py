@@ -15,6 +15,7 @@ from typing import Any
 
 from sioms.protocol import driver_verbs
 from sioms.protocol.flags import PageState
+from sioms.protocol.journal import Note
 from sioms.protocol.stopjournal import node_entry, parts_of, workcell_entry
 from sioms.protocol.verbs import Message
 
@@ -57,6 +58,7 @@ class Server:
         self.loop = loop
         self.log = log
         self.shared = Shared(listening.path, record)
+        log.note = self.shared.journal.note
         self.names = NameTable({}, {})
         self.devices: dict[str, DriverProcess] = {}
         self.config: Config | None = None
@@ -290,7 +292,9 @@ class Server:
         match message:
             case driver_verbs.Detached(handle):
                 self.clients.nodes.detached(device, handle)
-            case driver_verbs.MarkerSignalled():
+            case driver_verbs.MarkerSignalled(number):
+                stamp_ns = self.shared.markers.stamp_ns(number)
+                self.shared.journal.note(Note.MARKER, stamp_ns, device.name, number)
                 self.clients.markers.signalled()
             case driver_verbs.Stopped(source):
                 self.log("warning", "emergency stop", source=source, device=device.name)
@@ -400,6 +404,7 @@ class Server:
         device.shutdown(lambda: self._left(device))
 
     def _left(self, device: DriverProcess) -> None:
+        os.close(device.journal_fd)
         del self._leaving[device.name]
         if self.config is not None and device.name in self.config.devices:
             self._start(device.name)

@@ -10,6 +10,7 @@ from sioms.protocol.latch import LATCH_SIZE, Latch
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
 from sioms.protocol.stopfile import StopRequest
 
+from .journals import OwnJournal
 from .stop_files import StopFiles
 from .stop_record import StopRecord
 
@@ -24,12 +25,14 @@ class Shared:
         record: what is stopped.
 
     Attributes:
+        journal: what the daemon tells recorders.
         fds: descriptors of latch, stop-request file, file of the requests taken, marker table and journal of stops, as
             a driver gets them.
     """
 
     def __init__(self, path: str, record: StopRecord) -> None:
         self.record = record
+        self.journal = OwnJournal()
         self.files = StopFiles(path)
         latch_fd, latch = _memory("sioms-latch", LATCH_SIZE)
         markers_fd, markers = _memory("sioms-markers", TABLE_SIZE)

@@ -16,6 +16,7 @@ from sioms.protocol.messages import refusal, reply
 from sioms.protocol.text import printable
 
 from .devices import State
+from .journals import for_reading
 from .rights import Peer
 from .sessions import LATER, Refused, Session
 
@@ -108,6 +109,23 @@ class WorkcellVerbs:
             ],
             "holders": [[h.node.name, str(h.session), (now - h.since_ns) / 1e9] for h in self._clients.nodes.holders()],
         }
+
+    def journal(self, session: Session, number: int, device: str) -> Any:
+        """Open a journal: all that everybody does is in it, and the keys of the markers that commands signal."""
+        what = f"open the journal of {device or 'the daemon'}"
+        if not self._clients.rights.on_workcell(session.peer) & Right.ADMINISTER:
+            raise Refused(
+                errno.EPERM, f"{what}: {session.peer.user} has no right to administer every node; ask for a [[grant]]"
+            )
+        process = self._server.devices.get(device)
+        if device and process is None:
+            raise Refused(errno.ENOENT, f"{what}: no such device; there are: {', '.join(self._server.devices)}")
+        fd = for_reading(self._server.shared.journal.fd if process is None else process.journal_fd)
+        try:
+            self._clients.send(session, reply(number, process.generation if process else 0), [fd])
+        finally:
+            os.close(fd)
+        return LATER
 
     def emergency_stop(self, session: Session, message: EmergencyStop) -> None:
         """Stop the workcell, or a node."""

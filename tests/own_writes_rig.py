@@ -28,6 +28,7 @@ from sioms.client.node_core import NodeCore
 from sioms.motion import AxisSettings, DriveAction
 from sioms.protocol.driver_verbs import Attach, DriverVerb
 from sioms.protocol.flags import Access, ControlMode, NodeClass, Request, Right
+from sioms.protocol.journal import HEADER, JOURNAL_SIZE
 from sioms.protocol.latch import LATCH_SIZE, Latch
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
 from sioms.protocol.messages import encode
@@ -109,7 +110,8 @@ class World:
         self.chance = chance
         self.device = device
         self.clients: list[Client] = []
-        latch, request, taken, markers, journal = (_memory(n) for n in (LATCH_SIZE, 4096, 4096, TABLE_SIZE, 0))
+        sizes = (LATCH_SIZE, 4096, 4096, TABLE_SIZE, 0, HEADER + JOURNAL_SIZE)
+        latch, request, taken, markers, journal, events = (_memory(size) for size in sizes)
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.control = ours
         self.control.setblocking(False)
@@ -117,7 +119,7 @@ class World:
         options = {
             "stop_sources": [], "alarms": [], "daemon_lease_s": 1e6, "phase": 0.0, "state_folder": "", "stopped": [],
         }  # fmt: skip
-        fds = [theirs.detach(), latch, request, taken, markers, journal]
+        fds = [theirs.detach(), latch, request, taken, markers, journal, events]
         self.runtime = Runtime(driver, "dev", settings, 1, options, fds)
         import mmap
 

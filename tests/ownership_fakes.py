@@ -307,7 +307,7 @@ class Process:
         runtime._epoll.close()
         runtime.stops._request.close()
         runtime.stops._journal.close()
-        for fd in (self._fds[1], self._fds[4], runtime._timer.fd, runtime._line_timer.fd):
+        for fd in (self._fds[1], self._fds[4], self._fds[6], runtime._timer.fd, runtime._line_timer.fd):
             os.close(fd)
         self.life.end()
         PROCESSES.pop(self.pid, None)

@@ -75,6 +75,7 @@ class ClientVerb(IntEnum):
     INFO = 5
     STATUS = 6
     REPRESENT = 7
+    JOURNAL = 8
     RESERVE_MARKER = 10
     FREE_MARKER = 11
     SIGNAL_MARKER = 12
@@ -137,6 +138,18 @@ def decode(packet: bytes, most: int = MAX_PACKET, values: int = MAX_UNPACKED) ->
     if not (0 <= verb < 256 and 0 <= number < 1 << 53):
         raise MalformedMessage(f"decode packet: verb {verb}, id {number}; want integers from 0")
     return message
+
+
+def decode_payload(data: bytes) -> Any:
+    """Unpack what ``encode`` has packed, without judging its shape.
+
+    Raises:
+        MalformedMessage: it is no msgpack, or more than a message may be.
+    """
+    try:
+        return _unpack(data)
+    except Exception as error:
+        raise MalformedMessage(f"decode payload: {type(error).__name__}: {printable(str(error), 200)}") from None
 
 
 def decode_reply(packet: bytes, most: int = MAX_PACKET) -> list[Any]:

@@ -52,7 +52,7 @@ _ORDERED = os.uname().machine in ("x86_64", "i686", "AMD64")
 
 if _ORDERED:
 
-    def _fence() -> None:
+    def fence() -> None:
         """Keep store order: nothing to do, this processor does."""
 
 else:
@@ -60,7 +60,7 @@ else:
 
     _lock = allocate_lock()
 
-    def _fence() -> None:
+    def fence() -> None:
         """Keep store order: an acquire and a release."""
         with _lock:
             pass
@@ -165,12 +165,12 @@ class PageWriter:
         word = offset >> 3
         words = self._words
         words[word] = 0
-        _fence()
+        fence()
         words[word + 1] = stamp_ns
         words[word + 2] = tick
         words[word + 3] = as_of_ns
         self._bytes[offset + SLOT_HEADER : offset + self._size] = payload
-        _fence()
+        fence()
         words[word] = number
         words[_HEAD] = number
         self._number = number
@@ -178,7 +178,7 @@ class PageWriter:
     def set_state(self, state: PageState, reason: str = "") -> None:
         """Set the driver's state word, and the reason for a state that is not good."""
         _write_reason(self._bytes, reason)
-        _fence()
+        fence()
         pack_into("<I", self._bytes, 64, state)
 
     def release(self) -> None:
@@ -190,7 +190,7 @@ class PageWriter:
 def set_daemon_state(buffer: memoryview, state: PageState, reason: str) -> None:
     """Set the daemon's state word in a mapped page (the daemon's only store in it)."""
     _write_reason(buffer, reason)
-    _fence()
+    fence()
     pack_into("<I", buffer, 68, state)
 
 

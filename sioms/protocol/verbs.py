@@ -260,6 +260,16 @@ class Status(Message, on=FROM_CLIENT, verb=ClientVerb.STATUS, query=True):
     """Tell devices, sessions, holders and stops."""
 
 
+class Journal(Message, on=FROM_CLIENT, verb=ClientVerb.JOURNAL, query=True):
+    """Open the journal of a device's driver processes, '' = of the daemon; takes the right to administer
+    every node, because commands name the keys of markers.
+
+    Answer: number of the driver's generation, 0 for the daemon; descriptor: the journal, to be read only.
+    """
+
+    device: Name
+
+
 class ReserveMarker(Message, on=FROM_CLIENT, verb=ClientVerb.RESERVE_MARKER, somewhere="reserve markers"):
     """Reserve markers, all or none, for the session or to persist. Answer: their tokens."""
 

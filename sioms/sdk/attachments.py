@@ -19,6 +19,7 @@ from sioms.protocol import verbs
 from sioms.protocol.compiled import add_decoders
 from sioms.protocol.driver_verbs import Attach, Detached
 from sioms.protocol.flags import REQUESTS, Access, Right
+from sioms.protocol.journal import JournalWriter, Note
 from sioms.protocol.messages import MAX_INLINE, MAX_PACKET, MAX_WRITE, MalformedMessage
 from sioms.protocol.text import shown
 from sioms.protocol.verbs import Message
@@ -46,13 +47,15 @@ class Attachments:
         service: what their requests work with.
         turns: in which they take turns.
         tell: sends the daemon a message.
+        journal: where commands are noted.
     """
 
     def __init__(
-        self, handles: dict[int, Handle], service: Service, turns: Turns, tell: Callable[[Message], None]
-    ) -> None:
+        self, handles: dict[int, Handle], service: Service, turns: Turns, tell: Callable[[Message], None],
+        journal: JournalWriter,
+    ) -> None:  # fmt: skip
         self.handles = handles
-        self._service, self._turns, self._tell = service, turns, tell
+        self._service, self._turns, self._tell, self._journal = service, turns, tell, journal
         self._leased: list[Handle] = []
 
     def check_leases(self, now_ns: int) -> None:
@@ -136,7 +139,8 @@ class Attachments:
             if not packet:
                 self.drop(handle)
                 return
-            self._serve(handle, *verbs.take(packet, verbs.ON_HANDLE, pending=handle.waits))
+            number, message = verbs.take(packet, verbs.ON_HANDLE, pending=handle.waits)
+            self._serve(handle, number, message, packet)
         except MalformedMessage as error:
             self._service.log("warning", f"{handle.node}: connection of {handle.who} ended: malformed message: {error}")
             self.end(handle, errno.EPROTO, f"{handle.node}: malformed message: {error}")
@@ -147,11 +151,12 @@ class Attachments:
             self._service.log("error", f"{handle.node}: the driver failed to serve {handle.who}: {trace}")
             self.end(handle, errno.EIO, f"{handle.node}: the driver failed: {shown(error)}")
 
-    def _serve(self, handle: Handle, number: int, message: verbs.Message) -> None:
+    def _serve(self, handle: Handle, number: int, message: verbs.Message, packet: bytes) -> None:
         if isinstance(message, verbs.Keepalive):
             return
         if isinstance(message, verbs.Part):
             _keep_part(handle, message)
+            self._note(handle, packet, 0, "")
             return
         # Nothing is taken after a stop, or refused after its reset, because no tick has come in between; and no order
         # that was acknowledged before undoes what is acknowledged now.
@@ -161,10 +166,18 @@ class Attachments:
         try:
             value = self._value(handle, number, message)
         except OSError as error:
-            handle.refuse(number, error.errno or errno.EIO, error.strerror or str(error))
+            why = error.errno or errno.EIO, error.strerror or str(error)
+            handle.refuse(number, *why)
+            self._note(handle, packet, *why)
         else:
             if value is not LATER:
                 handle.answer(number, value)
+            if not message.query and not (isinstance(message, verbs.Ioctl) and REQUESTS[message.request][2]):
+                self._note(handle, packet, 0, "")
+
+    def _note(self, handle: Handle, packet: bytes, errno_: int, why: str) -> None:
+        """Note a command, after its answer has been sent: a client does not wait for that."""
+        self._journal.note(Note.COMMAND, handle.heard_ns, handle.node, handle.who, packet, errno_, why)
 
     def _value(self, handle: Handle, number: int, message: verbs.Message) -> Any:
         match message:

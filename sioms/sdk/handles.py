@@ -12,6 +12,7 @@ from __future__ import annotations
 import errno
 import os
 import socket
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.protocol.flags import Access, Right
+from sioms.protocol.journal import JournalWriter, Note
 from sioms.protocol.messages import refusal, reply
 
 from .blocks import AnyBlock
@@ -174,12 +176,14 @@ class Waits:
 
     Args:
         effects: where the effects of what has waited are noted.
+        journal: where refusals are noted.
         a_look: how many of each user are looked at after a publication.
     """
 
-    def __init__(self, effects: Effects, a_look: int = LOOKS_A_MS) -> None:
+    def __init__(self, effects: Effects, journal: JournalWriter, a_look: int = LOOKS_A_MS) -> None:
         self.a_look = a_look
         self._effects = effects
+        self._journal = journal
         self._of: dict[int, dict[Wait, None]] = {}
         self._idle: dict[tuple[int, frozenset[int]], bool] = {}
 
@@ -293,7 +297,9 @@ class Waits:
         if self._remove(wait):
             if wait.cancelled is not None:
                 wait.cancelled()
-            wait.handle.refuse(wait.number, errno_, text)
+            handle = wait.handle
+            handle.refuse(wait.number, errno_, text)
+            self._journal.note(Note.REFUSAL, time.monotonic_ns(), handle.node, handle.who, wait.number, errno_, text)
 
     def _remove(self, wait: Wait) -> bool:
         if wait.handle.waits.pop(wait.number, None) is None:

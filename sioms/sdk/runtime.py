@@ -25,6 +25,7 @@ from sioms.descriptors import receive
 from sioms.motion import CommandError
 from sioms.protocol import driver_verbs
 from sioms.protocol.flags import PageState
+from sioms.protocol.journal import HEADER, JOURNAL_SIZE, JournalWriter, Note
 from sioms.protocol.latch import LATCH_SIZE, Latch
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
 from sioms.protocol.messages import MAX_PACKET, MAX_UNPACKED
@@ -81,7 +82,8 @@ def run(
         generation: number of this process among the device's.
         options: stop_sources, alarms, daemon_lease_s, lease_s, realtime_priority, user, phase of the tick [period],
             state_folder, stopped: what of the device is stopped, see ``Stops.restore``.
-        fds: control socket, latch page, stop-request file, file of the requests taken, marker table, journal of stops.
+        fds: control socket, latch page, stop-request file, file of the requests taken, marker table, journal of stops,
+            journal.
     """
     name_process(f"sioms:{device}")
     runtime = Runtime(driver, device, settings, generation, options, fds)
@@ -102,8 +104,9 @@ class Runtime:
         self.device = device
         self.tick = 0
         self.running = True
+        self.journal = JournalWriter(memoryview(mmap.mmap(fds[6], HEADER + JOURNAL_SIZE)))
         self.effects = Effects()
-        self.waits = Waits(self.effects)
+        self.waits = Waits(self.effects, self.journal)
         self.looked_ns = 0
         self.outputs = Outputs()
         self.statistics = TickStatistics()
@@ -142,6 +145,7 @@ class Runtime:
         self.stops = Stops(
             device, self.blocks, self.outputs, self.effects, self.waits, self.pages, handles, self.log, self.tell,
             self.latch, request, StopJournal(fds[5]), options["stop_sources"],
+            self.journal,
         )  # fmt: skip
         parts = Parts(self, self.blocks, self.outputs, self.effects, self.waits, self.pages, self.stops, self.log)
         self.engine = self.stops.engine = self._make_engine(parts)
@@ -149,7 +153,7 @@ class Runtime:
             self, self.blocks, self.outputs, self.effects, self.waits, self.pages, self.stops, self.log,
             self.driver, self.engine, self.statistics_report,
         )  # fmt: skip
-        self.clients = Attachments(handles, service, self.turns, self.tell)
+        self.clients = Attachments(handles, service, self.turns, self.tell, self.journal)
         self.period_ns = int(1e9 / self.engine.tick_hz)
         self.waits.a_look = max(LOOKS_A_MS, LOOKS_A_MS * self.period_ns // 1_000_000)
         self._lead_ns = self.engine.lead_ns if isinstance(self.engine, TickEngine) else 0
@@ -204,6 +208,7 @@ class Runtime:
             self._line_timer.set(0 if when_ns is None else max(when_ns, 1))
 
     def _link_changed(self, state: PageState, reason: str) -> None:
+        self.journal.note(Note.LINK, time.monotonic_ns(), state.name, printable(reason))
         self.tell(driver_verbs.LinkChanged(int(state), printable(reason)))
 
     def after_publication(self, now_ns: int, shown: Sequence[AnyBlock]) -> None:

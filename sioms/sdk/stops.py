@@ -18,6 +18,7 @@ import numpy as np
 from sioms.motion import EventKind
 from sioms.protocol.driver_verbs import Stopped
 from sioms.protocol.flags import PageState
+from sioms.protocol.journal import JournalWriter, Note
 from sioms.protocol.latch import Latch
 from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.stopjournal import StopJournal, channels_and_bits, node_entry, parts_of, workcell_entry
@@ -79,6 +80,7 @@ class Stops:
         request: file in which any client asks for an emergency stop.
         journal: where stops are noted before they are acknowledged, so that they outlive this process.
         sources: inputs of this device that stop the workcell, each (block, channel, bit, active level).
+        events: where stops, faults and resets are told to recorders.
 
     Attributes:
         engine: of the device; set before the first tick.
@@ -93,6 +95,7 @@ class Stops:
         self, device: str, blocks: Sequence[AnyBlock], outputs: Outputs, effects: Effects, waits: Waits, pages: Pages,
         handles: Mapping[int, Handle], log: Callable[[str, str], None], tell: Callable[[Message], None],
         latch: Latch, request: StopRequest, journal: StopJournal, sources: Iterable[Sequence[int]],
+        events: JournalWriter,
     ) -> None:  # fmt: skip
         self.stopped = False
         self.latched_outputs: dict[tuple[int, int, int], str] = {}
@@ -105,6 +108,7 @@ class Stops:
         self._latch = latch
         self._request = request
         self._journal = journal
+        self._events = events
         self._sources = [tuple(source) for source in sources]
         self._seen = (0, latch.resets, request.mark)
         self._orders = latch.orders
@@ -170,6 +174,7 @@ class Stops:
             self._effects.note()
             self.stopped = False
             self.latched_outputs.clear()
+            self._events.note(Note.RESET, time.monotonic_ns(), "", [])
             for block in self._blocks:
                 if isinstance(block, AxisBlock):
                     self._reset_axes(block, range(block.n))
@@ -225,6 +230,8 @@ class Stops:
                 step()
             except Exception as error:  # nothing may keep the others from being stopped
                 failures.append(error)
+        told = [] if parts is None else [[b.spec.name, [int(c) for c in channels], bit] for b, channels, bit in parts]
+        self._events.note(Note.STOP, time.monotonic_ns(), reason.stop.name, reason.text, told)
         if failures:
             raise failures[0]
 
@@ -245,6 +252,7 @@ class Stops:
                     self._waits.end_axes(block, event.axes, event.errno or errno.EIO, event.text)
                     if event.kind is EventKind.FAULT:
                         names = ", ".join(block.spec.channels[a].name for a in event.axes[:4])
+                        self._events.note(Note.FAULT, time.monotonic_ns(), names, event.text)
                         self._log("error", f"fault of {names}: {event.text}")
 
     def _stop_axes(self, reason: Reason, parts: Iterable[Part]) -> None:
@@ -287,6 +295,7 @@ class Stops:
         if self.stopped:
             raise OSError(errno.EPERM, f"{what}: the whole workcell is stopped ({self.source}); reset that")
         self._effects.note()
+        self._events.note(Note.RESET, time.monotonic_ns(), block.spec.name, [int(c) for c in channels])
         if isinstance(block, AxisBlock):
             self._reset_axes(block, channels)
             return

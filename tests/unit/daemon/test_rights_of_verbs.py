@@ -16,6 +16,7 @@ from sioms.daemon import clients as clients_module
 from sioms.daemon.clients import Clients
 from sioms.daemon.config import GrantTable, NodeTable, QuotaTable, WorkcellTable
 from sioms.daemon.devices import State
+from sioms.daemon.journals import OwnJournal
 from sioms.daemon.loop import Loop
 from sioms.daemon.names import BlockInfo, DeviceInfo, NameTable
 from sioms.daemon.rights import RIGHTS, Peer, Rights
@@ -74,7 +75,7 @@ class Workcell:
             log=lambda *_a, **_k: None, hear_request=str,
             shared=SimpleNamespace(
                 markers=MarkerTable(memoryview(bytearray(TABLE_SIZE))), latch=latch, record=record,
-                files=SimpleNamespace(client_fds=[]),
+                files=SimpleNamespace(client_fds=[]), journal=OwnJournal(),
             ),
             stop_workcell=lambda source: self.done.append("stop"),
             reset_workcell=lambda who: self.done.append("reset"),
@@ -135,6 +136,7 @@ class Workcell:
         for each in (*self.ends.values(), self.listener, *(s.sock for s in self.sessions.values())):
             each.close()
         os.close(self.device.page_fds[0])
+        os.close(self.server.shared.journal.fd)
         self.loop.close()
 
 
@@ -158,6 +160,7 @@ ON_ALL: dict[str, tuple[Callable[[Workcell], int | None], Right]] = {
     "stop": (lambda c: c.ask("eva", ClientVerb.EMERGENCY_STOP, "", ""), Right.STOP),
     "reset": (lambda c: c.ask("eva", ClientVerb.RESET, ""), EITHER),
     "reload": (lambda c: c.ask("eva", ClientVerb.RELOAD), Right.ADMINISTER),
+    "journal": (lambda c: c.ask("eva", ClientVerb.JOURNAL, ""), Right.ADMINISTER),
 }
 ON_NOTHING: dict[ClientVerb, tuple[list[object], int]] = {
     ClientVerb.RESERVE_MARKER: ([1, False], 0),
@@ -185,6 +188,7 @@ def test_no_verb_is_left_out() -> None:
         ClientVerb.EMERGENCY_STOP,
         ClientVerb.RESET,
         ClientVerb.RELOAD,
+        ClientVerb.JOURNAL,
     }
     assert on_nodes | {*ON_NOTHING} | {*FREE} == {*ClientVerb}
 

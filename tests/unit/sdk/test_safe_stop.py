@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from sioms.protocol.flags import NodeClass
+from sioms.protocol.journal import HEADER, JOURNAL_SIZE, JournalWriter
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AxisBlock, BinaryBlock, BlockSpec
 from sioms.sdk.effects import Effects
@@ -52,6 +53,7 @@ class Device:
             nothing,
             nothing,
             [],
+            JournalWriter(memoryview(bytearray(HEADER + JOURNAL_SIZE))),
         )
         self.stops.engine = engine
 
