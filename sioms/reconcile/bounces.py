@@ -9,7 +9,8 @@ import numpy as np
 
 from sioms.reconcile.effect import Array
 from sioms.reconcile.effects import known
-from sioms.reconcile.fit import Fit, Free, Problem, descended, free_parameters, get, put, refit, shifted
+from sioms.reconcile.engine.fit import Free, get, put
+from sioms.reconcile.fit import Fit, Problem, descended, free_parameters, refit, shifted
 from sioms.reconcile.model import AxisModel
 
 #: Relative steps in which the numbers of a gap are searched: when it is new, and when it was found beside other

@@ -13,7 +13,8 @@ from sioms.reconcile.ambiguity import Rival
 from sioms.reconcile.blocks import better, block_ids, formal, intervals
 from sioms.reconcile.channels import Finding
 from sioms.reconcile.effects import known
-from sioms.reconcile.fit import Fit, Problem, get, refit
+from sioms.reconcile.engine.fit import get
+from sioms.reconcile.fit import Fit, Problem, refit
 from sioms.reconcile.rules import told_apart
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.thresholds import GAIN

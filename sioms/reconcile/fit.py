@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.reconcile.descent import descend
 from sioms.reconcile.effect import Array, Parameter, Slot
 from sioms.reconcile.effects import known
+from sioms.reconcile.engine.fit import BASE, Free, fitted, get, put
+from sioms.reconcile.engine.fit import Fit as AnyFit
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import Noise, response
 from sioms.reconcile.records import Record, Session
@@ -24,7 +25,7 @@ from sioms.reconcile.simulate import Run, inertia, linked, pack, replay, track
 
 #: ``map``, or the like of an executor.
 Mapper = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
-BASE = "base"
+Fit = AnyFit[AxisModel]
 #: Samples, and seconds, at the start of a record in which the observer finds the state.
 SKIP, SKIP_S = 50, 0.05
 
@@ -36,18 +37,6 @@ LEFT = 0.3
 #: A model whose friction falls with speed has two speeds at which it agrees with a force. It has lost the measurement
 #: where the innovation stays this many times over the expected one, and over its own median, for so many samples.
 LOST, LOST_SHARE, LOST_SAMPLES = 10.0, 8.0, 50
-
-
-@dataclass(frozen=True, slots=True)
-class Free:
-    """One free number: a parameter of an effect, or a base parameter of the axis."""
-
-    effect: str
-    symbol: str
-    scale: float
-    lower: float
-    upper: float
-    phase: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,31 +160,6 @@ def _falls(model: AxisModel) -> bool:
     return False
 
 
-@dataclass(frozen=True, slots=True)
-class Fit:
-    """A fitted model.
-
-    Attributes:
-        residual: at the optimum, shape (n,), in units of the floor.
-        jacobian: d residual / d (parameter / scale), shape (n, k).
-    """
-
-    model: AxisModel
-    free: tuple[Free, ...]
-    residual: Array
-    jacobian: Array
-
-    @property
-    def cost(self) -> float:
-        """Sum of squares."""
-        return float(self.residual @ self.residual)
-
-    @property
-    def ratio(self) -> float:
-        """Root mean square of the residual, in units of the expected innovation."""
-        return float(np.sqrt(np.mean(self.residual**2)))
-
-
 def free_parameters(model: AxisModel, frozen: Sequence[str] = ()) -> tuple[Free, ...]:
     """List what may move: every differentiable parameter of the effects not frozen, and the uncertain base."""
     lib, out = known(), []
@@ -217,29 +181,6 @@ def _free(model: AxisModel, name: str, p: Parameter, value: float) -> Free:
     lower, upper = (-np.inf, np.inf) if p.phase else (p.lower * scale, p.upper * scale)
     size = 1.0 if p.phase else max(abs(value), 0.1 * abs(p.start) * scale, 1e-12)
     return Free(name, p.symbol, size, lower, upper, p.phase)
-
-
-def get(model: AxisModel, free: Sequence[Free]) -> Array:
-    """Read the free numbers."""
-    return np.array(
-        [getattr(model, f.symbol) if f.effect == BASE else model.effects[f.effect][f.symbol] for f in free],
-        dtype=np.float64,
-    )
-
-
-def put(model: AxisModel, free: Sequence[Free], values: Array) -> AxisModel:
-    """Return the model with the free numbers set; phases are wrapped to (-pi, pi]."""
-    effects = {k: dict(v) for k, v in model.effects.items()}
-    base: dict[str, float] = {}
-    for f, value in zip(free, values, strict=True):
-        v = float(value)
-        if f.phase:
-            v = float(np.angle(np.exp(1j * v)))
-        if f.effect == BASE:
-            base[f.symbol] = v
-        else:
-            effects[f.effect][f.symbol] = v
-    return replace(model, effects=effects, **base)  # type: ignore[arg-type]
 
 
 def shifted(model: AxisModel, free: Sequence[Free], sizes: Array) -> AxisModel:
@@ -294,10 +235,6 @@ def refit(
         The fit at the best point found.
     """
     free = free_parameters(model, frozen)
-    if not free:
-        r = problem.residual(model)
-        return Fit(model, free, r, np.empty((len(r), 0)))
-
     fit = descended(problem, model, free, iterations, tolerance)
     smooth = tuple(f for f in free if f.effect == BASE or not known()[f.effect].mechanism.bounces)
     if 0 < len(smooth) < len(free):  # whose steps fail wherever a gap is to take part in them
@@ -318,18 +255,8 @@ def descended(
     """Descend from a model in some of its numbers, within their bounds.
 
     Args:
-        free: the numbers that move, at least one.
+        free: the numbers that move.
         iterations, tolerance, slopes: as of ``descend``; None takes the differences of ``jacobian``.
     """
-    at, r, j = descend(
-        lambda x: problem.residual(put(model, free, x)),
-        slopes or (lambda x, r: jacobian(problem, model, free, x, r)),
-        get(model, free),
-        np.array([f.scale for f in free]),
-        np.array([f.lower for f in free]),
-        np.array([f.upper for f in free]),
-        iterations,
-        tolerance,
-        left=LEFT,
-    )
-    return Fit(put(model, free, at), free, r, j)
+    way = slopes or (lambda x, r: jacobian(problem, model, free, x, r))
+    return fitted(model, free, problem.residual, way, iterations, tolerance, left=LEFT)

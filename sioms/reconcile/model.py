@@ -85,6 +85,15 @@ class AxisModel:
         """Return the model with one effect switched off."""
         return replace(self, effects={k: v for k, v in self.effects.items() if k != name})
 
+    @property
+    def base(self) -> AxisModel:
+        """What has the numbers that may be refined: the axis itself."""
+        return self
+
+    def with_numbers(self, effects: Mapping[str, Mapping[str, float]], base: Mapping[str, float]) -> AxisModel:
+        """Return the model with other numbers of its effects, and some of its own."""
+        return replace(self, effects=effects, **base)  # type: ignore[arg-type]
+
     def scale(self, parameter: Parameter) -> float:
         """Natural size of a parameter on this axis, in its own unit."""
         match parameter.ref:

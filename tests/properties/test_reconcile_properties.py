@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from sioms.reconcile.blocks import better
 from sioms.reconcile.channels import drive_output
 from sioms.reconcile.effects import library
-from sioms.reconcile.fit import free_parameters, get, put
+from sioms.reconcile.engine.fit import get, put
+from sioms.reconcile.fit import free_parameters
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import effective_samples, observer, rigid
 from sioms.reconcile.refuse import hats, since_reversal

@@ -245,7 +245,7 @@ def _describe(
 ) -> tuple[list[NamedEffect], list[NamedEffect]]:
     """Describe every effect, the largest first; terms apart."""
     half = half_intervals(subject.whole, fit, on_one_footing(subject.whole, found.fit.model))
-    spread = {(f.effect, f.quantity.symbol, f.index): float(s) for f, s in zip(fit.free, half, strict=True)}
+    spread = {(f.effect, f.symbol, f.index): float(s) for f, s in zip(fit.free, half, strict=True)}
     out: list[tuple[float, NamedEffect]] = [(np.inf, e) for e in subject.settled]
     for name in [n for n in fit.model.effects if n not in searcher.frozen]:
         effect = fit.model.library[name]
@@ -284,7 +284,7 @@ def _describe(
 
 
 def _estimates(
-    subject: Subject, effect: SensorEffect, model: SensorModel, spread: Mapping[tuple[str, str, int], float]
+    subject: Subject, effect: SensorEffect, model: SensorModel, spread: Mapping[tuple[str, str, int | None], float]
 ) -> tuple[Estimate, ...]:
     out = []
     for q in effect.parameters:

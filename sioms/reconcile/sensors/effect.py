@@ -117,6 +117,10 @@ class SensorModel:
         """Return the model with one effect switched off."""
         return replace(self, effects={k: v for k, v in self.effects.items() if k != name})
 
+    def with_numbers(self, effects: Mapping[str, Values], base: Mapping[str, float]) -> SensorModel:
+        """Return the model with other numbers of its effects, and some of its base."""
+        return replace(self, effects=effects, base=replace(self.base, **base) if base else self.base)
+
     def plain(self, name: str) -> dict[str, Array]:
         """Return an effect's starting values: neutral, the others at their first start."""
         effect, out = self.library[name], {}

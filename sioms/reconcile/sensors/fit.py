@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sioms.reconcile.blocks import intervals
-from sioms.reconcile.descent import descend
+from sioms.reconcile.engine.fit import BASE, Free, fitted, put
+from sioms.reconcile.engine.fit import Fit as AnyFit
 from sioms.reconcile.sensors.effect import Array, Quantity, SensorModel
 
-BASE = "base"
+Fit = AnyFit[SensorModel]
 _STEP = 2e-3
 
 
@@ -84,68 +85,26 @@ def half_intervals(data: Data, fit: Fit, weights: Array) -> Array:
     """Half-widths of the 95 % intervals of the free numbers: by blocks left out, and by what is systematic."""
     doubts = weights[:, None] * data.whiten(data.doubts(fit.model))
     moved = np.linalg.lstsq(fit.jacobian, doubts, rcond=1e-10)[0]
-    size = np.array([f.quantity.size for f in fit.free])
+    size = np.array([f.scale for f in fit.free])
     return np.asarray(size * np.hypot(intervals(fit, data.block), 1.96 * np.linalg.norm(moved, axis=1)))
-
-
-@dataclass(frozen=True, slots=True)
-class Free:
-    """One free number."""
-
-    effect: str
-    quantity: Quantity
-    index: int
-
-
-@dataclass(frozen=True, slots=True)
-class Fit:
-    """A fitted model: residual (n,) in units of the floor, Jacobian (n, k) per natural size."""
-
-    model: SensorModel
-    free: tuple[Free, ...]
-    residual: Array
-    jacobian: Array
-
-    @property
-    def cost(self) -> float:
-        """Sum of squares."""
-        return float(self.residual @ self.residual)
 
 
 def free_numbers(model: SensorModel, frozen: Sequence[str] = ()) -> tuple[Free, ...]:
     """List the free numbers of a model."""
-    out = [Free(BASE, q, 0) for q in model.refine]
+    out = [replace(f, index=None) for f in freed(BASE, model.refine, 1)]
     for name in model.effects:
         if name not in frozen:
-            for q in model.library[name].parameters:
-                out += [Free(name, q, i) for i in range(model.count if q.each else 1)]
+            out += freed(name, model.library[name].parameters, model.count)
     return tuple(out)
 
 
-def get(model: SensorModel, free: Sequence[Free]) -> Array:
-    """Read the free numbers."""
-    return np.array(
-        [
-            getattr(model.base, f.quantity.symbol)
-            if f.effect == BASE
-            else model.effects[f.effect][f.quantity.symbol][f.index]
-            for f in free
-        ],
-        dtype=np.float64,
-    )
-
-
-def put(model: SensorModel, free: Sequence[Free], values: Array) -> SensorModel:
-    """Return the model with the free numbers set; phases are wrapped to (-pi, pi]."""
-    effects = {k: {s: v.copy() for s, v in given.items()} for k, given in model.effects.items()}
-    base: dict[str, float] = {}
-    for f, value in zip(free, values, strict=True):
-        v = float(np.angle(np.exp(1j * value))) if f.quantity.phase else float(value)
-        if f.effect == BASE:
-            base[f.quantity.symbol] = v
-        else:
-            effects[f.effect][f.quantity.symbol][f.index] = v
-    return replace(model, effects=effects, base=replace(model.base, **base) if base else model.base)
+def freed(effect: str, parameters: Sequence[Quantity], count: int) -> list[Free]:
+    """Return the free numbers of parameters; of one that each has of its own ``count``."""
+    return [
+        Free(effect, q.symbol, q.size, q.lower, q.upper, q.phase, i, q.each)
+        for q in parameters
+        for i in range(count if q.each else 1)
+    ]
 
 
 def slopes(data: Data, model: SensorModel, free: Sequence[Free], at: Array) -> Array:
@@ -158,12 +117,12 @@ def slopes(data: Data, model: SensorModel, free: Sequence[Free], at: Array) -> A
     raw = np.zeros((len(base), len(free)))
     groups: dict[tuple[str, str], list[int]] = {}
     for i, f in enumerate(free):
-        groups.setdefault((f.effect, f.quantity.symbol), []).append(i)
+        groups.setdefault((f.effect, f.symbol), []).append(i)
     for places in groups.values():
-        q = free[places[0]].quantity
-        step = np.where(at[places] + _STEP * q.size > q.upper, -_STEP, _STEP)
+        q = free[places[0]]
+        step = np.where(at[places] + _STEP * q.scale > q.upper, -_STEP, _STEP)
         moved = at.copy()
-        moved[places] += step * q.size
+        moved[places] += step * q.scale
         change = data.predict(put(model, free, moved)) - base
         if q.each:
             for i, h in zip(places, step, strict=True):
@@ -188,22 +147,13 @@ def refit(
         weights: of the rows, shape (n,): views far from the floor are brought on one footing.
     """
     free = free_numbers(model, frozen)
-    if not free:
-        r = weights * data.miss(data.predict(model))
-        return Fit(model, free, r, np.empty((len(r), 0)))
-    size = np.array([f.quantity.size for f in free])
-    lower, upper = (np.array([getattr(f.quantity, n) for f in free]) for n in ("lower", "upper"))
-    wraps = np.array([f.quantity.phase for f in free])
-    at, r, j = descend(
-        lambda x: weights * data.miss(data.predict(put(model, free, x))),
+    return fitted(
+        model,
+        free,
+        lambda m: weights * data.miss(data.predict(m)),
         lambda x, _: weights[:, None] * slopes(data, model, free, x),
-        get(model, free),
-        size,
-        np.where(wraps, -np.inf, lower),
-        np.where(wraps, np.inf, upper),
         iterations,
         tolerance,
         damping=1e-5,
         ease=0.1,
     )
-    return Fit(put(model, free, at), free, r, j)

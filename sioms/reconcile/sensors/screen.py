@@ -8,8 +8,9 @@ from itertools import product
 
 import numpy as np
 
+from sioms.reconcile.engine.fit import Free
 from sioms.reconcile.sensors.effect import Array, Quantity, SensorEffect, SensorModel, Values
-from sioms.reconcile.sensors.fit import Data, Fit, Free, slopes
+from sioms.reconcile.sensors.fit import Data, Fit, freed, slopes
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +118,7 @@ def _amplitudes(effect: SensorEffect) -> tuple[Quantity, ...]:
 
 
 def _amounts(effect: SensorEffect, count: int) -> tuple[Free, ...]:
-    return tuple(Free(effect.name, q, i) for q in _amplitudes(effect) for i in range(count if q.each else 1))
+    return tuple(freed(effect.name, _amplitudes(effect), count))
 
 
 def _settled(effect: SensorEffect, shape: list[dict[str, Array]], amount: Array, count: int) -> dict[str, Array] | None:
@@ -131,9 +132,9 @@ def _settled(effect: SensorEffect, shape: list[dict[str, Array]], amount: Array,
         values[phase.symbol] = np.array([np.arctan2(b, a)])
         return values
     for f, change in zip(_amounts(effect, count), amount, strict=True):
-        wanted = values[f.quantity.symbol][f.index] + change * f.quantity.size
-        held = np.clip(wanted, f.quantity.lower, f.quantity.upper)
-        if f.quantity is q and not q.each and abs(held - effect.neutral) < 0.2 * abs(wanted - effect.neutral):
+        wanted = values[f.symbol][f.index] + change * f.scale
+        held = np.clip(wanted, f.lower, f.upper)
+        if f.symbol == q.symbol and not q.each and abs(held - effect.neutral) < 0.2 * abs(wanted - effect.neutral):
             return None
-        values[f.quantity.symbol][f.index] = held
+        values[f.symbol][f.index] = held
     return values

@@ -79,7 +79,7 @@ def _told(searcher: Searcher, fit: Fit, name: str) -> bool:
     """Say whether the first number of an effect is surely not neutral."""
     half = half_intervals(searcher.data, fit, searcher.weights)
     effect = fit.model.library[name]
-    own = [h for f, h in zip(fit.free, half, strict=True) if (f.effect, f.quantity) == (name, effect.primary)]
+    own = [h for f, h in zip(fit.free, half, strict=True) if (f.effect, f.symbol) == (name, effect.primary.symbol)]
     return bool(np.any(np.abs(fit.model.effects[name][effect.primary.symbol] - effect.neutral) > own))
 
 

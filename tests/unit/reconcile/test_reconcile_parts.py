@@ -15,10 +15,11 @@ from sioms.reconcile.blocks import better, block_ids, bootstrap, formal, heldout
 from sioms.reconcile.bounces import bent, deepest
 from sioms.reconcile.channels import drive, drive_output, index_fit, lattice
 from sioms.reconcile.descent import descend
+from sioms.reconcile.engine.fit import get
 from sioms.reconcile.evidence import spans_of
 from sioms.reconcile.excitation import common, gate
 from sioms.reconcile.experiment import Envelope, catalogue, demands, one_speed, repeated, separate
-from sioms.reconcile.fit import LEFT, Problem, free_parameters, get, jacobian, refit
+from sioms.reconcile.fit import LEFT, Problem, free_parameters, jacobian, refit
 from sioms.reconcile.locate import locate
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
