@@ -30,7 +30,7 @@ BARRED, HOMED = int(AxisStatus.EMERGENCY_STOP | AxisStatus.FAULT | AxisStatus.HO
 LOST = int(AxisStatus.POSITION_LOST)
 LIMIT_NAMES = ("position_min", "position_max", "velocity_max", "acceleration_max", "jerk_max", "force_max")
 
-PIECE = 512
+PIECE = 256
 """Records that are judged in one go: some 0.3 ms."""
 
 
@@ -126,6 +126,8 @@ class CommandQueue:
         tail = Tail(np.full((self.n, 3), np.nan), np.zeros(self.n), np.zeros(self.n))
         tail.set_rows(touched, begin)
         chunks: list[Chunk] = []
+        if len(records) > PIECE:
+            yield  # what is said of all records has taken as long as a piece
         for first in range(0, len(records), PIECE):
             piece = slice(first, first + PIECE)
             try:
@@ -134,7 +136,7 @@ class CommandQueue:
             except RecordError as error:
                 raise error.later(first) from None
             chunks += cut(commands)
-            if first + PIECE < len(records):
+            if len(records) > PIECE:
                 yield
         return Judged(chunks, touched, counts, replace, begin, tail.rows(touched), limits_set)
 

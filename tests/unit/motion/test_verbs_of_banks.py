@@ -81,3 +81,19 @@ def test_a_verb_after_a_short_write_is_as_after_a_long_one(name: str, replace: b
         for row in ("commanded_position", "status", "buffered", "in_motion"):
             short, long = (rig.trace(row, index) for rig in rigs)
             assert np.allclose(short[5:], long[5:], rtol=0, atol=MOVED), row
+
+
+def test_a_long_write_is_judged_in_pieces_and_taken_apart_from_them() -> None:
+    rig = Rig([axis()], capacity=4096)
+    judgement, looked = rig.bank.judge(records(mode=MODE.POSITION, position=[0.0] * 1000), [0], rig.now_ns), []
+    check = rig.bank._queue._validator.check
+    rig.bank._queue._validator.check = lambda piece, placed: looked.append(len(piece)) or check(piece, placed)
+    steps = []
+    try:
+        while True:
+            looked.clear()
+            next(judgement)
+            steps.append(sum(looked))
+    except StopIteration:
+        assert not looked  # what is good is taken in a step of its own
+    assert steps == [0, 256, 256, 256, 232]

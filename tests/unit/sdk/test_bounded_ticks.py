@@ -82,3 +82,15 @@ def test_statistics_are_worked_out_seldom_and_after_a_tick(world: World) -> None
         world.tick()
     assert 1 <= len(done) <= 3 and all(done)
     client.ioctl(Request.GET_STATISTICS, None, told.append)
+
+
+def test_a_long_tick_leaves_less_time_for_clients_work_and_one_in_four_always_some(world: World) -> None:
+    runtime = world.runtime
+    period_ns, due_ns = runtime.period_ns, runtime._scheduled_ns
+    left = {}
+    for share in (0.1, 0.4, 0.9):
+        ticked_ns = due_ns + int(share * period_ns)
+        left[share] = []
+        for runtime.tick in range(4):
+            left[share].append(round((runtime._spare_until(ticked_ns) - ticked_ns) / period_ns, 3))
+    assert left == {0.1: [0.25] * 4, 0.4: [0.25, 0.1, 0.1, 0.1], 0.9: [0.25, -0.4, -0.4, -0.4]}
