@@ -13,6 +13,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from sioms.notify import ServiceManager
 from sioms.protocol import driver_verbs
 from sioms.protocol.flags import PageState
 from sioms.protocol.journal import Note
@@ -30,7 +31,6 @@ from .loading import Loader, Plan, mistake
 from .log import Log
 from .loop import Loop
 from .names import NameTable, Node
-from .notify import ServiceManager
 from .realtime import LOOK_S, Budget, make_ordinary, realtime_use
 from .rights import Rights
 from .shared import Shared

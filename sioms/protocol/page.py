@@ -187,6 +187,37 @@ class PageWriter:
         self._bytes.release()
 
 
+class PageCopy(PageWriter):
+    """The writer's side of a copy of another machine's page: snapshots are put into it as they are there."""
+
+    def put(self, raw: bytes) -> None:
+        """Publish a snapshot of the other page, slot header included, unless it is an older one."""
+        number = int.from_bytes(raw[:8], "little")
+        if number <= self._number:
+            return
+        offset = HEADER_SIZE + (number & self._mask) * self._size
+        word = offset >> 3
+        words = self._words
+        words[word] = 0
+        _fence()
+        self._bytes[offset + 8 : offset + self._size] = raw[8:]
+        _fence()
+        words[word] = number
+        words[_HEAD] = number
+        self._number = number
+
+    def set_condition(self, alive_ns: int, driver: int, daemon: int, reason: bytes = b"") -> None:
+        """Set what readers judge the page by: when its driver was alive, both states, and why one is not good."""
+        words = self._words
+        if words[_STATES] != (states := driver | daemon << 32):
+            self._bytes[REASON_OFFSET : REASON_OFFSET + REASON_SIZE] = reason[: REASON_SIZE - 1].ljust(
+                REASON_SIZE, b"\0"
+            )
+            _fence()
+            words[_STATES] = states
+        words[_ALIVE] = alive_ns
+
+
 def set_daemon_state(buffer: memoryview, state: PageState, reason: str) -> None:
     """Set the daemon's state word in a mapped page (the daemon's only store in it)."""
     _write_reason(buffer, reason)
@@ -239,6 +270,23 @@ class PageReader:
     def alive_ns(self) -> int:
         """Last stamp of the driver [ns, CLOCK_MONOTONIC]."""
         return self._words[_ALIVE]
+
+    @property
+    def lease_ns(self) -> int:
+        """How old ``alive_ns`` may get before the driver counts as hung."""
+        return self._words[_LEASE]
+
+    @property
+    def as_of_ns(self) -> int:
+        """``as_of_ns`` of the newest snapshot, 0 before the first; it may be that of the one after it."""
+        offset = HEADER_SIZE + (self._words[_HEAD] & self._mask) * self._size
+        return self._words[(offset >> 3) + 3] if self._words[_HEAD] else 0
+
+    def condition(self) -> tuple[int, int, int, bytes]:
+        """Return what readers judge the page by: when its driver was alive, both states, and why one is not good."""
+        states = self._words[_STATES]
+        reason = b"" if states == _GOOD else self._buffer[REASON_OFFSET : REASON_OFFSET + REASON_SIZE].split(b"\0")[0]
+        return self._words[_ALIVE], states & 0xFFFFFFFF, states >> 32, reason
 
     def check(self, now_ns: int) -> None:
         """Raise NotReadable unless driver and daemon call the page good and the lease holds."""

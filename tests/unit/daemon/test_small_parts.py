@@ -14,11 +14,11 @@ from sioms.daemon.config import GrantTable
 from sioms.daemon.log import Log
 from sioms.daemon.loop import Loop
 from sioms.daemon.marker_owners import MarkerError, MarkerOwners
-from sioms.daemon.notify import ServiceManager
 from sioms.daemon.restarts import FIRST_PAUSE_NS, LIMIT, WINDOW_NS, Restarts
 from sioms.daemon.rights import Peer, Rights
 from sioms.daemon.sessions import peer_of, pidfd_of
 from sioms.daemon.users import Users
+from sioms.notify import ServiceManager
 from sioms.protocol.flags import Right
 from sioms.protocol.markers import MARKERS, TABLE_SIZE, MarkerTable, split_token, token_of
 

@@ -1,0 +1,45 @@
+"""This machine's wall clock, and how good its kernel knows it to be."""
+
+from __future__ import annotations
+
+import ctypes
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from sioms.protocol.clock import UNKNOWN_NS, Source, Wall
+
+_STA_UNSYNC = 0x40
+_PTP = ("/run/ptp4l", "/run/ptp4lro", "/run/timemaster", "/var/run/ptp4l")
+"""Where the PTP daemon of linuxptp listens while it runs."""
+
+
+class _Timex(ctypes.Structure):
+    """``struct timex`` of adjtimex(2), as far as it is read."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),
+        ("esterror", ctypes.c_long),
+        ("status", ctypes.c_int),
+        ("rest", ctypes.c_long * 32),
+    )
+
+
+def wall() -> Wall:
+    """Look at the clocks.
+
+    The error is the kernel's ``maxerror``, which whoever disciplines the clock keeps, and the kernel lets grow.
+    """
+    before = time.monotonic_ns()
+    utc_ns = time.time_ns()
+    after = time.monotonic_ns()
+    ahead_ns = utc_ns - (before + after) // 2
+    timex = _Timex()
+    with suppress(OSError, AttributeError):
+        if ctypes.CDLL(None).adjtimex(ctypes.byref(timex)) >= 0 and not timex.status & _STA_UNSYNC:
+            source = Source.PTP if any(Path(path).exists() for path in _PTP) else Source.NTP
+            return Wall(ahead_ns, timex.maxerror * 1000 + (after - before), source)
+    return Wall(ahead_ns, UNKNOWN_NS, Source.NONE)

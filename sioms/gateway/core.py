@@ -1,0 +1,495 @@
+"""Sessions of remote clients: who may, in which order, and for how long without being heard. Pure: no socket, no clock.
+
+A session passes packets of the local protocol on, both ways, and reads three of them: an open, whose lease it sets;
+the answer to one; and the greeting, which it does first, on behalf of the key. Everything else is between the client
+and the daemon or driver, which judge it as they judge any client's.
+
+Concurrency: one thread.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from sioms.protocol import link, verbs
+from sioms.protocol.clock import Wall
+from sioms.protocol.link import Down, MalformedFrame, PageShape, Up, Update
+from sioms.protocol.messages import MalformedMessage, decode_reply, refusal, value_of
+
+OWN_NUMBERS = 1 << 52
+"""Message numbers from here on are the gateway's own requests."""
+MOST_SESSIONS = 256
+MOST_WAITING = 64
+"""Packets that a client may send before the daemon has taken it in."""
+BATCH_BYTES = 48 << 10
+"""Bytes of snapshots in one frame; what is older is skipped."""
+IDLE_NS = 5_000_000
+"""How often the snapshots of a node that nobody waits for are sent."""
+STATE_NS = 50_000_000
+"""How often a page's state is sent when it publishes nothing."""
+URGENT_NS = 30_000_000
+"""How long after an answer snapshots are sent as they come: one of them shows what was acknowledged."""
+LOOK_NS = 500_000
+"""How often to look for them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Principal:
+    """Who holds a key.
+
+    Attributes:
+        name: of the key.
+        groups: of the key.
+    """
+
+    name: str
+    groups: tuple[str, ...] = ()
+
+
+class Page(Protocol):
+    """What is read of a page; see ``protocol.page.PageReader``."""
+
+    @property
+    def head(self) -> int:
+        """Number of the newest snapshot."""
+
+    def numbered(self, number: int) -> bytes | None:
+        """Copy a snapshot by its number."""
+
+    def condition(self) -> tuple[int, int, int, bytes]:
+        """Return what readers judge the page by."""
+
+
+class Node(Protocol):
+    """A node that has been opened at the daemon."""
+
+    page: Page
+    shape: PageShape
+
+    def send(self, packet: bytes) -> None:
+        """Send a packet to the driver; raises OSError."""
+
+    def end(self) -> None:
+        """Close the connection to the driver: what was owned is halted. The page stays."""
+
+    def close(self) -> None:
+        """Let go of everything."""
+
+
+class Line(Protocol):
+    """A connection to the daemon."""
+
+    def send(self, packet: bytes) -> None:
+        """Send a packet; raises OSError."""
+
+    def close(self) -> None:
+        """Close it: what its session has open is closed."""
+
+
+class Outside(Protocol):
+    """Sockets, around the core."""
+
+    def send(self, peer: bytes, frame: bytes) -> bool:
+        """Send a frame to a client; False when it has gone, or takes no more."""
+
+    def connect(self, session: Session) -> Line:
+        """Connect to the daemon; raises OSError."""
+
+    def attach(self, session: Session, handle: int, fds: Sequence[int]) -> Node:
+        """Take the descriptors of an open."""
+
+    def drop(self, fds: Sequence[int]) -> None:
+        """Close descriptors that nobody wants."""
+
+    def log(self, level: str, event: str, **words: object) -> None:
+        """Write a line."""
+
+
+@dataclass(slots=True, eq=False)
+class Held:
+    """A node that a remote client has open.
+
+    Attributes:
+        handle: number of the handle.
+        name: of the node.
+        node: at the daemon.
+        lease_ns: longest age of the client's word, 0 = any: it owns nothing.
+        until_ns: when the lease runs out.
+        cursor: number of the newest snapshot that has been sent.
+        ahead: frames of snapshots that are not confirmed.
+        sent_ns: when the last one was sent.
+        woken: whether the driver has woken us for it since.
+        ended: whether its connection has ended.
+    """
+
+    handle: int
+    name: str
+    node: Node
+    lease_ns: int
+    until_ns: int
+    cursor: int = 0
+    ahead: int = 0
+    sent_ns: int = 0
+    state: tuple[int, int] = (-1, -1)
+    woken: bool = False
+    ended: bool = False
+
+
+@dataclass(slots=True, eq=False)
+class Session:
+    """A connected client.
+
+    Attributes:
+        peer: address of it for the transport.
+        who: whose key it has; host: where it is.
+        heard: number of its last frame.
+        heard_ns: when that came; sent_ns: when something was last sent to it.
+        urgent_ns: until when its snapshots are sent as they come.
+        line: to the daemon; None before the first packet.
+        taken_in: whether the daemon has taken it for the key's.
+        waiting: packets from before that.
+        opens: what waits for an answer: leases by message number of the open.
+        asked: opens that wait for what their node is, by number of the gateway's own request.
+        held: open nodes by handle.
+    """
+
+    peer: bytes
+    who: Principal
+    host: str
+    heard_ns: int
+    heard: int = 1
+    sent_ns: int = 0
+    urgent_ns: int = 0
+    line: Line | None = None
+    taken_in: bool = False
+    waiting: list[bytes] = field(default_factory=list)
+    opens: dict[int, tuple[str, float]] = field(default_factory=dict)
+    asked: dict[int, tuple[int, verbs.Open]] = field(default_factory=dict)
+    held: dict[int, Held] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return f"{self.who.name}@{self.host}"
+
+
+class Gateway:
+    """All sessions.
+
+    Args:
+        outside: sockets.
+        now: the time [ns], any monotonic clock; it is what leases run by.
+        wall: tells of the wall clock.
+    """
+
+    def __init__(self, outside: Outside, now: Callable[[], int], wall: Callable[[], Wall]) -> None:
+        self.sessions: dict[bytes, Session] = {}
+        self._outside = outside
+        self._now = now
+        self._wall = wall
+        self._own = OWN_NUMBERS
+
+    # --- from clients ----------------------------------------------------------------------------
+
+    def frame(self, peer: bytes, who: Principal | None, host: str, frame: bytes) -> None:
+        """Take a frame of a client.
+
+        Args:
+            peer: its address for the transport.
+            who: whose key it is; None: a key that is not allowed, or not any more.
+            host: where it is.
+            frame: as it came.
+        """
+        now_ns = self._now()
+        session = self.sessions.get(peer)
+        if who is None:
+            if session is not None:
+                self.end(session, errno.EACCES, f"key {session.who.name} has been revoked")
+            return
+        try:
+            kind, channel, number, stamp_ns, body = link.unpack(frame, link.MAX_TO_GATEWAY)
+            if session is None:
+                self._begin(peer, who, host, (kind, channel, number), now_ns)
+                return
+            if number <= session.heard:
+                return  # had before: nothing is taken twice
+            if number != session.heard + 1:
+                raise MalformedFrame(f"frame {number} after {session.heard}: what was in between is lost")
+            if stamp_ns > session.sent_ns:
+                raise MalformedFrame("a frame that repeats a time that it has not been told")
+            session.heard, session.heard_ns = number, now_ns
+            self._take(session, kind, channel, stamp_ns, body, now_ns)
+        except (MalformedFrame, MalformedMessage) as error:
+            if session is not None:
+                self.end(session, errno.EPROTO, str(error))
+
+    def _begin(self, peer: bytes, who: Principal, host: str, head: tuple[int, int, int], now_ns: int) -> None:
+        kind, version, number = head
+        if kind != Up.HELLO or number != 1:
+            return  # of a session that has ended: nothing of it counts any more
+        session = Session(peer, who, host, now_ns)
+        if version != link.VERSION:
+            text = f"the client speaks version {version} of the link and the gateway {link.VERSION}; install the same"
+            self._tell_end(session, errno.EPROTO, f"{text} release of SIOMS on both machines")
+        elif len(self.sessions) >= MOST_SESSIONS:
+            self._tell_end(session, errno.EUSERS, f"{MOST_SESSIONS} sessions are open at the gateway; close one")
+        else:
+            self.sessions[peer] = session
+            self._outside.log("info", "session", peer=str(session))
+            self._send(session, Down.BEACON, now_ns=now_ns)
+
+    def _take(self, session: Session, kind: int, channel: int, stamp_ns: int, body: bytes, now_ns: int) -> None:
+        match kind:
+            case Up.PACKET if channel:
+                self._to_driver(session, channel, stamp_ns, body, now_ns)
+            case Up.PACKET:
+                self._to_daemon(session, body)
+            case Up.CREDIT:
+                if held := session.held.get(channel):
+                    held.ahead = max(0, held.ahead - 1)
+                    self._feed(session, held, now_ns)
+            case Up.CLOSED:
+                if held := session.held.pop(channel, None):
+                    held.node.close()
+            case Up.PING:
+                wall = self._wall()
+                pong = link.pong(link.take_ping(body), now_ns, wall.ahead_ns, wall.error_ns, wall.source)
+                self._send(session, Down.PONG, body=pong)
+            case Up.BYE:
+                self._forget(session)
+            case _:
+                raise MalformedFrame(f"a frame of kind {kind}, which is none")
+
+    def _to_driver(self, session: Session, handle: int, stamp_ns: int, packet: bytes, now_ns: int) -> None:
+        held = session.held.get(handle)
+        if held is None or held.ended:
+            return  # closed or ended: its client has been told, or is about to be
+        if held.lease_ns:
+            if stamp_ns + held.lease_ns < now_ns:
+                self._run_out(session, held)  # first of all: what comes late is not carried out
+                return
+            held.until_ns = max(held.until_ns, stamp_ns + held.lease_ns)
+        try:
+            held.node.send(packet)
+        except OSError:
+            self.driver_gone(session, handle)
+
+    def _to_daemon(self, session: Session, packet: bytes) -> None:
+        number, message = verbs.take(packet, verbs.FROM_CLIENT)
+        if number >= OWN_NUMBERS or isinstance(message, verbs.Represent):
+            raise MalformedMessage("that is the gateway's to say")
+        if session.taken_in:
+            self._pass(session, number, message, packet)
+            return
+        session.waiting.append(packet)
+        if len(session.waiting) > MOST_WAITING:
+            raise MalformedMessage(f"{MOST_WAITING} packets before the first answer")
+        if session.line is None:
+            try:
+                session.line = self._outside.connect(session)
+                groups = list(session.who.groups)
+                session.line.send(verbs.Represent(session.who.name, session.host, groups).packed(OWN_NUMBERS))
+            except OSError as error:
+                self._refuse_waiting(session, error.errno or errno.EIO, error.strerror or str(error))
+
+    def _pass(self, session: Session, number: int, message: verbs.Message, packet: bytes) -> None:
+        if isinstance(message, verbs.Open):
+            if message.lease_s > link.LONGEST_LEASE_S:
+                text = f"open {message.node}: lease {message.lease_s:g} s; from another machine at most"
+                answer = refusal(number, errno.EINVAL, f"{text} {link.LONGEST_LEASE_S:g} s are right")
+                self._send(session, Down.PACKET, body=answer)
+                return
+            self._own += 1
+            session.asked[self._own] = (number, message)
+            packet = verbs.Info(message.node).packed(self._own)
+        self._to_line(session, packet)
+
+    def _to_line(self, session: Session, packet: bytes) -> None:
+        try:
+            if session.line is not None:
+                session.line.send(packet)
+        except OSError as error:
+            self.end(session, errno.EIO, f"the daemon takes no requests: {error.strerror}")
+
+    def _refuse_waiting(self, session: Session, errno_: int, text: str) -> None:
+        """Refuse what a session has asked for before the daemon took it in; its next request is another try."""
+        if session.line is not None:
+            session.line.close()
+            session.line = None
+        waiting, session.waiting = session.waiting, []
+        for packet in waiting:
+            number, _ = verbs.take(packet, verbs.FROM_CLIENT)
+            self._send(session, Down.PACKET, body=refusal(number, errno_, text))
+
+    # --- from daemon and drivers -----------------------------------------------------------------
+
+    def daemon_packet(self, session: Session, packet: bytes, fds: Sequence[int] = ()) -> None:
+        """Take a packet of the daemon with its descriptors; an empty one: the daemon has gone."""
+        now_ns = self._now()
+        try:
+            message = decode_reply(packet) if packet else None
+        except MalformedMessage as error:
+            message = [0, 0, errno.EPROTO, str(error), False, 0]
+        if message is None or message[1] == 0:
+            self._outside.drop(fds)
+            errno_, text = (errno.EIO, "the daemon behind the gateway has gone") if message is None else message[2:4]
+            if session.taken_in:
+                self.end(session, errno_, text)
+            else:
+                self._refuse_waiting(session, errno_, text)
+            return
+        number, errno_ = message[1], message[2]
+        if number >= OWN_NUMBERS:
+            self._outside.drop(fds)
+            if number == OWN_NUMBERS:
+                self._taken_in(session, errno_, message[3])
+            else:
+                self._informed(session, number, message)
+            return
+        asked = session.opens.pop(number, None)
+        if asked is not None and not errno_ and len(fds) == 3:
+            self._opened(session, asked, value_of(message)[0], packet, fds, now_ns)
+            return
+        self._outside.drop(fds)
+        session.urgent_ns = now_ns + URGENT_NS
+        self._send(session, Down.PACKET, body=packet)
+
+    def _taken_in(self, session: Session, errno_: int, text: str) -> None:
+        if errno_:
+            self._refuse_waiting(session, errno_, text)
+            return
+        session.taken_in = True
+        waiting, session.waiting = session.waiting, []
+        for packet in waiting:
+            self._pass(session, *verbs.take(packet, verbs.FROM_CLIENT), packet)
+
+    def _informed(self, session: Session, own: int, message: Sequence[object]) -> None:
+        """Send an open on, now that it is known whether the node can be written."""
+        number, asked = session.asked.pop(own)
+        read_only = not message[2] and bool(value_of(list(message))[2])
+        lease_s = 0.0 if read_only else asked.lease_s or link.DEFAULT_LEASE_S
+        session.opens[number] = (asked.node, lease_s)
+        self._to_line(session, verbs.Open(asked.node, asked.access, asked.timeout_s, lease_s).packed(number))
+
+    def _opened(
+        self, session: Session, asked: tuple[str, float], handle: int, packet: bytes, fds: Sequence[int], now_ns: int
+    ) -> None:
+        node = self._outside.attach(session, handle, fds)
+        lease_ns = int(asked[1] * 1e9)
+        held = session.held[handle] = Held(handle, asked[0], node, lease_ns, now_ns + lease_ns)
+        self._send(session, Down.OPENED, handle, link.opened(node.shape, packet))
+        if handle in session.held:
+            self._feed(session, held, now_ns, must=True)
+
+    def driver_packet(self, session: Session, handle: int, packet: bytes) -> None:
+        """Take a packet of the driver behind a handle."""
+        session.urgent_ns = self._now() + URGENT_NS
+        self._send(session, Down.PACKET, handle, packet)
+
+    def driver_gone(self, session: Session, handle: int) -> None:
+        """The driver has ended a handle, or has gone; its page tells what is to be told."""
+        if held := session.held.get(handle):
+            self._end_handle(session, held, b"")
+
+    def woken(self, session: Session, handle: int) -> None:
+        """The driver has woken the subscriber of a handle."""
+        if held := session.held.get(handle):
+            held.woken = True
+            self._feed(session, held, self._now())
+
+    # --- time ------------------------------------------------------------------------------------
+
+    def tick(self) -> int:
+        """Do what is due; return when the next thing may be [ns]."""
+        now_ns = self._now()
+        due_ns = now_ns + int(link.BEACON_S * 1e9)
+        for session in list(self.sessions.values()):
+            if now_ns - session.heard_ns > link.GONE_S * 1e9:
+                self.end(session, errno.ETIMEDOUT, f"nothing came from the client for {link.GONE_S:g} s")
+                continue
+            owns = False
+            for held in list(session.held.values()):
+                if held.lease_ns and not held.ended:
+                    owns = True
+                    if held.until_ns < now_ns:
+                        self._run_out(session, held)
+                    else:
+                        due_ns = min(due_ns, held.until_ns + 1)
+                due_ns = min(due_ns, self._feed(session, held, now_ns))
+            beacon_ns = session.sent_ns + int((link.BEACON_S if owns else link.PING_S) * 1e9)
+            if beacon_ns <= now_ns and session.peer in self.sessions:
+                self._send(session, Down.BEACON)
+        return due_ns
+
+    def _run_out(self, session: Session, held: Held) -> None:
+        text = f"{held.name}: its client was silent, or its link late, for longer than its lease of"
+        text = f"{text} {held.lease_ns / 1e9:g} s"
+        self._outside.log("warning", "lease ran out", peer=str(session), node=held.name)
+        self._end_handle(session, held, refusal(0, errno.ETIMEDOUT, text))
+
+    def _end_handle(self, session: Session, held: Held, last_word: bytes) -> None:
+        if not held.ended:
+            held.ended = True
+            held.node.end()  # first: what it owns is halted
+            if last_word:
+                self._send(session, Down.PACKET, held.handle, last_word)
+            self._send(session, Down.PACKET, held.handle)
+
+    def _feed(self, session: Session, held: Held, now_ns: int, must: bool = False) -> int:
+        """Send what is new of a page, if its client keeps up; return when to look again [ns]."""
+        if held.ahead >= link.WINDOW:
+            return now_ns + IDLE_NS
+        urgent = session.urgent_ns > now_ns
+        if not (must or urgent or held.woken) and now_ns - held.sent_ns < IDLE_NS:
+            return held.sent_ns + IDLE_NS
+        page, size = held.node.page, held.node.shape.slot_size
+        head = page.head
+        alive_ns, driver, daemon, reason = page.condition()
+        changed = held.state != (driver, daemon)
+        if head > held.cursor or must or changed or held.woken or now_ns - held.sent_ns >= STATE_NS:
+            first = max(held.cursor + 1, head - held.node.shape.slots + 2, head + 1 - max(1, BATCH_BYTES // size))
+            news = [raw for raw in map(page.numbered, range(first, head + 1)) if raw is not None]
+            held.cursor, held.sent_ns, held.state = head, now_ns, (driver, daemon)
+            update = Update(alive_ns, driver, daemon, reason, held.woken, news)
+            held.woken = False
+            held.ahead += 1
+            self._send(session, Down.UPDATE, held.handle, update.packed())
+        return now_ns + (LOOK_NS if urgent else IDLE_NS)
+
+    # --- ends ------------------------------------------------------------------------------------
+
+    def allow(self, keys: Mapping[str, Principal]) -> None:
+        """End the sessions of keys that are not allowed any more, or whose groups have changed."""
+        for session in list(self.sessions.values()):
+            if keys.get(session.who.name) != session.who:
+                text = f"key {session.who.name} has been revoked, or has other groups now"
+                self.end(session, errno.EACCES, text)
+
+    def end(self, session: Session, errno_: int, text: str) -> None:
+        """End a session and say why; what it held halts."""
+        self._outside.log("warning", "session ended", peer=str(session), why=text)
+        self._forget(session)  # first of all
+        self._tell_end(session, errno_, text)
+
+    def _tell_end(self, session: Session, errno_: int, text: str) -> None:
+        frame = link.pack(Down.END, errno_, 0, self._now(), text.encode()[:1024])
+        self._outside.send(session.peer, frame)
+
+    def _forget(self, session: Session) -> None:
+        if self.sessions.pop(session.peer, None) is not None:
+            for held in session.held.values():
+                held.node.close()
+            session.held.clear()
+            if session.line is not None:
+                session.line.close()
+
+    def _send(
+        self, session: Session, kind: int, channel: int = 0, body: bytes = b"", now_ns: int | None = None
+    ) -> None:
+        now_ns = self._now() if now_ns is None else now_ns
+        session.sent_ns = now_ns
+        if not self._outside.send(session.peer, link.pack(kind, channel, 0, now_ns, body)):
+            if session.peer in self.sessions:
+                self._outside.log("info", "session lost", peer=str(session))
+            self._forget(session)
