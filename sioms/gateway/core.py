@@ -66,8 +66,11 @@ class Page(Protocol):
 class Node(Protocol):
     """A node that has been opened at the daemon."""
 
-    page: Page
     shape: PageShape
+
+    @property
+    def page(self) -> Page:
+        """What is read of it."""
 
     def send(self, packet: bytes) -> None:
         """Send a packet to the driver; raises OSError."""
@@ -181,6 +184,9 @@ class Gateway:
         outside: sockets.
         now: the time [ns], any monotonic clock; it is what leases run by.
         wall: tells of the wall clock.
+
+    Attributes:
+        due_ns: when ``tick`` is to be called at the latest.
     """
 
     def __init__(self, outside: Outside, now: Callable[[], int], wall: Callable[[], Wall]) -> None:
@@ -189,6 +195,7 @@ class Gateway:
         self._now = now
         self._wall = wall
         self._own = OWN_NUMBERS
+        self.due_ns = 0
 
     # --- from clients ----------------------------------------------------------------------------
 
@@ -294,6 +301,10 @@ class Gateway:
                 self._refuse_waiting(session, error.errno or errno.EIO, error.strerror or str(error))
 
     def _pass(self, session: Session, number: int, message: verbs.Message, packet: bytes) -> None:
+        if isinstance(message, verbs.Journal):
+            text = "read a journal: it is a file of the workcell's machine; read it there"
+            self._send(session, Down.PACKET, body=refusal(number, errno.EOPNOTSUPP, text))
+            return
         if isinstance(message, verbs.Open):
             if message.lease_s > link.LONGEST_LEASE_S:
                 text = f"open {message.node}: lease {message.lease_s:g} s; from another machine at most"
@@ -353,6 +364,7 @@ class Gateway:
             return
         self._outside.drop(fds)
         session.urgent_ns = now_ns + URGENT_NS
+        self.due_ns = min(self.due_ns, now_ns + LOOK_NS)
         self._send(session, Down.PACKET, body=packet)
 
     def _taken_in(self, session: Session, errno_: int, text: str) -> None:
@@ -384,8 +396,10 @@ class Gateway:
 
     def driver_packet(self, session: Session, handle: int, packet: bytes) -> None:
         """Take a packet of the driver behind a handle."""
-        session.urgent_ns = self._now() + URGENT_NS
-        self._send(session, Down.PACKET, handle, packet)
+        now_ns = self._now()
+        session.urgent_ns = now_ns + URGENT_NS
+        self.due_ns = min(self.due_ns, now_ns + LOOK_NS)
+        self._send(session, Down.PACKET, handle, packet, now_ns)
 
     def driver_gone(self, session: Session, handle: int) -> None:
         """The driver has ended a handle, or has gone; its page tells what is to be told."""
@@ -420,6 +434,7 @@ class Gateway:
             beacon_ns = session.sent_ns + int((link.BEACON_S if owns else link.PING_S) * 1e9)
             if beacon_ns <= now_ns and session.peer in self.sessions:
                 self._send(session, Down.BEACON)
+        self.due_ns = due_ns
         return due_ns
 
     def _run_out(self, session: Session, held: Held) -> None:

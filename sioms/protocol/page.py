@@ -199,9 +199,9 @@ class PageCopy(PageWriter):
         word = offset >> 3
         words = self._words
         words[word] = 0
-        _fence()
+        fence()
         self._bytes[offset + 8 : offset + self._size] = raw[8:]
-        _fence()
+        fence()
         words[word] = number
         words[_HEAD] = number
         self._number = number
@@ -213,7 +213,7 @@ class PageCopy(PageWriter):
             self._bytes[REASON_OFFSET : REASON_OFFSET + REASON_SIZE] = reason[: REASON_SIZE - 1].ljust(
                 REASON_SIZE, b"\0"
             )
-            _fence()
+            fence()
             words[_STATES] = states
         words[_ALIVE] = alive_ns
 
