@@ -124,7 +124,7 @@ class Clients:
         silent = sum(session.greeting is not None for session in own)
         may_stop = bool(self.rights.on_workcell(peer) & Right.STOP)
         return (
-            self.quotas.over(peer, "silent", silent, "connections that have not said a word")
+            self.quotas.over(peer, "silent", silent, "connections without a Hello")
             or self.quotas.over(peer, "sessions", len(own), "sessions")
             or why_full(len(self.sessions), len(own), self.bounds.max_sessions, may_stop)
         )
@@ -139,7 +139,7 @@ class Clients:
     def _was_silent(self, session: Session) -> None:
         """End a connection on which nothing has been said: it takes the place of others."""
         if session in self.sessions:
-            why = f"nothing was said within {self.quotas.greeting_s:g} s of connecting (greeting_s of [quota])"
+            why = f"no Hello within {self.quotas.greeting_s:g} s of connecting (greeting_s of [quota])"
             self.send(session, refusal(0, errno.ETIMEDOUT, f"connect: {why}"))
             if session in self.sessions:
                 self._end_session(session, why)

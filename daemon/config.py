@@ -100,10 +100,10 @@ class AlarmTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         limits = [limit for limit in (self.lolo, self.low, self.high, self.hihi) if limit is not None]
         if not limits:
-            raise ValueError("no limit; want at least one of lolo, low, high, hihi")
+            raise ValueError("no limit given; want at least one of lolo, low, high, hihi")
         if limits != sorted(limits):
             given = ", ".join(f"{limit:g}" for limit in limits)
-            raise ValueError(f"limits {given}; want lolo, low, high and hihi to rise in this order")
+            raise ValueError(f"limits {given}; want lolo < low < high < hihi")
 
 
 class Device(msgspec.Struct, frozen=True):
@@ -151,11 +151,11 @@ def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
     except tomllib.TOMLDecodeError as error:
         return None, [f"read configuration: {str(error)[0].lower() + str(error)[1:]}"]
     except RecursionError:
-        return None, [f"read configuration: arrays or tables nested too deep; at most {DEEPEST} deep is right"]
+        return None, [f"read configuration: arrays or tables nested too deep; want at most {DEEPEST} levels"]
     except ValueError as error:  # an integer of more digits than Python converts
         return None, [f"read configuration: {error}"]
     if {"family", "signals"} <= root.keys():
-        text = 'this is a register map; name it in the table of a device, map = "FILE", and give that configuration'
+        text = 'this is a register map, not a configuration; refer to it from a device, map = "FILE"'
         return None, [text]
     errors = [f"[{key}]: unknown section{did_you_mean(key, _SECTIONS)}" for key in root if key not in _SECTIONS]
     workcell = _convert(root.get("workcell", {}), WorkcellTable, "[workcell]", errors) or WorkcellTable()
@@ -171,7 +171,7 @@ def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
         if node is not None:
             nodes[name] = node
         if name in devices:
-            errors.append(f"[node.{name}]: a device has this name already; choose another")
+            errors.append(f"[node.{name}]: a device already has this name; choose another")
     grants = _list(root, "grant", GrantTable, errors)
     sources = _list(root, "emergency_stop", StopSourceTable, errors)
     if not devices and not errors:
@@ -190,9 +190,9 @@ def _tables(root: Mapping[str, Any], section: str, errors: list[str]) -> list[tu
         if not isinstance(table, dict):
             errors.append(f"[{section}].{name}: want a table [{section}.{name}]")
         elif not _is_name(name) and section == "device":
-            errors.append(f"[device.{name}]: a device name is letters, digits, - and _, beginning with a letter")
+            errors.append(f"[device.{name}]: not a device name; want letters, digits, - and _, beginning with a letter")
         elif section == "node" and not all(_is_name(part) for part in name.split(".")):
-            errors.append(f"[node.{name}]: a node name is words of letters, digits, - and _, joined by dots")
+            errors.append(f"[node.{name}]: not a node name; want words of letters, digits, - and _, joined by dots")
         else:
             good.append((name, table))
     return good
@@ -235,7 +235,7 @@ def _strange(value: object, where: str, depth: int = 0) -> Iterator[str]:
     """Tell the values that no message to a driver can carry: dates and times, integers over 64 bits, deep nesting."""
     if isinstance(value, (dict, list)):
         if depth > DEEPEST:
-            yield f"{where}: nested deeper than {DEEPEST}; no key of a device is"
+            yield f"{where}: nested more than {DEEPEST} deep; no key of a device takes that"
             return
         for key, each in value.items() if isinstance(value, dict) else enumerate(value):
             yield from _strange(each, f"{where}.{key}" if isinstance(value, dict) else f"{where}[{key}]", depth + 1)

@@ -43,7 +43,7 @@ class Listening:
         if path == own_path():
             os.makedirs(folder, mode=0o755, exist_ok=True)
         elif not os.path.isdir(folder):
-            raise OSError(errno.ENOENT, f"{path}: there is no folder {folder}; make it or choose another path")
+            raise OSError(errno.ENOENT, f"{path}: the folder {folder} does not exist; create it or choose another path")
         _check_folder(folder)
         self._lock = _lock(path + ".lock", path)
         try:
@@ -55,7 +55,7 @@ class Listening:
     def _bind(self, folder: str, mode: int, group: str) -> socket.socket:
         with suppress(FileNotFoundError):
             if not stat.S_ISSOCK(os.lstat(self.path).st_mode):
-                raise OSError(errno.EEXIST, f"{self.path} is there and is no socket; remove it or choose another path")
+                raise OSError(errno.EEXIST, f"{self.path} exists and is not a socket; remove it or choose another path")
         _refuse_answering(self.path)
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         # Under another name until it listens; by way of the folder's descriptor, as the path may be as long as fits.
@@ -104,8 +104,7 @@ def _check_folder(folder: str) -> None:
         why = "others may write to it" if owner_is_trusted else f"it belongs to user {about.st_uid}"
         raise OSError(
             errno.EPERM,
-            f"{one}: {why}, who could put another socket in the place of {folder}'s; want a folder of the daemon's "
-            "own, as 0755",
+            f"{one}: {why}, who could replace the socket of {folder}'s; want a folder of the daemon's own, as 0755",
         )
 
 

@@ -40,7 +40,7 @@ TELL_S = 5.0
 def mistake(what: str, error: Exception) -> str:
     """Return the sentence about an error of the daemon itself."""
     trace = "".join(traceback.format_exception(error)[-3:])
-    return f"{what}: a mistake of the daemon, please report it: {error!r}: {trace}"
+    return f"{what}: internal error of the daemon, please report it: {error!r}: {trace}"
 
 
 class NotDescribed(str):
@@ -189,7 +189,7 @@ class Loader:
         if why := self._patience.stuck(now_s):
             self._errors += [
                 NotDescribed(
-                    f"describe [device.{name}]: its driver does not come to an end: {why}; "
+                    f"describe [device.{name}]: its driver does not finish: {why}; "
                     "this says nothing about the configuration"
                 )
                 for name in [n for n in self._config.devices if n in self._waiting][:1]
@@ -255,7 +255,7 @@ def _read(path: str) -> str:
     fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe would hold up the daemon
     with open(fd, "rb") as file:
         if not stat.S_ISREG(os.fstat(fd).st_mode):
-            raise OSError(errno.EINVAL, "it is no regular file")
+            raise OSError(errno.EINVAL, "it is not a regular file")
         data = file.read(LARGEST + 1)
     if len(data) > LARGEST:
         raise OSError(errno.EFBIG, f"it has more than {LARGEST >> 20} MiB")

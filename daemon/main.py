@@ -20,7 +20,7 @@ def main(argv: list[str] | None = None) -> int:
 
     parser = argparse.ArgumentParser(
         prog="siomsd",
-        description="SIOMS device daemon: shows the devices of a workcell as nodes of class axis, analog and binary.",
+        description="SIOMS device daemon: exposes the devices of a workcell as nodes of class axis, analog and binary.",
     )
     parser.add_argument("--config", required=True, metavar="FILE", help="configuration (TOML)")
     parser.add_argument("--socket", metavar="PATH", help="where to listen, instead of the configured or default path")

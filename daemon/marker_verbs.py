@@ -74,7 +74,7 @@ class MarkerVerbs:
         return tokens
 
     def free(self, token: int) -> None:
-        """Free a marker; who waits for it gets EPIPE."""
+        """Free a marker; waits for it fail with EPIPE."""
         self._release(self._owners.entitled(int(token), "free"))
 
     def signal(self, token: int) -> None:
@@ -102,7 +102,7 @@ class MarkerVerbs:
         """Free what a session owns, and end its waits: it has ended, or lost its last right."""
         for reservation in self._owners.owned_by(session):
             self._release(reservation)
-        gone = f"{session.peer.user} has no right on any node any more"
+        gone = f"{session.peer.user} no longer has a right on any node"
         for _, wait in list(self._waits):
             if wait.session is session:
                 self._clients.answer(wait, refusal(wait.number, errno.EPERM, f"{wait.what}: {gone}"))

@@ -89,7 +89,7 @@ def shared_claims(devices: Iterable[DeviceInfo]) -> list[str]:
             ]
             owner = next((owners[each] for each in there if each in owners), None)
             if owner is not None:
-                errors.append(f"[device.{device.name}]: {claim} is that of device {owner} already; want one of its own")
+                errors.append(f"[device.{device.name}]: {claim} is already used by device {owner}; want another")
                 break
         owners |= dict.fromkeys(device.claims, device.name)
     return errors
@@ -142,8 +142,8 @@ class NameTable:
             for wanted in device.inputs:
                 if wanted not in self.nodes:
                     self.errors.append(
-                        f"[device.{device.name}]: reads node {wanted}, which there is "
-                        f"not{did_you_mean(wanted, self.nodes)}"
+                        f"[device.{device.name}]: reads node {wanted}, which does not "
+                        f"exist{did_you_mean(wanted, self.nodes)}"
                     )
 
     def block(self, node: Node) -> BlockInfo:
@@ -165,7 +165,7 @@ class NameTable:
         for each in self._companions(node):
             if each.name in self.nodes:
                 self.errors.append(
-                    f"{where}: node name {each.name} is taken already by device {self.nodes[each.name].device}"
+                    f"{where}: node name {each.name} is already taken by device {self.nodes[each.name].device}"
                 )
             else:
                 self.nodes[each.name] = each
@@ -199,7 +199,7 @@ class NameTable:
         where = f"[node.{name}]"
         target = self.nodes.get(alias.of)
         if target is None:
-            self.errors.append(f"{where}: of = {alias.of}, which there is not{did_you_mean(alias.of, self.nodes)}")
+            self.errors.append(f"{where}: of = {alias.of}, which does not exist{did_you_mean(alias.of, self.nodes)}")
             return
         channels = target.channels
         if alias.channels:

@@ -157,7 +157,7 @@ class NodeVerbs:
                 if device
                 else ("starting", "it has been reloaded")
                 if self._server.is_replaced(node.device)
-                else ("gone", "not configured any more")
+                else ("gone", "no longer configured")
             )
             return Refused(
                 errno.EIO,
@@ -222,7 +222,7 @@ class NodeVerbs:
         if handle is None:
             raise Refused(errno.EBADF, f"close: this session has no handle {handle_number}")
         if handle.closing:
-            raise Refused(errno.EBADF, f"close {handle.node.name}: it is being closed already")
+            raise Refused(errno.EBADF, f"close {handle.node.name}: it is already being closed")
         if handle.claims and self.detach(handle):
             handle.closing = number
             session.waits[number] = Wait(number, session, None, f"close {handle.node.name}")

@@ -47,7 +47,7 @@ class Patience:
         if used_s < 1e-3 and self._state(self._pid) not in "RD":  # neither waits for a processor nor for a disk
             self._asleep_s += passed_s
         if self._used_s > self._limit_s:
-            return f"it has worked for {self._used_s:.0f} s of processor time without an end"
+            return f"it has used {self._used_s:.0f} s of processor time and is not done"
         if self._asleep_s > self._limit_s:
             return f"it has waited for something else for {self._asleep_s:.0f} s"
         return ""

@@ -61,5 +61,5 @@ def why_full(sessions: int, own: int, most: int, may_stop: bool) -> str:
     kept = 0 if may_stop and own < FEW else most // KEPT_SHARE
     if sessions < most - kept:
         return ""
-    places = f", and {kept} places are kept for users who may stop and have none" if kept else ""
+    places = f", and {kept} places are reserved for users who may stop and have no session" if kept else ""
     return f"{sessions} sessions are open{places}; max_sessions of [workcell] allows {most}: close one, or allow more"

@@ -109,13 +109,13 @@ def check(path: str, process: ForkServerProcess) -> int:
         if plan is not None:
             plan.fork_server.close()
             kinds = len(plan.names.nodes)
-            print(f"{path}: good; {len(plan.config.devices)} devices, {kinds} nodes")
+            print(f"{path}: ok; {len(plan.config.devices)} devices, {kinds} nodes")
 
     def died(fork_server: ForkServer) -> None:
         """Nothing to do: the loader's requests have been answered with the death."""
 
     def slow(progress: str) -> None:
-        print(f"{path}: slow, not wrong: {progress}", file=sys.stderr)
+        print(f"{path}: still being checked: {progress}", file=sys.stderr)
 
     Loader(loop, path, loaded, died, process, slow).start()
     if loop.running and not result:

@@ -70,7 +70,7 @@ class StopRecord:
         if size == self._at:
             return
         if size < self._at:
-            self.state.take(None, "it has become shorter", time.time())
+            self.state.take(None, "it has been truncated", time.time())
             self._at = size
         entries, read = entries_from(_read(self._fd, self._at, size))
         self._at += read

@@ -153,7 +153,7 @@ class WorkcellVerbs:
             if not self._clients.rights.on_workcell(session.peer) & message.right:
                 raise Refused(errno.EPERM, f"reset: {session.peer.user} has no right to write or administer every node")
             if source := self._server.hear_request():
-                raise Refused(errno.EAGAIN, f"reset: a stop has just been asked for ({source}); look, and reset again")
+                raise Refused(errno.EAGAIN, f"reset: a stop has just been requested ({source}); reset again")
             self._server.reset_workcell(str(session))
             return
         node = self._clients.nodes.find(session, "reset", name, message.right)

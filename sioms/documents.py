@@ -51,7 +51,7 @@ def toml_of(text: str | bytes) -> dict[str, Any]:
     try:
         table = tomllib.loads(plain)
     except RecursionError:
-        raise ValueError(f"arrays or tables nested too deep; at most {DEEPEST} deep is right") from None
+        raise ValueError(f"arrays or tables nested too deep; want at most {DEEPEST} levels") from None
     _check(table, "", 0)
     return table
 

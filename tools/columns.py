@@ -70,7 +70,7 @@ class Columns:
             self.has_end = "t" in letters or "p" in letters
         elif letters:
             raise UsageError(
-                f"{target.name}: -{letters[0]} is for axes; this is a node of class {info.node_class.name.lower()}"
+                f"{target.name}: -{letters[0]} applies to axes; this is a node of class {info.node_class.name.lower()}"
             )
         self.count = len(self._channels) * len(self._names)
 
@@ -111,5 +111,5 @@ class Columns:
 
 def _whole(value: float, what: str) -> int:
     if value != int(value) or not -(1 << 53) <= value <= 1 << 53:
-        raise ValueError(f"{what} {value:g}; want a whole number")
+        raise ValueError(f"{what} {value:g}; want an integer")
     return int(value)

@@ -33,9 +33,9 @@ def _work(words: Sequence[str]) -> None:
     line = fold("devin", words)
     timed = any(key in line.common for key in "rtL")
     if line.numbers:
-        raise UsageError(f"{line.numbers[0]}: devin takes no numbers; an option's number stands right behind it")
+        raise UsageError(f"{line.numbers[0]}: devin takes no numbers; write an option's number right after its letter")
     if not line.targets:
-        raise UsageError("no device named; try --help")
+        raise UsageError("no device given; try --help")
     _check_trailing(line, timed)
     digits = int(line.common["digits"]) if "digits" in line.common else None
     cell = Workcell(name="devin")
@@ -62,7 +62,7 @@ def _record(line: Line, nodes: Sequence[Any]) -> None:
     from .recording import Table
 
     if len(nodes) != 1:
-        raise UsageError("--record takes one device: stamps of several are not alike; run one devin for each")
+        raise UsageError("--record takes one device, as several have different timestamps; run one devin for each")
     target, node = line.targets[0], nodes[0]
     other = [key for key in target.flags if key not in "lhn"]
     if other:
@@ -91,7 +91,7 @@ def _record(line: Line, nodes: Sequence[Any]) -> None:
     if lost and not period_s:
         complain(
             "devin",
-            f"{lost} readings are missing in the table: they were overwritten before they were read",
+            f"{lost} readings are missing from the table: they were overwritten before they were read",
             0,
         )
 
@@ -99,7 +99,7 @@ def _record(line: Line, nodes: Sequence[Any]) -> None:
 def _check_trailing(line: Line, timed: bool) -> None:
     lost = [key for key in line.trailing if not (key == "N" and timed)]
     if lost:
-        raise UsageError(f"-{lost[0]} holds for the device that follows it, and none follows")
+        raise UsageError(f"-{lost[0]} applies to the device that follows it, and none follows")
 
 
 def repeat(sample: Callable[[], str], period_s: float, count: int, numbered: bool) -> None:

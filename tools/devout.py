@@ -41,11 +41,11 @@ def main(words: Sequence[str] | None = None) -> int:
 def _work(words: Sequence[str]) -> None:
     line = fold("devout", words)
     if not line.targets:
-        raise UsageError("no device named; try --help")
+        raise UsageError("no device given; try --help")
     if line.trailing:
-        raise UsageError(f"-{next(iter(line.trailing))} holds for the device that follows it, and none follows")
+        raise UsageError(f"-{next(iter(line.trailing))} applies to the device that follows it, and none follows")
     if "H" in line.common and "lease" in line.common:
-        raise UsageError("-H and --lease exclude each other: one goes on without rows, the other ends without them")
+        raise UsageError("-H and --lease exclude each other: -H holds when no rows arrive, --lease halts")
     tokens = Tokens("skip-bad-lines" in line.common)
     if line.numbers:
         tokens.feed((" ".join(line.numbers) + " ").encode())

@@ -234,7 +234,7 @@ def driver_page() -> str:
 def daemon_page() -> str:
     """Return the manual page of ``siomsd``."""
     text = [
-        "siomsd reads a configuration, starts a driver process for each device, and shows the devices as nodes of "
+        "siomsd reads a configuration, starts a driver process for each device, and exposes the devices as nodes of "
         "class axis, analog and binary on a Unix socket.",
         "SIGHUP takes up added, removed and changed devices without touching the others, as `sioms reload` does. "
         "SIGTERM and SIGINT stop all motion and end it.",

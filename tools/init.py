@@ -55,13 +55,13 @@ def run(args: argparse.Namespace) -> int:
     """Write the file and check it; return the exit status."""
     path = Path(args.file)
     if path.exists() and not args.force:
-        raise OSError(errno.EEXIST, f"write {path}: it is there already; --force overwrites it, another FILE leaves it")
+        raise OSError(errno.EEXIST, f"write {path}: it already exists; --force overwrites it, or give another FILE")
     known = {entry.name: entry for entry in drivers()}
     if args.driver and args.driver not in known:
         text = f"no driver {args.driver}{did_you_mean(args.driver, known)}"
         raise OSError(errno.EINVAL, f"{text}; there are: {', '.join(known)}")
     if args.port and not args.driver:
-        raise OSError(errno.EINVAL, "--port goes with --driver, which says what is there")
+        raise OSError(errno.EINVAL, "--port needs --driver")
     name = _name(args.name or path.resolve().parent.name)
     text = (_HERE / "starter.toml").read_text().replace("{name}", name)
     if not args.driver or args.driver in ON_AXES:
@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise OSError(error.errno, f"write {path}: {error.strerror}; give a FILE in a folder that is there") from None
+        raise OSError(error.errno, f"write {path}: {error.strerror}; give a FILE in an existing folder") from None
     print(f"{path} written{told}")
     status = check(path)
     if status == 0:
@@ -90,7 +90,7 @@ def example(driver: str) -> str:
     text = page_of(driver)
     start = re.search(r"^( *)\[device\.[\w-]+\]$", text, re.MULTILINE)
     if start is None:
-        raise OSError(errno.EINVAL, f"the driver {driver} shows no example; see its page in drivers/README.md")
+        raise OSError(errno.EINVAL, f"the driver {driver} has no example; see its page in drivers/README.md")
     indent, lines = start[1], []
     for line in text[start.start() :].splitlines():
         if not line.strip() or not line.startswith(indent):

@@ -269,7 +269,7 @@ class Monitor:
     def _do(self, what: str, act: Any) -> str:
         cell = self._watch.cell
         if cell is None:
-            return f"{what}: no daemon to tell"
+            return f"{what}: no daemon to send it to"
         try:
             act(cell)
         except OSError as error:

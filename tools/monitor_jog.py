@@ -64,7 +64,7 @@ class Jogger:
         ]
         if not axes:
             self._which = None
-            return "there is no axis to jog"
+            return "no axis to jog"
         places = [axis[:2] for axis in axes]
         at = places.index(self._which) + 1 if self._which in places else 0
         name, axis, self._limit = axes[at % len(axes)]

@@ -149,7 +149,7 @@ def _jog(view: View, jog: Jog) -> Text:
     """Return the line of the chosen axis."""
     node = next((node for node in view.nodes if node.name == jog.node and node.info is not None), None)
     if node is None or node.info is None:
-        return Text(f"{jog.node} cannot be jogged: it is not there", Style.WARN)
+        return Text(f"{jog.node} cannot be jogged: it is not available", Style.WARN)
     channel = node.info.channels[jog.axis]
     size = f"{jog.speed:g} {channel.unit}/s, steps of {jog.step:g} {channel.unit}"
     if jog.held:
@@ -200,7 +200,7 @@ def head(view: View, width: int = 120, height: int = 1000) -> list[Text]:
         hidden = len(lines) - height + 1
         lines = [
             *lines[: height - 1],
-            Text(f"and {hidden} lines more of what is wrong; a taller window shows them", Style.ALARM),
+            Text(f"and {hidden} more lines of errors; enlarge the window to see them", Style.ALARM),
         ]
     return [*lines, Text("")]
 

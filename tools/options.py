@@ -292,7 +292,7 @@ def number(word: str) -> float:
     """
     value = float(word)
     if value - value != 0 or "_" in word:
-        raise ValueError(f"{word} is no finite number")
+        raise ValueError(f"{word} is not a finite number")
     return value
 
 
@@ -301,7 +301,7 @@ def _group(options: list[Option], word: str, items: list[Item]) -> None:
     by_letter = {option.letter: option for option in options if option.letter}
     at = 1
     if len(word) == 1:
-        raise UsageError("- alone is no option; numbers are read from standard input without being asked")
+        raise UsageError("- alone is not an option; without numbers, devout reads them from standard input")
     while at < len(word):
         letter = word[at]
         option = by_letter.get(letter)
@@ -361,6 +361,6 @@ def _value(option: Option, shown: str, text: str) -> float:
         if not low <= value <= high or (option.value != SECONDS and value != int(value)):
             raise ValueError
     except ValueError:
-        aside = "; for help use --help" if shown == "-h" and not text else ""
-        raise UsageError(f"{shown}{text}: want {want} right behind it{aside}") from None
+        hint = "; for help use --help" if shown == "-h" and not text else ""
+        raise UsageError(f"{shown}{text}: want {want}, without a space{hint}") from None
     return value

@@ -43,7 +43,7 @@ def _work(words: Sequence[str]) -> None:
     cell = Workcell(name="sdev")
     _stop(cell, line)
     if "t" in line.common and not any("w" in target.flags for target in line.targets):
-        raise UsageError("-t is for -w, and there is none")
+        raise UsageError("-t needs -w")
     Setter(cell, numbers, bool(line.numbers), line.common.get("t")).carry_out(
         [Target(t.name, {key: 0 for key in t.flags if key != "e"}) for t in line.targets]
     )
@@ -51,12 +51,12 @@ def _work(words: Sequence[str]) -> None:
 
 def _check(line: Line) -> None:
     if not line.targets and list(line.trailing) != ["e"]:
-        raise UsageError("no device named; only -e alone does without: it stops the whole workcell")
+        raise UsageError("no device given; only -e works without one: it stops the whole workcell")
     if line.targets and line.trailing:
-        raise UsageError(f"-{next(iter(line.trailing))} holds for the device that follows it, and none follows")
+        raise UsageError(f"-{next(iter(line.trailing))} applies to the device that follows it, and none follows")
     for target in line.targets:
         if not target.flags:
-            raise UsageError(f"{target.name}: nothing to do; an option holds for the device that follows it")
+            raise UsageError(f"{target.name}: nothing to do; an option applies to the device that follows it")
 
 
 def _stop(cell: Workcell, line: Line) -> None:
@@ -92,7 +92,7 @@ class Setter:
         nodes = [self._open(target) for target in targets if target.flags]
         plan = [(node, key, self._take(node, key)) for node, target in nodes for key in target.flags]
         if self._given and self._numbers.numbers:
-            raise UsageError(f"{len(self._numbers.numbers)} numbers too many; -c takes one an axis, -g n*n")
+            raise UsageError(f"{len(self._numbers.numbers)} numbers too many; -c takes one per axis, -g n*n")
         synched = [node for node, key, _ in plan if key == "s"]
         for node, key, numbers in plan:
             if key != "s":
@@ -114,7 +114,7 @@ class Setter:
         wanted = NodeClass.ANALOG if key == "g" else NodeClass.AXIS
         if key != "z" and node_class is not wanted:
             raise UsageError(
-                f"-{key} on {node.name}: is for nodes of class {wanted.name.lower()}; this one is "
+                f"-{key} on {node.name}: applies to nodes of class {wanted.name.lower()}; this one is "
                 f"{node_class.name.lower()}"
             )
         count = len(node.info.channels)
@@ -127,7 +127,7 @@ class Setter:
                 break
         if len(tokens.numbers) < need:
             why = tokens.bad or f"there are {len(tokens.numbers)}"
-            raise OSError(errno.EINVAL, f"-{key} on {node.name}: wants {need} numbers: {why}")
+            raise OSError(errno.EINVAL, f"-{key} on {node.name}: want {need} numbers: {why}")
         taken, tokens.numbers = tokens.numbers[:need], tokens.numbers[need:]
         return [value for value, _ in taken]
 

@@ -165,7 +165,7 @@ def _refuse_unseen(root: Path) -> None:
     if " " in str(prefix):
         raise OSError(
             errno.EINVAL,
-            f"install the service: {prefix} holds a blank, which systemd's ExecStart takes for its end",
+            f"install the service: {prefix} contains a space, at which systemd's ExecStart would split it",
         )
 
 
@@ -205,7 +205,7 @@ def _remove(items: list[Item], root: Path, dry_run: bool) -> int:
         if not path.exists() and not path.is_symlink():
             continue
         if item.kept or not item.is_there(root):
-            print(f"kept       {path}: {'yours' if item.kept else 'it differs from what was put there'}")
+            print(f"kept       {path}: {'yours' if item.kept else 'it differs from what was installed'}")
             continue
         print(f"{'would remove' if dry_run else 'removed':<10} {path}")
         if not dry_run:

@@ -28,7 +28,7 @@ def main(words: Sequence[str] | None = None) -> int:
 def _work(words: Sequence[str]) -> None:
     actions, numbers, timeout_s = _read(words)
     if timeout_s is not None and "w" not in actions:
-        raise UsageError("-t is for -w, and there is none")
+        raise UsageError("-t needs -w")
     if actions == ["r"]:
         if len(numbers) > 1:
             raise UsageError(f"-r takes one number, how many markers; {len(numbers)} are given")
@@ -39,7 +39,7 @@ def _work(words: Sequence[str]) -> None:
     if not actions or "r" in actions:
         raise UsageError("want -r alone, or -f, -s, -w with markers; try --help")
     if not numbers:
-        raise UsageError(f"-{actions[0]}: no marker named")
+        raise UsageError(f"-{actions[0]}: no marker given")
     cell = Workcell(name="smarkers")
     deadline = None if timeout_s is None else monotonic() + timeout_s
     act: dict[str, Callable[[int], object]] = {
@@ -64,7 +64,7 @@ def _read(words: Sequence[str]) -> tuple[list[str], list[int], float | None]:
         elif item.kind == FLAG:
             actions.append(item.text)
         elif item.kind == NAME or not item.text.isascii() or not item.text.isdigit() or int(item.text) > _MOST:
-            raise UsageError(f"{item.text}: want a marker, a whole number as smarkers -r prints it")
+            raise UsageError(f"{item.text}: want a marker: an integer as printed by smarkers -r")
         else:
             numbers.append(int(item.text))
     return actions, numbers, timeout_s

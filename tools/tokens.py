@@ -45,7 +45,7 @@ class Tokens:
                 return
             self._line += at < len(lines) - 1
         if len(self._rest) > (MAX_LINE if self._skip else MAX_TOKEN):
-            self.bad = f"line {self._line}: {len(self._rest)} characters without an end; want numbers"
+            self.bad = f"line {self._line}: {len(self._rest)} characters without a separator; want numbers"
 
     def _take(self, line: bytes) -> None:
         found: list[tuple[float, int]] = []
@@ -54,9 +54,9 @@ class Tokens:
                 found.append((number(word.decode("ascii")), self._line))
             except ValueError:
                 shown = word[:40].decode("ascii", "backslashreplace")
-                wrong = f"line {self._line}: {shown!r} is no finite number"
+                wrong = f"line {self._line}: {shown!r} is not a finite number"
                 if self._skip:
-                    self.skipped.append(f"{wrong}; line left out")
+                    self.skipped.append(f"{wrong}; line skipped")
                     return
                 self.bad = wrong
                 break

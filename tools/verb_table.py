@@ -20,9 +20,9 @@ Generated from `sioms/protocol/verbs.py` and `driver_verbs.py` by `python -m sio
 
 Every socket is a Unix SOCK_SEQPACKET socket, and a packet is one msgpack array: `[verb, number, arguments...]` for a request
 or a notice, `[0, number, errno, value or text, zipped, as_of_ns]` for a reply (`sioms/protocol/messages.py`). A request has a
-number above 0 that none of its unanswered ones has; a notice draws no reply. A message that is not in these tables, comes in
-a state in which it is not taken, or has other arguments is malformed: it ends the connection on which it came, and nothing
-else. A request whose meaning is wrong is refused with an errno and a sentence, and ends nothing.
+number above 0 that no unanswered request has; a notice has no reply. A message that is not in these tables, arrives
+in a state in which it is not accepted, or has other arguments is malformed: it ends the connection on which it came, and nothing
+else. A well-formed request that cannot be carried out is refused with an errno and a sentence; the connection remains open.
 """  # noqa: E501
 
 
@@ -69,7 +69,7 @@ def _states(sockets: tuple[Socket, ...]) -> list[str]:
 def _table(socket: Socket) -> list[str]:
     lines = [
         f"From the {socket.sender} to the {socket.receiver}:", "",
-        "| verb | message | arguments | taken while | right | |", "| ---: | --- | --- | --- | --- | --- |",
+        "| verb | message | arguments | accepted in state | right | |", "| ---: | --- | --- | --- | --- | --- |",
     ]  # fmt: skip
     for verb, kind in socket.items():
         fields = ", ".join(f"`{name}`: {kind_of.words.split(',')[0]}" for name, kind_of in kind.fields.items())

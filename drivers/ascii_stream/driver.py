@@ -318,14 +318,14 @@ class Inspection:
         seen = receiver.counters
         text = line.decode("ascii", "replace").strip()[:60]
         if not greeted and seen.lines:
-            why = f"did not greet with {self._greeting!r}; look at the port, or at greeting"
+            why = f"did not greet with {self._greeting!r}; check the port and the key greeting"
         elif seen.bad_checksum:
-            why = f"sends lines without a right checksum, e.g. {text!r}; look at checksum and baud"
+            why = f"sends lines without a right checksum, e.g. {text!r}; check checksum and baud"
         elif seen.bad_columns and text.isascii():
             columns = f"{self._columns} number{'s' * (self._columns > 1)} a line, the time column included"
             why = f"sends other lines, e.g. {text!r}; the configuration says {columns}"
         else:
-            why = f"sends lines that are no numbers, e.g. {text!r}; look at the baud rate"
+            why = f"sends lines that are not numbers, e.g. {text!r}; check the baud rate"
         return DeviceError(errno.ENODEV, f"identify the device: it {why}")
 
 

@@ -48,7 +48,7 @@ restarted.
 """
 BIAS_TRIES, BIAS_PAUSE_S = 3, 0.05
 TAKEN_PAUSE_NS = 60_000_000_000
-LOOK_AT_THE_SENSOR = "look at host and port, and that RDT is enabled on the sensor's communication page"
+CHECK_THE_SENSOR = "check host and port, and that RDT is enabled on the sensor's communication page"
 TAKEN = (
     "the stream had ended while the sensor ran on: the network lost it, or another client took it, for RDT serves one; "
     "look for other programs that ask this sensor"
@@ -88,7 +88,7 @@ class AtiRdt(StreamDriver):
     """
 
     Settings = AtiRdtSettings
-    advice = LOOK_AT_THE_SENSOR
+    advice = CHECK_THE_SENSOR
 
     @classmethod
     def describe(cls, name: str, settings: AtiRdtSettings) -> Description:
@@ -250,7 +250,7 @@ class AtiRdt(StreamDriver):
         try:
             first: rdt.Record = yield rdt.start(command, self.silence_s)
         except LinkError as error:
-            raise LinkError(f"{self.name} on {self.line}: {error}; {LOOK_AT_THE_SENSOR}") from None
+            raise LinkError(f"{self.name} on {self.line}: {error}; {CHECK_THE_SENSOR}") from None
         return first
 
     def _is_new_sample(self, count: int, now_ns: int) -> bool:

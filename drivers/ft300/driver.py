@@ -73,7 +73,7 @@ class Ft300(StreamDriver):
     Settings = Ft300Settings
     silence_s = SILENCE_S
     gap_s = LINE.frame_gap_s
-    advice = "look at the wiring; the sensor speaks 19200 baud, 8N1"
+    advice = "check the wiring; the sensor speaks 19200 baud, 8N1"
 
     @classmethod
     def variant(cls, settings: Ft300Settings) -> type[Driver]:
@@ -253,7 +253,7 @@ class Sensor:
             firmware = yield self.unit.read_holding(ft300.FIRMWARE_AT, 3)
             about = yield self.unit.read_holding(ft300.SERIAL_AT, 5)
         except LinkError as error:
-            text = f"{self._what}: {error}; look at port, power and address, and that the line has 19200 baud, 8N1"
+            text = f"{self._what}: {error}; check port, power and address, and that the line has 19200 baud, 8N1"
             raise LinkError(text) from None
         except DeviceError as error:
             raise DeviceError(errno.ENODEV, f"{self._what}: no FT 300 answers there: {error}") from None
@@ -262,9 +262,10 @@ class Sensor:
         if not (version and version.isascii() and version.decode().isprintable()):
             shown = " ".join(f"{word:04x}" for word in firmware)
             text = (
-                f"registers {ft300.FIRMWARE_AT} to {ft300.FIRMWARE_AT + 2} read {shown}, which is no firmware version"
+                f"registers {ft300.FIRMWARE_AT} to {ft300.FIRMWARE_AT + 2} read {shown}, which is not a firmware "
+                "version of an FT 300"
             )
-            raise DeviceError(errno.ENODEV, f"{self._what}: {text} of an FT 300")
+            raise DeviceError(errno.ENODEV, f"{self._what}: {text}")
         wanted = self._settings.serial_number
         if wanted and serial != wanted:
             text = f"the sensor has serial number {serial}; the configuration says {wanted}"

@@ -49,7 +49,7 @@ class GpioChip:
             hint = {
                 errno.ENOENT: "no such chip; gpiodetect lists those there are",
                 errno.EACCES: "no permission; put the daemon's user into the group of the file, or write a udev rule",
-                errno.ENODEV: "this is no GPIO chip; gpiodetect lists those there are",
+                errno.ENODEV: "this is not a GPIO chip; gpiodetect lists the chips",
             }.get(error.errno or 0, os.strerror(error.errno or errno.EIO).lower())
             raise LinkError(f"open {path}: {hint}") from None
 
@@ -86,7 +86,7 @@ class GpioChip:
             if error.errno == errno.EBUSY:
                 text = ", ".join(filter(None, map(self._holder, lines))) or "a line is in use"
             if error.errno in (errno.EINVAL, errno.ENOTSUP, errno.ENXIO):
-                text = "the chip cannot do what is asked; look at bias, drive, and whether it has edges"
+                text = "the chip cannot do what is asked; check bias, drive, and whether it has edges"
             raise LinkError(f"request lines of {self._path}: {text}") from None
 
     def _holder(self, offset: int) -> str:

@@ -164,7 +164,7 @@ def parse_report(line: str) -> Report:
     """
     match = _REPORT.fullmatch(line)
     if match is None:
-        raise LinkError(f"read the status: {line[:100]!r} is no report")
+        raise LinkError(f"read the status: {line[:100]!r} is not a status report")
     fields = dict(part.partition(":")[::2] for part in match[3].split("|")[1:])
     try:
         blocks = int(fields["Bf"].split(",")[0]) if "Bf" in fields else -1

@@ -49,7 +49,7 @@ class MachinePosition:
         if values is None or max(self._index) >= len(values):
             known = len(values) if values is not None else 0
             text = f"read {self._name}: the report tells {known} machine positions; {max(self._index) + 1} are needed"
-            raise DeviceError(errno.ENODEV, f"{text}, set $10=1 or look at the letters of the axes")
+            raise DeviceError(errno.ENODEV, f"{text}, set $10=1 or check the letters of the axes")
         return np.array([values[index] for index in self._index]) * self.in_report
 
 

@@ -84,7 +84,7 @@ class IioDevice:
         try:
             return float(text.split()[0])
         except (ValueError, IndexError):
-            raise LinkError(f"read {self.folder / attribute}: {text!r} is no number") from None
+            raise LinkError(f"read {self.folder / attribute}: {text!r} is not a number") from None
 
     def write(self, attribute: str, value: object) -> None:
         """Set an attribute.
@@ -184,6 +184,6 @@ def _why(error: OSError) -> str:
     return {
         errno.EACCES: "no permission; give the daemon's user rights on it by a udev rule",
         errno.EBUSY: "busy; its buffer is on, or another program uses it",
-        errno.ENOENT: "no such attribute; look at the device, and whether it is still there",
+        errno.ENOENT: "no such attribute; check the device, and whether it is still there",
         errno.EINVAL: "the device does not take that value",
     }.get(error.errno or 0, os.strerror(error.errno or errno.EIO).lower())

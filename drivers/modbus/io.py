@@ -175,7 +175,7 @@ def _port_plan(rmap: RegisterMap, settings: ModbusIoSettings, name: str, count: 
             ChannelInfo(shown, minimum=0, maximum=2**count - 1, width=count, description=rmap.title),
         )
         if safe is not None and not (0 <= safe < 2**count and safe == int(safe)):
-            raise ValueError(f"safe.{name} = {safe:g}; want a whole number from 0 to {2**count - 1}")
+            raise ValueError(f"safe.{name} = {safe:g}; want an integer from 0 to {2**count - 1}")
     else:
         unit = UNITS[signal.unit].si
         channels = tuple(

@@ -296,7 +296,7 @@ def _proof(m: RegisterMap, place: str, proof: Proof) -> Iterator[str]:
         yield f"{place}: unknown quantity {proof.source}; timeout is right"
     signal = m.signals.get(proof.signal)
     if signal is not None and (signal.count > 1 or signal.type == "text"):
-        yield f"{place}: {proof.signal} is no single number"
+        yield f"{place}: {proof.signal} is not a single number"
 
 
 def _restart(m: RegisterMap) -> Iterator[str]:
@@ -322,7 +322,7 @@ def _ports(m: RegisterMap) -> Iterator[str]:
         if port.node_class == "binary" and signal.count > 62:
             yield f"{place}: {signal.count} bits; a port has at most 62"
         if port.node_class == "analog" and (signal.is_bits or signal.type == "text"):
-            yield f"{place}: analog, but {port.signal} holds no numbers"
+            yield f"{place}: analog, but {port.signal} does not hold numbers"
         if port.writable and port.node_class == "analog":
             yield from _fits(f"{place}.minimum", signal, port.minimum)
             yield from _fits(f"{place}.maximum", signal, port.maximum)
@@ -357,7 +357,7 @@ def _alarms(m: RegisterMap) -> Iterator[str]:
         try:
             int(code, 0)
         except ValueError:
-            yield f"alarms.codes: {code!r} is no number; decimal or 0x… is right"
+            yield f"alarms.codes: {code!r} is not a number; write it in decimal or as 0x…"
 
 
 def _golden(m: RegisterMap) -> Iterator[str]:
@@ -373,4 +373,4 @@ def _golden(m: RegisterMap) -> Iterator[str]:
             try:
                 bytes.fromhex(text)
             except ValueError:
-                yield f"{place}: {text!r} is no hex; e.g. '01 06 60 02 00 40 37 fa' is right"
+                yield f"{place}: {text!r} is not hexadecimal; e.g. '01 06 60 02 00 40 37 fa' is right"

@@ -77,7 +77,7 @@ def number(text: str, what: str, *, is_limit: bool = False) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value) and not (is_limit and value > 0):
-        raise LinkError(f"{what}: {text[:60]!r} is no number")
+        raise LinkError(f"{what}: {text[:60]!r} is not a number")
     return value
 
 

@@ -462,7 +462,7 @@ class OdriveUnit(AxesUnit):
         if not bits:
             settled = self.clock() - self._closed_ns[axis] > SWITCH_ON_NS
             off = self._may_hold[axis] and settled and state == IDLE and not self._homes[axis]
-            self._faults[axis] = "the axis is idle; look at its calibration" if off else ""
+            self._faults[axis] = "the axis is idle; check its calibration" if off else ""
 
 
 def _reads(number: int) -> tuple[str, ...]:

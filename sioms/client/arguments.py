@@ -57,7 +57,7 @@ def _as_float(what: str, value: Any) -> float:
     try:
         return float(value)
     except OverflowError:
-        raise ValueError(f"{what}: {shown(value)} is beyond what a floating-point number holds") from None
+        raise ValueError(f"{what}: {shown(value)} is out of the range of a floating-point number") from None
 
 
 def numbers(what: str, values: Any, want: str = "numbers") -> list[float]:
@@ -88,7 +88,7 @@ def integer(what: str, value: Any, want: str = "an integer", *, flags: bool = Fa
     else:
         raise _wrong(what, value, want)
     if not _LEAST <= found < _MOST:
-        raise ValueError(f"{what}: {shown(found)} does not fit into 64 bits; want {want}")
+        raise ValueError(f"{what}: {shown(found)} does not fit in 64 bits; want {want}")
     return found
 
 
@@ -106,7 +106,7 @@ def plain(what: str, value: Any, depth: int = _DEPTH) -> Any:
     """Return a value as messages hold it: arrays and tuples as lists, numbers of numpy as plain ones.
 
     Raises:
-        TypeError: messages hold no such thing.
+        TypeError: messages do not contain this type.
         ValueError: it is nested too deep, or an integer of more than 64 bits.
     """
     if value is None or type(value) in (bool, float, str, bytes):

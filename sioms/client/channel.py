@@ -122,7 +122,7 @@ def connect(path: str, timeout_s: float = CONNECT_S) -> socket:
         sock.close()
         raise OSError(
             errno.ETIMEDOUT,
-            f"connect to {path}: many wait there, and the daemon lets nobody in; is its process hung?",
+            f"connect to {path}: its queue is full and the daemon accepts nobody; is its process hung?",
         ) from None
     except OSError as error:
         sock.close()
@@ -130,19 +130,19 @@ def connect(path: str, timeout_s: float = CONNECT_S) -> socket:
         hint = {
             errno.ENOENT: "no daemon listens there; start one with `siomsd --config FILE`, or name its socket in "
             "SIOMS_SOCKET",
-            errno.ECONNREFUSED: "the daemon that made this socket is gone; start one with `siomsd --config FILE`",
+            errno.ECONNREFUSED: "the daemon that made this socket has ended; start one with `siomsd --config FILE`",
             errno.EACCES: "no permission; ask to be put into the group of the socket",
             errno.ENAMETOOLONG: "the path of a socket has at most 107 bytes",
         }.get(number, os.strerror(number).lower())
         if number == errno.ECONNREFUSED and not _is_socket(path):
-            hint = "that is no socket; name the daemon's in SIOMS_SOCKET"
+            hint = "that is not a socket; set SIOMS_SOCKET to the daemon's"
         raise OSError(number, f"connect to {path}: {hint}") from None
     uid = unpack("3i", sock.getsockopt(SOL_SOCKET, SO_PEERCRED, 12))[1]
     if not may_serve(uid, path):
         sock.close()
         raise OSError(
             errno.EPERM,
-            f"connect to {path}: user {uid} listens there, who is neither you nor root nor the owner of its folder; a "
+            f"connect to {path}: user {uid} listens there, who is neither you nor root nor the owner of the folder; a "
             "daemon for others has its socket in a folder of its own user, as /run/sioms",
         )
     return sock

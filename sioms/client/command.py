@@ -67,7 +67,7 @@ def command(
         if missing and len(missing) < len(group):
             raise ValueError(f"make command: {', '.join(missing)} missing; {', '.join(group)} go together")
     if not mode & QUANTITIES:
-        raise ValueError(f"make command: nothing commanded; give one of {', '.join(_QUANTITY)}")
+        raise ValueError(f"make command: no setpoint; give one of {', '.join(_QUANTITY)}")
     fields["axis"] = integer("make command: axis", axis, "the index of an axis")
     if wait is not None:
         mode |= ControlMode.SPECIFIED_WAIT_MARKER

@@ -135,7 +135,7 @@ class Edges:
             kept, name = self._node.slots, self._node.name
             text = (
                 f"wait for an event on {name}: {lost} edges of its port came between two looks and cannot be told "
-                f"any more; {kept} publications are kept: look more often, or give the device a longer history"
+                f"any more; {kept} publications are kept: read more often, or give the device a longer history"
             )
             raise EdgesLost(text, lost, event)
         return event if (final ^ self._state) & self._mask else None
@@ -317,7 +317,7 @@ class NodeCore(Generic[S]):
 
     def _ioctl(self, request: Request, argument: object = None, timeout: float | None = 0.0) -> Call:
         if not isinstance(request, Request):
-            raise TypeError(f"ioctl on {self.name}: {text.shown(request)} is no request; want one of sioms.Request")
+            raise TypeError(f"ioctl on {self.name}: {text.shown(request)} is not a request; want one of sioms.Request")
         what = f"{request.name} on {self.name}"
         return Call(what, Ioctl(int(request), argument, timeout), limit_s=timeout)
 

@@ -48,7 +48,7 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
             _limit(sum(m.file_size for m in members))
             arrays = {m.filename.removesuffix(".npy"): _member(archive, m) for m in members}
     except Exception as error:  # readers raise whatever their parts raise: a dozen kinds, some of their own
-        raise UnreadableError(f"read {path}: it is no NPZ file, or damaged: {_words(error)}") from error
+        raise UnreadableError(f"read {path}: it is not an NPZ file, or is damaged: {_words(error)}") from error
     return {name: array for name, array in arrays.items() if array is not None}
 
 
@@ -93,7 +93,7 @@ def read_mat(path: Path) -> dict[str, Any]:
         names = [name for name, _, _ in variables]
         found: dict[str, Any] = loadmat(path, squeeze_me=True, variable_names=names)
     except Exception as error:  # readers raise whatever their parts raise: a dozen kinds, some of their own
-        raise UnreadableError(f"read {path}: it is no MAT file, or damaged: {_words(error)}") from error
+        raise UnreadableError(f"read {path}: it is not a MAT file, or is damaged: {_words(error)}") from error
     return {name: value for name, value in found.items() if not name.startswith("__")}
 
 

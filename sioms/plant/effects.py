@@ -274,7 +274,7 @@ def build_effects(table: Mapping[str, object], axes: Sequence[str], source: str 
             continue
         entry = table[key]
         if not isinstance(entry, Mapping):
-            mistakes.append(f"{where}: {entry!r} is no table; want a table of effects")
+            mistakes.append(f"{where}: {entry!r} is not a table; want a table of effects")
             continue
         for name, occurrences in entry.items():
             _collect(given, mistakes, f"{where}: effect {name!r}", name, occurrences, members)
@@ -301,7 +301,7 @@ def _collect(
     taken = {axis for (kind, _), axes in given.items() if kind == name for axis in axes}
     for layer, numbers in enumerate(layers):
         if not isinstance(numbers, Mapping):
-            mistakes.append(f"{where}: {numbers!r} is no table; want {{ {', '.join(CATALOGUE[name].parameters)} }}")
+            mistakes.append(f"{where}: {numbers!r} is not a table; want {{ {', '.join(CATALOGUE[name].parameters)} }}")
             continue
         values = _numbers(where, CATALOGUE[name].parameters, numbers, mistakes)
         for axis in members:
@@ -321,7 +321,7 @@ def _numbers(
         if isinstance(value, str) and key not in numbers:
             value = values.get(value, 0.0)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            missing = "missing" if key not in numbers else f"{value!r} is no finite number"
+            missing = "missing" if key not in numbers else f"{value!r} is not a finite number"
             mistakes.append(f"{where}: {key} [{parameter.unit}] {missing}")
         elif not parameter.low <= value <= parameter.high:
             mistakes.append(

@@ -44,7 +44,7 @@ TO_DRIVER = Socket("daemon", "driver", ("starting", "up", "ending"))
 
 
 class Attach(Message, on=TO_DRIVER, verb=DriverVerb.ATTACH, notice=True, states=("up",)):
-    """Serve a handle from now on; descriptors: its socket, the writing end of the wake pipe, and the client's pidfd if
+    """Serve a handle; descriptors: its socket, the writing end of the wake pipe, and the client's pidfd if
     any.
     """
 
@@ -71,7 +71,7 @@ class Detach(Message, on=TO_DRIVER, verb=DriverVerb.DETACH, notice=True, states=
 
 
 class StopChanged(Message, on=TO_DRIVER, verb=DriverVerb.STOP_CHANGED, notice=True):
-    """The latch has changed: look at once."""
+    """The latch has changed: read it at once."""
 
 
 class Shutdown(Message, on=TO_DRIVER, verb=DriverVerb.SHUTDOWN, notice=True, then="ending"):
@@ -79,7 +79,7 @@ class Shutdown(Message, on=TO_DRIVER, verb=DriverVerb.SHUTDOWN, notice=True, the
 
 
 class Input(Message, on=TO_DRIVER, verb=DriverVerb.INPUT, notice=True, states=("up", "ending")):
-    """A node that the driver reads is there; descriptor: its page."""
+    """A node that the driver reads is available; descriptor: its page."""
 
     name: Text
     channels: Array
@@ -89,7 +89,7 @@ class Input(Message, on=TO_DRIVER, verb=DriverVerb.INPUT, notice=True, states=("
 class NodeStop(Message, on=TO_DRIVER, verb=DriverVerb.NODE_STOP, notice=True):
     """Emergency stop of some channels, or of one bit of them (-1: all).
 
-    ``resets`` is how often the workcell had been reset; void when the driver has seen a later reset.
+    ``resets`` is how often the workcell had been reset; ignored when the driver has seen a later reset.
     """
 
     block: Integer
@@ -139,7 +139,7 @@ class Stopped(Message, on=FROM_DRIVER, verb=DriverVerb.STOPPED, notice=True):
 
 
 class LinkChanged(Message, on=FROM_DRIVER, verb=DriverVerb.LINK, notice=True):
-    """How the device behind the driver is: a PageState, and why."""
+    """The state of the link to the device: a PageState, and the reason."""
 
     state: Integer
     reason: Text

@@ -149,11 +149,11 @@ class Right(IntFlag):
 
 
 REQUESTS: dict[int, tuple[Right, bool, bool, str]] = {
-    Request.GET_IO_STRUCT_INFO: (Right.WRITE, False, False, "tell what the node is; answered by the client library"),
-    Request.CALIBRATE_DEVICE: (Right.WRITE, True, False, "give the present positions new values"),
-    Request.ZERO_DEVICE: (Right.WRITE, True, False, "take what is measured now as zero"),
-    Request.WAIT_UNTIL_IDLE: (Right.READ, False, True, "wait until all axes rest and their buffers are empty"),
-    Request.SEND_EXTERNAL_SYNCH: (Right.WRITE, False, False, "start what waits for the external synch"),
+    Request.GET_IO_STRUCT_INFO: (Right.WRITE, False, False, "describe the node; answered by the client library"),
+    Request.CALIBRATE_DEVICE: (Right.WRITE, True, False, "define the present positions"),
+    Request.ZERO_DEVICE: (Right.WRITE, True, False, "define the present position or reading as 0"),
+    Request.WAIT_UNTIL_IDLE: (Right.READ, False, True, "wait until all axes are at rest and their buffers are empty"),
+    Request.SEND_EXTERNAL_SYNCH: (Right.WRITE, False, False, "start all commands that wait for the external synch"),
     Request.EMERGENCY_STOP: (Right.STOP, False, False, "stop the node until it is reset"),
     Request.SIGNAL_MARKER: (Right.WRITE, False, False, "signal a marker; passed on to the daemon"),
     Request.WAIT_MARKER: (Right.WRITE, False, False, "wait for a marker; passed on to the daemon"),
@@ -163,19 +163,19 @@ REQUESTS: dict[int, tuple[Right, bool, bool, str]] = {
         Right.READ,
         False,
         False,
-        "wait for an edge; answered by the client library, out of the page",
+        "wait for an edge; answered by the client library, from the page",
     ),
     Request.SET_GAINS: (Right.WRITE, True, False, "set the gain matrix"),
-    Request.GET_GAINS: (Right.READ, False, True, "tell the gain matrix"),
+    Request.GET_GAINS: (Right.READ, False, True, "return the gain matrix"),
     Request.STOP: (Right.STOP | Right.WRITE, False, False, "stop at maximum deceleration and empty the buffers"),
     Request.RESET: (Right.WRITE | Right.ADMINISTER, False, False, "clear stops and faults of the node"),
     Request.HOME: (Right.WRITE, True, False, "start homing"),
-    Request.SET_LIMITS: (Right.WRITE, True, False, "narrow the limits"),
-    Request.GET_LIMITS: (Right.READ, False, True, "tell the limits in force"),
+    Request.SET_LIMITS: (Right.WRITE, True, False, "set limits, within the configured ones"),
+    Request.GET_LIMITS: (Right.READ, False, True, "return the limits in force"),
     Request.FLUSH: (Right.WRITE, True, False, "empty the buffers; the running command goes on"),
     Request.CANCEL_WAITS: (Right.WRITE | Right.ADMINISTER, False, False, "end the waits of all sessions on the node"),
-    Request.GET_STATISTICS: (Right.READ, False, True, "tell tick times and link counters"),
-    Request.GET_DIAGNOSTICS: (Right.READ, False, True, "tell what readings do not"),
+    Request.GET_STATISTICS: (Right.READ, False, True, "return tick times and link counters"),
+    Request.GET_DIAGNOSTICS: (Right.READ, False, True, "return raw position, offset, retries and misses of axes"),
 }
 """The table of requests: any of which rights it takes; whether it needs the output node itself, not its read-only
 companion; whether it only looks (else a reading after the answer shows its effect); what it does.

@@ -55,7 +55,7 @@ if "site" in sys.modules:
         return unpackb(data, raw=False, use_list=True, strict_map_key=True, max_ext_len=0, ext_hook=_no_extension)
 
     def _no_extension(kind: int, data: bytes) -> None:
-        raise ValueError(f"extension type {kind}; messages hold no such thing")
+        raise ValueError(f"extension type {kind}; messages do not contain this type")
 
 else:
     # A shell tool, started with -S to be quick (docs/decisions/0002-start-of-pipe-tools.md).

@@ -108,7 +108,7 @@ class Stopped:
                 self.parts.pop((device, block, channel, bit), None)
 
     def take(
-        self, entry: Mapping[str, Any] | None, damage: str = "a line that is no entry", now_s: float = 0.0
+        self, entry: Mapping[str, Any] | None, damage: str = "a line that is not an entry", now_s: float = 0.0
     ) -> None:
         """Take an entry of a journal into account; what is none stops the workcell, since now."""
         try:
@@ -162,7 +162,7 @@ def replay(data: bytes, start: int, now_s: float) -> Stopped:
     lines = _lines(data, start)
     found = next(((place, entry) for place, entry in reversed(lines) if entry and CHECKPOINT in entry), None)
     if found is None and start:
-        state.take(None, f"nothing is known of what was before byte {start}", now_s)
+        state.take(None, f"the entries before byte {start} are lost", now_s)
     if found is not None:
         state, at = _from_checkpoint(*found, start, now_s)
     for place, entry in lines:

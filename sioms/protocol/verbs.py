@@ -55,7 +55,7 @@ class Kind:
 
 INTEGER = Kind((int,), "an integer")
 NUMBER = Kind((float, int), "a number")
-SECONDS = Kind((float, int, type(None)), "seconds as a number, or none for ever")
+SECONDS = Kind((float, int, type(None)), "seconds as a number, or nil for no limit")
 FLAG = Kind((bool,), "true or false")
 ANYTHING = Kind((), "anything")
 KINDS = {
@@ -186,7 +186,7 @@ def _checked(parts: list[Any], socket: Socket) -> list[Any]:
     """Return the parts of a message whose verb and arguments are those of a socket."""
     kind_of, arguments = socket.get(parts[0]), parts[2:]
     if kind_of is None:
-        raise MalformedMessage(f"verb {parts[0]} is none")
+        raise MalformedMessage(f"verb {parts[0]} does not exist")
     fields = kind_of.fields
     if len(arguments) != len(fields):
         raise MalformedMessage(f"verb {parts[0]} with {len(arguments)} arguments; want {len(fields)}")
@@ -209,8 +209,8 @@ FROM_CLIENT = Socket("client", "daemon", ("starting", "serving"))
 
 
 class Hello(Message, on=FROM_CLIENT, verb=ClientVerb.HELLO, query=True):
-    """Say who one is. Answer: [protocol version, workcell, rights]; descriptors of the stop-request file if it may
-    stop.
+    """Introduce the client. Answer: [protocol version, workcell, rights]; descriptors of the stop-request file if it
+    may stop.
     """
 
     version: Integer
@@ -228,7 +228,7 @@ class Represent(Message, on=FROM_CLIENT, verb=ClientVerb.REPRESENT, query=True):
 
 
 class Open(Message, on=FROM_CLIENT, verb=ClientVerb.OPEN, right=Right.READ):
-    """Open a node, which takes the right to write, too, if the node can be written.
+    """Open a node; for writing it needs the right to write, too.
 
     Answer: [handle, node, channels, bit, [process that made the socket, process behind it]]; descriptors of page, wake
     pipe and the handle's socket.
@@ -241,23 +241,23 @@ class Open(Message, on=FROM_CLIENT, verb=ClientVerb.OPEN, right=Right.READ):
 
 
 class Close(Message, on=FROM_CLIENT, verb=ClientVerb.CLOSE, shown=True):
-    """Close a handle; answered when what it owned is being halted, and free."""
+    """Close a handle; answered when its axes are being halted and its channels are free."""
 
     handle: Integer
 
 
 class List(Message, on=FROM_CLIENT, verb=ClientVerb.LIST, query=True):
-    """Tell the nodes that the user may read."""
+    """List the nodes that the user may read."""
 
 
 class Info(Message, on=FROM_CLIENT, verb=ClientVerb.INFO, right=Right.READ, query=True):
-    """Tell what a node is."""
+    """Describe a node."""
 
     node: Name
 
 
 class Status(Message, on=FROM_CLIENT, verb=ClientVerb.STATUS, query=True):
-    """Tell devices, sessions, holders and stops."""
+    """Return the state of devices, sessions, owners and stops."""
 
 
 class Journal(Message, on=FROM_CLIENT, verb=ClientVerb.JOURNAL, query=True):
@@ -271,14 +271,14 @@ class Journal(Message, on=FROM_CLIENT, verb=ClientVerb.JOURNAL, query=True):
 
 
 class ReserveMarker(Message, on=FROM_CLIENT, verb=ClientVerb.RESERVE_MARKER, somewhere="reserve markers"):
-    """Reserve markers, all or none, for the session or to persist. Answer: their tokens."""
+    """Reserve markers, all or none; they end with the session or persist. Answer: their tokens."""
 
     how_many: Integer
     persist: Flag
 
 
 class FreeMarker(Message, on=FROM_CLIENT, verb=ClientVerb.FREE_MARKER, shown=True):
-    """Free a marker; who waits for it gets EPIPE."""
+    """Free a marker; waits for it fail with EPIPE."""
 
     token: Integer
 
@@ -290,7 +290,7 @@ class SignalMarker(Message, on=FROM_CLIENT, verb=ClientVerb.SIGNAL_MARKER, somew
 
 
 class WaitMarker(Message, on=FROM_CLIENT, verb=ClientVerb.WAIT_MARKER, somewhere="wait for a marker", shown=True):
-    """Wait until a marker, by number or token, is signalled. Answer: when that was [ns]."""
+    """Wait until a marker, by number or token, is signalled. Answer: the time of the signal [ns]."""
 
     marker: Integer
     timeout_s: Seconds
@@ -299,7 +299,7 @@ class WaitMarker(Message, on=FROM_CLIENT, verb=ClientVerb.WAIT_MARKER, somewhere
 class EmergencyStop(
     Message, on=FROM_CLIENT, verb=ClientVerb.EMERGENCY_STOP, right=Right.STOP, shown=True
 ):  # fmt: skip
-    """Stop a node, '' = the workcell, until it is reset. The right on any node will do for the workcell."""
+    """Stop a node, '' = the workcell, until it is reset. For the workcell, the right on any one node is sufficient."""
 
     node: Name
     why: Text
@@ -314,11 +314,11 @@ class Reset(
 
 
 class Reload(Message, on=FROM_CLIENT, verb=ClientVerb.RELOAD, right=Right.ADMINISTER):
-    """Take up the configuration anew. Answer: all errors; with any, nothing was taken up."""
+    """Reload the configuration. Answer: all errors; if there are any, nothing has changed."""
 
 
 class Cancel(Message, on=FROM_CLIENT, verb=ClientVerb.CANCEL):
-    """End a request of this session that waits. Answer: whether there was one."""
+    """Cancel a waiting request of this session. Answer: whether there was one."""
 
     number: Integer
 
@@ -329,8 +329,8 @@ ON_HANDLE = Socket("client", "driver", ("open",))
 
 
 class Write(Message, on=ON_HANDLE, verb=HandleVerb.WRITE, right=Right.WRITE, shown=True):
-    """Write records, those sent ahead in parts first, all or none; needs a handle that is open for writing. Answer: the
-    tick.
+    """Write records, all or none, beginning with those sent in parts; needs a handle that is open for writing. Answer:
+    the tick.
     """
 
     flags: Integer
@@ -339,7 +339,7 @@ class Write(Message, on=ON_HANDLE, verb=HandleVerb.WRITE, right=Right.WRITE, sho
 
 
 class Ioctl(Message, on=ON_HANDLE, verb=HandleVerb.IOCTL, shown=True):
-    """Carry out a request; what it takes and needs is in the table of requests."""
+    """Carry out a request of the table below."""
 
     request: Integer
     argument: Anything
@@ -347,7 +347,7 @@ class Ioctl(Message, on=ON_HANDLE, verb=HandleVerb.IOCTL, shown=True):
 
 
 class Subscribe(Message, on=ON_HANDLE, verb=HandleVerb.SUBSCRIBE, query=True):
-    """Wake the client by its pipe with every n-th publication; -1: with edges only; 0: not."""
+    """Wake the client through its pipe at every n-th publication; -1: at edges only; 0: never."""
 
     every: Integer
 
@@ -357,13 +357,13 @@ class Keepalive(Message, on=ON_HANDLE, verb=HandleVerb.KEEPALIVE, notice=True, q
 
 
 class CancelOnHandle(Message, on=ON_HANDLE, verb=HandleVerb.CANCEL, query=True):
-    """End a request of this handle that waits. Answer: whether there was one."""
+    """Cancel a waiting request of this handle. Answer: whether there was one."""
 
     number: Integer
 
 
 class Part(Message, on=ON_HANDLE, verb=HandleVerb.PART, notice=True):
-    """The beginning of the records of the write of this message number, which is to follow."""
+    """The first part of the records of the write with this message number, which follows."""
 
     write: Integer
     records: Records

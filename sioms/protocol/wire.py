@@ -106,7 +106,7 @@ def check(data: bytes, most: int) -> None:
             size, at = _take_integer(data, at, 1 << kind - (0xC4 if kind < 0xC7 else 0xD9))
             at += size
         else:
-            raise ValueError(f"type {kind:#x}; messages hold no such thing")
+            raise ValueError(f"type {kind:#x}; messages do not contain this type")
 
 
 def _put(out: bytearray, value: Any) -> None:
@@ -207,12 +207,12 @@ def _take(data: bytes, at: int, depth: int) -> tuple[Any, int]:
         case 0xDE | 0xDF:
             length, at = _take_integer(data, at, 2 << kind - 0xDE)
             return _take_map(data, at, length, depth)
-    raise ValueError(f"type {kind:#x}; messages hold no such thing")
+    raise ValueError(f"type {kind:#x}; messages do not contain this type")
 
 
 def _cut(data: bytes, at: int, length: int) -> bytes:
     if at + length > len(data):
-        raise ValueError(f"{length} bytes promised, {len(data) - at} there")
+        raise ValueError(f"{length} bytes announced, {len(data) - at} present")
     return data[at : at + length]
 
 
@@ -247,6 +247,6 @@ def _take_map(data: bytes, at: int, length: int, depth: int) -> tuple[dict[Any, 
 def _check(data: bytes, at: int, values: int, depth: int) -> None:
     """Refuse what promises more than there is, before memory or stack are spent on it."""
     if values > len(data) - at:
-        raise ValueError(f"{values} values promised, {len(data) - at} bytes there")
+        raise ValueError(f"{values} values announced, {len(data) - at} bytes present")
     if depth >= MAX_DEPTH:
         raise ValueError(f"values nested more than {MAX_DEPTH} deep")

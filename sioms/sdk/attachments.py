@@ -247,7 +247,7 @@ def _keep_part(handle: Handle, message: verbs.Part) -> None:
     """Keep records that come ahead of their write; those of a write that never came are dropped."""
     number, records = message
     if len(records) > MAX_INLINE:
-        raise MalformedMessage(f"a part of a write of {len(records)} bytes; want up to {MAX_INLINE}")
+        raise MalformedMessage(f"part of a write with {len(records)} bytes; want up to {MAX_INLINE}")
     if not handle.writes:
         return  # its write will be refused
     if handle.ahead[0] != number:

@@ -57,7 +57,7 @@ class Connected:
                     raise OSError(
                         errno.ETIMEDOUT,
                         f"connect to {self._base.line}: no answer within {self._base.line.connect_timeout_s:g} s; "
-                        "look at host, port and network",
+                        "check host, port and network",
                     )
                 return False
         except OSError as error:
@@ -117,7 +117,7 @@ class Connected:
         """Run the steps that a client's request takes; its answer comes when they end."""
         line, now_ns = self.line, self._loop.now_ns()
         if line is None:
-            raise OSError(errno.EIO, f"{what}: there is no connection to {self._base.line}")
+            raise OSError(errno.EIO, f"{what}: {self._base.line} is not connected")
 
         def done(value: Any, error: Exception | None) -> None:
             if error is None:

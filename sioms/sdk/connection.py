@@ -19,7 +19,7 @@ from .settings import LineSettings
 
 MOST_PORTS = 4
 """Ports that a sentence names."""
-_LOOK = "look at host, port and network"
+_LOOK = "check host, port and network"
 
 
 class Connection:
@@ -136,7 +136,7 @@ class Connection:
             cause = error.__context__  # the port was opened, and is none
             number = error.errno or (cause.args[0] if isinstance(cause, termios.error) else errno.EIO)
             hint = {
-                errno.ENOTTY: "it is no serial port",
+                errno.ENOTTY: "it is not a serial port",
                 errno.ENOENT: f"no such port; is the device plugged in{_or_one_of(_ports())}",
                 errno.EACCES: "no permission; is the user in the group dialout",
                 errno.EBUSY: "in use by another process",

@@ -104,9 +104,9 @@ class Datagrams:
     def _gone(self, error: OSError) -> OSError:
         number = error.errno or errno.EIO
         if number == errno.ECONNREFUSED:
-            why = "nothing takes datagrams at this port; look at host and port"
+            why = "nothing takes datagrams at this port; check host and port"
         else:
-            why = f"{os.strerror(number).lower()}; look at the host and the network"
+            why = f"{os.strerror(number).lower()}; check the host and the network"
         return OSError(number, f"datagrams of {self._peer}: {why}")
 
 

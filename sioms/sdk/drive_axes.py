@@ -318,7 +318,7 @@ class AxesUnit(LineUnit):
             elif now_ns - self._stood_ns[axis] > SHORT_NS:
                 self._goes[axis] = False
                 text = (
-                    f"{self.name}: came to rest at {self.bank.rows['position'][axis]:g} before its target; look at its "
+                    f"{self.name}: came to rest at {self.bank.rows['position'][axis]:g} before its target; check its "
                     "limit switches"
                 )
                 self.bank.fault([axis], text, now_ns)

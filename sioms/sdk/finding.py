@@ -85,7 +85,7 @@ def _from_file(path: str) -> type[Driver]:
 def _checked(found: object, name: str) -> type[Driver]:
     kinds = (TickDriver, LineDriver, StreamDriver)
     if not (isinstance(found, type) and issubclass(found, kinds)):
-        raise DriverNotFound(f"driver = {name}: {found!r} is no class of TickDriver, LineDriver or StreamDriver")
+        raise DriverNotFound(f"driver = {name}: {found!r} is not a subclass of TickDriver, LineDriver or StreamDriver")
     return found
 
 

@@ -169,16 +169,16 @@ class LineEngine(Connected):
         self._loop.after_publication(now_ns, state.unit.blocks)
 
     def _told(self, unit: LineUnit, error: Exception) -> str:
-        """Return what failed of which unit, and what to look at unless the driver has said so."""
+        """Return what failed of which unit, and what to check unless the driver has said so."""
         text, line = _named(unit, error), self._driver.line
-        if not isinstance(error, LinkError) or "look at" in text:
+        if not isinstance(error, LinkError) or "; check " in text:
             return text
         if line.serial is None:
             where = "what answers there" if error.heard else "the device, and who else is connected to it"
-            return f"{text}; look at {where}"
+            return f"{text}; check {where}"
         if error.heard:
-            return f"{text}; look at wiring and speed ({line.speed}), and whether two devices have one address"
-        return f"{text}; look at power, wiring, address and speed ({line.speed})"
+            return f"{text}; check wiring and speed ({line.speed}), and whether two devices have one address"
+        return f"{text}; check power, wiring, address and speed ({line.speed})"
 
     def _lose_unit(self, state: _UnitState, reason: str, now_ns: int) -> None:
         state.is_up = False

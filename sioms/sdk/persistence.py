@@ -73,7 +73,7 @@ def decode(data: bytes) -> Contents:
         ValueError: it is none, or a torn one.
     """
     if len(data) < HEADER.size or not data.startswith(MAGIC):
-        raise ValueError(f"{len(data)} bytes that are no file of positions")
+        raise ValueError(f"{len(data)} bytes that are not a position file")
     _, count, length, closed, boot = HEADER.unpack_from(data)
     if len(data) != HEADER.size + length + 24 * count:
         raise ValueError(f"{len(data)} bytes; want {HEADER.size + length + 24 * count} for {count} axes")
@@ -81,7 +81,7 @@ def decode(data: bytes) -> Contents:
         names = data[HEADER.size : HEADER.size + length].decode().split("\n")[:count]
         written_in = boot.rstrip(b"\0").decode()
     except UnicodeDecodeError:
-        raise ValueError("its names are no text") from None
+        raise ValueError("its names are not text") from None
     state = np.frombuffer(data, "<i8", count, HEADER.size + length).tolist()
     raw, position = np.frombuffer(data, "<f8", 2 * count, HEADER.size + length + 8 * count).reshape(2, count).tolist()
     entries = {name: Entry(*entry) for name, *entry in zip(names, state, raw, position, strict=True)}
@@ -102,7 +102,7 @@ def offset_of(entry: Entry, settings: AxisSettings, raw: float) -> tuple[float |
     if not entry.state & AT_REST:
         return None, "it was not known to be at rest when its driver ended"
     if not np.isfinite(raw):
-        return None, "its device does not tell where it is"
+        return None, "its device does not report its position"
     if rule.when == "always":
         return entry.position - raw, ""
     if not abs(raw - entry.raw) <= rule.tolerance:

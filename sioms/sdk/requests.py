@@ -80,7 +80,7 @@ def ioctl(
                 raise _refuse(errno.EINVAL, f"{what}: {shown(argument)} ticks; want a number from 1, or none")
             return _statistics(service, handle, number, argument or FEW_TICKS, what)
         case Request.WAIT_UNTIL_EVENT:
-            raise _refuse(errno.ENOTTY, f"{what}: is answered by the client library, out of the page")
+            raise _refuse(errno.ENOTTY, f"{what}: is answered by the client library, from the page")
         case Request.ZERO_DEVICE if _corrected_here(handle):
             return _zero_analog(service, handle, number, argument, timeout_s, what)
         case Request.SET_GAINS | Request.GET_GAINS if _corrected_here(handle):
@@ -180,7 +180,7 @@ def _axis_request(
         case Request.GET_DIAGNOSTICS:
             return bank.diagnostics(axes)
         case _:
-            raise _refuse(errno.ENOTTY, f"{what}: not a request an axis knows")
+            raise _refuse(errno.ENOTTY, f"{what}: not a request of an axis")
     service.engine.commands_written(handle.block)
     return None
 
@@ -213,9 +213,8 @@ def _zero_analog(
             names = ", ".join(block.spec.channels[channel].name for channel in channels[unfit])
             raise _refuse(
                 errno.EIO,
-                f"{what}: {bad} readings of {good + bad} were no measurement (last {names}: INVALID, SATURATED or not "
-                "finite); "
-                "the offset stays as it was",
+                f"{what}: {bad} readings of {good + bad} were not measurements (last {names}: INVALID, SATURATED or "
+                "not finite); the offset stays as it was",
             )
         total[:] += block.data[channels]
         good += 1

@@ -296,7 +296,7 @@ class Runtime:
     def _gave_up_realtime(self, worked_s: float) -> None:
         self.log(
             "warning",
-            f"gave up real-time scheduling: its tick has worked for {worked_s:g} s without a rest, and nothing else "
+            f"gave up real-time scheduling: its tick has run for {worked_s:g} s without a pause, and nothing else "
             "on that processor could; lower the rate, or give it fewer channels",
         )
 
@@ -475,7 +475,7 @@ class Runtime:
             return LineEngine(parts, self.driver, self._description.tick_hz)
         if isinstance(self.driver, StreamDriver):
             return StreamEngine(parts, self.driver)
-        raise TypeError(f"{type(self.driver).__name__} is no TickDriver, LineDriver or StreamDriver")
+        raise TypeError(f"{type(self.driver).__name__} is not a TickDriver, LineDriver or StreamDriver")
 
     def _miss_daemon(self) -> None:
         if self._daemon_late or self._ending_ns:

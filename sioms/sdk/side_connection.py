@@ -70,7 +70,7 @@ class SideConnection:
         if found is None and now_ns > self._until_ns:
             self.close()
             why = "no reply within its time-out" if self._sent else "nobody answers there"
-            raise LinkError(f"{exchange.what} at {self.settings}: {why}; look at its address, power and cable")
+            raise LinkError(f"{exchange.what} at {self.settings}: {why}; check its address, power and cable")
         if found is not None:
             self._exchange = None
         return found

@@ -184,8 +184,8 @@ def test_ft300_configured_wrongly(start: Callable[..., Any], short_folder: Path)
     }
     wire.serve("".join(f"[device.{name}]\n{table}" for name, table in tables.items()))
     for name, words in (
-        ("f0", "identify f0 at address 8 on .*no reply within its time-out; look at port, power and address"),
-        ("d0", "no FT 300 answers there: .*illegal address|which is no firmware version"),
+        ("f0", "identify f0 at address 8 on .*no reply within its time-out; check port, power and address"),
+        ("d0", "no FT 300 answers there: .*illegal address|which is not a firmware version"),
         ("n0", "open .*nothing: no such port; is the device plugged in"),
     ):
         wait_for(
@@ -300,7 +300,7 @@ def test_ati_wrong_host_port_identity_and_page(start: Callable[..., Any], short_
         ("model", "is a 'ETHERNET AXIA'; the configuration says model = net"),
         ("rate", "sends 1000 records/s; the configuration says rate_hz = 7000; change one of them"),
         ("serial", "has serial number 'FT12345'; the configuration says 'FT1'"),
-        ("port", f"{closed.partition(':')[2]}: nothing takes datagrams at this port; look at host and port"),
+        ("port", f"{closed.partition(':')[2]}: nothing takes datagrams at this port; check host and port"),
         ("host", "identify host: get http://127.0.0.1/netftapi2.xml: connect to .*: connection refused"),
     ):
         wait_for(
@@ -523,7 +523,7 @@ def test_schunk_wrong_host_identity_and_a_taken_port(start: Callable[..., Any], 
         for name, words in (
             ("product", "the sensor calls itself 'KMS'; the configuration says 'FTN'"),
             ("taken", f"listen on {taken} for .*:0: address already in use"),
-            ("mute", "open mute: stop at .*: no reply within its time-out; look at its address"),
+            ("mute", "open mute: stop at .*: no reply within its time-out; check its address"),
         ):
             wait_for(
                 lambda name=name, words=words: re.search(words, wire.reason(name)),
@@ -562,6 +562,6 @@ def test_back_off_of_a_dead_sensor(start: Callable[..., Any], short_folder: Path
                 stops.append(time.monotonic())
         pauses = [b - a for a, b in pairwise(stops)]
         assert pauses[1] > pauses[0] + 0.15 and pauses[2] > pauses[1] + 0.4
-        daemon.wait_line("no reply within its time-out; look at host and port, and that RDT is enabled")
+        daemon.wait_line("no reply within its time-out; check host and port, and that RDT is enabled")
         with sioms.Workcell(str(short_folder / "s")) as cell, raises(errno.EIO), cell.open("f0") as node:
             node.read()

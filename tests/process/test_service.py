@@ -78,8 +78,8 @@ def test_all_errors_of_all_devices_come_at_once(tmp_path: Path) -> None:
         r"^\[device.mod1\]: unknown key tick_hx; did you mean tick_hz\?",
         r"^\[device.mod2\].*unknown key mas; did you mean mass\?",
         r"^\[device.io0\]: outputs and inputs are both 0",
-        r"^\[device.scale1\]: serial port /dev/ttyNONE7 is that of device scale0 already; want one of its own",
-        r"^\[device.5x\]: a device name is letters",
+        r"^\[device.scale1\]: serial port /dev/ttyNONE7 is already used by device scale0; want another",
+        r"^\[device.5x\]: not a device name; want letters",
         r"^\[\[grant\]\] number 1.*reed",
         r"^\[\[emergency_stop\]\] number 1: unknown key nod",
     ):
@@ -96,11 +96,11 @@ def test_errors_of_names_come_at_once(tmp_path: Path) -> None:
     status, said = check(tmp_path / "bad.toml", text)
     assert status == 2
     for pattern in (
-        r"^\[node.gripper\]: of = io, which there is not",
+        r"^\[node.gripper\]: of = io, which does not exist",
         r"^\[node.xy\]: mod0 has no channel zaxis; did you mean (x|y)axis\?",
-        r"^\[node.mod0.xaxis\]: node name mod0.xaxis is taken already by device mod0",
+        r"^\[node.mod0.xaxis\]: node name mod0.xaxis is already taken by device mod0",
         r"^\[\[emergency_stop\]\] number 1: node = force0; want the name of one binary input",
-        r"^\[device.force0\]: reads node mod9.plant, which there is not",
+        r"^\[device.force0\]: reads node mod9.plant, which does not exist",
     ):
         assert any(re.search(pattern, re.sub(r"^line \d+: ", "", line)) for line in said), (pattern, said)
 
@@ -323,7 +323,7 @@ def test_a_stale_socket_is_taken_over_and_a_file_is_not(start_daemon: Callable[.
         [sys.executable, "-m", "sioms.daemon.main", "--config", daemon.config, "--socket", daemon.socket],
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
-    assert third.returncode == 1 and "is no socket" in third.stderr
+    assert third.returncode == 1 and "is not a socket" in third.stderr
     assert Path(daemon.socket).read_text() == "mine"
 
 

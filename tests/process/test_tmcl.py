@@ -194,11 +194,11 @@ def test_wrong_devices(start: Callable[..., Any], short_folder: Path) -> None:
         Misfit("module 1276", ("--module", "1276")),
         Misfit("heartbeat_s = 0 accepts", ("--no-heartbeat",)),
         Misfit(
-            "no reply within its time-out; look at power, wiring, address and speed (115200 baud, 8N1)",
+            "no reply within its time-out; check power, wiring, address and speed (115200 baud, 8N1)",
             ("--address", "3"),
         ),
         Misfit(
-            "look at wiring and speed (115200 baud, 8N1), and whether two devices have one",
+            "check wiring and speed (115200 baud, 8N1), and whether two devices have one",
             change="noise 1000",
         ),
     )

@@ -229,7 +229,7 @@ def test_a_bad_number_halts_and_is_named(devout: Callable[..., subprocess.Popen[
     feed(process, b"0.1 o.1 0.1\n")
     _, said = process.communicate(timeout=10)
     assert process.returncode == 1
-    assert said.decode() == "devout: line 3: 'o.1' is no finite number; stopped after 3 complete iterations\n"
+    assert said.decode() == "devout: line 3: 'o.1' is not a finite number; stopped after 3 complete iterations\n"
     halted(cell)
     cell.open("mod0.xaxis", "w").close()
 
@@ -238,7 +238,7 @@ def test_bad_lines_are_left_out_when_asked(shell: Shell, cell: sioms.Workcell) -
     result = shell("devout --skip-bad-lines -r -L-1 gripper0", "1\nx\n3\n")
     assert (result.returncode, result.stderr) == (
         0,
-        "devout: line 2: 'x' is no finite number; line left out\n",
+        "devout: line 2: 'x' is not a finite number; line skipped\n",
     )
 
 
@@ -364,19 +364,19 @@ def test_a_held_node_names_its_holder_and_can_be_read(
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("devin", "no device named"),
+        ("devin", "no device given"),
         ("devin -h mod0", "for help use --help"),
-        ("devin mod0 -v", "holds for the device that follows it"),
+        ("devin mod0 -v", "applies to the device that follows it"),
         ("devin -n4 mod0", "structure 4; want 0 to 3"),
         ("devout -v gripper0 1", "class binary"),
         ("devout -rvw mod0.xaxis 1", "add -t"),
         ("sdev mod0", "nothing to do"),
-        ("sdev -z", "no device named"),
+        ("sdev -z", "no device given"),
         ("sdev -c 1 2 3 4 5 mod0", "1 numbers too many"),
         ("sdev -g mod0", "class analog"),
         ("smarkers 5", "want -r alone"),
         ("smarkers -w foo", "want a marker"),
-        ("smarkers -s", "no marker named"),
+        ("smarkers -s", "no marker given"),
     ],
 )
 def test_wrong_command_lines(shell: Shell, line: str, words: str) -> None:
@@ -386,9 +386,9 @@ def test_wrong_command_lines(shell: Shell, line: str, words: str) -> None:
 def test_values_that_a_device_cannot_take(shell: Shell) -> None:
     refused(shell("devout mod0.xaxis 5"), "position 5 m", "-1 to 1 m")
     refused(shell("devout gripper0 256"), "data 256; want 0 to 255")
-    refused(shell("devout gripper0 1.5"), "whole number")
+    refused(shell("devout gripper0 1.5"), "integer")
     refused(shell("devout -t mod0.xaxis 0 0"), "time 0 s")
-    refused(shell("sdev -c mod0", "1 2"), "wants 4 numbers: there are 2")
+    refused(shell("sdev -c mod0", "1 2"), "want 4 numbers: there are 2")
     refused(shell("devout lord1 1"), "read-only node")
 
 
@@ -422,7 +422,7 @@ def test_sdev_zeroes_a_sensor_and_sets_gains(shell: Shell) -> None:
     good(shell("sdev -z lord1"))
     assert good(shell("devin -n0p lord1")) == "0.00e+00 "
     good(shell("sdev -g tactile0", " ".join(["2 " + "0 " * 16] * 15) + " 2"))
-    refused(shell("sdev -g tactile0", "1 2 3"), "wants 256 numbers: there are 3")
+    refused(shell("sdev -g tactile0", "1 2 3"), "want 256 numbers: there are 3")
 
 
 def test_sdev_stops_the_workcell_and_writes_stay_refused_until_reset(shell: Shell, cell: sioms.Workcell) -> None:
@@ -501,7 +501,7 @@ def test_sioms_tells_about_the_workcell(shell: Shell) -> None:
 
 
 def test_sioms_checks_a_configuration(shell: Shell, daemon: Daemon, tmp_path: Path) -> None:
-    assert "good" in good(shell(f"sioms check {daemon.config}"))
+    assert "ok" in good(shell(f"sioms check {daemon.config}"))
     (tmp_path / "bad.toml").write_text('[device.mod0]\ndriver = "sim-axis"\n[device.b]\ndriver = "sim-io"\n')
     result = shell("sioms check bad.toml")
     assert result.returncode == 2
@@ -650,7 +650,7 @@ def test_waits_of_sdev_and_smarkers_end(shell: Shell, cell: sioms.Workcell) -> N
         axis.command(velocity=0.01)
         refused(shell("sdev -w -t0.2 mod0.xaxis"), "not within")
     assert time.monotonic() - began < 20.0
-    refused(shell(f"smarkers -s -t1 {token}"), "-t is for -w", status=2)
+    refused(shell(f"smarkers -s -t1 {token}"), "-t needs -w", status=2)
     good(shell(f"smarkers -f {token}"))
     halted(cell)
 

@@ -75,10 +75,10 @@ def test_sets_and_what_is_read_behind_them(step: int) -> None:
     limit = odrive.read(["axis0.motor.config.torque_lim", "x"], 0.1)
     assert feed(limit, reply("inf", "1", "0 0"), step) == [[math.inf], [1.0]]
     for text in ("nan", "-inf"):
-        with pytest.raises(LinkError, match="no number"):
+        with pytest.raises(LinkError, match="not a number"):
             feed(limit, reply(text, "1", "0 0"), step)
     for text in ("nan", "word", "inf"):
-        with pytest.raises(LinkError, match="no number"):
+        with pytest.raises(LinkError, match="not a number"):
             feed(move, reply(text, "0 0"), step)
     with pytest.raises(LinkError, match="incomplete"):
         feed(odrive.read(["a", "b"], 0.1), reply("1", "0 0"), step)

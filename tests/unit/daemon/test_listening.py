@@ -60,7 +60,9 @@ def test_who_comes_second_is_refused_and_told_who_is_first(path: str) -> None:
 
 def test_a_folder_that_somebody_has_mistyped_is_not_made(short_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     missing = short_folder / "missing"
-    with pytest.raises(OSError, match=f"there is no folder {missing}; make it or choose another path") as caught:
+    with pytest.raises(
+        OSError, match=f"the folder {missing} does not exist; create it or choose another path"
+    ) as caught:
         Listening(f"{missing}/d.sock", 0o660, "")
     assert caught.value.errno == errno.ENOENT and not missing.exists()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(missing))
@@ -105,7 +107,7 @@ def test_of_many_that_start_together_one_goes_on(path: str) -> None:
 
 def test_what_is_no_socket_stays(path: str) -> None:
     Path(path).write_text("mine")
-    refused(path, errno.EEXIST, "is there and is no socket")
+    refused(path, errno.EEXIST, "exists and is not a socket")
     assert Path(path).read_text() == "mine"
 
 
@@ -119,7 +121,7 @@ def test_a_daemon_without_a_lock_is_left_alone(path: str) -> None:
 def test_a_folder_that_others_may_write_to_is_refused(path: str) -> None:
     folder = os.path.dirname(path)
     os.chmod(folder, 0o777)
-    refused(path, errno.EPERM, f"{re.escape(folder)}: others may write to it, who could put another socket in")
+    refused(path, errno.EPERM, f"{re.escape(folder)}: others may write to it, who could replace the socket of")
     if os.geteuid() == 0:
         os.chown(folder, -1, 4242)  # the group of who knows whom
         os.chmod(folder, 0o775)

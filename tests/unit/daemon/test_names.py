@@ -66,7 +66,7 @@ def test_aliases_and_their_parts() -> None:
 @pytest.mark.parametrize(
     ("alias", "words"),
     [
-        (NodeTable("mod1"), "of = mod1, which there is not; did you mean mod0?"),
+        (NodeTable("mod1"), "of = mod1, which does not exist; did you mean mod0?"),
         (NodeTable("mod0", ["x", "w"]), "mod0 has no channel w"),
         (NodeTable("mod0", ["x", "x"]), "a channel is named twice"),
     ],
@@ -78,12 +78,12 @@ def test_wrong_aliases(alias: NodeTable, words: str) -> None:
 
 def test_a_name_taken_twice() -> None:
     names = NameTable({"a": device("a", axes("x", "y"))}, {"a.x": NodeTable("a.y")})
-    assert "node name a.x is taken already by device a" in names.errors[0]
+    assert "node name a.x is already taken by device a" in names.errors[0]
 
 
 def test_an_input_of_a_driver_that_is_not_there() -> None:
     names = NameTable({"a": device("a", axes("x"), inputs=("b.z",))}, {})
-    assert "[device.a]: reads node b.z, which there is not" in names.errors[0]
+    assert "[device.a]: reads node b.z, which does not exist" in names.errors[0]
 
 
 def test_information_survives_the_wire() -> None:

@@ -23,8 +23,8 @@ def test_a_quota_is_named_with_its_setting_and_some_may_have_more():
 
 def test_places_are_kept_for_who_may_stop():
     assert why_full(239, 5, 256, may_stop=False) == ""
-    assert "16 places are kept" in why_full(240, 0, 256, may_stop=False)
-    assert "16 places are kept" in why_full(240, 2, 256, may_stop=True)
+    assert "16 places are reserved" in why_full(240, 0, 256, may_stop=False)
+    assert "16 places are reserved" in why_full(240, 2, 256, may_stop=True)
     assert why_full(240, 0, 256, may_stop=True) == why_full(255, 1, 256, may_stop=True) == ""
     assert "max_sessions of [workcell] allows 256" in why_full(256, 0, 256, may_stop=True)
 

@@ -313,7 +313,7 @@ def test_who_loses_the_last_right_loses_markers_and_waits_for_them(cell: Workcel
     assert cell.ask("eva", ClientVerb.WAIT_MARKER, theirs, None) is None
     assert cell.ask("tom", ClientVerb.WAIT_MARKER, mine, None) is None
     cell.grant((["read"], "eva", "*"))
-    assert cell.answer("tom") == errno.EPERM and "no right on any node any more" in cell.value
+    assert cell.answer("tom") == errno.EPERM and "no longer has a right on any node" in cell.value
     assert cell.answer("eva") == errno.EPIPE, "the marker that it waits for went with its owner's rights"
 
 
@@ -359,7 +359,7 @@ def test_what_becomes_free_is_offered_to_who_waits_for_it_alone(
 def test_an_open_of_a_device_that_is_reloaded_waits_until_it_is_back(cell: Workcell) -> None:
     cell.grant((["read", "write"], "eva", "*"))
     cell.server.devices = {}
-    assert cell.open("eva", "io0.bit0") == errno.EIO, "it is not configured any more"
+    assert cell.open("eva", "io0.bit0") == errno.EIO, "it is no longer configured"
     cell.is_replaced = True
     assert cell.open("eva", "io0.bit0") is None
     cell.is_replaced, cell.server.devices = False, {"io0": cell.device}

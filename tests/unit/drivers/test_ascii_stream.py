@@ -196,7 +196,7 @@ def test_a_board_that_waits_is_started_and_stopped() -> None:
         (("--time", "ms"), {}, "2 numbers a line, the time column included"),
         ((), {"greeting": "scale"}, "did not greet with 'scale'"),
         ((), {"checksum": True}, "without a right checksum"),
-        (("--separator", "|"), {}, r"sends lines that are no numbers|sends other lines"),
+        (("--separator", "|"), {}, r"sends lines that are not numbers|sends other lines"),
     ],
 )
 def test_another_device_is_refused(options: tuple[str, ...], table: dict[str, Any], words: str) -> None:
@@ -208,7 +208,7 @@ def test_a_wrong_baud_rate_is_told() -> None:
     noise = bytes((i * 37 + 128) % 256 or 1 for i in range(5000)).replace(b"\n", b"\xff")
     with pytest.raises(LinkError, match="without an end of line; is this the right device and baud rate"):
         Inspection(2, False, "").want(noise)
-    with pytest.raises(DeviceError, match=r"no numbers, .*look at the baud rate"):
+    with pytest.raises(DeviceError, match=r"not numbers, .*check the baud rate"):
         Inspection(2, False, "").want(b"\n" + b"\xfe\x83\xf8\x91\n" * 6)
 
 

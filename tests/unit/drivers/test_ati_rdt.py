@@ -368,7 +368,7 @@ def test_without_a_page_and_without_an_answer() -> None:
     rig.go(0.05)
     assert rig.pages == 0 and rig.data == pytest.approx(LOAD)
     rig.on_line = lambda data: b""
-    with pytest.raises(LinkError, match=r"f0 on 192.168.1.1:49152: .*; look at host and port, and that RDT is enabled"):
+    with pytest.raises(LinkError, match=r"f0 on 192.168.1.1:49152: .*; check host and port, and that RDT is enabled"):
         rig.do(rig.driver.open())
     other = AtiRig()
     other.side_line = lambda data: b"HTTP/1.0 404 Not Found\r\n\r\n"

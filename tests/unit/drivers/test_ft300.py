@@ -206,14 +206,14 @@ def test_another_device_is_refused(mode: str) -> None:
     assert caught.value.errno == errno.ENODEV and not other.device.streaming
     binary = FtRig(mode=mode)
     binary.device.words[500] = 0x0100
-    with pytest.raises(DeviceError, match="500 to 502 read 0100 332d 3231, which is no firmware version"):
+    with pytest.raises(DeviceError, match="500 to 502 read 0100 332d 3231, which is not a firmware version"):
         binary.do(opened(binary))
     drive = FtRig(mode=mode)
     del drive.device.words[502]
     with pytest.raises(DeviceError, match=r"no FT 300 answers there: .*illegal address"):
         drive.do(opened(drive))
     silent = FtRig(mode=mode, address=8)
-    with pytest.raises(LinkError, match=r"at address 8 on /x: .*; look at port, power and address"):
+    with pytest.raises(LinkError, match=r"at address 8 on /x: .*; check port, power and address"):
         silent.do(opened(silent))
 
 

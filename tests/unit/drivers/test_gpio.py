@@ -160,7 +160,7 @@ class TestRealBinding:
             self.driver("/dev/gpiochip-none").open()
 
     def test_no_gpio_chip(self) -> None:
-        with pytest.raises(LinkError, match="open /dev/null: this is no GPIO chip"):
+        with pytest.raises(LinkError, match="open /dev/null: this is not a GPIO chip"):
             self.driver("/dev/null").open()
 
     @pytest.mark.root

@@ -54,7 +54,7 @@ def test_scaling_is_the_channels_own_or_its_kinds(sysfs: Path) -> None:
     with pytest.raises(LinkError, match="in_temp_raw: no such attribute"):
         device.number("in_temp_raw")
     (device.folder / "in_temp_raw").write_text("\n")
-    with pytest.raises(LinkError, match="'' is no number"):
+    with pytest.raises(LinkError, match="'' is not a number"):
         device.number("in_temp_raw")
     with pytest.raises(LinkError, match=r"write 1 to .*buffer/enable: no such attribute"):
         device.write("buffer/enable", 1)

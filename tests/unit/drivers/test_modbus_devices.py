@@ -775,7 +775,7 @@ class TestIo:
             ({"model": "", "channels": {"dii": 4}}, "channels.dii: no such port; did you mean di"),
             ({"channels": {"di": 40}}, "channels.di = 40; want 0 to 16"),
             ({"safe": {"di": 1}}, "safe.di: no output of this device"),
-            ({"safe": {"do": 256}}, "safe.do = 256; want a whole number from 0 to 255"),
+            ({"safe": {"do": 256}}, "safe.do = 256; want an integer from 0 to 255"),
             ({"main": "ai"}, "main = ai: no port of this device"),
             ({"watchdog_s": 1.0}, "the map cannot set one"),
             ({"map": "leadshine"}, "describes no ports"),

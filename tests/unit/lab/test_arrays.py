@@ -74,7 +74,7 @@ def test_damage_anywhere_is_a_sentence_or_an_array(
 def test_bytes_of_any_kind_are_a_sentence(tmp_path_factory: pytest.TempPathFactory, junk: bytes, kind: str) -> None:
     path = tmp_path_factory.getbasetemp() / f"junk{kind}"
     path.write_bytes(junk)
-    with pytest.raises(BadInputError, match="or damaged"):
+    with pytest.raises(BadInputError, match="or is damaged"):
         load_table(path)
 
 

@@ -52,14 +52,14 @@ def test_all_mistakes_at_once_with_a_hint():
         "gap = -1 position; must be 0 to inf",
         "no parameter 'delay'; did you mean 'delay_s'",
         "delay_s [s] missing",
-        "3 is no table",
+        "3 is not a table",
     ):
         assert any(words in line for line in lines), words
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, True, "1"])
 def test_numbers_must_be_finite_numbers(value):
-    with pytest.raises(EffectsError, match="no finite number"):
+    with pytest.raises(EffectsError, match="not a finite number"):
         build_effects({"x": {"payload": {"mass": value}}}, ["x"])
 
 

@@ -100,7 +100,7 @@ def test_a_closed_port_a_taken_port_and_an_unknown_host() -> None:
     line = Connection(LineSettings(udp=closed))
     line.write(b"anybody")
     readable(line.fd)
-    with pytest.raises(OSError, match=f"{closed}: nothing takes datagrams at this port; look at host") as caught:
+    with pytest.raises(OSError, match=f"{closed}: nothing takes datagrams at this port; check host") as caught:
         line.read()
     assert caught.value.errno == errno.ECONNREFUSED
     line.close()
@@ -199,7 +199,7 @@ def test_exchanges_beside_the_line(server: socket.socket, device: socket.socket)
     made.pop().close()
     assert rig.run(word(b"f", 100), answer(b"well")) == b"well", "the device had closed it in between"
     failure = rig.run(word(b"g", 0.01), lambda: None)
-    assert isinstance(failure, LinkError) and "no reply within its time-out; look at" in str(failure)
+    assert isinstance(failure, LinkError) and "no reply within its time-out; check" in str(failure)
     made.clear()
     assert rig.run(word(b"h", 100), answer(b"late")) == b"late", "and not the reply to what timed out"
     assert isinstance(rig.run(word(b"i", 100), answer(b"x", end=True)), LinkError)

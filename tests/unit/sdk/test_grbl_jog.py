@@ -76,7 +76,7 @@ def test_positions_of_any_form_of_report() -> None:
     assert place.of(work).tolist() == [33.0, 11.0]
     place.in_report = 25.4
     assert place.of(parse_report("<Idle|MPos:1.000,2.000,3.000>")) == pytest.approx([76.2, 25.4])
-    with pytest.raises(DeviceError, match="look at the letters of the axes"):
+    with pytest.raises(DeviceError, match="check the letters of the axes"):
         place.of(parse_report("<Idle|MPos:1.000,2.000>"))
 
 

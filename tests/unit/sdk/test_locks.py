@@ -119,7 +119,7 @@ def info(name: str, *claims: str) -> DeviceInfo:
 )
 def test_two_devices_do_not_share_what_only_one_may_have(first: str, second: str, clash: bool) -> None:
     errors = shared_claims([info("a", first), info("b", second), info("c")])
-    assert errors == ([f"[device.b]: {second} is that of device a already; want one of its own"] if clash else [])
+    assert errors == ([f"[device.b]: {second} is already used by device a; want another"] if clash else [])
 
 
 def test_a_line_is_claimed_by_what_it_is(tmp_path: Path) -> None:

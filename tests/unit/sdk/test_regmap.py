@@ -132,7 +132,7 @@ ITEM = "commands/position/writes/0/items/2"
         (f"{ITEM}/maximum", 70000, "maximum 70000 does not fit type u16"),
         ("dead_man/refresh", ["jog"], "dead_man.refresh: unknown command jog"),
         ("dead_man/timeout_s", 0.0, "dead_man.timeout_s: is 0.0 s; more than 0 is right"),
-        ("alarms/codes/high", "x", "alarms.codes: 'high' is no number"),
+        ("alarms/codes/high", "x", "alarms.codes: 'high' is not a number"),
         ("alarms/signal", "alarms", "alarms: unknown signal alarms; did you mean alarm"),
         ("ports/do", {"signal": "enable", "node_class": "binary"}, "coil or discrete is right"),
         ("modells", {}, "modells: unknown key; did you mean models"),

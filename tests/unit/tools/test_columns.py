@@ -90,7 +90,7 @@ def test_modes_are_for_axes():
 
 @pytest.mark.parametrize("value", [0.5, 1e300])
 def test_bits_and_markers_are_whole(value):
-    with pytest.raises(ValueError, match="whole number"):
+    with pytest.raises(ValueError, match="integer"):
         columns("io", NodeClass.BINARY, ["out"]).records([value])
     with pytest.raises(ValueError, match="wait marker number"):
         columns("-n0m mod0").records([0.0, value])

@@ -50,7 +50,7 @@ def test_without_a_word_the_devices_are_simulated(tmp_path: Path) -> None:
 def test_a_file_that_is_there_is_left_alone(capsys: pytest.CaptureFixture[str]) -> None:
     Path("workcell.toml").write_text("mine")
     assert main(["init"]) == 1
-    assert "is there already; --force" in capsys.readouterr().err
+    assert "already exists; --force" in capsys.readouterr().err
     assert Path("workcell.toml").read_text() == "mine"
     assert main(["init", "--force"]) == 0
 
@@ -79,7 +79,7 @@ def test_what_is_plugged_in_is_a_device_when_it_is_recognised_and_a_comment_othe
     ("words", "sentence"),
     [
         (["--driver", "tmc"], "no driver tmc; did you mean tmcl?"),
-        (["--port", "/dev/x"], "--port goes with --driver"),
+        (["--port", "/dev/x"], "--port needs --driver"),
     ],
 )
 def test_what_cannot_be_is_a_sentence(words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]) -> None:

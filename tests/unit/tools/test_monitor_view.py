@@ -143,7 +143,7 @@ def test_faults_that_do_not_fit_are_counted(width, height, count):
     lines, _ = screen(many_faults(count), width, height, 0)
     text = " ".join(line.text for line in lines)
     shown = sum(f"mod{i}.{AXES[axis]}: " in text for i in range(count) for axis in (0, 3))
-    assert shown == 2 * count or "lines more of what is wrong"[:width] in text or width < 45
+    assert shown == 2 * count or "more lines of errors"[:width] in text or width < 45
 
 
 def test_the_head_has_a_clock():

@@ -67,11 +67,11 @@ def test_help_and_version_are_asked_for(word):
         ("devin", ["-t0", "mod0"], "want seconds from 0.000001"),
         ("devin", ["-tnan", "mod0"], "want seconds"),
         ("devin", ["-L-2", "mod0"], "-1 for no end"),
-        ("devin", ["-t", "0.05", "mod0"], "right behind it"),
+        ("devin", ["-t", "0.05", "mod0"], "without a space"),
         ("devin", ["--perod=1", "mod0"], "unknown option"),
         ("devin", ["--velocity=1", "mod0"], "takes no value"),
         ("devin", ["--period", "mod0"], "want seconds"),
-        ("devin", ["-", "mod0"], "no option"),
+        ("devin", ["-", "mod0"], "not an option"),
         ("devout", ["-inf"], "unknown option -i"),
     ],
 )

@@ -30,7 +30,7 @@ def test_a_wrong_word_ends_the_stream_behind_the_numbers_before_it(word):
     tokens = fed(b"1 2\n3 ", word.encode() + b" 4\n5\n")
     assert [value for value, _ in tokens.numbers] == [1, 2, 3]
     assert tokens.bad.startswith("line 2: ")
-    assert "no finite number" in tokens.bad
+    assert "not a finite number" in tokens.bad
 
 
 def test_bad_lines_are_left_out_whole_when_asked():
@@ -41,4 +41,4 @@ def test_bad_lines_are_left_out_whole_when_asked():
 
 
 def test_a_word_without_end_is_refused_before_it_fills_the_memory():
-    assert "without an end" in fed(b"1" * (MAX_TOKEN + 1)).bad
+    assert "without a separator" in fed(b"1" * (MAX_TOKEN + 1)).bad
