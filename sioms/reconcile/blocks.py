@@ -19,9 +19,7 @@ from scipy.stats import t as student
 
 from sioms.reconcile.descent import within
 from sioms.reconcile.effect import Array
-from sioms.reconcile.fit import Problem
 
-BLOCK_S = 0.5
 #: A step without a fold that moves a parameter by more than this share of its size is tried, as long or shorter, not
 #: extrapolated.
 NEAR, SHORTER = 0.1, (1.0, 0.3)
@@ -37,18 +35,6 @@ class Fitted(Protocol):
     def residual(self) -> Array: ...
     @property
     def jacobian(self) -> Array: ...
-
-
-def block_ids(problem: Problem, sample_time_s: float, block_s: float = BLOCK_S) -> NDArray[np.int64]:
-    """Number the blocks of all records as ``Problem.residual`` lays them out."""
-    size, out, first = max(int(block_s / sample_time_s), 1), [], 0
-    for r in problem.session.records:
-        n = len(range(len(r))[problem.span(r)])
-        count = max(n // size, 1)
-        ids = np.minimum(np.arange(n) // size, count - 1)
-        out.append(ids + first)
-        first += count
-    return np.concatenate(out)
 
 
 def _normal(fit: Fitted, ids: NDArray[np.int64]) -> tuple[Array, Array, Array]:

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.stats import t as student
 
 from sioms.reconcile.ambiguity import Rival
-from sioms.reconcile.blocks import better, block_ids, formal, intervals
+from sioms.reconcile.blocks import better, formal, intervals
 from sioms.reconcile.channels import Finding
 from sioms.reconcile.effects import known
 from sioms.reconcile.engine.fit import get
-from sioms.reconcile.fit import Fit, Problem, refit
+from sioms.reconcile.fit import Fit, Problem, block_ids, refit
 from sioms.reconcile.rules import told_apart
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.thresholds import GAIN

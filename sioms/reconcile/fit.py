@@ -26,6 +26,8 @@ from sioms.reconcile.simulate import Run, inertia, linked, pack, replay, track
 #: ``map``, or the like of an executor.
 Mapper = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 Fit = AnyFit[AxisModel]
+#: Length of a block of time, which is held out as a whole.
+BLOCK_S = 0.5
 #: Samples, and seconds, at the start of a record in which the observer finds the state.
 SKIP, SKIP_S = 50, 0.05
 
@@ -125,6 +127,18 @@ class Problem:
     def join(self, parts: Sequence[Array]) -> Array:
         """Lay per-record arrays out as ``residual`` does."""
         return np.concatenate([p[self.span(r)] for p, r in zip(parts, self.session.records, strict=True)])
+
+
+def block_ids(problem: Problem, sample_time_s: float, block_s: float = BLOCK_S) -> NDArray[np.int64]:
+    """Number the blocks of all records as ``Problem.residual`` lays them out."""
+    size, out, first = max(int(block_s / sample_time_s), 1), [], 0
+    for r in problem.session.records:
+        n = len(range(len(r))[problem.span(r)])
+        count = max(n // size, 1)
+        ids = np.minimum(np.arange(n) // size, count - 1)
+        out.append(ids + first)
+        first += count
+    return np.concatenate(out)
 
 
 def _longest(loud: NDArray[np.bool_]) -> int:

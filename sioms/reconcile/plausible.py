@@ -4,18 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sioms.reconcile.blocks import better
-from sioms.reconcile.effect import Array, Ref
-from sioms.reconcile.effects import known, library
+from sioms.reconcile.effect import Ref
+from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.rules import negligible
 from sioms.reconcile.thresholds import NEARLY
 from sioms.reconcile.variation import named
-
-#: A refitted candidate: fit, held-out losses, share saved, standard errors.
-Tried = tuple[Fit, Array, float, float]
-AND = " and "
 
 
 def plainer(name: str, names: Sequence[str]) -> list[str]:
@@ -58,26 +52,6 @@ def unspecific(name: str, gains: dict[str, float]) -> bool:
         *(n for n in lib if name in lib[n].lookalikes),
     }
     return any(g > NEARLY * gains[name] for n, g in gains.items() if n not in family)
-
-
-def simplest(good: dict[str, Tried]) -> str:
-    """Of the candidates within one standard error and ``GAIN`` of the best, the one with the fewest parameters.
-
-    A named effect goes before a nameless term that does no better. Names may be of several effects at once, joined by
-    ``AND``.
-    """
-    best = max(good, key=lambda n: good[n][2])
-    near = []
-    for n, (_, loss, _, _) in good.items():
-        lost, sure = better(good[best][1], loss)
-        if negligible(lost, sure):
-            near.append(n)
-
-    def plain(joined: str) -> tuple[bool, int, float]:
-        names = joined.split(AND)
-        return any(n not in library() for n in names), sum(map(size, names)), -good[joined][2]
-
-    return min(near, key=plain)
 
 
 def physical(fit: Fit, name: str) -> bool:

@@ -7,13 +7,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sioms.reconcile.blocks import block_ids
 from sioms.reconcile.calibrate import calibrated
 from sioms.reconcile.channels import Finding, drive, drive_output, index_fit, index_scale, lattice
 from sioms.reconcile.checks import check, check_scale, runs_the_loop
 from sioms.reconcile.effects import library
 from sioms.reconcile.experiment import Envelope
-from sioms.reconcile.fit import SKIP, SKIP_S, Mapper, Problem
+from sioms.reconcile.fit import SKIP, SKIP_S, Mapper, Problem, block_ids
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
 from sioms.reconcile.records import Session

@@ -10,9 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.reconcile.blocks import block_ids
 from sioms.reconcile.effect import Array
-from sioms.reconcile.fit import Fit, Problem
+from sioms.reconcile.fit import Fit, Problem, block_ids
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.screen import Motion, dead_band, direction, instrument_motion, smoothed_motion, thinned
 from sioms.reconcile.thresholds import BURST_S, LOUD_BLOCK, MOST_LOUD

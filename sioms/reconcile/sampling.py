@@ -15,10 +15,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
-from sioms.reconcile.blocks import better, block_ids
+from sioms.reconcile.blocks import better
 from sioms.reconcile.effect import Array
 from sioms.reconcile.effects import known
-from sioms.reconcile.fit import Fit, Problem, refit
+from sioms.reconcile.fit import Fit, Problem, block_ids, refit
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.thresholds import SURE

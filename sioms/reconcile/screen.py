@@ -19,6 +19,7 @@ from sioms.reconcile.bounces import rattles
 from sioms.reconcile.dry import dry_friction
 from sioms.reconcile.effect import Array, Effect, Parameter, Ref, Seen, Slot, Trials
 from sioms.reconcile.effects import known
+from sioms.reconcile.engine.search import Start
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.simulate import replay
@@ -47,15 +48,6 @@ class Motion:
     u: Array
     temperature: Array
     outer: Array
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """A screened candidate: its gain (share of the cost) and the values to start its fit from."""
-
-    effect: str
-    gain: float
-    values: dict[str, float]
 
 
 def bandwidth(problem: Problem, model: AxisModel) -> float:

@@ -1,40 +1,36 @@
-"""Search for the effects that are missing: screen, refit the best few nested, let earlier ones leave again.
-
-A step adds the effect that saves most on held-out blocks, but the simplest one within a standard error of
-it. After each step every effect must still earn its place, and a simpler look-alike that does as well takes
-the place of a richer one. The search stops when nothing saves ``GAIN`` of what remains.
+"""Search for the missing effects of an axis: one view; fits are kept, laws of friction are enriched and begun afresh,
+gaps bounce.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sioms.reconcile import ladder
-from sioms.reconcile.blocks import better, block_ids, heldout
+from sioms.reconcile.blocks import better, heldout
 from sioms.reconcile.bounces import POLISHED, UNPOLISHED, bent, polish, rattles, rough, spread
 from sioms.reconcile.effect import Array
-from sioms.reconcile.effects import known
-from sioms.reconcile.fit import Fit, Problem, closed_errors, refit, shifted
+from sioms.reconcile.effects import known, library
+from sioms.reconcile.engine.search import AND, Added, Saving, Search, Start, Tried
+from sioms.reconcile.fit import Fit, Problem, block_ids, closed_errors, refit, shifted
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.plausible import (
-    AND,
-    Tried,
     physical,
     plainer,
     replaced,
-    simplest,
+    size,
     small,
     swapped,
     unspecific,
     vacant,
 )
-from sioms.reconcile.rules import negligible
-from sioms.reconcile.screen import Start, screen
-from sioms.reconcile.thresholds import AXIS, CLEAR, GAIN, LOOSE, PAIRS, PERIODIC_SURE, SPECIFIC, SURE
+from sioms.reconcile.screen import screen
+from sioms.reconcile.thresholds import AXIS, CLEAR, GAIN, LOOSE, PERIODIC_SURE, SPECIFIC, SURE
 from sioms.reconcile.variation import accompanied, exchanged, named
 
 PASSES = 4  # at most so many times more for a new gap, while it gains
@@ -51,7 +47,7 @@ Found = ladder.Found[Fit, AxisModel]
 
 
 @dataclass(slots=True)
-class Searcher:
+class Searcher(Search[AxisModel]):
     """Search over one problem. Not thread-safe.
 
     Attributes:
@@ -65,6 +61,7 @@ class Searcher:
     frozen: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
     progress: Callable[[str], None] = lambda text: None
+    footing: ClassVar = AXIS
     ids: NDArray[np.int64] = field(init=False)
     _given: Problem = field(init=False)
     _fits: dict[Hashable, Fit] = field(init=False, default_factory=dict)
@@ -157,36 +154,37 @@ class Searcher:
                 self._loops[key] = closed_errors(self.problem, m)[0]
         return self._loops[values_of(model)] <= LOOSE * self._loops[values_of(before)]
 
-    def run(self, start: AxisModel) -> Found:
-        """Search from a model."""
-        fit, losses = self._on_one_footing(self.fit(start))
-        steps = [Step("start", "", fit.ratio, 0.0, fit.model)]
-        for _ in range(AXIS.steps):
-            if fit.ratio <= AXIS.floor:
-                break
-            step = self._add(fit, losses) or self._add_pair(fit, losses)
-            if step is None:
-                break
-            steps.append(step[2])
-            fit, losses = step[0], step[1]
-            if rattles(fit.model):  # beside what is new its numbers may be others
-                fit, losses = self._on_one_footing(self.searched(fit))
-            self.progress(f"{steps[-1].action} {steps[-1].effect}: residual {fit.ratio:.2f} of the expected")
-            fit, losses = self._simplify(fit, losses, steps)
-            fit, losses = self._eliminate(fit, losses, steps)
-            if not rattles(fit.model) and self.problem is not self._given:
-                fit, losses = self._on_one_footing(fit)
-        return Found(fit, losses, tuple(steps))
+    def done(self, fit: Fit) -> bool:
+        """Stop at the floor."""
+        return fit.ratio <= AXIS.floor
 
-    def _on_one_footing(self, fit: Fit) -> tuple[Fit, Array]:
+    def levelled(self, model: AxisModel) -> Fit:
         """Bend the residual as the bounces of this model ask for; where there is no gap, leave it straight."""
-        if rattles(fit.model) or self.problem is not self._given:
-            self.problem = bent(self._given, fit.model) if rattles(fit.model) else self._given
-            self._fits.clear()
-            self._starts.clear()
-            self._rough.clear()
-            fit = self.fit(fit.model)
-        return fit, self.loss(fit)
+        return self._straight(self.fit(model))
+
+    def _straight(self, fit: Fit) -> Fit:
+        if not rattles(fit.model) and self.problem is self._given:
+            return fit
+        self.problem = bent(self._given, fit.model) if rattles(fit.model) else self._given
+        self._fits.clear()
+        self._starts.clear()
+        self._rough.clear()
+        return self.fit(fit.model)
+
+    def settle_step(self, added: Added[AxisModel]) -> tuple[Fit, Array]:
+        """Search the numbers of a gap again: beside what is new they may be others."""
+        fit, losses, _ = added
+        if rattles(fit.model):
+            fit = self._straight(self.searched(fit))
+            losses = self.loss(fit)
+        return fit, losses
+
+    def settle_model(self, fit: Fit, losses: Array) -> tuple[Fit, Array]:
+        """Straighten the residual where a gap has left."""
+        if not rattles(fit.model) and self.problem is not self._given:
+            fit = self._straight(fit)
+            losses = self.loss(fit)
+        return fit, losses
 
     def plainly(self, found: Found) -> Found:
         """Take back what a searched order enriched, unless it saves half: where much is unexplained some order always
@@ -203,7 +201,7 @@ class Searcher:
                 steps.append(Step("simplify", f"{name} to {other}", fit.ratio, -lost, fit.model))
         return Found(fit, losses, tuple(steps))
 
-    def _candidates(self, fit: Fit, passed: int = 0) -> list[Start]:
+    def candidates(self, fit: Fit, passed: int = 0) -> list[Start]:
         """Screen what may be added: the best few after so many, and their look-alikes."""
         names = [
             n
@@ -244,58 +242,65 @@ class Searcher:
             out += self.screen(fit, [name], levels)
         return out
 
-    def _add(self, fit: Fit, losses: Array) -> tuple[Fit, Array, Step] | None:
-        """Refit the best candidates and take the simplest of those that save most.
+    def trials(self, fit: Fit, losses: Array) -> dict[str, Tried[AxisModel]]:
+        """Refit the best candidates.
 
         A rich friction law may have bent itself to stand in for the next effect; so the best candidates are tried
         with it started afresh too.
         """
-        tried: dict[str, Tried] = {}
-        chosen = self._candidates(fit)
+        tried: dict[str, Tried[AxisModel]] = {}
+        chosen = self.candidates(fit)
         for s in sorted(chosen, key=lambda s: known()[s.effect].mechanism.bounces):
-            best = min((t[0].cost for t in tried.values()), default=np.inf)
+            best = min((t.fit.cost for t in tried.values()), default=np.inf)
             self._try(tried, s.effect, self._with(fit, s, 8 if s is chosen[0] else 5, best), losses)
         for effect, new in self._enriched(tried):
             self._try(tried, effect, new, losses)
-        for effect in sorted(tried, key=lambda n: -tried[n][2])[:BEST] if rattles(fit.model) else ():
-            self._try(tried, effect, self.searched(tried[effect][0]), losses)
-        if max((t[2] for t in tried.values()), default=0.0) < CLEAR:
+        for effect in sorted(tried, key=lambda n: -tried[n].saved.share)[:BEST] if rattles(fit.model) else ():
+            self._try(tried, effect, self.searched(tried[effect].fit), losses)
+        if max((t.saved.share for t in tried.values()), default=0.0) < CLEAR:
             for effect, new in self._afresh(fit):
                 self._try(tried, effect, new, losses)
-        sure, good = self._good(tried, fit, losses)
-        if sure and not good:  # what cannot be has taken the places of what can
-            for s in self._candidates(fit, AXIS.tries):
-                self._try(tried, s.effect, self._with(fit, s, 5), losses)
-            sure, good = self._good(tried, fit, losses)
-        while good:
-            name = simplest(good)
-            new = self.fit(good[name][0].model)  # settled, it may be what cannot be
-            if self._sound(new, fit):
-                break
-            del good[name]
-        else:
-            return None
-        loss = self.loss(new)
-        gain, _ = better(loss, losses)
-        if gain < SPECIFIC and unspecific(name, {n: t[2] for n, t in tried.items()}):
-            return None
-        rivals = {n: t[2] for n, t in tried.items() if n != name}
-        return new, loss, Step("add", name, new.ratio, gain, new.model, rivals)
+        return tried
 
-    def _good(self, tried: dict[str, Tried], fit: Fit, losses: Array) -> tuple[dict[str, Tried], dict[str, Tried]]:
+    def good(self, tried: dict[str, Tried[AxisModel]], fit: Fit, losses: Array) -> dict[str, Tried[AxisModel]]:
+        """Pick those that save enough and can be; where what cannot be has taken the places of what can, try more."""
+        sure, good = self._good(tried, fit, losses)
+        if sure and not good:
+            for s in self.candidates(fit, AXIS.tries):
+                self._try(tried, s.effect, self._with(fit, s, 5), losses)
+            _, good = self._good(tried, fit, losses)
+        return good
+
+    def confirmed(self, new: Fit, fit: Fit) -> Fit | None:
+        """Settle what is to be added; settled, it may be what cannot be."""
+        new = self.fit(new.model)
+        return new if self.sound(new, fit) else None
+
+    def unspecific(self, name: str, tried: Mapping[str, Tried[AxisModel]], fit: Fit, losses: Array) -> bool:
+        """Say whether an effect of quite another kind saves nearly as much."""
+        return unspecific(name, {n: t.saved.share for n, t in tried.items()})
+
+    def order(self, name: str, tried: Tried[AxisModel], best: Fit) -> tuple[bool, int, float]:
+        """Go by the number of parameters; a named effect goes before a nameless term that does no better."""
+        names = name.split(AND)
+        return any(n not in library() for n in names), sum(map(size, names)), -tried.saved.share
+
+    def _good(
+        self, tried: dict[str, Tried[AxisModel]], fit: Fit, losses: Array
+    ) -> tuple[dict[str, Tried[AxisModel]], dict[str, Tried[AxisModel]]]:
         """Pick those that save enough, surely; and of them those that can be.
 
         Beside a gap, whose bounces fall out otherwise with any other number, a small saving says nothing.
         """
         least = SPECIFIC if rattles(fit.model) else GAIN
-        sure = {n: t for n, t in tried.items() if t[2] >= least and t[3] >= self._sure(n)}
-        good = {n: t for n, t in sure.items() if self._sound(t[0], fit)}
-        best = max(sure, key=lambda n: sure[n][2], default=None)
+        sure = {n: t for n, t in tried.items() if self.surely(t.saved, least, n)}
+        good = {n: t for n, t in sure.items() if self.sound(t.fit, fit)}
+        best = max(sure, key=lambda n: sure[n].saved.share, default=None)
         if best is not None and best not in good:
-            for new in self._plainer_beside(sure[best][0], fit):
-                if self._sound(new, fit):
+            for new in self._plainer_beside(sure[best].fit, fit):
+                if self.sound(new, fit):
                     self._try(good, best, new, losses)
-        return sure, {n: t for n, t in good.items() if t[2] >= least and t[3] >= self._sure(n)}
+        return sure, {n: t for n, t in good.items() if self.surely(t.saved, least, n)}
 
     def _plainer_beside(self, new: Fit, fit: Fit) -> list[Fit]:
         """Put a plainer effect, or none, in the place of each that can no longer be beside a new one: it stood for
@@ -308,48 +313,21 @@ class Searcher:
             out.append(self.fit(named(new.model.without_effect(name)), 6))
         return out
 
-    def _add_pair(self, fit: Fit, losses: Array) -> tuple[Fit, Array, Step] | None:
-        """Add two effects at once where neither saves enough alone: each hides what the other would save.
+    def beside(self, middle: Fit, first: Start) -> list[Start]:
+        """Return what is tried beside the first of a pair."""
+        both = known()[first.effect].replaces
+        found = (s for s in self.candidates(middle) if s.effect not in both or first.effect in known()[s.effect].joins)
+        return list(found)[: AXIS.tries]
 
-        Both must be sure together, and each must earn its place beside the other. One that joins the first with another
-        counts as both.
-        """
-        pairs: dict[str, Tried] = {}
-        if fit.ratio < AXIS.paired:
-            return None
-        for first in self._candidates(fit)[:PAIRS]:
-            middle = self._with(fit, first, 5, fit.cost)
-            if middle.cost > fit.cost:  # it only takes the place of something better
-                continue
-            inner = self.loss(middle)
-            beside = [
-                s
-                for s in self._candidates(middle)
-                if s.effect not in known()[first.effect].replaces or first.effect in known()[s.effect].joins
-            ]
-            for second in beside[: AXIS.tries]:
-                new = self._with(middle, second, 8, min((t[0].cost for t in pairs.values()), default=middle.cost))
-                joined = first.effect in known()[second.effect].joins
-                if first.effect not in new.model.effects and not joined:
-                    continue
-                loss = self.loss(new)
-                gain, sure = better(loss, losses)
-                more, surer = better(loss, inner)
-                good = gain >= SPECIFIC and sure >= SURE and more >= SPECIFIC and surer >= self._sure(second.effect)
-                if good and self._sound(new, fit):
-                    name = second.effect if joined else f"{first.effect}{AND}{second.effect}"
-                    pairs[name] = new, loss, gain, sure
-        if not pairs:
-            return None
-        both = simplest(pairs)
-        new, loss, gain, _ = pairs[both]
-        return new, loss, Step("add", both, new.ratio, gain, new.model)
+    def pair(self, first: str, second: str, new: Fit) -> str | None:
+        """Name a pair; an effect that joins the first with another counts as both."""
+        return second if first in known()[second].joins else Search.pair(self, first, second, new)
 
-    def _sound(self, new: Fit, fit: Fit) -> bool:
+    def sound(self, new: Fit, fit: Fit, name: str = "") -> bool:
         """Say whether a model can be, and the closed loop does not suffer by it."""
-        return self._possible(new, fit) and self.follows(new.model, fit.model)
+        return self.may_leave(new, fit) and self.follows(new.model, fit.model)
 
-    def _possible(self, new: Fit, fit: Fit) -> bool:
+    def may_leave(self, new: Fit, fit: Fit) -> bool:
         """Say whether what is new can be, and what could be before still can, or vanishes: it stood for the new."""
         kept = [n for n in new.model.effects if n not in self.frozen]
         return all(self._stays(new, fit, n) for n in kept)
@@ -361,24 +339,28 @@ class Searcher:
 
     def _with(self, fit: Fit, start: Start, iterations: int, best: float = np.inf) -> Fit:
         """Switch a candidate on, what it replaces off, and refit."""
-        return self.fit(exchanged(fit.model, start.effect, start.values), iterations, best)
+        return self.fit(self.switched_on(fit, start), iterations, best)
 
-    def _try(self, tried: dict[str, Tried], effect: str, new: Fit, losses: Array) -> None:
+    def switched_on(self, fit: Fit, start: Start) -> AxisModel:
+        """Switch a candidate on, and off what it replaces."""
+        return exchanged(fit.model, start.effect, start.values)
+
+    def _try(self, tried: dict[str, Tried[AxisModel]], effect: str, new: Fit, losses: Array) -> None:
         """Score a refitted candidate; keep the better of two ways to the same effect."""
         loss = self.loss(new)
-        gain, sure = better(loss, losses)
-        if effect not in tried or gain > tried[effect][2]:
-            tried[effect] = (new, loss, gain, sure)
+        saved = self.saving(loss, losses)
+        if effect not in tried or saved.share > tried[effect].saved.share:
+            tried[effect] = Tried(new, loss, saved)
 
-    def _enriched(self, tried: Mapping[str, Tried]) -> list[tuple[str, Fit]]:
+    def _enriched(self, tried: Mapping[str, Tried[AxisModel]]) -> list[tuple[str, Fit]]:
         """Start rich effects from their plain form too, where both were tried: from far the speed of a drop is not
         found.
         """
         pairs = [(n, o) for n in tried for o in plainer(n, self.names) if o in tried and o in known()[n].replaces]
         return [
-            (name, self._with(tried[other][0], start, 5))
+            (name, self._with(tried[other].fit, start, 5))
             for name, other in pairs
-            for start in self._upgrades(tried[other][0], [name])[:1]
+            for start in self._upgrades(tried[other].fit, [name])[:1]
         ]
 
     def _afresh(self, fit: Fit) -> list[tuple[str, Fit]]:
@@ -387,44 +369,30 @@ class Searcher:
         for name in [n for n in fit.model.effects if n not in self.frozen]:
             for other in [o for o in plainer(name, self.names) if o in known()[name].replaces]:
                 base = self.fit(swapped(fit.model, name, other), 5)
-                starts = [s for s in self._candidates(base) if name not in (s.effect, *known()[s.effect].replaces)]
+                starts = [s for s in self.candidates(base) if name not in (s.effect, *known()[s.effect].replaces)]
                 for s in starts[:2]:
                     middle = self._with(base, s, 5)
                     out += [(s.effect, self._with(middle, again, 6)) for again in self._upgrades(middle, [name])[:1]]
         return out
 
-    def _sure(self, name: str) -> float:
-        return PERIODIC_SURE if any(p.fixed for p in known()[name].parameters) else SURE
+    def surely(self, saved: Saving, least: float, name: str) -> bool:
+        """Say whether an effect saves at least a share, surely; one whose order is searched must do so more surely."""
+        searched = name and any(p.fixed for p in known()[name].parameters)
+        return saved.share >= least and saved.errors >= (PERIODIC_SURE if searched else SURE)
 
-    def _eliminate(self, fit: Fit, losses: Array, steps: list[Step]) -> tuple[Fit, Array]:
-        """Let effects leave that no longer save their share."""
-        for name in [n for n in fit.model.effects if n not in self.frozen]:
-            if len([n for n in fit.model.effects if n not in self.frozen]) < 2:
-                break
-            if name not in fit.model.effects:  # it left with what it stood beside
-                continue
-            without = self.searched(self.fit(named(fit.model.without_effect(name)), 6), fit.cost)
-            loss = self.loss(without)
-            gain, sure = better(losses, loss)
-            if (negligible(gain, sure) and self._possible(without, fit)) or small(fit.model, name):
-                fit, losses = without, loss
-                steps.append(Step("leave", name, fit.ratio, -gain, fit.model))
-        return fit, losses
+    def bare(self, fit: Fit, name: str) -> Fit:
+        """Fit without an effect; what varied beside it is named as it is named without."""
+        return self.searched(self.fit(named(fit.model.without_effect(name)), 6), fit.cost)
 
-    def _simplify(self, fit: Fit, losses: Array, steps: list[Step]) -> tuple[Fit, Array]:
-        """Put a simpler look-alike in the place of a richer effect where it does as well."""
-        for name in [n for n in fit.model.effects if n not in self.frozen]:
-            for other in plainer(name, self.names):
-                if name not in fit.model.effects or not vacant(fit.model, name, other):
-                    continue
-                new = self.fit(swapped(fit.model, name, other), 6)
-                loss = self.loss(new)
-                lost, sure = better(losses, loss)
-                if negligible(lost, sure):
-                    fit, losses = new, loss
-                    steps.append(Step("simplify", f"{name} to {other}", fit.ratio, -lost, fit.model))
-                    break
-        return fit, losses
+    def vanished(self, fit: Fit, name: str) -> bool:
+        """Say whether an effect has become smaller than it may be to be named."""
+        return small(fit.model, name)
+
+    def simpler(self, fit: Fit, name: str) -> Iterator[tuple[str, str, Fit]]:
+        """Yield look-alikes of fewer parameters in the place of an effect."""
+        for other in plainer(name, self.names):
+            if vacant(fit.model, name, other):
+                yield name, other, self.fit(swapped(fit.model, name, other), 6)
 
 
 def values_of(model: AxisModel) -> Hashable:

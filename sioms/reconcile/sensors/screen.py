@@ -3,26 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
 from sioms.reconcile.engine.fit import Free
-from sioms.reconcile.sensors.effect import Array, Quantity, SensorEffect, SensorModel, Values
+from sioms.reconcile.engine.search import Start
+from sioms.reconcile.sensors.effect import Array, Quantity, SensorEffect, SensorModel
 from sioms.reconcile.sensors.fit import Data, Fit, freed, slopes
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """A screened candidate: values to start from, the share of the view's squares it would save, and that of all
-    squares.
-    """
-
-    effect: str
-    values: Values
-    gain: float
-    total: float
 
 
 def screen(data: Data, fit: Fit, weights: Array, effect: SensorEffect, frozen: tuple[str, ...] = ()) -> list[Start]:
@@ -50,7 +38,7 @@ def screen(data: Data, fit: Fit, weights: Array, effect: SensorEffect, frozen: t
         if values is not None:
             left = r + known @ d[: len(gram)] + columns @ d[len(gram) :]
             lefts.append(left)
-            out.append(Start(effect.name, values, _gain(data, r, left), 1.0 - float(left @ left) / float(r @ r)))
+            out.append(Start(effect.name, _gain(data, r, left), values, 1.0 - float(left @ left) / float(r @ r)))
     if len(out) > 1 and any(q.each and len(q.starts) > 1 for q in effect.parameters):
         out.append(_elementwise(data, effect, out, lefts, r))
     return sorted(out, key=lambda s: -s.total)
@@ -66,7 +54,7 @@ def _elementwise(data: Data, effect: SensorEffect, starts: list[Start], lefts: l
         if q.each:
             values[q.symbol] = np.array([starts[k].values[q.symbol][i] for i, k in enumerate(which)])
     left = np.stack(lefts)[which[data.element], np.arange(len(before))]
-    return Start(effect.name, values, _gain(data, before, left), 1.0 - float(left @ left) / float(before @ before))
+    return Start(effect.name, _gain(data, before, left), values, 1.0 - float(left @ left) / float(before @ before))
 
 
 def _gain(data: Data, before: Array, after: Array) -> float:

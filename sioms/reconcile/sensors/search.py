@@ -1,53 +1,33 @@
 """Search for the missing effects of a sensor: screen, refit nested, let earlier ones leave again.
 
-The rules are those of the axis (``sioms.reconcile.search``); evidence comes in views (touches, courses in
-time, untouched frames ...), every view is brought to the floor on one footing, and an effect is judged in the
-view where it shows most.
+Evidence comes in views (touches, courses in time, untouched frames ...), every view is brought to the floor on one
+footing, and an effect is judged in the view where it shows most.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
 from sioms.reconcile import ladder
 from sioms.reconcile.blocks import better, heldout
 from sioms.reconcile.effect import TERM_PREFIX
-from sioms.reconcile.rules import negligible
+from sioms.reconcile.engine.search import AND, Added, Saving, Search, Start, Tried
 from sioms.reconcile.sensors.effect import Array, SensorModel
 from sioms.reconcile.sensors.fit import Data, Fit, on_one_footing, ratios, refit
 from sioms.reconcile.sensors.plausible import family, physical, termed, without
-from sioms.reconcile.sensors.screen import Start, screen
-from sioms.reconcile.thresholds import DEEP, GAIN, NEARLY, PAIRS, SENSOR, SPECIFIC, SURE
-
-
-@dataclass(frozen=True, slots=True)
-class Saving:
-    """What one model saves against another: share and standard errors in its best view, and those of all views
-    together.
-    """
-
-    share: float
-    errors: float
-    view: str
-    total: float
-    surely: float
-
-    @property
-    def weight(self) -> float:
-        """How much and how surely it saves; below zero where it loses."""
-        sure = min(abs(self.errors), 10.0)
-        return min(self.share, 1.0) * sure if self.errors > 0.0 else -abs(self.share) * sure
-
+from sioms.reconcile.sensors.screen import screen
+from sioms.reconcile.thresholds import DEEP, GAIN, NEARLY, SENSOR, SURE
 
 Step = ladder.Step[SensorModel]
 Found = ladder.Found[Fit, SensorModel]
 
 
 @dataclass(slots=True)
-class Searcher:
+class Searcher(Search[SensorModel]):
     """Search over one set of data. Not thread-safe.
 
     Attributes:
@@ -60,6 +40,7 @@ class Searcher:
     frozen: tuple[str, ...] = ()
     progress: Callable[[str], None] = lambda text: None
     terms: tuple[str, ...] = ()
+    footing: ClassVar = SENSOR
     weights: Array = field(init=False)
 
     def __post_init__(self) -> None:
@@ -67,7 +48,7 @@ class Searcher:
 
     # -- fits and losses
 
-    def fit(self, model: SensorModel, iterations: int = 6) -> Fit:
+    def fit(self, model: SensorModel, iterations: int = 6, best: float = np.inf) -> Fit:
         """Refit all free numbers."""
         return refit(self.data, model, self.weights, self.frozen, iterations)
 
@@ -94,45 +75,25 @@ class Searcher:
                 best = new_one
         return best
 
-    def lost(self, worse: Array, good: Array) -> Saving:
-        """Return what a worse model gives away, in the view where it gives away most."""
-        return self.saving(good, worse)
-
     # -- search
 
     def run(self, start: SensorModel) -> Found:
         """Search from a model; where the floor is not reached, again without the first step, which led astray if that
         reaches it.
         """
-        found = self._run(start)
+        found = Search.run(self, start)
         steps = [r for r in found.ladder if r.action == "add"]
         if len(steps) < 2 or not self.loud(found.fit) or set(self.terms) & set(self.names):
             return found
         names, footing = self.names, self.weights
         self.names = tuple(n for n in names if n != steps[0].effect)
-        other = self._run(start)
+        other = Search.run(self, start)
         self.names = names
         if not self.loud(other.fit):
             self.progress(f"{steps[0].effect} led astray: what is found without it reaches the floor")
             return other
         self.weights = footing
         return found
-
-    def _run(self, start: SensorModel) -> Found:
-        fit = self.levelled(start)
-        losses = self.loss(fit)
-        steps = [Step("start", "", self.ratio(fit), 0.0, fit.model)]
-        for _ in range(SENSOR.steps):
-            step = self._add(fit, losses) or self._add_pair(fit, losses) or self._restart(fit)
-            if step is None:
-                break
-            steps.append(step)
-            fit = self.levelled(step.model)
-            losses = self.loss(fit)
-            self.progress(f"{step.action} {step.effect}: residual {self.ratio(fit):.2f} of the floor")
-            fit, losses = self._simplify(fit, losses, steps)
-            fit, losses = self.eliminate(fit, losses, steps)
-        return Found(fit, losses, tuple(steps))
 
     def levelled(self, model: SensorModel) -> Fit:
         """Fit, bring the views to one footing, and fit again."""
@@ -149,77 +110,74 @@ class Searcher:
         """Root mean square over all rows, in units of the floor."""
         return float(np.sqrt(np.mean((fit.residual / self.weights) ** 2)))
 
-    def _add(self, fit: Fit, losses: Array) -> Step | None:
-        """Refit the best candidates and take the simplest of those that save most.
-
-        Below the floor, which is an estimate, only what saves much on blocks held out is no noise.
-        """
-        tried: dict[str, tuple[Fit, Array, Saving]] = {}
-        loud = self.loud(fit)
+    def trials(self, fit: Fit, losses: Array) -> dict[str, Tried[SensorModel]]:
+        """Refit the best candidates."""
+        tried = {}
         for start in self.candidates(fit):
             new = self.fit(self.switched_on(fit, start))
             loss = self.loss(new)
-            tried[start.effect] = (new, loss, self.saving(loss, losses, loud))
-        good = {
+            tried[start.effect] = Tried(new, loss, self.judged(loss, losses, fit))
+        return tried
+
+    def judged(self, losses: Array, old: Array, fit: Fit) -> Saving:
+        """Return what a candidate saves in the views above their floor, where there is one."""
+        return self.saving(losses, old, self.loud(fit))
+
+    def good(self, tried: dict[str, Tried[SensorModel]], fit: Fit, losses: Array) -> dict[str, Tried[SensorModel]]:
+        """Pick those that save enough, surely.
+
+        Below the floor, which is an estimate, only what saves much on blocks held out is no noise.
+        """
+        loud, taken = self.loud(fit), termed(fit.model)
+        return {
             n: t
             for n, t in tried.items()
-            if (surely(t[2], GAIN) if loud else beyond_noise(t[2]) and not termed(fit.model))
-            and physical(t[0].model, n)
+            if (surely(t.saved, GAIN) if loud else beyond_noise(t.saved) and not taken) and physical(t.fit.model, n)
         }
-        if not good:
-            return None
-        name = self._simplest(good)
-        new, _, saved = good[name]
-        if saved.share < SPECIFIC and self._may_be_another(fit, losses, name, tried):
-            return None
-        others = {n: t[2].share for n, t in tried.items() if n != name}
-        return Step("add", name, self.ratio(new), saved.share, new.model, others)
 
-    def _may_be_another(
-        self, fit: Fit, losses: Array, name: str, tried: Mapping[str, tuple[Fit, Array, Saving]]
-    ) -> bool:
+    def order(self, name: str, tried: Tried[SensorModel], best: Fit) -> tuple[bool, int, float]:
+        """Go by the count of numbers; where something has no name, a name is no better than another term."""
+        lib, count, names = best.model.library, best.model.count, name.split(AND)
+        term = not termed(best.model) and any(n.startswith(TERM_PREFIX) for n in names)
+        return term, sum(lib[n].size(count) for n in names), -tried.saved.total
+
+    def unspecific(self, name: str, tried: Mapping[str, Tried[SensorModel]], fit: Fit, losses: Array) -> bool:
         """Say whether what an effect saves may be a part of what another saves, of what a term does not fit, or of what
         has no name.
 
         Effects are compared on what they count by: their share of one view, below the floor that of everything.
         """
-        new, _, saved = tried[name]
+        new, saved = tried[name].fit, tried[name].saved
         if termed(new.model):
             return termed(fit.model) or not beyond_noise(saved)
         below, alike = not self.loud(fit), family(new.model, name)
-        for n, (_, _, other) in tried.items():
+        for n, other in ((n, t.saved) for n, t in tried.items()):
             nearly = other.total / saved.total if below else (other.view == saved.view) * other.share / saved.share
             if n not in alike and nearly > NEARLY:
                 return True
         return self._nameless(fit, losses, saved)
 
-    def _add_pair(self, fit: Fit, losses: Array) -> Step | None:
-        """Add two effects at once where neither is sure alone: each hides what the other would save.
+    def loudest(self, fit: Fit) -> float:
+        """Return the largest root mean square of a view, in units of its floor."""
+        return float(np.max(self.ratios(fit.model)))
 
-        Both must save much together, and each much beside the other; less than that has no name yet.
-        """
-        if np.max(self.ratios(fit.model)) < SENSOR.paired:
-            return None
-        best: tuple[Saving, Fit, str] | None = None
-        for first in self.candidates(fit)[:PAIRS]:
-            middle = self.fit(self.switched_on(fit, first), 4)
-            inner = self.loss(middle)
-            for second in self.candidates(middle)[:PAIRS]:
-                new = self.fit(self.switched_on(middle, second))
-                if first.effect not in new.model.effects or second.effect in family(new.model, first.effect):
-                    continue
-                loss = self.loss(new)
-                saved, more = self.saving(loss, losses), self.saving(loss, inner)
-                sure = surely(saved, SPECIFIC) and surely(more, SPECIFIC)
-                good = sure and physical(new.model, first.effect) and physical(new.model, second.effect)
-                if good and (best is None or new.cost < best[1].cost):
-                    best = saved, new, f"{first.effect} and {second.effect}"
-        if best is None or self._nameless(fit, losses, best[0]):
-            return None
-        saved, new, name = best
-        return Step("add", name, self.ratio(new), saved.share, new.model)
+    def surely(self, saved: Saving, least: float, name: str) -> bool:
+        """Say whether an effect saves at least a share, surely."""
+        return surely(saved, least)
 
-    def _restart(self, fit: Fit) -> Step | None:
+    def pair(self, first: str, second: str, new: Fit) -> str | None:
+        """Name a pair; two of a family are none."""
+        return None if second in family(new.model, first) else Search.pair(self, first, second, new)
+
+    def sound(self, new: Fit, fit: Fit, name: str) -> bool:
+        """Say whether the numbers of new effects can be."""
+        return all(physical(new.model, n) for n in name.split(AND))
+
+    def named(self, best: Tried[SensorModel], fit: Fit, losses: Array) -> bool:
+        """Say whether no term saves far more than a pair."""
+        return not self._nameless(fit, losses, best.saved)
+
+    def restart(self, fit: Fit) -> Added[SensorModel] | None:
         """Let shapes of the elements' own, of which some may have stuck, begin again."""
         own = [
             (name, q.symbol, start)
@@ -231,7 +189,8 @@ class Searcher:
         best = self.restarted(fit, own)
         if best is fit:
             return None
-        return Step("restart", "shapes", self.ratio(best), 1.0 - best.cost / fit.cost, best.model)
+        step = Step("restart", "shapes", self.ratio(best), 1.0 - best.cost / fit.cost, best.model)
+        return best, self.loss(best), step
 
     def restarted(self, fit: Fit, own: Iterable[tuple[str, str, float]]) -> Fit:
         """Let numbers of the elements' own begin again at some values; each element keeps what is best for it.
@@ -278,54 +237,21 @@ class Searcher:
         other = self.saving(self.loss(self.fit(fit.model.with_effect(best.effect, best.values))), losses)
         return other.view == saved.view and NEARLY * other.share > saved.share
 
-    def _simplest(self, good: dict[str, tuple[Fit, Array, Saving]]) -> str:
-        """Of those within one standard error and ``GAIN`` of the best, the one with the fewest numbers."""
-        best = max(good, key=lambda n: good[n][2].total)
-        near = []
-        for n, (_, loss, _) in good.items():
-            gap = self.lost(loss, good[best][1])
-            if negligible(gap.share, gap.errors):
-                near.append(n)
-        model = good[best][0].model
-        named = not termed(model)  # where something has no name, a name is no better than another term
+    def bare(self, fit: Fit, name: str) -> Fit:
+        """Fit without an effect."""
+        return self.fit(fit.model.without_effect(name))
 
-        def order(n: str) -> tuple[bool, int, float]:
-            return named and n.startswith(TERM_PREFIX), model.library[n].size(model.count), -good[n][2].total
+    def simpler(self, fit: Fit, name: str) -> Iterator[tuple[str, str, Fit]]:
+        """Yield look-alikes of fewer numbers in the place of an effect, or of all that it is like."""
+        for other, gone in self._simpler(fit.model, name):
+            bare = self.fit(without(fit.model, gone), 0)  # the others stay where they are, or they make up for it
+            start = next(iter(screen(self.data, bare, self.weights, fit.model.library[other], self.frozen)), None)
+            if start is not None:
+                yield AND.join(gone), other, self.fit(bare.model.with_effect(other, start.values))
 
-        return min(near or [best], key=order)
-
-    def eliminate(self, fit: Fit, losses: Array, steps: list[Step]) -> tuple[Fit, Array]:
-        """Let effects leave that no longer save their share."""
-        for name in [n for n in fit.model.effects if n not in self.frozen]:
-            if len(fit.model.effects) < 2:
-                break
-            bare = self.fit(fit.model.without_effect(name))
-            loss = self.loss(bare)
-            gap = self.lost(loss, losses)
-            if negligible(gap.share, gap.errors):
-                fit, losses = bare, loss
-                steps.append(Step("leave", name, self.ratio(fit), -gap.share, fit.model))
-        return fit, losses
-
-    def _simplify(self, fit: Fit, losses: Array, steps: list[Step]) -> tuple[Fit, Array]:
-        """Put a look-alike of fewer numbers in the place of an effect, or of all that it is like, where it does as
-        well.
-        """
-        for name in [n for n in fit.model.effects if n not in self.frozen]:
-            for other, gone in self._simpler(fit.model, name):
-                bare = self.fit(without(fit.model, gone), 0)  # the others stay where they are, or they make up for it
-                start = next(iter(screen(self.data, bare, self.weights, fit.model.library[other], self.frozen)), None)
-                if start is None:
-                    continue
-                new = self.fit(bare.model.with_effect(other, start.values))
-                loss = self.loss(new)
-                gap = self.lost(loss, losses)
-                if negligible(gap.share, gap.errors) and physical(new.model, other):
-                    fit, losses = new, loss
-                    said = f"{' and '.join(gone)} to {other}"
-                    steps.append(Step("simplify", said, self.ratio(fit), -gap.share, fit.model))
-                    break
-        return fit, losses
+    def may_stand(self, new: Fit, name: str) -> bool:
+        """Say whether the numbers of a look-alike can be."""
+        return physical(new.model, name)
 
     def _simpler(self, model: SensorModel, name: str) -> list[tuple[str, tuple[str, ...]]]:
         """Look-alikes of an effect with what each could take the place of, of more numbers in all."""

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sioms.reconcile.ambiguity import settle
-from sioms.reconcile.blocks import better, block_ids, bootstrap, formal, heldout, intervals
+from sioms.reconcile.blocks import better, bootstrap, formal, heldout, intervals
 from sioms.reconcile.bounces import bent, deepest
 from sioms.reconcile.channels import drive, drive_output, index_fit, lattice
 from sioms.reconcile.descent import descend
@@ -19,7 +19,7 @@ from sioms.reconcile.engine.fit import get
 from sioms.reconcile.evidence import spans_of
 from sioms.reconcile.excitation import common, gate
 from sioms.reconcile.experiment import Envelope, catalogue, demands, one_speed, repeated, separate
-from sioms.reconcile.fit import LEFT, Problem, free_parameters, jacobian, refit
+from sioms.reconcile.fit import LEFT, Problem, block_ids, free_parameters, jacobian, refit
 from sioms.reconcile.locate import locate
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
