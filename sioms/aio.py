@@ -24,11 +24,10 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar, overload
 
 from sioms.protocol import verbs
 from sioms.protocol.flags import NodeClass
-from sioms.protocol.socketpath import socket_path
+from sioms.protocol.socketpath import cell_address
 
 from .client.cell_verbs import MarkerVerbs, WorkcellVerbs
-from .client.channel import Answer, Call, Channel
-from .client.channel import connect as connect_socket
+from .client.channel import KEEPALIVE, Answer, Call, Channel, connect_channel
 from .client.faces import Awaiting
 from .client.node_core import S
 from .client.node_verbs import AnalogVerbs, AxisVerbs, BinaryVerbs, NodeVerbs, select_nodes
@@ -264,7 +263,17 @@ class AsyncWorkcell(Awaiting, WorkcellVerbs[AsyncMarker]):
         lease: float = 0.0,
         kind: type[AsyncNode[Any]] | None = None,
     ) -> Any:
-        return await self._open(name, mode, timeout, lease, kind)
+        node = await self._open(name, mode, timeout, lease, kind)
+        if node.clock is not None and node._channel.keepalive_s:
+            self._renew(node)
+        return node
+
+    def _renew(self, node: AsyncNode[Any]) -> None:
+        """Renew the lease of a node of another machine for as long as the loop runs."""
+        if not node.closed:
+            with suppress(OSError):  # its next request says what has happened
+                node._channel.notice(KEEPALIVE)
+            asyncio.get_running_loop().call_later(node._channel.keepalive_s, self._renew, node)
 
     open.__doc__ = WorkcellVerbs._open.__doc__
 
@@ -273,11 +282,12 @@ async def connect(path: str | None = None, name: str = "") -> AsyncWorkcell:
     """Open a session with the daemon.
 
     Args:
-        path: the daemon's socket; None for $SIOMS_SOCKET or the usual places.
+        path: the daemon's socket, or ``zmq://HOST:PORT`` of a gateway; None for $SIOMS_CELL, $SIOMS_SOCKET or the usual
+            places. Connecting to a gateway takes some milliseconds, in which the loop does nothing else.
         name: what this client calls itself.
     """
-    path = path or socket_path()
-    channel = Channel(connect_socket(path), "the daemon")
+    path = path or cell_address()
+    channel = connect_channel(path)
     cell = AsyncWorkcell(channel, _Requests(channel, verbs.Cancel), path)
     await cell._greet(name)
     return cell

@@ -41,6 +41,8 @@ COMMANDS: dict[str, Command] = {
     "reload": Command("sioms.tools.cell", "make the daemon reload its configuration"),
     "check": Command("sioms.tools.cell", "check a configuration"),
     "service": Command("sioms.tools.service", "install the daemon as a service of this machine"),
+    "serve": Command("sioms.gateway.command", "let clients on other machines use the workcell"),
+    "key": Command("sioms.gateway.command", "make, allow, list and revoke the keys of remote clients"),
     "driver": Command("sioms.tools.driver", "list, check, trace and replay drivers"),
     "bench": Command("sioms.bench", "measure latencies and throughput on this machine"),
     "tactile": Command("sioms.tactile.command", "design, calibrate and measure elastic fingers"),

@@ -70,6 +70,8 @@ complete -c sioms -n __fish_use_subcommand -a reset -d 'clear a latched stop or 
 complete -c sioms -n __fish_use_subcommand -a reload -d 'make the daemon reload its configuration'
 complete -c sioms -n __fish_use_subcommand -a check -d 'check a configuration'
 complete -c sioms -n __fish_use_subcommand -a service -d 'install the daemon as a service of this machine'
+complete -c sioms -n __fish_use_subcommand -a serve -d 'let clients on other machines use the workcell'
+complete -c sioms -n __fish_use_subcommand -a key -d 'make, allow, list and revoke the keys of remote clients'
 complete -c sioms -n __fish_use_subcommand -a driver -d 'list, check, trace and replay drivers'
 complete -c sioms -n __fish_use_subcommand -a bench -d 'measure latencies and throughput on this machine'
 complete -c sioms -n __fish_use_subcommand -a tactile -d 'design, calibrate and measure elastic fingers'

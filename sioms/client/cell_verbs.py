@@ -36,6 +36,8 @@ STARTING_S = 5.0
 """How long a client waits for a daemon that says that it is starting [s]."""
 SYNCH_LEAD_S = 0.01
 """How far ahead a synchronised start lies: long enough for every driver to hear of it."""
+REMOTE_LEASE_S = 0.2
+"""Lease of what can be written, on another machine, when none is asked for [s]."""
 _ACCESS = {"r": Access.READ, "w": Access.WRITE, "rw": Access.READ | Access.WRITE}
 
 
@@ -161,6 +163,7 @@ class WorkcellVerbs(Generic[M]):
         self.name, self.rights = "", 0
         self._request: StopRequest | None = None
         self._nodes: dict[int, NodeVerbs[Any]] = {}
+        self._fellows: list[Channel] = []
 
     async def _greet(self, name: str, enough: Callable[[], bool] | None = None) -> None:
         """Say hello; to a daemon that is starting again and again, for a while."""
@@ -214,7 +217,8 @@ class WorkcellVerbs(Generic[M]):
                 just starting any open waits 1.5 s.
             lease: longest silence of this client [s] before its axes are halted, for programs that may
                 hang; 0: none. Any request of the node renews it, ``keepalive`` does, and a call that
-                waits on the node keeps renewing it.
+                waits on the node keeps renewing it. On another machine whatever can be written has one, 0.2 s unless
+                another is asked for, at most 10 s, and every call or read of the session renews it.
             kind: the class of the node, as AxisNode, AnalogNode or BinaryNode: what the node must be, for type checkers
                 and against mistakes; None takes any.
 
@@ -228,7 +232,10 @@ class WorkcellVerbs(Generic[M]):
         if kind is not None and not (isinstance(kind, type) and issubclass(kind, self._NODE)):
             raise TypeError(f"open {name}: kind {shown(kind)}; want AxisNode, AnalogNode or BinaryNode")
         answer = await self._waiter.call(open_call(name, mode, timeout, lease))
-        core = node_parts(answer.value, answer.fds)
+        core = node_parts(answer.value, answer.fds, self._channel.clock)
+        if self._channel.clock is not None and not core[0].read_only:
+            lease = lease or REMOTE_LEASE_S
+            self._lives_with(core[-1], core[2], lease)
         node = self._NODES[core[0].node_class](core, self, self._waiter_of(core[-1]), lease)
         self._nodes[node.handle] = node
         if kind is not None and not isinstance(node, kind):
@@ -236,6 +243,15 @@ class WorkcellVerbs(Generic[M]):
             await self._closed_handle(node.handle)
             raise OSError(errno.EINVAL, f"open {name}: it is an {type(node).__name__}; want an {kind.__name__}")
         return node
+
+    def _lives_with(self, channel: Channel, page: Any, lease: float) -> None:
+        """Renew the lease of a node of another machine by every call of this session, whichever node it is about."""
+        fellows = self._fellows = [each for each in self._fellows if not each.closed] + [channel]
+        for each in (*fellows, self._channel):
+            each.fellows = fellows
+        page.every_ns = int(lease * 1e9 / 4)
+        own = self._channel
+        own.keepalive_s = min(own.keepalive_s or lease, lease / 3)
 
     async def _closed_handle(self, handle: int) -> None:
         """Tell the daemon that a node was closed, and wait until its channels are free (nodes call this)."""
@@ -259,10 +275,16 @@ class WorkcellVerbs(Generic[M]):
         """Return what a node is, without opening it."""
         return NodeInfo(await self._ask(f"get information of {name}", verbs.Info(name)))
 
+    def _here(self, there_ns: int) -> int:
+        """Return an instant of the cell's clock in that of this machine."""
+        return there_ns if self._channel.clock is None else self._channel.clock.here(there_ns)
+
     @verb
     async def status(self) -> dict[str, Any]:
         """Return devices, sessions, holders and the state of the emergency stop."""
         value: dict[str, Any] = await self._ask("get status", verbs.Status())
+        if value["stopped_ns"]:
+            value["stopped_ns"] = self._here(value["stopped_ns"])
         return value
 
     @verb
@@ -283,7 +305,7 @@ class WorkcellVerbs(Generic[M]):
         told: list[AxisVerbs] = []
         try:
             for node in nodes:
-                await node._ask(Request.SEND_EXTERNAL_SYNCH, start_ns)
+                await node._ask(Request.SEND_EXTERNAL_SYNCH, node._there(start_ns))
                 told.append(node)
         except OSError:
             for node in told:
@@ -323,7 +345,7 @@ class WorkcellVerbs(Generic[M]):
     @verb
     async def wait_marker(self, number: int, timeout: float | None = None) -> int:
         """Wait until a marker is signalled; return when that was [ns, CLOCK_MONOTONIC]."""
-        return int(await self._ask("wait for marker", verbs.WaitMarker(number, timeout), limit_s=timeout))
+        return self._here(int(await self._ask("wait for marker", verbs.WaitMarker(number, timeout), limit_s=timeout)))
 
     # --- stops -----------------------------------------------------------------------------------
 

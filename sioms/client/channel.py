@@ -25,6 +25,7 @@ from _socket import (
 from _thread import allocate_lock
 from stat import S_ISSOCK
 from struct import pack, unpack
+from sys import modules
 from time import monotonic
 
 from sioms.protocol.messages import MAX_PACKET, MalformedMessage, decode_reply, value_of
@@ -32,13 +33,14 @@ from sioms.protocol.socketpath import may_serve
 from sioms.protocol.verbs import Cancel, CancelOnHandle, Keepalive, Part
 
 from .arguments import checked, seconds
-from .shown import acknowledged_by_daemon
+from .shown import acknowledged_by_daemon, clock_acknowledged
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from typing import Any
 
+    from sioms.protocol.clock import Clock
     from sioms.protocol.verbs import Message
 
     from .overdue import Overdue
@@ -148,6 +150,22 @@ def connect(path: str, timeout_s: float = CONNECT_S) -> socket:
     return sock
 
 
+def connect_channel(address: str, timeout_s: float = CONNECT_S) -> Channel:
+    """Connect to the daemon at the path of its socket, or to a gateway at ``zmq://HOST:PORT``.
+
+    Raises:
+        OSError: with a sentence: nobody there, or one does not get in.
+    """
+    if "://" not in address:
+        return Channel(connect(address, timeout_s), "the daemon")
+    if "site" not in modules:  # a shell tool, started without it, needs packages now
+        __import__("site").main()
+    from .remote import connect as connect_remote
+
+    sock, clock = connect_remote(address, timeout_s)
+    return Channel(sock, f"the gateway {address}", acknowledged=clock_acknowledged(clock), clock=clock)
+
+
 def _is_socket(path: str) -> bool:
     try:
         return S_ISSOCK(os.stat(path).st_mode)
@@ -175,6 +193,7 @@ class Channel:
         acknowledged: told of the instant of the effect of what has been answered [ns], before the answer is.
         behind: the process that made the socket and the one that answers on it, as the former numbers them;
             empty: it is the one that made it.
+        clock: of the cell, where that is another machine's; None: it is ours.
 
     Attributes:
         keepalive_s: while a thread waits for an answer, it tells the other side this often [s] that it
@@ -189,9 +208,11 @@ class Channel:
         passed: bool = True,
         acknowledged: Callable[[int], None] = acknowledged_by_daemon,
         behind: Sequence[int] = (),
+        clock: Clock | None = None,
     ) -> None:
         self.name = name
         self.acknowledged = acknowledged
+        self.clock = clock
         self._sock = sock
         self._passed = passed
         self._behind = behind
@@ -274,7 +295,11 @@ class Channel:
         alive.
         """
         for channel in self.fellows or (self,):
-            channel.notice(KEEPALIVE)
+            try:
+                channel.notice(KEEPALIVE)
+            except OSError:
+                if channel is self:
+                    raise  # who uses another one hears of it there
 
     def wait(self, number: int, call: Call) -> Answer:
         """Wait for the answer to a sent request."""

@@ -13,7 +13,10 @@ from .channel import Channel
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from typing import Any
+
+    from sioms.protocol.clock import Clock
 
 _WAKES = 4096
 """Bytes taken out of the wake pipe in one go, one a publication."""
@@ -60,9 +63,47 @@ class LocalPage(PageReader):
             os.close(self._wake_fd)
 
 
-def node_parts(value: Any, fds: list[int]) -> tuple[Any, ...]:
-    """Turn the answer to an open into the arguments of a node."""
+class LeasedPage(LocalPage):
+    """The same of a node that must be heard of, as those behind a gateway: reading renews its lease.
+
+    Attributes:
+        renew: does so.
+        every_ns: how often at most [ns].
+    """
+
+    __slots__ = ("_due_ns", "every_ns", "renew")
+
+    def __init__(self, page_fd: int, wake_fd: int, renew: Callable[[], None]) -> None:
+        super().__init__(page_fd, wake_fd)
+        self.renew, self.every_ns, self._due_ns = renew, 0, 0
+
+    def latest(self, now_ns: int) -> bytes:
+        """Copy the newest snapshot; see ``PageReader.latest``."""
+        if now_ns > self._due_ns:
+            self._due_ns = now_ns + self.every_ns
+            self.renew()
+        return super().latest(now_ns)
+
+
+def node_parts(value: Any, fds: list[int], clock: Clock | None = None) -> tuple[Any, ...]:
+    """Turn the answer to an open into the arguments of a node.
+
+    Args:
+        value: the answer.
+        fds: that came with it.
+        clock: of the cell, where that is another machine's.
+    """
     handle, packed, channels, bit, behind = value
     info = NodeInfo(packed)
-    channel = Channel(socket(fileno=fds[2]), f"node {info.name}", False, behind=behind)
-    return info, handle, LocalPage(fds[0], fds[1]), list(channels), bit, channel
+    channel = Channel(socket(fileno=fds[2]), f"node {info.name}", False, behind=behind, clock=clock)
+    if clock is None or info.read_only:
+        return info, handle, LocalPage(fds[0], fds[1]), list(channels), bit, channel
+
+    def renew() -> None:
+        try:  # noqa: SIM105  # contextlib costs a shell tool a millisecond
+            channel.keepalive()
+        except OSError:
+            pass  # its next request says what has happened
+
+    page = LeasedPage(fds[0], fds[1], renew)
+    return info, handle, page, list(channels), bit, channel

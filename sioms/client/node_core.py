@@ -148,6 +148,7 @@ class NodeCore(Generic[S]):
         info: what the node is (GET_IO_STRUCT_INFO).
         name: node name.
         owed_ns: what took effect before this instant must be in what is read next; 0: nothing is owed.
+        clock: of the cell, which both are in, where that is another machine's; None: it is ours.
     """
 
     def __init__(
@@ -159,8 +160,9 @@ class NodeCore(Generic[S]):
         self._channel = channel
         self._page = readings
         self._event = readings.fileno()
+        self.clock = channel.clock
         names = [channel.name for channel in info.channels]
-        self._layout = Layout(info.node_class, self._page.channels, channels, bit, names)
+        self._layout = Layout(info.node_class, self._page.channels, channels, bit, names, channel.clock)
         self._snapshot: Any = SNAPSHOT[info.node_class]
         self._latest = self._page.latest
         self._subscribed = 0

@@ -294,7 +294,13 @@ class AxisVerbs(NodeVerbs[AxisSnapshot]):
     @verb
     async def synch(self, start_ns: int | None = None) -> int:
         """Send the external synch; return the instant at which the axes start [ns, CLOCK_MONOTONIC]."""
-        return int(await self._ask(Request.SEND_EXTERNAL_SYNCH, start_ns))
+        there_ns = None if start_ns is None else self._there(start_ns)
+        started_ns = int(await self._ask(Request.SEND_EXTERNAL_SYNCH, there_ns))
+        return started_ns if self.clock is None else self.clock.here(started_ns)
+
+    def _there(self, here_ns: int) -> int:
+        """Return an instant of this machine's clock in that of the cell."""
+        return here_ns if self.clock is None else self.clock.there(here_ns)
 
     @verb
     async def stop(self) -> None:

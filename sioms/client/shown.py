@@ -15,6 +15,10 @@ from _thread import allocate_lock
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from sioms.protocol.clock import Clock
+
     from .node_core import NodeCore
 
 MOST_DEVICES = 256
@@ -39,7 +43,8 @@ def join(node: NodeCore, device: int) -> None:
     """Let an open node of a driver process owe what has been acknowledged so far."""
     with _lock:
         _nodes.setdefault(device, []).append(node)
-        node.owed_ns = max(_last_ns.get(device, 0), _everywhere_ns)
+        everywhere_ns = _everywhere_ns if node.clock is None else node.clock.everywhere_ns
+        node.owed_ns = max(_last_ns.get(device, 0), everywhere_ns)
 
 
 def leave(node: NodeCore, device: int) -> None:
@@ -64,14 +69,23 @@ def acknowledged(device: int, as_of_ns: int) -> None:
                     node.owed_ns = as_of_ns
 
 
-def acknowledged_by_daemon(as_of_ns: int) -> None:
-    """Let all nodes show nothing that ends before an instant."""
+def acknowledged_by_daemon(as_of_ns: int, clock: Clock | None = None) -> None:
+    """Let all nodes that go by a clock, None for that of this machine, show nothing that ends before an instant."""
     global _everywhere_ns
     with _lock:
-        _everywhere_ns = max(_everywhere_ns, as_of_ns)
+        if clock is None:
+            _everywhere_ns = max(_everywhere_ns, as_of_ns)
+        else:
+            clock.everywhere_ns = max(clock.everywhere_ns, as_of_ns)
         for nodes in _nodes.values():
             for node in nodes:
-                node.owed_ns = max(node.owed_ns, as_of_ns)
+                if node.clock is clock:
+                    node.owed_ns = max(node.owed_ns, as_of_ns)
+
+
+def clock_acknowledged(clock: Clock) -> Callable[[int], None]:
+    """Return what a session with a cell of another clock tells of what has been acknowledged."""
+    return lambda as_of_ns: acknowledged_by_daemon(as_of_ns, clock)
 
 
 def paid(node: NodeCore, as_of_ns: int) -> None:

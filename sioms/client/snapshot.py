@@ -20,7 +20,11 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from sioms.protocol.clock import Clock, Utc
     from sioms.protocol.records import Column
+
+_INSTANT = "changed_ns"
+"""The column that is an instant by the clock of the cell."""
 
 
 class Layout:
@@ -32,9 +36,10 @@ class Layout:
         channels: which of them the node shows, in order.
         bit: for a node of one bit the bit of its port, else -1.
         names: of the channels that the node shows.
+        clock: of the cell, where that is another machine's; None: it is ours.
     """
 
-    __slots__ = ("bit", "block_channels", "channels", "columns", "count", "names", "node_class", "rows")
+    __slots__ = ("bit", "block_channels", "channels", "clock", "columns", "count", "names", "node_class", "rows")
 
     def __init__(
         self,
@@ -43,8 +48,10 @@ class Layout:
         channels: list[int],
         bit: int,
         names: Sequence[str] = (),
+        clock: Clock | None = None,
     ) -> None:
         self.names = names
+        self.clock = clock
         self.node_class = node_class
         self.block_channels = block_channels
         self.channels = channels
@@ -64,6 +71,8 @@ class Layout:
         """Return one column of all channels."""
         unpack, offset, pick = self.rows[name]
         values = unpack(raw, offset)
+        if name == _INSTANT and self.clock is not None:
+            values = tuple([value and self.clock.here(value) for value in values])
         return values if pick is None else tuple([values[i] for i in pick])
 
 
@@ -87,8 +96,33 @@ class Snapshot:
 
     @property
     def stamp_ns(self) -> int:
-        """Time the values hold for [ns, CLOCK_MONOTONIC]."""
+        """Time the values hold for [ns, CLOCK_MONOTONIC of this machine]."""
+        clock = self._layout.clock
+        return self.cell_stamp_ns if clock is None else clock.here(self.cell_stamp_ns)
+
+    @property
+    def cell_stamp_ns(self) -> int:
+        """The same by the clock of the cell's machine [ns, CLOCK_MONOTONIC there]."""
         return int(unpack_from("<Q", self._raw, 8)[0])
+
+    @property
+    def stamp_error_ns(self) -> int:
+        """How wrong ``stamp_ns`` is at most by what is known of both clocks [ns]; 0 of a cell on this machine."""
+        clock = self._layout.clock
+        return 0 if clock is None else clock.error_ns
+
+    @property
+    def utc(self) -> Utc:
+        """Time the values hold for by UTC, with its error and what keeps the clock of the cell's machine right."""
+        if self._layout.clock is not None:
+            return self._layout.clock.utc(self.cell_stamp_ns)
+        from sioms.protocol.clock import Clock
+
+        from .wall import wall
+
+        here = Clock()
+        here.wall = wall()
+        return here.utc(self.cell_stamp_ns)
 
     @property
     def tick(self) -> int:
@@ -146,6 +180,8 @@ class Snapshot:
 
 def _column(column: Column) -> property:
     name = column.name
+    if name == _INSTANT:
+        return property(lambda self: self._layout.row(self._raw, name), doc=f"Of each channel: {column.text} [ns].")
 
     def get(self: Snapshot) -> tuple[Any, ...]:
         unpack, offset, pick = self._layout.rows[name]

@@ -6,7 +6,7 @@ import errno
 import os
 from time import monotonic, monotonic_ns, sleep
 
-from sioms.protocol.socketpath import socket_path
+from sioms.protocol.socketpath import cell_address
 from sioms.protocol.stopfile import StopRequest, open_stop_request
 
 from .workcell import Workcell
@@ -20,7 +20,7 @@ def emergency_stop(why: str = "", path: str | None = None, name: str | None = No
 
     Args:
         why: for the log and for who asks why nothing moves.
-        path: the daemon's socket; None for $SIOMS_SOCKET or the usual places.
+        path: as of ``Workcell``; a gateway stops the cell without a daemon that answers, too.
         name: what this client calls itself.
 
     Returns:
@@ -29,8 +29,8 @@ def emergency_stop(why: str = "", path: str | None = None, name: str | None = No
     Raises:
         OSError: neither daemon nor drivers have taken the stop.
     """
-    path = path or socket_path()
-    request = open_stop_request(path)
+    path = path or cell_address()
+    request = None if "://" in path else open_stop_request(path)
     try:
         if request is None:
             with Workcell(path, name) as cell:

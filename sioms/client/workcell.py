@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import sys
 
-from sioms.protocol.socketpath import socket_path
+from sioms.protocol.socketpath import cell_address
 
 from .cell_verbs import MarkerVerbs, NodeEntry, WorkcellVerbs, is_part
-from .channel import CONNECT_S, ENOUGH_LOOK_S, Channel, connect
+from .channel import CONNECT_S, ENOUGH_LOOK_S, Channel, connect_channel
 from .faces import Blocking, BlockingWaiter, run
 from .node import NODE, Node
 
@@ -30,12 +30,13 @@ class Workcell(Blocking, WorkcellVerbs[Marker]):
     """A session with the daemon. Use it in a ``with`` block, or close it; the end of the process does.
 
     Args:
-        path: the daemon's socket; None for $SIOMS_SOCKET or the usual places.
+        path: the daemon's socket, or ``zmq://HOST:PORT`` of a gateway; None for $SIOMS_CELL, $SIOMS_SOCKET or the usual
+            places.
         name: what this client calls itself in messages and lists.
         enough: tells of a daemon that does not answer at once whether the session is not needed any more.
 
     Raises:
-        OSError: no daemon there, or of another protocol version.
+        OSError: no daemon there, or of another protocol version; a gateway that does not let one in.
 
     Concurrency: may be used by many threads.
     """
@@ -45,8 +46,8 @@ class Workcell(Blocking, WorkcellVerbs[Marker]):
     def __init__(
         self, path: str | None = None, name: str | None = None, *, enough: Callable[[], bool] | None = None
     ) -> None:
-        path = path or socket_path()
-        channel = Channel(connect(path, CONNECT_S if enough is None else ENOUGH_LOOK_S), "the daemon")
+        path = path or cell_address()
+        channel = connect_channel(path, CONNECT_S if enough is None else ENOUGH_LOOK_S)
         super().__init__(channel, BlockingWaiter(channel), path)
         title = os.path.basename(sys.argv[0]) if name is None and sys.argv and sys.argv[0] else name or ""
         run(self._greet(title, enough))

@@ -52,7 +52,7 @@ def secured(context: zmq.Context[zmq.Socket[bytes]], kind: int, pair: Pair) -> z
     sock.zap_domain = DOMAIN
     for option, value in (
         (zmq.MAXMSGSIZE, link.MAX_TO_GATEWAY), (zmq.HANDSHAKE_IVL, HANDSHAKE_MS), (zmq.LINGER, 200),
-        (zmq.SNDHWM, QUEUE), (zmq.RCVHWM, QUEUE), (zmq.ROUTER_MANDATORY, 1), (zmq.IPV6, 1),
+        (zmq.SNDHWM, QUEUE), (zmq.RCVHWM, QUEUE), (zmq.ROUTER_MANDATORY, 1),
     ):  # fmt: skip
         sock.setsockopt(option, value)
     return sock
@@ -271,6 +271,7 @@ def bind(sock: zmq.Socket[bytes], host: str, port: int) -> None:
         OSError: with a sentence.
     """
     place = f"[{host}]" if ":" in host else host
+    sock.setsockopt(zmq.IPV6, int(":" in host))
     try:
         sock.bind(f"tcp://{place}:{port}")
     except zmq.ZMQError as error:

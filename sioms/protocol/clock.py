@@ -122,9 +122,11 @@ class Clock:
 
     Attributes:
         wall: tells of the cell's wall clock; None: not known.
+        everywhere_ns: instant, in the cell's clock, before which nothing that its nodes show may end.
     """
 
     wall: Wall | None = None
+    everywhere_ns = 0
 
     @property
     def offset_ns(self) -> int:

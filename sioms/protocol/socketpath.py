@@ -4,6 +4,14 @@ import os
 
 SYSTEM_PATH = "/run/sioms/siomsd.sock"
 VARIABLE = "SIOMS_SOCKET"
+CELL = "SIOMS_CELL"
+
+
+def cell_address() -> str:
+    """Return where a client finds its workcell: $SIOMS_CELL, the path of a socket or the address of a gateway
+    (``zmq://HOST:PORT``), else ``socket_path``.
+    """
+    return os.environ.get(CELL) or socket_path()
 
 
 def socket_path() -> str:

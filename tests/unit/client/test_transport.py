@@ -63,6 +63,7 @@ class Link:
 
     keepalive_s = 0.0
     closed = False
+    clock = None
     acknowledged: Callable[[int], None]
 
     def __init__(self, readings: Memory) -> None:

@@ -1,0 +1,99 @@
+"""``sioms serve`` and ``sioms key``: the gateway, and who may come in by it."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import getpass
+import ipaddress
+import sys
+from typing import Any
+
+from sioms.client.keys import Folder
+from sioms.client.remote import SCHEME, place_of
+from sioms.protocol.socketpath import socket_path
+
+PLACE = "127.0.0.1:5770"
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add ``serve`` and ``key`` to the subcommands of ``sioms``."""
+    serve = subparsers.add_parser(
+        "serve",
+        help="let clients on other machines use the workcell",
+        description="A gateway: an ordinary client of the daemon that passes on what the holders of keys ask for, over "
+        "ZeroMQ with CURVE. It listens at PORT, and at the port after it for stops.",
+    )
+    serve.add_argument("--listen", metavar="HOST:PORT", default=PLACE, help=f"where; default {PLACE}, *:5770 for all")
+    serve.add_argument("--socket", metavar="PATH", default="", help="the daemon's socket")
+    key = subparsers.add_parser("key", help="make, allow, list and revoke the keys of remote clients")
+    verbs = key.add_subparsers(dest="verb", required=True, metavar="VERB")
+    new = verbs.add_parser("new", help="make a key of one's own")
+    new.add_argument("name", nargs="?", default="", help="default: the user's name")
+    allow = verbs.add_parser("allow", help="let the holder of a key in through the gateway of this user")
+    allow.add_argument("name", help="what messages and grants call it")
+    allow.add_argument("public", metavar="KEY", help="the public key, of `sioms key list` on the other machine")
+    allow.add_argument("--group", action="append", default=[], metavar="NAME", help="a group of grants; again for more")
+    trust = verbs.add_parser("trust", help="take a public key for that of a gateway")
+    trust.add_argument("address", help="zmq://HOST:PORT")
+    trust.add_argument("public", metavar="KEY", help="the public key, of `sioms key list` on that machine")
+    verbs.add_parser("list", help="list one's own public key, who may come in, and which gateways are trusted")
+    revoke = verbs.add_parser("revoke", help="let a key in no more, or forget a gateway; what it held halts")
+    revoke.add_argument("name", help="of a key, or HOST:PORT of a gateway")
+    for each in (serve, *verbs.choices.values()):
+        each.add_argument("--keys", metavar="FOLDER", default="", help="of keys; default $SIOMS_KEYS or the user's own")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out ``serve`` or ``key``."""
+    folder = Folder(args.keys)
+    if args.command == "serve":
+        _serve(args, folder)
+        return 0
+    match args.verb:
+        case "new":
+            pair = folder.new(args.name or getpass.getuser())
+            print(f"key of {pair.name}: {pair.public}")
+            print(f"at the gateway: sioms key allow {pair.name} '{pair.public}'", file=sys.stderr)
+        case "allow":
+            folder.allow(args.name, args.public, tuple(args.group))
+        case "trust":
+            host, port = place_of(args.address)
+            folder.trust(f"{host}:{port}", args.public)
+        case "revoke":
+            if not folder.distrust(args.name.removeprefix(SCHEME)):
+                folder.revoke(args.name)
+        case "list":
+            _list(folder)
+    return 0
+
+
+def _list(folder: Folder) -> None:
+    own = folder.own()
+    print(f"own      {own.name} {own.public}" if own else "own      none; make one with: sioms key new")
+    for one in folder.allowed():
+        print(f"allowed  {one.name} {one.public} {','.join(one.groups)}".rstrip())
+    for place, public in folder.trusted().items():
+        print(f"trusted  {place} {public}")
+
+
+def _serve(args: argparse.Namespace, folder: Folder) -> None:
+    host, colon, port = args.listen.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65535:
+        raise OSError(errno.EINVAL, f"listen on {args.listen}: want HOST:PORT, as {PLACE} or *:5770")
+    if not folder.allowed():
+        hint = f"nobody may come in by the keys in {folder.path}; run: sioms key allow NAME KEY"
+        if not _is_loopback(host):
+            raise OSError(errno.EACCES, f"listen on {args.listen}: {hint}")
+        print(f"sioms serve: {hint}", file=sys.stderr)
+    from .serve import serve
+
+    serve(args.socket or socket_path(), host, int(port), folder)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
