@@ -14,14 +14,13 @@ Pure; concurrency: that of its bank.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-REST = 0.01
-"""Part of the velocity limit below which an axis may be at rest."""
-BACK = 0.1
-"""Part of the force limit with which an axis that is thrown back may be braked in any case."""
+from .axis_step import REST
+
 REST_NS = 50_000_000
 """So long it must be so [ns]."""
 
@@ -69,20 +68,9 @@ class ForceEnds:
         self._direction[axes], self.asked[axes] = 0.0, math.nan
         self.any = bool(self._direction.any())
 
-    def bound(
-        self,
-        output: NDArray[np.float64],
-        velocity: NDArray[np.float64],
-        velocity_limit: NDArray[np.float64],
-        force_limit: NDArray[np.float64],
-    ) -> None:
-        """Bound the output in place; all (n,)."""
-        direction = self._direction
-        thrown_back = velocity * direction < -REST * velocity_limit
-        most = np.where(thrown_back, np.maximum(self._most, BACK * force_limit), self._most)
-        np.greater(output * direction, self._most, out=self._presses)
-        self._presses &= direction != 0.0
-        np.copyto(output, np.minimum(output * direction, most) * direction, where=self._presses)
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return what the law bounds outputs by, by the names of its fields."""
+        return {"asked": self.asked, "direction": self._direction, "most": self._most, "presses": self._presses}
 
     def look(self, velocity: NDArray[np.float64], limit: NDArray[np.float64], now_ns: int) -> NDArray[np.int64]:
         """Lift the bounds of axes at rest; return the axes whose set-point has to yield.

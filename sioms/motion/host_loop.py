@@ -14,14 +14,17 @@ from numpy.typing import NDArray
 
 from sioms.protocol.flags import AxisStatus
 
+from . import axis_step
+from .axis_step import FORCE, HOLD, STOP
 from .bank import FAULT, Axes, Bank
 from .guard import LimitGuard
 from .homing import HomingRuns
 from .host_watch import HostWatch
 from .law import ControlLaw
 from .queue import LOST
-from .sequencer import FORCE, HOLD, STOP, Sequencer
+from .sequencer import Sequencer
 from .settings import SWITCH_MINUS, SWITCH_PLUS, AxisSettings
+from .store import PlanStore
 from .types import EventKind, Keeper, MarkerPort
 
 HOMING, HOMED = int(AxisStatus.HOMING), int(AxisStatus.HOMED)
@@ -57,25 +60,32 @@ class AxisBank(Bank):
     ) -> None:
         super().__init__(settings, markers, capacity, passing=True)
         n = self.n
-        self._law = ControlLaw(settings, tick_s, [self.rows[name] for name in ("k", "kz", "kp", "kb")])
+        store = PlanStore(n)
+        queue, rows, limits = self._queue, self.rows, self._queue.limits
+        self._law = ControlLaw(
+            settings, tick_s, raw=self._raw, offset=self._offset, position=self._position, velocity=self._velocity,
+            present=store.present, segment_ns=store.segment_ns,
+            minimum=limits.minimum, maximum=limits.maximum, speed_most=limits.velocity, deceleration=limits.acceleration,
+            k=rows["k"], kz=rows["kz"], kp=rows["kp"], kb=rows["kb"], desired=self._desired,
+            desired_velocity=self._desired_velocity, following=self._following, force=self._force,
+            status=self._status, buffered=self._buffered, latched=queue.latched, waiting=queue.waiting,
+            has_head=queue.has_head,
+        )  # fmt: skip
+        self.loop = self._law.loop
+        self.loop.late_ns = self._late_ns = int(late_max_s * 1e9)
         self.stepper = self._law.stepper
         self._sequencer = Sequencer(
-            settings, self._queue, self._law, self._arrivals, self._position, self._velocity, self._in_motion,
+            settings, self._queue, store, self._law, self._arrivals, self._position, self._velocity, self._in_motion,
             tick_s,
         )  # fmt: skip
         self._guard = LimitGuard(self._queue, self._sequencer)
         self._homing = HomingRuns(settings, self._queue, self)
-        self._motion_watch = HostWatch(settings, tick_s, self._law.velocity_limit)
-        self._limp = np.zeros(n, dtype=bool)
+        self._motion_watch = HostWatch(settings, tick_s, self._law)
+        arrays = self._law.arrays
+        self._limp, self._actuator, self._last_raw = self._law.limp, self._law.actuator, arrays["last_raw"]
+        self._measured, self._switches, self._error_max = arrays["measured"], arrays["switches"], arrays["error_max"]
         self._any_limp = False
-        self._last_raw = np.zeros(n)
-        self._actuator, self._scratch = np.zeros(n), np.zeros(n)
-        self._flag = np.zeros(n, dtype=bool)
-        self._filter = np.array([s.velocity_filter_s for s in settings])
-        watched = [np.inf if s.following_error_max is None else s.following_error_max for s in settings]
-        self._error_max = np.array(watched, dtype=np.float64)
         self._tick_s = tick_s
-        self._late_ns = int(late_max_s * 1e9)
 
     def plan_ahead(self, count: int = 32) -> int:
         """Plan up to ``count`` next commands (10 to 20 us each), in the slack between ticks.
@@ -211,27 +221,71 @@ class AxisBank(Bank):
             (n,) force or torque of servos, raw output position of steppers (see ``stepper``). The
             array is reused by the next tick.
         """
-        last_ns = self._last_ns if self._seen else now_ns
+        loop, first = self.loop, not self._seen
+        last_ns = now_ns if first else self._last_ns
         self._last_ns = now_ns
-        dt = max((now_ns - last_ns) * 1e-9, 0.1 * self._tick_s) if self._seen else self._tick_s
         if now_ns - last_ns > self._late_ns:
             self._stop_late(last_ns, now_ns)
-        self._measure(position, dt, now_ns)
-        self._sequencer.begin_tick(dt)
+        self._measured[:] = position
+        loop.has_switches = switches is not None
+        if switches is not None:
+            self._switches[:] = switches
+        found = axis_step.take(loop, now_ns)
+        if found == axis_step.NOT_FINITE:
+            self._refuse_measurement(now_ns)
+            found = axis_step.take(loop, now_ns)
+        if first:
+            self._first_measurement(position, now_ns)
+        elif found or loop.any_odd or now_ns >= loop.due_ns:
+            self._look(now_ns)
+        else:
+            axis_step.looked_at(loop, now_ns)
+        loop.last_ns = last_ns if not first else now_ns - round(self._tick_s * 1e9)
+        axis_step.begin_tick(loop, now_ns)
+        self._sequencer.begin_tick(loop.dt)
         self._settle(now_ns)
         self._sequencer.release_held(now_ns)
         if self._queue.waits_for_markers:
             self._poll_markers(now_ns)
-        sequencer = self._sequencer
-        sequencer.advance(now_ns)
-        sequencer.store.evaluate(now_ns, self._desired, self._desired_velocity)
-        if sequencer.any_guard and self._guard.keep(self._desired, self._desired_velocity, last_ns, now_ns):
-            sequencer.store.evaluate(now_ns, self._desired, self._desired_velocity)
-        self._control(dt)
-        self._watch(switches, now_ns)
-        if self.keeper is not None:
-            self._keep(self.keeper, now_ns)
+        self._sequencer.advance(now_ns)
+        loop.any_guard = self._sequencer.any_guard
+        self._command(axis_step.set_points(loop, now_ns), last_ns, now_ns)
         return self._actuator
+
+    def is_quiet(self) -> bool:
+        """Tell whether the next ticks may be ``axis_step.quiet_tick``, as long as that finds nothing.
+
+        So it is where no command waits for a tick, no marker is waited for, no axis is homing or has left force mode.
+        """
+        sequencer, loop = self._sequencer, self.loop
+        if (
+            not self._seen or self._written or self._queue.waits_for_markers or self._homing.active
+            or self._law.force_ends.any or sequencer.has_held or self.keeper is not None
+        ):  # fmt: skip
+            return False
+        loop.any_guard, loop.next_ns, loop.last_ns = sequencer.any_guard, sequencer.store.next_ns, self._last_ns
+        return True
+
+    def after_quiet(self, found: int) -> None:
+        """Go on behind quiet ticks, the last of which returned ``found``; what it has not done is done now."""
+        loop = self.loop
+        self._last_ns = loop.last_ns
+        self._sequencer.begin_tick(loop.dt)
+        if found == axis_step.AT_LIMIT:
+            self._command(found, loop.previous_ns, loop.last_ns)
+        elif found in (axis_step.FOLLOWS_BADLY, axis_step.ON_SWITCH, axis_step.FOLLOWS_BADLY | axis_step.ON_SWITCH):
+            self._judge(found, loop.last_ns)
+
+    def _command(self, found: int, last_ns: int, now_ns: int) -> None:
+        """Let the laws follow the set-points of a tick."""
+        loop = self.loop
+        if found and self._guard.keep(self._desired, self._desired_velocity, last_ns, now_ns):
+            loop.any_guard = self._sequencer.any_guard
+            axis_step.set_points(loop, now_ns)
+        axis_step.control(loop)
+        if self._law.force_ends.any:
+            self._yield()
+        self._judge(axis_step.follow(loop), now_ns)
 
     def _stop_late(self, last_ns: int, now_ns: int) -> None:
         """Stop what moved, from the state of the last tick: a late tick never catches up."""
@@ -249,34 +303,9 @@ class AxisBank(Bank):
         self._queue.latch_fault(moving, text, now_ns, errno.ETIME)
         sequencer.refresh(moving)
 
-    def _measure(self, position: NDArray[np.float64], dt: float, now_ns: int) -> None:
-        raw, scratch, velocity, told = self._raw, self._scratch, self._velocity, position
-        if not np.isfinite(position.sum()):
-            position = self._refuse_measurement(position, now_ns)
-        raw[:] = position
-        np.add(raw, self._offset, out=self._position)
-        if not self._seen:
-            self._first_measurement(told, now_ns)
-        np.subtract(raw, self._last_raw, out=scratch)
-        if self._motion_watch.is_due(now_ns, scratch):
-            self._look(now_ns)
-        scratch /= dt
-        scratch -= velocity
-        scratch *= dt / (self._filter + dt)
-        velocity += scratch
-        self._last_raw[:] = raw
-
     def _look(self, now_ns: int) -> None:
         """Put axes in fault that move as nobody has told them."""
-        found = self._motion_watch.look(
-            now_ns,
-            self._raw,
-            self._last_raw,
-            self._desired_velocity,
-            self._sequencer.kind == HOLD,
-            self._limp,
-        )
-        for finding in found:
+        for finding in self._motion_watch.look(now_ns):
             if not self._queue.latched[finding.axis] & (LOST if finding.lost else FAULT):
                 (self.lose_place if finding.lost else self.fault)([finding.axis], finding.text, now_ns)
 
@@ -290,14 +319,14 @@ class AxisBank(Bank):
             self._queue.set_homed(np.flatnonzero(homed), True, now_ns)
         self._law.slewed[:] = self._position
         self._law.anchor[:] = self._offset
+        self._motion_watch.begin(now_ns)
         self._sequencer.hold(np.arange(self.n), self._position, now_ns)
 
-    def _refuse_measurement(self, position: NDArray[np.float64], now_ns: int) -> NDArray[np.float64]:
-        bad = np.flatnonzero(~np.isfinite(position))
+    def _refuse_measurement(self, now_ns: int) -> None:
+        """Go on with what was read before where a reading is no number."""
+        bad = np.flatnonzero(~np.isfinite(self._measured))
         self.fault(bad, "the measured position is not a finite number", now_ns)
-        good = position.copy()
-        good[bad] = self._last_raw[bad]
-        return good
+        self._measured[bad] = self._last_raw[bad]
 
     def _poll_markers(self, now_ns: int) -> None:
         released, broken = self._queue.poll_markers()
@@ -307,26 +336,6 @@ class AxisBank(Bank):
         for axis, number in broken:
             self._abandon(np.array([axis]), now_ns, errno.EPIPE, f"marker {number} was freed while waited for")
 
-    def _control(self, dt: float) -> None:
-        law, desired = self._law, self._desired
-        rows = self._sequencer.kind == FORCE if self._sequencer.any_force else None
-        law.step(desired, self._desired_velocity, self._position, self._velocity, dt, rows)
-        if rows is not None:
-            self._follow_actual(rows)
-        if law.force_ends.any:
-            self._yield()
-        if self._any_limp:
-            law.relax(self._limp)
-            self._follow_actual(self._limp)
-        self._actuator[:] = law.output
-        self._force[:] = law.output
-        if not law.all_servo:
-            s = law.stepper_rows
-            self._actuator[s] = law.slewed[s] - law.anchor[s]
-            self._force[s] = 0.0
-            desired[s] = law.slewed[s]
-        np.subtract(desired, self._position, out=self._following)
-
     def _yield(self) -> None:
         """Hold where they are the axes that would have to press harder than they were told to reach their set-point."""
         law = self._law
@@ -334,33 +343,24 @@ class AxisBank(Bank):
         if axes.size:
             law.give_way(axes)
             self._sequencer.hold(axes, self._position[axes], self._last_ns)
-            self._sequencer.store.evaluate(self._last_ns, self._desired, self._desired_velocity)
-
-    def _follow_actual(self, rows: NDArray[np.bool_]) -> None:
-        """Where no position is commanded, the commanded position is the actual one."""
-        self._desired[rows] = self._position[rows]
-        self._desired_velocity[rows] = self._velocity[rows]
+            self._desired[axes], self._desired_velocity[axes] = self._position[axes], 0.0
 
     # -- watching -----------------------------------------------------------------------------
 
-    def _watch(self, switches: NDArray[np.int64] | None, now_ns: int) -> None:
-        """Following error, saturation, switches: status bits and what they cause."""
-        np.abs(self._following, out=self._scratch)
-        np.greater(self._scratch, self._error_max, out=self._flag)
-        if self._flag.any():
-            self._lose(np.flatnonzero(self._flag & ~self._limp), now_ns)
-        if switches is not None:
-            self._keep_switches(switches, now_ns)
+    def _judge(self, found: int, now_ns: int) -> None:
+        """Following errors and switches, and what they cause; then what is shown."""
+        loop = self.loop
+        if found & axis_step.FOLLOWS_BADLY:
+            self._lose(np.flatnonzero((np.abs(self._following) > self._error_max) & ~self._limp), now_ns)
+        if found & axis_step.ON_SWITCH:
+            self._keep_switches(self._switches, now_ns)
         if self._homing.active:
-            for axis, reason in self._homing.tick(switches, now_ns):
+            for axis, reason in self._homing.tick(self._switches if loop.has_switches else None, now_ns):
                 self.fault([axis], reason, now_ns)
             self._sequencer.refresh(np.arange(self.n))
-        status = self._status
-        np.multiply(self._law.saturated, int(AxisStatus.SATURATED), out=status)
-        status |= self._sequencer.status
-        if switches is not None:
-            status |= (switches & (SWITCH_MINUS | SWITCH_PLUS)) * int(AxisStatus.SWITCH_MINUS)
-        self._queue.count(self._buffered)
+        axis_step.show(loop)
+        if self.keeper is not None:
+            self._keep(self.keeper, now_ns)
 
     def _lose(self, axes: Axes, now_ns: int) -> None:
         """Fault axes whose following error is too great; a stepper that does so has stalled."""
@@ -375,8 +375,6 @@ class AxisBank(Bank):
 
     def _keep_switches(self, switches: NDArray[np.int64], now_ns: int) -> None:
         """Stop axes that run onto an end switch; leaving it is free."""
-        if not (switches & (SWITCH_MINUS | SWITCH_PLUS)).any():
-            return
         v, kind = self._desired_velocity, self._sequencer.kind
         hit = ((switches & SWITCH_MINUS) != 0) & (v < 0) | ((switches & SWITCH_PLUS) != 0) & (v > 0)
         hit &= (kind != STOP) & (kind != HOLD) & ((self._queue.latched & HOMING) == 0)

@@ -23,11 +23,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from .axis_step import AWAY, HOLD, LOOK_NS, TOO_FAST, looked_at, watch
+from .law import ControlLaw
 from .settings import AxisSettings
 from .watch import (
     GAP_NS,
-    JITTER_S,
-    SETTLE_NS,
     Finding,
     away_text,
     fast_text,
@@ -39,10 +39,6 @@ from .watch import (
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-LOOK_NS = 10_000_000
-AGAINST = 3.0
-"""Tolerances by which an axis may run against the commanded velocity: it follows late when that changes its sign."""
-
 
 class HostWatch:
     """Watches the axes of a bank.
@@ -50,81 +46,73 @@ class HostWatch:
     Args:
         settings: of the axes.
         tick_s: nominal period [s].
-        velocity: velocity limits in force (n,), the bank's own array [unit/s].
+        law: whose loop it watches.
     """
 
-    def __init__(self, settings: Sequence[AxisSettings], tick_s: float, velocity: Floats) -> None:
-        n = len(settings)
-        self._settings, self._velocity = tuple(settings), velocity
-        self._factor = np.array([1.0 + one.watch.speed_margin for one in settings])
-        self._tolerance = np.array([tolerance_of(one) for one in settings])
-        self._watched = np.array([one.watch.uncommanded for one in settings], dtype=bool)
+    def __init__(self, settings: Sequence[AxisSettings], tick_s: float, law: ControlLaw) -> None:
+        self._settings, self._velocity, self._limp, self._kind = tuple(settings), law.velocity_limit, law.limp, law.kind
+        loop = self._loop = law.loop
+        arrays = law.arrays
+        arrays["factor"][:] = [1.0 + one.watch.speed_margin for one in settings]
+        arrays["tolerance"][:] = [tolerance_of(one) for one in settings]
+        arrays["watched"][:] = [one.watch.uncommanded for one in settings]
+        self._factor, self._tolerance, self._watched = arrays["factor"], arrays["tolerance"], arrays["watched"]
+        self._raw, self._last, self._way, self._odd = arrays["raw"], arrays["last_raw"], arrays["way"], arrays["odd"]
+        self._since_ns, self._place, self._reference = arrays["since_ns"], arrays["place"], arrays["reference"]
+        self._sums = [arrays[name] for name in ("excess", "against", "fast", "off", "odd")]
+        self._commanded = arrays["desired_velocity"]
         reach = self._factor * np.array([one.velocity_max for one in settings]) * tick_s + self._tolerance
-        self._bound = float(np.min(reach, initial=np.inf)) ** 2
-        """No step can be too wide where their squares make less than this."""
+        loop.bound = float(np.min(reach, initial=np.inf)) ** 2  # no step can be too wide where their squares make less
         self._doubted: dict[int, tuple[float, int, float]] = {}
         """Where an axis was before a step that it cannot have made, when [ns], and how far it can have come."""
-        self._place, self._reference = np.zeros(n), np.zeros(n)
-        self._excess, self._against = np.zeros(n), np.zeros(n)
-        self._fast, self._off = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
-        self._since_ns = np.zeros(n, dtype=np.int64)
-        self._before_ns = self._last_ns = self._looked_ns = self._earlier_ns = self._due_ns = 0
 
-    def is_due(self, now_ns: int, step: Floats) -> bool:
-        """Tell whether the readings of a tick have to be judged: it is time, or a step is wide.
+    def begin(self, now_ns: int) -> None:
+        """Take the first readings."""
+        loop = self._loop
+        self._place[:] = self._reference[:] = self._raw
+        self._since_ns[:] = now_ns
+        loop.before_ns = loop.watched_ns = loop.looked_ns = loop.earlier_ns = loop.due_ns = now_ns
 
-        Args:
-            now_ns: time of the readings [ns].
-            step: how far they are from those of the last tick (n,).
-        """
-        if now_ns >= self._due_ns or self._doubted or step.dot(step) > self._bound:
-            return True
-        self._before_ns, self._last_ns = self._last_ns, now_ns
-        return False
-
-    def look(
-        self, now_ns: int, raw: Floats, last: Floats, commanded: Floats, holds: Flags, limp: Flags
-    ) -> list[Finding]:
+    def look(self, now_ns: int) -> list[Finding]:
         """Judge the readings of a tick.
 
         Args:
             now_ns: time of the readings [ns].
-            raw: raw positions (n,).
-            last: those of the last tick.
-            commanded: velocities that were commanded in the last tick [unit/s].
-            holds: axes that are to hold.
-            limp: axes that the host has let go; they may be moved.
         """
-        last_ns = self._last_ns
-        if not last_ns:
-            self._place[:] = self._reference[:] = raw
-            self._since_ns[:] = now_ns
-            self._before_ns = self._last_ns = self._looked_ns = self._earlier_ns = now_ns
-            self._due_ns = now_ns + LOOK_NS
-            return []
-        found = self._steps(now_ns, last_ns, raw, last, holds & ~limp & self._watched)
-        if now_ns >= self._due_ns and not self._doubted:
-            self._due_ns = now_ns + LOOK_NS
-            found += self._motions(now_ns, last_ns, raw, commanded, holds, limp)
+        loop = self._loop
+        found = self._steps(now_ns, loop.watched_ns)
+        dt = (now_ns - loop.looked_ns) * 1e-9
+        if now_ns >= loop.due_ns and not self._doubted:
+            watch(loop, now_ns)
+        if loop.any_odd:
+            loop.any_odd = 0
+            found += [
+                self._told(axis, self._way[axis] / (dt or LOOK_NS * 1e-9))
+                for axis in np.flatnonzero(self._odd).tolist()
+            ]
         for finding in found:
-            self._forget(finding.axis, now_ns, raw)
-        self._before_ns, self._last_ns = last_ns, now_ns
+            self._forget(finding.axis, now_ns)
+        loop.doubted = len(self._doubted)
+        looked_at(loop, now_ns)
         return found
 
-    def _forget(self, axis: int, now_ns: int, raw: Floats) -> None:
+    def _forget(self, axis: int, now_ns: int) -> None:
         """Judge an axis by what comes from now on: what it did has been told."""
-        self._place[axis] = self._reference[axis] = raw[axis]
-        self._since_ns[axis], self._excess[axis], self._against[axis] = now_ns, 0.0, 0.0
-        self._fast[axis] = self._off[axis] = 0
+        self._place[axis] = self._reference[axis] = self._raw[axis]
+        self._since_ns[axis] = now_ns
+        for numbers in self._sums:
+            numbers[axis] = 0
 
     # -- steps --------------------------------------------------------------------------------
 
-    def _steps(self, now_ns: int, last_ns: int, raw: Floats, last: Floats, held: Flags) -> list[Finding]:
+    def _steps(self, now_ns: int, last_ns: int) -> list[Finding]:
         """Doubt steps that are too wide, and say in the next tick what they were."""
+        raw, last = self._raw, self._last
         found, fastest = [], self._factor * self._velocity
         # a reading may be as old as the last tick: what the device counts is then what it was told before
-        reach = fastest * (now_ns - self._before_ns) * 1e-9 + self._tolerance
+        reach = fastest * (now_ns - self._loop.before_ns) * 1e-9 + self._tolerance
         if now_ns - last_ns > GAP_NS:  # the readings were lost: what was held must read as before
+            held = (self._kind == HOLD) & ~self._limp & self._watched
             reach[held] = self._tolerance[held]
         wide = np.abs(raw - last) > reach
         for axis, (place, then_ns, most) in list(self._doubted.items()):
@@ -144,40 +132,12 @@ class HostWatch:
 
     # -- motions ------------------------------------------------------------------------------
 
-    def _motions(
-        self, now_ns: int, last_ns: int, raw: Floats, commanded: Floats, holds: Flags, limp: Flags
-    ) -> list[Finding]:
-        """Look at what has added up since the last look."""
-        # a reading may be as old as the tick before
-        dt, longest = (now_ns - self._looked_ns) * 1e-9, (now_ns - self._earlier_ns) * 1e-9
-        self._looked_ns, self._earlier_ns = now_ns, last_ns
-        way = raw - self._place
-        self._place[:] = raw
-        fastest = self._factor * self._velocity
-        beyond = np.abs(way) - fastest * longest
-        beyond[limp] = 0.0
-        self._excess = np.maximum(0.0, self._excess + beyond)
-        self._fast = np.where(beyond > 0.0, self._fast + 1, 0)
-        too_fast = (self._fast > 1) & (self._excess > JITTER_S * fastest)
-        # an axis that settles, or is let go, may be anywhere
-        self._since_ns[~(holds & ~limp & self._watched)] = now_ns
-        settles = now_ns - self._since_ns <= SETTLE_NS
-        self._reference[settles] = raw[settles]
-        self._off = np.where(np.abs(raw - self._reference) > self._tolerance, self._off + 1, 0)
-        along = way * np.sign(commanded)
-        self._against = np.where(holds | limp | (along >= 0.0), 0.0, self._against - along)
-        away = self._against > AGAINST * self._tolerance
-        odd = too_fast | (self._off > 1) | away
-        return [
-            self._told(axis, way[axis] / dt, raw, commanded, too_fast, away) for axis in np.flatnonzero(odd).tolist()
-        ]
-
-    def _told(self, axis: int, speed: float, raw: Floats, commanded: Floats, too_fast: Flags, away: Flags) -> Finding:
-        one = self._settings[axis]
-        if too_fast[axis]:
+    def _told(self, axis: int, speed: float) -> Finding:
+        one, odd = self._settings[axis], int(self._odd[axis])
+        if odd & TOO_FAST:
             text = fast_text(one, speed, float(self._velocity[axis]))
-        elif away[axis]:
-            text = away_text(one, speed, float(commanded[axis]))
+        elif odd & AWAY:
+            text = away_text(one, speed, float(self._commanded[axis]))
         else:
-            text = uncommanded_text(one, float(self._reference[axis]), float(raw[axis]), speed)
+            text = uncommanded_text(one, float(self._reference[axis]), float(self._raw[axis]), speed)
         return Finding(axis, text, lost=False)

@@ -90,6 +90,7 @@ class CommandQueue:
         self.latched = np.zeros(self.n, dtype=np.int64)
         self.home_required = np.array([s.homing is not None and s.homing.required for s in settings], dtype=bool)
         self._buffers = CommandBuffers(self.n, capacity)
+        self.waiting = self._buffers.count
         self._markers = markers
         self._validator = Validator(settings, self.limits, markers, passing)
         self.in_force = (self.limits.velocity.copy(), self.limits.acceleration.copy())

@@ -11,8 +11,6 @@ from __future__ import annotations
 import errno
 import math
 from collections.abc import Sequence
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +18,7 @@ from sioms.protocol.flags import AxisStatus
 
 from . import modes
 from .arrival import Approach, Arrivals, plan_point
+from .axis_step import BRAKE, FORCE, HOLD, POSITION, RATE, STOP
 from .commands import Command, is_point_move
 from .law import ControlLaw
 from .profile import Bounds, InfeasibleError, Plan, Planner, State
@@ -38,16 +37,6 @@ instants.
 """
 SPARE_SHARE, BEGIN_S = 0.05, 50e-6
 """Share of the period, and what beginning a command takes of it [s]: how many may follow short ones on axes at rest."""
-
-# What the running plan of an axis is. Plain integers: they live in arrays.
-HOLD: Final = 0
-POSITION: Final = 1
-RATE: Final = 2
-"""Velocity, acceleration or jerk command."""
-FORCE: Final = 3
-BRAKE: Final = 4
-STOP: Final = 5
-"""A brake that was asked for or forced by a limit."""
 
 _KIND_STATUS = np.array(
     [
@@ -71,6 +60,7 @@ class Sequencer:
     Args:
         settings: one per axis.
         queue: the waiting commands.
+        store: of the plans.
         law: where gains, offset and force limit of a command are put in force.
         arrivals: how point moves end.
         position, velocity: measured, (n,), kept up to date by the bank; axes in force mode begin
@@ -87,6 +77,7 @@ class Sequencer:
         self,
         settings: Sequence[AxisSettings],
         queue: CommandQueue,
+        store: PlanStore,
         law: ControlLaw,
         arrivals: Arrivals,
         position: Floats,
@@ -95,11 +86,9 @@ class Sequencer:
         tick_s: float,
     ) -> None:
         n = len(settings)
-        self.store = PlanStore(n)
-        self.kind = np.zeros(n, dtype=np.int64)
-        self.guard = np.zeros(n, dtype=bool)
+        self.store = store
+        self.kind, self.guard, self.status = law.kind, law.guard, law.event_status
         self.outcome = np.zeros(n, dtype=np.int64)
-        self.status = np.zeros(n, dtype=np.int64)
         self._velocity_limit, self._acceleration_limit = queue.in_force
         self.any_force = False
         self.any_guard = False
@@ -123,7 +112,7 @@ class Sequencer:
         self._ready = np.zeros(n, dtype=bool)
         self._todo: dict[int, None] = {}
         self._tick_s = tick_s
-        self._begun = np.zeros(n, dtype=np.int64)
+        self._begun = law.begun
         """Commands begun after short ones since the last tick began."""
         self._pieces = 2 * PIECES
         self._spare = self._spare_a_tick = max(2, int(SPARE_SHARE * tick_s / BEGIN_S))
@@ -153,6 +142,11 @@ class Sequencer:
                 return
         self.store.cut(axes, now_ns)
         self.advance(now_ns)  # all of these plans end now, and what follows is what refreshes
+
+    @property
+    def has_held(self) -> bool:
+        """Tell whether commands wait for the next tick."""
+        return bool(self._held)
 
     def begin_tick(self, dt: float) -> None:
         """A tick begins, dt after the last [s]: further commands may begin."""
@@ -467,7 +461,6 @@ class Sequencer:
         """Plan up to ``count`` heads whose starting state is known; return how many axes were looked at."""
         done = 0
         queue, todo, store = self._queue, self._todo, self.store
-        store.settle_order()
         while todo and done < count:
             axis = next(iter(todo))
             del todo[axis]

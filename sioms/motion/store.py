@@ -1,4 +1,4 @@
-"""Plans of all axes as arrays, evaluated at one instant by one vectorised Horner scheme.
+"""Plans of all axes as arrays.
 
 Every axis has two rows: the plan that runs and the one made ahead. Starting a plan made ahead
 flips the row and copies nothing. Instants are integer nanoseconds plus a fraction in [0, 1) that
@@ -28,7 +28,7 @@ class PlanStore:
 
     Arrays (n,): ``start_ns``, ``start_fraction`` begin of the running plan; ``segment_ns`` and
     ``end_ns`` begin and end of its present segment; ``cut_ns`` where the plan is made to end. ``final`` (2n, 3),
-    ``duration`` (2n,) belong to rows; ``row`` (n,) is the running row of an axis, ``row ^ 1`` the other.
+    ``duration`` (2n,) belong to rows; ``present`` (6, n) are the coefficients of the present segments; ``row`` (n,) is the running row of an axis, ``row ^ 1`` the other.
     """
 
     def __init__(self, n: int) -> None:
@@ -45,10 +45,7 @@ class PlanStore:
         self._count = np.ones(2 * n, dtype=np.int64)
         self._ends = np.full((2 * n, MAX_SEGMENTS), np.inf)
         self._coefficients = np.zeros((2 * n, MAX_SEGMENTS, 6))
-        self._present = np.zeros((6, n))
-        self._order = 3
-        self._dt = np.zeros(n)
-        self._integer = np.zeros(n, dtype=np.int64)
+        self.present = np.zeros((6, n))
 
     def put(self, row: int, plan: Plan) -> None:
         """Write a plan into a row."""
@@ -108,7 +105,7 @@ class PlanStore:
         for rows in (self.row[axes], self.row[axes] ^ 1):
             self._coefficients[rows, :, 0] += by
             self.final[rows, 0] += by
-        self._present[0, axes] += by
+        self.present[0, axes] += by
 
     def advance(self, axes: Axes) -> Axes:
         """Go to the next segment of axes whose segment ended; return those whose plan ended."""
@@ -149,7 +146,7 @@ class PlanStore:
         """Do what _end_here() does for one axis."""
         row, cut_ns = self.row[axis], int(self.cut_ns[axis])
         t = (cut_ns - int(self.segment_ns[axis])) * 1e-9
-        self.final[row] = _evaluate(t, *self._present[:, axis].tolist())
+        self.final[row] = _evaluate(t, *self.present[:, axis].tolist())
         self.start_ns[axis] = cut_ns
         self.start_fraction[axis] = 0.0
         self.duration[row] = 0.0
@@ -158,9 +155,7 @@ class PlanStore:
         """Do what _load() does for one axis."""
         row, segment = self.row[axis], self._segment[axis]
         present = self._coefficients[row, segment]
-        self._present[:, axis] = present
-        if self._order == 3 and (present[4] or present[5]):
-            self._order = 5
+        self.present[:, axis] = present
         end = float(self._ends[row, segment]) * 1e9 + float(self.start_fraction[axis])
         end_ns = NEVER_NS if end >= NEVER_NS else min(int(self.start_ns[axis]) + math.ceil(end), NEVER_NS)
         end_ns = min(end_ns, int(self.cut_ns[axis]))
@@ -174,9 +169,7 @@ class PlanStore:
             return
         rows, segment = self.row[axes], self._segment[axes]
         present = self._coefficients[rows, segment]
-        self._present[:, axes] = present.T
-        if self._order == 3 and present[:, 4:].any():
-            self._order = 5
+        self.present[:, axes] = present.T
         end = np.minimum(self._ends[rows, segment] * 1e9 + self.start_fraction[axes], float(NEVER_NS))
         # The fraction decides nothing here: it is below a nanosecond, and carried by finish().
         end_ns = np.minimum(self.start_ns[axes] + np.ceil(end).astype(np.int64), NEVER_NS)
@@ -205,30 +198,7 @@ class PlanStore:
     def state(self, axes: Axes, now_ns: int | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return position, velocity, acceleration (m, 3) of the present segments at now."""
         t = (now_ns - self.segment_ns[axes]) * 1e-9
-        return np.array(_evaluate(t, *self._present[:, axes])).T
-
-    def evaluate(self, now_ns: int, position: NDArray[np.float64], velocity: NDArray[np.float64]) -> None:
-        """Write the set-points of all axes at now into position and velocity (n,).
-
-        Horner with the derivative carried along; quintic terms only while some axis has them.
-        """
-        t, c = self._dt, self._present
-        np.subtract(now_ns, self.segment_ns, out=self._integer)
-        np.multiply(self._integer, 1e-9, out=t)
-        order = self._order
-        np.multiply(c[order], t, out=position)
-        position += c[order - 1]
-        velocity[:] = c[order]
-        for i in range(order - 2, -1, -1):
-            velocity *= t
-            velocity += position
-            position *= t
-            position += c[i]
-
-    def settle_order(self) -> None:
-        """Drop the quintic terms again when no axis has any (called between ticks)."""
-        if self._order == 5 and not self._present[4:].any():
-            self._order = 3
+        return np.array(_evaluate(t, *self.present[:, axes])).T
 
 
 def _evaluate(
