@@ -34,6 +34,8 @@ from numpy.typing import NDArray
 MODULES: tuple[str, ...] = (
     "sioms.native.system",
     "sioms.motion.axis_step",
+    "sioms.plant.friction_step",
+    "sioms.plant.motor_step",
 )
 """Modules whose records and steps are compiled, each after those that it uses."""
 LIBRARY = Path(__file__).with_name("_steps.so")
@@ -196,6 +198,8 @@ def step(function: F) -> F:
     kinds = list(hints.values())
     numbers = {int: ctypes.c_int64, float: ctypes.c_double}
     compiled.argtypes = [numbers.get(kind, ctypes.c_void_p) for kind in kinds]
+    if not kinds or not issubclass(kinds[0], Record):
+        return compiled  # type: ignore[return-value]
     match len(kinds):  # without a loop: it runs in every tick
         case 1:
             return lambda a: compiled(a.pointer)  # type: ignore[return-value]

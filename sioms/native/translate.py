@@ -11,7 +11,7 @@ import importlib
 import inspect
 import math
 from types import ModuleType
-from typing import Any, get_type_hints
+from typing import Any
 
 from . import system
 from .language import ARRAYS, Flags, Floats, Integers, Record, checksum
@@ -38,22 +38,24 @@ class Untranslatable(Exception):
 
 
 def translate(modules: tuple[str, ...]) -> str:
-    """Return the C of all records and steps of some modules."""
-    parts = [HEAD, f"const uint32_t sioms_checksum = {checksum()}u;", system.C]
-    functions: dict[str, Any] = {}
-    for name in modules[1:]:
+    """Return the C of all records and steps of some modules.
+
+    Raises:
+        Untranslatable: a step uses what steps have not.
+    """
+    records, functions = [], {}
+    found: list[tuple[ModuleType, ast.FunctionDef]] = []
+    for name in modules:
         module = importlib.import_module(name)
-        tree = ast.parse(inspect.getsource(module))
-        for node in tree.body:
-            if isinstance(node, ast.ClassDef) and isinstance(vars(module)[node.name], type):
-                if issubclass(vars(module)[node.name], Record):
-                    parts.append(_record(vars(module)[node.name]))
-            elif isinstance(node, ast.FunctionDef):
-                if any(isinstance(d, ast.Name) and d.id == "step" for d in node.decorator_list):
-                    hints = _hints(module, node)
-                    functions[node.name] = hints
-                    parts.append(_Function(module, node, hints, functions).text())
-    return "\n".join(parts)
+        for node in ast.parse(inspect.getsource(module)).body:
+            if isinstance(node, ast.ClassDef) and issubclass(vars(module)[node.name], Record):
+                records.append(_record(vars(module)[node.name]))
+            elif isinstance(node, ast.FunctionDef) and any(ast.unparse(d) == "step" for d in node.decorator_list):
+                functions[node.name] = _hints(module, node)
+                found.append((module, node))
+    bodies = [_Function(module, node, functions) for module, node in found]
+    head = [HEAD, f"const uint32_t sioms_checksum = {checksum()}u;", system.C]
+    return "\n".join([*head, *records, *(f"{b.head};" for b in bodies), "", *(b.text() for b in bodies)])
 
 
 def _hints(module: ModuleType, node: ast.FunctionDef) -> dict[str, Any]:
@@ -77,20 +79,18 @@ def _record(cls: type[Record]) -> str:
 class _Function:
     """One step."""
 
-    def __init__(
-        self, module: ModuleType, node: ast.FunctionDef, hints: dict[str, Any], functions: dict[str, Any]
-    ) -> None:
+    def __init__(self, module: ModuleType, node: ast.FunctionDef, functions: dict[str, Any]) -> None:
         self._module, self._node, self._functions = module, node, functions
-        self._result = hints["return"]
+        hints = functions[node.name]
         self._kinds = {a.arg: hints[a.arg] for a in node.args.args}
         self._locals: dict[str, Any] = {}
+        arguments = ", ".join(f"{_kind(kind)} {name}" for name, kind in self._kinds.items())
+        self.head = f"{_kind(hints['return'])} {node.name}({arguments})"
 
     def text(self) -> str:
-        node = self._node
-        body = self._block(node.body, 1)
-        arguments = ", ".join(f"{_kind(self._kinds[a.arg])} {a.arg}" for a in node.args.args)
+        body = self._block(self._node.body, 1)
         declared = "".join(f"    {_kind(kind)} {name} = 0;\n" for name, kind in self._locals.items())
-        return f"{_kind(self._result)} {node.name}({arguments})\n{{\n{declared}{body}}}\n"
+        return f"{self.head}\n{{\n{declared}{body}}}\n"
 
     def _refuse(self, node: ast.AST, what: str) -> Untranslatable:
         line = getattr(node, "lineno", 0)
@@ -270,6 +270,3 @@ def _loaded(target: ast.expr) -> ast.expr:
     """Return a target as what is read."""
     copy = ast.parse(ast.unparse(target), mode="eval").body
     return ast.copy_location(copy, target)
-
-
-__all__ = ["Untranslatable", "translate", "get_type_hints"]

@@ -294,25 +294,15 @@ class Walls:
 
     def __init__(self, position: Array, stiffness: Array, damping: Array, side: Array) -> None:
         self.position = position
-        self.stiffness, self.damping, self._side = stiffness, damping, side
+        self.stiffness, self.damping, self.side = stiffness, damping, side
         self._depth, self._rate = np.zeros((2, position.size))
-
-    def within(self, position: Array, speed: Array, time_s: float) -> bool:
-        """Return whether any axis touches its wall, or could in this time at this speed."""
-        depth, reach = self._depth, self._rate
-        np.subtract(position, self.position, out=depth)
-        np.multiply(depth, self._side, out=depth)
-        np.multiply(speed, time_s, out=reach)
-        np.add(depth, reach, out=depth)
-        np.multiply(depth, self.stiffness, out=depth)
-        return bool(depth.max() > 0.0)
 
     def press(self, position: Array, velocity: Array, out: Array) -> Array:
         """Return the force with which the axis presses on the wall [N], at least 0, in out."""
         depth, rate = self._depth, self._rate
         np.subtract(position, self.position, out=depth)
-        np.multiply(depth, self._side, out=depth)
-        np.multiply(velocity, self._side, out=rate)
+        np.multiply(depth, self.side, out=depth)
+        np.multiply(velocity, self.side, out=rate)
         np.multiply(rate, self.damping, out=rate)
         np.multiply(depth, self.stiffness, out=out)
         np.add(out, rate, out=out)
@@ -323,5 +313,5 @@ class Walls:
     def add(self, position: Array, velocity: Array, total: Array, out: Array) -> None:
         """Add the force of the wall on the axis to total; the pressing force goes to out."""
         self.press(position, velocity, out)
-        np.multiply(out, self._side, out=self._depth)
+        np.multiply(out, self.side, out=self._depth)
         np.subtract(total, self._depth, out=total)

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .friction_step import Friction, glide, keep
+
 Array = NDArray[np.float64]
 
-# Turns the surplus over stiction into a direction without disturbing any velocity that matters.
-_TINY = 1e-200
 _SERIES_BELOW = 1e-2
 
 
@@ -36,15 +36,6 @@ class Directed:
     def both(cls, value: Array) -> "Directed":
         """Return the same coefficient for both directions."""
         return cls(value, value)
-
-    @property
-    def symmetric(self) -> bool:
-        """Whether the direction makes no difference."""
-        return bool(np.array_equal(self.plus, self.minus))
-
-    def along(self, direction: Array, axes: NDArray[np.intp]) -> Array:
-        """Return the coefficient of the given axes for their direction (+1 or -1)."""
-        return np.where(direction > 0, self.plus[axes], self.minus[axes])
 
 
 def coefficients(viscous: Array, mass: Array, time_s: Array) -> tuple[Array, Array, Array, Array]:
@@ -94,28 +85,21 @@ class FrictionStep:
         n = mass.size
         self.state = state
         self.time_s = time_s
-        self._mass = mass
-        self._viscous = viscous
-        self._sliding = sliding
-        self._breakaway = breakaway
-        self._hold_minus = -breakaway.minus
         time = np.full(n, time_s)
         plus = np.array(coefficients(viscous.plus, mass, time))
         minus = np.array(coefficients(viscous.minus, mass, time))
-        self._directed = not (viscous.symmetric and sliding.symmetric)
-        # Rows (e, p) act on the old velocity, rows (g, q) on the net force: one product for both.
-        self._of_velocity, self._of_force = plus[[0, 2]], plus[[1, 3]]
+        # Rows (e, p) act on the old velocity, rows (g, q) on the net force.
         mean, half = (plus + minus) / 2, (plus - minus) / 2
-        self._velocity_mean, self._velocity_half = mean[[0, 2]], half[[0, 2]]
-        self._force_mean, self._force_half = mean[[1, 3]], half[[1, 3]]
-        self._level = sliding.plus.copy()
-        self._level_mean = (sliding.plus + sliding.minus) / 2
-        self._level_half = (sliding.plus - sliding.minus) / 2
-        self._direction, self._net, self._work = np.zeros((3, n))
-        self._new, self._part = np.zeros((2, 2, n))
-        self._reversed = np.zeros(n, dtype=np.bool_)
-        self._resistance: Array | None = None
-        self._variation: Array | None = None
+        self.force, self._resistance = np.zeros((2, n))
+        self._variation = np.ones(n)
+        self.record = Friction(
+            n=n, state=state, force=self.force, resistance=self._resistance, variation=self._variation,
+            plus=breakaway.plus.copy(), minus=-breakaway.minus,
+            sliding=(sliding.plus + sliding.minus) / 2, sliding_half=(sliding.plus - sliding.minus) / 2,
+            velocity_mean=mean[[0, 2]], velocity_half=half[[0, 2]], force_mean=mean[[1, 3]], force_half=half[[1, 3]],
+            fresh=np.zeros((2, n)), time_s=time_s, mass=mass.copy(),
+            viscous_plus=viscous.plus.copy(), viscous_minus=viscous.minus.copy(),
+        )  # fmt: skip
 
     def step(self, force: Array, resistance: Array | None = None, variation: Array | None = None) -> None:
         """Advance all masses.
@@ -125,72 +109,10 @@ class FrictionStep:
             resistance: further dry friction [N], at least 0, added to sliding and breakaway.
             variation: factor on sliding and breakaway, at least 0.
         """
-        velocity = self.state[0]
-        direction, net, new = self._direction, self._net, self._new
-        self._resistance, self._variation = resistance, variation
-        self._find_direction(force, velocity, resistance)
-        if self._directed:
-            self._select(direction)
-        # (F d - c) d is F - c d for a moving mass and 0 for one that sticks (d = 0).
-        np.multiply(force, direction, out=net)
-        np.subtract(net, self._level if variation is None else self._level * variation, out=net)
+        np.copyto(self.force, force)
         if resistance is not None:
-            np.subtract(net, resistance, out=net)
-        np.multiply(net, direction, out=net)
-        np.multiply(self._of_velocity, velocity, out=new)
-        np.multiply(self._of_force, net, out=self._part)
-        np.add(new, self._part, out=new)
-        np.add(new[1], self.state[1], out=new[1])
-        np.multiply(new[0], direction, out=self._work)
-        np.less(self._work, 0.0, out=self._reversed)
-        if np.count_nonzero(self._reversed):
-            self._stop_and_reverse(np.flatnonzero(self._reversed), force)
-        self.state[...] = new
-
-    def _find_direction(self, force: Array, velocity: Array, resistance: Array | None) -> None:
-        """Set the direction to the sign of the velocity; at rest to that of a force over stiction, else 0."""
-        work, direction = self._work, self._direction
-        plus, minus = self._breakaway.plus, self._hold_minus
-        if self._variation is not None:
-            plus, minus = plus * self._variation, minus * self._variation
-        if resistance is None:
-            np.minimum(force, plus, out=work)
-            np.maximum(work, minus, out=work)
-        else:
-            np.add(plus, resistance, out=work)
-            np.minimum(work, force, out=work)
-            np.subtract(minus, resistance, out=direction)
-            np.maximum(work, direction, out=work)
-        np.subtract(force, work, out=work)
-        np.multiply(work, _TINY, out=work)
-        np.add(work, velocity, out=work)
-        np.sign(work, out=direction)
-
-    def _select(self, direction: Array) -> None:
-        """Take the coefficients of the direction of motion."""
-        np.multiply(direction, self._velocity_half, out=self._of_velocity)
-        np.add(self._of_velocity, self._velocity_mean, out=self._of_velocity)
-        np.multiply(direction, self._force_half, out=self._of_force)
-        np.add(self._of_force, self._force_mean, out=self._of_force)
-        np.multiply(direction, self._level_half, out=self._level)
-        np.add(self._level, self._level_mean, out=self._level)
-
-    def _stop_and_reverse(self, axes: NDArray[np.intp], force_all: Array) -> None:
-        """Redo the axes that came to rest within the step: up to the stop, then rest or the way back."""
-        mass, force, net = self._mass[axes], force_all[axes], self._net[axes]
-        velocity, position = self.state[:, axes]
-        extra = 0.0 if self._resistance is None else self._resistance[axes]
-        times = 1.0 if self._variation is None else self._variation[axes]
-        viscous = self._viscous.along(velocity, axes)
-        # Time to rest: (m/b) ln(1 - b v/N), which is -m v/N for b = 0.
-        z = -viscous * velocity / net
-        log_ratio = np.where(z < 1e-8, 1 - z / 2, np.log1p(z) / np.where(z == 0, 1.0, z))
-        stop_s = np.minimum(-mass * velocity / net * log_ratio, self.time_s)
-        _, _, p, q = coefficients(viscous, mass, stop_s)
-        stopped_at = position + p * velocity + q * net
-        back = np.sign(force)
-        moves = np.abs(force) > times * self._breakaway.along(back, axes) + extra
-        net_back = np.where(moves, force - back * (times * self._sliding.along(back, axes) + extra), 0.0)
-        _, g, _, q = coefficients(self._viscous.along(back, axes), mass, self.time_s - stop_s)
-        self._new[0, axes] = g * net_back
-        self._new[1, axes] = stopped_at + q * net_back
+            np.copyto(self._resistance, resistance)
+        if variation is not None:
+            np.copyto(self._variation, variation)
+        glide(self.record)
+        keep(self.record)

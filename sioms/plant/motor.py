@@ -7,7 +7,7 @@ into substeps, of second order; while nothing does (no wall within reach of this
 at its limit) one step over the whole tick is exact and no substeps are spent.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from .encoder import Encoder
 from .forces import DRAGS, DRY, FORCES, FrictionVariation, Motion, middle_velocity
 from .foreign import Laws
 from .friction import FrictionStep
+from .motor_step import Motors, bound, coast, hold_at_stops, is_free, sense
 from .parameters import Motor, Supply, build_walls, check_motors, choose_substeps, column, mechanics
 from .transmission import Transmission
 
@@ -84,17 +85,15 @@ class MotorBank:
         np.copyto(command, force)
         for effect in self._drive:
             effect.apply(command)
-        np.minimum(command, self._force_max, out=command)
-        np.maximum(command, self._force_min, out=command)
-        np.copyto(self.drive_force, command)
-        if not self._nonlinear and self._is_free():
-            np.add(command, self._load_constant, out=self._force)
-            self._whole_tick.step(self._force)
-            self._hold_at_stops()
-        else:
-            for _ in range(self.substeps):
-                self._substep()
-        self._sense()
+        bound(self.record)
+        if is_free(self.record):
+            coast(self.record)
+            return
+        for _ in range(self.substeps):
+            self._substep()
+        sense(self.record)
+        if self._walls is not None:
+            self._walls.press(self.load_position, self.load_velocity, self.contact_force)
 
     def _build_state(self, motors: Sequence[Motor]) -> None:
         n = len(motors)
@@ -105,10 +104,6 @@ class MotorBank:
         self._command, self._force, self._load_force, self._resistance, self._work = np.zeros((5, n))
         self._last_velocity = np.zeros(n)
         self._flag = np.zeros(n, dtype=np.bool_)
-        self._force_max = column(motors, "force_max")
-        self._force_min = -self._force_max
-        self._stop_minus, self._stop_plus = column(motors, "stop_minus"), column(motors, "stop_plus")
-        self._has_stops = bool(np.isfinite([self._stop_minus, self._stop_plus]).any())
 
     def _count_substeps(self, wanted: int, tick_s: float, mass: Array) -> int:
         """Return 1 where the exact step covers everything, else what the fastest motion needs."""
@@ -148,28 +143,29 @@ class MotorBank:
         self.load_velocity = coupling.velocity if coupling else self.velocity
         n = self.position.size
         self.at_limit_minus, self.at_limit_plus, self.at_home = np.zeros((3, n), dtype=np.bool_)
-        self._switches = (column(motors, "limit_minus"), column(motors, "limit_plus"), column(motors, "home"))
-        self._has_switches = bool(np.isfinite(self._switches).any())
+        self.switches = np.zeros(n, dtype=np.int64)
+        switches, stops = (
+            {name: column(motors, name) for name in names}
+            for names in (("limit_minus", "limit_plus", "home"), ("stop_minus", "stop_plus"))
+        )
         self.encoder = Encoder(
             column(motors, "encoder_step"), column(motors, "index_pitch"), self._by_place[Place.ENCODER]
         )
+        walls, supply = self._walls, self._supply
+        none = np.zeros(n)
+        self.record = Motors(
+            n=n, free=not self._nonlinear, bounded=self._bounded, supplied=supply.limits,
+            has_stops=_any_finite(stops), has_switches=_any_finite(switches), tick_s=self._tick_s,
+            friction=self._whole_tick.record, encoders=self.encoder.record, command=self._command,
+            force_max=column(motors, "force_max"), drive_force=self.drive_force, load_force=self._load_constant,
+            position=self.position, velocity=self.velocity, speed_per_force=self._speed_per_force,
+            wall_position=walls.position if walls else none, wall_stiffness=walls.stiffness if walls else none,
+            wall_side=walls.side if walls else none, contact_force=self.contact_force,
+            stall=supply.stall, loss=supply.loss, at_minus=self.at_limit_minus, at_plus=self.at_limit_plus,
+            at_home=self.at_home, switches=self.switches, **stops, **switches,
+        )  # fmt: skip
         self.encoder.start(self.position)
-        self._sense()
-
-    def _is_free(self) -> bool:
-        """Return whether no axis can come to its wall or to the limit of its supply within this tick."""
-        if not self._bounded:
-            return True
-        # Friction only slows: |v| stays below |v0| + |F| t/m.
-        fastest, force = self._work, self._load_force
-        np.add(self._command, self._load_constant, out=force)
-        np.abs(force, out=force)
-        np.multiply(force, self._speed_per_force, out=fastest)
-        np.abs(self.velocity, out=force)
-        np.add(fastest, force, out=fastest)
-        if self._walls is not None and self._walls.within(self.load_position, fastest, self._tick_s):
-            return False
-        return not (self._supply.limits and self._supply.binds(fastest, self._command))
+        sense(self.record)
 
     def _substep(self) -> None:
         """Evaluate all forces at the mid-point and step motor and load."""
@@ -201,7 +197,7 @@ class MotorBank:
         self._friction.step(force, self._sum_resistance(), motion.variation)
         if coupling is not None:
             coupling.kick(load, self._state, h)
-        self._hold_at_stops()
+        hold_at_stops(self.record)
 
     def _predict(self) -> None:
         """Set the motion at the mid-point: positions by the velocity, velocities by the last change."""
@@ -226,24 +222,7 @@ class MotorBank:
             effect.add(motion, total)
         return total
 
-    def _hold_at_stops(self) -> None:
-        """Put motors that passed an end stop back onto it, at rest."""
-        if not self._has_stops:
-            return
-        np.minimum(self.position, self._stop_plus, out=self._work)
-        np.maximum(self._work, self._stop_minus, out=self._work)
-        np.not_equal(self._work, self.position, out=self._flag)
-        if np.count_nonzero(self._flag):
-            np.copyto(self.position, self._work)
-            np.copyto(self.velocity, 0.0, where=self._flag)
 
-    def _sense(self) -> None:
-        """Set readings, switches and contact force."""
-        self.encoder.read(self.position)
-        if self._walls is not None:
-            self._walls.press(self.load_position, self.load_velocity, self.contact_force)
-        if self._has_switches:
-            minus, plus, home = self._switches
-            np.less_equal(self.position, minus, out=self.at_limit_minus)
-            np.greater_equal(self.position, plus, out=self.at_limit_plus)
-            np.less_equal(self.position, home, out=self.at_home)
+def _any_finite(columns: Mapping[str, Array]) -> bool:
+    """Tell whether any axis has any of these."""
+    return bool(np.isfinite(list(columns.values())).any())

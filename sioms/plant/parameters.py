@@ -179,23 +179,15 @@ class Supply:
         per_ohm = np.divide(kt, ohm, out=np.zeros_like(kt), where=known)
         self.limits = bool(known.any())
         self.loss = per_ohm * kt
-        self._stall = np.where(known, per_ohm * np.where(known, volt, 0.0), np.inf)
+        self.stall = np.where(known, per_ohm * np.where(known, volt, 0.0), np.inf)
         self._work, self._bound = np.zeros((2, kt.size))
-
-    def binds(self, speed: Array, force: Array) -> bool:
-        """Return whether any force [N] could reach its limit at speeds up to this [m/s]."""
-        np.multiply(speed, self.loss, out=self._work)
-        np.abs(force, out=self._bound)
-        np.add(self._work, self._bound, out=self._work)
-        np.subtract(self._work, self._stall, out=self._work)
-        return bool(self._work.max() >= 0.0)
 
     def clip(self, velocity: Array, force: Array) -> None:
         """Limit force [N] in place at a velocity [m/s]."""
         np.multiply(velocity, self.loss, out=self._work)
-        np.subtract(self._stall, self._work, out=self._bound)
+        np.subtract(self.stall, self._work, out=self._bound)
         np.minimum(force, self._bound, out=force)
-        np.add(self._stall, self._work, out=self._bound)
+        np.add(self.stall, self._work, out=self._bound)
         np.negative(self._bound, out=self._bound)
         np.maximum(force, self._bound, out=force)
 
