@@ -38,6 +38,8 @@ MODULES: tuple[str, ...] = (
     "sioms.plant.motor_step",
 )
 """Modules whose records and steps are compiled, each after those that it uses."""
+PREFIX = "sioms_"
+"""Of all names in the library: those of the C library are not ours."""
 LIBRARY = Path(__file__).with_name("_steps.so")
 UNCOMPILED = "SIOMS_UNCOMPILED"
 """Environment variable: when set, and not empty, steps run as Python."""
@@ -192,7 +194,7 @@ def step(function: F) -> F:
     """Make a function a step: it takes records and numbers, returns a number or nothing."""
     if library is None:
         return function
-    compiled = library[function.__name__]
+    compiled = library[PREFIX + function.__name__]
     hints = get_type_hints(function)
     compiled.restype = {int: ctypes.c_int64, float: ctypes.c_double}.get(hints.pop("return"))
     kinds = list(hints.values())

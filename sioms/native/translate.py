@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import Any
 
 from . import system
-from .language import ARRAYS, Flags, Floats, Integers, Record, checksum
+from .language import ARRAYS, PREFIX, Flags, Floats, Integers, Record, checksum
 
 HEAD = """/* Made by sioms.native.translate; do not edit. */
 #include <math.h>
@@ -60,7 +60,7 @@ def translate(modules: tuple[str, ...]) -> str:
 
 def _hints(module: ModuleType, node: ast.FunctionDef) -> dict[str, Any]:
     annotations = {a.arg: a.annotation for a in node.args.args} | {"return": node.returns}
-    return {n: eval(ast.unparse(a), vars(module)) for n, a in annotations.items() if a is not None}  # noqa: S307
+    return {n: eval(ast.unparse(a), vars(module)) for n, a in annotations.items() if a is not None}
 
 
 def _kind(kind: Any) -> str:
@@ -85,7 +85,7 @@ class _Function:
         self._kinds = {a.arg: hints[a.arg] for a in node.args.args}
         self._locals: dict[str, Any] = {}
         arguments = ", ".join(f"{_kind(kind)} {name}" for name, kind in self._kinds.items())
-        self.head = f"{_kind(hints['return'])} {node.name}({arguments})"
+        self.head = f"{_kind(hints['return'])} {PREFIX}{node.name}({arguments})"
 
     def text(self) -> str:
         body = self._block(self._node.body, 1)
@@ -222,7 +222,7 @@ class _Function:
             name = getattr(root, "id", "")
             if name in self._kinds or name in self._locals or name not in vars(self._module):
                 return None
-            value = eval(ast.unparse(node), vars(self._module))  # noqa: S307 (our own source)
+            value = eval(ast.unparse(node), vars(self._module))
         else:
             return None
         if isinstance(value, bool | int):
@@ -262,7 +262,7 @@ class _Function:
             case ast.Name(id=name) if name in SYSTEM:
                 return f"{name}({texts})", SYSTEM[name]
             case ast.Name(id=name) if name in self._functions:
-                return f"{name}({texts})", self._functions[name]["return"] or int
+                return f"{PREFIX}{name}({texts})", self._functions[name]["return"] or int
         raise self._refuse(node, f"a step cannot call {ast.unparse(node.func)}")
 
 
