@@ -21,7 +21,7 @@ import math
 from typing import Final
 
 from sioms.native.language import Flags, Floats, Integers, Record, step
-from sioms.native.system import is_finite
+from sioms.native.numbers import is_finite
 from sioms.protocol.flags import AxisStatus
 
 from .settings import SWITCH_MINUS, SWITCH_PLUS
@@ -420,8 +420,8 @@ def show(a: Loop) -> int:
 def quiet_tick(a: Loop, now_ns: int) -> int:
     """Do a whole tick in which nothing begins, ends or is out of order. Returns 0, or what the bank has to see to.
 
-    LATE, ENDS, NOT_FINITE, WIDE and ODD: the bank does the tick. AT_LIMIT, FOLLOWS_BADLY and ON_SWITCH: so much of it has
-    been done as comes before that, and the bank goes on from there.
+    LATE, ENDS, NOT_FINITE, WIDE and ODD: the bank does the tick. AT_LIMIT, FOLLOWS_BADLY and ON_SWITCH: so much of it
+    has been done as comes before that, and the bank goes on from there.
     """
     if now_ns - a.last_ns > a.late_ns:
         return LATE

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from sioms.protocol.flags import AxisStatus
 
+from .axis_step import FORCE
 from .queue import CommandQueue
-from .sequencer import FORCE, Sequencer
+from .sequencer import Sequencer
 from .types import EventKind
 
 Axes = NDArray[np.int64]

@@ -65,7 +65,8 @@ class AxisBank(Bank):
         self._law = ControlLaw(
             settings, tick_s, raw=self._raw, offset=self._offset, position=self._position, velocity=self._velocity,
             present=store.present, segment_ns=store.segment_ns,
-            minimum=limits.minimum, maximum=limits.maximum, speed_most=limits.velocity, deceleration=limits.acceleration,
+            minimum=limits.minimum, maximum=limits.maximum, speed_most=limits.velocity,
+            deceleration=limits.acceleration,
             k=rows["k"], kz=rows["kz"], kp=rows["kp"], kb=rows["kb"], desired=self._desired,
             desired_velocity=self._desired_velocity, following=self._following, force=self._force,
             status=self._status, buffered=self._buffered, latched=queue.latched, waiting=queue.waiting,

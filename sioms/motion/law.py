@@ -1,4 +1,4 @@
-"""The arrays of the host-closed loops of a bank, and what is done to them between ticks; the laws are in axis_step.py."""
+"""The arrays of the host-closed loops of a bank, and what is done to them between ticks; the laws: axis_step.py."""
 
 from __future__ import annotations
 

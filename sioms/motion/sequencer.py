@@ -11,6 +11,7 @@ from __future__ import annotations
 import errno
 import math
 from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 

@@ -28,7 +28,8 @@ class PlanStore:
 
     Arrays (n,): ``start_ns``, ``start_fraction`` begin of the running plan; ``segment_ns`` and
     ``end_ns`` begin and end of its present segment; ``cut_ns`` where the plan is made to end. ``final`` (2n, 3),
-    ``duration`` (2n,) belong to rows; ``present`` (6, n) are the coefficients of the present segments; ``row`` (n,) is the running row of an axis, ``row ^ 1`` the other.
+    ``duration`` (2n,) belong to rows; ``present`` (6, n) are the coefficients of the present segments;
+    ``row`` (n,) is the running row of an axis, ``row ^ 1`` the other.
     """
 
     def __init__(self, n: int) -> None:

@@ -1,7 +1,7 @@
 """Makes the library of the compiled steps: ``python -m sioms.native.build [-o FILE] [COMPILER...]``.
 
-A compiler is any command that takes the options of cc: ``cc``, or ``python -m ziglang cc`` of the package ziglang, which
-brings all it needs. No header and no library of Python is wanted, so one library serves all versions of it.
+A compiler is any command that takes the options of cc: ``cc``, or ``python -m ziglang cc`` of the package ziglang,
+which brings all it needs. No header and no library of Python is wanted, so one library serves all versions of it.
 """
 
 from __future__ import annotations

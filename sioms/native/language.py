@@ -12,27 +12,24 @@
             f.value[i] += f.share * (f.reading[i] - f.value[i])
         return 0
 
-Numbers are ``int`` (64 bits) and ``float`` (double); arrays are one-dimensional, contiguous and made by numpy. There are
-assignments, ``if``, ``while``, ``for`` over a ``range``, arithmetic, comparisons, the functions of ``system`` and calls of
-other steps. A variable keeps the kind of its first value. A division by zero raises in Python and is not a number in C:
-steps do not divide by what may be zero.
+Numbers are ``int`` (64 bits) and ``float`` (double); arrays are contiguous and made by numpy. There are assignments,
+``if``, ``while``, ``for`` over a ``range``, arithmetic, comparisons, the functions of ``system`` and calls of other
+steps. A variable keeps the kind of its first value. A division by zero raises in Python and is not a number in C: steps
+do not divide by what may be zero.
 """
 
 from __future__ import annotations
 
 import ctypes
-import importlib
 import os
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, ClassVar, TypeVar, cast, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
 MODULES: tuple[str, ...] = (
-    "sioms.native.system",
     "sioms.motion.axis_step",
     "sioms.plant.friction_step",
     "sioms.plant.motor_step",
@@ -40,6 +37,7 @@ MODULES: tuple[str, ...] = (
 """Modules whose records and steps are compiled, each after those that it uses."""
 PREFIX = "sioms_"
 """Of all names in the library: those of the C library are not ours."""
+OWN = ("sioms.native.language", "sioms.native.numbers", "sioms.native.system", "sioms.native.translate")
 LIBRARY = Path(__file__).with_name("_steps.so")
 UNCOMPILED = "SIOMS_UNCOMPILED"
 """Environment variable: when set, and not empty, steps run as Python."""
@@ -77,10 +75,23 @@ class Flags:
 ARRAYS = (Floats, Integers, Flags)
 
 
+class Call:
+    """A step that a record names: it takes a record and three int and returns an int."""
+
+    def __call__(self, record: Context, a: int, b: int, c: int) -> int: ...  # type: ignore[empty-body]
+
+
+class Context:
+    """The record for such a step, whatever it is."""
+
+
+NUMBERS: dict[Any, Any] = {int: ctypes.c_int64, float: ctypes.c_double}
+
+
 def checksum() -> int:
     """Return a check sum of all that a library is made of."""
     total = 0
-    for name in (*MODULES, "sioms.native.translate", "sioms.native.language"):
+    for name in (*MODULES, *OWN):
         total = zlib.crc32(_source(name).read_bytes(), total)
     return total
 
@@ -111,107 +122,90 @@ class Record:
         TypeError: a field is missing, unknown, or of another kind.
     """
 
-    kinds: dict[str, Any]
+    kinds: ClassVar[dict[str, Any]]
+    layout: ClassVar[Any]
 
     def __init_subclass__(cls) -> None:
-        cls.kinds = {name: kind for name, kind in get_type_hints(cls).items() if name not in ("kinds", "pointer")}
+        cls.kinds = {name: kind for name, kind in get_type_hints(cls).items() if name not in ("kinds", "layout")}
+        if library is not None:
+            fields = [(name, NUMBERS.get(kind, ctypes.c_void_p)) for name, kind in cls.kinds.items()]
+            cls.layout = type(cls.__name__, (ctypes.Structure,), {"_fields_": fields})
+            for name, kind in cls.kinds.items():
+                if kind in NUMBERS:
+                    setattr(cls, name, _Number(name))
 
     def __init__(self, **fields: Any) -> None:
         name = type(self).__name__
         if fields.keys() != self.kinds.keys():
             wrong = ", ".join(sorted(fields.keys() ^ self.kinds.keys()))
             raise TypeError(f"make {name}: missing or unknown: {wrong}")
+        for field, value in fields.items():
+            kind = self.kinds[field]
+            if kind in ARRAYS and (
+                not isinstance(value, np.ndarray) or value.dtype != kind.dtype or not value.flags.c_contiguous
+            ):
+                wanted = kind.dtype.__name__
+                raise TypeError(f"make {name}: {field} is {value!r:.80}; want a contiguous array of {wanted}")
         if library is None:
             for field, value in fields.items():
-                setattr(self, field, _viewed(name, field, self.kinds[field], value))
+                setattr(self, field, value.reshape(-1).data if self.kinds[field] in ARRAYS else value)
             return
-        self.__dict__["_keep"] = dict(fields)  # arrays live as long as what points to them
-        self.__dict__["_c"] = made = _structure(type(self))()
-        self.__dict__["pointer"] = ctypes.byref(made)
+        self.made = self.layout()
+        self.pointer = ctypes.addressof(self.made)
         for field, value in fields.items():
-            if isinstance(value, Record):
-                setattr(made, field, ctypes.addressof(value.__dict__["_c"]))
-            elif self.kinds[field] in ARRAYS:
-                setattr(made, field, _checked(name, field, self.kinds[field], value).ctypes.data)
+            if self.kinds[field] in NUMBERS:
+                setattr(self, field, value)
             else:
-                setattr(made, field, value)
-        self.__class__ = _compiled(type(self))
-
-    pointer: Any
+                self.__dict__[field] = value  # it lives as long as what points to it
+                setattr(self.made, field, _address(value))
 
 
-def _compiled(cls: type) -> type:
-    """Return the class of records that live in C memory."""
-    found = _CLASSES.get(cls)
-    if found is None:
-        names: dict[str, Any] = {}
-        for field, kind in cls.kinds.items():  # type: ignore[attr-defined]
-            if kind in (int, float):
-                names[field] = _number(field)
-            else:
-                names[field] = property(lambda self, field=field: self.__dict__["_keep"][field])
-        found = _CLASSES[cls] = type.__new__(type, cls.__name__, (cls,), names)
-    return found
+class _Number:
+    """A number of a record that lives in C."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __get__(self, record: Any, _: Any) -> Any:
+        return getattr(record.made, self.name)
+
+    def __set__(self, record: Any, value: Any) -> None:
+        setattr(record.made, self.name, value)
 
 
-def _number(field: str) -> property:
-    def get(self: Any) -> Any:
-        return getattr(self.__dict__["_c"], field)
-
-    def put(self: Any, value: Any) -> None:
-        setattr(self.__dict__["_c"], field, value)
-
-    return property(get, put)
-
-
-_CLASSES: dict[type, type] = {}
-_STRUCTURES: dict[type, type[ctypes.Structure]] = {}
-
-
-def _structure(cls: type) -> type[ctypes.Structure]:
-    """Return the layout of a record in C."""
-    found = _STRUCTURES.get(cls)
-    if found is None:
-        numbers = {int: ctypes.c_int64, float: ctypes.c_double}
-        fields = [(name, numbers.get(kind, ctypes.c_void_p)) for name, kind in cls.kinds.items()]  # type: ignore[attr-defined]
-        found = _STRUCTURES[cls] = type(cls.__name__, (ctypes.Structure,), {"_fields_": fields})
-    return found
-
-
-def _checked(name: str, field: str, kind: Any, value: NDArray[Any]) -> NDArray[Any]:
-    if not isinstance(value, np.ndarray) or value.dtype != kind.dtype or not value.flags.c_contiguous:
-        raise TypeError(f"make {name}: {field} is {value!r:.80}; want a contiguous array of {kind.dtype.__name__}")
-    return value
-
-
-def _viewed(name: str, field: str, kind: Any, value: Any) -> Any:
-    if kind not in ARRAYS:
-        return value
-    return memoryview(_checked(name, field, kind, value).reshape(-1))
+def _address(value: Any) -> int:
+    if isinstance(value, Record):
+        return value.pointer
+    if isinstance(value, np.ndarray):
+        return value.ctypes.data
+    return ctypes.cast(value.compiled, ctypes.c_void_p).value or 0
 
 
 def step(function: F) -> F:
     """Make a function a step: it takes records and numbers, returns a number or nothing."""
     if library is None:
         return function
-    compiled = library[PREFIX + function.__name__]
+    compiled: Any = library[PREFIX + function.__name__]
     hints = get_type_hints(function)
-    compiled.restype = {int: ctypes.c_int64, float: ctypes.c_double}.get(hints.pop("return"))
-    kinds = list(hints.values())
-    numbers = {int: ctypes.c_int64, float: ctypes.c_double}
-    compiled.argtypes = [numbers.get(kind, ctypes.c_void_p) for kind in kinds]
-    if not kinds or not issubclass(kinds[0], Record):
-        return compiled  # type: ignore[return-value]
-    match len(kinds):  # without a loop: it runs in every tick
-        case 1:
-            return lambda a: compiled(a.pointer)  # type: ignore[return-value]
-        case 2:
-            return lambda a, b: compiled(a.pointer, b)  # type: ignore[return-value]
-        case _:
-            return lambda a, *b: compiled(a.pointer, *b)  # type: ignore[return-value]
+    compiled.restype = NUMBERS.get(hints.pop("return"))
+    compiled.argtypes = [NUMBERS.get(kind, ctypes.c_void_p) for kind in hints.values()]
+    call: Any = compiled
+    if hints and issubclass(next(iter(hints.values())), Record):
+        call = _of_record(compiled, len(hints))
+        call.compiled = compiled
+    return cast("F", call)
 
 
-def load_all() -> None:
-    """Import all modules of steps."""
-    for name in MODULES:
-        importlib.import_module(name)
+def _of_record(compiled: Any, arguments: int) -> Any:
+    """Return a function of a record; without a loop, because it runs in every tick."""
+
+    def one(record: Any) -> Any:
+        return compiled(record.pointer)
+
+    def two(record: Any, other: Any) -> Any:
+        return compiled(record.pointer, other)
+
+    def more(record: Any, *others: Any) -> Any:
+        return compiled(record.pointer, *others)
+
+    return {1: one, 2: two}.get(arguments, more)

@@ -1,36 +1,83 @@
-"""What steps may call besides each other: numbers, time and memory. Each has its C beside it."""
+"""What steps may ask the system for: time, events, memory in order. Each is here in Python and, in ``C``, in C."""
 
 from __future__ import annotations
 
-import math
+import os
+import select
 import time
 
+from .language import Integers
+
+MOST_EVENTS = 64
+
 C = """
-static inline int64_t lesser_int(int64_t a, int64_t b) { return b < a ? b : a; }
-static inline int64_t greater_int(int64_t a, int64_t b) { return b > a ? b : a; }
-static inline double lesser(double a, double b) { return b < a ? b : a; }
-static inline double greater(double a, double b) { return b > a ? b : a; }
-static inline double whole(double x) { return floor(x); }
-static inline int64_t is_finite(double x) { return isfinite(x) != 0; }
-static inline int64_t clock_ns(void)
+static inline int64_t sioms_clock_ns(void)
 {
     struct timespec now;
     clock_gettime(CLOCK_MONOTONIC, &now);
     return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
 }
+
+static inline int64_t sioms_wait_for(int64_t poll, int64_t *ready)
+{
+    struct epoll_event events[64];
+    int count = epoll_wait((int)poll, events, 64, -1);
+    for (int i = 0; i < count; i++)
+        ready[i] = events[i].data.fd;
+    return count < 0 ? 0 : count;
+}
+
+static inline int64_t sioms_expirations(int64_t timer)
+{
+    uint64_t count;
+    return read((int)timer, &count, 8) == 8 ? (int64_t)count : 0;
+}
+
+static inline int64_t sioms_wake(int64_t pipe) { return write((int)pipe, "\\1", 1); }
+
+static inline int64_t sioms_fence(void)
+{
+    __atomic_thread_fence(__ATOMIC_SEQ_CST);
+    return 0;
+}
 """
 
-
-def whole(x: float) -> float:
-    """Return the greatest whole number that is not above x."""
-    return float(math.floor(x)) if math.isfinite(x) else x
-
-
-def is_finite(x: float) -> int:
-    """Return 1 for a finite number."""
-    return int(math.isfinite(x))
+_polls: dict[int, select.epoll] = {}
 
 
 def clock_ns() -> int:
     """Return the time [ns, CLOCK_MONOTONIC]."""
     return time.monotonic_ns()
+
+
+def wait_for(poll: int, ready: Integers) -> int:
+    """Wait for events of an epoll; write the descriptors that are ready into an array, return how many.
+
+    A signal ends the wait, too: none is ready then.
+    """
+    found = _polls.setdefault(poll, select.epoll.fromfd(poll)) if poll not in _polls else _polls[poll]
+    events = found.poll(maxevents=MOST_EVENTS)
+    for i, (fd, _) in enumerate(events):
+        ready[i] = fd
+    return len(events)
+
+
+def expirations(timer: int) -> int:
+    """Return how often a timer has expired since the last call."""
+    try:
+        return int.from_bytes(os.read(timer, 8), "little")
+    except BlockingIOError:
+        return 0
+
+
+def wake(pipe: int) -> int:
+    """Make the other end of a pipe readable; one that is full has been readable for long."""
+    try:
+        return os.write(pipe, b"\1")
+    except OSError:
+        return -1
+
+
+def fence() -> int:
+    """Keep the order of stores before and after for whoever reads the memory."""
+    return 0

@@ -1,7 +1,7 @@
 """From the modules of steps to one C file.
 
-Only what steps need is understood (``language``), and everything else is refused with its place: what is translated means
-the same in both languages, integers within 64 bits and no division by zero given.
+Only what steps need is understood (``language``), and everything else is refused with its place: what is translated
+means the same in both languages, given that integers stay within 64 bits and nothing is divided by zero.
 """
 
 from __future__ import annotations
@@ -11,21 +11,24 @@ import importlib
 import inspect
 import math
 from types import ModuleType
-from typing import Any
+from typing import Any, get_type_hints
 
-from . import system
-from .language import ARRAYS, PREFIX, Flags, Floats, Integers, Record, checksum
+from . import numbers, system
+from .language import ARRAYS, PREFIX, Call, Context, Flags, Floats, Integers, Record, checksum
 
 HEAD = """/* Made by sioms.native.translate; do not edit. */
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
+#include <sys/epoll.h>
 #include <time.h>
+#include <unistd.h>
 """
 MATHS = {"sqrt": float, "sin": float, "cos": float, "copysign": float, "exp": float, "expm1": float, "log1p": float}
-SYSTEM = {"whole": float, "is_finite": int, "clock_ns": int}
+EXTERNAL = (numbers, system)
 ELEMENTS = {Floats: float, Integers: int, Flags: int}
 NUMBERS = {int: "int64_t", float: "double", bool: "int64_t", type(None): "void"}
+CALL = "int64_t (*NAME)(void *, int64_t, int64_t, int64_t)"
 OPERATORS: dict[type, str] = {
     ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^", ast.LShift: "<<",
     ast.RShift: ">>", ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=",
@@ -43,7 +46,13 @@ def translate(modules: tuple[str, ...]) -> str:
     Raises:
         Untranslatable: a step uses what steps have not.
     """
-    records, functions = [], {}
+    records: list[str] = []
+    functions = {
+        name: get_type_hints(function)
+        for module in EXTERNAL
+        for name, function in vars(module).items()
+        if inspect.isfunction(function)
+    }
     found: list[tuple[ModuleType, ast.FunctionDef]] = []
     for name in modules:
         module = importlib.import_module(name)
@@ -54,7 +63,7 @@ def translate(modules: tuple[str, ...]) -> str:
                 functions[node.name] = _hints(module, node)
                 found.append((module, node))
     bodies = [_Function(module, node, functions) for module, node in found]
-    head = [HEAD, f"const uint32_t sioms_checksum = {checksum()}u;", system.C]
+    head = [HEAD, f"const uint32_t sioms_checksum = {checksum()}u;", *(module.C for module in EXTERNAL)]
     return "\n".join([*head, *records, *(f"{b.head};" for b in bodies), "", *(b.text() for b in bodies)])
 
 
@@ -66,13 +75,18 @@ def _hints(module: ModuleType, node: ast.FunctionDef) -> dict[str, Any]:
 def _kind(kind: Any) -> str:
     if kind in ARRAYS:
         return str(kind.c)
+    if kind is Context:
+        return "void *"
     if kind in NUMBERS or kind is None:
         return NUMBERS.get(kind, "void")
     return f"struct {kind.__name__} *"
 
 
 def _record(cls: type[Record]) -> str:
-    fields = "".join(f"    {_kind(kind)} {name};\n" for name, kind in cls.kinds.items())
+    fields = "".join(
+        f"    {CALL if kind is Call else f'{_kind(kind)} {name}'};\n".replace("NAME", name)
+        for name, kind in cls.kinds.items()
+    )
     return f"struct {cls.__name__} {{\n{fields}}};"
 
 
@@ -149,10 +163,7 @@ class _Function:
         return f"{place} = {text}"
 
     def _declare(self, node: ast.AST, name: str, kind: Any) -> None:
-        if name in self._kinds:
-            known = self._kinds[name]
-        else:
-            known = self._locals.setdefault(name, kind)
+        known = self._kinds[name] if name in self._kinds else self._locals.setdefault(name, kind)
         if known is not kind:
             raise self._refuse(node, f"{name} is {known.__name__} and is given {kind.__name__}")
 
@@ -259,8 +270,8 @@ class _Function:
                 return f"((int64_t){texts})", int
             case ast.Attribute(value=ast.Name(id="math"), attr=name) if name in MATHS:
                 return f"{name}({texts})", MATHS[name]
-            case ast.Name(id=name) if name in SYSTEM:
-                return f"{name}({texts})", SYSTEM[name]
+            case ast.Attribute() if self._expression(node.func)[1] is Call:
+                return f"{self._expression(node.func)[0]}({texts})", int
             case ast.Name(id=name) if name in self._functions:
                 return f"{PREFIX}{name}({texts})", self._functions[name]["return"] or int
         raise self._refuse(node, f"a step cannot call {ast.unparse(node.func)}")

@@ -17,8 +17,8 @@ class Friction(Record):
 
     ``state``: velocities [m/s], then positions [m]. ``force`` [N] is held over the step, ``resistance`` is dry friction
     added to ``sliding`` and breakaway (``plus``, ``minus`` its negative), ``variation`` a factor on both.
-    ``of_velocity`` and ``of_force``: what the old velocity and the net force contribute, mean of both directions and half
-    of the difference. ``fresh`` is the state after the step.
+    ``of_velocity`` and ``of_force``: what the old velocity and the net force contribute, mean of both directions and
+    half of the difference. ``fresh`` is the state after the step.
     """
 
     n: int

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from sioms.native.language import Flags, Floats, Integers, Record, step
-from sioms.native.system import whole
+from sioms.native.numbers import whole
 
 from .friction_step import Friction, glide, keep
 
@@ -41,8 +41,8 @@ class Motors(Record):
     of their supply.
 
     ``command`` of the drive [N], bounded by ``force_max``; ``position`` and ``velocity`` of motor and load;
-    ``speed_per_force`` that a tick gives; a wall each (``wall_stiffness`` 0 where there is none) and a supply, which can
-    push ``stall`` less ``loss`` times the speed; stops, switches.
+    ``speed_per_force`` that a tick gives; a wall each (``wall_stiffness`` 0 where there is none) and a supply, which
+    can push ``stall`` less ``loss`` times the speed; stops, switches.
     """
 
     n: int
