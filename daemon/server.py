@@ -17,7 +17,7 @@ from sioms.notify import ServiceManager
 from sioms.protocol import driver_verbs
 from sioms.protocol.flags import PageState
 from sioms.protocol.journal import Note
-from sioms.protocol.stopjournal import node_entry, parts_of, workcell_entry
+from sioms.protocol.stopjournal import NODE, PID, node_entry, parts_of, workcell_entry
 from sioms.protocol.verbs import Message
 
 from . import suspended
@@ -249,8 +249,31 @@ class Server:
 
     def stopped_of(self, device: str) -> list[list[Any]]:
         """Return what of a device is stopped and must be so from its driver's start."""
-        self.shared.record.look()
+        record = self.shared.record
+        record.look()
+        record.by_drivers = [entry for entry in record.by_drivers if entry.get("device") != device]
         return self.shared.record.state.of_device(device)
+
+    def _pass_on_stops(self) -> None:
+        """Send on the stops of nodes that drivers have acknowledged which are not ours, as of a daemon before us.
+
+        Only stops: what such a driver resets, it resets for itself.
+        """
+        record = self.shared.record
+        entries, record.by_drivers = record.by_drivers, []
+        for entry in entries:
+            device = self.devices.get(str(entry.get("device")))
+            if device is None or not device.is_there or device.pid == entry[PID]:
+                continue
+            channels_of: dict[tuple[int, int], list[int]] = {}
+            for _, name, channel, bit in record.state.still(entry):
+                number = next((i for i, block in enumerate(device.info.blocks) if block.name == name), -1)
+                if number >= 0 and channel < len(channels := device.info.blocks[number].channels):
+                    channels_of.setdefault((number, bit if channels[channel].width else -1), []).append(channel)
+            for (number, bit), stopped in channels_of.items():
+                device.tell(driver_verbs.NodeStop(number, stopped, bit, str(entry["by"]), self.shared.latch.resets))
+                self.shared.latch.ordered()
+            self.log("warning", "emergency stop", node=entry[NODE], source=entry["by"], heard_by=entry[PID])
 
     # --- what devices tell -----------------------------------------------------------------------
 
@@ -457,6 +480,7 @@ class Server:
         self.shared.record.look()
         if (source := self.shared.record.state.workcell) and not self.shared.latch.stopped_ns:
             self.stop_workcell(source)  # a driver could not keep a stop
+        self._pass_on_stops()
         for device in list(self.devices.values()):
             device.check(now)
         if self._fork_server is not None and (why := self._fork_server.check(now / 1e9)):

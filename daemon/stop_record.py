@@ -16,7 +16,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from sioms.protocol.stopjournal import CHECKPOINT, StopJournal, Stopped, entries_from, replay
+from sioms.protocol.stopjournal import CHECKPOINT, PID, StopJournal, Stopped, entries_from, replay
 
 from .realtime import end_promptly
 
@@ -37,6 +37,7 @@ class StopRecord:
     Attributes:
         state: what is stopped, after the last ``look``.
         drivers_fd: descriptor for drivers, to append to.
+        by_drivers: entries of drivers that have been read, the oldest first; who has seen to them takes them out.
     """
 
     def __init__(self, path: str) -> None:
@@ -54,6 +55,7 @@ class StopRecord:
         size = os.fstat(self._fd).st_size
         start = _first_byte(self._fd, size)
         self.state: Stopped = replay(_read(self._fd, start, size), start, time.time())
+        self.by_drivers: list[Mapping[str, Any]] = []
         self._at = size
         self._checked_at = start
         self._flusher = _Flusher(self._fd)
@@ -76,6 +78,8 @@ class StopRecord:
         self._at += read
         for entry in entries:
             self.state.take(entry, now_s=time.time())
+            if entry and PID in entry:
+                self.by_drivers.append(entry)
         if read:
             self._flusher.flush()
         if self._at - self._checked_at > MOST_BYTES:

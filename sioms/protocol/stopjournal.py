@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     Part: TypeAlias = tuple[str, str, int, int]
     """(device, block, channel, bit): a piece that can be stopped by itself; bit 0 for a channel without bits."""
 
-NODE, WORKCELL, CHECKPOINT = "node", "workcell", "checkpoint"
+NODE, WORKCELL, CHECKPOINT, PID = "node", "workcell", "checkpoint", "pid"
 MOST_PARTS = 1 << 20
 """Channels, and bits of a channel, that an entry may name."""
 _DAMAGE = (ValueError, TypeError, LookupError, ArithmeticError)
@@ -34,10 +34,16 @@ _DAMAGE = (ValueError, TypeError, LookupError, ArithmeticError)
 
 
 def node_entry(
-    name: str, device: str, block: str, parts: Iterable[tuple[int, int]], source: str, *, stop: bool
+    name: str, device: str, block: str, parts: Iterable[tuple[int, int]], source: str, *, stop: bool, pid: int = 0
 ) -> dict[str, Any]:
-    """Return the entry of the stop or the reset of a node: its name, its parts (channel, bit), and who did it."""
-    return {NODE: name, "device": device, "block": block, "parts": _packed(parts), "stop": stop, "by": source}
+    """Return the entry of the stop or the reset of a node: its name, its parts (channel, bit), and who did it.
+
+    ``pid`` is that of the driver process in which it holds; 0: the daemon tells the driver.
+    """
+    of_driver = {PID: pid} if pid else {}
+    return {
+        NODE: name, "device": device, "block": block, "parts": _packed(parts), "stop": stop, "by": source, **of_driver,
+    }  # fmt: skip
 
 
 def parts_of(channel: int, bit: int, width: int) -> list[tuple[int, int]]:
@@ -119,6 +125,15 @@ class Stopped:
             if not self.workcell:
                 self.workcell = f"the journal of stops, which is damaged: {damage}"
                 self.since_s = now_s
+
+    def still(self, entry: Mapping[str, Any]) -> list[Part]:
+        """Return the parts of the stop of a node that are stopped still; none for what is no such stop."""
+        try:
+            device, block = str(entry["device"]), str(entry["block"])
+            parts = [(device, block, *part) for part in _unpacked(entry["parts"])] if entry["stop"] else []
+        except _DAMAGE:
+            return []
+        return [part for part in parts if part in self.parts]
 
     def nodes(self) -> list[list[str]]:
         """Return the nodes that are stopped, in whole or in part, each [name, who did it]."""

@@ -61,6 +61,8 @@ SETTLE_NS = 20_000_000
 """An axis whose loop is closed here follows its command by so much; only then is the loop given up."""
 FAIL_GRACE_NS = 500_000_000
 """How long a failed driver's line may take to send the stops."""
+MOST_ORDERS = 512
+"""More messages than the daemon's socket holds: what is behind them has been sent since they were begun with."""
 SURE = 4
 """One tick in so many leaves time for clients' work however long it took."""
 REPORT_NS = 20_000_000
@@ -386,8 +388,9 @@ class Runtime:
     def heed(self) -> None:
         """Heed the daemon's orders, then the latch and the stop-request file; cheap when there is nothing new."""
         if self.stops.heed_orders():
-            while self.running and self._take_order():
-                pass
+            for _ in range(MOST_ORDERS):
+                if not self.running or not self._take_order():
+                    break
         self.stops.heed()
 
     def _tick_and_publish(self, scheduled_ns: int) -> int:

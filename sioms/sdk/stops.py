@@ -309,7 +309,7 @@ class Stops:
         parts = [part for c in handle.channels.tolist() for part in parts_of(c, handle.bit, spec.channels[c].width)]
         what = f"emergency stop of {handle.node}" if stop else f"reset of {handle.node}"
         self._log("warning", f"{what} by {handle.who}")
-        self._note(node_entry(handle.node, self._device, spec.name, parts, source, stop=stop))
+        self._note(node_entry(handle.node, self._device, spec.name, parts, source, stop=stop, pid=os.getpid()))
 
     def restore(self, stopped: Iterable[tuple[str, list[list[int]], str, str]]) -> None:
         """Stop what was stopped when the process before this one ended, before anything can move.

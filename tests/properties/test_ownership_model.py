@@ -22,6 +22,8 @@ from ownership_explorer import (
 )
 
 from sioms.protocol.messages import ClientVerb
+from sioms.protocol.stopjournal import StopJournal, node_entry
+from sioms.sdk.runtime import MOST_ORDERS
 
 DEPTH = int(os.environ.get("SIOMS_EXPLORE_DEPTH", "1"))
 """Steps from each beginning; a deeper exploration takes hours, see tests/ownership_explorer.py."""
@@ -118,6 +120,45 @@ def test_the_last_words_of_a_driver_are_heard(capsys: pytest.CaptureFixture[str]
         cell.take(("kill", 1))
         cell.take(("bury", 1, "process"))
         assert "part 2" in capsys.readouterr().err
+
+
+def test_a_stop_that_a_driver_of_an_earlier_daemon_acknowledged_reaches_the_driver_of_this_one() -> None:
+    with cells() as make:
+        cell = make()
+        for action in begin("nobody owns anything"):
+            cell.take(action)
+        record = cell.server.shared.record  # type: ignore[union-attr]
+        entries = [
+            node_entry("port", "port", "", [(0, 1)], "an orphan's client", stop=True, pid=1),
+            node_entry("axis", "axis", "", [(0, 0)], "another", stop=True, pid=1),
+            node_entry("axis", "axis", "", [(0, 0)], "another", stop=False, pid=1),
+            node_entry("axis", "axis", "gone", [(7, 0)], "a third", stop=True, pid=1),
+        ]
+        for entry in entries:
+            StopJournal(os.dup(record.drivers_fd)).append(entry, 0.0)
+        orders = cell.server.shared.latch.orders  # type: ignore[union-attr]
+        cell.beat()
+        cell.tick(1)
+        assert [*cell._process(1).runtime.stops.latched_outputs.values()] == ["an orphan's client"]
+        assert cell.server.shared.latch.orders == orders + 1, "of what has been reset, nothing"  # type: ignore[union-attr]
+
+
+def test_orders_that_do_not_end_do_not_hold_up_a_tick() -> None:
+    with cells() as make:
+        cell = make()
+        for action in begin("nobody owns anything"):
+            cell.take(action)
+        runtime, looks = cell._process(1).runtime, 0
+
+        def another() -> bool:
+            nonlocal looks
+            looks += 1
+            return looks < 100_000
+
+        runtime._take_order = another  # type: ignore[method-assign]
+        runtime.latch.ordered()
+        runtime.heed()
+        assert looks == MOST_ORDERS
 
 
 def test_nothing_of_a_dead_client_is_left() -> None:
