@@ -49,18 +49,22 @@ AGAIN = 2  # times that the noise is taken again at most
 
 
 def analyse(session: Session, nominal: AxisModel, options: Options | None = None) -> AxisVerdict:
-    """Find what the nominal model lacks.
+    """Find what the nominal model of a motor axis lacks.
+
+    Takes five seconds to a minute of one core; ``options.mapper`` may share the work out.
 
     Args:
-        session: recordings of one axis, in order.
+        session: recordings of one axis, in order; m or rad, N or N m, s.
         nominal: the model to be corrected; effects already in it may be re-estimated and may leave. A resolution of
             zero is the smallest step of the recorded position.
+        options: seed, pictures, resampling; None takes the defaults.
 
     Returns:
-        The verdict with its evidence.
+        The verdict with its evidence: ``model`` is the corrected model, ``effects`` what was named, with 95 %
+        intervals, ``gaps`` the disagreement on samples that took no part in any choice.
 
     Raises:
-        BadInputError: the data cannot be used.
+        BadInputError: the data cannot be used: too short, no motion, saturated, wrong units or signs.
     """
     o = options or Options()
     ready = prepare(session, with_resolution(nominal, searched(session)), o)

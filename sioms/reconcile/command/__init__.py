@@ -147,13 +147,11 @@ def _live(args: argparse.Namespace, subject: Subject, say: Say) -> tuple[Any, fl
 
 def _write(args: argparse.Namespace, subject: Subject, verdict: Any, seconds: float) -> None:
     """Write report.html, verdict.json and the models; print the summary."""
-    from sioms.reconcile.report.page import page
-    from sioms.reconcile.report.words import as_json, summary
+    from sioms.reconcile.report import write_report
+    from sioms.reconcile.report.words import summary
 
     out: Path = args.out
-    out.mkdir(parents=True, exist_ok=True)
-    page(verdict, seconds).write(out / "report.html")
-    (out / "verdict.json").write_text(as_json(verdict, seconds))
+    write_report(verdict, out, seconds)
     subject.write(args, verdict)
     print("\n".join(summary(verdict, str(out / "report.html"))))
 

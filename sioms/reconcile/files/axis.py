@@ -88,14 +88,19 @@ LINEAR = {**ROTARY, "position": "length", "command": "length"} | dict.fromkeys(
 
 
 def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Session:
-    """Read all records of one axis.
+    """Read all records of one axis into SI units.
 
     Args:
-        data: a file, a folder of files, or a folder of the layout with ``nominal.json``.
-        columns: column description; by default ``columns.toml`` beside the data.
+        data: a CSV, NPZ or MAT file, a folder of such files, or a folder of the layout with ``nominal.json``.
+        model: nominal model: says whether positions are m or rad, and what a count is worth.
+        columns: column description; by default ``columns.toml`` beside the data, which files whose heads say name and
+            unit (``position [m]``) do without.
+
+    Returns:
+        The records in order, arrays of shape (n,) each.
 
     Raises:
-        BadInputError: something is missing or not understood.
+        BadInputError: something is missing or not understood; if there is no description, the text holds a draft.
     """
     if not data.exists():
         raise BadInputError(f"read {data}: no such file or folder")

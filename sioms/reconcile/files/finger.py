@@ -57,10 +57,18 @@ def reconcile_tactile(
     progress: Callable[[str], None] = lambda text: None,
     bench: Bench | None = None,
 ) -> SensorVerdict:
-    """Read and analyse one finger.
+    """Read and analyse one tactile finger.
 
     Args:
+        data: folder with one npz for each experiment: ``raw`` (frames, elements) in per cent, ``time`` [s], ``touch``,
+            ``phase``, and of each touch ``cmd_theta`` [deg], ``cmd_P`` [N/m], ``cmd_rc`` [mm].
+        model: nominal finger (TOML or JSON); None takes ``nominal.json`` in the folder.
+        seed: of permutations and bootstrap, 0 or more.
+        progress: told what is being done.
         bench: what touches can be made to decide between look-alikes.
+
+    Returns:
+        The verdict; lengths in m, angles in rad, loads in N/m, outputs as fractions.
 
     Raises:
         BadInputError: data or model cannot be used.

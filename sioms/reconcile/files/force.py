@@ -62,10 +62,18 @@ def reconcile_force(
     progress: Callable[[str], None] = lambda text: None,
     plans: Sequence[Plan] = (),
 ) -> SensorVerdict:
-    """Read and analyse one sensor.
+    """Read and analyse one force/torque sensor.
 
     Args:
+        data: file or folder of recordings: time, known load and reading of each component.
+        model: nominal sensor (TOML): components, their full ranges [N, N m] and the matrix.
+        columns: column description; None takes ``columns.toml`` beside the data.
+        seed: of permutations and bootstrap, 0 or more.
+        progress: told what is being done.
         plans: programmes of loads that can be applied to decide between look-alikes.
+
+    Returns:
+        The verdict; loads and readings as shares of each component's full range.
 
     Raises:
         BadInputError: data or model cannot be used.
