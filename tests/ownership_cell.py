@@ -161,6 +161,7 @@ class Cell:
         own = server.shared.journal.fd
         for fd in (server.shared.fds[0], server.shared.fds[3], *files.client_fds, record.drivers_fd, own):
             os.close(fd)
+        os.close(server.shared.journal.fd)
         server.shared.request.close()
         record._journal.close()
         server.loop.close()
