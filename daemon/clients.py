@@ -244,6 +244,8 @@ class Clients:
                 return self._server.names.pack(self.nodes.find(session, "get information", node, right))
             case verbs.Journal(device):
                 return self._workcell.journal(session, number, device)
+            case verbs.Report():
+                return self._workcell.report(session, message)
             case verbs.Status():
                 return self._status_now()
             case verbs.ReserveMarker(how_many, persist):

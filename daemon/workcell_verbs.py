@@ -21,7 +21,7 @@ from .rights import Peer
 from .sessions import LATER, Refused, Session
 
 if TYPE_CHECKING:
-    from sioms.protocol.verbs import EmergencyStop, Hello, Reload, Represent, Reset
+    from sioms.protocol.verbs import EmergencyStop, Hello, Reload, Report, Represent, Reset
 
     from .clients import Clients
     from .server import Server
@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 
 NAMED = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}").fullmatch
 """The name of a key or of a group of keys."""
+
+
+REPORTS, REPORTED_NS = 16, 3_600_000_000_000
+"""So many troubles of clients are kept for the status, so long [ns]."""
 
 
 class WorkcellVerbs:
@@ -42,6 +46,7 @@ class WorkcellVerbs:
     def __init__(self, server: Server, clients: Clients) -> None:
         self._server = server
         self._clients = clients
+        self._reports: list[tuple[int, str, str, int, str]] = []
 
     def represent(self, session: Session, message: Represent) -> None:
         """Take a session for one of the holder of a key from now on."""
@@ -103,6 +108,9 @@ class WorkcellVerbs:
                 }
                 for d in server.devices.values()
             ],
+            "reports": [
+                [who, (now - at) / 1e9, text] for _, _, who, at, text in self._reports if now - at < REPORTED_NS
+            ],
             "node_stops": server.shared.record.state.nodes(),
             "sessions": [
                 [str(s), len(s.handles), len(s.waits), self._clients.markers.count(s)] for s in self._clients.sessions
@@ -126,6 +134,18 @@ class WorkcellVerbs:
         finally:
             os.close(fd)
         return LATER
+
+    def report(self, session: Session, message: Report) -> None:
+        """Log what a client says, and keep what is wrong for the status."""
+        level, text = message
+        if level not in ("info", "warning", "error"):
+            raise Refused(errno.EINVAL, f"report: level {level!r}; want info, warning or error")
+        now_ns, user = time.monotonic_ns(), session.peer.uid
+        kept = [each for each in self._reports if each[1] != session.name or each[0] != user]
+        if level != "info":
+            kept.append((user, session.name, str(session), now_ns, printable(text, 400)))
+        self._reports = kept[-REPORTS:]
+        self._server.log(level, "report", peer=session, text=printable(text, 1000))
 
     def emergency_stop(self, session: Session, message: EmergencyStop) -> None:
         """Stop the workcell, or a node."""

@@ -203,6 +203,7 @@ def troubles(status: dict[str, Any], device: str = "", node: str = "") -> list[s
     lines = []
     if status["stopped_ns"]:
         lines.append(f"EMERGENCY STOP by {status['stop_source']}; `sioms reset` clears it")
+    lines += [f"{who}: {text} ({age_s:.0f} s ago)" for who, age_s, text in status.get("reports", ())]
     for name, source in status["node_stops"]:
         if not node or _touch(name, node):
             lines.append(f"{name}: emergency stop by {source}; `sioms reset {name}` clears it")

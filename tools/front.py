@@ -39,6 +39,7 @@ COMMANDS: dict[str, Command] = {
     "stop": Command("sioms.tools.cell", "emergency stop of a node or of the whole workcell"),
     "reset": Command("sioms.tools.cell", "clear a latched stop or fault"),
     "reload": Command("sioms.tools.cell", "make the daemon reload its configuration"),
+    "record": Command("sioms.recording.command.record", "record everything that nodes publish and are told"),
     "check": Command("sioms.tools.cell", "check a configuration"),
     "service": Command("sioms.tools.service", "install the daemon as a service of this machine"),
     "serve": Command("sioms.gateway.command", "let clients on other machines use the workcell"),
@@ -81,7 +82,7 @@ def main(words: Sequence[str] | None = None) -> int:
     return _guarded(wanted, module, args)
 
 
-EXTRAS = {"gpiod": "gpio", "matplotlib": "report", "numba": "fast"}
+EXTRAS = {"gpiod": "gpio", "matplotlib": "report", "numba": "fast", "zstandard": "record"}
 """Packages that not everybody needs, and the extra of SIOMS that brings each."""
 
 

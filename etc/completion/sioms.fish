@@ -68,6 +68,7 @@ complete -c sioms -n __fish_use_subcommand -a monitor -d 'display all nodes live
 complete -c sioms -n __fish_use_subcommand -a stop -d 'emergency stop of a node or of the whole workcell'
 complete -c sioms -n __fish_use_subcommand -a reset -d 'clear a latched stop or fault'
 complete -c sioms -n __fish_use_subcommand -a reload -d 'make the daemon reload its configuration'
+complete -c sioms -n __fish_use_subcommand -a record -d 'record everything that nodes publish and are told'
 complete -c sioms -n __fish_use_subcommand -a check -d 'check a configuration'
 complete -c sioms -n __fish_use_subcommand -a service -d 'install the daemon as a service of this machine'
 complete -c sioms -n __fish_use_subcommand -a serve -d 'let clients on other machines use the workcell'

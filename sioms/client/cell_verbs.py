@@ -288,6 +288,29 @@ class WorkcellVerbs(Generic[M]):
         return value
 
     @verb
+    async def journal(self, device: str = "") -> int:
+        """Open the journal of a device's driver, '' = of the daemon, for ``JournalReader``.
+
+        Returns:
+            A descriptor to be mapped for reading, and closed by the caller.
+
+        Raises:
+            OSError: EPERM, without the right to administer every node; ENOENT, no such device.
+        """
+        answer = await self._waiter.call(Call(f"open the journal of {device or 'the daemon'}", verbs.Journal(device)))
+        return answer.fds[0]
+
+    @verb
+    async def report(self, level: str, text: str) -> None:
+        """Write a line to the daemon's log.
+
+        Args:
+            level: "info", "warning" or "error"; the last two stand in the status, too.
+            text: a sentence.
+        """
+        await self._ask("report", verbs.Report(level, printable(text)))
+
+    @verb
     async def synch(self, *nodes: AxisVerbs, lead: float = SYNCH_LEAD_S) -> int:
         """Start the waiting commands of several nodes at the same instant.
 

@@ -172,6 +172,16 @@ class NodeCore(Generic[S]):
         channel.acknowledged = lambda instant_ns: shown.acknowledged(device, instant_ns)
 
     @property
+    def readings(self) -> Readings:
+        """Where its snapshots come from, for who takes all of them."""
+        return self._page
+
+    @property
+    def layout(self) -> Layout:
+        """Where its channels lie in them."""
+        return self._layout
+
+    @property
     def closed(self) -> bool:
         """Whether it has been closed."""
         return self._page.closed

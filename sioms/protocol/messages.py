@@ -76,6 +76,7 @@ class ClientVerb(IntEnum):
     STATUS = 6
     REPRESENT = 7
     JOURNAL = 8
+    REPORT = 9
     RESERVE_MARKER = 10
     FREE_MARKER = 11
     SIGNAL_MARKER = 12

@@ -326,6 +326,20 @@ class PageReader:
             return raw
         return None
 
+    def slots_view(self) -> memoryview:
+        """Return the memory of the ring as 8-byte words, for who takes many snapshots at once.
+
+        It may change at any time; a snapshot that was copied is good if its number still stands in the ring
+        afterwards.
+        """
+        return self._words[HEADER_SIZE // 8 : (HEADER_SIZE + self.slots * self._size) // 8]
+
+    @property
+    def states(self) -> tuple[PageState, PageState]:
+        """How driver and daemon call the page."""
+        driver, daemon = unpack_from("<II", self._buffer, 64)
+        return PageState(driver), PageState(daemon)
+
     def release(self) -> None:
         """Drop the view, so that the mapping can be closed."""
         self._words.release()

@@ -270,6 +270,15 @@ class Journal(Message, on=FROM_CLIENT, verb=ClientVerb.JOURNAL, query=True):
     device: Name
 
 
+class Report(Message, on=FROM_CLIENT, verb=ClientVerb.REPORT, somewhere="report"):
+    """Write a line to the daemon's log; one of level "error" or "warning" stands in the status until a program of
+    that name and user reports again, at most an hour.
+    """
+
+    level: Name
+    text: Text
+
+
 class ReserveMarker(Message, on=FROM_CLIENT, verb=ClientVerb.RESERVE_MARKER, somewhere="reserve markers"):
     """Reserve markers, all or none; they end with the session or persist. Answer: their tokens."""
 

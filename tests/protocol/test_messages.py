@@ -77,6 +77,7 @@ from sioms.protocol.verbs import (
     Open,
     Part,
     Reload,
+    Report,
     Represent,
     ReserveMarker,
     Reset,
@@ -121,6 +122,7 @@ RECORDED: list[tuple[Message, str]] = [
     (Info("mod0.xaxis"), "930505aa6d6f64302e7861786973"),
     (Status(), "920605"),
     (Journal("mod0"), "930805a46d6f6430"),
+    (Report("info", "well"), "940905a4696e666fa477656c6c"),
     (ReserveMarker(2, True), "940a0502c3"),
     (FreeMarker(562949953421312), "930b05cf0002000000000000"),
     (SignalMarker(7), "930c0507"),
@@ -258,8 +260,8 @@ def test_a_long_reply_is_compressed_and_one_too_long_is_a_refusal() -> None:
 
 
 NUMBERS = {
-    ClientVerb: "HELLO=1 OPEN=2 CLOSE=3 LIST=4 INFO=5 STATUS=6 REPRESENT=7 JOURNAL=8 RESERVE_MARKER=10 FREE_MARKER=11 "
-    "SIGNAL_MARKER=12 WAIT_MARKER=13 EMERGENCY_STOP=20 RESET=21 RELOAD=22 CANCEL=30",
+    ClientVerb: "HELLO=1 OPEN=2 CLOSE=3 LIST=4 INFO=5 STATUS=6 REPRESENT=7 JOURNAL=8 REPORT=9 RESERVE_MARKER=10 "
+    "FREE_MARKER=11 SIGNAL_MARKER=12 WAIT_MARKER=13 EMERGENCY_STOP=20 RESET=21 RELOAD=22 CANCEL=30",
     HandleVerb: "WRITE=1 IOCTL=2 SUBSCRIBE=3 KEEPALIVE=4 CANCEL=5",
     DriverVerb: "ATTACH=1 DETACH=2 STOP_CHANGED=3 SHUTDOWN=4 INPUT=5 NODE_STOP=6 NODE_RESET=7 READY=20 DETACHED=21 "
     "MARKER_SIGNALLED=22 STOPPED=23 LINK=24 LOG=25",

@@ -166,6 +166,7 @@ ON_NOTHING: dict[ClientVerb, tuple[list[object], int]] = {
     ClientVerb.RESERVE_MARKER: ([1, False], 0),
     ClientVerb.WAIT_MARKER: ([5, 0.0], errno.EINVAL),
     ClientVerb.SIGNAL_MARKER: ([5], errno.EINVAL),
+    ClientVerb.REPORT: (["info", "all is well"], 0),
 }
 """What belongs to no node, and the answer to somebody with any right."""
 FREE: dict[ClientVerb, tuple[list[object], int]] = {

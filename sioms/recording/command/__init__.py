@@ -1,0 +1,1 @@
+"""Commands about recordings: ``sioms record``, ``log``, ``replay`` and ``blackbox``."""

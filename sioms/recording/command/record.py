@@ -1,0 +1,109 @@
+"""``sioms record``: record everything, or some nodes."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import signal
+import sys
+import time
+from typing import Any
+
+from sioms.arguments import positive
+from sioms.client.workcell import Workcell
+from sioms.recording.live.files import LiveFile
+from sioms.recording.live.recorder import Recorder, be_prompt
+
+
+def size(text: str) -> int:
+    """Return the bytes that a size in words means, as 500M or 2G.
+
+    Raises:
+        argparse.ArgumentTypeError: it is none.
+
+    Example:
+        >>> size("2k"), size("1.5M")
+        (2000, 1500000)
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([kMGT]?)B?", text)
+    if not match or not float(match[1]):
+        raise argparse.ArgumentTypeError(f"{text!r}: want a size, as 500M or 2G")
+    return int(float(match[1]) * 1000 ** (" kMGT".index(match[2]) if match[2] else 0))
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command."""
+    one = subparsers.add_parser(
+        "record",
+        help="record everything that nodes publish and are told",
+        description="Record every publication of every node, and commands, refusals, markers, stops, faults and log "
+        "lines, until interrupted. What has been recorded outlives a kill of the recorder.",
+    )
+    one.add_argument("nodes", metavar="NODE", nargs="*", help="nodes to record (default: all)")
+    one.add_argument("-o", "--output", metavar="FILE", required=True, help="MCAP file to write")
+    one.add_argument("-t", "--time", type=positive, metavar="SECONDS", help="end after SECONDS")
+    rotation = "begin a new file after"
+    one.add_argument("--rotate-size", type=size, default=0, metavar="SIZE", help=f"{rotation} SIZE, as 500M or 2G")
+    one.add_argument("--rotate-time", type=positive, default=0.0, metavar="SECONDS", help=f"{rotation} SECONDS")
+    one.add_argument("--no-pack", action="store_true", help="leave files as written, not compressed, not indexed")
+    one.add_argument("-v", "--verbose", action="store_true", help="print once a second how much has been recorded")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Record; return the exit status: 1 if the recording ended before it was to."""
+    ended = False
+
+    def end(_number: int, _frame: object) -> None:
+        nonlocal ended
+        ended = True
+
+    sink = LiveFile(args.output, args.rotate_size, args.rotate_time, pack=not args.no_pack)
+    name = "sioms record"
+    try:
+        recorder = Recorder(sink, lambda: Workcell(name=name), args.nodes, log=_say)
+    except OSError:
+        sink.drop()
+        raise
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, end)
+    be_prompt()
+    began_s = told_s = time.monotonic()
+
+    def until() -> bool:
+        nonlocal told_s
+        now_s = time.monotonic()
+        if args.verbose and now_s >= told_s + 1:
+            told_s = now_s
+            print(f"{now_s - began_s:.0f} s: {_sum(recorder)}", flush=True)
+        return ended or (args.time is not None and now_s - began_s >= args.time)
+
+    status = 0
+    try:
+        recorder.run(until)
+    except OSError as error:
+        status = 1
+        why = error.strerror or str(error)
+        print(f"sioms record: {why}; the recording has ended, what came before is whole", file=sys.stderr)
+        alarm(recorder, f"recording has ended: {why}")
+    recorder.close()
+    print(f"{sink.path}: {_sum(recorder)}", file=sys.stderr)
+    return status
+
+
+def _say(text: str) -> None:
+    print(f"sioms record: {text}", file=sys.stderr)
+
+
+def alarm(recorder: Recorder, text: str) -> None:
+    """Say in the daemon's log and status that something is wrong."""
+    try:
+        if recorder.cell is not None:
+            recorder.cell.report("error", text)
+    except OSError as error:
+        print(f"sioms record: the daemon could not be told: {error.strerror}", file=sys.stderr)
+
+
+def _sum(recorder: Recorder) -> str:
+    lost = {name: count for name, count in recorder.lost.items() if count}
+    rest = "none lost" if not lost else "lost: " + ", ".join(f"{count} of {name}" for name, count in lost.items())
+    return f"{sum(recorder.recorded.values())} snapshots of {len(recorder.recorded)} nodes, {rest}"

@@ -1,0 +1,258 @@
+"""The recorder: looks into the rings of pages and journals often enough to miss nothing, and says what it missed.
+
+It is an ordinary client of the daemon, in a process of its own: drivers and daemon wait for nothing that it does.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import socket
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from select import POLLIN, poll
+from typing import Any
+
+from sioms.client.workcell import Workcell, is_part
+from sioms.protocol.flags import READONLY
+from sioms.recording import mcap, messages
+from sioms.recording.messages import Event, NodeFormat
+
+from .files import Sink
+from .taps import JournalTap, NodeTap
+
+PERIOD_S = (0.004, 0.02)
+"""Least and longest time between two looks [s]; a third of the time that snapshots stay in the shortest ring."""
+RETRY_S = 0.25
+"""How often a node or a daemon that is gone is looked for [s]."""
+
+
+class Recorder:
+    """Everything that a workcell publishes and is told, into a sink.
+
+    Args:
+        sink: where it goes.
+        connect: makes a session with the daemon.
+        wanted: nodes; none: all.
+        seen: called with each event, after it has been recorded.
+        log: called with a sentence that its user shall see.
+        past: whether the events that the journals keep from before are recorded, too.
+
+    Attributes:
+        recorded: snapshots that are safe, by node.
+        lost: snapshots that were overwritten before they were taken, by node.
+
+    Concurrency: one thread.
+    """
+
+    def __init__(
+        self, sink: Sink, connect: Callable[[], Workcell], wanted: Sequence[str] = (), *,
+        seen: Callable[[Event], None] = lambda _event: None, log: Callable[[str], None] = lambda _text: None,
+        past: bool = False,
+    ) -> None:  # fmt: skip
+        self.recorded: dict[str, int] = {}
+        self.lost: dict[str, int] = {}
+        self._sink, self._connect, self._wanted = sink, connect, list(wanted)
+        self._seen, self._log, self._past = seen, log, past
+        self._offset_ns = time.time_ns() - time.monotonic_ns()
+        self._schemas: dict[tuple[str, str], int] = {}
+        self._channels = 0
+        self._taps: dict[str, tuple[NodeTap, NodeFormat]] = {}
+        self._journals: dict[str, JournalTap] = {}
+        self._pending: list[Event] = []
+        self._sequence = 0
+        self._retry_s = 0.0
+        self._poll = poll()
+        self._may_hear = True
+        self.cell: Workcell | None = connect()
+        about = {
+            "workcell": self.cell.name, "host": socket.gethostname(), "offset_ns": str(self._offset_ns),
+            "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), "boot": _boot(),
+            "clock": "UTC = CLOCK_MONOTONIC + offset_ns",
+        }  # fmt: skip
+        self._sink.define(mcap.metadata("sioms", about))
+        self._events = self._channel(messages.EVENT, messages.EVENTS)
+        try:
+            self._attach(self.cell)
+        except OSError:
+            self.cell.close()
+            raise
+        missing = [name for name in self._wanted if name not in self._taps]
+        if missing:
+            nodes = ", ".join(entry.name for entry in self.cell.nodes() if not entry.name.endswith(READONLY))
+            raise OSError(
+                errno.ENOENT, f"record {missing[0]}: no such node, or its device is not up; there are: {nodes}"
+            )
+
+    # --- what is in the file ---------------------------------------------------------------------
+
+    def _schema(self, name: str, definition: str) -> int:
+        if (name, definition) not in self._schemas:
+            number = self._schemas[name, definition] = len(self._schemas) + 1
+            self._sink.define(mcap.Schema(number, name, "ros2msg", definition.encode()).packed())
+        return self._schemas[name, definition]
+
+    def _channel(self, type_: tuple[str, str], topic: str) -> int:
+        self._channels += 1
+        self._sink.define(mcap.Channel(self._channels, self._schema(*type_), topic, "cdr").packed())
+        return self._channels
+
+    # --- what is read ----------------------------------------------------------------------------
+
+    def _attach(self, cell: Workcell) -> None:
+        """Open what is there and not open yet."""
+        entries = cell.nodes()
+        for entry in entries:
+            name = entry.name
+            if name.endswith(READONLY) or entry.state != "up":
+                continue
+            if name not in self._wanted if self._wanted else is_part(entry, entries):
+                continue
+            try:
+                if name not in self._taps:
+                    tap = NodeTap(cell, name, name if entry.read_only else name + READONLY)
+                    self._add(name, tap)
+                elif self._taps[name][0].is_over:
+                    self._taps[name][0].open(cell)
+                    self._tell("opened again", name, text="its driver process is another one")
+            except OSError as error:
+                self._log(f"{name}: {error.strerror}")
+        try:
+            for device in ["", *[each["name"] for each in cell.status()["devices"]]] if self._may_hear else []:
+                if device not in self._journals:
+                    self._journals[device] = JournalTap(cell.journal(device), device or "daemon", from_start=self._past)
+        except OSError as error:
+            if error.errno != errno.EPERM:
+                raise
+            self._may_hear = False
+            self._tell("lost", text=f"commands, stops and faults are not recorded: {error.strerror}")
+            self._log(f"only readings are recorded: {error.strerror}")
+        self._poll = poll()
+        self._poll.register(cell.fileno(), POLLIN)
+        self._sink.define(mcap.metadata("status", {"json": json.dumps(cell.status(), default=str)}))
+
+    def _add(self, name: str, tap: NodeTap) -> None:
+        form = NodeFormat(tap.info, tap.bit, self._channels + 1, self._schema, self._offset_ns)
+        self._channels += len(form.channels)
+        for channel in form.channels:
+            self._sink.define(channel.packed())
+        self._taps[name] = (tap, form)
+        self.recorded[name] = self.lost[name] = 0
+
+    def _tell(self, kind: str, node: str = "", text: str = "", **data: Any) -> None:
+        """Record something about the recording itself."""
+        self._pending.append(Event(time.monotonic_ns(), 0, "recorder", kind, node, text=text, data=data or None))
+
+    @property
+    def period_s(self) -> float:
+        """How long to wait until the next look [s]."""
+        rings = [tap.ring_s for tap, _ in self._taps.values() if not tap.is_over]
+        return min(max(min(rings, default=1.0) / 3, PERIOD_S[0]), PERIOD_S[1])
+
+    def look(self) -> int:
+        """Take what is new and write it; return how many snapshots there were.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        parts, counts = [], dict[str, int]()
+        for name, (tap, form) in self._taps.items():
+            slots, lost = tap.take()
+            if lost:
+                self.lost[name] += lost
+                last = int(slots[0, 0]) if slots is not None and len(slots) else 0
+                text = f"{lost} snapshots before number {last} were overwritten before they were taken"
+                self._tell("lost", name, text, snapshots=lost, before=last)
+            if slots is not None and len(slots):
+                counts[name] = len(slots)
+                parts.append(form.messages(slots))
+        events, self._pending = self._pending, []
+        for source, journal in self._journals.items():
+            found, lost = journal.take()
+            events += found
+            if lost:
+                text = f"{lost} events of {source or 'the daemon'} were overwritten before they were taken"
+                events.append(Event(time.monotonic_ns(), 0, "recorder", "lost", text=text, data={"events": lost}))
+        for event in events:
+            self._sequence += 1
+            parts.append(mcap.message(self._events, self._sequence, event.stamp_ns + self._offset_ns, event.packed()))
+        if parts:
+            self._sink.append(b"".join(parts))
+        for name, count in counts.items():
+            self.recorded[name] += count
+        for event in events:
+            self._seen(event)
+        self._look_around(events)
+        self._sink.look()
+        return sum(counts.values())
+
+    def _look_around(self, events: list[Event]) -> None:
+        """See whether the daemon or drivers are others than before."""
+        if self.cell is not None and self._poll.poll(0):
+            self.cell.close()
+            self.cell = None
+            self._tell("daemon gone", text="the daemon has ended; drivers stop by themselves")
+        changed = any(
+            event.source == "daemon" and event.kind == "log" and event.text == "device up" for event in events
+        )
+        over = self.cell is None or any(tap.is_over for tap, _ in self._taps.values())
+        now_s = time.monotonic()
+        if not changed and (not over or now_s < self._retry_s):
+            return
+        self._retry_s = now_s + RETRY_S
+        if self.cell is None:
+            with suppress(OSError):
+                self.cell = self._connect()
+                self._tell("daemon back", text=f"connected to the daemon of {self.cell.name} again")
+                for journal in self._journals.values():
+                    journal.release()
+                self._journals = {}
+        if self.cell is not None:
+            with suppress(OSError):
+                self._attach(self.cell)
+
+    def run(self, until: Callable[[], bool]) -> None:
+        """Record until told to end.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self._tell("began", text="recording begins")
+        next_s = time.monotonic()
+        while not until():
+            self.look()
+            next_s = max(next_s + self.period_s, time.monotonic())
+            time.sleep(max(0.0, next_s - time.monotonic()))
+
+    def close(self) -> None:
+        """Take what is left, and end in order."""
+        with suppress(OSError):
+            self._tell("ended", text="recording ends", lost={name: lost for name, lost in self.lost.items() if lost})
+            self.look()
+        for tap, _ in self._taps.values():
+            tap.release()
+        for journal in self._journals.values():
+            journal.release()
+        if self.cell is not None:
+            self.cell.close()
+            self.cell = None
+        self._sink.close()
+
+
+def _boot() -> str:
+    try:
+        with open("/proc/sys/kernel/random/boot_id", encoding="ascii") as file:
+            return file.read().strip()
+    except OSError:
+        return ""
+
+
+def be_prompt() -> bool:
+    """Ask for the lowest real-time priority, so that a busy machine costs no snapshots; return whether it was given."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+    except OSError:
+        return False
+    return True

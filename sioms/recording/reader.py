@@ -1,0 +1,353 @@
+"""Reads recordings: live or packed, whole or damaged. What is whole is read, what is lost is said.
+
+A file is read in pieces, of some megabytes each, and never as a whole; what is asked for in columns is kept, the rest
+is not.
+"""
+
+from __future__ import annotations
+
+import json
+import mmap
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from struct import unpack_from
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.protocol.flags import NodeClass
+from sioms.protocol.nodeinfo import NodeInfo
+from sioms.protocol.records import READ
+
+from . import mcap
+from .messages import CDR, EVENTS, Event
+
+PIECE = 8 << 20
+"""Bytes of a live file that are looked at together."""
+
+
+@dataclass(slots=True)
+class Piece:
+    """Some messages, in the order of the file.
+
+    Attributes:
+        data: their records, one after the other, perhaps with others between them.
+        by_channel: where the records of each channel begin.
+    """
+
+    data: Any
+    by_channel: dict[int, list[int]]
+
+    def rows(self, channel: int, size: int) -> NDArray[np.uint8]:
+        """Return the messages of a channel as rows of bytes, those of another size left out."""
+        offsets = np.array(self.by_channel.get(channel, ()), np.int64)
+        places = np.frombuffer(self.data, np.uint8)
+        start, whole = mcap.HEAD + mcap.MESSAGE_HEAD, mcap.MESSAGE_HEAD + size
+        offsets = (
+            offsets[[unpack_from("<Q", self.data, at + 1)[0] == whole for at in offsets.tolist()]]
+            if len(offsets)
+            else offsets
+        )
+        if not len(offsets):
+            return np.empty((0, size), np.uint8)
+        windows = np.lib.stride_tricks.sliding_window_view(places, size)
+        return np.array(windows[offsets + start])
+
+    def messages(self, channel: int) -> Iterator[bytes]:
+        """Yield the messages of a channel."""
+        for at in self.by_channel.get(channel, ()):
+            (size,) = unpack_from("<Q", self.data, at + 1)
+            yield bytes(self.data[at + mcap.HEAD + mcap.MESSAGE_HEAD : at + mcap.HEAD + size])
+
+
+@dataclass(slots=True)
+class NodeRecord:
+    """A node of a recording.
+
+    Attributes:
+        info: what it is.
+        bit: for a node of one bit the bit of its port, else -1.
+        channel: of the file, of its snapshots.
+    """
+
+    info: NodeInfo
+    bit: int
+    channel: int
+
+    @property
+    def size(self) -> int:
+        """Bytes of a snapshot."""
+        return 32 + 8 * len(READ[self.info.node_class]) * len(self.info.channels)
+
+
+@dataclass(slots=True)
+class Table:
+    """Readings of a node.
+
+    Attributes:
+        stamps_ns: when [ns, CLOCK_MONOTONIC], in ascending order.
+        numbers: of the snapshots, as the driver counts them.
+        values: by column; shape (snapshots, channels).
+    """
+
+    stamps_ns: NDArray[np.int64]
+    numbers: NDArray[np.int64]
+    values: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+
+class Recording:
+    """A recording.
+
+    Args:
+        path: of the file.
+
+    Attributes:
+        nodes: by name.
+        channels, schemas: of the file, by number.
+        metadata: name and values of each, in order.
+        is_packed: whether it has been closed in order.
+        damage: a sentence for each place that could not be read, of what was read so far.
+
+    Raises:
+        OSError: it cannot be read; EINVAL: it is no recording.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = str(path)
+        with open(path, "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            if file.read(8) != mcap.MAGIC:
+                raise OSError(22, f"read {path}: it is no recording: it does not begin as MCAP files do")
+            self._data = mmap.mmap(file.fileno(), size, prot=mmap.PROT_READ)
+        self.nodes: dict[str, NodeRecord] = {}
+        self.schemas: dict[int, mcap.Schema] = {}
+        self.channels: dict[int, mcap.Channel] = {}
+        self.metadata: list[tuple[str, dict[str, str]]] = []
+        self.damage: list[str] = []
+        self.is_packed = self._data[-8:] == mcap.MAGIC and size > 100
+        self.size = size
+        self._lengths: dict[int, int] = {}
+        self._events = -1
+        self._known: dict[bytes, int] = {}
+        self._head()
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._data.close()
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def about(self) -> dict[str, str]:
+        """What the recorder says of the recording: workcell, host, start, clock."""
+        return {key: value for name, values in self.metadata if name == "sioms" for key, value in values.items()}
+
+    @property
+    def offset_ns(self) -> int:
+        """UTC minus CLOCK_MONOTONIC [ns]."""
+        return int(self.about.get("offset_ns", "0") or 0)
+
+    def _head(self) -> None:
+        """Take up what stands before the first message; channels may come later, too."""
+        try:
+            for kind, start, stop in mcap.walk(self._data, len(mcap.MAGIC), self.size):
+                if kind in (mcap.MESSAGE, mcap.CHUNK, mcap.DATA_END):
+                    return
+                self._take(kind, self._data[start:stop])
+        except mcap.Damaged:
+            return  # it is said by who reads the messages
+
+    def _take(self, kind: int, content: bytes) -> None:
+        if kind == mcap.SCHEMA:
+            schema = mcap.schema_of(content)
+            self.schemas[schema.number] = schema
+        elif kind == mcap.METADATA:
+            entry = mcap.metadata_of(content)
+            if entry not in self.metadata:
+                self.metadata.append(entry)
+        elif kind == mcap.CHANNEL:
+            channel = mcap.channel_of(content)
+            if channel.number in self.channels:
+                return
+            self.channels[channel.number] = channel
+            if channel.topic == EVENTS:
+                self._events = channel.number
+            if packed := channel.metadata.get("sioms"):
+                try:
+                    info = NodeInfo(values := json.loads(packed))
+                except (ValueError, TypeError):
+                    raise mcap.Damaged(f"the description of channel {channel.topic} cannot be understood") from None
+                node = NodeRecord(info, int(values[4]), channel.number)
+                self.nodes[info.name] = node
+                self._known[np.array([node.size + 4 + mcap.MESSAGE_HEAD], "<u8").tobytes()] = channel.number
+
+    # --- pieces ----------------------------------------------------------------------------------
+
+    def pieces(self, channels: Iterable[int] | None = None) -> Iterator[Piece]:
+        """Yield the messages of the file, piece by piece.
+
+        Args:
+            channels: what is wanted; None: all.
+        """
+        wanted = None if channels is None else frozenset(channels)
+        self.damage = []
+        at = begin = len(mcap.MAGIC)
+        found: dict[int, list[int]] = {}
+        ended = False
+        data, size = self._data, self.size
+        while at < size and not ended:
+            try:
+                for kind, start, stop in mcap.walk(data, at, size):
+                    at = stop
+                    if kind == mcap.MESSAGE:
+                        channel = int.from_bytes(data[start : start + 2], "little")
+                        if channel not in self.channels or stop - start < mcap.MESSAGE_HEAD:
+                            raise mcap.Damaged(f"a message at {start - mcap.HEAD} is of no channel")
+                        if wanted is None or channel in wanted:
+                            found.setdefault(channel, []).append(start - mcap.HEAD - begin)
+                        if at - begin > PIECE:
+                            if found:
+                                yield Piece(data[begin:at], found)
+                            begin, found = at, {}
+                    elif kind == mcap.CHUNK:
+                        if (piece := self._chunk(data[start:stop], start, wanted)) and piece.by_channel:
+                            yield piece
+                        begin = at
+                    elif kind == mcap.DATA_END:
+                        ended = True
+                        break
+                    elif kind not in (mcap.MESSAGE_INDEX, mcap.HEADER):
+                        self._take(kind, data[start:stop])
+                else:
+                    break
+            except mcap.Damaged as problem:
+                if found:
+                    yield Piece(data[begin:at], found)
+                next_at = self._resume(at)
+                lost = (next_at or size) - at
+                rest = "" if next_at else ", to the end of the file"
+                self.damage.append(f"{problem}: {lost} bytes from {at} on are lost{rest}")
+                if next_at is None:
+                    return
+                begin, found, at = next_at, {}, next_at
+        if found:
+            yield Piece(data[begin:at], found)
+        if not ended and not self.damage and self.is_packed:
+            self.damage.append("the summary is damaged; the messages are whole")
+
+    def _chunk(self, content: bytes, at: int, wanted: frozenset[int] | None) -> Piece | None:
+        """Take a chunk apart; one that is damaged is lost, and said."""
+        found: dict[int, list[int]] = {}
+        try:
+            records = mcap.chunk_of(content).records()
+            for kind, start, stop in mcap.walk(records, 0, len(records)):
+                if kind == mcap.MESSAGE:
+                    channel = int.from_bytes(records[start : start + 2], "little")
+                    if wanted is None or channel in wanted:
+                        found.setdefault(channel, []).append(start - mcap.HEAD)
+                else:
+                    self._take(kind, records[start:stop])
+        except mcap.Damaged as problem:
+            self.damage.append(f"chunk at {at}: {problem}: its messages are lost")
+            return None
+        return Piece(records, found)
+
+    def _resume(self, at: int) -> int | None:
+        """Return where the next message of a known node begins behind a place, None for nowhere."""
+        best: int | None = None
+        for size, channel in self._known.items():
+            pattern = bytes([mcap.MESSAGE]) + size + channel.to_bytes(2, "little")
+            place = self._data.find(pattern, at + 1, best if best is not None else self.size)
+            if place >= 0 and (best is None or place < best):
+                best = place
+        return best
+
+    # --- what is asked for -----------------------------------------------------------------------
+
+    def events(self) -> list[Event]:
+        """Return what happened, in the order of stamps."""
+        if self._events < 0:
+            list(self.pieces(()))  # its channel may stand later in the file
+        found = []
+        for piece in self.pieces([self._events]):
+            for data in piece.messages(self._events):
+                try:
+                    found.append(Event.of(data))
+                except mcap.Damaged as problem:
+                    self.damage.append(str(problem))
+        return sorted(found, key=lambda event: event.stamp_ns)
+
+    def node(self, name: str) -> NodeRecord:
+        """Return a node.
+
+        Raises:
+            OSError: ENOENT, it is not in the recording.
+        """
+        if name not in self.nodes:
+            raise OSError(2, f"{self.path}: no node {name} is recorded; there are: {', '.join(self.nodes) or 'none'}")
+        return self.nodes[name]
+
+    def slots(self, name: str) -> Iterator[NDArray[np.uint64]]:
+        """Yield the snapshots of a node in the order of the file: arrays of shape (snapshots, words)."""
+        node = self.node(name)
+        for piece in self.pieces([node.channel]):
+            rows = piece.rows(node.channel, 4 + node.size)
+            if len(rows):
+                yield np.ascontiguousarray(rows[:, len(CDR) :]).view("<u8")
+
+    def table(self, name: str, columns: Iterable[str] | None = None, start_ns: int = 0, end_ns: int = 1 << 62) -> Table:
+        """Return columns of a node.
+
+        Args:
+            name: of the node.
+            columns: names, as ``position``; None: all of its class.
+            start_ns, end_ns: from when until when [ns, CLOCK_MONOTONIC].
+
+        Raises:
+            OSError: no such node; EINVAL, no such column.
+        """
+        node = self.node(name)
+        known = READ[node.info.node_class]
+        wanted = list(known) if columns is None else list(columns)
+        for column in wanted:
+            if column not in known:
+                raise OSError(22, f"{self.path}: {name} has no column {column}; there are: {', '.join(known)}")
+        count, order = len(node.info.channels), list(known)
+        heads: list[NDArray[np.uint64]] = []
+        kept: dict[str, list[NDArray[np.uint64]]] = {column: [] for column in wanted}
+        for slots in self.slots(name):
+            inside = (slots[:, 1] >= start_ns) & (slots[:, 1] < end_ns)
+            chosen = slots[inside]
+            heads.append(chosen[:, :2].copy())
+            for column in wanted:
+                first = 4 + order.index(column) * count
+                kept[column].append(chosen[:, first : first + count].copy())
+        head = np.concatenate(heads) if heads else np.empty((0, 2), "<u8")
+        values: dict[str, NDArray[Any]] = {}
+        for column in wanted:
+            joined = np.concatenate(kept[column]) if heads else np.empty((0, count), "<u8")
+            values[column] = joined.view("<f8" if known[column].code == "d" else "<i8")
+        if node.bit >= 0 and "data" in values:
+            values["data"] = values["data"] >> node.bit & 1
+        if node.info.node_class is NodeClass.BINARY and (np.diff(head[:, 1].astype(np.int64)) < 0).any():
+            order_ns = np.argsort(head[:, 1], kind="stable")
+            head, values = head[order_ns], {name: value[order_ns] for name, value in values.items()}
+        return Table(head[:, 1].astype(np.int64), head[:, 0].astype(np.int64), values)
+
+    def span(self) -> tuple[int, int, dict[int, int]]:
+        """Return first and last time [ns, UTC] and the number of messages of each channel."""
+        first, last, counts = 0, 0, dict[int, int]()
+        for piece in self.pieces():
+            for channel, offsets in piece.by_channel.items():
+                counts[channel] = counts.get(channel, 0) + len(offsets)
+                for at in (offsets[0], offsets[-1]):
+                    when = mcap.message_at(piece.data, at)[2]
+                    first, last = min(first or when, when), max(last, when)
+        return first, last, counts
