@@ -58,7 +58,7 @@ class SimForceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         bias: readings without load.
         limit: the readings saturate here.
         cross_talk: 6 rows of 6, applied to the true components.
-        flaws_file: TOML file with flaws, read when the driver starts.
+        flaws_file: TOML file with flaws.
         model_file: sensor and effects from a model instead.
         seed: of the noise.
         tick_hz: rate.
@@ -90,7 +90,7 @@ class SimForce(TickDriver):
     @classmethod
     def describe(cls, name: str, settings: SimForceSettings) -> Description:
         """Tell the six channels and the contact nodes."""
-        _sensor(settings, None)
+        _sensor(settings, _flaws(settings.flaws_file))
         what = ""
         if settings.model_file:
             what = f"model {zlib.crc32(Path(settings.model_file).read_bytes()):08x}"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import importlib.util
 import os
+import stat
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -140,6 +142,42 @@ def _named_files(value: Any, key: str = "") -> Iterator[str]:
         yield value
 
 
+def missing_files(value: Any, folder: str) -> list[str]:
+    """Return an error for each file that a table names and that cannot be read, each beginning with ``: ``.
+
+    A driver may read its files not before it starts. A reload would then end the device that runs, for one that fails.
+
+    Args:
+        value: the table.
+        folder: that relative paths are taken from.
+    """
+    errors = []
+    for key, path in _keys_of_files(_anchored(value, folder)):
+        try:
+            with open(path, "rb", opener=_at_once) as file:
+                if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                    raise OSError(errno.EINVAL, "it is no regular file")
+        except (OSError, ValueError) as error:
+            why = error.strerror if isinstance(error, OSError) else str(error)
+            errors.append(f": {key} = {shown(path)}: {why}; want a file that can be read")
+    return errors
+
+
+def _at_once(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe would hold up whoever waits for the answer
+
+
+def _keys_of_files(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    if isinstance(value, Mapping):
+        for k, each in value.items():
+            yield from _keys_of_files(each, k)
+    elif isinstance(value, list):
+        for each in value:
+            yield from _keys_of_files(each, key)
+    elif isinstance(value, str) and value and (key.endswith("_file") or (key == "map" and value.endswith(".toml"))):
+        yield key, value
+
+
 def contents(driver: type[Driver], table: Mapping[str, Any], folder: str) -> str:
     """Return a digest of what a device is made of beside its table: the driver's file, and the files that its table
     names.
@@ -173,7 +211,7 @@ def describe(
     """
     try:
         description = driver.describe(name, settings)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         return None, [f": {line}" for line in str(error).splitlines()]
     errors = _block_errors(description.blocks)
     if not 0.1 <= description.tick_hz <= 20_000:

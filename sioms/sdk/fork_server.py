@@ -22,7 +22,7 @@ from sioms.protocol.driver_verbs import TO_FORK_SERVER, Describe, Spawn
 from sioms.protocol.messages import MAX_UNPACKED, encode, pack_compressed, refusal, reply
 from sioms.protocol.verbs import take
 
-from .finding import DriverNotFound, contents, describe, find_driver, read_settings
+from .finding import DriverNotFound, contents, describe, find_driver, missing_files, read_settings
 
 
 def main(fd: int) -> None:
@@ -75,7 +75,7 @@ def _describe(device: str, driver: str, table: dict[str, Any], folder: str) -> l
     if settings is None:
         return [errors, None]
     packed, more = describe(found, device, settings, contents(found, table, folder))
-    return [errors + more, packed]
+    return [errors + (more or missing_files(table, folder)), packed]
 
 
 def _spawn(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
-from sioms.sdk.finding import DriverNotFound, contents, find_driver, read_settings
+from sioms.sdk import fork_server
+from sioms.sdk.finding import DriverNotFound, contents, find_driver, missing_files, read_settings
 
 FILE = """
 from __future__ import annotations
@@ -84,3 +86,31 @@ def test_the_contents_of_a_device_are_the_files_that_it_names(tmp_path: Path) ->
     (tmp_path / "a.toml").write_text("x = 2")
     assert of({"map": "a.toml", "axis": [{"model_file": "a.toml"}]}) != before
     assert of({"map": "shipped"}) == of({"map": "gone.toml", "description": "a.toml"})
+
+
+def test_a_file_that_is_named_and_cannot_be_read_is_an_error_whatever_the_driver_says(tmp_path: Path) -> None:
+    (tmp_path / "there.toml").write_text("")
+    os.mkfifo(tmp_path / "pipe")
+    table = {
+        "flaws_file": "there.toml", "map": "mapped", "axis": [{"model_file": "gone.toml"}, {"model_file": ""}],
+        "inner": {"map": "gone/too.toml", "a_file": "pipe", "b_file": "."},
+    }  # fmt: skip
+    told = missing_files(table, str(tmp_path))
+    assert [line.split(" = ")[0] for line in told] == [": model_file", ": map", ": a_file", ": b_file"]
+    assert all("want a file that can be read" in line and str(tmp_path) in line for line in told)
+
+
+def test_a_reload_hears_of_a_deleted_file_before_the_device_that_runs_ends(tmp_path: Path) -> None:
+    table = {"flaws_file": "flaws.toml", "contact": [], "limit": [1.0] * 6}
+    (tmp_path / "flaws.toml").write_text("")
+    assert fork_server._describe("f", "sim-force", table, str(tmp_path))[0] == []
+    for text in ("nonsense = 1", None):
+        if text is None:
+            (tmp_path / "flaws.toml").unlink()
+        else:
+            (tmp_path / "flaws.toml").write_text(text)
+        (error,) = fork_server._describe("f", "sim-force", table, str(tmp_path))[0]
+        assert "flaws_file" in error
+    (tmp_path / "own.py").write_text(FILE.replace("    line:", "    table_file: str\n    line:"))
+    table = {"table_file": "gone.csv", "line": {"tcp": "localhost:1"}}
+    assert "table_file = " in fork_server._describe("d", "own.py", table, str(tmp_path))[0][0]
