@@ -128,7 +128,21 @@ class Rubber:
         q_hat = -np.fft.rfft(series_q).imag
         total = self.strain[0] * p_hat[:, None] + self.strain[1] * q_hat[:, None]
         profile = np.fft.irfft(total, POINTS, axis=0)
-        return Pressing(load, step * float(np.count_nonzero(w) - 0.5), profile)
+        approach = float(self._normal[0] @ w) - float(self._lift(q, place)[0])
+        return Pressing(load, step * float(np.count_nonzero(w) - 0.5), profile, approach)
+
+    def shear_stiffness(self, half_width: float) -> float:
+        """Return the force per length that moves a contact along the surface by one metre against the core [N/m^2].
+
+        Args:
+            half_width: of an elliptical traction [rad], > 0.
+        """
+        angle = 2 * math.pi / POINTS * (np.arange(POINTS) - POINTS // 2)
+        traction = np.sqrt(np.maximum(1.0 - (angle / half_width) ** 2, 0.0))
+        share = traction / np.sum(traction)
+        load = self.layer.outer_m * 2 * math.pi / POINTS
+        spread = np.abs(np.fft.rfft(share)) ** 2 * self.compliance[3]  # mean displacement, weighted by the traction
+        return 1.0 / float(np.fft.irfft(spread, POINTS)[0] / load)
 
     def pattern(self, loads: Array, radius_m: float, adhesion: float) -> Array:
         """Return the profiles per unit load at some loads, shape (loads, POINTS, nr); tabulated
@@ -183,11 +197,13 @@ class Pressing:
         load: P [N/m].
         half_width: of the contact [rad], to the middle between points.
         profile: strain at the radii over the angle, shape (POINTS, nr), angle 2 pi n/POINTS in row n.
+        approach: of the indenter from first touch [m].
     """
 
     load: float
     half_width: float
     profile: Array
+    approach: float
 
 
 def _complement(normal: Array, h: Array, weight: Array, load: float, guess: int) -> Array:
