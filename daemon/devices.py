@@ -16,7 +16,7 @@ from functools import partial
 from typing import Any, Protocol
 
 from sioms.descriptors import receive
-from sioms.protocol.driver_verbs import FROM_DRIVER, LinkChanged, Ready, Shutdown
+from sioms.protocol.driver_verbs import FROM_DRIVER, InUse, LinkChanged, Ready, Shutdown
 from sioms.protocol.flags import PageState
 from sioms.protocol.messages import MAX_PACKET, MalformedMessage
 from sioms.protocol.page import NotReadable, PageReader, set_daemon_state
@@ -97,6 +97,7 @@ class DriverProcess:
         self.page_fds: list[int] = []
         self.journal_fd = journal_file(f"sioms:{device.name}.journal")
         self.hung = False
+        self.used = True
         self.options = options
         self._maps: list[mmap.mmap] = []
         self._readers: list[PageReader] = []
@@ -138,7 +139,7 @@ class DriverProcess:
         self.generation += 1
         self.state = State.STARTING
         self.started_ns = time.monotonic_ns()
-        self.hung = False
+        self.hung, self.used = False, True
         try:
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         except OSError as error:
@@ -215,6 +216,15 @@ class DriverProcess:
             self.send(message)
         except OSError as error:
             self._log("warning", "notice lost", device=self.name, verb=type(message).__name__, why=error.strerror)
+
+    def tell_use(self, used: bool) -> None:
+        """Tell the driver whether somebody reads it through another device, when that is news; it may be asked again
+        and again.
+        """
+        if self.state is State.UP and used != self.used:
+            with suppress(OSError):
+                self.send(InUse(used))
+                self.used = used
 
     def why_unreadable(self, block: int) -> str:
         """Return why readers of a block are refused, empty when they are not."""

@@ -10,6 +10,7 @@ import itertools
 import os
 import socket
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -53,6 +54,7 @@ class NodeVerbs:
         self._server = server
         self._clients = clients
         self._handles: dict[int, Handle] = {}
+        self._open: Counter[str] = Counter()
         self._claims: Claims[Handle] = Claims()
         self._opens: list[tuple[Wait, Node, Callable[[], None]]] = []
         self._numbers = itertools.count(1)
@@ -195,6 +197,9 @@ class NodeVerbs:
                 raise Refused(errno.EIO, f"open {node.name}: {error.strerror}") from None
             self._handles[handle.number] = session.handles[handle.number] = handle
             self._claims.take(handle.claims, handle)
+            self._open[node.device] += 1
+            if self._open[node.device] == 1:
+                self._server.look_at_use()
             behind = [os.getpid(), device.pid]
             value = [handle.number, self._server.names.pack(node), node.channels, node.bit, behind]
             self._clients.send(session, reply(number, value), [device.page_fds[node.block], readable, ours.fileno()])
@@ -299,6 +304,9 @@ class NodeVerbs:
             return
         handle.session.handles.pop(handle.number, None)
         self._server.shared.journal.note(Note.CLOSED, time.monotonic_ns(), handle.node.name, str(handle.session))
+        self._open[handle.node.device] -= 1
+        if not self._open[handle.node.device]:
+            self._server.look_at_use()
         self._claims.release(handle.claims)
         wait = handle.session.waits.get(handle.closing)
         if wait is not None:
@@ -320,6 +328,10 @@ class NodeVerbs:
         for handle in [h for h in self._handles.values() if h.node.device == device.name]:
             self._forget(handle)
         self.retry_opens()
+
+    def is_open(self, device: str) -> bool:
+        """Whether somebody has a node of a device open."""
+        return self._open[device] > 0
 
     def holders(self) -> Iterator[Handle]:
         """Return the handles that own outputs."""

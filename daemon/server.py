@@ -283,8 +283,26 @@ class Server:
             for name in other.info.inputs:
                 if other is device or self.names.nodes[name].device == device.name:
                     self._send_input(other, name)
+        self.look_at_use()
         self.clients.nodes.retry_opens()
         self._maybe_ready()
+
+    def look_at_use(self) -> None:
+        """Tell drivers whether somebody reads them through other devices, directly or not.
+
+        Somebody is who has a node open, and the workcell's stop where an input of a device is to stop it.
+        """
+        used: set[str] = set()
+        readers = [name for name in self.devices if self.clients.nodes.is_open(name) or self._watched_inputs.get(name)]
+        while readers:
+            reader = self.devices.get(readers.pop())
+            for name in reader.info.inputs if reader is not None else ():
+                source = self.names.nodes.get(name)
+                if source is not None and source.device not in used:
+                    used.add(source.device)
+                    readers.append(source.device)
+        for device in self.devices.values():
+            device.tell_use(device.name in used)
 
     def device_gone(self, device: DriverProcess, reason: str) -> None:
         """Void the handles of a process that is no more, and stop what is tied to it."""
@@ -389,6 +407,7 @@ class Server:
             for name in device.info.inputs:
                 if names.nodes.get(name) != self.names.nodes[name]:
                     self._send_input(device, name)  # the name shows something else now
+        self.look_at_use()
         if old is not None:
             old.close()
         self.clients.nodes.retry_opens()
@@ -490,6 +509,7 @@ class Server:
     def _look_at_budget(self) -> None:
         self.log.tell_suppressed()
         use = realtime_use({device.name: device.pid for device in self.devices.values()})
+        self.look_at_use()  # a driver may not have taken what it was told
         if greedy := self._budget.look(time.monotonic(), use):
             make_ordinary(greedy[1])
         self.loop.after(LOOK_S, self._look_at_budget)

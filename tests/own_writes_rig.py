@@ -182,7 +182,8 @@ class World:
     def tick(self, skipped: int = 0) -> None:
         """Let the driver tick; some ticks before that were missed."""
         runtime = self.runtime
-        CLOCK.now_ns = max(CLOCK.now_ns, runtime._scheduled_ns + runtime.period_ns * (skipped + 1))
+        step_ns = runtime.period_ns * runtime._idling.periods
+        CLOCK.now_ns = max(CLOCK.now_ns, runtime._scheduled_ns + step_ns * (skipped + 1))
         runtime._timer.expired = skipped + 1  # type: ignore[attr-defined]
         self.ticks += 1
         runtime._on_timer()

@@ -173,6 +173,12 @@ class SimAxes(TickDriver):
         self._late_ns = int(settings.late_max_s * 1e9)
         self._stride = min(_stride(axis, 1 / settings.tick_hz) for axis in settings.axis)
         self._ahead = 0
+        self._is_still = False
+        self._has_effects = bool(settings.effects or settings.effects_file or any(a.model_file for a in settings.axis))
+        self._all = np.arange(n)
+        self._seen = np.full(n, np.nan)
+        # A stepper's command, and one with an integral in it, goes on if it does so at all; others only come to rest.
+        self._near = np.array([0.0 if s.kind is AxisKind.STEPPER or s.ki else 1e-9 * s.force_max for s in configured])
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
@@ -186,6 +192,8 @@ class SimAxes(TickDriver):
         made up for, a few at once. Later than ``late_max_s`` the bank stops all motion.
         """
         behind = round((now_ns - self._last_ns) / self._tick_ns) if self._command is not None else 0
+        if self._is_still:
+            behind, self._is_still = min(behind, 1), False
         if now_ns - self._last_ns <= self._late_ns:
             while behind > self._stride:
                 self._turn(self._last_ns + self._stride * self._tick_ns, self._stride)
@@ -210,6 +218,18 @@ class SimAxes(TickDriver):
         self._show()
         if self._port is not None and not beside_ns:
             self._look(self._port, now_ns)
+
+    def is_at_rest(self) -> bool:
+        """Whether world and command are at a fixed point; turns that are left out then need not be made up for."""
+        if self._command is None or self._has_effects:
+            return False
+        with np.errstate(invalid="ignore"):
+            still = bool((np.abs(self._command - self._seen) <= self._near).all())
+        self._seen[:] = self._command
+        worlds = [world for world in (self._servos, self._steppers) if world is not None]
+        still = still and not any(np.count_nonzero(world.velocity) for world in worlds)
+        self._is_still = still and self.bank.is_idle(self._all)
+        return self._is_still
 
     def slack(self, now_ns: int, until_ns: int) -> None:
         """Let the world go on to the next tick, which is sooner done then, and plan profiles ahead while there is

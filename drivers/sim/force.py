@@ -110,7 +110,7 @@ class SimForce(TickDriver):
         self._block = AnalogBlock(self.describe(name, settings).blocks[0])
         self._sensor = _sensor(settings, _flaws(settings.flaws_file))
         self._twin = _twin(settings.model_file) if settings.model_file else None
-        self._forces = np.zeros(len(settings.contact))
+        self._forces, self._seen = np.zeros((2, len(settings.contact)))
         self._limit = np.array(settings.limit)
 
     @property
@@ -133,6 +133,12 @@ class SimForce(TickDriver):
         self._block.flags[:] = (np.abs(data) >= self._limit) * int(AnalogStatus.SATURATED)
         if missing:
             self._block.flags |= int(AnalogStatus.INVALID)
+
+    def is_at_rest(self) -> bool:
+        """Whether the contacts press as they did at the last look: noise that nobody sees need not be made."""
+        at_rest = bool((self._forces == self._seen).all())
+        self._seen[:] = self._forces
+        return at_rest
 
 
 def _sensor(settings: SimForceSettings, flaws: Flaws | None) -> ForceSensor:

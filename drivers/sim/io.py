@@ -177,6 +177,11 @@ class SimIo(TickDriver):
         if self._inputs is not None:
             self._show(self._inputs, edges, now_ns)
 
+    def is_at_rest(self) -> bool:
+        """Whether no edge can come by itself: outputs are set, jaws rest, and there are neither waves nor beams."""
+        settled = all(gripper.is_at_rest for _, gripper in self._grippers)
+        return settled and not (self._wanted or self._waves or self._beams)
+
     def _drive(self, port: BinaryBlock, wanted: int, now_ns: int) -> None:
         rising = wanted & ~int(port.data[0])
         falling = ~wanted & int(port.data[0])

@@ -110,6 +110,8 @@ class SimTactile(TickDriver):
         self._finger = tactile_nodes.TactileNodes(settings.shape, more, kit) if settings.shape else None
         self._array = _twin(settings) if settings.model_file else _array(settings)
         self._array.mount(settings.indenter_radius_m)
+        self._touch: tuple[float | None, float | None] = (None, None)
+        self._seen: tuple[float | None, float | None] = (None, None)
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
@@ -120,6 +122,7 @@ class SimTactile(TickDriver):
         """Read force and angle; while a device is not there the reading is invalid."""
         settings = self.settings
         force, angle = self._value(settings.force_node, now_ns), self._value(settings.angle_node, now_ns)
+        self._touch = force, angle
         contact_rad = settings.angle_rad + settings.angle_per_position * (angle or 0.0)
         radius_m = settings.indenter_radius_m
         self._array.read(force or 0.0, contact_rad, radius_m, self._block.data, now_ns * 1e-9)
@@ -127,6 +130,11 @@ class SimTactile(TickDriver):
         self._block.flags[:] = int(AnalogStatus.INVALID) if missing else 0
         if self._finger is not None:
             self._finger.take(self._block.data, self._block.flags, now_ns, now_ns)
+
+    def is_at_rest(self) -> bool:
+        """Whether the finger is touched as it was at the last look: noise that nobody sees need not be made."""
+        at_rest, self._seen = self._touch == self._seen, self._touch
+        return at_rest
 
     def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
         """Answer the requests of the finger's nodes."""

@@ -200,6 +200,11 @@ class Gripper:
         self._sampled_ns = stamp_ns
         return closed, opened
 
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether the jaws stand still, and will without another command."""
+        return not self._goals and self.opening == (self.object_at if self._closing else 1.0)
+
     def _move(self, since_ns: int, until_ns: int, closed: list[Edge], opened: list[Edge]) -> None:
         """Move one way from a time to another."""
         end = self.object_at if self._closing else 1.0

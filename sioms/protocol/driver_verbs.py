@@ -23,6 +23,7 @@ class DriverVerb(IntEnum):
     INPUT = 5
     NODE_STOP = 6
     NODE_RESET = 7
+    IN_USE = 8
     READY = 20
     DETACHED = 21
     MARKER_SIGNALLED = 22
@@ -107,6 +108,12 @@ class NodeReset(Message, on=TO_DRIVER, verb=DriverVerb.NODE_RESET, notice=True):
     bit: Integer
     source: Text
     resets: Integer
+
+
+class InUse(Message, on=TO_DRIVER, verb=DriverVerb.IN_USE, notice=True):
+    """Whether somebody reads this device through another one; a device of whom nobody reads may tick seldom."""
+
+    used: Flag
 
 
 # --- from a driver to the daemon -----------------------------------------------------------------

@@ -205,6 +205,15 @@ class TickDriver(Driver):
         next.
         """
 
+    def is_at_rest(self) -> bool:
+        """Return whether a tick that is left out would change nothing but the readings' time stamps.
+
+        Asked after a tick, while nobody has a node of the device open or reads one through another device. When it has
+        been true for a second, ticks come seldom until it is not: see ``sioms.sdk.idling``. Only for what is simulated:
+        a real device has faults to be seen and a watchdog to be fed.
+        """
+        return False
+
     def close(self) -> None:  # a hook that may stay empty
         """Leave the device safe; axes have already been stopped."""
 

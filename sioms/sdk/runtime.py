@@ -42,6 +42,7 @@ from .effects import Effects
 from .engine import Engine
 from .exchange import HookError
 from .handles import LOOKS_A_MS, Handle, Waits
+from .idling import Idling
 from .inputs import Input
 from .line_engine import LineEngine
 from .markers import Markers
@@ -160,6 +161,9 @@ class Runtime:
         self.clients = Attachments(handles, service, self.turns, self.tell, self.journal)
         self.period_ns = int(1e9 / self.engine.tick_hz)
         self.waits.a_look = max(LOOKS_A_MS, LOOKS_A_MS * self.period_ns // 1_000_000)
+        self._idling = Idling(self.period_ns, lease_ns)
+        self._stops_workcell = bool(options["stop_sources"])
+        self._is_used = True
         self._lead_ns = self.engine.lead_ns if isinstance(self.engine, TickEngine) else 0
         self._spare_until_ns = 0
 
@@ -291,6 +295,7 @@ class Runtime:
 
         def asked() -> None:
             watch.drain()
+            self._wake()
             self.stops.heed()
 
         self.watch(watch.fd, asked)
@@ -343,8 +348,9 @@ class Runtime:
             self._is_ticking = False
 
     def _usual_tick(self, expired: int) -> None:
-        self._scheduled_ns += expired * self.period_ns
-        self.statistics.skipped += expired - 1
+        periods = self._idling.periods
+        self._scheduled_ns += expired * periods * self.period_ns
+        self.statistics.skipped += (expired - 1) * periods
         scheduled_ns = self._scheduled_ns
         engine, slack_ns = self.engine, 0
         if self._lead_ns and isinstance(engine, TickEngine):
@@ -369,6 +375,26 @@ class Runtime:
                 engine.slack(ended_ns, scheduled_ns + self.period_ns)
                 slack_ns = time.monotonic_ns() - ended_ns
             self.statistics.record_slack(slack_ns)
+            if not self.clients.handles:
+                self._rest(engine, ended_ns)
+
+    def _rest(self, engine: TickEngine, now_ns: int) -> None:
+        """Tick seldom when nobody looks and nothing has happened for a while."""
+        if self._is_used or self._stops_workcell or not engine.is_at_rest():
+            self._wake()
+        elif self._idling.rest(now_ns):
+            idle_ns = self._idling.periods * self.period_ns
+            self._timer.set(self._scheduled_ns + idle_ns - self._lead_ns, idle_ns)
+
+    def _wake(self) -> None:
+        """Tick at the full rate again, beginning now: something has happened, or is going to."""
+        now_ns = time.monotonic_ns()
+        if not self._idling.wake(now_ns):
+            return
+        self._scheduled_ns += (now_ns - self._scheduled_ns) // self.period_ns * self.period_ns
+        self._timer.set(self._scheduled_ns + self.period_ns - self._lead_ns, self.period_ns)
+        if not self._is_ticking:
+            self.set_line_timer(now_ns)
 
     def _spare_until(self, ticked_ns: int) -> int:
         """Return until when pieces of clients' work may begin after a tick [ns].
@@ -518,6 +544,7 @@ class Runtime:
             self.end("the daemon has gone")
             return False
         _, message = take(packet, driver_verbs.TO_DRIVER, values=MAX_UNPACKED)
+        self._wake()
         self._obey(message, fds)
         return True
 
@@ -527,6 +554,8 @@ class Runtime:
                 self.clients.attach(fds, message)
             case driver_verbs.Detach(handle, errno_, reason):
                 self.clients.detach(handle, errno_, reason)
+            case driver_verbs.InUse(used):
+                self._is_used = used
             case driver_verbs.StopChanged():
                 self.stops.look()
             case driver_verbs.Shutdown():

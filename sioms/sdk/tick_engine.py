@@ -151,6 +151,10 @@ class TickEngine:
     def line_due(self) -> None:
         """Nothing: there is no line."""
 
+    def is_at_rest(self) -> bool:
+        """Whether the next ticks may be left out, as far as the driver knows."""
+        return self._is_open and self._driver.is_at_rest()
+
     def is_quiet(self) -> bool:
         """A tick is all there is."""
         return True

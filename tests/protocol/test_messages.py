@@ -21,6 +21,7 @@ from sioms.protocol.driver_verbs import (
     DriverVerb,
     ForkServerVerb,
     Input,
+    InUse,
     LinkChanged,
     LogLine,
     MarkerSignalled,
@@ -150,6 +151,7 @@ RECORDED: list[tuple[Message, str]] = [
     (Input("io0", [0], 3), "950505a3696f30910003"),
     (NodeStop(0, [0, 1], -1, "eva", 2), "97060500920001ffa365766102"),
     (NodeReset(0, [1], 4, "eva", 2), "97070500910104a365766102"),
+    (InUse(True), "930805c3"),
     (Ready(2), "93140502"),
     (Detached(7), "93150507"),
     (MarkerSignalled(9), "93160509"),
@@ -263,8 +265,8 @@ NUMBERS = {
     ClientVerb: "HELLO=1 OPEN=2 CLOSE=3 LIST=4 INFO=5 STATUS=6 REPRESENT=7 JOURNAL=8 REPORT=9 RESERVE_MARKER=10 "
     "FREE_MARKER=11 SIGNAL_MARKER=12 WAIT_MARKER=13 EMERGENCY_STOP=20 RESET=21 RELOAD=22 CANCEL=30",
     HandleVerb: "WRITE=1 IOCTL=2 SUBSCRIBE=3 KEEPALIVE=4 CANCEL=5",
-    DriverVerb: "ATTACH=1 DETACH=2 STOP_CHANGED=3 SHUTDOWN=4 INPUT=5 NODE_STOP=6 NODE_RESET=7 READY=20 DETACHED=21 "
-    "MARKER_SIGNALLED=22 STOPPED=23 LINK=24 LOG=25",
+    DriverVerb: "ATTACH=1 DETACH=2 STOP_CHANGED=3 SHUTDOWN=4 INPUT=5 NODE_STOP=6 NODE_RESET=7 IN_USE=8 READY=20 "
+    "DETACHED=21 MARKER_SIGNALLED=22 STOPPED=23 LINK=24 LOG=25",
     ForkServerVerb: "DESCRIBE=1 SPAWN=2",
     NodeClass: "BINARY=1 ANALOG=2 AXIS=3",
     Access: "READ=1 WRITE=2",

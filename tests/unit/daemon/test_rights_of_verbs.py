@@ -82,7 +82,7 @@ class Workcell:
             stop_node=lambda node, source: self.done.append(f"stop {node.name}"),
             reset_node=lambda node, who: self.done.append(f"reset {node.name}"),
             load=lambda done, begin: self.loads.append((done, begin)),
-            is_replaced=lambda _name: self.is_replaced,
+            is_replaced=lambda _name: self.is_replaced, look_at_use=lambda: None,
         )  # fmt: skip
         self.listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.clients = Clients(self.server, self.listener, "test.sock")

@@ -1,0 +1,121 @@
+"""A device at rest whom nobody looks at ticks seldom; nobody can tell by what it does afterwards."""
+
+import random
+from typing import Any
+
+import numpy as np
+import pytest
+from own_writes_rig import World, own_time
+
+from sioms.drivers.sim.axes import SimAxes
+from sioms.drivers.sim.force import SimForce
+from sioms.drivers.sim.io import SimIo
+from sioms.protocol.driver_verbs import DriverVerb
+from sioms.protocol.flags import ControlMode, NodeClass
+from sioms.protocol.records import AXIS_WRITE, WRITE
+from sioms.sdk.driver import Driver
+from sioms.sdk.idling import Idling
+
+LIMITS = {"position_min": -1.0, "position_max": 1.0, "velocity_max": 0.5, "acceleration_max": 5.0}
+AXES = {
+    "axis": [
+        {"name": "x", **LIMITS, "motor": {"mass": 1.0, "coulomb": 1.0, "stiction": 1.5}, "force_max": 60.0},
+        {"name": "s", **LIMITS, "stepper": {"mass": 0.5, "step": 2e-4, "hold_force": 40.0, "coulomb": 1.0}},
+    ]
+}
+PERIOD_NS = 1_000_000
+
+
+def rested(driver: type[Driver], table: dict[str, Any], made: list[World], *, used: bool, ticks: int = 1400) -> World:
+    """Return a world in which nothing has happened for so many ticks."""
+    made[:] = [World(driver, table, random.Random(1))]
+    world = made[0]
+    world.order(DriverVerb.IN_USE, used)
+    world.runtime.heed()
+    for _ in range(ticks):
+        world.tick()
+    return world
+
+
+def periods(world: World) -> int:
+    """Return how many periods lie between two ticks."""
+    return world.runtime._idling.periods
+
+
+def test_idle_after_a_second_within_the_lease_and_awake_at_once() -> None:
+    idling = Idling(PERIOD_NS, lease_ns=100_000_000)
+    idling.wake(0)
+    assert not idling.rest(999_999_999)
+    assert idling.rest(1_000_000_000) and idling.periods == 25
+    assert not idling.rest(1_025_000_000)
+    assert idling.wake(1_030_000_000) and idling.periods == 1
+    assert not idling.wake(1_030_000_001)
+    seldom = Idling(30_000_000, lease_ns=1_000_000_000)
+    seldom.wake(0)
+    assert not seldom.rest(2_000_000_000)
+
+
+def test_missed_turns_of_a_world_at_rest_need_not_be_made_up() -> None:
+    traces = []
+    for used in (True, False):
+        made: list[World] = []
+        with own_time(made):
+            world = rested(SimAxes, AXES, made, used=used)
+            assert periods(world) == (1 if used else 40)
+            bank = world.runtime.blocks[0].bank  # type: ignore[attr-defined]
+            turns = 0
+            advance = world.runtime.driver._servos.advance  # type: ignore[attr-defined]
+
+            def count(force: Any, advance: Any = advance) -> None:
+                nonlocal turns
+                turns += 1
+                advance(force)
+
+            world.runtime.driver._servos.advance = count  # type: ignore[attr-defined]
+            for _ in range(10):
+                world.tick()
+            assert turns <= 20
+            client = world.open(0, [0, 1], exclusive=True)
+            world.runtime._wake()
+            given = {"control_mode": int(ControlMode.POSITION), "position": 0.1, "velocity": 0.5, "acceleration": 5.0}
+            record = AXIS_WRITE.pack(*(given.get(name, 0) for name in WRITE[NodeClass.AXIS]))
+            client.write(record * 2, replace=True)
+            assert periods(world) == 1
+            trace = []
+            for _ in range(300):
+                world.tick()
+                trace.append(bank.fields[0].copy())
+            traces.append(np.array(trace))
+            world.close()
+    assert np.abs(traces[0][-1]).max() > 0.02
+    assert traces[0] == pytest.approx(traces[1], abs=1e-5)
+
+
+def test_an_order_a_stop_and_an_input_wake_it() -> None:
+    made: list[World] = []
+    with own_time(made):
+        world = rested(SimAxes, AXES, made, used=False)
+        world.order(DriverVerb.IN_USE, True)
+        world.runtime._control_readable()
+        assert periods(world) == 1
+        world.order(DriverVerb.IN_USE, False)
+        world.runtime._control_readable()
+        for _ in range(1100):
+            world.tick()
+        assert periods(world) == 40
+        world.order(DriverVerb.NODE_STOP, 0, [0], -1, "eva", world.latch.resets)
+        world.runtime._control_readable()
+        assert periods(world) == 1
+        world.close()
+
+
+def test_what_moves_by_itself_is_not_idle() -> None:
+    made: list[World] = []
+    with own_time(made):
+        waves = {"inputs": 1, "wave": [{"bit": 0, "period_s": 0.1, "high_s": 0.05}]}
+        world = rested(SimIo, waves, made, used=False)
+        assert periods(world) == 1
+        world.close()
+        world = rested(SimForce, {}, made, used=False)
+        assert periods(world) == 40
+        world.close()
