@@ -13,6 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
 BIN = Path(sys.executable).parent
+_NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?")
 
 
 def block(kind: str, after: str) -> str:
@@ -101,8 +102,10 @@ def test_the_reconcile_example_says_what_it_says(tmp_path: Path) -> None:
     words[words.index("report")] = str(tmp_path / "report")
     done = subprocess.run([BIN / "sioms", *words], capture_output=True, text=True, timeout=110, cwd=ROOT)
     assert "verdict: named" in done.stdout, done.stdout + done.stderr
-    told = re.search(r"^  (Stribeck friction .*)$", README, re.MULTILINE)
-    assert told is not None
-    numbers = [float(n) for n in re.findall(r"= ([\d.]+)", told[1])]
-    found = next(one for one in done.stdout.splitlines() if "Stribeck friction" in one)
-    assert [float(n) for n in re.findall(r"= ([\d.]+)", found)] == pytest.approx(numbers, rel=0.01)
+    shown = README.partition(line)[2].partition("\n$ ")[0].strip().splitlines()
+    assert [each.partition(":")[0].split()[0] for each in shown] == ["verdict", "Stribeck", "where", "why", "gap"]
+    said = {_NUMBER.sub("#", each): each for each in done.stdout.splitlines()}
+    for each in shown:
+        assert _NUMBER.sub("#", each) in said, f"{each!r}; it says:\n{done.stdout}"
+        numbers = [float(n) for n in _NUMBER.findall(said[_NUMBER.sub("#", each)])]
+        assert [float(n) for n in _NUMBER.findall(each)] == pytest.approx(numbers, rel=0.02)
