@@ -16,6 +16,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TypeVar
 
+from .realtime import end_promptly
+
 _T = TypeVar("_T")
 
 ANSWER_S = 0.05
@@ -87,6 +89,7 @@ class Users:
         answers: list[_T] = []
 
         def ask() -> None:
+            end_promptly()
             with suppress(KeyError):
                 answers.append(question())
 

@@ -5,7 +5,12 @@ from __future__ import annotations
 import itertools
 import os
 import socket
+import subprocess
+import sys
 import time
+from pathlib import Path
+
+import pytest
 
 from sioms.daemon.loop import Loop
 from sioms.daemon.realtime import Budget, make_ordinary, realtime_use
@@ -62,3 +67,33 @@ def test_timers_are_served_between_the_requests_of_a_crowd() -> None:
             for each in pair:
                 each.close()
         loop.close()
+
+
+THREADS = """
+import os, sys, threading
+from sioms.daemon.service import _become_prompt
+from sioms.daemon.stop_record import StopRecord
+from sioms.daemon.users import Users
+
+early = StopRecord(sys.argv[1])
+told = []
+_become_prompt(lambda *words, **more: told.append(words))
+if told:
+    sys.exit(77)  # it may not
+late = StopRecord(sys.argv[1] + "2")
+Users(0.2)._ask(lambda: threading.Event().wait(0.4))
+if not late._flusher._thread.is_alive():
+    sys.exit("the record has no thread any more")
+classes = {t: os.sched_getscheduler(int(t)) & ~os.SCHED_RESET_ON_FORK for t in os.listdir("/proc/self/task")}
+print(len(classes), set(classes.values()) == {os.SCHED_FIFO})
+os._exit(0)
+"""
+
+
+def test_every_thread_of_the_daemon_has_the_class_of_its_loop(tmp_path: Path) -> None:
+    """A killed daemon is dead, and its drivers halt, when its last thread has had a processor to end on."""
+    command = [sys.executable, "-c", THREADS, str(tmp_path / "stops")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30)
+    if done.returncode == 77:
+        pytest.skip("needs the right to real-time classes")
+    assert done.stdout == "4 True\n", done.stdout + done.stderr

@@ -133,6 +133,25 @@ def test_objects_strings_and_cells_are_no_columns_and_no_code(tmp_path: Path) ->
         assert set(load_table(tmp_path / name).columns) == {"x"}
 
 
+def test_of_a_mat_file_the_library_is_given_arrays_of_numbers_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A damaged cell array ends the process in which the library reads it."""
+    cells = np.empty(1, dtype=object)
+    cells[0] = np.zeros(3)
+    kinds = {"cells": cells, "record": {"a": np.zeros(3)}, "words": "text", "flag": np.array([True]), "x": COLUMNS["x"]}
+    savemat(tmp_path / "a.mat", kinds)
+    asked: list[str] = []
+
+    def load(path: Path, *, squeeze_me: bool, variable_names: list[str]) -> dict[str, object]:
+        asked.extend(variable_names)
+        return {}
+
+    monkeypatch.setattr("scipy.io.loadmat", load)
+    read_mat(tmp_path / "a.mat")
+    assert "x" in asked and not {"cells", "record", "words"} & set(asked)
+
+
 def test_version_7_3_is_told(tmp_path: Path) -> None:
     path = tmp_path / "new.mat"
     path.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512) + b"\x89HDF\r\n\x1a\n" + bytes(100))
