@@ -259,9 +259,9 @@ class WorkcellVerbs(Generic[M]):
         try:
             await self._ask("close", verbs.Close(handle))
         except OSError as error:
-            # The daemon has gone, or knows no such handle any more: the driver has halted the axes
-            # at the end of file of the node's own socket either way.
-            if error.errno not in (errno.EIO, errno.EBADF):
+            # The session has ended, the daemon has gone, or knows no such handle any more: the driver has halted the
+            # axes at the end of file of the node's own socket either way.
+            if error.errno not in (errno.EIO, errno.EBADF) and not self._channel.ended:
                 raise
 
     @verb

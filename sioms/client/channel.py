@@ -232,6 +232,11 @@ class Channel:
         """Whether the channel has been closed on this side."""
         return self._sock.fileno() < 0
 
+    @property
+    def ended(self) -> bool:
+        """Whether no more requests can be sent: either side has ended the channel."""
+        return self._ended is not None
+
     def fileno(self) -> int:
         """Return the socket's descriptor."""
         return self._sock.fileno()

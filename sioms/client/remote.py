@@ -391,7 +391,7 @@ class _Bridge:
                 if body:
                     far.ours.send(body)  # a program that does not read its answers ends its session
                 else:
-                    far.ours.shutdown(socket.SHUT_WR)
+                    self._end_of(far, channel)
             case Down.PACKET if not channel:
                 self._stop = None
                 self.ours.send(body)
@@ -405,6 +405,15 @@ class _Bridge:
                 self._compare(stamp_ns, body)
             case Down.END:
                 self._last_word = (channel or errno.EIO, printable(body.decode("utf-8", "replace"), 1024))
+
+    def _end_of(self, far: _Far, handle: int) -> None:
+        """Let the program find a node's connection ended; its page goes on telling how the device is."""
+        fd = far.ours.fileno()
+        if self._by_fd.pop(fd, None) is not None:
+            self._epoll.unregister(fd)
+            far.ours.shutdown(socket.SHUT_RDWR)
+            self._by_fd[far.wake] = handle  # an error on it says that the program has closed its end
+            self._epoll.register(far.wake, 0)
 
     def _compare(self, answered_ns: int, body: bytes) -> None:
         sent_ns, got_ns, ahead_ns, error_ns, source = link.take_pong(body)

@@ -1,0 +1,158 @@
+"""A gateway of one's own with keys for both sides, and a relay that treats its link badly."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import shutil
+import socket
+import tempfile
+import threading
+import time
+from collections import deque
+from typing import Self
+
+from sioms.children import Process
+from sioms.client.keys import VARIABLE, Folder
+
+
+def free_ports() -> int:
+    """Return a port that is free, as the one after it is."""
+    while True:
+        with socket.socket() as one, socket.socket() as two, contextlib.suppress(OSError):
+            one.bind(("127.0.0.1", 0))
+            port = int(one.getsockname()[1])
+            two.bind(("127.0.0.1", port + 1))
+            return port
+
+
+class Gateway:
+    """``sioms serve`` on loopback for the clients of this process and its children. Use it in a ``with`` block.
+
+    Args:
+        daemon_socket: of the daemon.
+        name: of the key that clients have.
+
+    Attributes:
+        socket: the address, as that of a daemon.
+        keys, own: folders of keys of the gateway and of the clients.
+    """
+
+    def __init__(self, daemon_socket: str, name: str = "eva") -> None:
+        self.folder = tempfile.mkdtemp(prefix="sioms-gateway-")
+        self.keys, self.own = Folder(f"{self.folder}/cell"), Folder(f"{self.folder}/own")
+        self.name, self._daemon_socket = name, daemon_socket
+        self.public = self.keys.new("gateway").public
+        self.keys.allow(name, self.own.new(name).public, ("crew",))
+        self.port = free_ports()
+        self.socket = self.trusted(self.port)
+        self._before = os.environ.get(VARIABLE)
+        os.environ[VARIABLE] = self.own.path
+        self.start()
+
+    def trusted(self, port: int) -> str:
+        """Return the address of a port of this machine, at which this gateway's key is trusted from now on."""
+        self.own.trust(f"127.0.0.1:{port}", self.public)
+        return f"zmq://127.0.0.1:{port}"
+
+    def start(self) -> None:
+        """Start the process, which has not been started or has ended."""
+        place = ["--listen", f"127.0.0.1:{self.port}", "--socket", self._daemon_socket, "--keys", self.keys.path]
+        self.process = Process(["sioms.tools.front", "serve", *place], "event=ready", errors=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.end()
+        os.environ.pop(VARIABLE, None)
+        if self._before is not None:
+            os.environ[VARIABLE] = self._before
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+class Relay:
+    """Passes TCP connections on to a gateway's two ports, as badly as it is told. Use it in a ``with`` block.
+
+    Args:
+        to_port: of the gateway.
+
+    Attributes:
+        port: where clients connect.
+        delay_s: how long bytes stay on their way [s].
+        stalled: whether nothing comes through; what has been sent comes when it does again.
+        doubled: whether every piece comes twice.
+
+    Concurrency: a thread of its own; attributes may be set by any.
+    """
+
+    def __init__(self, to_port: int) -> None:
+        self.delay_s, self.stalled, self.doubled = 0.0, False, False
+        self.port = free_ports()
+        self._pairs: dict[socket.socket, socket.socket] = {}
+        self._held: deque[tuple[float, socket.socket, bytes]] = deque()
+        self._to = to_port
+        self._listeners = [socket.create_server(("127.0.0.1", self.port + i)) for i in (0, 1)]
+        self._ending = False
+        self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ending = True
+        self._thread.join()
+        self.cut()
+        for listener in self._listeners:
+            listener.close()
+
+    def cut(self) -> int:
+        """End all connections; return when [ns, CLOCK_MONOTONIC]."""
+        with self._lock:
+            now_ns = time.monotonic_ns()
+            for sock in self._pairs:
+                sock.close()
+            self._pairs.clear()
+            self._held.clear()
+        return now_ns
+
+    def _run(self) -> None:
+        while not self._ending:
+            try:
+                readable, _, _ = select.select([*self._listeners, *list(self._pairs)], [], [], 0.001)
+            except (OSError, ValueError):  # cut meanwhile
+                continue
+            with self._lock:
+                for sock in readable:
+                    if sock in self._listeners:
+                        self._accept(sock)
+                    elif sock in self._pairs:
+                        self._take(sock)
+                now = time.monotonic()
+                while self._held and not self.stalled and self._held[0][0] <= now:
+                    _, sock, data = self._held.popleft()
+                    with contextlib.suppress(OSError):
+                        sock.sendall(data)
+
+    def _accept(self, listener: socket.socket) -> None:
+        near, _ = listener.accept()
+        far = socket.create_connection(("127.0.0.1", self._to + self._listeners.index(listener)))
+        for sock in (near, far):
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._pairs |= {near: far, far: near}
+
+    def _take(self, sock: socket.socket) -> None:
+        try:
+            data = sock.recv(65536)
+        except OSError:
+            data = b""
+        other = self._pairs[sock]
+        if data:
+            self._held.append((time.monotonic() + self.delay_s, other, data * (2 if self.doubled else 1)))
+            return
+        for each in (sock, other):
+            self._pairs.pop(each, None)
+            each.close()

@@ -1,0 +1,234 @@
+"""A workcell on another machine: one gateway, the same library and tools, and whatever a link can do."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from daemon_rig import Client, Daemon, jog, raises, wait_for
+
+import sioms
+import sioms.aio
+from sioms.bench.watching import Watch, halting_ns
+from sioms.check.remote import Gateway, Relay, free_ports
+from sioms.client.keys import Folder
+from sioms.protocol.link import DEFAULT_LEASE_S
+
+LATE_NS = int((DEFAULT_LEASE_S + 0.020) * 1e9)
+"""Within which whatever fails halts what it held."""
+BUSY_NS = 100_000_000
+"""More for a machine that runs other tests at the same time; `sioms bench reach` has the figures."""
+
+
+@pytest.fixture(scope="module")
+def gate(shared_daemon: Daemon) -> Iterator[Gateway]:
+    """A gateway to the module's daemon."""
+    with Gateway(shared_daemon.socket) as gateway:
+        yield gateway
+
+
+@pytest.fixture
+def remote(daemon: Daemon, gate: Gateway) -> Iterator[sioms.Workcell]:
+    """A session through it."""
+    with sioms.Workcell(gate.socket, "far") as cell:
+        yield cell
+
+
+def _keeping(lease: float = 0.0) -> str:
+    return jog("mod0.xaxis", 0.2, lease) + "while True:\n    node.keepalive(); time.sleep(0.01)\n"
+
+
+def test_the_library_is_the_same_and_others_hear_whose_it_is(remote: sioms.Workcell, cell: sioms.Workcell) -> None:
+    with remote.open("mod0", "rw") as arm:
+        start = arm.read()
+        for axis in (0, 1):
+            arm.move(0.02 if start.position[axis] < 0.01 else 0.0, axis)
+        arm.wait_until_idle(5.0)
+        with cell.open("mod0.readonly") as seen:
+            here, there = seen.read(), arm.read()
+            assert there.position == pytest.approx(here.position, abs=1e-4) and there.number > start.number
+        assert abs(there.stamp_ns - here.stamp_ns) < 1e9 and there.stamp_error_ns < 50_000_000
+        assert abs(there.utc.ns - time.time_ns()) < 2e9 and here.stamp_error_ns == 0
+        with raises(errno.EBUSY, "held by eva@127.0.0.1 through sioms serve (far)"):
+            cell.open("mod0", "rw")
+        with raises(errno.ENOENT, "no such node", "mod0"):
+            remote.open("mod00")
+        with raises(errno.EINVAL, "lease"):
+            remote.open("mod1", "rw", lease=60.0)
+        position = arm.read().position[0]
+        for step in range(20):
+            arm.command(position=position + 0.01, replace=True)
+            arm.stop()
+            arm.command(position=position + 0.01, synch=True)
+            assert arm.read().buffered[0] == 1, "a reading after an acknowledgement shows it"
+            arm.flush()
+            assert arm.read().buffered[0] == 0, step
+        assert len(arm.history(arm.read().number - 10)) >= 5
+        marker = remote.reserve_marker()
+        arm.command(position=position, signal=marker, replace=True)
+        assert abs(marker.wait(5.0) - time.monotonic_ns()) < 2e9
+    with cell.open("mod0", "rw", timeout=2.0):
+        pass
+
+
+def test_a_subscriber_gets_every_publication(remote: sioms.Workcell) -> None:
+    with remote.open("mod0.readonly") as seen:
+        first = seen.read().number
+        numbers = []
+        while len(numbers) < 300:
+            numbers += [s.number for s in seen.history(numbers[-1] if numbers else first)]
+            seen.wait_new(numbers[-1] if numbers else first, 2.0)
+        assert numbers == list(range(first + 1, first + 1 + len(numbers)))
+
+
+def test_the_asyncio_face_and_its_loop_keep_what_is_held(daemon: Daemon, gate: Gateway) -> None:
+    async def go() -> None:
+        async with await sioms.aio.connect(gate.socket) as cell, await cell.open("mod1", "rw") as axis:
+            await axis.command(velocity=0.05)
+            await asyncio.sleep(3 * DEFAULT_LEASE_S)
+            assert axis.read().commanded_velocity[0] > 0.04, "the loop runs"
+            time.sleep(2 * DEFAULT_LEASE_S)  # and now it hangs
+            with raises(errno.ETIMEDOUT, "lease"):
+                await axis.command(velocity=0.05)
+
+    asyncio.run(go())
+
+
+def test_the_pipe_tools_and_the_front_door_are_the_same(daemon: Daemon, gate: Gateway) -> None:
+    environment = {**os.environ, "SIOMS_CELL": gate.socket}
+    tools = Path(os.sys.executable).parent  # type: ignore[attr-defined]
+
+    def run(*words: str, text: str = "") -> str:
+        done = subprocess.run(
+            [tools / words[0], *words[1:]], env=environment, input=text, capture_output=True, text=True
+        )
+        assert not done.returncode, done.stderr
+        return done.stdout
+
+    run("devout", "mod1", "0.03")
+    assert run("devin", "mod1").split()[0] == "0"
+    assert "mod1" in run("sioms", "list")
+    run("sdev", "-e")
+    assert "eva@127.0.0.1 through sioms serve" in run("sioms", "status")
+    run("sioms", "reset")
+
+
+@pytest.mark.parametrize("what", ["client killed", "client hung", "gateway killed", "gateway hung", "cut", "stalled"])
+def test_whatever_fails_halts_what_was_held_within_the_lease(
+    what: str, daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client]
+) -> None:
+    with Gateway(daemon.socket) as gate, Relay(gate.port) as relay, cell.open("mod0.xaxis.readonly") as seen:
+        gate.socket = gate.trusted(relay.port)
+        victim = client(gate, _keeping())
+        watch = Watch(seen)
+        time.sleep(0.3)
+        assert seen.read().commanded_velocity[0] == pytest.approx(0.2), "who is alive keeps its motion"
+        begin = time.monotonic_ns()
+        hung = {"client hung": victim.pid, "gateway hung": gate.process.pid}.get(what, 0)
+        if hung:
+            os.kill(hung, signal.SIGSTOP)
+        elif what == "client killed":
+            victim.kill()
+        elif what == "gateway killed":
+            gate.process.kill()
+        elif what == "cut":
+            relay.cut()
+        else:
+            relay.stalled = True
+        try:
+            assert halting_ns(watch, begin) - begin < LATE_NS + BUSY_NS
+            if what == "stalled":
+                relay.stalled = False  # what was held back comes now, in a burst
+            if hung:
+                os.kill(hung, signal.SIGCONT)
+            time.sleep(0.3)
+            assert not seen.read().in_motion[0], "nothing resumes"
+            with cell.open("mod0.xaxis", "rw", timeout=2.0):
+                pass
+            if what != "client killed":
+                victim.wait_line("Error")
+        finally:
+            if hung:
+                os.kill(hung, signal.SIGCONT)
+
+
+def test_a_link_that_delays_serves_and_one_that_doubles_ends_with_a_sentence(daemon: Daemon, gate: Gateway) -> None:
+    with Relay(gate.port) as relay:
+        relay.delay_s = 0.02
+        with sioms.Workcell(gate.trusted(relay.port), "slow") as cell, cell.open("mod1", "rw") as axis:
+            for _ in range(5):
+                axis.move(axis.read().position[0])
+            assert axis.read().stamp_error_ns > 10_000_000, "what is not known of the clocks is said"
+            relay.doubled = True
+            with raises(errno.EIO, "lost"):
+                for _ in range(100):
+                    axis.move(0.0, replace=True)
+
+
+def test_a_revoked_key_is_out_at_once(daemon: Daemon, gate: Gateway, cell: sioms.Workcell) -> None:
+    with sioms.Workcell(gate.socket, "far") as far, far.open("mod1", "rw", lease=10.0):
+        gate.keys.revoke(gate.name)
+        try:
+            with cell.open("mod1", "rw", timeout=2.0):
+                pass
+            with raises(errno.EACCES, "revoked"):
+                far.nodes()
+            with raises(errno.EACCES, "does not let your key in", "sioms key allow"):
+                sioms.Workcell(gate.socket)
+        finally:
+            own = gate.own.own()
+            assert own is not None
+            gate.keys.allow(gate.name, own.public, ("crew",))
+            time.sleep(0.3)
+
+
+def test_wrong_addresses_and_keys_are_told_in_a_sentence(
+    daemon: Daemon, gate: Gateway, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with raises(errno.EINVAL, "want zmq://HOST:PORT"):
+        sioms.Workcell("tcp://127.0.0.1:5")
+    gate.own.trust("no-such-host.invalid:5770", gate.public)
+    with raises(errno.EHOSTUNREACH, "no-such-host.invalid", "not known"):
+        sioms.Workcell("zmq://no-such-host.invalid:5770")
+    with raises(errno.ECONNREFUSED, "sioms serve"):
+        sioms.Workcell(gate.trusted(free_ports()))
+    with raises(errno.EACCES, "sioms key trust"):
+        sioms.Workcell("zmq://localhost:5770")
+    monkeypatch.setenv("SIOMS_KEYS", str(tmp_path / "other"))
+    with raises(errno.EACCES, "sioms key new"):
+        sioms.Workcell(gate.socket)
+    other = Folder()
+    other.new("mallory")
+    other.trust(f"127.0.0.1:{gate.port}", gate.public)
+    with raises(errno.EACCES, "does not let your key in"):
+        sioms.Workcell(gate.socket)
+    other.distrust(f"127.0.0.1:{gate.port}")
+    mallory = other.own()
+    assert mallory is not None
+    other.trust(f"127.0.0.1:{gate.port}", mallory.public)
+    with raises(errno.EACCES, "another key than the one that is trusted"):
+        sioms.Workcell(gate.socket)
+
+
+def test_sessions_come_and_go_and_leave_nothing(daemon: Daemon, gate: Gateway) -> None:
+    def descriptors(pid: int) -> int:
+        return len(os.listdir(f"/proc/{pid}/fd"))
+
+    def come_and_go() -> None:
+        with sioms.Workcell(gate.socket) as cell, cell.open("mod1", "rw") as axis:
+            axis.read()
+
+    come_and_go()
+    time.sleep(0.3)
+    before = descriptors(gate.process.pid), descriptors(os.getpid())
+    for _ in range(30):
+        come_and_go()
+    wait_for(lambda: descriptors(gate.process.pid) <= before[0] + 2, "the gateway has let go", 5.0)
+    wait_for(lambda: descriptors(os.getpid()) <= before[1] + 6, "we have let go", 5.0)
