@@ -9,17 +9,16 @@ fit, that two effects leave one and the same trace, more than that is needed: ``
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from sioms.reconcile import rules
-from sioms.reconcile.blocks import better
 from sioms.reconcile.bounces import rattles
 from sioms.reconcile.effects import library
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.plausible import physical, size
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.thresholds import ALIKE, AMBIGUOUS, GAIN, ROUGH, SAME_TRACE, SURE
-from sioms.reconcile.variation import accompanied, exchanged, named
+from sioms.reconcile.variation import accompanied, named
 
 Rival = rules.Rival[Fit]
 
@@ -37,39 +36,31 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
     Args:
         pairs: effects that leave the same trace, with the share in common, as of ``excitation.Gate``.
     """
-    out = []
     same = {frozenset(p[:2]) for p in pairs if p[2] > SAME_TRACE}
+    model = found.fit.model
     lib = library()
-    for name in [n for n in found.fit.model.effects if n not in searcher.frozen and n in lib]:
-        names = [n for n in _alike(name) if n in searcher.names and n not in found.fit.model.effects]
-        if not names:
-            continue
-        bare = searcher.fit(named(found.fit.model.without_effect(name)), 5)
-        contribution = bare.cost - found.fit.cost
-        if contribution <= 0.0:
-            continue
-        for start in searcher.screen(bare, [n for n in names if accompanied(bare.model, n)]):
+    alike = {
+        name: [n for n in _alike(name) if n in searcher.names and n not in model.effects]
+        for name in model.effects
+        if name not in searcher.frozen and name in lib
+    }
+
+    def replacements(bare: Fit, name: str, contribution: float) -> Iterator[tuple[str, Fit, float, None]]:
+        for start in searcher.screen(bare, [n for n in alike[name] if accompanied(bare.model, n)]):
             if start.gain * bare.cost < 0.3 * contribution:
                 continue
-            fit = searcher.searched(searcher.fit(exchanged(bare.model, start.effect, start.values)))
-            if not physical(fit, start.effect):
-                continue
-            _, errors = better(found.losses, searcher.loss(fit))
-            allowed = ALIKE if frozenset((name, start.effect)) in same else AMBIGUOUS
-            if rattles(found.fit.model):
-                allowed = ROUGH
-            out.append(
-                Rival(
-                    name,
-                    start.effect,
-                    (fit.cost - found.fit.cost) / contribution,
-                    allowed,
-                    errors,
-                    fit.cost / found.fit.cost - 1.0,
-                    fit,
-                )
-            )
-    return rules.closest(out)
+            fit = searcher.searched(searcher.fit(searcher.switched_on(bare, start)))
+            if physical(fit, start.effect):
+                allowed = ALIKE if frozenset((name, start.effect)) in same else AMBIGUOUS
+                yield start.effect, fit, ROUGH if rattles(model) else allowed, None
+
+    return rules.weighed(
+        found,
+        [n for n, others in alike.items() if others],
+        lambda name: searcher.fit(named(model.without_effect(name)), 5),
+        replacements,
+        searcher.loss,
+    )
 
 
 def settle(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]]) -> tuple[Found, list[Rival]]:

@@ -111,8 +111,7 @@ def _plain(s: Searched) -> Searched:
     # Names given to half of nothing mislead: the model, or a column, belongs to something else.
     note = (
         f"whatever is added, {bare.ratio:.0f} times what noise would leave remains: the nominal model does not match "
-        "these "
-        "data; are model, force and position of the same axis?"
+        "these data; are model, force and position of the same axis?"
     )
     found = replace(s.found, fit=bare, losses=searcher.loss(bare))
     return replace(s, ready=replace(s.ready, notes=(*s.ready.notes, note)), found=found)

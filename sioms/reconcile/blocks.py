@@ -1,8 +1,8 @@
-"""Blocks of time: held-out scores, standard errors and bootstrap without refitting.
+"""Blocks of time: held-out scores and standard errors without refitting.
 
-With the Jacobian of a fit at hand, leaving a block out moves the parameters by one Gauss-Newton step, and a
-bootstrap replicate re-weights the normal equations; both are exact to first order. Blocks, not samples, are
-the independent units, because residuals of an axis are correlated over tens to hundreds of samples.
+With the Jacobian of a fit at hand, leaving a block out moves the parameters by one Gauss-Newton step, exact to first
+order. Blocks, not samples, are the independent units, because residuals of an axis are correlated over tens to hundreds
+of samples.
 Source: P. W. Koh, P. Liang, "Understanding black-box predictions via influence functions", 2017, sec. 2;
 H. R. Kuensch, "The jackknife and the bootstrap for general stationary observations", Ann. Stat. 17 (1989).
 """
@@ -72,20 +72,6 @@ def heldout(
             out[inside] = min(tried, key=lambda e: float(e[~inside].sum()))[inside]
         else:
             out[inside] = c[inside] + 2.0 * g[inside] @ d + np.einsum("i,bij,j->b", d, h[inside], d)
-    return out
-
-
-def bootstrap(fit: Fitted, ids: NDArray[np.int64], replicates: int, rng: np.random.Generator) -> Array:
-    """Parameter changes, in units of their scale, over block bootstrap replicates, shape (replicates, k)."""
-    h, g, _ = _normal(fit, ids)
-    b, k = g.shape
-    out = np.zeros((replicates, k))
-    if k == 0:
-        return out
-    ridge = 1e-9 * np.trace(h.sum(0)) * np.eye(k)
-    for i in range(replicates):
-        w = np.bincount(rng.integers(0, b, b), minlength=b).astype(np.float64)
-        out[i] = np.linalg.solve(np.tensordot(w, h, 1) + ridge, -(w @ g))
     return out
 
 

@@ -191,9 +191,8 @@ def drive(session: Session, model: AxisModel) -> list[Finding]:
                 late.name,
                 {"delay" if late.name == "delay" else "tau": late.value},
                 {"delay" if late.name == "delay" else "tau": late.error},
-                f"measured force is late by {1e3 * late.value:.3f} ms; misfit {np.sqrt(late.left / n):.3g}, "
-                f"with {other} {np.sqrt(late.other / n):.3g}, with neither {np.sqrt(late.none / n):.3g} "
-                f"{model.force_unit}",
+                f"measured force is late by {1e3 * late.value:.3f} ms; misfit {np.sqrt(late.left / n):.3g}, with "
+                f"{other} {np.sqrt(late.other / n):.3g}, with neither {np.sqrt(late.none / n):.3g} {model.force_unit}",
             )
         )
     return found

@@ -98,8 +98,7 @@ def _check_record(r: Record, model: AxisModel) -> None:
         if not np.all(np.isfinite(a)):
             raise BadInputError(
                 f"{where}: {name} has {int(np.sum(~np.isfinite(a)))} of {len(a)} values that are no numbers; needs a "
-                "number in "
-                f"{100 * (1 - MOST):.0f} % of the rows (gaps are then interpolated), or no such column"
+                f"number in {100 * (1 - MOST):.0f} % of the rows (gaps are then interpolated), or no such column"
             )
     for name, a, what in (
         ("force", r.force, "the force that moved the axis"),
@@ -217,10 +216,9 @@ def _notes(session: Session, model: AxisModel) -> list[str]:
         shares = [(r.name, _beyond_feedback(r, model)) for r in session.records + session.final]
         if odd := [f"{name} {100 * share:.0f} %" for name, share in shares if share > FOREIGN]:
             out.append(
-                "the controller of the model does not make the recorded force from command and position (off by, share "
-                "of the "
-                f"force: {', '.join(odd)}), and the closed loop suffers; if a feed-forward or a test signal was added, "
-                "name its column feedforward"
+                "the controller of the model does not make the recorded force from command and position (off by, "
+                f"share of the force: {', '.join(odd)}), and the closed loop suffers; if a feed-forward or a test "
+                "signal was added, name its column feedforward"
             )
     return out
 
@@ -280,8 +278,7 @@ def check_scale(problem: Problem, model: AxisModel) -> list[str]:
         return []
     return [
         f"force is {ratio:.3g} times what the nominal inertia of {model.inertia:.4g} needs: a heavy payload, or a "
-        "wrong unit (turns for "
-        "radians make 6.3)"
+        "wrong unit (turns for radians make 6.3)"
     ]
 
 

@@ -14,6 +14,7 @@ from sioms.reconcile.ambiguity import Rival
 from sioms.reconcile.axis_verdict import AxisVerdict, Trace
 from sioms.reconcile.bounces import deepest, rattles
 from sioms.reconcile.effect import Array
+from sioms.reconcile.engine.evidence import alternative, outcome
 from sioms.reconcile.evidence import describe, spans_of
 from sioms.reconcile.excitation import Gate
 from sioms.reconcile.experiment import Envelope, Experiment, separate
@@ -35,8 +36,7 @@ from sioms.reconcile.verdict import Gap, Outcome, Place
 
 HELD = (
     "delay and lag are counted from a force that is held from row to row of the log; of a loop much faster than the "
-    "log they are up to {:.2g} ms longer "
-    "(loop_time_s in columns.toml would tell)"
+    "log they are up to {:.2g} ms longer (loop_time_s in columns.toml would tell)"
 )
 #: Steps of the last fit.
 LAST = 12
@@ -81,9 +81,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     disturbance = ratio > QUIET and burst > BURSTS and s.share < UNEXPLAINED and not rattles(found.fit.model)
     odd = ratio > AXIS.odd and s.share > UNEXPLAINED
     leaning = [e for e in named if e.name not in s.searcher.frozen and leans(fit.model, e.name)]
-    outcome = _outcome(
-        bool(named), bool(terms) or bool(leaning) or disturbance or ratio > LARGE or odd, bool(open_rivals)
-    )
+    said = outcome(bool(named), bool(terms) or bool(leaning) or disturbance or ratio > LARGE or odd, bool(open_rivals))
     notes = [*ready.notes]
     notes += [f"{e.title} leans on the end of what it can be: it stands for something else" for e in leaning]
     if ready.held and any(e.name in TIMES for e in named):
@@ -92,16 +90,16 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         notes.append(_of_bursts(ready.problem, found.fit, burst))
     elif ratio > LARGE:
         notes.append(_of_much(ratio, s.share))
-    elif outcome is not Outcome.UNEXPLAINED:
+    elif said is not Outcome.UNEXPLAINED:
         notes += _of_loops(gaps, ratio)
-    open_now = open_rivals if outcome is Outcome.AMBIGUOUS else []
+    open_now = open_rivals if said is Outcome.AMBIGUOUS else []
     places, spectrum, traces = _pictures(ready, nominal, found.fit.model, o, rng)
     return AxisVerdict(
-        outcome=outcome,
+        outcome=said,
         nominal=nominal,
         model=fit.model,
         effects=tuple(named),
-        alternatives=tuple(_set(r, fit.model) for r in open_now),
+        alternatives=tuple(alternative(r, fit.model.effects) for r in open_now),
         symbolic=tuple(terms),
         gaps=gaps,
         ladder=found.ladder,
@@ -178,9 +176,8 @@ def _of_bursts(problem: Problem, fit: Fit, burst: float) -> str:
     if turning > MOSTLY * loud and binom.sf(turning - 1, loud, usual) < CHANCE:
         return (
             f"{text}, {turning} of {loud} where the motion turns, starts or stops (which is {100 * usual:.0f} % of the "
-            "time): "
-            "play, presliding or stick-slip in a form that no effect of the library has, rather than a disturbance "
-            "from outside"
+            "time): play, presliding or stick-slip in a form that no effect of the library has, rather than a "
+            "disturbance from outside"
         )
     return f"{text} that no state of the axis orders: a disturbance from outside, not an effect"
 
@@ -194,19 +191,6 @@ def _of_loops(gaps: Sequence[Gap], ratio: float) -> list[str]:
         for g in gaps
         if g.channel == "force, closed loop" and g.after > LOOPS * g.floor
     ]
-
-
-def _outcome(named: bool, unexplained: bool, ambiguous: bool) -> Outcome:
-    if unexplained:
-        return Outcome.UNEXPLAINED
-    if ambiguous:
-        return Outcome.AMBIGUOUS
-    return Outcome.NAMED if named else Outcome.NONE
-
-
-def _set(r: Rival, model: AxisModel) -> tuple[str, ...]:
-    kept = (n for n in model.effects if n == r.effect or n in r.fit.model.effects)
-    return tuple(r.rival if n == r.effect else n for n in kept)
 
 
 def _plan(ready: Prepared, o: Options, model: AxisModel, open_rivals: Sequence[Rival]) -> Experiment | None:

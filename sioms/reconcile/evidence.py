@@ -13,11 +13,10 @@ from sioms.reconcile.ambiguity import Rival
 from sioms.reconcile.blocks import better, formal, intervals
 from sioms.reconcile.channels import Finding
 from sioms.reconcile.effects import known
+from sioms.reconcile.engine.evidence import described, frequency
 from sioms.reconcile.engine.fit import get
 from sioms.reconcile.fit import Fit, Problem, block_ids, refit
-from sioms.reconcile.rules import told_apart
 from sioms.reconcile.search import Found, Searcher
-from sioms.reconcile.thresholds import GAIN
 from sioms.reconcile.verdict import Estimate, NamedEffect, apart
 
 
@@ -67,7 +66,7 @@ def describe(
     """
     named: list[NamedEffect] = []
     for name in fit.model.effects:
-        saved, errors, frequency = _worth(found, searcher, name, rng)
+        saved, errors, often = _worth(found, searcher, name, rng)
         effect = known()[name]
         finding = next((f for f in findings if f.effect == name), None)
         spans = dict(given)
@@ -92,32 +91,18 @@ def describe(
         evidence.append(
             f"without it {100 * saved:.1f} % of the residual energy would come back ({errors:.1f} standard errors)"
         )
-        ruled, still = told_apart(name, effect.lookalikes, others, found.ladder, fit.model.effects)
-        still = {rival: f"{text}, with {_numbers(name, rival, others)}" for rival, text in still.items()}
-        named.append(
-            NamedEffect(
-                name,
-                effect.title,
-                effect.equation,
-                effect.channel.value,
-                estimates,
-                saved,
-                errors,
-                frequency,
-                tuple(evidence),
-                ruled,
-                still,
-            )
-        )
+        numbers = {r.rival: _numbers(r) for r in others if r.effect == name}
+        worth = saved, errors, often
+        named.append(described(effect, estimates, worth, evidence, others, found.ladder, fit.model.effects, numbers))
     return apart(sorted(named, key=lambda e: -e.saved))
 
 
-def _numbers(name: str, rival: str, others: Sequence[Rival]) -> str:
+def _numbers(r: Rival) -> str:
     """Say with which numbers a look-alike stands in the place of an effect."""
-    model = next(r.fit.model for r in others if (r.effect, r.rival) == (name, rival))
+    model = r.fit.model
     return ", ".join(
-        f"{p.symbol} = {model.effects[rival][p.symbol]:.4g}" + ("" if model.unit(p) == "1" else f" {model.unit(p)}")
-        for p in known()[rival].parameters
+        f"{p.symbol} = {model.effects[r.rival][p.symbol]:.4g}" + ("" if model.unit(p) == "1" else f" {model.unit(p)}")
+        for p in known()[r.rival].parameters
     )
 
 
@@ -126,7 +111,4 @@ def _worth(found: Found, searcher: Searcher, name: str, rng: np.random.Generator
     bare = refit(searcher.problem, found.fit.model.without_effect(name), searcher.frozen, 4)
     loss = searcher.loss(bare)
     saved, errors = better(found.losses, loss)
-    d, n = loss - found.losses, len(loss)
-    draws = rng.integers(0, n, (200, n))
-    frequency = float(np.mean(d[draws].sum(1) > GAIN * loss[draws].sum(1)))
-    return saved, errors, frequency
+    return saved, errors, frequency(found.losses, loss, rng)

@@ -1,9 +1,8 @@
 """How far measurement and model disagree on samples that took no part in any choice, and the floor under it.
 
 The floor in closed loop comes from repeated laps where all that drives the axis repeats itself (difference over sqrt
-2),
-else from sensor and drive noise propagated through the linear loop. It is an estimate of its own: what a model reaches
-does not change it.
+2), else from sensor and drive noise propagated through the linear loop. It is an estimate of its own: what a model
+reaches does not change it.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ from scipy.signal import butter, sosfiltfilt, welch
 from sioms.reconcile.dry import dry_friction
 from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import known
+from sioms.reconcile.engine.evidence import place
 from sioms.reconcile.fit import Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.refuse import since_reversal
@@ -103,15 +104,9 @@ def locate(problem: Problem, model: AxisModel, rng: np.random.Generator, shifts:
     out = []
     for name, (unit, parts) in variables(motions, model, dead_band(problem, model)).items():
         v = problem.join(parts)
-        bins = bins_of(v)
-        share = explained(r, bins)
         least = len(r) // 20  # a turn by less, either way round, is hardly one
-        chance = [explained(np.roll(r, int(s)), bins) for s in rng.integers(least, len(r) - least, shifts)]
-        p = (1 + sum(c >= share for c in chance)) / (shifts + 1)
-        count = np.maximum(np.bincount(bins), 1)
-        mean = np.bincount(bins, weights=r) / count
-        spread = np.sqrt(np.maximum(np.bincount(bins, weights=r**2) / count - mean**2, 0.0))
-        out.append(Place(name, unit, share, p, np.bincount(bins, weights=v) / count, mean, spread))
+        turned = (np.roll(r, int(s)) for s in rng.integers(least, len(r) - least, shifts))
+        out.append(place(name, unit, r, v, bins_of(v), turned))
     return sorted(out, key=lambda q: -q.explained)
 
 
@@ -120,14 +115,6 @@ def bins_of(v: Array) -> NDArray[np.int64]:
     edges = np.unique(np.quantile(v, np.linspace(0.0, 1.0, BINS + 1)[1:-1]))
     number = np.searchsorted(edges, v, side="right")
     return np.asarray(np.unique(number, return_inverse=True)[1], dtype=np.int64)
-
-
-def explained(r: Array, bins: NDArray[np.int64]) -> float:
-    """Share of the variance of r between bins."""
-    count = np.maximum(np.bincount(bins), 1)
-    mean = np.bincount(bins, weights=r) / count
-    centred = mean - r.mean()
-    return float(np.sum(count * centred**2) / max(np.sum((r - r.mean()) ** 2), 1e-300))
 
 
 def spectra(problem: Problem, model: AxisModel) -> tuple[Spectrum, Spectrum]:

@@ -113,7 +113,7 @@ def _controller(table: Mapping[str, Any], where: str) -> Controller:
     return Controller(**numbers, velocity_mean=truth(table, "velocity_mean", of_controller, False))
 
 
-def write_model(model: AxisModel, comments: Mapping[str, str] | None = None) -> str:
+def write_model(model: AxisModel) -> str:
     """Write a model as TOML, every effect switchable by ``on``."""
     lines = ["[axis]", f'name = "{model.name}"', f'kind = "{"rotary" if model.rotary else "linear"}"']
     for key in AXIS_NUMBERS:
@@ -125,7 +125,6 @@ def write_model(model: AxisModel, comments: Mapping[str, str] | None = None) -> 
     for name, values in model.effects.items():
         effect = known()[name]
         lines += ["", f"# {effect.title}: {effect.equation}"]
-        lines += [f"# {comments[name]}"] if comments and name in comments else []
         lines += [f"[effects.{name}]", "on = true"]
         units = {p.symbol: f"{model.unit(p)}, {p.text}" for p in effect.parameters}
         lines += [f"{k} = {float(v)!r}  # {units[k]}" for k, v in values.items()]

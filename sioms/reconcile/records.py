@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -80,13 +79,3 @@ class Session:
     def samples(self) -> int:
         """Number of samples altogether."""
         return sum(len(r) for r in self.records)
-
-    def subset(self, which: Sequence[int]) -> Session:
-        """Return some of the records; the heat state no longer carries over where one is missing."""
-        whole = list(which) == list(range(len(self.records)))
-        return replace(
-            self,
-            records=tuple(self.records[i] for i in which),
-            continuous=self.continuous and whole,
-            final=(),
-        )

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.reconcile.effect import Array
+from sioms.reconcile.engine.evidence import unseen
 from sioms.reconcile.fit import Fit, Problem, block_ids
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.screen import Motion, dead_band, direction, instrument_motion, smoothed_motion, thinned
@@ -33,9 +34,9 @@ def hats(x: Array, knots: Array) -> Array:
     return out
 
 
-def _knots(parts: list[Array], count: int = KNOTS) -> Array:
-    """Knots at quantiles, so that every hat has data."""
-    q = np.unique(np.quantile(np.concatenate(parts), np.linspace(0.0, 1.0, count)))
+def knots(values: Array, count: int = KNOTS) -> Array:
+    """Knots at quantiles, so that every hat over them has data."""
+    q = np.unique(np.quantile(values, np.linspace(0.0, 1.0, count)))
     return q if len(q) > 1 else np.array([q[0], q[0] + 1.0])
 
 
@@ -50,8 +51,8 @@ def since_reversal(x: Array, sign: Array) -> Array:
 
 def basis(motions: list[Motion], model: AxisModel, dead: float) -> list[Array]:
     """Generic force columns of the state for every record, shape (n, k) each."""
-    kx, kv = _knots([m.x for m in motions]), _knots([m.v for m in motions], 2 * KNOTS)
-    ku, ka = _knots([m.u for m in motions], 8), _knots([m.a for m in motions], 8)
+    x, v, u, a = (np.concatenate([getattr(m, q) for m in motions]) for q in "xvua")
+    kx, kv, ku, ka = knots(x), knots(v, 2 * KNOTS), knots(u, 8), knots(a, 8)
     turn = 2.0 * np.pi / model.pitch
     whole = max(float(np.ptp(m.x)) for m in motions) > 0.5 * model.pitch
     length = max(float(np.ptp(m.x)) for m in motions)
@@ -106,17 +107,7 @@ def smoother_rest(problem: Problem, fit: Fit, folds: int = 5) -> Array:
     f = f[:, size > 1e-12] / size[size > 1e-12]
     fold = block_ids(problem, fit.model.sample_time_s)[rows] % folds
     r = fit.residual[rows]
-    best = r
-    grams = [(f[fold == i].T @ f[fold == i], f[fold == i].T @ r[fold == i]) for i in range(folds)]
-    for ridge in RIDGES:
-        left = np.empty_like(r)
-        for i in range(folds):
-            h = sum((g[0] for k, g in enumerate(grams) if k != i), np.zeros_like(grams[0][0]))
-            y = sum((g[1] for k, g in enumerate(grams) if k != i), np.zeros_like(grams[0][1]))
-            c = np.linalg.solve(h + ridge * len(r) * 1e-2 * np.eye(len(h)), y)
-            left[fold == i] = r[fold == i] - f[fold == i] @ c
-        best = min(best, left, key=lambda e: float(e @ e))
-    return best
+    return unseen(f, r, fold, [1e-2 * ridge for ridge in RIDGES])
 
 
 def loud_turns(problem: Problem, fit: Fit) -> tuple[int, int, float]:

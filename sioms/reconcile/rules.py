@@ -6,6 +6,8 @@ from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
+from sioms.reconcile.blocks import better
+from sioms.reconcile.effect import Array
 from sioms.reconcile.ladder import Found, Step
 from sioms.reconcile.thresholds import DOUBTFUL, GAIN, SWAPS
 
@@ -52,6 +54,38 @@ class Rival(Generic[F]):
     def open(self) -> bool:
         """True where the data do not rule the rival out."""
         return self.missed < self.allowed or (self.errors < 1.0 and self.excess < DOUBTFUL)
+
+
+def weighed(
+    found: Found[F, M],
+    names: Iterable[str],
+    bare: Callable[[str], F],
+    replacements: Callable[[F, str, float], Iterable[tuple[str, F, float, float | None]]],
+    loss: Callable[[F], Array],
+) -> list[Rival[F]]:
+    """Refit look-alikes in the place of each named effect.
+
+    Args:
+        names: effects that may be another.
+        bare: fit without one of them.
+        replacements: of the fit without an effect, its name and what it contributes: yields a look-alike, its fit, the
+            share that it must miss to be ruled out, and the share that it misses where that is not told by the costs.
+        loss: held-out loss of each block.
+
+    Returns:
+        Of each look-alike of each effect the fit that misses least, the closest first.
+    """
+    out = []
+    for name in names:
+        without = bare(name)
+        contribution = without.cost - found.fit.cost
+        if contribution <= 0.0:
+            continue
+        for other, fit, allowed, missed in replacements(without, name, contribution):
+            _, errors = better(found.losses, loss(fit))
+            share = (fit.cost - found.fit.cost) / contribution if missed is None else missed
+            out.append(Rival(name, other, share, allowed, errors, fit.cost / found.fit.cost - 1.0, fit))
+    return closest(out)
 
 
 def closest(rivals: Iterable[Rival[F]]) -> list[Rival[F]]:

@@ -233,8 +233,7 @@ def _doubts(nominal: Finger, finger: Finger, fits: Fits, poisson: float, faults:
         if not low + _CLOSE * thick < fit.radius_m < high - _CLOSE * thick:
             doubts.append(
                 f"element {element}: its effective radius runs to the end of what it can be, {1e3 * fit.radius_m:.2f} "
-                "mm between a "
-                f"core of {1e3 * body.core_m:.2f} and a surface of {1e3 * body.outer_m:.2f} mm"
+                f"mm between a core of {1e3 * body.core_m:.2f} and a surface of {1e3 * body.outer_m:.2f} mm"
             )
         turned = abs(fit.angle_rad - nominal.elements.angle_rad[element])
         if turned > (1.0 - _CLOSE) * TURN:
@@ -256,8 +255,7 @@ def _doubts(nominal: Finger, finger: Finger, fits: Fits, poisson: float, faults:
     if quadratic is not None and float(np.max(np.abs(quadratic.value))) > _MOST_QUADRATIC:
         doubts.append(
             f"the quadratic comes out as {float(np.max(np.abs(quadratic.value))) / 100.0:.2f} per per cent: at "
-            f"{_MOST_QUADRATIC / 100.0:.2f} and "
-            "more an output of a few per cent is at the end of its range"
+            f"{_MOST_QUADRATIC / 100.0:.2f} and more an output of a few per cent is at the end of its range"
         )
     if pull is not None and quadratic is not None:
         bent = 4.0 * float(np.max(quadratic.value)) * abs(pull.amplitude)
@@ -300,14 +298,12 @@ def _check(nominal: Finger, touches: Touches, warnings: list[str]) -> None:
     if span < 0.1 * arc:
         raise ValueError(
             f"calibrate finger: touches lie within {np.degrees(span):.3g} of {np.degrees(arc):.0f} degrees; places "
-            "must be in "
-            "degrees and spread over the elements"
+            "must be in degrees and spread over the elements"
         )
     if away.size and np.median(away) > max(arc / 6.0, 1.5 * arc / (count - 1)):
         raise ValueError(
             f"calibrate finger: the element that answers most lies {np.degrees(np.median(away)):.0f} degrees from the "
-            "touch, "
-            "as a rule; places must be in degrees, in direction and order of the elements' angles"
+            "touch, as a rule; places must be in degrees, in direction and order of the elements' angles"
         )
     if np.median(own[np.arange(len(touches)), nearest]) < 0.0:
         raise ValueError("calibrate finger: pressing lowers the output; compression must be positive: change its sign")
@@ -329,8 +325,7 @@ def _check_gains(nominal: Finger, fits: Fits, warnings: list[str]) -> None:
     if not 1.0 / _FAR_GAIN < ratio < _FAR_GAIN:
         warnings.append(
             f"the gains come out {ratio:.3g} times the nominal ones: outputs must be in the finger's raw unit (per "
-            "cent of "
-            "the untouched output), loads in N/m"
+            "cent of the untouched output), loads in N/m"
         )
 
 

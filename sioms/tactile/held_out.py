@@ -114,8 +114,7 @@ def doubts(found: Estimates, beside: Systematic) -> list[str]:
     if share > MOST_DOUBTFUL:
         out.append(
             f"{100.0 * share:.0f} % of the touches left out of it are doubtful when it estimates them; of a sound "
-            "finger "
-            f"less than {100.0 * MOST_DOUBTFUL:.0f} % are"
+            f"finger less than {100.0 * MOST_DOUBTFUL:.0f} % are"
         )
     for what, unit, factor, one, most in (
         ("places", "degrees", 180.0 / np.pi, beside.place_rad, MOST.place_rad),
@@ -125,7 +124,6 @@ def doubts(found: Estimates, beside: Systematic) -> list[str]:
         if one > most:
             out.append(
                 f"it tells the {what} of touches left out of it no better than to {factor * one:.2g} {unit} beside the "
-                "noise (one standard "
-                f"deviation); of a sound finger want less than {factor * most:.2g} {unit}"
+                f"noise (one standard deviation); of a sound finger want less than {factor * most:.2g} {unit}"
             )
     return out

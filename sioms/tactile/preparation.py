@@ -194,8 +194,7 @@ def _tell(quadratic: Quadratic | None, proximity: Proximity | None, ramps: bool,
         few = int(np.count_nonzero(~np.isfinite(quadratic.deviation)))
         warnings.append(
             f"{few} of {quadratic.value.size} elements have too few load series for a quadratic of their own: theirs "
-            "is the "
-            f"common {quadratic.common / 100.0:.3g} per per cent"
+            f"is the common {quadratic.common / 100.0:.3g} per per cent"
         )
 
 

@@ -173,8 +173,7 @@ class ShapeSensor:
         if state in (State.TOUCHED, State.DOUBTFUL) and Quality.WRONG_SIGN not in quality:
             raise ValueError(
                 f"{_told(self._last)}: lift that off and zero it again; if nothing touches, load the finger's file "
-                "anew, which "
-                "takes what is there for untouched"
+                "anew, which takes what is there for untouched"
             )
         self._rebasing = self._chain.rebase(frames, since_ns)
         return self._rebasing

@@ -133,8 +133,7 @@ def average(recording: Recording, angle_rad: Floats, load: Floats, radius_m: Flo
         if not (before.any() and under.any()):
             raise ValueError(
                 f"average touch {number} of {count}: {int(before.sum())} baseline and {int(under.sum())} loaded "
-                "frames; "
-                "need at least one of each"
+                "frames; need at least one of each"
             )
         shares[number] = 1.0 / before.sum() + 1.0 / under.sum()
         output[number] = _mean(recording.raw[under]) - _mean(recording.raw[before])
@@ -168,8 +167,7 @@ def _check_range(raw: Floats, stuck_at: Floats) -> None:
         if full >= _FULL and top > np.nanmin(raw[:, element]):
             raise ValueError(
                 f"average touches: element {element} reads exactly {top:g} in all frames of {full} touches, and never "
-                "more: "
-                "it is at the end of its range; press less hard, or lower the gain of the electronics"
+                "more: it is at the end of its range; press less hard, or lower the gain of the electronics"
             )
 
 

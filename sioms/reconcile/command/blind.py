@@ -92,8 +92,7 @@ def judge_all(hidden: Sequence[H], judge: Callable[[H, Path], Scored], out: Path
             truth = ", ".join((*row.axis.named, *row.axis.nameless)) or "nothing"
             print(
                 f"{row.axis.name} {row.axis.kind:10s} {'right' if row.right else 'WRONG'}  hidden {truth} | "
-                f"{row.verdict}: "
-                f"{', '.join(row.got) or '-'} ({row.seconds:.0f} s)",
+                f"{row.verdict}: {', '.join(row.got) or '-'} ({row.seconds:.0f} s)",
                 flush=True,
             )
     print(table(rows))

@@ -73,9 +73,8 @@ def score(public: Path, truth: Path) -> int:
         errors = ", ".join(f"{k} {100 * v:.1f} %" for k, v in row.errors.items())
         print(
             f"{row.name}  {'right' if row.right else 'WRONG'}  hidden {', '.join(row.hidden) or 'nothing'} | "
-            f"{row.verdict}: "
-            f"{', '.join(row.named) or '-'} | errors {errors or '-'} | gap closed {row.closed:.3f} ({row.seconds:.0f} "
-            "s)",
+            f"{row.verdict}: {', '.join(row.named) or '-'} | errors {errors or '-'} | gap closed {row.closed:.3f} "
+            f"({row.seconds:.0f} s)",
             flush=True,
         )
     print(table(rows))

@@ -128,8 +128,7 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
     if loop is not None and not 0.0 < loop <= 1.02 * model.sample_time_s:
         raise BadInputError(
             f"{where}: loop_time_s is {loop:g}; needs the period of the loop that makes the force, more than 0 and at "
-            "most the "
-            f"{model.sample_time_s:g} between two rows"
+            f"most the {model.sample_time_s:g} between two rows"
         )
     continuous = truth(table, "continuous", where, True)
     last = [folder / n for n in words(table, "final", where, "names of files") or ()]
@@ -198,8 +197,7 @@ def _convert(quantity: str, raw: Array, spec: Mapping[str, Any], stated: str | N
         )
         raise BadInputError(
             f"{where}: {unit} is a unit of {kind}, the {quantity} of a {'rotary' if model.rotary else 'linear'} axis "
-            "is "
-            f"{'an' if right == 'angle' else 'a'} {right}; {hint}"
+            f"is {'an' if right == 'angle' else 'a'} {right}; {hint}"
         )
     scale, offset = (float(spec.get(key, instead)) for key, instead in (("scale", 1.0), ("offset", 0.0)))
     factor = UNITS[kind][unit] if kind != "count" else _per_count(where, spec, scale, model)
@@ -243,8 +241,7 @@ def _draft(files: Sequence[Path], description: Path) -> str:
         lines.append(f'{guess} = {{ name = "{head}", unit = "{unit or "UNIT"}" }}')
     return (
         f"write {description} with what each column is ({', '.join(QUANTITIES)}; position and force are needed, leave "
-        "out the "
-        "others), for instance\n    " + "\n    ".join(lines)
+        "out the others), for instance\n    " + "\n    ".join(lines)
     )
 
 

@@ -24,9 +24,8 @@ from sioms.reconcile.finger.effects import library
 from sioms.reconcile.finger.plan import Bench, indenter, propose
 from sioms.reconcile.finger.pressures import Floats
 from sioms.reconcile.finger.terms import TERMS
-from sioms.reconcile.refuse import hats
+from sioms.reconcile.refuse import hats, knots
 from sioms.reconcile.sensors.effect import SensorModel
-from sioms.reconcile.sensors.refuse import knots
 from sioms.reconcile.sensors.subject import Variable, View, by_chance, untouched
 from sioms.reconcile.sensors.verdict import Curve, Proposal
 from sioms.reconcile.thresholds import SHARPER

@@ -116,8 +116,7 @@ HYSTERESIS = SensorEffect(
     change=responding(lagging, "b", "r", "a", "m"),
     equation=(
         "reading_i = l_i + b_i ((1 - m) mean over w of (z_w - l_i)/w weighed with w^a - m y_i), z_w the play of width "
-        "w about l_i, "
-        "w up to r_i, y' = 3/r_i l_i' where it falls to 0, 3/r_i l_i' (1 - |y|) beyond"
+        "w about l_i, w up to r_i, y' = 3/r_i l_i' where it falls to 0, 3/r_i l_i' (1 - |y|) beyond"
     ),
     parameters=(
         Quantity("b", "1", 0.0, 0.5, 5e-3, "half width of the loop, of each component", each=True),

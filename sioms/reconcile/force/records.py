@@ -81,8 +81,7 @@ def check(r: ForceRecords, model: SensorModel) -> list[str]:
             name = what if what == "time" else f"{what} {r.names[column]}"
             raise BadInputError(
                 f"read loads: {name} has {int(bad[:, column].sum())} of {len(bad)} values that are no numbers; needs "
-                "numbers "
-                f"in {100 * LEAST_WHOLE:.0f} % of the rows"
+                f"numbers in {100 * LEAST_WHOLE:.0f} % of the rows"
             )
     if np.any(np.diff(r.time)[np.diff(r.record) == 0] < 0.0):
         raise BadInputError("read loads: time does not rise; needs seconds in the order of recording")
@@ -91,8 +90,7 @@ def check(r: ForceRecords, model: SensorModel) -> list[str]:
     if step.max() > max(LONG_REST * float(np.median(step)), REST_S):
         notes.append(
             f"time jumps by {step.max():.4g} s after row {int(step.argmax()) + 1}: what follows a long rest may have "
-            "another zero; "
-            "give it as a file of its own"
+            "another zero; give it as a file of its own"
         )
     moved = np.ptp(r.load, axis=0) > 1e-3 * model.base.full
     if not moved.any():
@@ -102,9 +100,8 @@ def check(r: ForceRecords, model: SensorModel) -> list[str]:
         i = int(share.argmax())
         raise BadInputError(
             f"compare loads with the full range: {r.names[i]} is loaded up to {np.max(np.abs(r.load[:, i])):.4g}, "
-            f"{share[i]:.3g} times "
-            f"its full_range of {model.base.full[i]:.4g} {unit_of(r.names[i])}; needs {LEAST_RANGE:g} to "
-            f"{MOST_RANGE:g} times, in one unit"
+            f"{share[i]:.3g} times its full_range of {model.base.full[i]:.4g} {unit_of(r.names[i])}; needs "
+            f"{LEAST_RANGE:g} to {MOST_RANGE:g} times, in one unit"
         )
     for n, here in zip(r.names, moved, strict=True):
         if not here:

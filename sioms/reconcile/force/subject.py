@@ -13,11 +13,10 @@ from sioms.reconcile.effect import TERM_PREFIX
 from sioms.reconcile.force.belief import Floats, Loads, readings
 from sioms.reconcile.force.plan import Plan, catalogue, propose
 from sioms.reconcile.force.records import ForceRecords, check, unit_of, whole_rows
-from sioms.reconcile.refuse import hats
+from sioms.reconcile.refuse import hats, knots
 from sioms.reconcile.sensors.analyse import Options, analyse
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.fit import ratios
-from sioms.reconcile.sensors.refuse import knots
 from sioms.reconcile.sensors.subject import Variable, View, by_chance
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
 from sioms.reconcile.thresholds import SHARPER

@@ -135,8 +135,7 @@ def _envelope(channel: ChannelInfo, model: AxisModel, here: float, travel: float
     if reach < 100.0 * model.resolution:
         raise BadInputError(
             f"plan experiments on {channel.name}: {2.0 * reach:.3g} {channel.unit} to move in; needs hundreds of "
-            "counts "
-            f"({model.resolution:.3g} {channel.unit} each)"
+            f"counts ({model.resolution:.3g} {channel.unit} each)"
         )
     limits = channel.limits
     speed = min(SHARE * limits["velocity"], model.max_speed)

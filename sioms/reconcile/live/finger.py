@@ -188,8 +188,7 @@ def _agree(asked: Probe, bench: Bench, plan: list[Plan]) -> None:
     told = [
         f"{rig.place} will go from {places.min():.3g} to {places.max():.3g} rad and {rig.press} press the "
         f"{indenter(bench.radii[0])} on {rig.finger} with up to {bench.most:g} N/m ({most_n:.3g} N on {rig.force}), "
-        "for some "
-        f"{TOUCH_S * len(places):.0f} s:",
+        f"for some {TOUCH_S * len(places):.0f} s:",
         *(f"  {name}: {text}, {len(scene.place)} touches" for name, text, scene in plan),
     ]
     agree(f"probe {rig.finger}", told, "the indenter is clear of the finger; move?", asked.yes)

@@ -97,8 +97,7 @@ class Recorder:
             lost += 1
         raise ExperimentStopped(
             f"record {experiment.name} on {self.node.name}: ticks were missing in {lost} runs; the machine is too busy "
-            "to "
-            "record at the rate of the axis"
+            "to record at the rate of the axis"
         )
 
     def _go(self, position: float) -> None:

@@ -84,8 +84,7 @@ def _where(v: Verdict) -> str:
     text = "; ".join(f"{q.variable} {100 * q.explained:.0f} % (p = {q.p:.2f})" for q in shown)
     return (
         "What the residual of the old model goes with, as the share of its squares that lies in its means over the "
-        "values "
-        f"of one variable (bars: spread about them; p: how often chance does as well): {text}."
+        f"values of one variable (bars: spread about them; p: how often chance does as well): {text}."
     )
 
 
@@ -142,8 +141,7 @@ def _gaps(p: Page, v: Verdict) -> None:
     if of_axis:
         p.text(
             "Table and pictures are of the model to which the untouched samples have contributed nothing. The numbers "
-            "of the "
-            "effects and model.toml come from a last fit to all records after that."
+            "of the effects and model.toml come from a last fit to all records after that."
         )
 
 
@@ -198,8 +196,7 @@ def _session(p: Page, v: AxisVerdict) -> None:
     shown = knobs(v.model)
     p.text(
         "Session parameters, estimated on the first half of what is untouched of each record (no property of the axis, "
-        "and no part "
-        "of the model):"
+        "and no part of the model):"
     )
     rows = [
         [name, *(Cell(f"{number(getattr(state, k))} {units.get(k, '')}".rstrip()) for k in shown)]
@@ -215,8 +212,7 @@ def _footing(v: Verdict) -> str:
         floors = ", ".join(f"{n} {r:.2f}" for n, r in v.floors.items() if r > 0.0)
         return (
             f"{v.samples} numbers (the main view's count as {v.effective_samples:.0f} independent ones); residual of "
-            "the final "
-            f"model in units of the floor: {floors}; {smoother}."
+            f"the final model in units of the floor: {floors}; {smoother}."
         )
     return (
         f"{v.samples} samples count as {v.effective_samples:.0f} independent ones; the residual of the final model is "

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sioms.reconcile import rules
-from sioms.reconcile.blocks import better
 from sioms.reconcile.effect import TERM_PREFIX
 from sioms.reconcile.sensors.effect import SensorEffect
 from sioms.reconcile.sensors.fit import Fit, refit
@@ -46,39 +45,34 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
     Args:
         pairs: effects that leave the same trace, with the share in common, as the gate found them.
     """
-    out = []
     same = {frozenset(p[:2]) for p in pairs}
-    lib, count = found.fit.model.library, found.fit.model.count
-    for name in [n for n in found.fit.model.effects if n not in searcher.frozen and not n.startswith(TERM_PREFIX)]:
-        bare = searcher.fit(found.fit.model.without_effect(name), 4)
-        contribution = bare.cost - found.fit.cost
-        if contribution <= 0.0:
-            continue
+    good = found.fit
+    lib, count = good.model.library, good.model.count
+
+    def replacements(bare: Fit, name: str, contribution: float) -> Iterator[tuple[str, Fit, float, float | None]]:
         for other in alike(lib, name, count):
-            if other.startswith(TERM_PREFIX) or not lib[other].rankable or other in found.fit.model.effects:
+            if other.startswith(TERM_PREFIX) or not lib[other].rankable or other in good.model.effects:
                 continue
             one_trace = frozenset((name, other)) in same
             for start in screen(searcher.data, bare, searcher.weights, lib[other], searcher.frozen)[:2]:
                 fit = searcher.fit(searcher.switched_on(bare, start), PATIENCE)
                 if one_trace:
                     fit = searcher.restarted(fit, _elsewhere(lib[other]))
-                if physical(fit.model, other):
-                    _, errors = better(found.losses, searcher.loss(fit))
-                    missed = (fit.cost - found.fit.cost) / contribution
-                    if one_trace and lib[name].primary.each and lib[other].primary.each:
-                        missed = min(missed, max(_missed_by_most(searcher, found.fit, bare, fit, name, other), 0.0))
-                    out.append(
-                        Rival(
-                            name,
-                            other,
-                            missed,
-                            ALIKE if one_trace else AMBIGUOUS,
-                            errors,
-                            fit.cost / found.fit.cost - 1.0,
-                            fit,
-                        )
-                    )
-    return rules.closest(out)
+                if not physical(fit.model, other):
+                    continue
+                missed = None
+                if one_trace and lib[name].primary.each and lib[other].primary.each:
+                    all_missed = (fit.cost - good.cost) / contribution
+                    missed = min(all_missed, max(_missed_by_most(searcher, good, bare, fit, name, other), 0.0))
+                yield other, fit, ALIKE if one_trace else AMBIGUOUS, missed
+
+    return rules.weighed(
+        found,
+        [n for n in good.model.effects if n not in searcher.frozen and not n.startswith(TERM_PREFIX)],
+        lambda name: searcher.fit(good.model.without_effect(name), 4),
+        replacements,
+        searcher.loss,
+    )
 
 
 def _missed_by_most(searcher: Searcher, good: Fit, bare: Fit, rival: Fit, name: str, other: str) -> float:

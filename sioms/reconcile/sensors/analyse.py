@@ -11,10 +11,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sioms.reconcile.engine.evidence import alternative, described, frequency, outcome
 from sioms.reconcile.noise import effective_samples
-from sioms.reconcile.rules import negligible, told_apart
+from sioms.reconcile.rules import negligible
 from sioms.reconcile.sensors.ambiguity import Rival, settle
-from sioms.reconcile.sensors.effect import Array, SensorEffect, SensorModel
+from sioms.reconcile.sensors.effect import SensorEffect, SensorModel
 from sioms.reconcile.sensors.excitation import gate
 from sioms.reconcile.sensors.fit import Fit, half_intervals, on_one_footing, ratios, refit
 from sioms.reconcile.sensors.locate import locate
@@ -24,7 +25,7 @@ from sioms.reconcile.sensors.stand_ins import credible, displaced, ruled
 from sioms.reconcile.sensors.steady import changes
 from sioms.reconcile.sensors.subject import Subject
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
-from sioms.reconcile.thresholds import BURSTS, GAIN, QUIET, REFUSED, SENSOR, SURELY, UNEXPLAINED, UNSTEADY
+from sioms.reconcile.thresholds import BURSTS, QUIET, REFUSED, SENSOR, SURELY, UNEXPLAINED, UNSTEADY
 from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome, Place, apart
 
 
@@ -166,26 +167,17 @@ def _conclude(
     disturbed = bursts > BURSTS and share < UNEXPLAINED
     unexplained = bool(terms) or left or disturbed
     ambiguous = bool(open_rivals)
-    outcome = (
-        Outcome.UNEXPLAINED
-        if unexplained
-        else Outcome.AMBIGUOUS
-        if ambiguous
-        else Outcome.NAMED
-        if named
-        else Outcome.NONE
-    )
+    said = outcome(bool(named), unexplained, ambiguous)
     alternatives: tuple[tuple[str, ...], ...] = ()
     plan: tuple[Proposal, ...] = ()
-    if outcome is Outcome.AMBIGUOUS:
-        alternatives = tuple(tuple(r.rival if n == r.effect else n for n in fit.model.effects) for r in open_rivals)
+    if said is Outcome.AMBIGUOUS:
+        alternatives = tuple(alternative(r, fit.model.effects) for r in open_rivals)
         plan = subject.propose([fit.model, *(r.fit.model for r in open_rivals)])
     notes = list(subject.notes)
     if disturbed:
         notes.append(
             f"the residual comes in bursts ({100 * bursts:.0f} % of its energy in a tenth of the touches) that no "
-            "state "
-            "orders: a disturbance from outside, not an effect"
+            "state orders: a disturbance from outside, not an effect"
         )
     places: tuple[Place, ...] = ()
     curves: tuple[Curve, ...] = ()
@@ -197,7 +189,7 @@ def _conclude(
     mine = subject.whole.view == 0
     e = subject.whole.miss(subject.whole.predict(fit.model))
     return SensorVerdict(
-        outcome=outcome,
+        outcome=said,
         nominal=subject.model,
         model=fit.model,
         effects=tuple(named),
@@ -252,33 +244,17 @@ def _describe(
         bare = searcher.fit(found.fit.model.without_effect(name), 4)
         loss = searcher.loss(bare)
         gap = searcher.saving(found.losses, loss)
-        frequency = _frequency(searcher, found.losses, loss, gap.view, rng)
+        mine = searcher.of_block == searcher.data.views.index(gap.view)
+        often = frequency(found.losses[mine], loss[mine], rng)
         estimates = _estimates(subject, effect, fit.model, spread)
         title = subject.views()[gap.view].title
         evidence = [
             f"without it the squared residual of the {title} would be {1.0 / max(1.0 - gap.share, 1e-3):.3g} times as "
-            "large "
-            f"({gap.errors:.1f} standard errors, on blocks held out)"
+            f"large ({gap.errors:.1f} standard errors, on blocks held out)"
         ]
-        ruled, still = told_apart(name, effect.lookalikes, others, found.ladder, fit.model.effects)
-        out.append(
-            (
-                bare.cost - found.fit.cost,
-                NamedEffect(
-                    name,
-                    effect.title,
-                    effect.equation,
-                    effect.channel.value,
-                    estimates,
-                    gap.share,
-                    gap.errors,
-                    frequency,
-                    tuple(evidence),
-                    ruled,
-                    still,
-                ),
-            )
-        )
+        worth = gap.share, gap.errors, often
+        told = described(effect, estimates, worth, evidence, others, found.ladder, fit.model.effects, {})
+        out.append((bare.cost - found.fit.cost, told))
     out.sort(key=lambda e: -e[0])
     return apart(e for _, e in out)
 
@@ -297,13 +273,3 @@ def _estimates(
             span = max(float(v) - s, float(low)), min(float(v) + s, float(high))
             out.append(Estimate(symbol, float(v), *span, unit, q.text))
     return tuple(out)
-
-
-def _frequency(searcher: Searcher, good: Array, bad: Array, view: str, rng: np.random.Generator) -> float:
-    """Share of block bootstrap replicates in which an effect saves its share of its best view."""
-    of_block = np.zeros(len(good), dtype=np.int64)
-    of_block[searcher.data.block] = searcher.data.view
-    mine = of_block == searcher.data.views.index(view)
-    d, b = (bad - good)[mine], bad[mine]
-    draws = rng.integers(0, len(d), (200, len(d)))
-    return float(np.mean(d[draws].sum(1) > GAIN * b[draws].sum(1)))

@@ -7,7 +7,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.reconcile.locate import bins_of, explained
+from sioms.reconcile.engine.evidence import place
+from sioms.reconcile.locate import bins_of
 from sioms.reconcile.sensors.effect import Array, SensorModel
 from sioms.reconcile.sensors.subject import Subject
 from sioms.reconcile.verdict import Place
@@ -24,25 +25,10 @@ def locate(subject: Subject, model: SensorModel, rng: np.random.Generator, shift
         r = e[mine]
         if len(r) < 40 or np.ptp(values) == 0.0:
             continue
+        shuffled = (_shuffled(r, data.block[mine], rng) for _ in range(shifts))
+        shown = told[data.views[view]]
         bins = bins_of(values) if own is None else own
-        share = explained(r, bins)
-        chance = [explained(_shuffled(r, data.block[mine], rng), bins) for _ in range(shifts)]
-        p = (1 + sum(c >= share for c in chance)) / (shifts + 1)
-        count = np.maximum(np.bincount(bins), 1)
-        floor = told[data.views[view]].floor
-        mean = np.bincount(bins, weights=r) / count
-        spread = np.sqrt(np.maximum(np.bincount(bins, weights=r**2) / count - mean**2, 0.0))
-        out.append(
-            Place(
-                f"{name} ({told[data.views[view]].title})",
-                unit,
-                share,
-                p,
-                np.bincount(bins, weights=values) / count,
-                mean * floor,
-                spread * floor,
-            )
-        )
+        out.append(place(f"{name} ({shown.title})", unit, r, values, bins, shuffled, shown.floor))
     # whatever else changed meanwhile goes with the time: it comes first only where nothing else explains a third as
     # much
     return sorted(out, key=lambda q: -q.explained / (3.0 if q.variable.startswith("time (") else 1.0))

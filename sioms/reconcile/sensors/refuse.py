@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.reconcile.engine.evidence import unseen
 from sioms.reconcile.sensors.effect import Array
 from sioms.reconcile.sensors.fit import Data, Fit
 
@@ -27,31 +28,10 @@ def smoother_shares(data: Data, fit: Fit, weights: Array, features: Mapping[int,
         r = fit.residual[mine] / weights[mine]
         size = np.sqrt(np.mean(columns**2, axis=0))
         f = columns[:, size > 1e-12] / size[size > 1e-12]
-        out[view] = _explained(f, r, data.block[mine] % FOLDS)
+        total = float(r @ r)
+        left = unseen(f, r, data.block[mine] % FOLDS, RIDGES) if f.shape[1] and total else r
+        out[view] = 1.0 - float(left @ left) / total if total else 0.0
     return out
-
-
-def knots(values: Array, count: int) -> Array:
-    """Return knots at quantiles, so that every hat over them has data."""
-    q = np.unique(np.quantile(values, np.linspace(0.0, 1.0, count)))
-    return q if len(q) > 1 else np.array([q[0], q[0] + 1.0])
-
-
-def _explained(f: Array, r: Array, fold: NDArray[np.int64]) -> float:
-    total = float(r @ r)
-    if f.shape[1] == 0 or total == 0.0:
-        return 0.0
-    grams = [(f[fold == i].T @ f[fold == i], f[fold == i].T @ r[fold == i]) for i in range(FOLDS)]
-    best = 0.0
-    for ridge in RIDGES:
-        left = 0.0
-        for i in range(FOLDS):
-            h = sum((g[0] for k, g in enumerate(grams) if k != i), np.zeros_like(grams[0][0]))
-            y = sum((g[1] for k, g in enumerate(grams) if k != i), np.zeros_like(grams[0][1]))
-            c = np.linalg.solve(h + ridge * len(r) * np.eye(len(h)), y)
-            left += float(np.sum((r[fold == i] - f[fold == i] @ c) ** 2))
-        best = max(best, 1.0 - left / total)
-    return best
 
 
 def burst_share(residual: Array, groups: NDArray[np.int64]) -> float:

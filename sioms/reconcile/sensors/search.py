@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sioms.reconcile import ladder
 from sioms.reconcile.blocks import better, heldout
@@ -60,11 +61,17 @@ class Searcher(Search[SensorModel]):
         """Return the root mean square of each view in units of its floor."""
         return ratios(self.data, model)
 
+    @property
+    def of_block(self) -> NDArray[np.int64]:
+        """Number of the view of each block, shape (blocks,)."""
+        view = np.zeros(int(self.data.block.max()) + 1, dtype=np.int64)
+        view[self.data.block] = self.data.view
+        return view
+
     def saving(self, new: Array, old: Array, among: Collection[str] = ()) -> Saving:
         """Compare held-out losses by view: of all views, or of some."""
-        of_block = np.zeros(len(new), dtype=np.int64)
-        of_block[self.data.block] = self.data.view
         best = Saving(-np.inf, 0.0, "", *better(new, old))
+        of_block = self.of_block
         for i, view in enumerate(self.data.views):
             mine = of_block == i
             if np.count_nonzero(mine) < 2 or (among and view not in among):

@@ -50,8 +50,7 @@ def calibrate(args: argparse.Namespace) -> int:
             progress.close()
             raise ValueError(
                 f"calibrate {args.data}: not to be believed, no finger was written: {'; '.join(result.doubts)}. See "
-                f"{report}; record "
-                "again, or write it all the same with --doubtful"
+                f"{report}; record again, or write it all the same with --doubtful"
             )
         finger = msgspec.structs.replace(finger, notes={**finger.notes, "doubts": "; ".join(result.doubts)})
     args.output.write_text(to_toml(finger), encoding="utf-8")
@@ -88,11 +87,9 @@ def _summary(page: Page, result: Calibration) -> None:
     page.text(
         f"Contact model {finger.contact.model}, share of adhesion {finger.contact.adhesion:.2f}; Poisson's ratio "
         f"{finger.geometry.poisson:.3f}; an element averages over +-{math.degrees(finger.geometry.extent_rad):.2f} "
-        "deg; map in "
-        f"use: {finger.notes['map']}. Residuals are root mean squares over touches "
-        f"that were left out of the fit, in per cent of the peak strain of a 200 N/m edge ({100 * result.peak:.2f} %); "
-        "those "
-        "of the model within 25 degrees of the element, those of identified maps over all touches."
+        f"deg; map in use: {finger.notes['map']}. Residuals are root mean squares over touches that were left out of "
+        f"the fit, in per cent of the peak strain of a 200 N/m edge ({100 * result.peak:.2f} %); those of the model "
+        "within 25 degrees of the element, those of identified maps over all touches."
     )
     page.table(("method", "least", "mean", "most"), rows)
     page.table(

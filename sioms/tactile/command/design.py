@@ -52,8 +52,7 @@ def design(args: argparse.Namespace) -> int:
     limit = math.degrees(spacing_needed(body, radius))
     coarse = (
         f"elements {args.pitch_deg:g} deg apart are too coarse: {limit:.2f} deg are needed, half a wavelength of the "
-        "cut-off; "
-        "between two of them touches are told less well, and two touches pass for one"
+        "cut-off; between two of them touches are told less well, and two touches pass for one"
     )
     if args.pitch_deg > limit:
         page.warn(coarse)

@@ -37,8 +37,7 @@ def reproduce(args: argparse.Namespace) -> int:
     page = Page("Elastic tactile fingers: published results, recomputed")
     page.text(
         "Finger A: core 8.9, outer 12.7, elements at 9.4 mm, nu 0.5. Finger B: core 9.6, elements at 10.3 mm, nu 0.46, "
-        "16 "
-        "elements at 9.22 degrees. Each verdict is computed from the numbers beside it."
+        "16 elements at 9.22 degrees. Each verdict is computed from the numbers beside it."
     )
     page.table(
         ("where", "published", "computed", "verdict"),

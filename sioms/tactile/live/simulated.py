@@ -16,8 +16,7 @@ from sioms.tactile.live.prober import wait_links
 
 FINGER = (
     "length_m = 0.012; gain = 3.0; gain_scatter = 0.1; depth_scatter_m = 2e-4; angle_scatter_rad = 0.007; quadratic = "
-    "0.03; "
-    "adhesion = 0.3; creep = 0.05; drift = 0.3; drift_s = 300.0; mains = 0.03; strip_gain = 0.02; seed = 1"
+    "0.03; adhesion = 0.3; creep = 0.05; drift = 0.3; drift_s = 300.0; mains = 0.03; strip_gain = 0.02; seed = 1"
 )
 """The finger that is probed if none is described: faults of the sizes that the dissertation reports."""
 

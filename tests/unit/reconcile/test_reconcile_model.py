@@ -17,7 +17,6 @@ from sioms.reconcile.jit import compiled
 from sioms.reconcile.kernel import summed
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.model_file import model_from, write_model
-from sioms.reconcile.records import Record, Session
 from sioms.reconcile.screen import shapes
 from sioms.reconcile.simulate import pack, simulate
 from sioms.reconcile.verdict import BadInputError
@@ -322,11 +321,3 @@ def test_a_closed_loop_needs_a_controller() -> None:
     bare = AxisModel(True, 1e-3, 2e-3, 1e-3, 1e-4, 6.28, 0.7, 20.0)
     with pytest.raises(ValueError, match="no controller"):
         simulate(bare, np.zeros(10))
-
-
-def test_a_session_keeps_its_heat_only_when_whole() -> None:
-    r = Record("a", np.zeros(10), np.zeros(10))
-    session = Session((r, r, r))
-    assert session.subset([0, 1, 2]).continuous
-    assert not session.subset([0, 2]).continuous
-    assert session.samples == 30
