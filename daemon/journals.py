@@ -17,6 +17,8 @@ def journal_file(name: str) -> int:
     os.fchmod(fd, 0o600)
     os.ftruncate(fd, HEADER + JOURNAL_SIZE)
     fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _SEALS)
+    with mmap.mmap(fd, HEADER + JOURNAL_SIZE) as mapping:  # a reader may come before the writer
+        JournalWriter(memoryview(mapping)).release()
     return fd
 
 

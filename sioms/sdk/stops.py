@@ -109,6 +109,7 @@ class Stops:
         self._request = request
         self._journal = journal
         self._events = events
+        self._stops_again = False
         self._sources = [tuple(source) for source in sources]
         self._seen = (0, latch.resets, request.mark)
         self._orders = latch.orders
@@ -164,8 +165,9 @@ class Stops:
         stopped_ns, resets = latch.stopped_ns, latch.resets
         self._seen = (stopped_ns, resets, mark)
         if (stopped_ns and stopped_ns != seen_stop) or resets != seen_resets:
-            self.stopped = True
+            self._stops_again, self.stopped = self.stopped and not stopped_ns, True
             self.safe_stop(_emergency_stop_by(self.source))
+            self._stops_again = False
         if fresh:
             if stopped_ns:  # also by another driver, which may not have come to note it
                 self._note(workcell_entry(latch.source, stop=True))
@@ -231,7 +233,8 @@ class Stops:
             except Exception as error:  # nothing may keep the others from being stopped
                 failures.append(error)
         told = [] if parts is None else [[b.spec.name, [int(c) for c in channels], bit] for b, channels, bit in parts]
-        self._events.note(Note.STOP, time.monotonic_ns(), reason.stop.name, reason.text, told)
+        if not self._stops_again:  # before a reset what is stopped already is stopped once more
+            self._events.note(Note.STOP, time.monotonic_ns(), reason.stop.name, reason.text, told)
         if failures:
             raise failures[0]
 

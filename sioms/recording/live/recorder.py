@@ -66,6 +66,7 @@ class Recorder:
         self._retry_s = 0.0
         self._poll = poll()
         self._may_hear = True
+        self._gone: list[Workcell] = []
         self.cell: Workcell | None = connect()
         about = {
             "workcell": self.cell.name, "host": socket.gethostname(), "offset_ns": str(self._offset_ns),
@@ -75,13 +76,15 @@ class Recorder:
         self._sink.define(mcap.metadata("sioms", about))
         self._events = self._channel(messages.EVENT, messages.EVENTS)
         try:
+            self._sink.define(mcap.metadata("status", {"json": json.dumps(self.cell.status(), default=str)}))
             self._attach(self.cell)
         except OSError:
-            self.cell.close()
+            self._release()
             raise
         missing = [name for name in self._wanted if name not in self._taps]
         if missing:
-            nodes = ", ".join(entry.name for entry in self.cell.nodes() if not entry.name.endswith(READONLY))
+            entries = self.cell.nodes()
+            nodes = ", ".join(entry.name for entry in entries if not is_part(entry, entries))
             raise OSError(
                 errno.ENOENT, f"record {missing[0]}: no such node, or its device is not up; there are: {nodes}"
             )
@@ -124,14 +127,13 @@ class Recorder:
                 if device not in self._journals:
                     self._journals[device] = JournalTap(cell.journal(device), device or "daemon", from_start=self._past)
         except OSError as error:
-            if error.errno != errno.EPERM:
+            if error.errno not in (errno.EPERM, errno.EROFS):
                 raise
             self._may_hear = False
             self._tell("lost", text=f"commands, stops and faults are not recorded: {error.strerror}")
             self._log(f"only readings are recorded: {error.strerror}")
         self._poll = poll()
         self._poll.register(cell.fileno(), POLLIN)
-        self._sink.define(mcap.metadata("status", {"json": json.dumps(cell.status(), default=str)}))
 
     def _add(self, name: str, tap: NodeTap) -> None:
         form = NodeFormat(tap.info, tap.bit, self._channels + 1, self._schema, self._offset_ns)
@@ -191,8 +193,10 @@ class Recorder:
     def _look_around(self, events: list[Event]) -> None:
         """See whether the daemon or drivers are others than before."""
         if self.cell is not None and self._poll.poll(0):
-            self.cell.close()
+            self._gone.append(self.cell)  # its pages are read to their end
             self.cell = None
+            for tap, _ in self._taps.values():
+                tap.renew = True
             self._tell("daemon gone", text="the daemon has ended; drivers stop by themselves")
         changed = any(
             event.source == "daemon" and event.kind == "log" and event.text == "device up" for event in events
@@ -231,14 +235,18 @@ class Recorder:
         with suppress(OSError):
             self._tell("ended", text="recording ends", lost={name: lost for name, lost in self.lost.items() if lost})
             self.look()
+        self._release()
+        self._sink.close()
+
+    def _release(self) -> None:
+        """Let go of everything but the sink."""
         for tap, _ in self._taps.values():
             tap.release()
         for journal in self._journals.values():
             journal.release()
-        if self.cell is not None:
-            self.cell.close()
-            self.cell = None
-        self._sink.close()
+        for cell in [*self._gone, *([self.cell] if self.cell is not None else [])]:
+            cell.close()
+        self.cell = None
 
 
 def _boot() -> str:

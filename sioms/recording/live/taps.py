@@ -78,11 +78,12 @@ class NodeTap:
     Attributes:
         info: what it is; bit: of its port, -1 for none.
         lost: snapshots that were overwritten before they were taken.
+        renew: whether it is to be opened again in any case.
     """
 
     def __init__(self, cell: Workcell, name: str, opened_as: str) -> None:
         self.name, self._opened_as = name, opened_as
-        self.lost = 0
+        self.lost, self.renew = 0, False
         self._tap: PageTap | None = None
         self._node: Any = None
         self._device = 0
@@ -94,7 +95,7 @@ class NodeTap:
     @property
     def is_over(self) -> bool:
         """Whether the driver process behind it has ended, so that it must be opened again."""
-        if self._node is None:
+        if self._node is None or self.renew:
             return True
         readings = self._node.readings
         if hasattr(readings, "states"):
@@ -112,6 +113,7 @@ class NodeTap:
         self.release()
         if self._device not in (0, node.readings.device):  # else the daemon is another one, the driver is not
             self._last = 0
+        self.renew = False
         self._node, self._device, self.bit = node, node.readings.device, node.layout.bit
         self._tap = PageTap(node.readings, node.layout.channels, len(node.layout.columns), self._last)
 

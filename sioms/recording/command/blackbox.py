@@ -1,0 +1,143 @@
+"""``sioms blackbox``: tell what went wrong; keep the last minute of everything."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from sioms.arguments import positive
+from sioms.client.workcell import Workcell
+from sioms.recording.live.box import KEPT_S, Box
+from sioms.recording.live.recorder import Recorder, be_prompt
+from sioms.recording.reader import Recording
+from sioms.recording.story import sentence, tell, utc
+
+from .record import size
+
+KEEPER = "keeper.pid"
+WRITTEN_S = 30.0
+"""How long a box that was asked for may take [s]."""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command."""
+    one = subparsers.add_parser(
+        "blackbox",
+        help="tell what went wrong; keep the last minute of everything",
+        description="Tell in sentences what happened in a black box or in any other recording, in which order, and "
+        "what began it. With --keep: keep the last minute of everything in memory, and write it to a file at each "
+        "stop, fault and death, and on request.",
+    )
+    one.add_argument("file", metavar="FILE", nargs="?", help="box or recording (default: the newest in the folder)")
+    one.add_argument("--keep", action="store_true", help="keep the last minute, until interrupted")
+    one.add_argument("--write", action="store_true", help="have the keeper write a box now; print its name")
+    one.add_argument(
+        "-d", "--folder", metavar="FOLDER", help="folder of boxes (default: $SIOMS_BLACKBOX, or the user's)"
+    )
+    one.add_argument("--memory", type=size, default=256_000_000, metavar="SIZE", help="memory at most (default: 256M)")
+    one.add_argument(
+        "--seconds", type=positive, default=KEPT_S, metavar="SECONDS", help="how much to keep (default: 60)"
+    )
+    one.add_argument(
+        "-a", "--all", action="store_true", help="tell all that happened, not only what belongs to the trouble"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; return the exit status."""
+    folder = Path(args.folder or os.environ.get("SIOMS_BLACKBOX") or _usual())
+    if args.keep:
+        return _keep(folder, args.memory, args.seconds)
+    if args.write:
+        print(_write(folder))
+        return 0
+    path = args.file
+    if path is None:
+        boxes = sorted(folder.glob("*.mcap"))
+        if not boxes:
+            raise OSError(errno.ENOENT, f"no black box in {folder}; `sioms blackbox --keep` writes them")
+        path = str(boxes[-1])
+    return _tell(path, everything=args.all)
+
+
+def _usual() -> str:
+    state = (
+        os.environ.get("STATE_DIRECTORY") or os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
+    )
+    return os.path.join(state, "sioms", "blackbox")
+
+
+def _tell(path: str, *, everything: bool) -> int:
+    with Recording(path) as recording:
+        events = recording.events()
+        story = tell(events)
+        zero = story.first.stamp_ns if story.first is not None else (events[0].stamp_ns if events else 0)
+        print(f"{path}: workcell {recording.about.get('workcell', '?')} on {recording.about.get('host', '?')}")
+        if story.first is not None:
+            print(f"Cause: {story.cause}, at {utc(zero + recording.offset_ns)}: {story.text}.")
+        else:
+            print(f"Cause: none: {story.text}.")
+        for event in events if everything else story.events:
+            print(f"{(event.stamp_ns - zero) / 1e9:+11.6f} s  {sentence(event)}")
+        for text in recording.damage:
+            print(f"sioms blackbox: {text}", file=sys.stderr)
+        return 1 if recording.damage else 0
+
+
+def _keep(folder: Path, memory: int, seconds: float) -> int:
+    folder.mkdir(parents=True, exist_ok=True)
+    ended = False
+
+    def end(_number: int, _frame: object) -> None:
+        nonlocal ended
+        ended = True
+
+    box = Box(folder, memory, seconds)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, end)
+    signal.signal(signal.SIGUSR1, lambda *_: box.ask("request"))
+    recorder: Recorder | None = None
+    while recorder is None and not ended:
+        try:
+            recorder = Recorder(
+                box, lambda: Workcell(name="sioms blackbox"), seen=box.seen,
+                log=lambda text: print(f"sioms blackbox: {text}", file=sys.stderr),
+            )  # fmt: skip
+        except OSError as error:
+            if error.errno not in (errno.ENOENT, errno.ECONNREFUSED, errno.EAGAIN, errno.EIO, errno.ETIMEDOUT):
+                raise
+            time.sleep(0.5)  # the daemon will come
+    if recorder is None:
+        return 0
+    be_prompt()
+    keeper = folder / KEEPER
+    keeper.write_text(f"{os.getpid()}\n")
+    try:
+        recorder.run(lambda: ended)
+    finally:
+        keeper.unlink(missing_ok=True)
+        recorder.close()
+    return 0
+
+
+def _write(folder: Path) -> str:
+    """Have the keeper write a box; return its path."""
+    before = set(folder.glob("*.mcap"))
+    try:
+        pid = int((folder / KEEPER).read_text())
+        os.kill(pid, signal.SIGUSR1)
+    except (OSError, ValueError):
+        text = f"no keeper is at work in {folder}; start one with `sioms blackbox --keep`"
+        raise OSError(errno.ESRCH, text) from None
+    deadline = time.monotonic() + WRITTEN_S
+    while time.monotonic() < deadline:
+        if new := sorted(set(folder.glob("*.mcap")) - before):
+            return str(new[-1])
+        time.sleep(0.05)
+    raise OSError(errno.ETIMEDOUT, f"the keeper (process {pid}) has written no box to {folder} within {WRITTEN_S:g} s")

@@ -1,0 +1,151 @@
+"""``sioms log``: look at recordings, export, cut and merge them."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import os
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from sioms.recording.reader import Recording
+from sioms.recording.rewrite import rewrite
+from sioms.recording.story import sentence, utc
+from sioms.recording.tables import FORMATS, columns_of, export, head_of, main_column
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command with its actions."""
+    log = subparsers.add_parser("log", help="show, plot, export, cut and merge recordings")
+    actions = log.add_subparsers(dest="action", metavar="ACTION", required=True)
+    one = actions.add_parser("info", help="print what is in a recording, and what is lost")
+    one.add_argument("file", metavar="FILE")
+    one.add_argument("-e", "--events", action="store_true", help="print all that happened, in order")
+    one = actions.add_parser("plot", help="plot nodes over time")
+    one.add_argument("file", metavar="FILE")
+    one.add_argument("nodes", metavar="NODE", nargs="*", help="nodes (default: all)")
+    one.add_argument("-c", "--column", default="", help="e.g. velocity (default: position of axes, data of others)")
+    one.add_argument("-o", "--output", metavar="PICTURE", required=True, help="PNG, SVG or PDF to write")
+    _add_span(one)
+    one = actions.add_parser("export", help="write a node as a table")
+    one.add_argument("file", metavar="FILE")
+    one.add_argument("node", metavar="NODE")
+    one.add_argument("-o", "--output", metavar="TABLE", required=True, help=f"file that ends in {', '.join(FORMATS)}")
+    one.add_argument("-c", "--column", action="append", help="e.g. position; several by several -c (default: all)")
+    _add_span(one)
+    one = actions.add_parser("cut", help="write a part of a recording as a recording")
+    one.add_argument("file", metavar="FILE")
+    one.add_argument("nodes", metavar="NODE", nargs="*", help="nodes (default: all); events are kept in any case")
+    one.add_argument("-o", "--output", metavar="FILE", required=True, help="MCAP file to write")
+    _add_span(one)
+    one = actions.add_parser(
+        "merge", help="write several recordings as one; of one: pack it, leaving out what is damaged"
+    )
+    one.add_argument("files", metavar="FILE", nargs="+")
+    one.add_argument("-o", "--output", metavar="FILE", required=True, help="MCAP file to write")
+
+
+def _add_span(parser: Any) -> None:
+    parser.add_argument("--from", dest="start", type=float, metavar="SECONDS", help="begin so long after its beginning")
+    parser.add_argument("--to", dest="end", type=float, metavar="SECONDS", help="end so long after its beginning")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run an action; return the exit status: 1 if something of a recording was lost."""
+    match args.action:
+        case "info":
+            lost = _info(args.file, args.events)
+        case "plot":
+            lost = _plot(args)
+        case "export":
+            with Recording(args.file) as recording:
+                start, end = _span(recording, args)
+                offset = recording.offset_ns
+                table = columns_of(recording, args.node, args.column, start - offset, end - offset)
+                export(table, _fresh(args.output))
+                lost = recording.damage
+        case "cut":
+            with Recording(args.file) as recording:
+                for name in args.nodes:
+                    recording.node(name)
+                start, end = _span(recording, args)
+            lost = rewrite([args.file], str(_fresh(args.output)), start, end, args.nodes or None)
+        case _:
+            lost = rewrite(args.files, str(_fresh(args.output)))
+    for text in lost:
+        print(f"sioms log: {text}", file=sys.stderr)
+    return 1 if lost else 0
+
+
+def _fresh(path: str) -> Path:
+    if os.path.exists(path):
+        raise OSError(errno.EEXIST, f"write {path}: it is there already; name another file, or remove it")
+    return Path(path)
+
+
+def _span(recording: Recording, args: argparse.Namespace) -> tuple[int, int]:
+    """Return from when until when [ns, UTC]."""
+    if args.start is None and args.end is None:
+        return 0, 1 << 62
+    first, last, _ = recording.span()
+    start = first if args.start is None else first + int(args.start * 1e9)
+    return start, (last + 1 if args.end is None else first + int(args.end * 1e9))
+
+
+def _info(path: str, with_events: bool) -> list[str]:
+    with Recording(path) as recording:
+        first, last, counts = recording.span()
+        about, lost = recording.about, list(recording.damage)
+        state = "packed" if recording.is_packed else "not packed: its recorder is at work, or was killed"
+        print(f"{path}: {os.path.getsize(path) / 1e6:.1f} MB, {state}")
+        print(f"workcell {about.get('workcell', '?')} on {about.get('host', '?')}")
+        print(f"{utc(first)} to {utc(last)}: {(last - first) / 1e9:.3f} s")
+        events = recording.events()
+        print(f"{len(events)} events")
+        gaps: dict[str, int] = {}
+        for event in events:
+            if event.source == "recorder" and event.kind == "lost":
+                gaps[event.node] = gaps.get(event.node, 0) + (event.data or {}).get("snapshots", 0)
+        for name, node in recording.nodes.items():
+            channels = ", ".join(f"{c.name} [{c.unit}]" if c.unit else c.name for c in node.info.channels)
+            missing = f", {gaps[name]} lost" if gaps.get(name) else ""
+            kind = node.info.node_class.name.lower()
+            print(f"  {name}: {kind}, {counts.get(node.channel, 0)} snapshots{missing}: {channels}")
+        if with_events:
+            for event in events:
+                print(f"{utc(event.stamp_ns + recording.offset_ns)[11:]}  {sentence(event)}")
+    return lost
+
+
+def _plot(args: argparse.Namespace) -> list[str]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with Recording(args.file) as recording:
+        names: Iterable[str] = args.nodes or recording.nodes
+        nodes = [recording.node(name) for name in names]
+        if not nodes:
+            raise OSError(errno.EINVAL, f"plot {args.file}: no nodes are recorded")
+        start, end = (each - recording.offset_ns for each in _span(recording, args))
+        figure = Figure(figsize=(10, 1 + 2.2 * len(nodes)), layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.subplots(len(nodes), 1, sharex=True, squeeze=False)[:, 0]
+        zero: int | None = None
+        for axis, node in zip(axes, nodes, strict=True):
+            column = args.column or main_column(node.info)
+            table = recording.table(node.info.name, [column], start, end)
+            zero = int(table.stamps_ns[0]) if zero is None and len(table.stamps_ns) else zero
+            for channel in range(len(node.info.channels)):
+                label = head_of(node.info, channel, column)
+                axis.plot((table.stamps_ns - (zero or 0)) / 1e9, table.values[column][:, channel], label=label, lw=0.8)
+            axis.set_title(node.info.name, loc="left")
+            axis.legend(loc="upper right", fontsize=6)
+        for event in recording.events():
+            if event.kind in ("stop", "fault") and zero is not None and start <= event.stamp_ns < end:
+                for axis in axes:
+                    axis.axvline((event.stamp_ns - zero) / 1e9, color="red", lw=0.6)
+        axes[-1].set_xlabel("time [s]")
+        figure.savefig(_fresh(args.output))
+        return list(recording.damage)

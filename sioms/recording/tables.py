@@ -1,0 +1,80 @@
+"""Readings of a recording as tables of named columns with units, and as files that other programs read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sioms.protocol.flags import NodeClass
+from sioms.protocol.nodeinfo import NodeInfo
+from sioms.protocol.records import READ
+
+from .reader import Recording
+
+FORMATS = (".csv", ".npz", ".parquet")
+_TITLES = {"commanded_position": "command", "data": ""}
+"""Columns whose titles are others than their names: those of ``devin --record``."""
+
+
+def head_of(info: NodeInfo, channel: int, column: str) -> str:
+    """Return the head of a column, as ``xaxis position [m]``; the channel is left out where there is only one."""
+    about = info.channels[channel]
+    title = _TITLES.get(column, column)
+    push = "N m" if about.unit == "rad" else "N"
+    unit = READ[info.node_class][column].unit.format(u=about.unit, f=push) if about.unit else ""
+    words = [about.name if len(info.channels) > 1 or not title else "", title]
+    shown = " ".join([word for word in words if word])
+    return f"{shown} [{unit}]" if unit else shown
+
+
+def columns_of(
+    recording: Recording, node: str, columns: list[str] | None = None, start_ns: int = 0, end_ns: int = 1 << 62
+) -> dict[str, NDArray[Any]]:
+    """Return the readings of a node by heads, "time [s]" first: stamps on the monotonic clock.
+
+    Args:
+        recording: where they are.
+        node: its name.
+        columns: of its class; None: all.
+        start_ns, end_ns: from when until when [ns, CLOCK_MONOTONIC].
+    """
+    info = recording.node(node).info
+    table = recording.table(node, columns, start_ns, end_ns)
+    found: dict[str, NDArray[Any]] = {"time [s]": table.stamps_ns / 1e9, "number": table.numbers}
+    for channel in range(len(info.channels)):
+        for column, values in table.values.items():
+            found[head_of(info, channel, column)] = values[:, channel]
+    return found
+
+
+def export(columns: dict[str, NDArray[Any]], path: Path) -> None:
+    """Write a table: CSV, NPZ or Parquet, by the ending of the name.
+
+    Raises:
+        OSError: it cannot be written, or EINVAL, an ending that is none of these.
+        ModuleNotFoundError: pyarrow is not installed, for Parquet.
+    """
+    match path.suffix:
+        case ".csv":
+            with open(path, "w", encoding="utf-8") as file:
+                file.write(",".join(columns) + "\n")
+                rows = zip(*[values.tolist() for values in columns.values()], strict=True)
+                for row in rows:
+                    file.write(f"{row[0]:.9f}," + ",".join([repr(value) for value in row[1:]]) + "\n")
+        case ".npz":
+            np.savez_compressed(path, **columns)  # type: ignore[arg-type]
+        case ".parquet":
+            import pyarrow  # type: ignore[import-not-found]
+            from pyarrow import parquet
+
+            parquet.write_table(pyarrow.table(columns), path)
+        case _:
+            raise OSError(22, f"export to {path}: want a name that ends in {', '.join(FORMATS)}")
+
+
+def main_column(info: NodeInfo) -> str:
+    """Return the column that a plot shows, if none is asked for."""
+    return "position" if info.node_class is NodeClass.AXIS else "data"
