@@ -82,6 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="draw what the sub-bench tactile finds (png, pdf or svg)",
     )
     parser.add_argument("--json", metavar="FILE", help="write all figures to a file")
+    parser.add_argument("--append", metavar="FILE", help="append them to a file, as one line of JSON")
     parser.add_argument("--tables", metavar="FILE", help="write them as Markdown tables")
 
 
@@ -114,6 +115,8 @@ def run(args: argparse.Namespace) -> int:
         report.note("interrupted: what follows is not complete")
     report.summary()
     _write(args, report)
+    if args.append:
+        report.append(args.append, benches=args.names, seed=args.seed, failed=failed)
     for text in failed:
         print(f"sioms bench: {text}", file=sys.stderr)
     return 1 if failed else 0

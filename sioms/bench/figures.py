@@ -114,6 +114,7 @@ class Report:
 
     def __init__(self) -> None:
         self.figures: list[Figure] = []
+        self.notes: list[str] = []
         self._bench = ""
         self._said = 0.0
         self._load_before = os.getloadavg()[0]
@@ -151,6 +152,7 @@ class Report:
 
     def note(self, text: str) -> None:
         """Print a line between the figures."""
+        self.notes.append(text)
         print(f"  {text}")
 
     def progress(self, text: str) -> None:
@@ -206,6 +208,22 @@ class Report:
         with open(path, "w", encoding="utf-8") as file:
             json.dump({"machine": self._machine(), **facts, "figures": figures}, file, indent=1)
             file.write("\n")
+
+    def append(self, path: str, **facts: object) -> None:
+        """Append what has been measured to a file, as one line of JSON: a long measurement is a file of short ones.
+
+        Args:
+            path: of the file.
+            facts: further keys.
+        """
+        figures = {
+            f"{f.bench}: {f.name}": f.value if f.summary is None else {"count": f.summary.count, **f.summary.values}
+            for f in self.figures
+        }
+        missed = [f"{f.bench}: {f.name}" for f in self.figures if not all(met for _, _, met in f.verdicts())]
+        line = {"machine": self._machine(), **facts, "figures": figures, "missed": missed, "notes": self.notes}
+        with open(path, "a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
 
     def _add(self, figure: Figure) -> Figure:
         self.figures.append(figure)

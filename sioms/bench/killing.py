@@ -36,9 +36,12 @@ LEASE_S = 0.25
 DAEMON_LEASE_S = 0.5
 ROUNDS = 25
 """Rounds that one daemon lives at most; then it is killed, or stopped, itself."""
+BAR_MS = 20.0
+LIMITS = {"client stopped": LEASE_S * 1e3 + BAR_MS, "daemon stopped": DAEMON_LEASE_S * 1e3 + BAR_MS}
+"""How soon an axis halts [ms], by what has happened; BAR_MS after all others."""
 KINDS: Mapping[str, int] = {
-    "clients": 10, "clients stopped": 1, "driver": 2, "driver stopped": 1, "fork server": 1, "client and driver": 3,
-    "client and fork server": 2, "driver and fork server": 2, "two drivers": 1,
+    "clients": 20, "clients stopped": 3, "driver": 3, "driver stopped": 1, "fork server": 2, "client and driver": 5,
+    "client and fork server": 4, "driver and fork server": 3, "two drivers": 1,
 }  # fmt: skip
 """How often each kind of round is, among all of a daemon's life."""
 ENDS: Mapping[str, int] = {"daemon": 3, "daemon and client": 3, "daemon and driver": 3, "daemon and fork server": 2,
@@ -94,13 +97,9 @@ def _tell(tally: Tally, report: Report) -> None:
         report.note(note[:300])
     report.value("processes killed", tally.signals[signal.SIGKILL])
     report.value("processes stopped", tally.signals[signal.SIGSTOP])
-    limits = {
-        "client stopped": LEASE_S * 1e3 + 20.0,
-        "daemon stopped": DAEMON_LEASE_S * 1e3 + 20.0,
-    }
     for what, halts in tally.halts.items():
-        late = sum(halt > limits.get(what, 20.0) * 1e6 for halt in halts)
-        report.samples(f"{what} to its axis halting", halts, "ms", bars=[Bar("max", limits.get(what, 20.0))],
+        late = sum(halt > LIMITS.get(what, BAR_MS) * 1e6 for halt in halts)
+        report.samples(f"{what} to its axis halting", halts, "ms", bars=[Bar("max", LIMITS.get(what, BAR_MS))],
                        notes=f"{late} later than that")  # fmt: skip
     for what in WRONG:
         report.value(what, tally.wrong[what], bars=[Bar("value", 0)])
@@ -151,7 +150,7 @@ def _round(daemon: Daemon, kind: str, chance: random.Random, tally: Tally) -> No
             device, _, number = axis.partition(".a")
             if device not in drivers and device != stopped:
                 what = "client stopped" if stops else "client killed"
-                _take_halt(watches[device], int(number), begin_of[axis], what, tally)
+                _take_halt(watches[device], int(number), begin_of[axis], what, pids[device], tally)
         for pid in clients.values():
             daemon.kill(pid)
             daemon.reap(pid)
@@ -227,14 +226,26 @@ def _marked(cell: Any) -> None:
     marker.free()
 
 
-def _take_halt(watch: Watch, axis: int, begin: int, what: str, tally: Tally) -> None:
+def _take_halt(watch: Watch, axis: int, begin: int, what: str, pid: int, tally: Tally) -> None:
     """Take how long an axis took from a signal to its first slower snapshot."""
     try:
         snapshot = watch.first(lambda s: abs(s.commanded_velocity[axis]) < SPEED - 1e-6, begin, 5.0, "an axis halting")
     except (TimeoutError, OSError) as error:
         tally.is_wrong("axes that never halted", f"{what}: {error}")
         return
-    tally.halts.setdefault(what, []).append(int(snapshot.stamp_ns) - begin)
+    halt = int(snapshot.stamp_ns) - begin
+    tally.halts.setdefault(what, []).append(halt)
+    if halt > LIMITS.get(what, BAR_MS) * 1e6:
+        tally.notes.append(f"{what}: {halt / 1e6:.0f} ms; {_circumstances(pid)}")
+
+
+def _circumstances(pid: int) -> str:
+    """Return what explains that a driver was late: its class of scheduling, and the load."""
+    try:
+        real = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
+    except OSError:
+        return "its driver has ended"
+    return f"its driver is {'in a real-time class' if real else 'an ordinary process'}, load {os.getloadavg()[0]:.1f}"
 
 
 def _judge(cell: Any, stopped: str, tally: Tally) -> None:
@@ -294,7 +305,7 @@ def _end(daemon: Daemon, chance: random.Random, tally: Tally) -> None:
     for name in ("mod1",) if "driver" in kind else ("mod0", "mod1"):
         for axis in range(AXES):
             if not ("client" in kind and (name, axis) == ("mod0", 0)):
-                _take_halt(watches[name], axis, begin, what, tally)
+                _take_halt(watches[name], axis, begin, what, pids[name], tally)
     if how is signal.SIGSTOP:
         os.kill(daemon.pid, signal.SIGKILL)
         tally.signals[signal.SIGKILL] += 1

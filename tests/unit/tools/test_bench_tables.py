@@ -1,5 +1,8 @@
 """Figures become Markdown tables that say what was met."""
 
+import json
+from pathlib import Path
+
 from sioms.bench.figures import Bar, Report
 from sioms.bench.tables import markdown
 
@@ -19,3 +22,18 @@ def test_each_sub_bench_is_a_table_with_its_verdicts(capsys: object) -> None:
     assert lines[-1] == "| axes carried |  | 2500 |  |  |  |  |  | value ≥ 2000: met; core 60% |"
     widths = {line.count("|") for line in lines if line.startswith("|")}
     assert widths == {10}
+
+
+def test_a_run_is_a_line_of_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "runs"
+    for seed in (1, 2):
+        report = Report()
+        report.begin("deaths", "deaths")
+        report.samples("halt", [3_000_000, 30_000_000], "ms", bars=[Bar("max", 20.0)])
+        report.value("stops lost", 0, bars=[Bar("value", 0)])
+        report.note("late")
+        report.append(str(path), seed=seed)
+    first, second = map(json.loads, path.read_text().splitlines())
+    assert (first["seed"], second["seed"]) == (1, 2)
+    assert first["missed"] == ["deaths: halt"] and first["notes"] == ["late"]
+    assert first["figures"]["deaths: stops lost"] == 0 and first["figures"]["deaths: halt"]["max"] == 30.0
