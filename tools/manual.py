@@ -160,7 +160,10 @@ DAEMON_OPTIONS = [
     Option("", "help", "", ALL, "print help"),
 ]
 STATUS = "0 on success; 1 after a failure, 2 after a wrong command line, each with one line on standard error."
-VARIABLES = "SIOMS_SOCKET is the daemon's socket; else /run/sioms/siomsd.sock, else one in the user's runtime folder."
+VARIABLES = (
+    "SIOMS_CELL is the workcell: the path of a socket, or zmq://HOST:PORT of a gateway on another machine. Without it, "
+    "SIOMS_SOCKET is the daemon's socket; else /run/sioms/siomsd.sock, else one in the user's runtime folder."
+)
 
 
 def answer(tool: str, wanted: str) -> int:

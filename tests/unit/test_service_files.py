@@ -21,13 +21,19 @@ def run(*command):
     return subprocess.run(command, capture_output=True, text=True, env={**os.environ, "LC_ALL": "C.UTF-8"})
 
 
-@pytest.fixture
-def unit(tmp_path):
-    """The unit with an executable of this machine in the place of the installed daemon."""
-    text = (ETC / "sioms.service").read_text()
-    assert text.count("ExecStart=/opt/sioms/bin/siomsd --config /etc/sioms/workcell.toml\n") == 1
-    path = tmp_path / "sioms.service"
-    path.write_text(text.replace("/opt/sioms/bin/siomsd", "/bin/true"))
+STARTS = {
+    "sioms.service": "ExecStart=/opt/sioms/bin/siomsd --config /etc/sioms/workcell.toml\n",
+    "sioms-serve.service": "ExecStart=/opt/sioms/bin/sioms serve --listen *:5770 --socket /run/sioms/siomsd.sock\n",
+}
+
+
+@pytest.fixture(params=STARTS)
+def unit(tmp_path, request):
+    """Each unit with an executable of this machine in the place of the installed program."""
+    text = (ETC / request.param).read_text()
+    assert text.count(STARTS[request.param]) == 1
+    path = tmp_path / request.param
+    path.write_text(re.sub("ExecStart=/opt/sioms/bin/[a-z]+", "ExecStart=/bin/true", text))
     return path
 
 
@@ -89,6 +95,9 @@ def test_users_and_folders_are_made(tmp_path):
     folder, settings = (root / "run" / "sioms").stat(), (root / "etc" / "sioms").stat()
     assert (folder.st_mode & 0o777, folder.st_uid, folder.st_gid) == (0o750, int(uid), int(gid))
     assert (settings.st_mode & 0o777, settings.st_uid, settings.st_gid) == (0o750, 0, int(gid))
+    done = run("systemd-sysusers", f"--root={root}", ETC / "sysusers.d" / "sioms-serve.conf")
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"^sioms:x:\d+:sioms-serve$", (root / "etc" / "group").read_text(), re.MULTILINE)
 
 
 def rules():
