@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 NODE, WORKCELL, CHECKPOINT, PID = "node", "workcell", "checkpoint", "pid"
 MOST_PARTS = 1 << 20
 """Channels, and bits of a channel, that an entry may name."""
+LAST_S = 1e11
+"""No entry is of a later time [s since 1970]: a calendar could not show it."""
 _DAMAGE = (ValueError, TypeError, LookupError, ArithmeticError)
 """What an entry raises that is none."""
 
@@ -104,7 +106,9 @@ class Stopped:
                 self.workcell, self.since_s = "", 0.0
                 self.parts.clear()
             elif not self.workcell or entry.get("named"):
-                self.workcell, self.since_s = by or "somebody", self.since_s or float(entry["at"])
+                if not 0 <= (at := float(entry["at"])) < LAST_S:
+                    raise ValueError(f"at {at} s")
+                self.workcell, self.since_s = by or "somebody", self.since_s or at
             return
         name, device, block = str(entry[NODE]), str(entry["device"]), str(entry["block"])
         for channel, bit in _unpacked(entry["parts"]):

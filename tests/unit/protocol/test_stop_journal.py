@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import time
 import random
 import resource
 from collections.abc import Iterator
@@ -100,6 +101,13 @@ def test_two_daemons_do_not_keep_one_record(path: str) -> None:
     record.close()
     StopRecord(path).close()  # a driver that lives on does not keep the next daemon out
     os.close(drivers)
+
+
+@pytest.mark.parametrize("at", ["1e300", "NaN", "-5.0"])
+def test_a_time_that_no_calendar_has_is_damage(path: str, at: str) -> None:
+    Path(path).write_text('{"at":%s,"workcell":"","stop":true,"by":"eva"}\n' % at)
+    state = kept(path)
+    assert "damaged" in state.workcell and time.gmtime(state.since_s).tm_year > 1970
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped", "zeros", "garbage", "shortened"])
