@@ -491,10 +491,7 @@ class Dynamixel(LineDriver):
     @classmethod
     def describe(cls, name: str, settings: DynamixelSettings) -> Description:
         """Tell the axes, one block a servo; raises ValueError for what a servo could not carry out."""
-        if not settings.axis:
-            raise ValueError("axis: none given; want a table [[...axis]] for each servo")
-        drive_axes.check_rate(settings.poll_hz, 1000)
-        drive_axes.check_once("id", [axis.id for axis in settings.axis], 0, 252)
+        drive_axes.check_axes(settings.axis, "servo", "id", (0, 252), settings.poll_hz, 1000)
         if settings.watchdog_s and not max(0.02, 3 / settings.poll_hz) <= settings.watchdog_s <= 2.54:
             low = max(0.02, 3 / settings.poll_hz)
             raise ValueError(
@@ -516,7 +513,7 @@ class Dynamixel(LineDriver):
             )
             for axis in settings.axis
         )
-        return Description(specs, settings.poll_hz, lease_s=max(0.5, 5 / settings.poll_hz))
+        return drive_axes.polled(specs, settings.poll_hz)
 
     @classmethod
     def golden(cls, settings: Any) -> Sequence[Golden]:

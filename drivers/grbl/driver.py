@@ -78,17 +78,11 @@ class Grbl(LineDriver):
     @classmethod
     def describe(cls, name: str, settings: GrblSettings) -> Description:
         """Tell the axes; raises ValueError for what the controller could not carry out."""
-        if not settings.axis:
-            raise ValueError("axis: none given; want a table [[...axis]] for each axis")
-        drive_axes.check_rate(settings.poll_hz, 50)
-        letters = [axis.letter for axis in settings.axis]
-        for letter in letters:
-            if letters.count(letter) > 1:
-                raise ValueError(f"axis: {letters.count(letter)} axes have letter = {letter}; want one each")
+        drive_axes.check_axes(settings.axis, "axis", "letter", None, settings.poll_hz, 50)
         if settings.line.udp:
             raise ValueError("line = udp: Grbl speaks on serial and tcp")
         spec = drive_axes.axis_spec("", _axes(settings), ABOUT, settings.capacity, settings.history)
-        return Description((spec,), settings.poll_hz, lease_s=max(0.5, 5 / settings.poll_hz))
+        return drive_axes.polled((spec,), settings.poll_hz)
 
     @classmethod
     def golden(cls, settings: Any) -> Sequence[Golden]:

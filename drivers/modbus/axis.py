@@ -32,6 +32,7 @@ from sioms.motion import AxisSettings, Homing
 from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import BlockSpec, Description
+from sioms.sdk.drive_axes import check_axes, polled
 from sioms.sdk.driver import Kit, LineDriver, LineUnit
 from sioms.sdk.golden import Golden
 from sioms.sdk.settings import LineSettings
@@ -128,28 +129,18 @@ class ModbusAxis(LineDriver):
     @classmethod
     def describe(cls, name: str, settings: ModbusAxisSettings) -> Description:
         """Tell the axes, one block a unit; raises ValueError for what a drive could not carry out."""
-        if not settings.axis:
-            raise ValueError("axis: none given; want a table [[...axis]] for each drive")
-        if not 0.1 <= settings.poll_hz <= 1000:
-            raise ValueError(f"poll_hz = {settings.poll_hz:g}; want 0.1 to 1000")
-        addresses = [axis.address for axis in settings.axis]
-        for address in set(addresses):
-            if addresses.count(address) > 1:
-                raise ValueError(f"axis: {addresses.count(address)} drives have address {address}; want one each")
+        check_axes(settings.axis, "drive", "address", None, settings.poll_hz, 1000)
         drives = [_Drive(settings, axis) for axis in settings.axis]
         _check_dead_man(settings, drives)
         alone = len(drives) == 1
-        return Description(
-            tuple(
-                BlockSpec(
-                    "" if alone else drive.axis.name, NodeClass.AXIS, (drive.channel(),),
-                    history=settings.history, capacity=settings.capacity,
-                )
-                for drive in drives
-            ),
-            settings.poll_hz,
-            lease_s=max(0.5, 5 / settings.poll_hz),
-        )  # fmt: skip
+        specs = [
+            BlockSpec(
+                "" if alone else drive.axis.name, NodeClass.AXIS, (drive.channel(),),
+                history=settings.history, capacity=settings.capacity,
+            )
+            for drive in drives
+        ]  # fmt: skip
+        return polled(specs, settings.poll_hz)
 
     @classmethod
     def golden(cls, settings: Any) -> Sequence[Golden]:

@@ -490,10 +490,7 @@ class Odrive(LineDriver):
     @classmethod
     def describe(cls, name: str, settings: OdriveSettings) -> Description:
         """Tell the axes; raises ValueError for what the board could not carry out."""
-        if not settings.axis:
-            raise ValueError("axis: none given; want a table [[...axis]] for each axis")
-        drive_axes.check_rate(settings.poll_hz, 400)
-        drive_axes.check_once("number", [axis.number for axis in settings.axis], 0, 1)
+        drive_axes.check_axes(settings.axis, "axis", "number", (0, 1), settings.poll_hz, 400)
         for axis in settings.axis:
             if axis.travel_per_turn == 0 or axis.standstill <= 0:
                 raise ValueError(
@@ -505,7 +502,7 @@ class Odrive(LineDriver):
                 f"least {3 / settings.poll_hz:.3g} s or a higher poll_hz"
             )
         spec = drive_axes.axis_spec("", _axes(settings), "ODrive axis", settings.capacity, settings.history)
-        return Description((spec,), settings.poll_hz, lease_s=max(0.5, 5 / settings.poll_hz))
+        return drive_axes.polled((spec,), settings.poll_hz)
 
     @classmethod
     def golden(cls, settings: Any) -> Sequence[Golden]:

@@ -483,17 +483,14 @@ class Tmcl(LineDriver):
     @classmethod
     def describe(cls, name: str, settings: TmclSettings) -> Description:
         """Tell the axes; raises ValueError for what the module could not carry out."""
-        if not settings.axis:
-            raise ValueError("axis: none given; want a table [[...axis]] for each motor")
-        drive_axes.check_rate(settings.poll_hz, 1000)
-        drive_axes.check_once("motor", [axis.motor for axis in settings.axis], 0, 5)
+        drive_axes.check_axes(settings.axis, "motor", "motor", (0, 5), settings.poll_hz, 1000)
         for axis in settings.axis:
             Scale.of(axis, settings).check(axis)
         _check_heartbeat(settings)
         spec = drive_axes.axis_spec(
             "", _axes(settings), f"TMCL module {settings.address}", settings.capacity, settings.history
         )
-        return Description((spec,), settings.poll_hz, lease_s=max(0.5, 5 / settings.poll_hz))
+        return drive_axes.polled((spec,), settings.poll_hz)
 
     @classmethod
     def golden(cls, settings: Any) -> Sequence[Golden]:

@@ -1,9 +1,8 @@
 """Axes of drives that close their own loop: their configuration, and a unit that obeys the bank.
 
 A driver of such a family subclasses :class:`AxesUnit`, reads the drive in ``poll`` and calls ``report``, and tells how
-to
-start, stop, home and reset one axis. What is the same for all is here: the actions of the bank, starts that a stop has
-made void, the speed of a move of given time, and velocities that would run past a soft limit.
+to start, stop, home and reset one axis. What is the same for all is here: the actions of the bank, starts that a stop
+has made void, the speed of a move of given time, and velocities that would run past a soft limit.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from sioms.motion import ActionKind, AxisSettings, Command, DriveAction, DriveBa
 from sioms.protocol.flags import AxisStatus, ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 
-from .blocks import AnyBlock, AxisBlock, BlockSpec
+from .blocks import AnyBlock, AxisBlock, BlockSpec, Description
 from .driver import Kit, LineUnit
 from .exchange import DeviceError, LinkError, Steps, while_wanted
 from .settings import LineSettings
@@ -95,19 +94,36 @@ def axis_spec(name: str, settings: Sequence[AxisSettings], about: str, capacity:
     return BlockSpec(name, NodeClass.AXIS, tuple(channels), history=history, capacity=capacity)
 
 
-def check_rate(poll_hz: float, highest: float) -> None:
-    """Raise ValueError when a rate of polling is not possible."""
-    if not 0.1 <= poll_hz <= highest:
-        raise ValueError(f"poll_hz = {poll_hz:g}; want 0.1 to {highest:g}")
+def check_axes(
+    axes: Sequence[Any], what: str, key: str, span: tuple[int, int] | None, poll_hz: float, highest_hz: float
+) -> None:
+    """Check what all drivers of axes have in common.
+
+    Args:
+        axes: tables of the configuration, one an axis.
+        what: is behind an axis, e.g. a motor.
+        key: of an axis, that tells it from the others: an address, a number, a letter.
+        span: lowest and highest value of the key; None: any.
+        poll_hz, highest_hz: rate of polling, and the highest that is possible [Hz].
+
+    Raises:
+        ValueError: there is no axis, two have the same key, a key or the rate is out of range.
+    """
+    if not axes:
+        raise ValueError(f"axis: none given; want a table [[...axis]] for each {what}")
+    if not 0.1 <= poll_hz <= highest_hz:
+        raise ValueError(f"poll_hz = {poll_hz:g}; want 0.1 to {highest_hz:g}")
+    values = [getattr(axis, key) for axis in axes]
+    for value in values:
+        if values.count(value) > 1:
+            raise ValueError(f"axis: {values.count(value)} axes have {key} = {value}; want one each")
+        if span is not None and not span[0] <= value <= span[1]:
+            raise ValueError(f"axis: {key} = {value}; want {span[0]} to {span[1]}")
 
 
-def check_once(what: str, numbers: Sequence[int], lowest: int, highest: int) -> None:
-    """Raise ValueError when addresses or motors repeat or are impossible."""
-    for number in numbers:
-        if numbers.count(number) > 1:
-            raise ValueError(f"axis: {numbers.count(number)} axes have {what} = {number}; want one each")
-        if not lowest <= number <= highest:
-            raise ValueError(f"axis: {what} = {number}; want {lowest} to {highest}")
+def polled(specs: Sequence[BlockSpec], poll_hz: float) -> Description:
+    """Describe a device of these blocks that is polled at a rate [Hz]; five polls late, its driver is called hung."""
+    return Description(tuple(specs), poll_hz, lease_s=max(0.5, 5 / poll_hz))
 
 
 def trapezoid_speed(distance: float, duration_s: float, top: float, rate: float) -> float:

@@ -673,7 +673,7 @@ def test_the_drive_cannot_pass_a_position() -> None:
             "1 drives on the line: a round takes .* want a faster line",
         ),
         ({"axis": []}, "axis: none given"),
-        ({"axis": [{"name": "a"}, {"name": "b"}]}, "2 drives have address 1"),
+        ({"axis": [{"name": "a"}, {"name": "b"}]}, "2 axes have address = 1"),
         (
             {"axis": [{"name": "a", "velocity_max": 1e3}]},
             "axis a: velocity_max: speed 1000 is .* in the register",
