@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import signal
 import sys
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,16 +15,6 @@ from daemon_rig import wait_for
 
 import sioms
 from sioms.protocol.flags import AxisStatus
-
-RUNNER = """
-import sys, sioms
-cell = sioms.Workcell(sys.argv[1])
-for line in sys.stdin:
-    node = cell.open(sys.argv[2], "rw")
-    node.command(velocity=float(sys.argv[3]))
-    print("moving", line.strip(), flush=True)
-"""
-"""A client that runs an axis each time it is told a number."""
 
 SLIDE = """
 [device.slide0]
@@ -184,47 +171,3 @@ class Wire:
     def pid(self, device: str) -> int:
         """Return the process of a driver."""
         return int(next(each for each in self.client.status()["devices"] if each["name"] == device)["pid"] or 0)
-
-    def run_client(self, node: str, velocity: float) -> Any:
-        """Start a client of its own that can run an axis."""
-        return self._start([sys.executable, "-c", RUNNER, self.socket, node, str(velocity)])
-
-    def run(self, client: Any, number: int, moving: Callable[[], bool]) -> None:
-        """Let a client run its axis."""
-        client.process.stdin.write(f"{number}\n")
-        client.process.stdin.flush()
-        client.wait_line(f"moving {number}")
-        wait_for(moving, "motion")
-
-    def check_deaths(self, node: str, velocity: float, speed: Callable[[], float], fast: float, rest_s: float) -> None:
-        """Kill client, driver and daemon in motion: the device is at rest in time, and nothing resumes.
-
-        Args:
-            node: to run.
-            velocity: to run it at.
-            speed: what the device really does.
-            fast: speed above which it counts as running.
-            rest_s: longest time from each death to rest.
-        """
-        device = node.partition(".")[0]
-
-        def rests(after: str) -> None:
-            began = time.monotonic()
-            wait_for(lambda: speed() == 0, f"rest after the death of the {after}", rest_s)
-            print(f"{node}: at rest {time.monotonic() - began:.3f} s after the death of the {after}")
-
-        clients = [self.run_client(node, velocity) for _ in range(2)]
-        self.run(clients[0], 1, lambda: abs(speed()) > fast)
-        clients[0].process.kill()
-        rests("client")
-        wait_for(lambda: self.reads(node), "the axis after its client's death")
-        self.run(clients[1], 1, lambda: abs(speed()) > fast)
-        driver = self.pid(device)
-        os.kill(driver, signal.SIGKILL)
-        rests("driver")
-        wait_for(lambda: self.pid(device) not in (0, driver), "a new driver")
-        self.wait_up(node)
-        assert speed() == 0, "motion must not resume"
-        self.run(clients[1], 2, lambda: abs(speed()) > fast)
-        self.daemon.process.kill()
-        rests("daemon")

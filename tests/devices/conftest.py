@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 from daemon_rig import Daemon
 from device_rigs import GROUPS, at_work, group_of
 
 import sioms
+
+DURATIONS = Path(__file__).parents[1] / "durations.json"
 
 
 def _group(item: pytest.Item) -> int | None:
@@ -28,14 +32,15 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the drivers' check, which takes longer than all else and mostly waits; put the tests of one workcell
-    together.
+    together, and of the other files those first that take longest.
     """
+    taken: dict[str, float] = json.loads(DURATIONS.read_text()) if DURATIONS.exists() else {}
 
-    def place(item: pytest.Item) -> int:
+    def place(item: pytest.Item) -> tuple[int, float]:
         if "shipped" in getattr(item, "fixturenames", ()):
-            return -1
+            return -1, 0.0
         group = _group(item)
-        return len(GROUPS) if group is None else group
+        return (len(GROUPS), -taken.get(item.nodeid.partition("::")[0], 0.0)) if group is None else (group, 0.0)
 
     items.sort(key=place)
 

@@ -98,24 +98,6 @@ def test_modes_stops_and_shutdown(start: Callable[..., Any], short_folder: Path)
     assert not wire.reads("arm0.gone")
 
 
-def test_watchdog_and_deaths(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "dynamixel.simulator", "--ids", "1,2")
-    cell = wire.serve(CONFIG)
-    wire.wait_up("arm0.b")
-    with cell.open("arm0.b", "rw") as b:
-        b.command(velocity=3.0)
-        wait_for(lambda: wire.state("velocity", 2) < -1800, "motion")
-        wire.tell("deaf")
-        wait_for(lambda: wire.state("velocity", 2) == 0, "rest by the watchdog", 4.0)
-        assert wire.state("watchdog", 2) == 0xFF
-        wait_for(lambda: not wire.reads("arm0.b"), "the loss")
-        wire.tell("clear")
-        wire.wait_up("arm0.b")
-        b.reset()
-        wait_for(lambda: not b.read().status[0] & AxisStatus.FAULT, "the reset")
-    wire.check_deaths("arm0.b", 3.0, lambda: float(wire.state("velocity", 2)), 1000, 2.0)
-
-
 def test_stray_bytes_restarts_and_other_masters(start: Callable[..., Any], short_folder: Path) -> None:
     wire = Wire(start, short_folder, "dynamixel.simulator", "--ids", "1,2")
     cell = wire.serve(CONFIG)

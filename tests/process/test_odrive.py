@@ -101,35 +101,6 @@ def test_moves_torques_homes_and_faults(start: Callable[..., Any], short_folder:
         x.wait_until_idle(8.0)
 
 
-def test_line_faults_watchdog_and_deaths(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "odrive.simulator")
-    cell = wire.serve(CONFIG)
-    wire.wait_up("mod0.x")
-    with cell.open("mod0.x", "rw") as x:
-        for fault in ("noise 2", "double 1", "cut 1 3", "deaf 1"):
-            wire.tell(fault)
-            time.sleep(0.2)
-            x.reset()
-            wire.wait_up("mod0.x")
-        x.reset()
-        x.move(0.01)
-        x.wait_until_idle(8.0)
-        assert wire.state("position") == pytest.approx(1.0, abs=0.01)
-        # nothing is fed: the board lets go by itself
-        x.command(velocity=0.05)
-        wait_for(lambda: wire.state("velocity") > 4, "motion")
-        wire.tell("deaf")
-        wait_for(lambda: wire.state("state") == 1, "idle by the watchdog", 3.0)
-        assert int(wire.state("error")) == 1 << 11
-        wait_for(lambda: not wire.reads("mod0.x"), "the loss")
-        wire.tell("clear")
-        wire.wait_up("mod0.x")
-        x.reset()
-        x.move(0.0)
-        x.wait_until_idle(8.0)
-    wire.check_deaths("mod0.x", 0.05, lambda: float(abs(wire.state("velocity")) > 0.02), 0.5, 1.5)
-
-
 def test_boards_that_do_not_fit(start: Callable[..., Any], short_folder: Path) -> None:
     misfits = (
         Misfit("counts positions in encoder counts", ("--version", "0.4.12")),

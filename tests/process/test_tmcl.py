@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -94,45 +93,6 @@ def test_moves_homes_and_faults(start: Callable[..., Any], short_folder: Path) -
 
 def counted(node: Any, counter: str, before: int) -> bool:
     return bool(node.statistics()["link"][counter] > before)
-
-
-def test_line_faults_and_deaths(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "tmcl.simulator", "--motors", "2")
-    cell = wire.serve(CONFIG)
-    wire.wait_up("mod0.x")
-    with cell.open("mod0.x", "rw") as x:
-        for fault, counter in (("noise 3", "garbled"), ("deaf 1", "timeouts")):
-            before = x.statistics()["link"][counter]
-            while not counted(x, counter, before):  # a single byte may be what it does not hear
-                wire.tell(fault)
-                time.sleep(0.2)
-        assert wire.reads("mod0.x")
-        wire.tell("unplug 0.3")
-        wait_for(lambda: not wire.reads("mod0.x"), "the loss")
-        wire.wait_up("mod0.x")
-        x.reset()
-        # the replies to a move are lost: it is not sent again, and the motor stops
-        wire.tell("mute")
-        with raises(5, "mod0"):
-            x.move(0.05)
-            x.wait_until_idle(8.0)
-        wait_for(lambda: wire.state("velocity") == 0, "rest by heartbeat or stop", 2.0)
-        wait_for(lambda: not wire.reads("mod0.x"), "the loss")
-        wire.tell("clear")
-        wire.wait_up("mod0.x")
-        x.reset()
-        # frozen for longer than the heartbeat: the module stops by itself
-        x.command(velocity=0.02)
-        wait_for(lambda: wire.state("velocity") > 0, "motion")
-        began = time.monotonic()
-        wire.tell("deaf")
-        wait_for(lambda: wire.state("velocity") == 0, "rest by heartbeat", 1.5)
-        assert time.monotonic() - began < 1.0
-        wait_for(lambda: not wire.reads("mod0.x"), "the loss")
-        wire.tell("clear")
-        wire.wait_up("mod0.x")
-        x.reset()
-    wire.check_deaths("mod0.x", 0.05, lambda: float(wire.state("velocity")), 0.02 * PER_M, 1.0)
 
 
 def test_stray_bytes_restarts_and_other_masters(start: Callable[..., Any], short_folder: Path) -> None:

@@ -120,43 +120,6 @@ def cell(start: Callable[..., Any], short_folder: Path, wait_until: Callable[...
     made.client.close()
 
 
-JOG = """
-import sys, time, sioms
-node = sioms.Workcell(sys.argv[1]).open("bus0.x", "rw")
-node.command(velocity=0.05)
-print("moving", flush=True)
-time.sleep(60)
-"""
-
-
-def jog(cell: Cell, start: Callable[..., Any], wait_until: Callable[..., None]) -> Any:
-    """Let a client of its own jog the first drive."""
-    client = start([sys.executable, "-c", JOG, cell.socket])
-    client.wait_line("moving")
-    wait_until(lambda: cell.velocity() > 40000, what="the drive moving")
-    return client
-
-
-def test_deaths_in_motion_stop_the_drive(
-    cell: Cell, start: Callable[..., Any], wait_until: Callable[..., None]
-) -> None:
-    client = jog(cell, start, wait_until)
-    client.process.kill()
-    wait_until(lambda: cell.velocity() == 0, 2.0, "rest after the client's death")
-    wait_until(lambda: cell.device("bus0")["pid"], what="the driver's pid")
-    client = jog(cell, start, wait_until)
-    driver = cell.device("bus0")["pid"]
-    os.kill(driver, signal.SIGKILL)
-    wait_until(lambda: cell.velocity() == 0, 2.0, "rest after the driver's death")
-    client.process.kill()
-    wait_until(lambda: cell.device("bus0")["pid"] not in (0, None, driver), what="a new driver")
-    wait_until(lambda: cell.reads("bus0.x"), what="the axis again")
-    assert cell.velocity() == 0, "motion must not resume"
-    jog(cell, start, wait_until)
-    cell.daemon.process.kill()
-    wait_until(lambda: cell.velocity() == 0, 2.0, "rest after the daemon's death")
-
-
 def test_faults_of_the_serial_line(cell: Cell, wait_until: Callable[..., None]) -> None:
     with cell.client.open("bus0.x", "rw") as x:
         # the dead drive beside it takes little of the line
