@@ -78,3 +78,37 @@ def export(columns: dict[str, NDArray[Any]], path: Path) -> None:
 def main_column(info: NodeInfo) -> str:
     """Return the column that a plot shows, if none is asked for."""
     return "position" if info.node_class is NodeClass.AXIS else "data"
+
+
+def of_one_node(path: Path, node_class: NodeClass) -> tuple[NodeInfo, dict[str, NDArray[Any]]]:
+    """Return the node that a recording is about and its readings, none of them missing.
+
+    Args:
+        path: of the recording.
+        node_class: whose node it is, if several are recorded: the only one of this class.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is about no or several such nodes, or readings are missing; the sentence says what helps.
+    """
+    with Recording(path) as recording:
+        nodes = [node.info for node in recording.nodes.values()]
+        chosen = [info for info in nodes if info.node_class is node_class] if len(nodes) > 1 else nodes
+        if len(chosen) != 1:
+            names = ", ".join(info.name for info in chosen or nodes) or "none"
+            raise ValueError(
+                f"read {path}: it holds the nodes {names}; want one {node_class.name.lower()} node: `sioms log cut "
+                f"{path} NODE -o FILE` leaves one"
+            )
+        columns = columns_of(recording, chosen[0].name)
+        if recording.damage:
+            raise ValueError(f"read {path}: {recording.damage[0]}; `sioms log cut` takes what is whole before or after")
+        gaps = np.flatnonzero(np.diff(columns["number"]) != 1)
+        if len(gaps):
+            at_s = columns["time [s]"][gaps[0]] - columns["time [s]"][0]
+            raise ValueError(
+                f"read {path}: snapshots of {chosen[0].name} are missing {at_s:.3f} s after the beginning; `sioms log "
+                "cut --from, --to` takes what is whole"
+            )
+        del columns["number"]
+        return chosen[0], columns

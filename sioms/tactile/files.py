@@ -1,9 +1,11 @@
-"""Read a folder of tactile recordings: `*.npz` tables of frames and the finger as built.
+"""Read a folder of tactile recordings: `*.npz` tables of frames, or `*.mcap` of one node, and the finger as built.
 
 Each npz holds raw (frames, ns), time, touch (-1 without), phase (0 baseline, 1 under load, 2 other), fs, and
 may hold force and temperature; touch experiments add cmd_theta [deg], cmd_P [N/m] and cmd_rc [mm] for each
-touch (0 edge, inf flat). Files named noise, thermal and ramp are what they say.  The finger is nominal.toml,
-or nominal.json with radii and angles.
+touch (0 edge, inf flat). Beside an mcap `NAME.touches.csv` has a line for each touch: base_s, start_s and end_s
+after the beginning of the recording (rest from base_s on, load from start_s on), and the same cmd columns.
+Files named noise, thermal and ramp are what they say.  The finger is nominal.toml, or nominal.json with radii and
+angles.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from numpy.typing import NDArray
 
 from sioms.documents import json_of, read_bytes, read_text
 from sioms.lab.arrays import read_npz
+from sioms.protocol.flags import NodeClass
+from sioms.recording.tables import head_of, of_one_node
 from sioms.tactile.cylinder import Cylinder
 from sioms.tactile.finger import Elements, Finger, from_toml, nominal_finger
 from sioms.tactile.touches import Recording, Touches, average
@@ -47,7 +51,7 @@ def read_folder(folder: Path) -> Data:
     """
     nominal = read_nominal(folder)
     recordings, touches = {}, {}
-    for path in sorted(folder.glob("*.npz")):
+    for path in sorted([*folder.glob("*.npz"), *folder.glob("*.mcap")]):
         try:
             file = _opened(path)
             recordings[path.stem] = recording = _recording(file)
@@ -75,9 +79,31 @@ def read_recording(path: Path) -> Recording:
 
 def _opened(path: Path) -> dict[str, Any]:
     path.stat()
+    if path.suffix == ".mcap":
+        return _recorded(path)
     if not zipfile.is_zipfile(path):
         raise ValueError("this is no npz archive; want arrays raw and time, as numpy.savez writes them")
     return read_npz(path)
+
+
+def _recorded(path: Path) -> dict[str, Any]:
+    """Return the frames of a recording, and the touches that are listed beside it."""
+    info, columns = of_one_node(path, NodeClass.ANALOG)
+    heads = [head_of(info, channel, "data") for channel in range(len(info.channels))]
+    time_s = columns["time [s]"] - columns["time [s]"][0]
+    found: dict[str, Any] = {"raw": np.stack([columns[head] for head in heads], axis=1), "time": time_s}
+    if (listed := path.with_suffix(".touches.csv")).exists():
+        touches = np.atleast_1d(np.genfromtxt(listed, delimiter=",", names=True))
+        names = ("base_s", "start_s", "end_s", "cmd_theta", "cmd_P", "cmd_rc")
+        if missing := [name for name in names if name not in (touches.dtype.names or ())]:
+            raise ValueError(f"{listed.name} has no column {missing[0]}; want {', '.join(names)}")
+        found["touch"], found["phase"] = np.full(len(time_s), -1), np.full(len(time_s), 2)
+        for number, touch in enumerate(touches):
+            for phase, begin, end in ((0, "base_s", "start_s"), (1, "start_s", "end_s")):
+                inside = (time_s >= touch[begin]) & (time_s < touch[end])
+                found["touch"][inside], found["phase"][inside] = number, phase
+        found |= {name: touches[name] for name in names[3:]}
+    return found
 
 
 def _words(error: BaseException) -> str:

@@ -1,4 +1,4 @@
-"""Read tables as instruments and spreadsheets write them: CSV of any dialect, NPZ, MAT.
+"""Read tables as instruments and spreadsheets write them: CSV of any dialect, NPZ, MAT, and recordings of one node.
 
 A CSV may part its columns by comma, semicolon, tab or blanks, write 1,5 for 1.5, carry lines of remarks before its
 head, a unit in each name (``pos [deg]``, ``pos (deg)``, ``pos/deg``, ``pos_deg``) or a line of units below the head. A
@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 
 from sioms.documents import read_bytes
 from sioms.lab.arrays import MOST_BYTES, UnreadableError, read_mat, read_npz
+from sioms.protocol.flags import NodeClass
 from sioms.reconcile.errors import BadInputError
+from sioms.recording.tables import of_one_node
 
 Array = NDArray[np.float64]
-SUFFIXES = (".csv", ".npz", ".mat", ".txt")
+SUFFIXES = (".csv", ".npz", ".mat", ".txt", ".mcap")
 #: Factors to SI, by what they measure.
 UNITS = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
@@ -128,6 +130,14 @@ def load_table(path: Path) -> Table:
                 if np.ndim(v) == 1 and np.asarray(v).dtype.kind in NUMBERS
             }
         )
+    if path.suffix == ".mcap":
+        try:
+            _, columns = of_one_node(path, NodeClass.AXIS)
+        except (OSError, ValueError) as error:
+            raise BadInputError(
+                error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+            ) from None
+        return _table({head: np.asarray(values, dtype=np.float64) for head, values in columns.items()})
     return _text(path)
 
 
