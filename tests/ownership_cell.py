@@ -158,8 +158,7 @@ class Cell:
             for fd in (*device.page_fds, device.journal_fd):
                 os.close(fd)
         files = server.shared.files
-        own = server.shared.journal.fd
-        for fd in (server.shared.fds[0], server.shared.fds[3], *files.client_fds, record.drivers_fd, own):
+        for fd in (server.shared.fds[0], server.shared.fds[3], *files.client_fds, record.drivers_fd):
             os.close(fd)
         os.close(server.shared.journal.fd)
         server.shared.request.close()

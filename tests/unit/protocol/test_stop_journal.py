@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import time
 import random
 import resource
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -105,7 +105,8 @@ def test_two_daemons_do_not_keep_one_record(path: str) -> None:
 
 @pytest.mark.parametrize("at", ["1e300", "NaN", "-5.0"])
 def test_a_time_that_no_calendar_has_is_damage(path: str, at: str) -> None:
-    Path(path).write_text('{"at":%s,"workcell":"","stop":true,"by":"eva"}\n' % at)
+    os.makedirs(os.path.dirname(path))
+    Path(path).write_text(f'{{"at":{at},"workcell":"","stop":true,"by":"eva"}}\n')
     state = kept(path)
     assert "damaged" in state.workcell and time.gmtime(state.since_s).tm_year > 1970
 
