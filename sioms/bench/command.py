@@ -30,6 +30,7 @@ BENCHES: dict[str, tuple[str, str]] = {
         "emergency stop to 16 axes in 4 processes acting on it, from Python and from the shell",
     ),
     "pipe": ("pipes", "start of devin; devin piped into devout as a 1 kHz loop"),
+    "reach": ("reach", "through a gateway: requests, readings, stops; what fails to axes halting"),
     "drivers": (
         "drivers",
         "drivers: cycle against the line's speed, streams without loss, stop on a busy line",
