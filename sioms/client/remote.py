@@ -256,6 +256,7 @@ class _Bridge:
         self._send(Up.HELLO, link.VERSION)
         with suppress(zmq.ZMQError):
             self._stops.send(link.pack(Up.HELLO), zmq.DONTWAIT)
+            self._stops.getsockopt(zmq.EVENTS)  # from now on its descriptor tells
         while not self._told_ns:
             self._wait_frame(what, deadline)
         for _ in range(FIRST_PINGS):
@@ -291,23 +292,30 @@ class _Bridge:
         session = self.ours.fileno()
         for fd in (requests, stops, monitor, session):
             self._epoll.register(fd, select.EPOLLIN)
-        busy = True
+        due_ns = 0
         while self._last_word is None:
-            for fd, _ in self._epoll.poll(0 if busy else link.PING_S / 2):
+            ready = [fd for fd, _ in self._epoll.poll(link.PING_S / 2)]
+            for fd in ready:
                 if fd == session:
                     if not self._from_program():
                         return
                 elif fd in self._by_fd:
                     self._from_node(fd)
-            self._look(time.monotonic_ns())
-            busy = self._take_all()  # last: sending takes the edge off the descriptor of what has come
+            if stops in ready:
+                self._take_from(self._stops)
+            now_ns = time.monotonic_ns()
+            if monitor in ready or now_ns >= due_ns or self._stop is not None:
+                self._look(now_ns)
+                due_ns = now_ns + int(link.PING_S * 1e9 / 4)
+            # Last: sending takes the edge off the descriptor of what has come.
+            self._take_from(self._requests)
 
     def _look(self, now_ns: int) -> None:
         """Do what is due by time."""
-        if int(self._monitor.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+        while int(self._monitor.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
             happened: Any = parse_monitor_message(self._monitor.recv_multipart())
             if happened["event"] == zmq.EVENT_DISCONNECTED:
-                self._take_all()  # the gateway may have said why
+                self._take_from(self._requests)  # the gateway may have said why
                 text = f"link to {self._address} lost: the connection has ended"
                 self._last_word = self._last_word or (errno.EIO, text)
         if now_ns - self._pinged_ns > link.PING_S * 1e9:
@@ -321,18 +329,10 @@ class _Bridge:
             packet, self._stop = self._stop[1], None
             self._send(Up.PACKET, body=packet)
 
-    def _take_all(self) -> bool:
-        """Take what has come; return whether there is more."""
-        for sock in (self._stops, self._requests):
-            for _ in range(64):
-                try:
-                    frame = sock.recv(zmq.DONTWAIT)
-                except zmq.Again:
-                    break
-                self._take(frame)
-            else:
-                return True
-        return any(int(sock.getsockopt(zmq.EVENTS)) & zmq.POLLIN for sock in (self._requests, self._stops))
+    def _take_from(self, sock: zmq.Socket[bytes]) -> None:
+        """Take what has come."""
+        while int(sock.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            self._take(sock.recv(zmq.DONTWAIT))
 
     def _send(self, kind: int, channel: int = 0, body: bytes = b"") -> None:
         self._number += 1
@@ -354,6 +354,7 @@ class _Bridge:
             self._stop = (time.monotonic() + STOP_AGAIN_S, packet)
             with suppress(zmq.ZMQError):  # it goes the other way then
                 self._stops.send(link.pack(Up.PACKET, body=packet), zmq.DONTWAIT)
+                self._take_from(self._stops)
             return True
         self._send(Up.PACKET, 0, packet)
         return True

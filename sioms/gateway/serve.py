@@ -198,19 +198,18 @@ class Serve:
         """Take frames of clients; return whether there are more."""
         router, known = self._router, self._known
         for _ in range(TURN):
-            try:
-                peer = router.recv(zmq.DONTWAIT)
-                if peer in known and peer in self.gateway.sessions:
-                    frame = router.recv()
-                else:
-                    first = router.recv(copy=False)
-                    known[peer] = (str(first.get("User-Id")), str(first.get("Peer-Address")))
-                    frame = first.bytes
-                more = router.getsockopt(zmq.RCVMORE)
-                while more and router.getsockopt(zmq.RCVMORE):
-                    router.recv()
-            except zmq.Again:
+            if not int(router.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
                 return False
+            peer = router.recv()
+            if peer in known and peer in self.gateway.sessions:
+                frame = router.recv()
+            else:
+                first = router.recv(copy=False)
+                known[peer] = (str(first.get("User-Id")), str(first.get("Peer-Address")))
+                frame = first.bytes
+            more = router.getsockopt(zmq.RCVMORE)
+            while router.getsockopt(zmq.RCVMORE):
+                router.recv()
             public, host = known[peer]
             # A peer that names itself could take over the name of one that has gone: those of ZeroMQ begin with zero.
             if more or peer[:1] != b"\0":
@@ -218,7 +217,7 @@ class Serve:
             self.gateway.frame(peer, self._principal(public), host, frame)
             if peer not in self.gateway.sessions:
                 known.pop(peer, None)
-        return bool(int(router.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
+        return True
 
     def run(self) -> None:
         """Serve until ``end``."""
@@ -238,14 +237,15 @@ class Serve:
             now_ns = time.monotonic_ns()
             if now_ns >= self.gateway.due_ns:
                 self.gateway.tick()
+                busy = busy or bool(int(self._router.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
             if now_ns >= keys_ns:
                 keys_ns = now_ns + int(KEYS_S * 1e9)
                 if self._keys.look():
                     self.gateway.allow(self._keys.by_name)
+                    busy = True  # sending takes the edge off the descriptor of what has come
             if manager.watchdog_ns and now_ns - fed_ns >= manager.watchdog_ns:
                 fed_ns = now_ns
                 manager.tell("WATCHDOG=1")
-            busy = busy or bool(int(self._router.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
         manager.tell("STOPPING=1")
         self.close()
 
