@@ -187,6 +187,8 @@ class World:
         runtime._timer.expired = skipped + 1  # type: ignore[attr-defined]
         self.ticks += 1
         runtime._on_timer()
+        if runtime._announced:
+            runtime._on_line_timer()
         self.latch.daemon_alive(CLOCK.now_ns)
         while True:
             try:

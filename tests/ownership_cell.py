@@ -160,7 +160,6 @@ class Cell:
         files = server.shared.files
         for fd in (server.shared.fds[0], server.shared.fds[3], *files.client_fds, record.drivers_fd):
             os.close(fd)
-        os.close(server.shared.journal.fd)
         server.shared.request.close()
         record._journal.close()
         server.loop.close()

@@ -297,6 +297,8 @@ class Process:
             runtime._moved_ns = CLOCK.now_ns  # who ends does not come to rest before its step is due
         runtime._timer.expired = 1  # type: ignore[attr-defined]
         runtime._on_timer()
+        if runtime._announced:
+            runtime._on_line_timer()
 
     def end(self) -> None:
         """Let the kernel take everything back, as at the end of a process."""

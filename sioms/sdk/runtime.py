@@ -165,6 +165,7 @@ class Runtime:
         self._stops_workcell = bool(options["stop_sources"])
         self._is_used = True
         self._lead_ns = self.engine.lead_ns if isinstance(self.engine, TickEngine) else 0
+        self._announced = self._slack_ns = 0
         self._spare_until_ns = 0
 
     # --- services to the driver (Kit) ------------------------------------------------------------
@@ -324,7 +325,7 @@ class Runtime:
         A loop that is closed here measures velocities over the time between two ticks; a quarter of the usual one is
         the least that it gets.
         """
-        if not self._lead_ns or self._is_ticking:  # the next one of frequent ticks comes as soon
+        if not self._lead_ns or self._is_ticking or self._announced:  # the next one of frequent ticks comes as soon
             return
         next_ns = self._scheduled_ns + self.period_ns
         early_ns = max(time.monotonic_ns(), self._ticked_ns + self.period_ns // 4)
@@ -341,6 +342,18 @@ class Runtime:
         expired = self._timer.expirations()
         if not expired:
             return
+        if self._lead_ns and self._idling.periods == 1 and isinstance(self.engine, TickEngine):
+            self._announced += expired
+            due_ns = self._scheduled_ns + self._announced * self.period_ns
+            began_ns = time.monotonic_ns()
+            self.engine.slack(began_ns, due_ns)
+            self._slack_ns = time.monotonic_ns() - began_ns
+            self.set_line_timer(due_ns)
+        else:
+            self._tick_on_time(expired)
+
+    def _tick_on_time(self, expired: int) -> None:
+        self._announced = 0
         self._is_ticking = True
         try:
             self._usual_tick(expired)
@@ -352,9 +365,7 @@ class Runtime:
         self._scheduled_ns += expired * periods * self.period_ns
         self.statistics.skipped += (expired - 1) * periods
         scheduled_ns = self._scheduled_ns
-        engine, slack_ns = self.engine, 0
-        if self._lead_ns and isinstance(engine, TickEngine):
-            slack_ns = engine.warm_up(scheduled_ns)
+        engine, slack_ns = self.engine, self._slack_ns
         began_ns = time.monotonic_ns()
         self.tick += 1
         self._look_around(began_ns)
@@ -384,7 +395,7 @@ class Runtime:
             self._wake()
         elif self._idling.rest(now_ns):
             idle_ns = self._idling.periods * self.period_ns
-            self._timer.set(self._scheduled_ns + idle_ns - self._lead_ns, idle_ns)
+            self._timer.set(self._scheduled_ns + idle_ns, idle_ns)
 
     def _wake(self) -> None:
         """Tick at the full rate again, beginning now: something has happened, or is going to."""
@@ -434,7 +445,9 @@ class Runtime:
     def _on_line_timer(self) -> None:
         self._line_timer.expirations()
         self._line_due_ns = None
-        if isinstance(self.engine, TickEngine):
+        if self._announced:
+            self._tick_on_time(self._announced)
+        elif isinstance(self.engine, TickEngine):
             self._early_tick()
         else:
             self.engine.line_due()

@@ -19,8 +19,8 @@ from .parts import Parts
 
 SELDOM_HZ = 250.0
 """Ticks that come less often find the processor asleep and the caches cold."""
-WAKE_NS = 100_000
-WARM_NS = 400_000
+LEAD_NS, WORK_NS = 100_000, 400_000
+"""How long before such a tick to wake up, and what is added where there is work to do."""
 
 
 class TickEngine:
@@ -28,13 +28,13 @@ class TickEngine:
 
     Attributes:
         tick_hz: ticks a second.
-        lead_ns: how long before a tick to wake and warm up [ns]; 0 for ticks that come often.
+        lead_ns: how long before a tick to work, and then sleep [ns]; 0 for ticks that come often.
     """
 
     def __init__(self, parts: Parts, driver: TickDriver, tick_hz: float) -> None:
         self.tick_hz = tick_hz
         has_work = type(driver).slack is not TickDriver.slack
-        self.lead_ns = 0 if tick_hz > SELDOM_HZ else WAKE_NS + WARM_NS * has_work
+        self.lead_ns = 0 if tick_hz > SELDOM_HZ else LEAD_NS + WORK_NS * has_work
         self._loop, self._pages, self._stops = parts.loop, parts.pages, parts.stops
         self._outputs = parts.outputs
         self._driver = driver
@@ -128,15 +128,6 @@ class TickEngine:
     def slack(self, now_ns: int, until_ns: int) -> None:
         """Let the driver use the time that is left."""
         self._driver.slack(now_ns, until_ns)
-
-    def warm_up(self, until_ns: int) -> int:
-        """Do the work of the slack just before the tick, begin the tick on time; return how long the work took [ns]."""
-        began_ns = time.monotonic_ns()
-        self._driver.slack(began_ns, until_ns)
-        ended_ns = time.monotonic_ns()
-        while time.monotonic_ns() < until_ns:  # for at most the lead: a sleep so short would end late
-            pass
-        return ended_ns - began_ns
 
     def commands_written(self, block: AnyBlock) -> None:
         """Nothing: the next tick sees it."""

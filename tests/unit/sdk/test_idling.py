@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from own_writes_rig import World, own_time
+from own_writes_rig import CLOCK, World, own_time
 
 from sioms.drivers.sim.axes import SimAxes
 from sioms.drivers.sim.force import SimForce
@@ -118,4 +118,23 @@ def test_what_moves_by_itself_is_not_idle() -> None:
         world.close()
         world = rested(SimForce, {}, made, used=False)
         assert periods(world) == 40
+        world.close()
+
+
+def test_a_driver_that_ticks_seldom_sleeps_before_its_tick() -> None:
+    """It does the work of the slack first, and begins the tick by a timer."""
+    made: list[World] = []
+    with own_time(made):
+        world = rested(SimForce, {"tick_hz": 100.0}, made, used=True, ticks=2)
+        runtime, worked = world.runtime, []
+        world.runtime.driver.slack = lambda *times: worked.append(times)  # type: ignore[method-assign]
+        CLOCK.now_ns = runtime._scheduled_ns + runtime.period_ns - runtime._lead_ns
+        before, begun_ns = runtime.statistics.ticks, CLOCK.now_ns
+        runtime._timer.expired = 1  # type: ignore[attr-defined]
+        runtime._on_timer()
+        assert CLOCK.now_ns < begun_ns + 1000, "nothing but to look at the clock takes time here: it has spun"
+        assert (len(worked), runtime.statistics.ticks) == (1, before)
+        assert runtime._line_due_ns == runtime._scheduled_ns + runtime.period_ns
+        runtime._on_line_timer()
+        assert (len(worked), runtime.statistics.ticks) == (1, before + 1)
         world.close()
