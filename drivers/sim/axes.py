@@ -17,6 +17,10 @@ the axes a tick earlier than those of another process.
     name = "beam0"
     boxes = [{ xaxis = [0.10, 0.14] }]
 
+An axis with a ``load_node``, an analog node of one channel (of a ``sim-world``), bears the force there [N or N m]
+beside that of its motor. While that node is not there the device is lost: its axes stop. A world that waits for its
+axes holds the loads it showed last.
+
 An axis with a ``model_file`` (as ``sioms reconcile`` writes it) is the twin of the axis that the model was found
 for: mass, friction, encoder and all effects come from the file, stops and switches from ``motor``. The name and a
 check sum of the model show in the plant's description, so that a reload takes up a changed file.
@@ -47,6 +51,7 @@ from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, AxisBlock, BinaryBlock, BlockSpec, Description
 from sioms.sdk.driver import Kit, TickDriver
+from sioms.sdk.exchange import LinkError
 from sioms.sdk.tables import from_table, table_type
 
 # More than this many ticks late, the simulated world stands still instead of catching up.
@@ -74,9 +79,10 @@ AxisTable: Any = table_type(
         "motor": (table_type(Motor) | None, None),
         "stepper": (table_type(Stepper) | None, None),
         "model_file": (str, ""),
+        "load_node": (str, ""),
     },
 )
-"""Keys of an axis: those of AxisSettings, ``motor`` or ``stepper``, and the ``model_file`` of a twin.
+"""Keys of an axis: those of AxisSettings, ``motor`` or ``stepper``, the ``model_file`` of a twin, and a ``load_node``.
 
 ``bandwidth_hz`` sets the gains of a servo that gives none; ``count`` above 1 makes so many of it, with
 the numbers from 0 behind their name.
@@ -146,7 +152,8 @@ class SimAxes(TickDriver):
         if beams:
             port = ChannelInfo("in", minimum=0, maximum=2**beams - 1, width=beams)
             blocks.append(BlockSpec("beams", NodeClass.BINARY, (port,), history=4 * settings.history))
-        return Description(tuple(blocks), settings.tick_hz, lease_s=1.0)
+        inputs = tuple(dict.fromkeys(axis.load_node for axis in axes if axis.load_node))
+        return Description(tuple(blocks), settings.tick_hz, inputs, lease_s=1.0)
 
     def __init__(self, name: str, settings: SimAxesSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
@@ -166,6 +173,9 @@ class SimAxes(TickDriver):
         n = len(configured)
         stepper = np.array([axis.kind is AxisKind.STEPPER for axis in configured])
         self._servo_rows, self._stepper_rows = np.flatnonzero(~stepper), np.flatnonzero(stepper)
+        servos = [axis for axis in _axes(settings) if axis.motor is not None]
+        self._loads = [(row, axis.load_node) for row, axis in enumerate(servos) if axis.load_node]
+        self._constant = np.array([axis.motor.load_force for axis in servos])
         self._reading = np.zeros(n)
         self._switches = np.zeros(n, dtype=np.int64)
         self._command: Array | None = None
@@ -191,6 +201,7 @@ class SimAxes(TickDriver):
         The controller of a device does not miss its turns because this machine was busy: after a late tick they are
         made up for, a few at once. Later than ``late_max_s`` the bank stops all motion.
         """
+        self._bear(now_ns)
         behind = round((now_ns - self._last_ns) / self._tick_ns) if self._command is not None else 0
         if self._is_still:
             behind, self._is_still = min(behind, 1), False
@@ -199,6 +210,24 @@ class SimAxes(TickDriver):
                 self._turn(self._last_ns + self._stride * self._tick_ns, self._stride)
                 behind -= self._stride
         self._turn(now_ns, behind)
+
+    def open(self) -> None:
+        """Wait for the loads."""
+        self._bear(time.monotonic_ns())
+
+    def _bear(self, now_ns: int) -> None:
+        """Take the loads from their nodes.
+
+        Raises:
+            LinkError: one of them is not there.
+        """
+        for row, node in self._loads:
+            reading = self.kit.inputs[node].read(now_ns)
+            if reading is None:
+                self._command = None  # no motion is made up for
+                raise LinkError(f"{node}: no load is known; want the simulated world there")
+            if self._servos is not None:
+                self._servos.load_force[row] = self._constant[row] + float(reading["value"][0])
 
     def _turn(self, now_ns: int, ticks: int) -> None:
         beside_ns = 0
@@ -221,7 +250,7 @@ class SimAxes(TickDriver):
 
     def is_at_rest(self) -> bool:
         """Whether world and command are at a fixed point; turns that are left out then need not be made up for."""
-        if self._command is None or self._has_effects:
+        if self._command is None or self._has_effects or self._loads:
             return False
         with np.errstate(invalid="ignore"):
             still = bool((np.abs(self._command - self._seen) <= self._near).all())
@@ -310,6 +339,10 @@ def _build(settings: SimAxesSettings) -> tuple[MotorBank | None, StepperBank | N
     for axis in axes:
         if (axis.motor is None) == (axis.stepper is None):
             raise ValueError(f"axis {axis.name}: has neither or both of motor and stepper; want one of them")
+        if axis.load_node and axis.motor is None:
+            raise ValueError(
+                f"axis {axis.name}: a stepper with a load_node; want a motor, steppers bear no load from nodes"
+            )
     names = [axis.name for axis in servos]
     plants, effects, laws = _twins(servos, [from_table(Motor, a.motor) for a in servos], tick_s)
     effects += _effects(settings, names)

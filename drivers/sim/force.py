@@ -123,6 +123,8 @@ class SimForce(TickDriver):
         missing = False
         for index, contact in enumerate(self.settings.contact):
             reading = self.kit.inputs[contact.node].read(now_ns)
+            if reading is not None and "flags" in reading and int(reading["flags"][0]) & int(AnalogStatus.INVALID):
+                reading = None
             missing |= reading is None
             self._forces[index] = 0.0 if reading is None else reading["value"][0]
         data, sensor, time_s = self._block.data, self._sensor, now_ns * 1e-9

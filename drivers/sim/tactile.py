@@ -48,6 +48,7 @@ class SimTactileSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True
         angle_rad: contact angle, at position 0 of the angle node.
         angle_per_position: [rad/m or rad/rad].
         indenter_radius_m: radius of the object, infinite for a flat, 0 for an edge.
+        curvature_node: node of one channel with the object's curvature [1/m], instead of a fixed radius.
         finger: geometry, material and faults.
         model_file: finger and effects from a model instead; only the length of contact is still ``finger``'s.
         gain, offset: of the elements [1, %]; one number for each.
@@ -60,6 +61,7 @@ class SimTactileSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
     force_node: str = ""
     angle_node: str = ""
+    curvature_node: str = ""
     angle_rad: float = 1.29
     angle_per_position: float = 0.0
     indenter_radius_m: float = 6e-3
@@ -92,7 +94,12 @@ class SimTactile(TickDriver):
         if settings.model_file:
             what += f", model {zlib.crc32(Path(settings.model_file).read_bytes()):08x}"
         channels = tuple(ChannelInfo(f"e{index}", "%", description=what) for index in range(elements))
-        felt = (settings.force_node, settings.angle_node, *tactile_nodes.inputs(settings.shape))
+        felt = (
+            settings.force_node,
+            settings.angle_node,
+            settings.curvature_node,
+            *tactile_nodes.inputs(settings.shape),
+        )
         return Description(
             (
                 BlockSpec("", NodeClass.ANALOG, channels, history=settings.history),
@@ -109,9 +116,12 @@ class SimTactile(TickDriver):
         self._block = AnalogBlock(first)
         self._finger = tactile_nodes.TactileNodes(settings.shape, more, kit) if settings.shape else None
         self._array = _twin(settings) if settings.model_file else _array(settings)
-        self._array.mount(settings.indenter_radius_m)
-        self._touch: tuple[float | None, float | None] = (None, None)
-        self._seen: tuple[float | None, float | None] = (None, None)
+        if settings.curvature_node and isinstance(self._array, TactileArray):
+            self._array.mount_all()
+        else:
+            self._array.mount(settings.indenter_radius_m)
+        self._touch: tuple[float | None, ...] = (None, None, None)
+        self._seen: tuple[float | None, ...] = (None, None, None)
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
@@ -122,11 +132,14 @@ class SimTactile(TickDriver):
         """Read force and angle; while a device is not there the reading is invalid."""
         settings = self.settings
         force, angle = self._value(settings.force_node, now_ns), self._value(settings.angle_node, now_ns)
-        self._touch = force, angle
+        curvature = self._value(settings.curvature_node, now_ns)
+        self._touch = force, angle, curvature
         contact_rad = settings.angle_rad + settings.angle_per_position * (angle or 0.0)
         radius_m = settings.indenter_radius_m
+        if settings.curvature_node:
+            radius_m = 1.0 / curvature if curvature else math.inf
         self._array.read(force or 0.0, contact_rad, radius_m, self._block.data, now_ns * 1e-9)
-        missing = force is None or angle is None
+        missing = force is None or angle is None or curvature is None
         self._block.flags[:] = int(AnalogStatus.INVALID) if missing else 0
         if self._finger is not None:
             self._finger.take(self._block.data, self._block.flags, now_ns, now_ns)
@@ -143,11 +156,13 @@ class SimTactile(TickDriver):
         return self._finger.ioctl(block, request, argument)
 
     def _value(self, node: str, now_ns: int) -> float | None:
-        """Return a node's value, 0 for no node, None while its device is not there."""
+        """Return a node's value, 0 for no node, None while its device is not there or says that it is invalid."""
         if not node:
             return 0.0
         reading = self.kit.inputs[node].read(now_ns)
-        return None if reading is None else float(reading["value"][0])
+        if reading is None or ("flags" in reading and int(reading["flags"][0]) & int(AnalogStatus.INVALID)):
+            return None
+        return float(reading["value"][0])
 
 
 def _check(settings: SimTactileSettings) -> int:
@@ -159,6 +174,10 @@ def _check(settings: SimTactileSettings) -> int:
     """
     shape = from_table(FingerShape, settings.finger)
     elements = _twin(settings).count if settings.model_file else len(shape.angles_rad)
+    if settings.curvature_node and settings.model_file:
+        raise ValueError(
+            "curvature_node: a finger with a model_file has a fixed indenter_radius_m; want one of the two"
+        )
     for key, values in (("gain", settings.gain), ("offset", settings.offset)):
         if len(values) not in (0, elements):
             raise ValueError(f"{key}: {len(values)} numbers; want {elements}, one for each element")

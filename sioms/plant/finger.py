@@ -148,6 +148,7 @@ class TactileArray:
         self._noise, self._step = noise, resolution
         self._random = np.random.default_rng(seed)
         self._late = np.zeros(n)
+        self._all = False
         self._time_s: float | None = None
         self._rows = np.arange(n)
 
@@ -161,6 +162,13 @@ class TactileArray:
             raise ValueError(f"mount indenter: radius {indenter_radius_m} m; want 0 (an edge) or more")
         self._rubber.pattern(_LOADS, indenter_radius_m, self.shape.adhesion)
 
+    def mount_all(self) -> None:
+        """Let round objects of all sizes come; tabulates the flat, and takes an object for the flat that touches as
+        wide: a contact's strains per load depend on its width alone, up to the difference of arcs from their parabolas.
+        """
+        self._all = True
+        self.mount(math.inf)
+
     def strain(self, load: float, angle_rad: float, indenter_radius_m: float) -> Array:
         """Return the radial strain at the elements, shape (ns,); zero without load.
 
@@ -171,6 +179,10 @@ class TactileArray:
         """
         if load <= 0.0:
             return np.zeros(self._rows.size)
+        if self._all and math.isfinite(indenter_radius_m):
+            share = indenter_radius_m / (indenter_radius_m + self.shape.radius_m)
+            widened: Array = self.strain(load * share, angle_rad, math.inf) / share
+            return widened
         table = self._rubber.pattern(_LOADS, indenter_radius_m, self.shape.adhesion)
         # even steps in the root of the load, along which the pattern changes evenly
         place = min(max((math.sqrt(load / _MOST) - _LEAST) / _STEP, 0.0), _STEPS - 1e-9)

@@ -79,6 +79,11 @@ class MotorBank:
         """Positions of the walls [m], which may be changed between ticks; None when no axis has one."""
         return None if self._walls is None else self._walls.position
 
+    @property
+    def load_force(self) -> Array:
+        """Constant forces on the loads [N], which may be changed between ticks."""
+        return self._load_constant
+
     def advance(self, force: Array) -> None:
         """Step all motors by one tick under a commanded force [N], shape (n,), finite."""
         command = self._command

@@ -186,6 +186,12 @@ class World:
         for finger, place in zip(self.fingers, places, strict=True):
             finger.rate = [(to - now) / time_s for to, now in zip(place, finger.command, strict=True)]
 
+    def place(self, joints: Sequence[Sequence[float]]) -> None:
+        """Put the fingers, at rest, where their joints are."""
+        for finger, joint in zip(self.fingers, joints, strict=True):
+            finger.place, finger.command = list(joint), list(joint)
+            finger.speed, finger.rate, finger.stretch = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0
+
     def advance(self, time_s: float, steps: int) -> None:
         """Go on by `time_s` in equal steps; 0.25 ms or less follow the stiffest contacts."""
         h = time_s / steps

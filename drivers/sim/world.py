@@ -1,0 +1,222 @@
+"""A simulated plane: an object on the platen between rubber fingers that simulated axes carry.
+
+It reads where the axes are from their ``plant`` nodes, integrates finer than its tick, and shows for each finger what
+other simulated devices feel: axes take the loads (``load_node``), force sensors ``fx`` and ``fy``, tactile fingers
+``normal``, ``angle`` and ``curvature``. Where the object truly is shows the node ``pose``, for pictures and tests.
+
+    [device.world]
+    driver = "sim-world"
+    object = { shape = "disk", radius_m = 0.02, pose = [0.17, 0.16, 0.0] }
+    [[device.world.finger]]
+    name = "left"
+    axes = ["mod0.plant.x_position", "mod0.plant.y_position", "mod0.plant.th_position"]
+    mount = { stiffness = 1e5, turn_stiffness = 5.0, mass = 0.3, inertia = 2e-4 }
+
+The stiffness of a mount lies between the axis and its finger, behind the axis's encoder; that of the servo comes in
+series. While an axis is not there the world stands still and its readings are invalid. A world that is killed takes
+what leans on it along: axes with a ``load_node`` of it are lost, fingers and force sensors read invalid.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import msgspec
+
+from sioms.plant import outline as outlines
+from sioms.plant.outline import Outline
+from sioms.plant.planar import Body, Finger, Mount, World
+from sioms.plant.skin import skin
+from sioms.protocol.flags import AnalogStatus, NodeClass
+from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
+from sioms.sdk.driver import Kit, TickDriver
+from sioms.sdk.tables import from_table, table_type
+
+MountTable: Any = table_type(Mount)
+
+_STEP_S = 0.25e-3
+_CATCH_UP_S = 0.05
+_INVALID = int(AnalogStatus.INVALID)
+
+_POSE = (("x", "m"), ("y", "m"), ("angle", "rad"), ("vx", "m/s"), ("vy", "m/s"), ("spin", "rad/s"))
+_FINGER = (
+    ("normal", "N", "force along the contact's normal"),
+    ("tangential", "N", "force on the object, anti-clockwise across the normal"),
+    ("angle", "rad", "place of contact in the finger's own angle"),
+    ("curvature", "1/m", "of the object, as the contact feels it"),
+    ("clearance", "m", "from the object; negative in contact"),
+    ("slides", "", "1 while the contact slides"),
+    ("fx", "N", "force of the object on the finger"),
+    ("fy", "N", "force of the object on the finger"),
+    ("x_load", "N", "force of the finger on the axis x"),
+    ("y_load", "N", "force of the finger on the axis y"),
+    ("th_load", "N*m", "torque of the link on the axis th"),
+)
+
+
+class ObjectTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The object.
+
+    Attributes:
+        shape: disk (radius_m), rectangle (size_m, corner_m), ellipse (size_m), polygon (points_m, corner_m) or spline
+            (points_m).
+        radius_m: of a disk.
+        size_m: full sizes along its own x and y.
+        points_m: corners, or points of the curve, anti-clockwise.
+        corner_m: radius of the corners, 0 for sharp ones.
+        pose: x [m], y [m] of the centroid and angle [rad] at the start.
+        mass: [kg].
+        platen_friction: coefficient on the platen.
+    """
+
+    shape: Literal["disk", "rectangle", "ellipse", "polygon", "spline"]
+    radius_m: float = 0.0
+    size_m: tuple[float, float] = (0.0, 0.0)
+    points_m: tuple[tuple[float, float], ...] = ()
+    corner_m: float = 0.0
+    pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mass: float = 0.1
+    platen_friction: float = 0.2
+
+
+class FingerTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A finger.
+
+    Attributes:
+        name: of its node.
+        axes: nodes of one channel each with the positions of x [m], y [m] and th [rad].
+        mount: what lies between the axes and the rubber.
+    """
+
+    name: str
+    axes: tuple[str, str, str]
+    mount: MountTable = MountTable()
+
+
+class SimWorldSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Keys of the device.
+
+    Attributes:
+        object: what lies on the platen.
+        finger: the fingers.
+        tick_hz: rate of what is shown; the world goes on in steps of at most 0.25 ms.
+        history: snapshots kept for readers.
+    """
+
+    object: ObjectTable
+    finger: list[FingerTable]
+    tick_hz: float = 1000.0
+    history: int = 64
+
+
+class SimWorld(TickDriver):
+    """A simulated plane.
+
+    Concurrency: the one thread of the driver process.
+    """
+
+    Settings = SimWorldSettings
+    realtime_priority = 0
+
+    @classmethod
+    def describe(cls, name: str, settings: SimWorldSettings) -> Description:
+        """Tell the object's pose and what each finger feels."""
+        _body(settings.object)
+        names = [finger.name for finger in settings.finger]
+        for index, finger in enumerate(settings.finger):
+            if finger.name in (*names[:index], "pose"):
+                raise ValueError(f"finger {index}: name {finger.name!r} is taken; want another")
+            from_table(Mount, finger.mount)
+        pose = tuple(ChannelInfo(channel, unit, description="true, of the object") for channel, unit in _POSE)
+        felt = tuple(ChannelInfo(channel, unit, description=what) for channel, unit, what in _FINGER)
+        blocks = [BlockSpec("pose", NodeClass.ANALOG, pose, history=settings.history)]
+        blocks += [BlockSpec(one, NodeClass.ANALOG, felt, history=settings.history) for one in names]
+        inputs = tuple(dict.fromkeys(node for finger in settings.finger for node in finger.axes))
+        return Description(tuple(blocks), settings.tick_hz, inputs, lease_s=1.0)
+
+    def __init__(self, name: str, settings: SimWorldSettings, kit: Kit) -> None:
+        super().__init__(name, settings, kit)
+        self._blocks = [AnalogBlock(spec) for spec in self.describe(name, settings).blocks]
+        self._body = _body(settings.object)
+        skin()  # the tables, before the first tick
+        self._world: World | None = None
+        self._missing = True
+        self._last_ns = 0
+
+    @property
+    def blocks(self) -> Sequence[AnyBlock]:
+        """The pose, then one block for each finger."""
+        return self._blocks
+
+    def tick(self, now_ns: int) -> None:
+        """Follow the axes up to now; while one is not there, stand still."""
+        places = [[self._position(node, now_ns) for node in finger.axes] for finger in self.settings.finger]
+        known = [[at for at in place if at is not None] for place in places]
+        missing = any(len(place) < 3 for place in known)
+        elapsed_s, self._last_ns = (now_ns - self._last_ns) * 1e-9, now_ns
+        if not missing:
+            if self._world is None:
+                mounts = [from_table(Mount, finger.mount) for finger in self.settings.finger]
+                self._world = World(self._body, mounts, known, self.settings.object.pose)
+            elif self._missing:  # an axis that is back may be elsewhere
+                self._world.place(known)
+            elif elapsed_s > 0.0:
+                elapsed_s = min(elapsed_s, _CATCH_UP_S)
+                self._world.command(known, elapsed_s)
+                self._world.advance(elapsed_s, math.ceil(elapsed_s / _STEP_S))
+        self._missing = missing
+        self._show(_INVALID if missing else 0)
+
+    def _position(self, node: str, now_ns: int) -> float | None:
+        reading = self.kit.inputs[node].read(now_ns)
+        return None if reading is None else float(reading["value"][0])
+
+    def _show(self, flags: int) -> None:
+        for block in self._blocks:
+            block.flags[:] = flags
+        world = self._world
+        if world is None:
+            return
+        self._blocks[0].data[:] = (*world.pose, *world.speed)
+        for block, finger in zip(self._blocks[1:], world.fingers, strict=True):
+            block.data[:] = _felt(finger)
+
+
+def _felt(finger: Finger) -> tuple[float, ...]:
+    """Return a finger's channels."""
+    angle = finger.phi + finger.place[2]
+    c, s = math.cos(angle), math.sin(angle)
+    fx, fy = finger.tangential * s - finger.normal * c, -finger.normal * s - finger.tangential * c
+    return (
+        finger.normal, finger.tangential, finger.phi, 1.0 / finger.radius_m, finger.gap_m, float(finger.slides),
+        fx, fy, *finger.joint_force,
+    )  # fmt: skip
+
+
+def _body(table: ObjectTable) -> Body:
+    """Make the object.
+
+    Raises:
+        ValueError: an outline that is not convex, or a number out of its range.
+    """
+    return Body(_outline(table), table.mass, table.platen_friction)
+
+
+def _outline(table: ObjectTable) -> Outline:
+    match table.shape:
+        case "disk":
+            return outlines.disk(table.radius_m)
+        case "rectangle":
+            return outlines.rectangle(*table.size_m, table.corner_m)
+        case "ellipse":
+            return outlines.ellipse(0.5 * table.size_m[0], 0.5 * table.size_m[1])
+        case "polygon":
+            return outlines.polygon(table.points_m, table.corner_m)
+        case "spline":
+            return outlines.spline(table.points_m)
+
+
+DRIVER = SimWorld
