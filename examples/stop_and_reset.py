@@ -9,7 +9,7 @@ import sioms
 
 
 def main() -> None:
-    with sioms.Workcell() as cell, cell.open("mod0.xaxis", "rw") as axis:
+    with sioms.Workcell() as cell, cell.open("mod0.xaxis", "rw", lease=2.0) as axis:
         axis.command(velocity=0.1)
         time.sleep(0.3)
         cell.emergency_stop(why="the example says so")

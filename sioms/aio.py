@@ -264,7 +264,7 @@ class AsyncWorkcell(Awaiting, WorkcellVerbs[AsyncMarker]):
         kind: type[AsyncNode[Any]] | None = None,
     ) -> Any:
         node = await self._open(name, mode, timeout, lease, kind)
-        if node.clock is not None and node._channel.keepalive_s:
+        if node.clock is not None and not node.info.read_only:
             self._renew(node)
         return node
 

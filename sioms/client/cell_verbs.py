@@ -17,7 +17,7 @@ from sioms.protocol.text import printable, shown
 from .arguments import number as as_number
 from .channel import Call, Channel
 from .faces import Generic, verb
-from .local import node_parts
+from .local import RENEWED_NS, node_parts
 from .shown import acknowledged_by_daemon
 
 TYPE_CHECKING = False
@@ -164,6 +164,7 @@ class WorkcellVerbs(Generic[M]):
         self._request: StopRequest | None = None
         self._nodes: dict[int, NodeVerbs[Any]] = {}
         self._fellows: list[Channel] = []
+        self._beat_s = 0.0
 
     async def _greet(self, name: str, enough: Callable[[], bool] | None = None) -> None:
         """Say hello; to a daemon that is starting again and again, for a while."""
@@ -233,25 +234,30 @@ class WorkcellVerbs(Generic[M]):
             raise TypeError(f"open {name}: kind {shown(kind)}; want AxisNode, AnalogNode or BinaryNode")
         answer = await self._waiter.call(open_call(name, mode, timeout, lease))
         core = node_parts(answer.value, answer.fds, self._channel.clock)
-        if self._channel.clock is not None and not core[0].read_only:
-            lease = lease or REMOTE_LEASE_S
-            self._lives_with(core[-1], core[2], lease)
+        if self._channel.clock is not None:
+            lease = 0.0 if core[0].read_only else lease or REMOTE_LEASE_S
         node = self._NODES[core[0].node_class](core, self, self._waiter_of(core[-1]), lease)
         self._nodes[node.handle] = node
+        if self._channel.clock is not None:
+            self._live_together(node, lease)
         if kind is not None and not isinstance(node, kind):
             node.release()
             await self._closed_handle(node.handle)
             raise OSError(errno.EINVAL, f"open {name}: it is an {type(node).__name__}; want an {kind.__name__}")
         return node
 
-    def _lives_with(self, channel: Channel, page: Any, lease: float) -> None:
-        """Renew the lease of a node of another machine by every call of this session, whichever node it is about."""
-        fellows = self._fellows = [each for each in self._fellows if not each.closed] + [channel]
-        for each in (*fellows, self._channel):
-            each.fellows = fellows
-        page.every_ns = int(lease * 1e9 / 4)
-        own = self._channel
-        own.keepalive_s = min(own.keepalive_s or lease, lease / 3)
+    def _live_together(self, node: NodeVerbs[Any], lease: float) -> None:
+        """Renew the leases of a session's nodes on another machine by every call of it, whichever that is about."""
+        self._fellows[:] = [each for each in self._fellows if not each.closed]
+        if not self._fellows:
+            self._beat_s = 0.0
+        if lease:
+            self._fellows.append(node._channel)
+            self._beat_s = min(self._beat_s or lease, lease / 3)
+        for channel in (self._channel, *[each._channel for each in self._nodes.values()]):
+            channel.fellows, channel.keepalive_s = self._fellows, self._beat_s
+        for each in self._nodes.values():
+            each._page.every_ns = min(int(self._beat_s * 1e9) or RENEWED_NS, RENEWED_NS)  # type: ignore[attr-defined]
 
     async def _closed_handle(self, handle: int) -> None:
         """Tell the daemon that a node was closed, and wait until its channels are free (nodes call this)."""

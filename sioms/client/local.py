@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
     from sioms.protocol.clock import Clock
 
+RENEWED_NS = 50_000_000
+"""How often reading renews leases, unless one is shorter than four times that [ns]."""
 _WAKES = 4096
 """Bytes taken out of the wake pipe in one go, one a publication."""
 
@@ -64,7 +66,7 @@ class LocalPage(PageReader):
 
 
 class LeasedPage(LocalPage):
-    """The same of a node that must be heard of, as those behind a gateway: reading renews its lease.
+    """The same of a node behind a gateway: reading renews the leases of its session.
 
     Attributes:
         renew: does so.
@@ -75,7 +77,7 @@ class LeasedPage(LocalPage):
 
     def __init__(self, page_fd: int, wake_fd: int, renew: Callable[[], None]) -> None:
         super().__init__(page_fd, wake_fd)
-        self.renew, self.every_ns, self._due_ns = renew, 0, 0
+        self.renew, self.every_ns, self._due_ns = renew, RENEWED_NS, 0
 
     def latest(self, now_ns: int) -> bytes:
         """Copy the newest snapshot; see ``PageReader.latest``."""
@@ -96,14 +98,15 @@ def node_parts(value: Any, fds: list[int], clock: Clock | None = None) -> tuple[
     handle, packed, channels, bit, behind = value
     info = NodeInfo(packed)
     channel = Channel(socket(fileno=fds[2]), f"node {info.name}", False, behind=behind, clock=clock)
-    if clock is None or info.read_only:
+    if clock is None:
         return info, handle, LocalPage(fds[0], fds[1]), list(channels), bit, channel
 
     def renew() -> None:
-        try:  # noqa: SIM105  # contextlib costs a shell tool a millisecond
-            channel.keepalive()
+        try:
+            if channel.fellows:
+                channel.keepalive()
         except OSError:
-            pass  # its next request says what has happened
+            return  # its next request says what has happened
 
     page = LeasedPage(fds[0], fds[1], renew)
     return info, handle, page, list(channels), bit, channel

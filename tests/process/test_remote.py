@@ -88,6 +88,24 @@ def test_a_subscriber_gets_every_publication(remote: sioms.Workcell) -> None:
         assert numbers == list(range(first + 1, first + 1 + len(numbers)))
 
 
+def test_every_call_of_a_session_renews_what_it_holds(remote: sioms.Workcell) -> None:
+    def goes_on() -> bool:
+        return bool(axis.read().commanded_velocity[0] > 0.04)
+
+    with remote.open("force0") as force, remote.open("mod1", "rw") as axis:
+        axis.command(velocity=0.05)
+        with raises(errno.ETIMEDOUT):  # a wait at the daemon
+            remote.wait_marker(remote.reserve_marker(), 3 * DEFAULT_LEASE_S)
+        assert goes_on()
+        end_s = time.monotonic() + 3 * DEFAULT_LEASE_S
+        while time.monotonic() < end_s:  # readings of another node
+            force.wait_new(force.read().number, 1.0)
+        assert goes_on()
+        axis.stop()
+    with remote.open("force0"), raises(errno.ETIMEDOUT):  # with nothing to renew any more
+        remote.wait_marker(remote.reserve_marker(), 2 * DEFAULT_LEASE_S)
+
+
 def test_the_asyncio_face_and_its_loop_keep_what_is_held(daemon: Daemon, gate: Gateway) -> None:
     async def go() -> None:
         async with await sioms.aio.connect(gate.socket) as cell, await cell.open("mod1", "rw") as axis:
