@@ -5,6 +5,7 @@ No process, no clock, no I/O.  SI units: m, rad, N, N m.  Angles are counter-clo
 * `kinematics`: joints of two modules and the six hand coordinates;
 * `contacts`: normals, contact points and friction angles of a grasp, and what is said of it;
 * `statics`: grasp matrix, internal force, and its sampled control loop;
+* `control`: the laws that move the hand, sample by sample;
 * `regrasp`: where the fingers go for a parallel grasp;
 * `rolling`: rigid fingers rolling on an object without slip.
 """

@@ -50,6 +50,19 @@ def damper_limit(stiffness: float, sample_s: float, late: int = 0) -> float:
     return 2.0 * math.sin(0.5 * math.pi / (2 * late + 1)) / (stiffness * sample_s)
 
 
+def damped_limit(stiffness: float, damping: float, sample_s: float) -> float:
+    """Return the gain K_v [m/(s N)] at which the loop becomes unstable where force also goes with speed, 2/(k T + 2 c).
+
+    A servo's damping answers a closing speed at once, before any way is gone; at high rates it is what limits K_v.
+
+    Args:
+        stiffness: k, of everything in series [N/m].
+        damping: c, of everything in series [N s/m].
+        sample_s: T.
+    """
+    return 2.0 / (stiffness * sample_s + 2.0 * damping)
+
+
 def damper_factor(gain: float, stiffness: float, sample_s: float, late: int = 0) -> float:
     """Return the largest |z| of the loop z^(n+1) - z^n + K_v k T = 0: below 1 it is stable.
 
