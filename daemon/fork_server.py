@@ -11,6 +11,7 @@ import os
 import signal
 import socket
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -52,6 +53,8 @@ class ForkServer:
         self._sock, self.pid = process or start_fork_server()
         self._pidfd = os.pidfd_open(self.pid)
         self._answers: dict[int, Answer] = {}
+        self._unsent: deque[tuple[int, bytes, list[int]]] = deque()
+        """Requests that the socket had no room for, with descriptors of their own; each answer makes room."""
         self._patience = Patience(self.pid)
         self._number = 0
         loop.watch(self._sock.fileno(), self._receive)
@@ -80,6 +83,9 @@ class ForkServer:
 
     def close(self) -> None:
         """End the fork server, also one that is stuck; the drivers it forked live on."""
+        while self._unsent:
+            for fd in self._unsent.popleft()[2]:
+                os.close(fd)
         if self._sock.fileno() >= 0:
             self._loop.unwatch(self._sock.fileno())
             self._sock.close()
@@ -105,11 +111,27 @@ class ForkServer:
         if not self._answers:
             self._patience.renew(time.monotonic())
         self._answers[self._number] = answer
+        if self._unsent or not self._send(self._number, packet, fds):
+            self._unsent.append((self._number, packet, [os.dup(fd) for fd in fds]))
+
+    def _send(self, number: int, packet: bytes, fds: Sequence[int]) -> bool:
+        """Send a request, or answer it when that cannot be; return False when there is no room for it yet."""
         try:
             socket.send_fds(self._sock, [packet], list(fds))
+        except BlockingIOError:
+            return False
         except OSError as error:
-            del self._answers[self._number]
-            answer(None, DIED, f"the fork server does not answer: {error}", [])
+            self._answers.pop(number)(None, DIED, f"the fork server does not answer: {error}", [])
+        return True
+
+    def _send_more(self) -> None:
+        while self._unsent:
+            request = self._unsent.popleft()
+            if not self._send(*request):
+                self._unsent.appendleft(request)
+                return
+            for fd in request[2]:
+                os.close(fd)
 
     def _receive(self) -> None:
         try:
@@ -122,6 +144,7 @@ class ForkServer:
             self._end()
             return
         self._patience.renew(time.monotonic())
+        self._send_more()
         try:
             message = decode_reply(packet, MAX_ANSWER)
         except MalformedMessage:
