@@ -12,6 +12,7 @@ import json
 import os
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from importlib.resources import files
@@ -34,8 +35,9 @@ from sioms.drivers.modbus.regmap import RegisterMapError, parse_map
 from sioms.drivers.schunk_ft.codec import parse as parse_schunk
 from sioms.lab.arrays import UnreadableError, read_mat, read_npz
 from sioms.plant.effects import EffectsError, parse_effects
-from sioms.protocol import wire
+from sioms.protocol import link, wire
 from sioms.protocol.driver_verbs import FROM_DRIVER, TO_DRIVER, TO_FORK_SERVER, DriverVerb, ForkServerVerb
+from sioms.protocol.flags import NodeClass
 from sioms.protocol.messages import (
     MAX_PACKET,
     ClientVerb,
@@ -84,6 +86,16 @@ class Target:
     raises: tuple[type[Exception], ...]
     share: int = 1
     frames: bool = False
+
+
+def _link(data: bytes) -> None:
+    """Each body of a frame of the link is taken or malformed."""
+    for decode_body in (
+        link.take_opened, link.take_ping, link.take_pong, lambda body: link.Update.take(body, 8),
+        lambda body: link.unpack(body, link.MAX_TO_GATEWAY),
+    ):  # fmt: skip
+        with suppress(link.MalformedFrame):
+            decode_body(data)
 
 
 def _message(data: bytes) -> None:
@@ -279,6 +291,19 @@ TARGETS = {
         [bytes([i]) + bytes.fromhex(golden.reply) for i, golden in enumerate(GOLDEN[:256])],
         (LinkError, DeviceError, Incomplete),
         7,
+        True,
+    ),
+    "link": Target(
+        _link,
+        [
+            link.pack(17, 1, 2, 3, b"x"),
+            link.ping(3),
+            link.pong(1, 2, 3, 4, 1),
+            link.opened(link.PageShape(NodeClass.AXIS, 3, 64, 10**8, 2, 9), b"packet"),
+            link.Update(9, 1, 2, b"why", True, [bytes(8)]).packed(),
+        ],
+        (),
+        2,
         True,
     ),
     "streams": Target(

@@ -424,7 +424,7 @@ class Gateway:
                 continue
             owns = False
             for held in list(session.held.values()):
-                if held.lease_ns and not held.ended:
+                if held.lease_ns and not held.ended and session.held:
                     owns = True
                     if held.until_ns < now_ns:
                         self._run_out(session, held)
@@ -453,7 +453,7 @@ class Gateway:
 
     def _feed(self, session: Session, held: Held, now_ns: int, must: bool = False) -> int:
         """Send what is new of a page, if its client keeps up; return when to look again [ns]."""
-        if held.ahead >= link.WINDOW:
+        if held.ahead >= link.WINDOW or session.held.get(held.handle) is not held:  # the session may just have ended
             return now_ns + IDLE_NS
         urgent = session.urgent_ns > now_ns
         if not (must or urgent or held.woken) and now_ns - held.sent_ns < IDLE_NS:

@@ -45,7 +45,9 @@ class Node:
         self.state = "ended"
 
     def close(self) -> None:
-        self.state = "closed"
+        if self.state != "closed":
+            self.state = "closed"
+            self.page.release()
 
 
 class Line:
@@ -321,6 +323,17 @@ def test_the_end_of_a_session_halts_what_it_held(world: World, end: str) -> None
         world.now_ns += 100 * MS
         world.gateway.tick()
     assert node.state == "closed" and line.closed and not world.gateway.sessions
+
+
+def test_a_client_that_vanishes_with_many_nodes_open_disturbs_nobody(world: World) -> None:
+    world.begin(b"a")
+    nodes = [world.open(b"a", handle, 10.0, read_only=handle > 6) for handle in range(5, 9)]
+    world.now_ns += 100 * MS
+    for node in nodes:
+        node.publish(world.now_ns)
+    world.takes = False
+    world.gateway.tick()
+    assert {node.state for node in nodes} == {"closed"} and not world.gateway.sessions
 
 
 def test_a_reader_that_confirms_gets_every_snapshot_and_one_that_does_not_gets_four_frames(world: World) -> None:
