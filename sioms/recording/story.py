@@ -103,9 +103,8 @@ class Story:
 def tell(events: Sequence[Event]) -> Story:
     """Find out what began the last trouble in a recording.
 
-    The last event of weight is followed back to the first one of the same trouble, by gaps of less than 2 s. Of
-    that trouble's first 50 ms the weightiest event is the cause: the stop that a death brings about may have been noted
-    before the death was seen.
+    The last event of weight is followed back to the first one of the same trouble, by gaps of less than 2 s. That is the
+    cause, unless a death was seen within 50 ms: what a death brings about may have been noted before.
     """
     heavy = [event for event in events if weight(event)]
     if not heavy:
@@ -114,7 +113,7 @@ def tell(events: Sequence[Event]) -> Story:
     while begin and heavy[begin].stamp_ns - heavy[begin - 1].stamp_ns < GAP_NS:
         begin -= 1
     near = [event for event in heavy[begin:] if event.stamp_ns - heavy[begin].stamp_ns < 50_000_000]
-    first = max(near, key=lambda event: (weight(event), -event.stamp_ns))
+    first = next((event for event in near if weight(event) == 3), heavy[begin])
     cause = ("request", "stop", "fault", "death")[weight(first)]
     told = [event for event in events if event.stamp_ns > heavy[begin].stamp_ns - GAP_NS and event.kind not in _QUIET]
     return Story(cause, first, sentence(first), told)

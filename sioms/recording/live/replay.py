@@ -23,7 +23,7 @@ from sioms.protocol.messages import MAX_PACKET, MalformedMessage, refusal, reply
 from sioms.protocol.page import PageWriter, page_size
 from sioms.recording.reader import NodeRecord, Recording
 
-SLOTS = 1024
+SLOTS = 8192
 LEASE_NS = 5_000_000_000
 """A replay that hangs is stale after so long."""
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | 0x0010 | fcntl.F_SEAL_SEAL  # 0x10: F_SEAL_FUTURE_WRITE

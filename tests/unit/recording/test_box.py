@@ -88,7 +88,7 @@ HALT = at(59_999, "mod0", "stop", "its owner has gone", stop="CONTROLLED", parts
         ([OLD, HALT, STOP], "stop", "eva"),
         ([OLD, STOP, LOST], "death", "driver of mod1 has died: its driver process ended"),
         ([OLD, FAULT, STOP], "fault", "fault of xaxis: following error"),
-        ([STOP, at(61_000, "mod0", "fault", "later", channels="x")], "stop", "eva"),
+        ([STOP, at(60_003, "mod0", "fault", "later", channels="x")], "stop", "eva"),
         ([HALT, at(60_000, "recorder", "daemon gone", "the daemon has ended")], "death", "daemon has ended"),
     ],
 )
