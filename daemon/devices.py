@@ -170,6 +170,8 @@ class DriverProcess:
                 self._bury(fd)
         elif errno_:
             self._end(f"its process could not be started: {text}")
+        elif not fds:  # the kernel drops what goes beyond the limit; the process ends with its control socket
+            self._end("its process could not be started: too many open files in the daemon; raise LimitNOFILE")
         else:
             self.pid, self._pidfd = pid, fds[0]
             self._patience = Patience(pid)
@@ -310,6 +312,11 @@ class DriverProcess:
         return True
 
     def _ready(self, fds: list[int]) -> None:
+        if len(fds) < len(self.info.blocks):  # as above
+            for fd in fds:
+                os.close(fd)
+            self.kill("its pages could not be taken: too many open files in the daemon; raise LimitNOFILE")
+            return
         self._maps = [mmap.mmap(fd, 4096) for fd in fds]
         for fd in fds:
             fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _SEALS)

@@ -135,8 +135,12 @@ class _Flusher:
         """Have what has been written reach the disk, and then free the file up to a place."""
         self._free_to = max(self._free_to, free_to)
         if self._thread is None:
-            self._thread = threading.Thread(target=self._run, daemon=True, name="stops")
-            self._thread.start()
+            thread = threading.Thread(target=self._run, daemon=True, name="stops")
+            try:
+                thread.start()
+            except RuntimeError:  # no memory, or no more threads: the next entry tries again
+                return
+            self._thread = thread
         self._wanted.set()
 
     def end(self) -> None:

@@ -94,7 +94,10 @@ class Users:
                 answers.append(question())
 
         thread = threading.Thread(target=ask, name="name service", daemon=True)
-        thread.start()
+        try:
+            thread.start()
+        except RuntimeError:  # no memory, or no more threads: as a question that is not answered
+            return None
         thread.join(self._answer_s)
         return answers[0] if answers else None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from _socket import socket
 from mmap import PROT_READ, mmap
@@ -94,9 +95,16 @@ def node_parts(value: Any, fds: list[int], clock: Clock | None = None) -> tuple[
         value: the answer.
         fds: that came with it.
         clock: of the cell, where that is another machine's.
+
+    Raises:
+        OSError: EMFILE, this process has no descriptors left.
     """
     handle, packed, channels, bit, behind = value
     info = NodeInfo(packed)
+    if len(fds) < 3:  # the kernel drops what goes beyond the limit; its driver sees that nobody has it
+        for fd in fds:
+            os.close(fd)
+        raise OSError(errno.EMFILE, f"open {info.name}: too many open files in this process; close some")
     channel = Channel(socket(fileno=fds[2]), f"node {info.name}", False, behind=behind, clock=clock)
     if clock is None:
         return info, handle, LocalPage(fds[0], fds[1]), list(channels), bit, channel

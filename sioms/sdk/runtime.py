@@ -574,6 +574,9 @@ class Runtime:
             case driver_verbs.Shutdown():
                 self.end("the device was taken out of service")
             case driver_verbs.Input(name, channels, bit):
+                if not fds:  # the kernel drops what goes beyond the limit
+                    self.log("error", f"{name} cannot be read: too many open descriptors")
+                    return
                 self.inputs[name].attach(fds[0], channels, bit)
             case driver_verbs.NodeStop() | driver_verbs.NodeReset():
                 block, channels, bit, text, resets = message

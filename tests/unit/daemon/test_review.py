@@ -4,6 +4,7 @@ one before lives.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import os
 import signal
@@ -69,6 +70,24 @@ def test_a_start_without_descriptors_is_a_death_like_any_other(monkeypatch: pyte
     monkeypatch.setattr(socket, "socketpair", none_left)
     device.start()
     assert device.state is State.RESTARTING and "Too many open files" in owner.gone[0]
+    loop.close()
+
+
+def test_a_process_whose_descriptors_do_not_reach_the_daemon_is_a_death_like_any_other() -> None:
+    loop, owner = Loop(), _Owner()
+    spawned: list[Any] = []
+    device = _device(loop, SimpleNamespace(spawn=lambda *arguments: spawned.append(arguments[-1])), owner)
+    device.start()
+    spawned[0](1 << 22, 0, "", [])
+    assert device.state is State.RESTARTING and "raise LimitNOFILE" in owner.gone[0]
+    device = _device(loop, SimpleNamespace(spawn=lambda *_: None), owner)
+    device.info = dataclasses.replace(device.info, blocks=(object(), object()))  # type: ignore[arg-type]
+    device.start()
+    only = os.open("/dev/null", os.O_RDONLY)
+    device._ready([only])
+    assert device.state is State.RESTARTING and "pages could not be taken" in owner.gone[1]
+    with pytest.raises(OSError):
+        os.fstat(only)
     loop.close()
 
 

@@ -7,6 +7,7 @@ import os
 import pwd
 import socket
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -17,10 +18,12 @@ from sioms.daemon.marker_owners import MarkerError, MarkerOwners
 from sioms.daemon.restarts import FIRST_PAUSE_NS, LIMIT, WINDOW_NS, Restarts
 from sioms.daemon.rights import Peer, Rights
 from sioms.daemon.sessions import peer_of, pidfd_of
+from sioms.daemon.stop_record import StopRecord
 from sioms.daemon.users import Users
 from sioms.notify import ServiceManager
 from sioms.protocol.flags import Right
 from sioms.protocol.markers import MARKERS, TABLE_SIZE, MarkerTable, split_token, token_of
+from sioms.protocol.stopjournal import workcell_entry
 
 S = 1_000_000_000
 EVA = Peer(10, 1000, "eva", frozenset({20, 1000}))
@@ -100,6 +103,23 @@ def test_a_name_service_that_hangs_holds_nobody_up(monkeypatch: pytest.MonkeyPat
         if users.name(1234) == "root":
             return
     raise AssertionError("the answer that came later is not remembered")
+
+
+def test_where_no_thread_can_be_started_names_are_numbers_and_stops_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def start(_thread: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("threading.Thread.start", start)
+        assert Users().name(os.getuid()) == f"uid {os.getuid()}"
+        record = StopRecord(str(tmp_path / "stops"))
+        record.note(workcell_entry("somebody", stop=True))
+    record.note(workcell_entry("somebody", stop=True))
+    assert record._flusher._thread is not None, "tried again"
+    record.close()
+    assert StopRecord(str(tmp_path / "stops")).state.workcell == "somebody"
 
 
 def test_credentials_come_from_the_kernel() -> None:
