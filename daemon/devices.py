@@ -97,7 +97,7 @@ class DriverProcess:
         self.page_fds: list[int] = []
         self.journal_fd = journal_file(f"sioms:{device.name}.journal")
         self.hung = False
-        self.used = True
+        self.used = False
         self.options = options
         self._maps: list[mmap.mmap] = []
         self._readers: list[PageReader] = []
@@ -139,7 +139,7 @@ class DriverProcess:
         self.generation += 1
         self.state = State.STARTING
         self.started_ns = time.monotonic_ns()
-        self.hung, self.used = False, True
+        self.hung = self.used = False
         try:
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         except OSError as error:

@@ -292,7 +292,7 @@ class Process:
     def tick(self, after_ns: int = 0) -> None:
         """Tick once."""
         runtime = self.runtime
-        CLOCK.now_ns = max(CLOCK.now_ns, runtime._scheduled_ns + runtime.period_ns) + after_ns
+        CLOCK.now_ns = max(CLOCK.now_ns, runtime._scheduled_ns + runtime.period_ns * runtime._idling.periods) + after_ns
         if not after_ns:
             runtime._moved_ns = CLOCK.now_ns  # who ends does not come to rest before its step is due
         runtime._timer.expired = 1  # type: ignore[attr-defined]

@@ -163,7 +163,7 @@ class Runtime:
         self.waits.a_look = max(LOOKS_A_MS, LOOKS_A_MS * self.period_ns // 1_000_000)
         self._idling = Idling(self.period_ns, lease_ns)
         self._stops_workcell = bool(options["stop_sources"])
-        self._is_used = True
+        self._is_used = False
         self._lead_ns = self.engine.lead_ns if isinstance(self.engine, TickEngine) else 0
         self._announced = self._slack_ns = 0
         self._spare_until_ns = 0

@@ -49,7 +49,7 @@ def test_one_that_owes_an_answer_and_is_stuck_is_killed_and_whoever_asked_is_tol
 def test_more_requests_than_the_socket_holds_wait_for_their_turn() -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.setblocking(False)
-    with subprocess.Popen(["sleep", "100"]) as process, theirs, open(os.devnull) as null:
+    with subprocess.Popen(["sleep", "5"]) as process, theirs, open(os.devnull) as null:
         loop, asked, answers = Loop(), [], list[int]()
         fork_server = ForkServer(loop, lambda _: None, ForkServerProcess(ours, process.pid))
         table = {"text": "x" * 20_000}

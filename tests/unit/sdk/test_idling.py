@@ -50,6 +50,7 @@ def test_idle_after_a_second_within_the_lease_and_awake_at_once() -> None:
     assert not idling.rest(1_025_000_000)
     assert idling.wake(1_030_000_000) and idling.periods == 1
     assert not idling.wake(1_030_000_001)
+    assert Idling(PERIOD_NS, lease_ns=100_000_000).rest(5_000_000_000), "from its start"
     seldom = Idling(30_000_000, lease_ns=1_000_000_000)
     seldom.wake(0)
     assert not seldom.rest(2_000_000_000)
