@@ -303,7 +303,7 @@ class Gateway:
     def _pass(self, session: Session, number: int, message: verbs.Message, packet: bytes) -> None:
         if isinstance(message, verbs.Journal):
             text = "read a journal: it is a file of the workcell's machine; read it there"
-            self._send(session, Down.PACKET, body=refusal(number, errno.EOPNOTSUPP, text))
+            self._send(session, Down.PACKET, body=refusal(number, errno.EPERM, text))
             return
         if isinstance(message, verbs.Open):
             if message.lease_s > link.LONGEST_LEASE_S:

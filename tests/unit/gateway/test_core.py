@@ -177,7 +177,7 @@ def test_a_client_says_nothing_in_the_gateways_name(world: World) -> None:
 def test_what_comes_as_a_descriptor_is_refused_with_a_sentence(world: World) -> None:
     line = world.begin(b"a")
     world.ask(b"a", 4, verbs.Journal(""))
-    assert decode_reply(world.last(b"a", Down.PACKET)[1])[1:3] == [4, errno.EOPNOTSUPP] and len(line.got) == 2
+    assert decode_reply(world.last(b"a", Down.PACKET)[1])[1:3] == [4, errno.EPERM] and len(line.got) == 2
 
 
 @pytest.mark.parametrize(("asked_s", "gets_s"), [(0.0, link.DEFAULT_LEASE_S), (2.0, 2.0)])
