@@ -103,8 +103,8 @@ class Story:
 def tell(events: Sequence[Event]) -> Story:
     """Find out what began the last trouble in a recording.
 
-    The last event of weight is followed back to the first one of the same trouble, by gaps of less than 2 s. That is the
-    cause, unless a death was seen within 50 ms: what a death brings about may have been noted before.
+    The last event of weight is followed back to the first one of the same trouble, by gaps of less than 2 s. That is
+    the cause, unless a death was seen within 50 ms: what a death brings about may have been noted before.
     """
     heavy = [event for event in events if weight(event)]
     if not heavy:

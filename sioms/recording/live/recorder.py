@@ -107,11 +107,14 @@ class Recorder:
     def _attach(self, cell: Workcell) -> None:
         """Open what is there and not open yet."""
         entries = cell.nodes()
+        alike = {(e.name, e.device, e.node_class, e.channels) for e in entries}
         for entry in entries:
             name = entry.name
             if name.endswith(READONLY) or entry.state != "up":
                 continue
-            if name not in self._wanted if self._wanted else is_part(entry, entries):
+            parent = name.rpartition(".")[0]  # of a device with one channel both names show the same
+            part = is_part(entry, entries) or (parent, entry.device, entry.node_class, entry.channels) in alike
+            if name not in self._wanted if self._wanted else part:
                 continue
             try:
                 if name not in self._taps:
