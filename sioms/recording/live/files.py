@@ -14,6 +14,9 @@ from typing import Protocol
 from sioms.recording import mcap
 from sioms.recording.rewrite import LIBRARY, rewrite
 
+_FLAGS = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+"""Appending: what follows a record that was cut off comes in its place."""
+
 
 class Sink(Protocol):
     """Where records go."""
@@ -60,7 +63,7 @@ class LiveFile:
         name = self._name
         self.path = str(name.with_name(f"{name.stem}-{self._part:04d}{name.suffix}") if self._rotates else name)
         try:
-            self._fd = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+            self._fd = os.open(self.path, _FLAGS, 0o644)
         except FileExistsError:
             text = f"record to {self.path}: it is there already; name another file, or remove it"
             raise OSError(errno.EEXIST, text) from None

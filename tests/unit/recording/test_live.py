@@ -64,8 +64,12 @@ def test_a_full_disk_leaves_whole_records(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(os, "write", write)
     with pytest.raises(OSError, match="no space left"):
         file.append(bytes(100))
-    file.close()
     assert os.path.getsize(file.path) == size
+    monkeypatch.setattr(os, "write", real)
+    file.append(b"there is room again")
+    file.close()
+    data = Path(file.path).read_bytes()
+    assert len(data) == size + 19 and data.endswith(b"there is room again")
 
 
 def test_files_rotate_and_each_stands_for_itself(tmp_path: Path) -> None:
