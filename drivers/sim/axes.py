@@ -50,9 +50,12 @@ from sioms.plant.stepper import Stepper, StepperBank
 from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, AxisBlock, BinaryBlock, BlockSpec, Description
-from sioms.sdk.driver import Kit, TickDriver
+from sioms.sdk.driver import Kit, QuietSteps, TickDriver
 from sioms.sdk.exchange import LinkError
+from sioms.sdk.pages import Pages
 from sioms.sdk.tables import from_table, table_type
+
+from .axes_step import SimulatedAxes, advance_axes, tick_axes
 
 # More than this many ticks late, the simulated world stands still instead of catching up.
 _CATCH_UP = 50
@@ -189,11 +192,22 @@ class SimAxes(TickDriver):
         self._seen = np.full(n, np.nan)
         # A stepper's command, and one with an integral in it, goes on if it does so at all; others only come to rest.
         self._near = np.array([0.0 if s.kind is AxisKind.STEPPER or s.ki else 1e-9 * s.force_max for s in configured])
+        self._found = 0
+        """What the steps have found in a tick that they have begun."""
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
         """The axes, the plant and, if there are any, the beams."""
         return (self._axes, self._plant) if self._port is None else (self._axes, self._plant, self._port)
+
+    def quiet_steps(self, pages: Pages, instants: NDArray[np.int64]) -> QuietSteps | None:
+        """Return the steps of motors, unless something else goes on between commands and positions."""
+        motors = self._servos
+        if motors is None or self._steppers is not None or self._port is not None or self._loads:
+            return None
+        if motors.has_drive_effects:
+            return None
+        return QuietAxes(self, motors, pages, instants)
 
     def tick(self, now_ns: int) -> None:
         """Let the world go on under the last command up to now, measure, and command anew.
@@ -201,6 +215,11 @@ class SimAxes(TickDriver):
         The controller of a device does not miss its turns because this machine was busy: after a late tick they are
         made up for, a few at once. Later than ``late_max_s`` the bank stops all motion.
         """
+        if self._found:
+            found, self._found = self._found, 0
+            self._command = self.bank.finish_tick(found)
+            self._show()
+            return
         self._bear(now_ns)
         behind = round((now_ns - self._last_ns) / self._tick_ns) if self._command is not None else 0
         if self._is_still:
@@ -307,6 +326,44 @@ class SimAxes(TickDriver):
             if index:
                 self.kit.publish(port, now_ns)
             port.set(0, value, stamp_ns)
+
+
+class QuietAxes:
+    """The steps of motors that move and nothing else (QuietSteps).
+
+    Args:
+        driver: theirs.
+        motors: its motors.
+        pages: of the process.
+        instants: where steps note theirs.
+    """
+
+    tick = staticmethod(tick_axes)
+    slack = staticmethod(advance_axes)
+
+    def __init__(self, driver: SimAxes, motors: MotorBank, pages: Pages, instants: NDArray[np.int64]) -> None:
+        self._driver, self._axes, self._plant = driver, driver._axes, driver._plant
+        plant = self._plant
+        self.record = SimulatedAxes(
+            period_ns=driver._tick_ns, ahead=0, last_ns=0, found=0, loop=driver.bank.loop, motors=motors.record,
+            instants=instants, data=plant.data, offset=plant.offset, shown=plant.shown_data,
+            flags=plant.flags, shown_flags=plant.shown_flags,
+            axes=pages.record(self._axes), plant=pages.record(plant),
+        )  # fmt: skip
+
+    def is_ready(self) -> bool:
+        """Tell whether nothing but motion is to be expected."""
+        driver = self._driver
+        if not driver._ahead or driver._found or not self._plant.is_plain or not driver.bank.is_quiet():
+            return False
+        self.record.ahead, self.record.last_ns, self.record.found = driver._ahead, driver._last_ns, 0
+        return True
+
+    def resume(self) -> None:
+        """Go on from where the steps have come."""
+        driver, record = self._driver, self.record
+        driver._ahead, driver._last_ns, driver._found = record.ahead, record.last_ns, record.found
+        driver.bank.after_quiet()
 
 
 def _switch_bits(bank: MotorBank | StepperBank) -> NDArray[np.int64]:

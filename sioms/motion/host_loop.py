@@ -261,21 +261,26 @@ class AxisBank(Bank):
         sequencer, loop = self._sequencer, self.loop
         if (
             not self._seen or self._written or self._queue.waits_for_markers or self._homing.active
-            or self._law.force_ends.any or sequencer.has_held or self.keeper is not None
+            or self._law.force_ends.any or sequencer.has_work or self.keeper is not None
         ):  # fmt: skip
             return False
         loop.any_guard, loop.next_ns, loop.last_ns = sequencer.any_guard, sequencer.store.next_ns, self._last_ns
         return True
 
-    def after_quiet(self, found: int) -> None:
-        """Go on behind quiet ticks, the last of which returned ``found``; what it has not done is done now."""
+    def after_quiet(self) -> None:
+        """Go on behind quiet ticks, if there were any."""
+        if self._last_ns != self.loop.last_ns:
+            self._last_ns = self.loop.last_ns
+            self._sequencer.begin_tick(self.loop.dt)
+
+    def finish_tick(self, found: int) -> NDArray[np.float64]:
+        """Finish a quiet tick that has found something, and return what ``tick`` would have."""
         loop = self.loop
-        self._last_ns = loop.last_ns
-        self._sequencer.begin_tick(loop.dt)
         if found == axis_step.AT_LIMIT:
-            self._command(found, loop.previous_ns, loop.last_ns)
-        elif found in (axis_step.FOLLOWS_BADLY, axis_step.ON_SWITCH, axis_step.FOLLOWS_BADLY | axis_step.ON_SWITCH):
+            self._command(axis_step.set_points(loop, loop.last_ns), loop.previous_ns, loop.last_ns)
+        else:
             self._judge(found, loop.last_ns)
+        return self._actuator
 
     def _command(self, found: int, last_ns: int, now_ns: int) -> None:
         """Let the laws follow the set-points of a tick."""

@@ -145,9 +145,9 @@ class Sequencer:
         self.advance(now_ns)  # all of these plans end now, and what follows is what refreshes
 
     @property
-    def has_held(self) -> bool:
-        """Tell whether commands wait for the next tick."""
-        return bool(self._held)
+    def has_work(self) -> bool:
+        """Tell whether commands wait for the next tick, or to be planned ahead."""
+        return bool(self._held or self._todo)
 
     def begin_tick(self, dt: float) -> None:
         """A tick begins, dt after the last [s]: further commands may begin."""

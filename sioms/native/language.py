@@ -33,6 +33,8 @@ MODULES: tuple[str, ...] = (
     "sioms.motion.axis_step",
     "sioms.plant.friction_step",
     "sioms.plant.motor_step",
+    "sioms.sdk.quiet_step",
+    "sioms.drivers.sim.axes_step",
 )
 """Modules whose records and steps are compiled, each after those that it uses."""
 PREFIX = "sioms_"

@@ -84,6 +84,11 @@ class MotorBank:
         """Constant forces on the loads [N], which may be changed between ticks."""
         return self._load_constant
 
+    @property
+    def has_drive_effects(self) -> bool:
+        """Whether a drive changes its command."""
+        return bool(self._drive)
+
     def advance(self, force: Array) -> None:
         """Step all motors by one tick under a commanded force [N], shape (n,), finite."""
         command = self._command

@@ -142,6 +142,10 @@ class PageWriter:
         """Number of the newest snapshot, 0 before the first."""
         return self._number
 
+    def published(self, number: int) -> None:
+        """Note that snapshots have been written up to this number, by somebody else in this process."""
+        self._number = number
+
     @property
     def as_of_ns(self) -> int:
         """``as_of_ns`` of the newest snapshot, 0 before the first."""

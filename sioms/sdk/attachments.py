@@ -68,6 +68,10 @@ class Attachments:
             text = f"{handle.node}: its client was silent for longer than its lease of {lease_s:g} s"
             self.end(handle, errno.ETIMEDOUT, text)
 
+    def until_ns(self) -> int:
+        """Return until when no lease can run out [ns]."""
+        return min((handle.heard_ns + handle.lease_ns for handle in self._leased), default=2**62)
+
     def end_all(self, errno_: int, text: str, exclusive_only: bool = False) -> None:
         """End all handles, or those that own outputs."""
         ending = [h for h in self.handles.values() if h.exclusive or not exclusive_only]

@@ -112,6 +112,7 @@ class AnalogBlock(Block):
         offset: shape (n,), subtracted; set by ZERO_DEVICE.
         gains: shape (n, n), or None for the unit matrix; set by SET_GAINS.
         alarms: limits of what is published, whose bits join ``flags``; None when there are none.
+        shown: what is published, in the shape of ``fields``; ``shown_data`` and ``shown_flags`` are rows of it.
         corrected_by_driver: the driver's ``ioctl`` answers ZERO_DEVICE, SET_GAINS and GET_GAINS; nothing is done here.
     """
 
@@ -123,10 +124,11 @@ class AnalogBlock(Block):
         self.offset: NDArray[np.float64] = np.zeros(self.n)
         self.gains: NDArray[np.float64] | None = None
         self.alarms: Alarms | None = None
-        self._shown = np.zeros_like(self.fields)
-        rows = read_rows(spec.node_class, self._shown)
-        self._shown_data, self._shown_flags = rows["data"], rows["flags"]
-        self._bytes = self._shown.data.cast("B")
+        self.shown = np.zeros_like(self.fields)
+        rows = read_rows(spec.node_class, self.shown)
+        self.shown_data: NDArray[np.float64] = rows["data"]
+        self.shown_flags: NDArray[np.int64] = rows["flags"]
+        self._bytes = self.shown.data.cast("B")
 
     def unfit(self) -> NDArray[np.bool_]:
         """Return which readings are no measurement, so that no offset may come from them, shape (n,)."""
@@ -136,15 +138,20 @@ class AnalogBlock(Block):
         """Take readings of some channels for their zero from now on."""
         self.offset[channels] = offset
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether what is published is the readings less an offset, and nothing else."""
+        return self.gains is None and self.alarms is None
+
     def payload(self) -> memoryview:
         """Return the readings, corrected, as bytes in page order."""
-        shown = self._shown_data
+        shown = self.shown_data
         np.subtract(self.data, self.offset, out=shown)
         if self.gains is not None:
             shown[:] = self.gains @ shown
-        self._shown_flags[:] = self.flags
+        self.shown_flags[:] = self.flags
         if self.alarms is not None:
-            self._shown_flags |= self.alarms.look(shown)
+            self.shown_flags |= self.alarms.look(shown)
         return self._bytes
 
 

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import msgspec
 
+from sioms.native.language import Record
 from sioms.protocol.flags import Request
 
 from .blocks import AnyBlock, BlockSpec, Description
@@ -35,9 +36,12 @@ from .locks import claims_of
 from .settings import LineSettings
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from sioms.motion import DriveAction, MarkerPort
+
+    from .pages import Pages
 
 
 class InputNode(Protocol):
@@ -79,6 +83,32 @@ class Kit(Protocol):
 
     def now_ns(self) -> int:
         """Return the time [ns, CLOCK_MONOTONIC]."""
+
+
+class QuietSteps(Protocol):
+    """How a TickDriver ticks while nothing happens, as steps (sioms.native); the loop asks for nothing else then."""
+
+    @property
+    def record(self) -> Record:
+        """What the steps work on."""
+
+    @property
+    def tick(self) -> Callable[[Any, int, int, int], int]:
+        """Step of a tick: takes the record, the tick's time, the instant up to which everything is shown [ns], and its
+        number; notes the instants and publishes. Returns 0, or something else when ``TickDriver.tick`` is to be called.
+        """
+
+    @property
+    def slack(self) -> Callable[[Any, int, int, int], int]:
+        """Step between ticks: takes the record, now, and the time of the next tick [ns], and 0. Returns 0, or 1 when
+        ``TickDriver.slack`` is to be called.
+        """
+
+    def is_ready(self) -> bool:
+        """Tell whether the next ticks may be steps, and hand the record over."""
+
+    def resume(self) -> None:
+        """Take the record over: steps have been done."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,6 +229,15 @@ class TickDriver(Driver):
         safe values when a writer goes away or the workcell stops.
         """
         raise NotImplementedError(f"{type(self).__name__} describes a writable block but takes no outputs")
+
+    def quiet_steps(self, pages: Pages, instants: NDArray[np.int64]) -> QuietSteps | None:
+        """Return the steps that tick while nothing happens; None, as by default, where there are none.
+
+        Args:
+            pages: what the steps publish, as ``Pages.record``.
+            instants: where the steps note when the readings are there and when the outputs are set [ns].
+        """
+        return None
 
     def slack(self, now_ns: int, until_ns: int) -> None:  # a hook that may stay empty
         """Use the time between two ticks, e.g. for ``bank.plan_ahead``: after a tick, or, of a slow rate, before the

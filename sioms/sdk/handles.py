@@ -157,6 +157,7 @@ class Wait:
         channels: axes it depends on: dropped buffers end it.
         cancelled: undoes what the wait has begun.
         looks: it changes nothing, it only waits for what readings show.
+        on_events: it is not ready before an event of the bank, or another request.
         refusal: with what it has ended, until its client is told: errno and sentence.
     """
 
@@ -168,6 +169,7 @@ class Wait:
     channels: frozenset[int] = frozenset()
     cancelled: Callable[[], None] | None = None
     looks: bool = False
+    on_events: bool = False
     refusal: tuple[int, str] | None = None
 
 
@@ -203,6 +205,18 @@ class Waits:
             )
         handle.waits[wait.number] = wait
         waiting[wait] = None
+
+    def until_ns(self) -> int:
+        """Return until when nothing can be answered unless there is an event [ns]; 0: now."""
+        until_ns = 2**62
+        for waiting in self._of.values():
+            for wait in waiting if len(waiting) <= LOOKS_A_MS else ():
+                if not wait.on_events or wait.refusal is not None:
+                    return 0
+                until_ns = min(until_ns, until_ns if wait.deadline_ns is None else wait.deadline_ns)
+            if len(waiting) > LOOKS_A_MS:
+                return 0
+        return until_ns
 
     def check(self, now_ns: int, shown: Sequence[AnyBlock]) -> None:
         """Answer what is ready or late, as far as it is looked at; cheap when nothing waits.

@@ -10,11 +10,15 @@ import os
 import time
 from collections.abc import Callable, Sequence
 
-from sioms.protocol.flags import PageState
-from sioms.protocol.page import PageWriter, page_size
+import numpy as np
+from numpy.typing import NDArray
 
-from .blocks import AnyBlock, BinaryBlock
+from sioms.protocol.flags import PageState
+from sioms.protocol.page import PageWriter, page_size, slot_size
+
+from .blocks import AnalogBlock, AnyBlock, AxisBlock, BinaryBlock
 from .handles import Handle
+from .quiet_step import MOST_SUBSCRIBERS, Page
 
 PAGE = 4096
 
@@ -40,6 +44,8 @@ class Pages:
         self._told = told
         self.fds: list[int] = []
         self._writers: dict[int, PageWriter] = {}
+        self._words: dict[int, NDArray[np.int64]] = {}
+        self._records: list[tuple[int, Page]] = []
         self._subscribers: dict[int, list[Handle]] = {id(block): [] for block in blocks}
         self._edges: dict[int, int] = {}
         self._links: dict[int, tuple[PageState, str]] = {}
@@ -54,6 +60,7 @@ class Pages:
             writer = PageWriter(memory, spec.node_class, block.n, spec.history, lease_ns, generation, device_number)
             writer.alive(time.monotonic_ns())
             self._writers[id(block)] = writer
+            self._words[id(block)] = np.frombuffer(memory, dtype=np.int64)
 
     def alive(self, now_ns: int) -> None:
         """Stamp all pages as alive [ns, CLOCK_MONOTONIC]."""
@@ -67,6 +74,39 @@ class Pages:
         subscribers = self._subscribers[key]
         if subscribers:
             self._wake(block, subscribers)
+
+    def record(self, block: AnyBlock) -> Page:
+        """Return the page of a block for steps that publish it; ``lend`` and ``take_back`` around them."""
+        shown = block.bank.fields if isinstance(block, AxisBlock) else block.fields
+        if isinstance(block, AnalogBlock):
+            shown = block.shown
+        spec = block.spec
+        page = Page(
+            words=self._words[id(block)], payload=shown.reshape(-1).view(np.int64), count=shown.size,
+            slot=slot_size(spec.node_class, block.n) // 8, mask=spec.history - 1, number=0, subscribers=0,
+            pipes=np.zeros(MOST_SUBSCRIBERS, dtype=np.int64), every=np.zeros(MOST_SUBSCRIBERS, dtype=np.int64),
+            countdown=np.zeros(MOST_SUBSCRIBERS, dtype=np.int64),
+        )  # fmt: skip
+        self._records.append((id(block), page))
+        return page
+
+    def lend(self) -> bool:
+        """Let steps publish from the present state on; False where there are more subscribers than they can wake."""
+        for key, page in self._records:
+            subscribers = self._subscribers[key]
+            if len(subscribers) > MOST_SUBSCRIBERS:
+                return False
+            page.number, page.subscribers = self._writers[key].number, len(subscribers)
+            for i, handle in enumerate(subscribers):
+                page.pipes[i], page.every[i], page.countdown[i] = handle.wakes, handle.every, handle.countdown
+        return True
+
+    def take_back(self) -> None:
+        """Go on from the state in which steps have left the pages."""
+        for key, page in self._records:
+            self._writers[key].published(page.number)
+            for i, handle in enumerate(self._subscribers[key]):
+                handle.countdown = page.countdown[i]
 
     def number(self, block: AnyBlock) -> int:
         """Return the number of a block's newest snapshot."""

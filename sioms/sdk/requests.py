@@ -144,6 +144,7 @@ def _axis_request(
                 Wait(
                     handle, number, what, service.loop.deadline(timeout_s),
                     lambda: (None,) if service.waits.is_idle(block, channels) else None, channels, looks=True,
+                    on_events=True,
                 )
             )  # fmt: skip
             return LATER

@@ -23,6 +23,7 @@ import numpy as np
 
 from sioms.descriptors import receive
 from sioms.motion import CommandError
+from sioms.native.language import library
 from sioms.protocol import driver_verbs
 from sioms.protocol.flags import PageState
 from sioms.protocol.journal import HEADER, JOURNAL_SIZE, JournalWriter, Note
@@ -50,6 +51,8 @@ from .outputs import Outputs
 from .pages import Pages
 from .parts import Parts, Service
 from .persistence import keep_positions
+from .quiet import QuietRun
+from .quiet_step import Quiet
 from .rt import ChangeWatch, TimerFd, become_realtime, name_process
 from .statistics import TickStatistics
 from .stops import Reason, Stop, Stops
@@ -117,7 +120,8 @@ class Runtime:
         self.statistics = TickStatistics()
         self._control = socket.socket(fileno=fds[0])
         self._control.setblocking(False)
-        self.latch = Latch(memoryview(mmap.mmap(fds[1], LATCH_SIZE)))
+        latch = mmap.mmap(fds[1], LATCH_SIZE)
+        self.latch, self._latch_words = Latch(memoryview(latch)), np.frombuffer(latch, dtype=np.int64, count=8)
         request, self._request_fd = StopRequest(fds[2], fds[3]), fds[2]
         table = MarkerTable(memoryview(mmap.mmap(fds[4], TABLE_SIZE)))
         self.markers = Markers(table, lambda number: self.tell(driver_verbs.MarkerSignalled(number)))
@@ -167,6 +171,9 @@ class Runtime:
         self._lead_ns = self.engine.lead_ns if isinstance(self.engine, TickEngine) else 0
         self._announced = self._slack_ns = 0
         self._spare_until_ns = 0
+        self._expired = 0
+        self._quiet: QuietRun | None = None
+        self._sees_requests = False
 
     # --- services to the driver (Kit) ------------------------------------------------------------
 
@@ -284,7 +291,21 @@ class Runtime:
         self.stops.look()
         self._tick_and_publish(self._scheduled_ns)  # who opens a node at once finds readings
         self._scheduled_ns += self.period_ns
+        self._quiet = self._make_quiet()
         self._tell_ready()
+
+    def _make_quiet(self) -> QuietRun | None:
+        """Return what ticks by compiled steps; None where there are none, or where a tick has to look at more."""
+        if not isinstance(self.driver, TickDriver) or library is None or self._lead_ns:
+            return None
+        if self.stops.looks_at_inputs or not self._sees_requests or any(b.spec.writable for b in self.blocks):
+            return None
+        instants = np.zeros(2, dtype=np.int64)
+        steps = self.driver.quiet_steps(self.pages, instants)
+        return None if steps is None else QuietRun(
+            steps, self._epoll.fileno(), self._timer.fd, self._latch_words, self.period_ns, self._daemon_lease_ns,
+            instants, self.pages, self.stops, self.waits, self.clients, self.statistics,
+        )  # fmt: skip
 
     def _watch_requests(self) -> None:
         """Wake up when somebody asks for a stop; a tick would see it, too, but later."""
@@ -300,6 +321,7 @@ class Runtime:
             self.stops.heed()
 
         self.watch(watch.fd, asked)
+        self._sees_requests = True
 
     def _gave_up_realtime(self, worked_s: float) -> None:
         self.log(
@@ -309,15 +331,38 @@ class Runtime:
         )
 
     def _loop(self) -> None:
-        poll, callbacks, turns = self._epoll.poll, self._callbacks, self.turns
+        callbacks, turns = self._callbacks, self.turns
         while self.running:
-            for fd, _ in poll(turns.pause_s):
+            for fd in self._wait():
                 callback = callbacks.get(fd)
                 if callback is not None:
                     callback()
                 else:
                     turns.mark(fd)
             turns.serve()  # one request, after all that is due
+
+    def _wait(self) -> list[int]:
+        """Wait for events; return the descriptors that are ready."""
+        pause_s = self.turns.pause_s
+        if self._quiet is not None and pause_s is None and not self._ending_ns and not self._daemon_late:
+            ready = self._quiet.wait(self._scheduled_ns, self.tick)
+            if ready is not None:
+                self._resume(self._quiet.record)
+                return ready
+        return [fd for fd, _ in self._epoll.poll(pause_s)]
+
+    def _resume(self, quiet: Quiet) -> None:
+        """Go on behind ticks that have been done by steps."""
+        self._expired = quiet.expired
+        if not quiet.done:
+            return
+        self.tick, self.looked_ns = quiet.number, quiet.began_ns
+        self._scheduled_ns = self._ticked_ns = quiet.scheduled_ns
+        if quiet.slackens and isinstance(self.engine, TickEngine):
+            began_ns = time.monotonic_ns()
+            self.engine.slack(began_ns, self._scheduled_ns + self.period_ns)
+            self.statistics.record_slack(time.monotonic_ns() - began_ns)
+        self._spare_until_ns = self._scheduled_ns + self.period_ns // 4
 
     def tick_early(self) -> None:
         """Have a tick as soon as there can be one: what has been stopped shall not wait for its turn.
@@ -339,7 +384,7 @@ class Runtime:
         self.after_publication(self._tick_and_publish(now_ns), self.blocks if self.engine.publishes else ())
 
     def _on_timer(self) -> None:
-        expired = self._timer.expirations()
+        expired, self._expired = self._expired or self._timer.expirations(), 0
         if not expired:
             return
         if self._lead_ns and self._idling.periods == 1 and isinstance(self.engine, TickEngine):

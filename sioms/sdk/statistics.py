@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Sequence
 
 import numpy as np
 
+from .quiet_step import RING
+
 PHASES = ("late_ns", "input_ns", "control_ns", "publish_ns", "busy_ns", "total_ns", "spent_ns")
 """Scheduled to begun; to the readings being there; to the outputs being set; to all being published; all from begun;
 all from scheduled; all from begun, with what is done in the slack between two ticks."""
-_SIZE = 8192
+_SIZE = RING
 
 
 class TickStatistics:
@@ -20,10 +21,12 @@ class TickStatistics:
         ticks: ticks done.
         skipped: ticks that never ran because the ones before took too long.
         longest_ns: longest total.
+        ring: times of the last ticks, (phases, kept ticks) [ns].
     """
 
     def __init__(self) -> None:
-        self._ring = [array("q", bytes(8 * _SIZE)) for _ in PHASES]  # of fixed size, as lists of numbers are not
+        self.ring = np.zeros((len(PHASES), _SIZE), dtype=np.int64)
+        self._ring = [phase.data for phase in self.ring]  # quicker for single numbers
         self.ticks = 0
         self.skipped = 0
         self.longest_ns = 0
@@ -67,9 +70,8 @@ class TickStatistics:
             "longest_ns": self.longest_ns,
         }
         chosen = np.arange(newest - n, newest)
-        for phase, ring in zip(PHASES, self._ring, strict=True):
+        for phase, kept in zip(PHASES, self.ring, strict=True):
             # By numpy: sorting thousands of Python numbers takes longer than axes may go without a tick.
-            kept = np.frombuffer(ring, dtype=np.int64)
             ranks = [min(n - 1, int(n * p / 100)) for p in percentiles]
             values = np.partition(np.take(kept, chosen, mode="wrap"), ranks) if n else kept
             result[phase] = {str(p): int(values[rank]) for p, rank in zip(percentiles, ranks, strict=True) if n}
