@@ -1,0 +1,133 @@
+"""Ticks by compiled steps show what ticks of the driver show, with commands, limits, stops and walls in between."""
+
+from types import MappingProxyType
+
+import msgspec
+import numpy as np
+
+from sioms.drivers.sim.axes import SimAxes
+from sioms.motion import CommandError
+from sioms.protocol.flags import ControlMode, NodeClass
+from sioms.protocol.records import numpy_dtype
+from sioms.sdk.driver import TickDriver
+from sioms.sdk.handles import Wait, Waits
+from sioms.sdk.pages import Pages
+
+PERIOD_NS = 1_000_000
+MODES = (
+    (ControlMode.POSITION, "position", 0.3),
+    (ControlMode.VELOCITY, "velocity", 0.4),
+    (ControlMode.FORCE, "force", 8.0),
+)
+MOTOR = {"mass": 2.0, "viscous": 4.0, "coulomb": 3.0, "stiction": 4.0, "encoder_step": 1e-6, "limit_plus": 0.25}
+AXIS = {"velocity_max": 0.5, "acceleration_max": 5.0, "force_max": 40.0, "position_min": -0.2, "position_max": 0.28}
+
+
+class Kit:
+    markers = None
+    inputs = MappingProxyType({})
+
+    def log(self, level, text): ...
+
+
+class Cell:
+    """A driver with its pages, ticked as the loop does, by steps where it may."""
+
+    def __init__(self, by_steps):
+        axes = [
+            AXIS | {"name": "a", "motor": MOTOR},
+            AXIS | {"name": "b", "motor": MOTOR | {"wall": {"position": 0.15, "stiffness": 2e4, "damping": 20.0}}},
+        ]
+        settings = msgspec.convert({"axis": axes}, SimAxes.Settings)
+        self.driver = SimAxes("mod0", settings, Kit())
+        self.pages = Pages("mod0", self.driver.blocks, 10**9, 1, lambda state, reason: None)
+        self.instants = np.zeros(2, dtype=np.int64)
+        steps = self.driver.quiet_steps(self.pages, self.instants)
+        self.steps = steps if by_steps else None
+        self.number, self.quiet = 0, 0
+
+    def tick(self, now_ns):
+        self.number += 1
+        if not (self.steps and self.by_step(now_ns)):
+            self.driver.tick(now_ns)
+            for block in self.driver.blocks:
+                self.pages.publish(block, now_ns, self.number, now_ns)
+            self.driver.slack(now_ns, now_ns + 10 * PERIOD_NS)
+
+    def by_step(self, now_ns):
+        steps = self.steps
+        if not steps.is_ready() or not self.pages.lend():
+            return False
+        done = steps.tick(steps.record, now_ns, now_ns, self.number) == 0
+        self.quiet += done
+        slackens = done and steps.slack(steps.record, now_ns, now_ns + PERIOD_NS, 0)
+        self.pages.take_back()
+        steps.resume()
+        if slackens:
+            self.driver.slack(now_ns, now_ns + 10 * PERIOD_NS)
+        return done
+
+    def shown(self):
+        return [
+            (self.pages._writers[id(block)]._bytes[72:80].tobytes(), bytes(self.pages._words[id(block)][32:]))
+            for block in self.driver.blocks
+        ]
+
+
+def test_steps_show_what_the_driver_shows(monkeypatch):
+    monkeypatch.setattr("sioms.drivers.sim.axes._SLACK_NS", -(10**18))  # plans are made ahead, whatever the time is
+    plain, quiet = Cell(False), Cell(True)
+    rng, now_ns, refused = np.random.default_rng(5), 1_000_000_000, 0
+    for tick in range(5000):
+        now_ns += PERIOD_NS * (1 if rng.random() < 0.99 else 3)
+        for cell in (plain, quiet):
+            cell.tick(now_ns)
+        assert plain.shown() == quiet.shown(), f"tick {tick}"
+        draw = rng.random()
+        if draw < 0.01:
+            mode, column, most = MODES[int(rng.integers(len(MODES)))]
+            record = np.zeros(1, numpy_dtype(NodeClass.AXIS))
+            record["axis"], record["control_mode"] = rng.integers(2), int(mode)
+            record[column] = rng.uniform(-most, most)
+        for cell in (plain, quiet):
+            bank = cell.driver.bank
+            if draw < 0.01:
+                try:
+                    bank.append(record, range(2), now_ns + 300_000, replace=bool(tick % 2))
+                except CommandError:
+                    refused += 1
+            elif draw < 0.012:
+                bank.stop([0], now_ns + 200_000)
+            elif draw < 0.014:
+                bank.emergency_stop([1], now_ns + 200_000)
+            elif draw < 0.018:
+                bank.reset([0, 1])
+            cell.driver.bank.take_events()
+    assert quiet.quiet > 2000, "most ticks are steps"
+    assert 5000 - quiet.quiet > 200, "and some are not"
+
+
+def test_a_driver_in_plain_python_has_no_steps():
+    assert TickDriver.quiet_steps(object(), None, None) is None
+
+
+class Handle:
+    uid = 1
+
+    def __init__(self):
+        self.waits = {}
+        self.quota = type("Quota", (), {"waits": 64})
+
+
+def waits_of(*kinds):
+    waits = Waits(None, None)
+    for number, (deadline_ns, on_events) in enumerate(kinds):
+        waits.add(Wait(Handle(), number, "wait", deadline_ns, lambda: None, on_events=on_events))
+    return waits
+
+
+def test_only_waits_for_events_leave_ticks_alone():
+    assert waits_of().until_ns() == 2**62
+    assert waits_of((None, True), (700, True), (900, True)).until_ns() == 700
+    assert waits_of((700, True), (None, False)).until_ns() == 0
+    assert waits_of(*[(None, True)] * 40).until_ns() == 0
