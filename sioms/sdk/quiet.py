@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sioms.native.language import library
 from sioms.native.system import MOST_EVENTS
 
-from .driver import QuietSteps
+from .driver import Driver, QuietSteps, TickDriver
 from .quiet_step import Quiet, run
 from .statistics import TickStatistics
 
@@ -79,3 +80,17 @@ class QuietRun:
         self._steps.resume()
         ready: list[int] = self._ready[:count].tolist()
         return ready
+
+
+def quiet_run(
+    driver: Driver, poll: int, timer: int, latch: NDArray[np.int64], period_ns: int, daemon_lease_ns: int, pages: Pages,
+    stops: Stops, waits: Waits, clients: Attachments, statistics: TickStatistics,
+) -> QuietRun | None:  # fmt: skip
+    """Return what ticks by compiled steps, see QuietRun; None for a driver that has none, or without a library."""
+    if library is None or not isinstance(driver, TickDriver) or any(block.spec.writable for block in driver.blocks):
+        return None
+    instants = np.zeros(2, dtype=np.int64)
+    steps = driver.quiet_steps(pages, instants)
+    return None if steps is None else QuietRun(
+        steps, poll, timer, latch, period_ns, daemon_lease_ns, instants, pages, stops, waits, clients, statistics,
+    )  # fmt: skip

@@ -141,3 +141,13 @@ def become_realtime(priority: int, gave_up: Callable[[float], None]) -> list[str
     gc.freeze()
     gc.disable()
     return refused
+
+
+def become_user(user: str) -> None:
+    """Give up root for a user, with his groups."""
+    import pwd
+
+    entry = pwd.getpwnam(user)
+    os.initgroups(user, entry.pw_gid)
+    os.setgid(entry.pw_gid)
+    os.setuid(entry.pw_uid)

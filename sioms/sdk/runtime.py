@@ -23,7 +23,6 @@ import numpy as np
 
 from sioms.descriptors import receive
 from sioms.motion import CommandError
-from sioms.native.language import library
 from sioms.protocol import driver_verbs
 from sioms.protocol.flags import PageState
 from sioms.protocol.journal import HEADER, JOURNAL_SIZE, JournalWriter, Note
@@ -51,10 +50,10 @@ from .outputs import Outputs
 from .pages import Pages
 from .parts import Parts, Service
 from .persistence import keep_positions
-from .quiet import QuietRun
+from .quiet import QuietRun, quiet_run
 from .quiet_step import Quiet
-from .rt import ChangeWatch, TimerFd, become_realtime, name_process
-from .statistics import TickStatistics
+from .rt import ChangeWatch, TimerFd, become_realtime, become_user, name_process
+from .statistics import Reports, TickStatistics
 from .stops import Reason, Stop, Stops
 from .stream_engine import StreamEngine
 from .tick_engine import TickEngine
@@ -69,8 +68,6 @@ MOST_ORDERS = 512
 """More messages than the daemon's socket holds: what is behind them has been sent since they were begun with."""
 SURE = 4
 """One tick in so many leaves time for clients' work however long it took."""
-REPORT_NS = 20_000_000
-"""How old statistics may be that are told: to sort them takes longer than anything else a reader can ask for."""
 
 
 def run(
@@ -134,8 +131,6 @@ class Runtime:
         self._timer = TimerFd()
         self._line_timer = TimerFd()
         self._line_due_ns: int | None = None
-        self._summaries: dict[int, tuple[int, dict[str, object]]] = {}
-        self._summed_ns: dict[int, int] = {}
         self._stopped = options["stopped"]
         self._phase = float(options["phase"])
         self._daemon_lease_ns = int(float(options["daemon_lease_s"]) * 1e9)
@@ -160,7 +155,7 @@ class Runtime:
         self.engine = self.stops.engine = self._make_engine(parts)
         service = Service(
             self, self.blocks, self.outputs, self.effects, self.waits, self.pages, self.stops, self.log,
-            self.driver, self.engine, self.statistics_report,
+            self.driver, self.engine, Reports(self.statistics, self.engine, self.driver, handles),
         )  # fmt: skip
         self.clients = Attachments(handles, service, self.turns, self.tell, self.journal)
         self.period_ns = int(1e9 / self.engine.tick_hz)
@@ -171,9 +166,8 @@ class Runtime:
         self._lead_ns = self.engine.lead_ns if isinstance(self.engine, TickEngine) else 0
         self._announced = self._slack_ns = 0
         self._spare_until_ns = 0
-        self._expired = 0
+        self._expired, self._sees_requests = 0, False
         self._quiet: QuietRun | None = None
-        self._sees_requests = False
 
     # --- services to the driver (Kit) ------------------------------------------------------------
 
@@ -233,38 +227,13 @@ class Runtime:
         self.waits.check(now_ns, shown)
         self.stops.look_at_inputs()
 
-    def statistics_report(self, uid: int, last: int, *, fresh: bool) -> dict[str, object] | None:
-        """Return what GET_STATISTICS tells: times of the last ticks, link counters, handles.
-
-        Args:
-            uid: who asks; times are sorted once in REPORT_NS for each user.
-            last: over so many ticks.
-            fresh: whether they may be sorted now; None is returned when it is not, or he has had his turn.
-        """
-        now_ns = time.monotonic_ns()
-        self._summaries = {n: kept for n, kept in self._summaries.items() if now_ns - kept[0] < REPORT_NS}
-        if last not in self._summaries:
-            if not fresh or now_ns - self._summed_ns.get(uid, -REPORT_NS) < REPORT_NS:
-                return None
-            self._summed_ns[uid] = now_ns
-            self._summaries[last] = (now_ns, self.statistics.summary(last))
-        report = dict(self._summaries[last][1])
-        report["tick_hz"] = self.engine.tick_hz
-        report["handles"] = len(self.clients.handles)
-        counters = getattr(self.engine, "counters", None)
-        if counters is not None:
-            report["link"] = {name: getattr(counters, name) for name in counters.__slots__}
-        if counters := self.driver.counters():
-            report["stream"] = dict(counters)
-        return report
-
     # --- life ------------------------------------------------------------------------------------
 
     def run(self, priority: int, user: str) -> int:
         """Tick until told to end; return the exit status."""
         self._watch_requests()  # before that user may not look at it any more
         if user and os.getuid() == 0:
-            _become_user(user)
+            become_user(user)
         refused = become_realtime(priority, self._gave_up_realtime)
         if refused:
             self.log("debug", "runs without " + ", ".join(refused))
@@ -295,16 +264,12 @@ class Runtime:
         self._tell_ready()
 
     def _make_quiet(self) -> QuietRun | None:
-        """Return what ticks by compiled steps; None where there are none, or where a tick has to look at more."""
-        if not isinstance(self.driver, TickDriver) or library is None or self._lead_ns:
+        """Return what ticks by compiled steps; None where a tick has to look at more than they do."""
+        if self._lead_ns or self._stops_workcell or not self._sees_requests:
             return None
-        if self.stops.looks_at_inputs or not self._sees_requests or any(b.spec.writable for b in self.blocks):
-            return None
-        instants = np.zeros(2, dtype=np.int64)
-        steps = self.driver.quiet_steps(self.pages, instants)
-        return None if steps is None else QuietRun(
-            steps, self._epoll.fileno(), self._timer.fd, self._latch_words, self.period_ns, self._daemon_lease_ns,
-            instants, self.pages, self.stops, self.waits, self.clients, self.statistics,
+        return quiet_run(
+            self.driver, self._epoll.fileno(), self._timer.fd, self._latch_words, self.period_ns, self._daemon_lease_ns,
+            self.pages, self.stops, self.waits, self.clients, self.statistics,
         )  # fmt: skip
 
     def _watch_requests(self) -> None:
@@ -344,7 +309,8 @@ class Runtime:
     def _wait(self) -> list[int]:
         """Wait for events; return the descriptors that are ready."""
         pause_s = self.turns.pause_s
-        if self._quiet is not None and pause_s is None and not self._ending_ns and not self._daemon_late:
+        looked_at = self.clients.handles or self._is_used  # else it is soon idle
+        if self._quiet is not None and looked_at and pause_s is None and not self._ending_ns and not self._daemon_late:
             ready = self._quiet.wait(self._scheduled_ns, self.tick)
             if ready is not None:
                 self._resume(self._quiet.record)
@@ -359,10 +325,8 @@ class Runtime:
         self.tick, self.looked_ns = quiet.number, quiet.began_ns
         self._scheduled_ns = self._ticked_ns = quiet.scheduled_ns
         if quiet.slackens and isinstance(self.engine, TickEngine):
-            began_ns = time.monotonic_ns()
-            self.engine.slack(began_ns, self._scheduled_ns + self.period_ns)
-            self.statistics.record_slack(time.monotonic_ns() - began_ns)
-        self._spare_until_ns = self._scheduled_ns + self.period_ns // 4
+            self.engine.slack(time.monotonic_ns(), self._scheduled_ns + self.period_ns)
+        self._spare_until_ns = self._spare_until(self._scheduled_ns)
 
     def tick_early(self) -> None:
         """Have a tick as soon as there can be one: what has been stopped shall not wait for its turn.
@@ -637,12 +601,3 @@ class Runtime:
                     self.log("warning", str(error))
             case _:
                 raise NotImplementedError(f"{type(message).__name__} is not served")
-
-
-def _become_user(user: str) -> None:
-    import pwd
-
-    entry = pwd.getpwnam(user)
-    os.initgroups(user, entry.pw_gid)
-    os.setgid(entry.pw_gid)
-    os.setuid(entry.pw_uid)

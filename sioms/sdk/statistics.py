@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from .driver import Driver
+from .engine import Engine
+from .handles import Handle
 from .quiet_step import RING
 
 PHASES = ("late_ns", "input_ns", "control_ns", "publish_ns", "busy_ns", "total_ns", "spent_ns")
 """Scheduled to begun; to the readings being there; to the outputs being set; to all being published; all from begun;
 all from scheduled; all from begun, with what is done in the slack between two ticks."""
 _SIZE = RING
+REPORT_NS = 20_000_000
+"""How old statistics may be that are told: to sort them takes longer than anything else a reader can ask for."""
 
 
 class TickStatistics:
@@ -76,3 +82,45 @@ class TickStatistics:
             values = np.partition(np.take(kept, chosen, mode="wrap"), ranks) if n else kept
             result[phase] = {str(p): int(values[rank]) for p, rank in zip(percentiles, ranks, strict=True) if n}
         return result
+
+
+class Reports:
+    """What GET_STATISTICS tells.
+
+    Args:
+        statistics: of the ticks.
+        engine, driver: whose counters are told, too.
+        handles: of the process.
+    """
+
+    def __init__(
+        self, statistics: TickStatistics, engine: Engine, driver: Driver, handles: Mapping[int, Handle]
+    ) -> None:
+        self._statistics, self._engine, self._driver, self._handles = statistics, engine, driver, handles
+        self._summaries: dict[int, tuple[int, dict[str, object]]] = {}
+        self._summed_ns: dict[int, int] = {}
+
+    def __call__(self, uid: int, last: int, *, fresh: bool) -> dict[str, object] | None:
+        """Return what GET_STATISTICS tells: times of the last ticks, link counters, handles.
+
+        Args:
+            uid: who asks; times are sorted once in REPORT_NS for each user.
+            last: over so many ticks.
+            fresh: whether they may be sorted now; None is returned when it is not, or he has had his turn.
+        """
+        now_ns = time.monotonic_ns()
+        self._summaries = {n: kept for n, kept in self._summaries.items() if now_ns - kept[0] < REPORT_NS}
+        if last not in self._summaries:
+            if not fresh or now_ns - self._summed_ns.get(uid, -REPORT_NS) < REPORT_NS:
+                return None
+            self._summed_ns[uid] = now_ns
+            self._summaries[last] = (now_ns, self._statistics.summary(last))
+        report = dict(self._summaries[last][1])
+        report["tick_hz"] = self._engine.tick_hz
+        report["handles"] = len(self._handles)
+        counters = getattr(self._engine, "counters", None)
+        if counters is not None:
+            report["link"] = {name: getattr(counters, name) for name in counters.__slots__}
+        if counters := self._driver.counters():
+            report["stream"] = dict(counters)
+        return report

@@ -143,11 +143,6 @@ class Stops:
         """What has been seen: the time of the workcell's stop [ns], how often it was reset, orders of the daemon."""
         return (*self._seen[:2], self._orders)
 
-    @property
-    def looks_at_inputs(self) -> bool:
-        """Whether readings may stop the workcell."""
-        return bool(self._sources)
-
     def heed_orders(self) -> bool:
         """Return whether the daemon has sent orders since the last look; cheap."""
         orders = self._latch.orders
