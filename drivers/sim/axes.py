@@ -221,9 +221,10 @@ class SimAxes(TickDriver):
             self._show()
             return
         self._bear(now_ns)
+        if self._is_still:  # the turns that were left out change nothing; the world keeps to its grid of ticks
+            self._last_ns += max(0, (now_ns - self._last_ns) // self._tick_ns - 1) * self._tick_ns
+            self._is_still = False
         behind = round((now_ns - self._last_ns) / self._tick_ns) if self._command is not None else 0
-        if self._is_still:
-            behind, self._is_still = min(behind, 1), False
         if now_ns - self._last_ns <= self._late_ns:
             while behind > self._stride:
                 self._turn(self._last_ns + self._stride * self._tick_ns, self._stride)

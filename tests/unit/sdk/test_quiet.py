@@ -131,3 +131,19 @@ def test_only_waits_for_events_leave_ticks_alone():
     assert waits_of((None, True), (700, True), (900, True)).until_ns() == 700
     assert waits_of((700, True), (None, False)).until_ns() == 0
     assert waits_of(*[(None, True)] * 40).until_ns() == 0
+
+
+def test_behind_a_rest_the_world_is_on_the_grid_of_ticks_again():
+    cell, now_ns = Cell(True), 1_000_000_000
+    for _ in range(200):
+        now_ns += PERIOD_NS
+        cell.tick(now_ns)
+    assert cell.driver.is_at_rest() or cell.driver.is_at_rest()
+    now_ns += 40 * PERIOD_NS
+    cell.driver.tick(now_ns + 300_000)  # woken in between two ticks
+    cell.driver.slack(now_ns, now_ns + 10 * PERIOD_NS)
+    for _ in range(3):
+        now_ns += PERIOD_NS
+        cell.quiet = 0
+        cell.tick(now_ns)
+    assert cell.quiet == 1
