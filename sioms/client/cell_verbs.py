@@ -301,9 +301,11 @@ class WorkcellVerbs(Generic[M]):
             A descriptor to be mapped for reading, and closed by the caller.
 
         Raises:
-            OSError: EPERM, without the right to administer every node; ENOENT, no such device.
+            OSError: EPERM, without the right to administer every node; ENOENT, no such device; EMFILE.
         """
         answer = await self._waiter.call(Call(f"open the journal of {device or 'the daemon'}", verbs.Journal(device)))
+        if not answer.fds:  # the kernel drops what goes beyond the limit of open descriptors
+            raise OSError(errno.EMFILE, f"open the journal of {device or 'the daemon'}: too many open descriptors")
         return answer.fds[0]
 
     @verb

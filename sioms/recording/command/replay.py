@@ -11,6 +11,7 @@ import tempfile
 from typing import Any
 
 from sioms.arguments import positive
+from sioms.children import ends_with_us
 from sioms.recording.live.replay import Replay
 from sioms.recording.reader import Recording
 
@@ -46,7 +47,8 @@ def run(args: argparse.Namespace) -> int:
             signal.signal(number, end)
         child: subprocess.Popen[bytes] | None = None
         if args.words:
-            child = subprocess.Popen(args.words, env={**os.environ, "SIOMS_SOCKET": replay.path})
+            environment = {**os.environ, "SIOMS_SOCKET": replay.path}
+            child = subprocess.Popen(args.words, env=environment, preexec_fn=ends_with_us())
         else:
             print(f"SIOMS_SOCKET={replay.path}", flush=True)
 
