@@ -45,8 +45,10 @@ from sioms.plant.binary import Beam, Box, port_values
 from sioms.plant.effects import Effect, build_effects, parse_effects
 from sioms.plant.foreign import Laws, TwinAxes, twin
 from sioms.plant.motor import MotorBank
+from sioms.plant.motor_step import Motors
 from sioms.plant.parameters import Motor
 from sioms.plant.stepper import Stepper, StepperBank
+from sioms.plant.stepper_step import Steppers
 from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, AxisBlock, BinaryBlock, BlockSpec, Description
@@ -201,13 +203,11 @@ class SimAxes(TickDriver):
         return (self._axes, self._plant) if self._port is None else (self._axes, self._plant, self._port)
 
     def quiet_steps(self, pages: Pages, instants: NDArray[np.int64]) -> QuietSteps | None:
-        """Return the steps of motors, unless something else goes on between commands and positions."""
+        """Return the steps of motors and steppers, unless something else goes on between commands and positions."""
         motors = self._servos
-        if motors is None or self._steppers is not None or self._port is not None or self._loads:
+        if self._port is not None or self._loads or (motors is not None and motors.has_drive_effects):
             return None
-        if motors.has_drive_effects:
-            return None
-        return QuietAxes(self, motors, pages, instants)
+        return QuietAxes(self, pages, instants)
 
     def tick(self, now_ns: int) -> None:
         """Let the world go on under the last command up to now, measure, and command anew.
@@ -330,11 +330,10 @@ class SimAxes(TickDriver):
 
 
 class QuietAxes:
-    """The steps of motors that move and nothing else (QuietSteps).
+    """The steps of motors and steppers that move and nothing else (QuietSteps).
 
     Args:
         driver: theirs.
-        motors: its motors.
         pages: of the process.
         instants: where steps note theirs.
     """
@@ -342,11 +341,14 @@ class QuietAxes:
     tick = staticmethod(tick_axes)
     slack = staticmethod(advance_axes)
 
-    def __init__(self, driver: SimAxes, motors: MotorBank, pages: Pages, instants: NDArray[np.int64]) -> None:
+    def __init__(self, driver: SimAxes, pages: Pages, instants: NDArray[np.int64]) -> None:
         self._driver, self._axes, self._plant = driver, driver._axes, driver._plant
-        plant = self._plant
+        plant, motors, steppers = self._plant, driver._servos, driver._steppers
         self.record = SimulatedAxes(
-            period_ns=driver._tick_ns, ahead=0, last_ns=0, found=0, loop=driver.bank.loop, motors=motors.record,
+            period_ns=driver._tick_ns, ahead=0, last_ns=0, found=0, loop=driver.bank.loop,
+            motors=motors.record if motors else Motors.empty(),
+            steppers=steppers.record if steppers else Steppers.empty(),
+            motor_rows=driver._servo_rows, stepper_rows=driver._stepper_rows,
             instants=instants, data=plant.data, offset=plant.offset, shown=plant.shown_data,
             flags=plant.flags, shown_flags=plant.shown_flags,
             axes=pages.record(self._axes), plant=pages.record(plant),

@@ -8,6 +8,7 @@ from sioms.motion.axis_step import ENDS, LATE, NOT_FINITE, ODD, WIDE, Loop, quie
 from sioms.native.language import Floats, Integers, Record, step
 from sioms.native.system import clock_ns
 from sioms.plant.motor_step import Motors, bound, coast, is_free
+from sioms.plant.stepper_step import Steppers, turn
 from sioms.sdk.quiet_step import ALIVE, INPUTS, OUTPUTS, Page, publish
 
 NOT_READY: Final = 1 << 20
@@ -16,10 +17,10 @@ UNDONE: Final = LATE | ENDS | NOT_FINITE | WIDE | ODD
 
 
 class SimulatedAxes(Record):
-    """Servos over simulated motors. ``ahead``: the world has gone on to the next tick; ``last_ns``: its time.
+    """Servos over simulated motors and steppers, each a row of the loop.
 
-    ``found`` by the bank in a tick that is half done. ``data`` and ``flags`` of the plant, as they are and as ``shown``
-    less the ``offset``.
+    ``ahead``: the world has gone on to the next tick; ``last_ns``: its time. ``found`` by the bank in a tick that is
+    half done. ``data`` and ``flags`` of the plant, as they are and as ``shown`` less the ``offset``.
     """
 
     period_ns: int
@@ -28,6 +29,9 @@ class SimulatedAxes(Record):
     found: int
     loop: Loop
     motors: Motors
+    steppers: Steppers
+    motor_rows: Integers
+    stepper_rows: Integers
     instants: Integers
     data: Floats
     offset: Floats
@@ -45,9 +49,14 @@ def tick_axes(s: SimulatedAxes, now_ns: int, as_of_ns: int, number: int) -> int:
         return NOT_READY
     loop = s.loop
     m = s.motors
-    for i in range(m.n):
-        loop.measured[i] = m.encoders.reading[i]
-        loop.switches[i] = m.switches[i]
+    p = s.steppers
+    for j in range(m.n):
+        loop.measured[s.motor_rows[j]] = m.encoders.reading[j]
+        loop.switches[s.motor_rows[j]] = m.switches[j]
+    for j in range(p.n):
+        i = s.stepper_rows[j]
+        loop.measured[i] = p.reading[j]
+        loop.switches[i] = (1 if p.at_minus[j] else 0) + (2 if p.at_plus[j] else 0) + (4 if p.at_home[j] else 0)
     s.instants[INPUTS] = clock_ns()
     found = quiet_tick(loop, now_ns)
     if found & UNDONE:
@@ -58,10 +67,12 @@ def tick_axes(s: SimulatedAxes, now_ns: int, as_of_ns: int, number: int) -> int:
     if found:
         return found
     s.instants[OUTPUTS] = clock_ns()
-    for i in range(m.n):
-        s.data[2 * i] = m.position[i]
-        s.data[2 * i + 1] = m.contact_force[i]
-    for i in range(2 * m.n):
+    for j in range(m.n):
+        s.data[2 * s.motor_rows[j]] = m.position[j]
+        s.data[2 * s.motor_rows[j] + 1] = m.contact_force[j]
+    for j in range(p.n):
+        s.data[2 * s.stepper_rows[j]] = p.position[j]
+    for i in range(2 * loop.n):
         s.shown[i] = s.data[i] - s.offset[i]
         s.shown_flags[i] = s.flags[i]
     s.axes.words[ALIVE] = s.instants[OUTPUTS]
@@ -75,13 +86,19 @@ def tick_axes(s: SimulatedAxes, now_ns: int, as_of_ns: int, number: int) -> int:
 def advance_axes(s: SimulatedAxes, now_ns: int, until_ns: int, unused: int) -> int:
     """Let the world go on to the next tick. Returns 1 when that takes more than free motion."""
     m = s.motors
+    p = s.steppers
     if s.ahead:
         return 0
-    for i in range(m.n):
-        m.command[i] = s.loop.actuator[i]
-    bound(m)
-    if not is_free(m):
-        return 1
-    coast(m)
+    if m.n:
+        for j in range(m.n):
+            m.command[j] = s.loop.actuator[s.motor_rows[j]]
+        bound(m)
+        if not is_free(m):
+            return 1
+        coast(m)
+    if p.n:
+        for j in range(p.n):
+            p.goal[j] = s.loop.actuator[s.stepper_rows[j]]
+        turn(p)
     s.ahead = 1
     return 0

@@ -25,7 +25,7 @@ import os
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, cast, get_type_hints
+from typing import Any, ClassVar, Self, TypeVar, cast, get_type_hints
 
 import numpy as np
 
@@ -33,6 +33,7 @@ MODULES: tuple[str, ...] = (
     "sioms.motion.axis_step",
     "sioms.plant.friction_step",
     "sioms.plant.motor_step",
+    "sioms.plant.stepper_step",
     "sioms.sdk.quiet_step",
     "sioms.drivers.sim.axes_step",
 )
@@ -160,6 +161,17 @@ class Record:
             else:
                 self.__dict__[field] = value  # it lives as long as what points to it
                 setattr(self.made, field, _address(value))
+
+    @classmethod
+    def empty(cls) -> Self:
+        """Return a record of nothing: numbers 0, arrays without elements."""
+        fields: dict[str, Any] = {}
+        for name, kind in cls.kinds.items():
+            if kind in ARRAYS:
+                fields[name] = np.zeros(0, kind.dtype)
+            else:
+                fields[name] = kind(0) if kind in NUMBERS else kind.empty()
+        return cls(**fields)
 
 
 class _Number:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .friction import Directed, FrictionStep
+from .stepper_step import Steppers, know, turn
 
 Array = NDArray[np.float64]
 
@@ -97,120 +98,32 @@ class StepperBank:
         viscous = 2 * _column(steppers, "damping_ratio") * np.sqrt(stiffness * mass)
         sliding = Directed.both(_column(steppers, "coulomb"))
         self._tick_s, self._substep_s = tick_s, tick_s / self.substeps
-        self._state = np.zeros((2, n))
-        self.velocity, self.position = self._state
+        state = np.zeros((2, n))
+        self.velocity, self.position = state
         self.position[:] = _column(steppers, "start")
-        self._rotor = FrictionStep(self._state, mass, Directed.both(viscous), sliding, sliding, self._substep_s)
-        self._viscous, self._damping_of_move = viscous, viscous / tick_s
-        self._micro = self._step / _column(steppers, "microsteps")
-        self._wave_number = math.pi / (2 * self._step)
-        self._hold, self._load = _column(steppers, "hold_force"), _column(steppers, "load_force")
-        self._per_corner = 1 / _column(steppers, "corner_velocity")
-        self.field = np.round(self.position / self._micro) * self._micro
-        self._encoder_step = _column(steppers, "encoder_step")
-        self._encoded = np.flatnonzero(self._encoder_step)
-        self.reading = self.field.copy()
-        self._switches = [_column(steppers, name) for name in ("limit_minus", "limit_plus", "home")]
-        self.at_limit_minus, self.at_limit_plus, self.at_home = np.zeros((3, n), dtype=np.bool_)
-        self.stalled, self._flag = np.zeros((2, n), dtype=np.bool_)
-        self._in_step = np.ones(n)
-        self._rested = False
-        self.lost_steps = np.zeros(n)
-        self._goal, self._move, self._field, self._force, self._work, self._strength = np.zeros((6, n))
-        self._sense()
+        rotors = FrictionStep(state, mass, Directed.both(viscous), sliding, sliding, tick_s / self.substeps)
+        micro = self._step / _column(steppers, "microsteps")
+        self.field = np.round(self.position / micro) * micro
+        self.reading, self.lost_steps, self._goal = self.field.copy(), np.zeros(n), np.zeros(n)
+        self.at_limit_minus, self.at_limit_plus, self.at_home, self.stalled = np.zeros((4, n), dtype=np.bool_)
+        self.record = Steppers(
+            n=n, substeps=self.substeps, substep_s=tick_s / self.substeps, tick_s=tick_s, rested=0,
+            rotors=rotors.record, goal=self._goal, field=self.field, move=np.zeros(n), strength=np.zeros(n),
+            position=self.position, velocity=self.velocity, micro=micro, full_step=self._step,
+            wave_number=math.pi / (2 * self._step), hold=_column(steppers, "hold_force"),
+            load_force=_column(steppers, "load_force"), per_corner=1 / _column(steppers, "corner_velocity"),
+            viscous=viscous, rate=self._rate, encoder_step=_column(steppers, "encoder_step"), reading=self.reading,
+            stalled=self.stalled, lost_steps=self.lost_steps,
+            limit_minus=_column(steppers, "limit_minus"), limit_plus=_column(steppers, "limit_plus"),
+            home=_column(steppers, "home"), at_minus=self.at_limit_minus, at_plus=self.at_limit_plus,
+            at_home=self.at_home,
+        )  # fmt: skip
+        know(self.record)
 
     def advance(self, position: Array) -> None:
         """Turn the fields to a commanded position [m or rad], shape (n,), evenly over one tick."""
-        goal, move = self._goal, self._move
-        np.divide(position, self._micro, out=goal)
-        np.round(goal, out=goal)
-        np.multiply(goal, self._micro, out=goal)
-        np.subtract(goal, self.field, out=move)
-        # Rotors that rest on a resting field stay there: their force stays below stiction.
-        if np.count_nonzero(move) or np.count_nonzero(self.velocity) or not self._rested:
-            self._turn()
-        self._rested = not np.count_nonzero(move)
-        np.copyto(self.field, goal)
-        self._sense()
-
-    def _turn(self) -> None:
-        """Turn the fields by the move, with the force left at its speed: 1/sqrt(1 + (v/corner)^2)."""
-        work = self._work
-        np.multiply(self._move, self._per_corner, out=work)
-        np.divide(work, self._tick_s, out=work)
-        np.multiply(work, work, out=work)
-        np.add(work, 1.0, out=work)
-        np.sqrt(work, out=work)
-        np.divide(self._hold, work, out=self._strength)
-        for index in range(self.substeps):
-            self._substep((index + 0.5) / self.substeps)
-
-    def _substep(self, share: float) -> None:
-        """Step the rotors under the field at the middle of the substep."""
-        field, force, work = self._field, self._force, self._work
-        np.multiply(self._move, share, out=field)
-        np.add(field, self.field, out=field)
-        np.multiply(self.velocity, self._substep_s / 2, out=force)
-        np.add(force, self.position, out=force)
-        np.subtract(field, force, out=force)
-        np.multiply(force, self._wave_number, out=force)
-        # Mean of the sine over the substep: no false locking where the field slips far in one.
-        np.multiply(self._move, self._wave_number / (2 * self.substeps), out=work)
-        np.multiply(self.velocity, self._wave_number * self._substep_s / 2, out=field)
-        np.subtract(work, field, out=work)
-        np.divide(work, math.pi, out=work)
-        np.sin(force, out=force)
-        np.multiply(force, np.sinc(work), out=force)
-        np.multiply(force, self._strength, out=force)
-        np.add(force, self._load, out=force)
-        self._damp_against_field()
-        self._rotor.step(force)
-
-    def _damp_against_field(self) -> None:
-        """Damp rotors in step against the field, with its force at most, instead of against the ground.
-
-        The friction step brakes by b v; adding clip(b (v_field - v)) + b v leaves the clipped part.
-        """
-        brake, relative = self._field, self._work
-        np.multiply(self.velocity, self._viscous, out=brake)
-        np.multiply(self._move, self._damping_of_move, out=relative)
-        np.subtract(relative, brake, out=relative)
-        np.minimum(relative, self._strength, out=relative)
-        np.add(brake, relative, out=brake)
-        np.add(relative, self._strength, out=relative)
-        np.minimum(relative, 0.0, out=relative)
-        np.subtract(brake, relative, out=brake)
-        np.multiply(brake, self._in_step, out=brake)
-        np.add(self._force, brake, out=self._force)
-
-    def _sense(self) -> None:
-        """Set reading, step loss and switches."""
-        np.copyto(self.reading, self.field)
-        if self._encoded.size:
-            rows, step = self._encoded, self._encoder_step[self._encoded]
-            self.reading[rows] = np.round(self.position[rows] / step) * step
-        lag, work = self._field, self._work
-        np.subtract(self.field, self.position, out=lag)
-        np.divide(lag, self._step, out=lag)
-        np.subtract(lag, self.lost_steps, out=work)
-        np.abs(work, out=work)
-        # Half an electrical turn behind: the field pulls backwards.
-        np.greater(work, 2.0, out=self._flag)
-        np.logical_or(self.stalled, self._flag, out=self.stalled)
-        if np.count_nonzero(self.stalled):
-            self._lock_again(lag)
-        minus, plus, home = self._switches
-        np.less_equal(self.position, minus, out=self.at_limit_minus)
-        np.greater_equal(self.position, plus, out=self.at_limit_plus)
-        np.less_equal(self.position, home, out=self.at_home)
-
-    def _lock_again(self, lag: Array) -> None:
-        """End the stall of rotors that rest under a resting field; the steps behind it are lost."""
-        calm = np.abs(self.velocity) < 0.1 * self._step * self._rate
-        locked = self.stalled & (self._move == 0.0) & calm
-        self.stalled[locked] = False
-        self.lost_steps[locked] = 4 * np.round(lag[locked] / 4)
-        np.logical_not(self.stalled, out=self._in_step)
+        np.copyto(self._goal, position)
+        turn(self.record)
 
 
 def _column(steppers: Sequence[Stepper], name: str) -> Array:

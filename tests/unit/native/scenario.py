@@ -9,6 +9,7 @@ from sioms.native import language
 from sioms.plant.effects import build_effects
 from sioms.plant.motor import MotorBank
 from sioms.plant.parameters import Motor, Wall
+from sioms.plant.stepper import Stepper, StepperBank
 from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.records import numpy_dtype
 
@@ -49,18 +50,20 @@ def main():
     waves = {"x0": {"encoder_eccentricity": {"amplitude": 1e-5, "pitch": 0.1}, "encoder_scale": {"gain": 1.001}}}
     effects = build_effects(waves, ["x0", "x1", "x2"])
     plants = [MotorBank(motors, 1e-3), MotorBank(motors, 1e-3, effects)]
+    coils = [Stepper(0.1, 1e-3, hold_force=5.0, coulomb=0.2), Stepper(0.02, 2e-3, hold_force=1.0, encoder_step=1e-5)]
+    rotors = [StepperBank(coils, 1e-3) for _ in plants]
     banks = [AxisBank(settings, tick_s=1e-3, markers=NoMarkers()) for _ in plants]
     now, digest, refused = 1_000_000_000, hashlib.sha256(), 0
     reading, switches = np.zeros(5), np.zeros(5, dtype=np.int64)
     for tick in range(6000):
         now += 1_000_000 if rng.random() < 0.98 else int(rng.integers(200_000, 3_000_000))
-        for bank, plant in zip(banks, plants, strict=True):
-            reading[:3] = plant.encoder.position
+        for bank, plant, rotor in zip(banks, plants, rotors, strict=True):
+            reading[:3], reading[3:] = plant.encoder.position, rotor.reading
             switches[:3] = plant.switches
             out = bank.tick(now, reading, switches if tick % 3 else None)
             plant.advance(out[:3])
-            reading[3:] = out[3:] if tick < 4000 else reading[3:]
-            digest.update(bank.fields.tobytes() + out.tobytes() + plant.position.tobytes())
+            rotor.advance(out[3:] if tick < 4000 else out[3:] * 1.5)
+            digest.update(bank.fields.tobytes() + out.tobytes() + plant.position.tobytes() + rotor.position.tobytes())
         if rng.random() < 0.02:
             mode, column, most = MODES[int(rng.integers(len(MODES)))]
             record = np.zeros(1, numpy_dtype(NodeClass.AXIS))

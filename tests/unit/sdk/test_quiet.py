@@ -20,6 +20,7 @@ MODES = (
     (ControlMode.FORCE, "force", 8.0),
 )
 MOTOR = {"mass": 2.0, "viscous": 4.0, "coulomb": 3.0, "stiction": 4.0, "encoder_step": 1e-6, "limit_plus": 0.25}
+STEPPER = {"mass": 0.1, "step": 1e-3, "hold_force": 20.0, "coulomb": 1.0, "limit_minus": -0.1}
 AXIS = {"velocity_max": 0.5, "acceleration_max": 5.0, "force_max": 40.0, "position_min": -0.2, "position_max": 0.28}
 
 
@@ -36,6 +37,7 @@ class Cell:
     def __init__(self, by_steps):
         axes = [
             AXIS | {"name": "a", "motor": MOTOR},
+            {k: v for k, v in AXIS.items() if k != "force_max"} | {"name": "c", "stepper": STEPPER},
             AXIS | {"name": "b", "motor": MOTOR | {"wall": {"position": 0.15, "stiffness": 2e4, "damping": 20.0}}},
         ]
         settings = msgspec.convert({"axis": axes}, SimAxes.Settings)
@@ -87,13 +89,13 @@ def test_steps_show_what_the_driver_shows(monkeypatch):
         if draw < 0.01:
             mode, column, most = MODES[int(rng.integers(len(MODES)))]
             record = np.zeros(1, numpy_dtype(NodeClass.AXIS))
-            record["axis"], record["control_mode"] = rng.integers(2), int(mode)
+            record["axis"], record["control_mode"] = rng.integers(3), int(mode)
             record[column] = rng.uniform(-most, most)
         for cell in (plain, quiet):
             bank = cell.driver.bank
             if draw < 0.01:
                 try:
-                    bank.append(record, range(2), now_ns + 300_000, replace=bool(tick % 2))
+                    bank.append(record, range(3), now_ns + 300_000, replace=bool(tick % 2))
                 except CommandError:
                     refused += 1
             elif draw < 0.012:
@@ -101,7 +103,7 @@ def test_steps_show_what_the_driver_shows(monkeypatch):
             elif draw < 0.014:
                 bank.emergency_stop([1], now_ns + 200_000)
             elif draw < 0.018:
-                bank.reset([0, 1])
+                bank.reset([0, 1, 2])
             cell.driver.bank.take_events()
     assert quiet.quiet > 2000, "most ticks are steps"
     assert 5000 - quiet.quiet > 200, "and some are not"
