@@ -9,7 +9,7 @@ other simulated devices feel: axes take the loads (``load_node``), force sensors
     object = { shape = "disk", radius_m = 0.02, pose = [0.17, 0.16, 0.0] }
     [[device.world.finger]]
     name = "left"
-    axes = ["mod0.plant.x_position", "mod0.plant.y_position", "mod0.plant.th_position"]
+    axes = ["mod0.plant.xaxis_position", "mod0.plant.zaxis_position", ""]  # x, y and angle; "" stays 0
     mount = { stiffness = 1e5, turn_stiffness = 5.0, mass = 0.3, inertia = 2e-4 }
 
 The stiffness of a mount lies between the axis and its finger, behind the axis's encoder; that of the servo comes in
@@ -87,7 +87,7 @@ class FingerTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         name: of its node.
-        axes: nodes of one channel each with the positions of x [m], y [m] and th [rad].
+        axes: nodes of one channel each with the positions of x [m], y [m] and th [rad]; '' for one that stays 0.
         mount: what lies between the axes and the rubber.
     """
 
@@ -134,7 +134,7 @@ class SimWorld(TickDriver):
         felt = tuple(ChannelInfo(channel, unit, description=what) for channel, unit, what in _FINGER)
         blocks = [BlockSpec("pose", NodeClass.ANALOG, pose, history=settings.history)]
         blocks += [BlockSpec(one, NodeClass.ANALOG, felt, history=settings.history) for one in names]
-        inputs = tuple(dict.fromkeys(node for finger in settings.finger for node in finger.axes))
+        inputs = tuple(dict.fromkeys(node for finger in settings.finger for node in finger.axes if node))
         return Description(tuple(blocks), settings.tick_hz, inputs, lease_s=1.0)
 
     def __init__(self, name: str, settings: SimWorldSettings, kit: Kit) -> None:
@@ -171,6 +171,8 @@ class SimWorld(TickDriver):
         self._show(_INVALID if missing else 0)
 
     def _position(self, node: str, now_ns: int) -> float | None:
+        if not node:
+            return 0.0
         reading = self.kit.inputs[node].read(now_ns)
         return None if reading is None else float(reading["value"][0])
 

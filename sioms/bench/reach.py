@@ -53,7 +53,7 @@ class CurveRoundTrip:
     def __init__(self) -> None:
         server, secret = zmq.curve_keypair()
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _ECHO, secret.decode()], stdout=subprocess.PIPE, text=True,
+            [sys.executable, "-P", "-c", _ECHO, secret.decode()], stdout=subprocess.PIPE, text=True,
             preexec_fn=ends_with_us(),
         )  # fmt: skip
         assert self._process.stdout is not None
@@ -196,7 +196,7 @@ def _fail_once(what: str, daemon: Daemon) -> int:
     """Let something fail while a remote client moves axes; return how long they went on [ns]."""
     with Gateway(daemon.socket) as gateway, Relay(gateway.port) as relay, daemon.cell() as cell:
         victim = subprocess.Popen(
-            [sys.executable, "-c", _CRUISE, gateway.trusted(relay.port), str(SPEED)], stdout=subprocess.PIPE,
+            [sys.executable, "-P", "-c", _CRUISE, gateway.trusted(relay.port), str(SPEED)], stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL, preexec_fn=ends_with_us(),
         )  # fmt: skip
         stopped = 0

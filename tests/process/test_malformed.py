@@ -236,7 +236,7 @@ def test_end_of_a_session_is_told_in_the_log(start_daemon: Callable[..., Daemon]
     session.sock.send(encode(250, 1, "oddity"))
     assert session.is_ended()
     session.close()
-    daemon.said(r'level=warning event="session ended" peer="pid \d+ \(\w+\)" why="verb 250 is none"')
+    daemon.said(r'level=warning event="session ended" peer="pid \d+ \(\w+\)" why="verb 250 does not exist"')
 
 
 def _texts(value: object) -> Iterator[str]:

@@ -234,7 +234,7 @@ def test_silent_connections_are_few_and_end(start_daemon: Callable[..., Daemon])
             sock.connect(str(daemon.socket))
             sock.settimeout(5.0)
         assert b"4 connections without a Hello" in silent[4].recv(1000)
-        assert b"nothing was said within 0.5 s" in silent[0].recv(1000)
+        assert b"no Hello within 0.5 s" in silent[0].recv(1000)
         assert silent[0].recv(1000) == b""
         wait_for(lambda: len(cell.status()["sessions"]) == 1, "the silent ones are gone, who has spoken is not")
         for sock in silent:

@@ -59,7 +59,7 @@ def test_commands_import_nothing_from_where_they_are_started(trap: Path, command
     plant_sioms(trap)
     done = run(trap, *command)
     if "check" in str(command[1]):
-        assert done.returncode == 0 and "good; 2 devices" in done.stdout, done.stderr
+        assert done.returncode == 0 and "ok; 2 devices" in done.stdout, done.stderr
 
 
 @pytest.mark.parametrize(

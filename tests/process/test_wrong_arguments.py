@@ -23,6 +23,7 @@ GOOD: dict[str, Any] = {
     "position": 0.0, "velocity": 0.0, "step": 0.0, "user": 0.0, "after": 0, "request": Request.GET_LIMITS, "which": 0,
     "records": sioms.command(position=0.0), "values": 0.0, "every": 0, "name": "mod0.readonly", "token": 1, "number": 1,
     "count": 1, "handle": 0, "axis": 0, "last": 0, "gains": [1.0], "positions": 0.0, "nodes": None,
+    "level": "warning", "text": "a word",
 }  # fmt: skip
 """What the other parameters of a verb get."""
 NO_NUMBER: list[Any] = ["1", [], {}, True, object(), b"x", 1j, [1.0]]
@@ -38,7 +39,7 @@ WRONG: dict[str, list[Any]] = {
     "Request": [5, None, "HOME", [], 1 << 70],
     "Any": ["1", [], {}, object()],
 }
-ANY_TEXT = {"why"}
+ANY_TEXT = {"why", "text"}
 """A stop is not refused for what it says."""
 FLAGS = {"replace", "persist", "gone"}
 WORDS = {
