@@ -151,7 +151,9 @@ class Folder:
                 errno.EEXIST,
                 f"make a key in {self.path}: there is one; remove its file `secret` first if nobody is to know it",
             )
-        public, secret = (key.decode() for key in zmq.curve_keypair())
+        public = "-"
+        while public.startswith("-"):  # a command line would take such a key for an option
+            public, secret = (key.decode() for key in zmq.curve_keypair())
         self._write("secret", [f"{checked_name('make a key', name)} {public} {secret}"], 0o600)
         return Pair(name, public, secret)
 

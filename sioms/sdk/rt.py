@@ -101,12 +101,16 @@ def name_process(name: str) -> None:
     _libc.prctl(_PR_SET_NAME, name.encode()[:15], 0, 0, 0)
 
 
-def _limit_restlessness(gave_up: Callable[[float], None]) -> None:
+def _limit_restlessness(log: Callable[[str, str], None]) -> None:
     """Become an ordinary process when the kernel says that we have not waited for anything for too long."""
 
     def take(_number: int, _frame: object) -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        gave_up(RESTLESS_S)
+        log(
+            "warning",
+            f"gave up real-time scheduling: its tick has run for {RESTLESS_S:g} s without a pause, and nothing else "
+            "on that processor could; lower the rate, or give it fewer channels",
+        )
 
     signal.signal(signal.SIGXCPU, take)
     _, most = resource.getrlimit(resource.RLIMIT_RTTIME)
@@ -115,12 +119,12 @@ def _limit_restlessness(gave_up: Callable[[float], None]) -> None:
         resource.setrlimit(resource.RLIMIT_RTTIME, (soft, most))
 
 
-def become_realtime(priority: int, gave_up: Callable[[float], None]) -> list[str]:
+def become_realtime(priority: int, log: Callable[[str, str], None]) -> list[str]:
     """Ask for real-time scheduling and resident memory, and switch the cyclic collector off.
 
     Args:
         priority: SCHED_FIFO priority 1 to 99; 0 leaves the scheduling as it is.
-        gave_up: called when the process has worked for RESTLESS_S [s] without waiting for anything, and was
+        log: takes level and text, when the process has worked for RESTLESS_S [s] without waiting for anything, and was
             therefore made an ordinary one.
 
     Returns:
@@ -130,7 +134,7 @@ def become_realtime(priority: int, gave_up: Callable[[float], None]) -> list[str
     _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     if priority:
         try:
-            _limit_restlessness(gave_up)
+            _limit_restlessness(log)
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
         except (PermissionError, OSError) as error:
             refused.append(f"SCHED_FIFO priority {priority} ({errno.errorcode.get(error.errno or 0, '?')})")

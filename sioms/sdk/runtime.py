@@ -234,7 +234,7 @@ class Runtime:
         self._watch_requests()  # before that user may not look at it any more
         if user and os.getuid() == 0:
             become_user(user)
-        refused = become_realtime(priority, self._gave_up_realtime)
+        refused = become_realtime(priority, self.log)
         if refused:
             self.log("debug", "runs without " + ", ".join(refused))
         self.turns.gives_way = os.sched_getscheduler(0) == os.SCHED_FIFO
@@ -288,13 +288,6 @@ class Runtime:
         self.watch(watch.fd, asked)
         self._sees_requests = True
 
-    def _gave_up_realtime(self, worked_s: float) -> None:
-        self.log(
-            "warning",
-            f"gave up real-time scheduling: its tick has run for {worked_s:g} s without a pause, and nothing else "
-            "on that processor could; lower the rate, or give it fewer channels",
-        )
-
     def _loop(self) -> None:
         callbacks, turns = self._callbacks, self.turns
         while self.running:
@@ -310,12 +303,13 @@ class Runtime:
         """Wait for events; return the descriptors that are ready."""
         pause_s = self.turns.pause_s
         looked_at = self.clients.handles or self._is_used  # else it is soon idle
-        if self._quiet is not None and looked_at and pause_s is None and not self._ending_ns and not self._daemon_late:
+        ready = None
+        if self._quiet and looked_at and pause_s is None and not self._ending_ns and not self._daemon_late:
             ready = self._quiet.wait(self._scheduled_ns, self.tick)
-            if ready is not None:
-                self._resume(self._quiet.record)
-                return ready
-        return [fd for fd, _ in self._epoll.poll(pause_s)]
+        if self._quiet is None or ready is None:
+            return [fd for fd, _ in self._epoll.poll(pause_s)]
+        self._resume(self._quiet.record)
+        return ready
 
     def _resume(self, quiet: Quiet) -> None:
         """Go on behind ticks that have been done by steps."""

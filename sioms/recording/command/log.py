@@ -101,7 +101,7 @@ def _info(path: str, with_events: bool) -> list[str]:
         state = "packed" if recording.is_packed else "not packed: its recorder is at work, or was killed"
         print(f"{path}: {os.path.getsize(path) / 1e6:.1f} MB, {state}")
         print(f"workcell {about.get('workcell', '?')} on {about.get('host', '?')}")
-        print(f"{utc(first)} to {utc(last)}: {(last - first) / 1e9:.3f} s")
+        print(f"{utc(first)} to {utc(last)}: {(last - first) / 1e9:.3f} s" if last else "nothing was recorded, or left")
         events = recording.events()
         print(f"{len(events)} events")
         gaps: dict[str, int] = {}

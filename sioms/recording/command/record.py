@@ -106,4 +106,5 @@ def alarm(recorder: Recorder, text: str) -> None:
 def _sum(recorder: Recorder) -> str:
     lost = {name: count for name, count in recorder.lost.items() if count}
     rest = "none lost" if not lost else "lost: " + ", ".join(f"{count} of {name}" for name, count in lost.items())
-    return f"{sum(recorder.recorded.values())} snapshots of {len(recorder.recorded)} nodes, {rest}"
+    nodes = "1 node" if len(recorder.recorded) == 1 else f"{len(recorder.recorded)} nodes"
+    return f"{sum(recorder.recorded.values())} snapshots of {nodes}, {rest}"

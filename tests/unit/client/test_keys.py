@@ -106,3 +106,9 @@ def test_the_commands(folder: Folder, capsys: pytest.CaptureFixture[str]) -> Non
     status, _, err = sioms("serve", "--listen", "*:5770")
     assert status == 1 and "nobody may come in" in err and "sioms key allow" in err
     assert "want HOST:PORT" in sioms("serve", "--listen", "5770")[2]
+
+
+def test_no_key_looks_like_an_option(folder: Folder, monkeypatch: pytest.MonkeyPatch) -> None:
+    pairs = iter([(b"-" + b"x" * 39, b"y" * 40), (b"z" * 40, b"y" * 40)])
+    monkeypatch.setattr("zmq.curve_keypair", lambda: next(pairs))
+    assert folder.new("kate").public == "z" * 40
