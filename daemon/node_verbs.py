@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import itertools
+import math
 import os
 import socket
 import time
@@ -188,7 +189,7 @@ class NodeVerbs:
                 device.send(
                     Attach(
                         handle.number, node.block, node.channels, node.bit, int(access), exclusive,
-                        int(rights), int(lease_s * 1e9), str(session), session.peer.uid,
+                        int(rights), math.ceil(lease_s * 1e9), str(session), session.peer.uid,
                         self._clients.quotas.of_device(session.peer.uid), node.name,
                     ),
                     fds,

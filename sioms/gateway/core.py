@@ -10,7 +10,8 @@ Concurrency: one thread.
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable, Mapping, Sequence
+import traceback
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -22,6 +23,8 @@ from sioms.protocol.messages import MalformedMessage, decode_reply, refusal, val
 OWN_NUMBERS = 1 << 52
 """Message numbers from here on are the gateway's own requests."""
 MOST_SESSIONS = 256
+MOST_OF_A_KEY = 48
+"""Sessions of one key at a time, of these; the daemon's ``sessions`` of [quota] bounds those that it has taken in."""
 MOST_WAITING = 64
 """Packets that a client may send before the daemon has taken it in."""
 BATCH_BYTES = 48 << 10
@@ -43,10 +46,12 @@ class Principal:
     Attributes:
         name: of the key.
         groups: of the key.
+        public: the key itself.
     """
 
     name: str
     groups: tuple[str, ...] = ()
+    public: str = ""
 
 
 class Page(Protocol):
@@ -230,6 +235,11 @@ class Gateway:
         except (MalformedFrame, MalformedMessage) as error:
             if session is not None:
                 self.end(session, errno.EPROTO, str(error))
+        except Exception as error:  # our own mistake costs one session, not all
+            trace = "".join(traceback.format_exception(error)[-3:])
+            self._outside.log("error", "internal error", peer=who.name, trace=trace)
+            if session is not None:
+                self.end(session, errno.EPROTO, f"internal error: {error!r}")
 
     def _begin(self, peer: bytes, who: Principal, host: str, head: tuple[int, int, int], now_ns: int) -> None:
         kind, version, number = head
@@ -241,6 +251,9 @@ class Gateway:
             self._tell_end(session, errno.EPROTO, f"{text} release of SIOMS on both machines")
         elif len(self.sessions) >= MOST_SESSIONS:
             self._tell_end(session, errno.EUSERS, f"{MOST_SESSIONS} sessions are open at the gateway; close one")
+        elif sum(other.who.name == who.name for other in self.sessions.values()) >= MOST_OF_A_KEY:
+            text = f"key {who.name} has {MOST_OF_A_KEY} sessions open at the gateway, as many as one may; close one"
+            self._tell_end(session, errno.EUSERS, text)
         else:
             self.sessions[peer] = session
             self._outside.log("info", "session", peer=str(session))
@@ -306,9 +319,10 @@ class Gateway:
             self._send(session, Down.PACKET, body=refusal(number, errno.EPERM, text))
             return
         if isinstance(message, verbs.Open):
-            if message.lease_s > link.LONGEST_LEASE_S:
-                text = f"open {message.node}: lease {message.lease_s:g} s; from another machine at most"
-                answer = refusal(number, errno.EINVAL, f"{text} {link.LONGEST_LEASE_S:g} s are right")
+            if not (message.lease_s == 0 or link.SHORTEST_LEASE_S <= message.lease_s <= link.LONGEST_LEASE_S):
+                text = f"open {message.node}: lease {message.lease_s:g} s; from another machine want"
+                text = f"{text} {link.SHORTEST_LEASE_S:g} to {link.LONGEST_LEASE_S:g} s"
+                answer = refusal(number, errno.EINVAL, text)
                 self._send(session, Down.PACKET, body=answer)
                 return
             self._own += 1
@@ -474,11 +488,11 @@ class Gateway:
 
     # --- ends ------------------------------------------------------------------------------------
 
-    def allow(self, keys: Mapping[str, Principal]) -> None:
-        """End the sessions of keys that are not allowed any more, or whose groups have changed."""
+    def allow(self, keys: Collection[Principal]) -> None:
+        """End the sessions of keys that are not allowed any more, or are now other keys or in other groups."""
         for session in list(self.sessions.values()):
-            if keys.get(session.who.name) != session.who:
-                text = f"key {session.who.name} has been revoked, or has other groups now"
+            if session.who not in keys:
+                text = f"key {session.who.name} has been revoked, or replaced, or has other groups now"
                 self.end(session, errno.EACCES, text)
 
     def end(self, session: Session, errno_: int, text: str) -> None:

@@ -24,17 +24,20 @@ from sioms.protocol.clock import Wall
 from sioms.protocol.text import printable
 
 from .core import Gateway, Line, Node, Principal, Session
+from .inflow import MOST, Inflow
 from .sockets import DaemonLine, OpenNode
 from .stops import DOMAIN, Stops
 
 KEYS_S = 0.1
-"""How often the list of keys is looked at [s]."""
+"""How often the list of keys, and what piles up, are looked at [s]."""
 WALL_S = 1.0
 """How often the wall clock is looked at [s]."""
 TURN = 200
 """Frames of clients that are taken before others have their turn."""
 QUEUE = 1000
 """Frames that wait for one client's connection, at most; a session with more has ended."""
+QUEUE_IN = 200
+"""Frames of a client that wait to be taken, at most; more wait at the client."""
 HANDSHAKE_MS = 2000
 
 
@@ -52,7 +55,7 @@ def secured(context: zmq.Context[zmq.Socket[bytes]], kind: int, pair: Pair) -> z
     sock.zap_domain = DOMAIN
     for option, value in (
         (zmq.MAXMSGSIZE, link.MAX_TO_GATEWAY), (zmq.HANDSHAKE_IVL, HANDSHAKE_MS), (zmq.LINGER, 200),
-        (zmq.SNDHWM, QUEUE), (zmq.RCVHWM, QUEUE), (zmq.ROUTER_MANDATORY, 1),
+        (zmq.SNDHWM, QUEUE), (zmq.RCVHWM, QUEUE_IN), (zmq.ROUTER_MANDATORY, 1),
     ):  # fmt: skip
         sock.setsockopt(option, value)
     return sock
@@ -72,7 +75,6 @@ class Keys:
         self._folder = folder
         self._seen: tuple[int, ...] = ()
         self.by_public: dict[str, Principal] = {}
-        self.by_name: dict[str, Principal] = {}
         self.look(strict=True)
 
     def look(self, *, strict: bool = False) -> bool:
@@ -92,8 +94,7 @@ class Keys:
                 raise
             log("error", "keys", why=error.strerror)
             allowed = []
-        self.by_public = {one.public: Principal(one.name, one.groups) for one in allowed}
-        self.by_name = {who.name: who for who in self.by_public.values()}
+        self.by_public = {one.public: Principal(one.name, one.groups, one.public) for one in allowed}
         return True
 
 
@@ -114,7 +115,8 @@ class Serve:
         self._epoll = select.epoll()
         self._readable: dict[int, Callable[[], None]] = {}
         self._writable: dict[int, Callable[[], None]] = {}
-        self._known: dict[bytes, tuple[str, str]] = {}
+        self._known: dict[bytes, tuple[str, str, int]] = {}
+        self._inflow = Inflow()
         self._ending = False
         self._wall, self._wall_ns = wall(), time.monotonic_ns()
         self._keys = Keys(folder)
@@ -124,7 +126,7 @@ class Serve:
         self._context = zmq.Context(1)
         self._router = secured(self._context, zmq.ROUTER, pair)
         stops = secured(self._context, zmq.ROUTER, pair)
-        self._stops = Stops(self._context, stops, path, self._principal)
+        self._stops = Stops(self._context, stops, path, self._principal, self._inflow, log)
         bind(self._router, host, port)
         bind(stops, host, port + 1)
         self._router_fd = int(self._router.getsockopt(zmq.FD))
@@ -205,12 +207,13 @@ class Serve:
                 frame = router.recv()
             else:
                 first = router.recv(copy=False)
-                known[peer] = (str(first.get("User-Id")), str(first.get("Peer-Address")))
+                known[peer] = (str(first.get("User-Id")), str(first.get("Peer-Address")), int(first.get(zmq.SRCFD)))
                 frame = first.bytes
-            more = router.getsockopt(zmq.RCVMORE)
+            public, host, fd = known[peer]
+            size, more = len(frame), router.getsockopt(zmq.RCVMORE)
             while router.getsockopt(zmq.RCVMORE):
-                router.recv()
-            public, host = known[peer]
+                size += len(router.recv())
+            self._inflow.took(fd, size)
             # A peer that names itself could take over the name of one that has gone: those of ZeroMQ begin with zero.
             if more or peer[:1] != b"\0":
                 continue
@@ -240,8 +243,10 @@ class Serve:
                 busy = busy or bool(int(self._router.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
             if now_ns >= keys_ns:
                 keys_ns = now_ns + int(KEYS_S * 1e9)
+                for fd in self._inflow.look():
+                    log("warning", "connection ended", why=f"more than {MOST} bytes of it wait", descriptor=fd)
                 if self._keys.look():
-                    self.gateway.allow(self._keys.by_name)
+                    self.gateway.allow(self._keys.by_public.values())
                     busy = True  # sending takes the edge off the descriptor of what has come
             if manager.watchdog_ns and now_ns - fed_ns >= manager.watchdog_ns:
                 fed_ns = now_ns

@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -26,6 +27,7 @@ from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.text import printable
 
 from .core import Principal
+from .inflow import Inflow
 
 DOMAIN = b"sioms"
 MOST_WAYS = 64
@@ -76,6 +78,8 @@ class Stops:
         sock: the ROUTER for stops, owned from now on.
         path: the daemon's socket.
         principal: tells who holds a public key, None for nobody who may come in.
+        inflow: is told what has been taken.
+        log: writes a line: level, event, words.
     """
 
     def __init__(
@@ -84,10 +88,14 @@ class Stops:
         sock: zmq.Socket[bytes],
         path: str,
         principal: Callable[[str], Principal | None],
+        inflow: Inflow,
+        log: Callable[..., None],
     ) -> None:
         self._sock = sock
         self._path = path
         self._principal = principal
+        self._inflow = inflow
+        self._log = log
         self._ways: dict[tuple[Principal, str], Way] = {}
         self._zap = context.socket(zmq.REP)
         self._zap.linger = 0
@@ -115,10 +123,9 @@ class Stops:
         while True:
             ready = dict(poller.poll())
             if self._sock in ready:
-                with suppress(zmq.ZMQError, MalformedFrame, MalformedMessage):
-                    self._take()
+                self._serve(self._take)
             if self._zap in ready:
-                self._judge(self._zap.recv_multipart())
+                self._serve(self._judge)
             if self._quit in ready:
                 break
         for way in self._ways.values():
@@ -126,8 +133,18 @@ class Stops:
         for each in (self._zap, self._sock, self._quit):
             each.close()
 
-    def _judge(self, asked: list[bytes]) -> None:
+    def _serve(self, take: Callable[[], None]) -> None:
+        """Take what has come. A mistake of ours costs what came, not the next stop."""
+        try:
+            take()
+        except (zmq.ZMQError, MalformedFrame, MalformedMessage):
+            return
+        except Exception as error:
+            self._log("error", "internal error", trace="".join(traceback.format_exception(error)[-3:]))
+
+    def _judge(self) -> None:
         """Answer whether a peer may come in; its name from now on is its public key."""
+        asked = self._zap.recv_multipart()
         version, number, _, _, _, mechanism = asked[:6]
         public = z85.encode(asked[6]).decode() if mechanism == b"CURVE" and len(asked) == 7 else ""
         good = bool(public) and self._principal(public) is not None
@@ -136,6 +153,7 @@ class Stops:
 
     def _take(self) -> None:
         peer, *frames = self._sock.recv_multipart(zmq.DONTWAIT, copy=False)
+        self._inflow.took(int(frames[0].get(zmq.SRCFD)), sum(map(len, frames)))
         if len(frames) != 1:
             return
         who, host = self._principal(str(frames[0].get("User-Id"))), str(frames[0].get("Peer-Address"))
@@ -157,8 +175,10 @@ class Stops:
             try:
                 return reply(number, None, self._way(who, host).stop(message))
             except OSError as error:
-                if error.errno == errno.EIO and not attempt:
-                    self._ways.pop((who, host)).close()  # the daemon has been started again since
+                way = self._ways.pop((who, host), None) if error.errno == errno.EIO else None
+                if way is not None:  # the daemon has been started again since
+                    way.close()
+                if way is not None and not attempt:
                     continue
                 return refusal(number, error.errno or errno.EIO, error.strerror or str(error))
         raise AssertionError("two attempts")

@@ -33,8 +33,8 @@ MAX_FROM_GATEWAY = 1 << 20
 """Bytes of a frame that a client takes."""
 WINDOW = 4
 """Sets of snapshots of a node that a gateway sends ahead of the confirmations of its client."""
-DEFAULT_LEASE_S, LONGEST_LEASE_S = 0.2, 10.0
-"""Of what can be written, when the client asks for none, and the most it gets [s]."""
+DEFAULT_LEASE_S, SHORTEST_LEASE_S, LONGEST_LEASE_S = 0.2, 0.001, 10.0
+"""Of what can be written, when the client asks for none, and the least and the most it gets [s]."""
 BEACON_S = 0.02
 """A gateway sends a frame at least so often to a session that holds something [s], so that leases can be renewed."""
 PING_S = 0.25

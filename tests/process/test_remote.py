@@ -10,8 +10,10 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import zmq
 from daemon_rig import Client, Daemon, jog, raises, wait_for
 
 import sioms
@@ -19,6 +21,7 @@ import sioms.aio
 from sioms.bench.watching import Watch, halting_ns
 from sioms.check.remote import Gateway, Relay, free_ports
 from sioms.client.keys import Folder
+from sioms.gateway.inflow import MOST
 from sioms.protocol.link import DEFAULT_LEASE_S
 
 LATE_NS = int((DEFAULT_LEASE_S + 0.020) * 1e9)
@@ -205,6 +208,24 @@ def test_a_revoked_key_is_out_at_once(daemon: Daemon, gate: Gateway, cell: sioms
             assert own is not None
             gate.keys.allow(gate.name, own.public, ("crew",))
             time.sleep(0.3)
+
+
+def test_a_message_without_an_end_ends_its_connection_alone(remote: sioms.Workcell, gate: Gateway) -> None:
+    context: Any = zmq.Context()
+    dealer, own = context.socket(zmq.DEALER), gate.own.own()
+    assert own is not None
+    dealer.curve_publickey, dealer.curve_secretkey = own.public.encode(), own.secret.encode()
+    dealer.curve_serverkey = gate.public.encode()
+    dealer.setsockopt(zmq.RECONNECT_IVL, -1)
+    monitor = dealer.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+    dealer.connect(f"tcp://127.0.0.1:{gate.port}")
+    part = bytes(60_000)
+    for _ in range(3 * MOST // len(part)):
+        dealer.send(part, zmq.SNDMORE)
+    dealer.send(b"")
+    assert monitor.poll(10_000), "the gateway ends the connection"
+    assert remote.status()["workcell"] == "test"
+    context.destroy(0)
 
 
 def test_wrong_addresses_and_keys_are_told_in_a_sentence(

@@ -110,6 +110,16 @@ def test_a_handle_is_closed_once_and_each_close_is_answered() -> None:
         assert not cell._session(0).waits
 
 
+def test_no_lease_is_so_short_that_it_is_none() -> None:
+    with cells() as make:
+        cell = make()
+        for action in begin("nobody owns anything"):
+            cell.take(action)
+        cell._ask(0, ClientVerb.OPEN, "axis", 3, None, 1e-12)
+        cell.hear(0)
+        assert [handle.lease_ns for handle in cell._process(0).runtime.clients.handles.values()] == [1]
+
+
 def test_the_last_words_of_a_driver_are_heard(capsys: pytest.CaptureFixture[str]) -> None:
     with cells() as make:
         cell = make()

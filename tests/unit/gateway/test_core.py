@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from sioms.gateway.core import MOST_SESSIONS, OWN_NUMBERS, Gateway, Principal, Session
+from sioms.gateway.core import MOST_OF_A_KEY, MOST_SESSIONS, OWN_NUMBERS, Gateway, Principal, Session
 from sioms.protocol import link, verbs
 from sioms.protocol.clock import Wall
 from sioms.protocol.flags import NodeClass, PageState
@@ -269,11 +269,11 @@ def test_a_time_that_was_not_told_is_no_time(world: World) -> None:
     assert b"a" not in world.gateway.sessions and not node.got
 
 
-@pytest.mark.parametrize("keys", [{}, {"kate": Principal("kate")}, {"ben": KATE}])
-def test_a_revoked_key_loses_what_it_has_at_once(world: World, keys: dict[str, Principal]) -> None:
+@pytest.mark.parametrize("keys", [[], [BEN], [Principal("kate")], [Principal("kate", ("ops",), "another key")]])
+def test_a_revoked_key_loses_what_it_has_at_once(world: World, keys: list[Principal]) -> None:
     line = world.begin(b"a")
     node = world.open(b"a", 5)
-    world.gateway.allow({"kate": KATE, "ben": BEN})
+    world.gateway.allow([KATE, BEN])
     assert node.state == "open"
     world.gateway.allow(keys)
     assert node.state == "closed" and line.closed and not world.gateway.sessions
@@ -294,8 +294,36 @@ def test_another_version_is_told_and_sessions_are_bounded(world: World) -> None:
     world.frame(b"a", Up.HELLO, link.VERSION + 1)
     assert b"same release" in world.last(b"a", Down.END)[1] and not world.gateway.sessions
     for i in range(MOST_SESSIONS + 3):
-        world.frame(b"%d" % i, Up.HELLO, link.VERSION)
+        world.frame(b"%d" % i, Up.HELLO, link.VERSION, who=Principal(f"key{i % 7}"))
     assert len(world.gateway.sessions) == MOST_SESSIONS
+
+
+def test_one_key_does_not_keep_others_out(world: World) -> None:
+    for i in range(MOST_SESSIONS):
+        world.frame(b"%d" % i, Up.HELLO, link.VERSION)
+    assert len(world.gateway.sessions) == MOST_OF_A_KEY
+    assert b"key kate has 48 sessions open" in world.last(b"200", Down.END)[1]
+    world.begin(b"b", BEN)
+
+
+@pytest.mark.parametrize("lease_s", [1e-12, 1e-4, -1.0, float("-inf"), float("inf")])
+def test_no_lease_is_so_short_that_it_is_none(world: World, lease_s: float) -> None:
+    line = world.begin(b"a")
+    sent = len(line.got)
+    world.ask(b"a", 9, verbs.Open("mod0", 3, 0.0, lease_s))
+    assert len(line.got) == sent
+    assert decode_reply(world.last(b"a", Down.PACKET)[1])[2] == errno.EINVAL
+
+
+def test_a_mistake_of_ours_costs_one_session(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(_: bytes) -> int:
+        raise RuntimeError("a mistake")
+
+    world.begin(b"a")
+    world.begin(b"b", BEN)
+    monkeypatch.setattr(link, "take_ping", broken)
+    world.frame(b"a", Up.PING, 0, link.ping(1))
+    assert list(world.gateway.sessions) == [b"b"] and b"a mistake" in world.last(b"a", Down.END)[1]
 
 
 def test_one_session_has_no_hold_on_what_is_anothers(world: World) -> None:
