@@ -23,6 +23,7 @@ import msgpack
 import numpy as np
 
 from sioms.check.traces import BadTrace, read_trace
+from sioms.client.keys import Folder
 from sioms.daemon.config import parse as parse_config
 from sioms.documents import json_of, toml_of
 from sioms.drivers.ascii_stream.codec import LineReceiver
@@ -33,11 +34,13 @@ from sioms.drivers.ft300.codec import RecordReceiver
 from sioms.drivers.iio.codec import Element, Layout, ScanReceiver, parse_type
 from sioms.drivers.modbus.regmap import RegisterMapError, parse_map
 from sioms.drivers.schunk_ft.codec import parse as parse_schunk
+from sioms.gateway.core import OWN_NUMBERS, Gateway, Principal
 from sioms.lab.arrays import UnreadableError, read_mat, read_npz
 from sioms.plant.effects import EffectsError, parse_effects
-from sioms.protocol import link, wire
+from sioms.protocol import link, verbs, wire
+from sioms.protocol.clock import Wall
 from sioms.protocol.driver_verbs import FROM_DRIVER, TO_DRIVER, TO_FORK_SERVER, DriverVerb, ForkServerVerb
-from sioms.protocol.flags import NodeClass
+from sioms.protocol.flags import NodeClass, PageState
 from sioms.protocol.messages import (
     MAX_PACKET,
     ClientVerb,
@@ -50,6 +53,8 @@ from sioms.protocol.messages import (
     reply,
     value_of,
 )
+from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
+from sioms.protocol.page import PageReader, PageWriter, page_size
 from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.stopjournal import Stopped, entries_from, node_entry, replay, workcell_entry
 from sioms.protocol.text import printable, shown
@@ -58,6 +63,12 @@ from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.files.axis import read_model
 from sioms.reconcile.files.table import load_table
 from sioms.reconcile.live.force import read_stand
+from sioms.recording import mcap
+from sioms.recording.messages import EVENT, EVENTS, Event, NodeFormat
+from sioms.recording.reader import Recording
+from sioms.recording.rewrite import LIBRARY, rewrite
+from sioms.recording.story import sentence, tell, utc
+from sioms.recording.tables import columns_of
 from sioms.sdk.exchange import DeviceError, LinkError
 from sioms.sdk.golden import Golden, Incomplete, read_reply
 from sioms.sdk.persistence import Contents, Entry
@@ -223,6 +234,158 @@ def _positions(data: bytes) -> Contents:
     return found
 
 
+class _Far:
+    """What is around a gateway: a daemon that takes a session in and grants every open, a driver that takes all."""
+
+    def __init__(self) -> None:
+        memory = bytearray(page_size(NodeClass.AXIS, 1, 8))
+        PageWriter(memoryview(memory), NodeClass.AXIS, 1, 8, 10**12, 1, 77).set_state(PageState.GOOD)
+        self.page = PageReader(memory)
+        self.shape = link.PageShape(NodeClass.AXIS, 1, 8, 10**12, 1, 77)
+        self.answers: list[tuple[bytes, Sequence[int]]] = []
+        self.told_ns = 0
+
+    def send(self, peer: bytes, frame: bytes) -> bool:
+        """Take what goes to a client: the next frame of it repeats its time."""
+        self.told_ns = link.unpack(frame, link.MAX_FROM_GATEWAY)[3]
+        return True
+
+    def connect(self, session: object) -> _Line:
+        return _Line(self)
+
+    def attach(self, session: object, handle: int, fds: object) -> _Node:
+        return _Node(self)
+
+    def drop(self, fds: object) -> None: ...
+
+    def log(self, level: str, event: str, **words: object) -> None:
+        assert level != "error", words
+
+
+class _Line:
+    """A connection to that daemon."""
+
+    def __init__(self, far: _Far) -> None:
+        self._answers = far.answers
+
+    def send(self, packet: bytes) -> None:
+        """Answer a request."""
+        number, message = verbs.take(packet, verbs.FROM_CLIENT)
+        match message:
+            case verbs.Info():
+                self._answers.append((reply(number, ["mod0", 3, False, []]), ()))
+            case verbs.Open():
+                self._answers.append((reply(number, [number, [], [0], -1, [1, 1]]), (0, 0, 0)))
+            case _ if number != OWN_NUMBERS:
+                self._answers.append((reply(number), ()))
+
+    def close(self) -> None: ...
+
+
+class _Node:
+    """A node of it."""
+
+    def __init__(self, far: _Far) -> None:
+        self.page, self.shape = far.page, far.shape
+
+    def send(self, packet: bytes) -> None: ...
+
+    def end(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def _gateway(data: bytes) -> None:
+    """Frames of a client that is let in: a kind, a handle and a length each. No more than its session ends."""
+    far, now_ns = _Far(), 10**9
+    gateway = Gateway(far, lambda: now_ns, lambda: Wall(5, 7, 1))
+    gateway.frame(b"other", Principal("other"), "h", link.pack(link.Up.HELLO, link.VERSION, 1))
+    at = number = 0
+    while at + 3 <= len(data) and number < 100:
+        kind, channel, size = data[at : at + 3]
+        body, at, number = data[at + 3 : at + 3 + size], at + 3 + size, number + 1
+        now_ns += 1_000_000 * (kind >> 4)
+        head = (kind & 15, channel or link.VERSION * (number == 1), number, far.told_ns)
+        gateway.frame(b"peer", Principal("a"), "h", link.pack(*head, body))
+        session = gateway.sessions.get(b"peer")
+        if session is not None and session.line is not None and not session.taken_in:
+            gateway.daemon_packet(session, reply(OWN_NUMBERS))
+        while far.answers and b"peer" in gateway.sessions:
+            gateway.daemon_packet(gateway.sessions[b"peer"], *far.answers.pop(0))
+        far.answers.clear()
+        gateway.tick()
+    assert b"other" in gateway.sessions
+    assert all(held.lease_ns for session in gateway.sessions.values() for held in session.held.values())
+
+
+def _frames(*frames: tuple[int, int, bytes]) -> bytes:
+    return b"".join([bytes([kind, channel, len(body)]) + body for kind, channel, body in frames])
+
+
+def _keys(data: bytes) -> object:
+    """The files of a folder of keys."""
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as path:
+        folder = Folder(path)
+        for name in ("secret", "allowed", "trusted"):
+            fd = os.open(folder.file(name), os.O_WRONLY | os.O_CREAT, 0o600)
+            with open(fd, "wb") as file:
+                file.write(data)
+        with suppress(OSError):
+            folder.own()
+        with suppress(OSError):
+            folder.trusted()
+        return folder.allowed()
+
+
+def _mcap(path: Path) -> None:
+    """All that is done with a recording."""
+    with Recording(path) as recording:
+        first, last, _ = recording.span()
+        events = recording.events()
+        told = [f"{utc(event.stamp_ns + recording.offset_ns)} {sentence(event)}" for event in events]
+        assert all(
+            isinstance(line, str) for line in (utc(first), utc(last), tell(events).text, *told, *recording.damage)
+        )
+        for name in list(recording.nodes)[:3]:
+            columns_of(recording, name)
+        lost = set(recording.damage)
+    packed = path.with_suffix(".packed")
+    try:
+        rewrite([str(path)], str(packed))
+        with Recording(packed) as recording:
+            assert recording.span() and lost.issuperset(recording.damage)
+    finally:
+        packed.unlink(missing_ok=True)
+
+
+def _recorded() -> bytes:
+    """A live recording of an axis, with an event."""
+    schemas: list[bytes] = []
+
+    def schema(name: str, text: str) -> int:
+        schemas.append(mcap.Schema(len(schemas) + 1, name, "ros2msg", text.encode()).packed())
+        return len(schemas)
+
+    info = NodeInfo(
+        ["x", int(NodeClass.AXIS), False, [ChannelInfo("a", "m").pack()], -1, 1000.0, 16, "dev", "sim-axes", 2]
+    )
+    event = Event(5, 1, "dev", "stop", "x", "eva", 0, "why", {"stop": "EMERGENCY"}, b"raw").packed()
+    node = NodeFormat(info, -1, 2, schema, 10**18)
+    channels = [mcap.Channel(1, schema(*EVENT), EVENTS, "cdr"), *node.channels]
+    slots = np.arange(4 * (4 + 13), dtype="<u8").reshape(4, -1)
+    about = mcap.metadata("sioms", {"offset_ns": str(10**18), "workcell": "w"})
+    parts = [mcap.header(LIBRARY), about, *schemas, *[channel.packed() for channel in channels]]
+    return b"".join([*parts, node.messages(slots), mcap.message(1, 1, 10**18 + 5, event)])
+
+
+def _packed_again(data: bytes) -> bytes:
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
+        path = Path(folder, "a")
+        path.write_bytes(data)
+        rewrite([str(path)], str(path))
+        return path.read_bytes()
+
+
 def _saved(save: Callable[[Any], None]) -> bytes:
     with tempfile.TemporaryFile() as file:
         save(file)
@@ -344,6 +507,26 @@ TARGETS = {
         (ValueError,),
     ),
     "journal of stops": Target(_journal, [JOURNAL], (), 2),
+    "gateway": Target(
+        _gateway,
+        [
+            _frames(
+                (link.Up.HELLO, 0, b""),
+                (link.Up.PACKET, 0, verbs.Hello(2, "a").packed(1)),
+                (link.Up.PACKET, 0, verbs.Open("mod0", 3, 0.0, 0.1).packed(2)),
+                (link.Up.PACKET, 2, b"write"),
+                (link.Up.CREDIT, 2, b""),
+                (link.Up.PING, 0, link.ping(1)),
+                (link.Up.CLOSED, 2, b""),
+                (link.Up.BYE, 0, b""),
+            )
+        ],
+        (),
+        2,
+        True,
+    ),
+    "keys": Target(_keys, [b"eva " + b"a1-Z." * 8 + b" crew,ops\n# no\nben " + b"b2+Y." * 8], (OSError,)),
+    "recording of a workcell": Target(_file(_mcap, ".mcap"), [_recorded(), _packed_again(_recorded())], (OSError,), 2),
     "stop request": Target(_stop_request, [bytes(16) + b"why", b"\xff" * 300], ()),
 }
 

@@ -16,6 +16,8 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.protocol.text import printable
+
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = 0x0B, 0x0C, 0x0D, 0x0E, 0x0F
@@ -23,8 +25,8 @@ HEAD = 9
 """Bytes before the content of a record: its kind and its length."""
 MESSAGE_HEAD = 22
 """Bytes before the data in the content of a message."""
-LONGEST = 1 << 30
-"""Bytes of one record that are believed."""
+LONGEST = 1 << 26
+"""Bytes of one record, or of an unpacked chunk, that are believed."""
 _RECORD = Struct("<BQ")
 _MESSAGE = Struct("<BQHIQQ")
 _CHUNK = Struct("<QQQI")
@@ -84,11 +86,15 @@ class Chunk:
             ModuleNotFoundError: zstandard is not installed.
         """
         data = self.data
+        if self.size > LONGEST:
+            raise Damaged(f"a chunk of {self.size} bytes; want at most {LONGEST}")
         if self.compression == "zstd":
             import zstandard
 
             try:
-                data = zstandard.ZstdDecompressor().decompress(data, max_output_size=min(self.size, LONGEST))
+                if zstandard.frame_content_size(data) not in (-1, self.size):  # it says what will be allocated
+                    raise Damaged("a chunk is not as long as it says")
+                data = zstandard.ZstdDecompressor().decompress(data, max_output_size=self.size)
             except zstandard.ZstdError as problem:
                 raise Damaged(f"a chunk cannot be unpacked: {problem}") from None
         elif self.compression:
@@ -160,8 +166,8 @@ class Parts:
         return value
 
     def text(self) -> str:
-        """Return the next string."""
-        return self.block().decode("utf-8", "replace")
+        """Return the next string, made fit to be shown."""
+        return printable(self.block().decode("utf-8", "replace"), LONGEST)
 
     def table(self) -> dict[str, str]:
         """Return the next map of strings."""

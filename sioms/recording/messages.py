@@ -16,9 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.documents import json_of
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.records import READ
+from sioms.protocol.text import printable
 
 from . import mcap
 
@@ -111,7 +113,9 @@ class Event:
             more, at = _text_at(data, at)
             at += -(at - 4) % 4
             (size,) = unpack_from("<I", data, at)
-            values = json.loads(more) if more else None
+            values = json_of(more) if more else None
+            if not isinstance(values, dict | None):
+                raise ValueError("its data is no object")
         except Exception as problem:
             raise mcap.Damaged(f"an event cannot be taken apart: {problem}") from None
         source, kind, node, who = words
@@ -125,7 +129,7 @@ def _text_at(data: bytes, at: int) -> tuple[str, int]:
     end = at + 4 + size
     if size < 1 or end > len(data):
         raise ValueError(f"a string of {size} bytes at {at}")
-    return data[at + 4 : end - 1].decode("utf-8", "replace"), end
+    return printable(data[at + 4 : end - 1].decode("utf-8", "replace"), mcap.LONGEST), end
 
 
 class Cdr:

@@ -6,10 +6,9 @@ is not.
 
 from __future__ import annotations
 
-import json
 import mmap
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from struct import unpack_from
@@ -18,15 +17,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.documents import json_of
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.records import READ
+from sioms.protocol.text import printable
 
 from . import mcap
 from .messages import CDR, EVENTS, Event
 
 PIECE = 8 << 20
 """Bytes of a live file that are looked at together."""
+MOST_CHANNELS = 1 << 16
+"""Of a node, as in a page of one on another machine."""
 
 
 @dataclass(slots=True)
@@ -83,6 +86,33 @@ class NodeRecord:
         return 32 + 8 * len(READ[self.info.node_class]) * len(self.info.channels)
 
 
+def node_of(packed: str) -> NodeInfo:
+    """Take the description of a node apart.
+
+    Raises:
+        mcap.Damaged: it is none.
+    """
+    try:
+        info = NodeInfo(json_of(packed))
+        words = [info.name, *[word for each in info.channels for word in (each.name, each.unit)]]
+        whole = 0 < len(info.channels) <= MOST_CHANNELS and type(info.bit) is int and -1 <= info.bit < 64
+        if not whole or not info.name or not all(type(w) is str and w.isprintable() and len(w) < 256 for w in words):
+            raise ValueError("want a name, channels with units, and a bit")
+    except (ValueError, TypeError) as problem:
+        raise mcap.Damaged(
+            f"the description of its node cannot be understood: {printable(str(problem), 120)}"
+        ) from None
+    return info
+
+
+def _offset_of(about: Mapping[str, str]) -> int | None:
+    """Return UTC minus CLOCK_MONOTONIC [ns], 0 where nothing is said of it; None for what is no such number."""
+    text = about.get("offset_ns", "")
+    if not text:
+        return 0
+    return int(text) if len(text) < 20 and text.isascii() and text.isdecimal() and int(text) < 1 << 62 else None
+
+
 @dataclass(slots=True)
 class Table:
     """Readings of a node.
@@ -127,6 +157,8 @@ class Recording:
         self.channels: dict[int, mcap.Channel] = {}
         self.metadata: list[tuple[str, dict[str, str]]] = []
         self.damage: list[str] = []
+        self._odd: list[str] = []
+        """Sentences about what the file says of itself."""
         self.is_packed = self._data[-8:] == mcap.MAGIC and size > 100
         self.size = size
         self._lengths: dict[int, int] = {}
@@ -151,8 +183,8 @@ class Recording:
 
     @property
     def offset_ns(self) -> int:
-        """UTC minus CLOCK_MONOTONIC [ns]."""
-        return int(self.about.get("offset_ns", "0") or 0)
+        """UTC minus CLOCK_MONOTONIC [ns]; 0 where the file does not tell."""
+        return _offset_of(self.about) or 0
 
     def _head(self) -> None:
         """Take up what stands before the first message; channels may come later, too."""
@@ -172,6 +204,10 @@ class Recording:
             entry = mcap.metadata_of(content)
             if entry not in self.metadata:
                 self.metadata.append(entry)
+                if _offset_of(entry[1]) is None:
+                    self._is_odd(
+                        f"the offset of its clocks is {printable(entry[1]['offset_ns'], 80)!r}; want nanoseconds"
+                    )
         elif kind == mcap.CHANNEL:
             channel = mcap.channel_of(content)
             if channel.number in self.channels:
@@ -181,12 +217,17 @@ class Recording:
                 self._events = channel.number
             if packed := channel.metadata.get("sioms"):
                 try:
-                    info = NodeInfo(values := json.loads(packed))
-                except (ValueError, TypeError):
-                    raise mcap.Damaged(f"the description of channel {channel.topic} cannot be understood") from None
-                node = NodeRecord(info, int(values[4]), channel.number)
+                    info = node_of(packed)
+                except mcap.Damaged as problem:
+                    self._is_odd(f"channel {printable(channel.topic, 80)}: {problem}")
+                    return
+                node = NodeRecord(info, info.bit, channel.number)
                 self.nodes[info.name] = node
                 self._known[np.array([node.size + 4 + mcap.MESSAGE_HEAD], "<u8").tobytes()] = channel.number
+
+    def _is_odd(self, text: str) -> None:
+        self._odd.append(text)
+        self.damage.append(text)
 
     # --- pieces ----------------------------------------------------------------------------------
 
@@ -197,7 +238,7 @@ class Recording:
             channels: what is wanted; None: all.
         """
         wanted = None if channels is None else frozenset(channels)
-        self.damage = []
+        self.damage = list(self._odd)
         at = begin = len(mcap.MAGIC)
         found: dict[int, list[int]] = {}
         ended = False
@@ -250,6 +291,8 @@ class Recording:
             for kind, start, stop in mcap.walk(records, 0, len(records)):
                 if kind == mcap.MESSAGE:
                     channel = int.from_bytes(records[start : start + 2], "little")
+                    if channel not in self.channels or stop - start < mcap.MESSAGE_HEAD:
+                        raise mcap.Damaged("a message in it is of no channel")
                     if wanted is None or channel in wanted:
                         found.setdefault(channel, []).append(start - mcap.HEAD)
                 else:

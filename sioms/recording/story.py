@@ -6,23 +6,33 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
+from sioms.protocol.text import printable
+
 from .messages import Event
 
 ENDINGS = ("device lost", "device late", "fork server died", "fork server killed")
 """Lines of the daemon's log that tell of a process that has died or hangs."""
 GAP_NS = 2_000_000_000
 """Events that are further apart than this do not belong to one story."""
+LONGEST = 2000
+"""Characters of a sentence at most."""
 _QUIET = ("began", "ended", "opened again", "closed")
 
 
 def utc(stamp_ns: int) -> str:
-    """Return a time [ns, UTC] in words, to the microsecond."""
+    """Return a time [ns, UTC] in words, to the microsecond; of one before 1970 or beyond 2262 the bare number."""
+    if not 0 <= stamp_ns < 1 << 63:
+        return f"{stamp_ns} ns"
     whole = datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).strftime("%Y-%m-%dT%H:%M:%S")
     return f"{whole}.{stamp_ns % 1_000_000_000 // 1000:06d}Z"
 
 
 def sentence(event: Event) -> str:
     """Return what an event tells, without its time."""
+    return printable(_sentence(event), LONGEST)
+
+
+def _sentence(event: Event) -> str:
     data = event.data or {}
     refused = f", refused: {event.text}" if event.error else ""
     match event.kind:
@@ -55,7 +65,9 @@ def sentence(event: Event) -> str:
             )
             return f"the daemon logged {data.get('level')}: {event.text}" + (f" ({more})" if more else "")
         case "request":
-            arguments = ", ".join(str(value) for value in data.get("arguments", ()) if value not in ("", None))
+            given = data.get("arguments")
+            given = given if isinstance(given, list) else [given]
+            arguments = ", ".join(str(value) for value in given if value not in ("", None))
             return f"{event.who} asked the daemon: {data.get('verb')} {arguments}".rstrip() + refused
         case "marker":
             return f"{data.get('device')} signalled marker {data.get('marker')}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import fcntl
 import os
 import signal
 import sys
@@ -92,6 +93,9 @@ def _tell(path: str, *, everything: bool) -> int:
 
 def _keep(folder: Path, memory: int, seconds: float) -> int:
     folder.mkdir(parents=True, exist_ok=True)
+    if not _lock(folder):
+        text = f"keep boxes in {folder}: another keeper is at work there; name another folder, or end that one"
+        raise OSError(errno.EBUSY, text)
     ended = False
 
     def end(_number: int, _frame: object) -> None:
@@ -126,11 +130,24 @@ def _keep(folder: Path, memory: int, seconds: float) -> int:
     return 0
 
 
+def _lock(folder: Path) -> bool:
+    """Lock a folder for the life of this process; return whether no keeper has."""
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(fd)
+        return False
+    return True
+
+
 def _write(folder: Path) -> str:
     """Have the keeper write a box; return its path."""
     before = set(folder.glob("*.mcap"))
     try:
         pid = int((folder / KEEPER).read_text())
+        if _lock(folder):  # it was killed: that number may be another's by now
+            raise ProcessLookupError
         os.kill(pid, signal.SIGUSR1)
     except (OSError, ValueError):
         text = f"no keeper is at work in {folder}; start one with `sioms blackbox --keep`"

@@ -107,7 +107,8 @@ def _info(path: str, with_events: bool) -> list[str]:
         gaps: dict[str, int] = {}
         for event in events:
             if event.source == "recorder" and event.kind == "lost":
-                gaps[event.node] = gaps.get(event.node, 0) + (event.data or {}).get("snapshots", 0)
+                lacks = (event.data or {}).get("snapshots", 0)
+                gaps[event.node] = gaps.get(event.node, 0) + (lacks if isinstance(lacks, int) else 0)
         for name, node in recording.nodes.items():
             channels = ", ".join(f"{c.name} [{c.unit}]" if c.unit else c.name for c in node.info.channels)
             missing = f", {gaps[name]} lost" if gaps.get(name) else ""

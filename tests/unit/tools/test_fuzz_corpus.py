@@ -6,12 +6,14 @@ from __future__ import annotations
 
 import random
 import time
+from struct import pack
 
 import pytest
 
 from sioms.bench.decoders import TARGETS, feed
 from sioms.bench.search import changed
 
+FRAMES, RECORDED = (TARGETS[name].seeds[0] for name in ("gateway", "recording of a workcell"))
 FOUND: dict[str, list[bytes]] = {
     "message": [
         b"\x91" * 30_000,
@@ -33,6 +35,18 @@ FOUND: dict[str, list[bytes]] = {
         b'{"at":1,"node":"n","device":"d","block":"b","parts":[[0,0,' + b"9" * 4000 + b']],"stop":true,"by":"a"}\n',
         b'{"at":' + b"9" * 400 + b',"workcell":"","stop":true,"by":"a"}\n',
         b'{"checkpoint":[],"from":1e999}\n',
+    ],
+    "gateway": [FRAMES.replace(pack(">d", 0.1), pack(">d", lease_s)) for lease_s in (1e-12, -1.0, float("inf"))],
+    "recording of a workcell": [
+        RECORDED.replace(good, bad)
+        for good, bad in (
+            (b"1" + b"0" * 18, b"x" * 19),
+            (b'["x", 3', b"[[ ], 3"),
+            (b"], -1, ", b"], [], "),
+            (b"], -1, ", b"], 1e9, "[:7]),
+            (b'[["a"', b"[[[ ]"),
+            (b'{"stop"', b'["stop"'),
+        )
     ],
 }
 """What broke a decoder, or would have."""
