@@ -5,6 +5,7 @@ from __future__ import annotations
 import _socket
 import asyncio
 import contextlib
+import dataclasses
 import errno
 import os
 import signal
@@ -13,7 +14,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 
 import pytest
 
@@ -32,27 +32,52 @@ WORK = {
 }
 
 
-@pytest.fixture(params=WORK)
-def peer(request: pytest.FixtureRequest) -> Iterator[tuple[str, Channel, socket.socket]]:
-    """What a process does, a channel on which it owes the answers, and the other end of that."""
-    process = subprocess.Popen([sys.executable, "-c", WORK[request.param]])
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    behind = (os.getpid(), process.pid)
-    channel = Channel(_socket.socket(fileno=ours.detach()), "peer", False, behind=behind)
-    time.sleep(0.3)  # until it does what it is to do
-    yield request.param, channel, theirs
-    channel.close()
-    theirs.close()
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+@dataclasses.dataclass
+class Case:
+    """A process, and how many ask it at once; 0 is a session of asyncio."""
 
+    does: str
+    threads: int
+    outcomes: list[tuple[object, float]] = dataclasses.field(default_factory=list)
 
-def _judge(does: str, outcome: object, took_s: float) -> None:
-    if does == "starved":
-        assert outcome == "late but right" and ANSWERED_S <= took_s < MOST_S
-    else:
-        assert isinstance(outcome, OSError) and outcome.errno == errno.ETIMEDOUT and "hung" in str(outcome)
-        assert took_s == pytest.approx(GRACE_S, abs=0.7)
+    def run(self) -> None:
+        """Ask, and keep what came of it and after how long [s]."""
+        process = subprocess.Popen([sys.executable, "-c", WORK[self.does]])
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        channel = Channel(_socket.socket(fileno=ours.detach()), "peer", False, behind=(os.getpid(), process.pid))
+        try:
+            time.sleep(0.5)  # until it does what it is to do
+            answering = [threading.Thread(target=_answer, args=(theirs,)) for _ in range(self.threads or 1)]
+            asking = [threading.Thread(target=self._ask, args=(channel,)) for _ in range(self.threads)]
+            for thread in answering + asking:
+                thread.start()
+            if not self.threads:
+                asyncio.run(self._await(channel))
+            for thread in answering + asking:
+                thread.join()
+        finally:
+            channel.close()
+            theirs.close()
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+
+    def _ask(self, channel: Channel) -> None:
+        began = time.monotonic()
+        try:
+            outcome: object = channel.call(Call("ask", Keepalive())).value
+        except OSError as error:
+            outcome = error
+        self.outcomes.append((outcome, time.monotonic() - began))
+
+    async def _await(self, channel: Channel) -> None:
+        requests = _Requests(channel, CancelOnHandle)
+        began = time.monotonic()
+        try:
+            outcome: object = (await requests.call(Call("ask", Keepalive()))).value
+        except OSError as error:
+            outcome = error
+        self.outcomes.append((outcome, time.monotonic() - began))
+        requests.close()
 
 
 def _answer(sock: socket.socket) -> None:
@@ -62,46 +87,28 @@ def _answer(sock: socket.socket) -> None:
         sock.send(reply(number, "late but right"))
 
 
-@pytest.mark.parametrize("threads", [1, 3])
-def test_blocking(peer: tuple[str, Channel, socket.socket], threads: int) -> None:
-    does, channel, sock = peer
-    outcomes: list[tuple[object, float]] = []
-
-    def ask() -> None:
-        began = time.monotonic()
-        try:
-            outcome: object = channel.call(Call("ask", Keepalive())).value
-        except OSError as error:
-            outcome = error
-        outcomes.append((outcome, time.monotonic() - began))
-
-    asking = [threading.Thread(target=ask) for _ in range(threads)]
-    answering = [threading.Thread(target=_answer, args=(sock,)) for _ in range(threads)]
-    for thread in asking + answering:
+@pytest.fixture(scope="module")
+def cases() -> dict[tuple[str, int], Case]:
+    """All cases, waited for side by side."""
+    found = [Case(does, threads) for does in WORK for threads in (0, 1, 3)]
+    running = [threading.Thread(target=case.run) for case in found]
+    for thread in running:
         thread.start()
-    for thread in asking + answering:
+    for thread in running:
         thread.join()
+    return {(case.does, case.threads): case for case in found}
+
+
+@pytest.mark.parametrize("threads", [1, 3, 0], ids=["one thread", "three threads", "asyncio"])
+@pytest.mark.parametrize("does", WORK)
+def test_who_is_late_is_waited_for_and_who_hangs_is_told(
+    cases: dict[tuple[str, int], Case], does: str, threads: int
+) -> None:
+    outcomes = cases[does, threads].outcomes
+    assert len(outcomes) == (threads or 1)
     for outcome, took_s in outcomes:
-        _judge(does, outcome, took_s)
-    assert len(outcomes) == threads
-
-
-def test_asyncio(peer: tuple[str, Channel, socket.socket]) -> None:
-    does, channel, sock = peer
-
-    async def ask() -> tuple[object, float]:
-        requests = _Requests(channel, CancelOnHandle)
-        began = time.monotonic()
-        try:
-            outcome: object = (await requests.call(Call("ask", Keepalive()))).value
-        except OSError as error:
-            outcome = error
-        took_s = time.monotonic() - began
-        requests.close()
-        return outcome, took_s
-
-    answering = threading.Thread(target=_answer, args=(sock,))
-    answering.start()
-    outcome, took_s = asyncio.run(ask())
-    answering.join()
-    _judge(does, outcome, took_s)
+        if does == "starved":
+            assert outcome == "late but right" and ANSWERED_S <= took_s < MOST_S
+        else:
+            assert isinstance(outcome, OSError) and outcome.errno == errno.ETIMEDOUT and "hung" in str(outcome)
+            assert took_s == pytest.approx(GRACE_S, abs=0.7)
