@@ -260,6 +260,10 @@ class Clients:
                 return self._workcell.emergency_stop(session, message)
             case verbs.Reset():
                 return self._workcell.reset(session, message)
+            case verbs.Alarms():
+                return self._workcell.alarms(session)
+            case verbs.Acknowledge():
+                return self._workcell.acknowledge(session, message)
             case verbs.Reload():
                 return self._workcell.reload(session, number, message)
             case verbs.Cancel(waiting):

@@ -6,6 +6,7 @@ validated by the driver's ``Settings`` in the fork server, so that every device 
 
 from __future__ import annotations
 
+import math
 import os.path
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -15,6 +16,7 @@ import msgspec
 from msgspec import Meta
 
 from sioms.documents import DEEPEST
+from sioms.protocol.flags import Reaction
 from sioms.wording import choices, did_you_mean, every_error, explain, field_names
 
 Table = TypeVar("Table", bound=msgspec.Struct)
@@ -87,23 +89,53 @@ class StopSourceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     on_loss: Literal["stop", "none"] = "stop"
 
 
+ReactionName = Literal["none", "stop_node", "stop_device", "stop_workcell"]
+
+
 class AlarmTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[[alarm]]``: limits of the channels of an analog node, minor inside and major outside."""
+    """``[[alarm]]``: limits of a column of the channels of a node, minor inside and major outside, or the state of a
+    binary node; and what is stopped when they are reached, or cannot be judged.
+    """
 
     node: str
+    column: str = ""
     lolo: float | None = None
     low: float | None = None
     high: float | None = None
     hihi: float | None = None
     hysteresis: Annotated[float, Meta(ge=0)] = 0.0
+    state: Literal[0, 1] | None = None
+    severity: Literal["minor", "major"] = "major"
+    on_minor: ReactionName = "none"
+    on_major: ReactionName = "none"
+    on_invalid: ReactionName | None = None
 
     def __post_init__(self) -> None:
         limits = [limit for limit in (self.lolo, self.low, self.high, self.hihi) if limit is not None]
-        if not limits:
-            raise ValueError("no limit given; want at least one of lolo, low, high, hihi")
+        if self.state is not None and limits:
+            raise ValueError("a state and limits; want state of a binary node, limits of any other")
+        if not limits and self.state is None:
+            raise ValueError("no limit given; want at least one of lolo, low, high, hihi, or state of a binary node")
         if limits != sorted(limits):
             given = ", ".join(f"{limit:g}" for limit in limits)
             raise ValueError(f"limits {given}; want lolo < low < high < hihi")
+
+    def limits(self) -> list[float]:
+        """Return lolo, low, high, hihi, infinite where there is none, and the hysteresis."""
+        if self.state is not None:
+            found: list[float] = [-math.inf, -math.inf, math.inf, math.inf]
+            found[{(0, "major"): 0, (0, "minor"): 1, (1, "minor"): 2, (1, "major"): 3}[self.state, self.severity]] = (
+                self.state
+            )
+            return [*found, 0.0]
+        low = [-math.inf if limit is None else limit for limit in (self.lolo, self.low)]
+        high = [math.inf if limit is None else limit for limit in (self.high, self.hihi)]
+        return [*low, *high, self.hysteresis]
+
+    def reactions(self) -> list[int]:
+        """Return the Reaction to each severity: to what cannot be read that to a major alarm, unless it is told."""
+        names = (self.on_minor, self.on_major, self.on_major if self.on_invalid is None else self.on_invalid)
+        return [int(Reaction[name.upper()]) for name in names]
 
 
 class Device(msgspec.Struct, frozen=True):

@@ -59,6 +59,9 @@ class Owner(Protocol):
     def device_hung(self, device: DriverProcess, reason: str) -> None:
         """The driver has missed its lease."""
 
+    def device_ticks(self, device: DriverProcess) -> None:
+        """The driver ticks again."""
+
     def stopped_of(self, device: str) -> list[list[Any]]:
         """Return what of a device is stopped and must be so from its driver's start."""
 
@@ -255,6 +258,8 @@ class DriverProcess:
             self._patience.renew(now_ns / 1e9)
             self._owner.device_hung(self, f"its driver has not ticked for {age_ns / 1e9:.3f} s")
         elif age_ns < self._lease_s * 1e9:
+            if self.hung:
+                self._owner.device_ticks(self)
             self.hung = False
         if self.hung and self._patience is not None and (why := self._patience.stuck(now_ns / 1e9)):
             self.kill(f"its driver hung for {age_ns / 1e9:.2f} s and was killed: {why}")

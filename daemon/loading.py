@@ -6,7 +6,6 @@ Everything is checked before anything is touched, and all errors of all devices 
 from __future__ import annotations
 
 import errno
-import math
 import os
 import pwd
 import stat
@@ -18,17 +17,22 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from sioms.protocol.flags import NodeClass, Reaction
 from sioms.protocol.messages import MalformedMessage, unpack_compressed
+from sioms.protocol.records import READ, VALUE
 from sioms.protocol.text import printable
+from sioms.wording import did_you_mean
 
-from .config import Config, parse
+from .config import AlarmTable, Config, parse
 from .fork_server import DIED, ForkServer
 from .fork_server_process import ForkServerProcess
 from .lines import with_lines
 from .loop import Loop, Timer
-from .names import DeviceInfo, NameTable, shared_claims
+from .names import DeviceInfo, NameTable, Node, shared_claims
 from .patience import Patience
 
+UNWATCHED = ("changed_ns", "flags", "status")
+"""Columns that are no quantity."""
 LARGEST = 16 << 20
 """Of a configuration [bytes]."""
 LOOK_S = 1.0
@@ -55,7 +59,7 @@ class Plan:
         stop_sources: for each device with emergency-stop inputs [block, channel, bit, active] lists.
         watched_inputs: for each device the blocks with emergency-stop inputs that must be readable, and the node of
             one.
-        alarms: for each device with alarm limits [block, channels, lolo, low, high, hihi, hysteresis] lists.
+        alarms: for each device with alarms what drivers make a Rule of.
     """
 
     config: Config
@@ -233,16 +237,49 @@ class Loader:
         return found
 
     def _alarms(self, names: NameTable) -> dict[str, list[list[Any]]]:
-        found: dict[str, list[list[Any]]] = {}
+        found: dict[str, dict[tuple[object, ...], list[Any]]] = {}
         for number, alarm in enumerate(self._config.alarms, 1):
             node = names.nodes.get(alarm.node)
-            if node is None or names.block(node).node_class.name != "ANALOG":
-                names.errors.append(f"[[alarm]] number {number}: node = {alarm.node}; want the name of an analog node")
+            why = why_no_alarm(alarm, node, names)
+            if why or node is None:
+                names.errors.append(f"[[alarm]] number {number}: {why}")
                 continue
-            low = [-math.inf if limit is None else limit for limit in (alarm.lolo, alarm.low)]
-            high = [math.inf if limit is None else limit for limit in (alarm.high, alarm.hihi)]
-            found.setdefault(node.device, []).append([node.block, list(node.channels), *low, *high, alarm.hysteresis])
-        return found
+            column = alarm.column or VALUE[names.block(node).node_class]
+            for channel in node.channels:
+                rule = [
+                    node.block, channel, node.bit, column, *alarm.limits(), *alarm.reactions(), alarm.node,
+                    list(node.channels),
+                ]  # fmt: skip
+                found.setdefault(node.device, {})[node.block, channel, node.bit, column] = rule
+        return {device: list(rules.values()) for device, rules in found.items()}
+
+
+def why_no_alarm(alarm: AlarmTable, node: Node | None, names: NameTable) -> str:
+    """Return what is wrong with an alarm on a node, '' when nothing is."""
+    if node is None:
+        return f"node = {alarm.node}, which does not exist{did_you_mean(alarm.node, names.nodes)}"
+    block = names.block(node)
+    columns, cls = READ[block.node_class], block.node_class.name.lower()
+    watched = [name for name in columns if name not in UNWATCHED]
+    if alarm.column and alarm.column not in watched:
+        return f"column = {alarm.column}; want one of the {cls} node {alarm.node}: {', '.join(watched)}"
+    is_bit = block.node_class is NodeClass.BINARY and all(
+        node.bit >= 0 or block.channels[channel].width <= 1 for channel in node.channels
+    )
+    if alarm.state is not None and not is_bit:
+        return f"state = {alarm.state}; {alarm.node} is no binary node of single bits: want limits, or one bit"
+    if is_bit and alarm.state is None and alarm.column in ("", "data"):
+        return f"{alarm.node} is a binary node of single bits; want state = 0 or 1 in the place of limits"
+    device = names.devices[node.device].blocks
+    for key, reaction in zip(("on_minor", "on_major", "on_invalid"), alarm.reactions(), strict=True):
+        stops_none = {
+            Reaction.STOP_NODE: not block.writable,
+            Reaction.STOP_DEVICE: not any(each.writable for each in device),
+        }.get(Reaction(reaction), False)
+        if stops_none:
+            what = alarm.node if reaction == Reaction.STOP_NODE else f"device {node.device}"
+            return f"{key} = {Reaction(reaction).name.lower()}; {what} has no outputs to stop: want stop_workcell"
+    return ""
 
 
 def _read(path: str) -> str:

@@ -76,6 +76,15 @@ class DeviceInfo:
         )
 
 
+def part_name(device: DeviceInfo, block: int, channel: int, bit: int) -> str:
+    """Return the name of the node that shows one channel of a device, or one bit of it (-1: all)."""
+    info = device.blocks[block]
+    name = f"{device.name}.{info.name}" if info.name else device.name
+    if len(info.channels) > 1 or info.node_class is not NodeClass.BINARY:
+        name += f".{info.channels[channel].name}"
+    return name if bit < 0 else f"{name}.bit{bit}"
+
+
 def shared_claims(devices: Iterable[DeviceInfo]) -> list[str]:
     """Return a sentence for each device that wants what one before it has already: a port, a unit, a line."""
     errors, owners = [], dict[str, str]()
@@ -113,6 +122,14 @@ class Node:
     def claims(self) -> list[Claim]:
         """Return what an open of this node owns: nothing for a read-only one."""
         return [] if self.read_only else [(self.device, self.block, channel, self.bit) for channel in self.channels]
+
+
+def shows(node: Node, part: Node) -> bool:
+    """Whether a node shows all that another one, of one channel or bit, shows."""
+    return (
+        (node.device, node.block) == (part.device, part.block)
+        and set(part.channels) <= set(node.channels) and node.bit in (-1, part.bit)
+    )  # fmt: skip
 
 
 class NameTable:

@@ -21,6 +21,7 @@ from sioms.protocol.stopjournal import NODE, PID, node_entry, parts_of, workcell
 from sioms.protocol.verbs import Message
 
 from . import suspended
+from .alarm_keeper import AlarmKeeper
 from .clients import Clients
 from .config import Config
 from .devices import DriverProcess, State
@@ -30,7 +31,7 @@ from .listening import Listening
 from .loading import Loader, Plan, mistake
 from .log import Log
 from .loop import Loop
-from .names import NameTable, Node
+from .names import NameTable, Node, part_name
 from .realtime import LOOK_S, Budget, make_ordinary, realtime_use
 from .rights import Rights
 from .shared import Shared
@@ -77,6 +78,7 @@ class Server:
         self._ending = False
         self._request_seen = self.shared.request.mark
         self._budget = Budget(log)
+        self.alarms = AlarmKeeper(self, record.path + ".alarms")
         self._restore_stops()
         self.clients.welcome()
         self._alive()
@@ -279,6 +281,7 @@ class Server:
 
     def device_up(self, device: DriverProcess) -> None:
         """Give the new process the pages it reads, and its page to those that read it."""
+        self.alarms.of_device(device.name, "driver", "")
         for other in self.devices.values():
             for name in other.info.inputs:
                 if other is device or self.names.nodes[name].device == device.name:
@@ -308,6 +311,7 @@ class Server:
         """Void the handles of a process that is no more, and stop what is tied to it."""
         device.trouble = ""
         self.clients.nodes.device_gone(device, reason)
+        self.alarms.gone(device, reason)
         if device.state is not State.DOWN and device.device.common.on_loss == "stop":
             self.stop_workcell(f"device {device.name} lost: {reason}")
         if device.state is not State.DOWN:
@@ -317,9 +321,14 @@ class Server:
     def device_hung(self, device: DriverProcess, reason: str) -> None:
         """Report a missed lease, and stop what is tied to the device."""
         self.log("warning", "device late", device=device.name, reason=reason)
+        self.alarms.hung(device, reason)
         if device.device.common.on_loss == "stop":
             self.stop_workcell(f"device {device.name}: {reason}")
         self._look_at_stop_inputs(device)
+
+    def device_ticks(self, device: DriverProcess) -> None:
+        """Note that a driver that had missed its lease ticks again."""
+        self.alarms.of_device(device.name, "driver", "")
 
     def _look_at_stop_inputs(self, device: DriverProcess) -> None:
         """Stop the workcell when an input of a device that is to stop it cannot be read: it may be pressed."""
@@ -351,10 +360,15 @@ class Server:
                     state=state.name.lower(),
                     reason=reason,
                 )
+                if state is not PageState.STARTING:
+                    self.alarms.of_device(device.name, "link", "" if good else reason or state.name.lower())
                 if not good and device.device.common.on_loss == "stop":
                     self.stop_workcell(f"device {device.name}: {reason}")
                 if not good:
                     self._look_at_stop_inputs(device)
+            case driver_verbs.AlarmChanged(block, channel, bit, what, severity, text):
+                node = part_name(device.info, block, channel, bit)
+                self.alarms.take(node, device.name, what, severity, text)
             case driver_verbs.LogLine(level, text):
                 if text.startswith("fault of "):
                     device.trouble = text
@@ -386,6 +400,7 @@ class Server:
         self.config, self.names, self._fork_server = plan.config, plan.names, plan.fork_server
         self._watched_inputs = plan.watched_inputs
         self._options = {name: self._options_of(name, plan) for name in plan.config.devices}
+        self.alarms.look_at_plan(plan)
         self.clients.take_up_rights(rights)
         try:
             why = self.shared.files.entitle(rights.who_may_stop())
@@ -490,6 +505,7 @@ class Server:
         if self._ending and not self._leaving:
             if self._fork_server is not None:
                 self._fork_server.close()
+            self.alarms.close()
             self.loop.running = False
 
     def _alive(self) -> None:

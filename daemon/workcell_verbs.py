@@ -15,13 +15,15 @@ from sioms.protocol.flags import PROTOCOL_VERSION, Right
 from sioms.protocol.messages import refusal, reply
 from sioms.protocol.text import printable
 
+from .alarms import Alarm
 from .devices import State
 from .journals import for_reading
+from .names import shows
 from .rights import Peer
 from .sessions import LATER, Refused, Session
 
 if TYPE_CHECKING:
-    from sioms.protocol.verbs import EmergencyStop, Hello, Reload, Report, Represent, Reset
+    from sioms.protocol.verbs import Acknowledge, EmergencyStop, Hello, Reload, Report, Represent, Reset
 
     from .clients import Clients
     from .server import Server
@@ -146,6 +148,32 @@ class WorkcellVerbs:
             kept.append((user, session.name, str(session), now_ns, printable(text, 400)))
         self._reports = kept[-REPORTS:]
         self._server.log(level, "report", peer=session, text=printable(text, 1000))
+
+    def alarms(self, session: Session) -> list[dict[str, Any]]:
+        """List the alarms on what the session may read."""
+        rights = self._clients.rights
+        return [
+            alarm.packed() for alarm in self._server.alarms if rights.on_node(session.peer, alarm.node) & Right.READ
+        ]  # fmt: skip
+
+    def acknowledge(self, session: Session, message: Acknowledge) -> list[dict[str, Any]]:
+        """Acknowledge the alarms of a node or device, '' = all that the session may."""
+        (name, note), nodes, alarms = message, self._server.names.nodes, self._server.alarms
+        what = f"acknowledge {name or 'all alarms'}"
+        named = self._clients.nodes.find(session, what, name, message.right) if name in nodes else None
+        if name and named is None and name not in self._server.devices:
+            raise Refused(errno.ENOENT, f"{what}: no such node or device; `sioms alarms` lists all alarms")
+        parts, others = list[Alarm](), list[Alarm]()
+        for alarm in alarms:
+            there = nodes.get(alarm.node)
+            if alarm.node == name or (named and there and shows(named, there)):
+                parts.append(alarm)
+            elif name in ("", alarm.device):
+                others.append(alarm)
+        allowed = [a for a in others if self._clients.rights.on_node(session.peer, a.node) & message.right]
+        if named is None and others and not parts + allowed:
+            raise Refused(errno.EPERM, f"{what}: {session.peer.user} has no right to write or administer it")
+        return [alarm.packed() for alarm in alarms.acknowledge(parts + allowed, str(session), note)]
 
     def emergency_stop(self, session: Session, message: EmergencyStop) -> None:
         """Stop the workcell, or a node."""

@@ -39,6 +39,7 @@ COMMANDS: dict[str, Command] = {
     "stop": Command("sioms.tools.cell", "emergency stop of a node or of the whole workcell"),
     "reset": Command("sioms.tools.cell", "clear a latched stop or fault"),
     "reload": Command("sioms.tools.cell", "make the daemon reload its configuration"),
+    "alarms": Command("sioms.tools.alarms", "list alarms; acknowledge them"),
     "record": Command("sioms.recording.command.record", "record everything that nodes publish and are told"),
     "log": Command("sioms.recording.command.log", "show, plot, export, cut and merge recordings"),
     "replay": Command("sioms.recording.command.replay", "serve a recording as read-only nodes"),

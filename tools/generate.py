@@ -303,6 +303,8 @@ def bash() -> str:
         "    fi",
         "    case ${COMP_WORDS[1]} in",
         f'    {" | ".join(_NODE_COMMANDS)}) mapfile -t COMPREPLY < <(compgen -W "$(_sioms_nodes)" -- "$word") ;;',
+        "    alarms) if ((COMP_CWORD == 2)); then mapfile -t COMPREPLY < <(compgen -W 'ack --json' -- \"$word\")",
+        '        else mapfile -t COMPREPLY < <(compgen -W "$(_sioms_nodes) --all --message" -- "$word"); fi ;;',
         "    driver) _sioms_driver ;;",
         '    *) mapfile -t COMPREPLY < <(compgen -f -- "$word") ;;',
         "    esac",
@@ -349,6 +351,7 @@ def zsh() -> str:
         "    else",
         "        case $words[2] in",
         f"        {'|'.join(_NODE_COMMANDS)}) _sioms_nodes ;;",
+        "        alarms) ((CURRENT == 3)) && compadd ack || _sioms_nodes ;;",
         f"        driver) ((CURRENT == 3)) && compadd {' '.join(driver_actions())} || _files ;;",
         "        *) _files ;;",
         "        esac",
@@ -377,6 +380,8 @@ def fish() -> str:
         f"complete -c sioms -n '__fish_seen_subcommand_from {' '.join(_NODE_COMMANDS)}' -f -a '(sioms list --names "
         "2>/dev/null)'"
     )
+    lines.append("complete -c sioms -n '__fish_seen_subcommand_from alarms' -f -a ack")
+    lines.append("complete -c sioms -n '__fish_seen_subcommand_from ack' -f -a '(sioms list --names 2>/dev/null)'")
     lines.append(
         "complete -c sioms -n 'test (count (commandline -opc)) -eq 2; and __fish_seen_subcommand_from driver' "
         f"-f -a '{' '.join(driver_actions())}'"

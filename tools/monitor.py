@@ -92,6 +92,7 @@ class Watch:
         self.ended = threading.Event()
         self._only = only
         self._status: dict[str, Any] = {}
+        self._alarms: list[dict[str, Any]] = []
         self._entries: list[NodeEntry] = []
         self._nodes: dict[str, Any] = {}
         self._why: dict[str, str] = {}
@@ -113,7 +114,7 @@ class Watch:
                 cell = Workcell(name="sioms monitor")
             entries = [e for e in cell.nodes() if not e.name.endswith(READONLY)] if self._only else cell.nodes()
             self._entries = [e for e in entries if (e.name in self._only if self._only else not is_part(e, entries))]
-            self._status = cell.status()
+            self._status, self._alarms = cell.status(), cell.alarms()
             self._open(cell)
             self.cell, self.lost = cell, ""
         except OSError as error:
@@ -146,7 +147,8 @@ class Watch:
         now_ns = monotonic_ns()
         nodes = [self._look(entry, now_ns) for entry in list(self._entries)]
         clock = strftime("%H:%M:%S", localtime())
-        return View(self._status if self.cell else {}, nodes, self.lost, message, now_ns, clock=clock, jog=jog)
+        status, alarms = (self._status, self._alarms) if self.cell else ({}, [])
+        return View(status, nodes, self.lost, message, now_ns, clock=clock, jog=jog, alarms=alarms)
 
     def _look(self, entry: NodeEntry, now_ns: int) -> NodeView:
         node = self._nodes.get(entry.name)

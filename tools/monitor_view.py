@@ -8,8 +8,10 @@ from enum import Enum
 from textwrap import wrap
 from typing import Any
 
-from sioms.protocol.flags import AnalogStatus, AxisStatus, NodeClass
+from sioms.protocol.flags import AnalogStatus, AxisStatus, NodeClass, Severity
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
+
+from .alarms import acknowledged, ordered, word
 
 KEYS = "space, e: EMERGENCY STOP  R: reset  tab, c: jog  h: history  arrows  q: quit"
 JOG_KEYS = "space, e: EMERGENCY STOP  left, right: jog  < >: step  + -: speed  c: let go"
@@ -95,6 +97,7 @@ class View:
         events: what has happened, as lines, oldest first.
         history: whether the events are shown instead of the nodes.
         jog: the axis that is chosen, if one is.
+        alarms: as the daemon lists them.
     """
 
     status: dict[str, Any]
@@ -106,6 +109,7 @@ class View:
     events: Sequence[str] = ()
     history: bool = False
     jog: Jog | None = None
+    alarms: Sequence[dict[str, Any]] = ()
 
 
 def screen(view: View, width: int, height: int, scroll: int) -> tuple[list[Text], int]:
@@ -195,6 +199,7 @@ def head(view: View, width: int = 120, height: int = 1000) -> list[Text]:
                     f"{why}"
                 )
                 lines.append(Text(text.removesuffix(": "), Style.WARN))
+    lines += alarm_lines(view.alarms)
     lines += [Text(text, Style.ALARM) for text in _wrapped([f"{who}: {what}" for who, what in faults(view)], width)]
     if len(lines) > height:
         hidden = len(lines) - height + 1
@@ -203,6 +208,18 @@ def head(view: View, width: int = 120, height: int = 1000) -> list[Text]:
             Text(f"and {hidden} more lines of errors; enlarge the window to see them", Style.ALARM),
         ]
     return [*lines, Text("")]
+
+
+def alarm_lines(alarms: Sequence[dict[str, Any]]) -> list[Text]:
+    """Return the alarms, those first that want attention; present faults and losses stand beside them already."""
+    lines = []
+    for alarm in ordered(alarms):
+        if alarm["severity"] and alarm["what"] in ("driver", "fault", "link"):
+            continue
+        is_urgent = alarm["state"] == "unacknowledged" and alarm["severity"] >= Severity.MAJOR
+        text = f"{alarm['state']} {word(alarm['severity'] or alarm['worst'])} alarm of {alarm['node']} {alarm['what']}"
+        lines.append(Text(f"{text}: {alarm['text']}{acknowledged(alarm)}", Style.ALARM if is_urgent else Style.WARN))
+    return lines
 
 
 def faults(view: View) -> list[tuple[str, str]]:

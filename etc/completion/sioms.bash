@@ -33,11 +33,13 @@ _sioms_driver() {
 _sioms() {
     local word=${COMP_WORDS[COMP_CWORD]}
     if ((COMP_CWORD == 1)); then
-        mapfile -t COMPREPLY < <(compgen -W 'demo init list info status wait monitor stop reset reload record log replay blackbox check service serve key driver bench tactile reconcile --help --version' -- "$word")
+        mapfile -t COMPREPLY < <(compgen -W 'demo init list info status wait monitor stop reset reload alarms record log replay blackbox check service serve key driver bench tactile reconcile --help --version' -- "$word")
         return
     fi
     case ${COMP_WORDS[1]} in
     info | monitor | reset | stop) mapfile -t COMPREPLY < <(compgen -W "$(_sioms_nodes)" -- "$word") ;;
+    alarms) if ((COMP_CWORD == 2)); then mapfile -t COMPREPLY < <(compgen -W 'ack --json' -- "$word")
+        else mapfile -t COMPREPLY < <(compgen -W "$(_sioms_nodes) --all --message" -- "$word"); fi ;;
     driver) _sioms_driver ;;
     *) mapfile -t COMPREPLY < <(compgen -f -- "$word") ;;
     esac

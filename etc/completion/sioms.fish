@@ -68,6 +68,7 @@ complete -c sioms -n __fish_use_subcommand -a monitor -d 'display all nodes live
 complete -c sioms -n __fish_use_subcommand -a stop -d 'emergency stop of a node or of the whole workcell'
 complete -c sioms -n __fish_use_subcommand -a reset -d 'clear a latched stop or fault'
 complete -c sioms -n __fish_use_subcommand -a reload -d 'make the daemon reload its configuration'
+complete -c sioms -n __fish_use_subcommand -a alarms -d 'list alarms; acknowledge them'
 complete -c sioms -n __fish_use_subcommand -a record -d 'record everything that nodes publish and are told'
 complete -c sioms -n __fish_use_subcommand -a log -d 'show, plot, export, cut and merge recordings'
 complete -c sioms -n __fish_use_subcommand -a replay -d 'serve a recording as read-only nodes'
@@ -81,6 +82,8 @@ complete -c sioms -n __fish_use_subcommand -a bench -d 'measure latencies and th
 complete -c sioms -n __fish_use_subcommand -a tactile -d 'design, calibrate and measure elastic fingers'
 complete -c sioms -n __fish_use_subcommand -a reconcile -d 'identify missing effects of a model from measurements'
 complete -c sioms -n '__fish_seen_subcommand_from info monitor reset stop' -f -a '(sioms list --names 2>/dev/null)'
+complete -c sioms -n '__fish_seen_subcommand_from alarms' -f -a ack
+complete -c sioms -n '__fish_seen_subcommand_from ack' -f -a '(sioms list --names 2>/dev/null)'
 complete -c sioms -n 'test (count (commandline -opc)) -eq 2; and __fish_seen_subcommand_from driver' -f -a 'list check trace replay'
 complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from list' -l help
 complete -c sioms -n '__fish_seen_subcommand_from driver; and __fish_seen_subcommand_from list' -l json

@@ -418,6 +418,39 @@ class WorkcellVerbs(Generic[M]):
         """Clear the latched stop of the workcell or of a node. Nothing resumes by itself."""
         await self._ask("reset", verbs.Reset(node))
 
+    # --- alarms ----------------------------------------------------------------------------------
+
+    @verb
+    async def alarms(self) -> list[dict[str, Any]]:
+        """Return the alarms that are active, or that nobody has acknowledged yet, on nodes that this user may read.
+
+        Returns:
+            A map each: ``node`` (of one channel or bit, or a device), ``device``, ``what`` (the column that is watched,
+            "fault", "link" or "driver"), ``severity`` and ``worst`` (as Severity), ``state`` ("unacknowledged",
+            "acknowledged", "returned": to normal, and nobody has acknowledged it), ``text``, ``since`` [s, UTC],
+            ``times`` it has been raised, ``by``, ``at`` [s, UTC] and ``note`` of who has acknowledged it.
+        """
+        alarms: list[dict[str, Any]] = await self._ask("list alarms", verbs.Alarms())
+        return alarms
+
+    @verb
+    async def acknowledge(self, node: str = "", note: str = "") -> list[dict[str, Any]]:
+        """Acknowledge alarms, on behalf of this user.
+
+        Args:
+            node: a node or device, with all its parts; '' = all on which this user has the right.
+            note: what to tell others.
+
+        Returns:
+            Those that nobody had acknowledged before, as ``alarms``.
+
+        Raises:
+            OSError: ENOENT, no such node; EPERM, without the right to write or to administer it.
+        """
+        what = f"acknowledge {node or 'all alarms'}"
+        done: list[dict[str, Any]] = await self._ask(what, verbs.Acknowledge(node, printable(str(note), 200)))
+        return done
+
     @verb
     async def reload(self) -> None:
         """Let the daemon take up its configuration anew.

@@ -30,6 +30,7 @@ class DriverVerb(IntEnum):
     STOPPED = 23
     LINK = 24
     LOG = 25
+    ALARM = 26
 
 
 class ForkServerVerb(IntEnum):
@@ -150,6 +151,19 @@ class LinkChanged(Message, on=FROM_DRIVER, verb=DriverVerb.LINK, notice=True):
 
     state: Integer
     reason: Text
+
+
+class AlarmChanged(Message, on=FROM_DRIVER, verb=DriverVerb.ALARM, notice=True):
+    """What a channel's alarm is now, of one bit of it (-1: all): a Severity, and why. ``what`` is the column that is
+    watched, or "fault".
+    """
+
+    block: Integer
+    channel: Integer
+    bit: Integer
+    what: Text
+    severity: Integer
+    text: Text
 
 
 class LogLine(Message, on=FROM_DRIVER, verb=DriverVerb.LOG, notice=True):

@@ -104,6 +104,25 @@ class AnalogStatus(IntFlag):
         return 2 if int(self) & 0x62 else 1 if int(self) & 0x1D else 0
 
 
+class Severity(IntEnum):
+    """How bad an alarm is; the words are those of EPICS."""
+
+    NONE = 0
+    MINOR = 1
+    MAJOR = 2
+    INVALID = 3
+    """What is to be watched cannot be read."""
+
+
+class Reaction(IntEnum):
+    """What an alarm stops, until that is reset."""
+
+    NONE = 0
+    STOP_NODE = 1
+    STOP_DEVICE = 2
+    STOP_WORKCELL = 3
+
+
 class Request(IntEnum):
     """ioctl requests (dissertation, table F.5, and beyond it from STOP on); see ``REQUESTS``."""
 

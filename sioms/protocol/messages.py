@@ -84,6 +84,8 @@ class ClientVerb(IntEnum):
     EMERGENCY_STOP = 20
     RESET = 21
     RELOAD = 22
+    ALARMS = 23
+    ACKNOWLEDGE = 24
     CANCEL = 30
 
 

@@ -326,6 +326,21 @@ class Reload(Message, on=FROM_CLIENT, verb=ClientVerb.RELOAD, right=Right.ADMINI
     """Reload the configuration. Answer: all errors; if there are any, nothing has changed."""
 
 
+class Alarms(Message, on=FROM_CLIENT, verb=ClientVerb.ALARMS, query=True):
+    """List the alarms on the nodes that the user may read. Answer: a map each."""
+
+
+class Acknowledge(
+    Message, on=FROM_CLIENT, verb=ClientVerb.ACKNOWLEDGE, right=Right.WRITE | Right.ADMINISTER
+):  # fmt: skip
+    """Acknowledge the alarms of a node or a device, '' = all on which the user has the right. Answer: a map for each
+    that has been acknowledged by this.
+    """
+
+    node: Name
+    note: Text
+
+
 class Cancel(Message, on=FROM_CLIENT, verb=ClientVerb.CANCEL):
     """Cancel a waiting request of this session. Answer: whether there was one."""
 

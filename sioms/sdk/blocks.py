@@ -8,9 +8,8 @@ Concurrency: owned by the one thread of the driver process.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -213,12 +212,3 @@ class AxisBlock:
 
 
 AnyBlock = AxisBlock | AnalogBlock | BinaryBlock
-
-
-def set_alarms(blocks: Sequence[AnyBlock], alarms: Sequence[Sequence[Any]]) -> None:
-    """Give analog blocks their alarm limits: [block, channels, lolo, low, high, hihi, hysteresis] each."""
-    for number, channels, *limits in alarms:
-        block = blocks[number]
-        if isinstance(block, AnalogBlock):
-            block.alarms = block.alarms or Alarms(block.n)
-            block.alarms.watch(channels, *limits)

@@ -31,17 +31,19 @@ class Pages:
         blocks: the blocks.
         lease_ns: how old the stamp of life may get.
         generation: of the driver process.
-        told: called with state and reason when the device behind blocks gets, or loses, a good link.
+        told: called with blocks, state and reason when the device behind them gets, or loses, a good link.
 
     Attributes:
         fds: descriptors of the pages in the order of the blocks, until they have been handed over.
+        watch: called with each block that has been published, and its time stamp [ns]; None: nobody watches.
     """
 
     def __init__(
         self, device: str, blocks: Sequence[AnyBlock], lease_ns: int, generation: int,
-        told: Callable[[PageState, str], None],
+        told: Callable[[Sequence[AnyBlock], PageState, str], None],
     ) -> None:  # fmt: skip
         self._told = told
+        self.watch: Callable[[AnyBlock, int], None] | None = None
         self.fds: list[int] = []
         self._writers: dict[int, PageWriter] = {}
         self._words: dict[int, NDArray[np.int64]] = {}
@@ -74,6 +76,8 @@ class Pages:
         subscribers = self._subscribers[key]
         if subscribers:
             self._wake(block, subscribers)
+        if self.watch is not None:
+            self.watch(block, stamp_ns)
 
     def record(self, block: AnyBlock) -> Page:
         """Return the page of a block for steps that publish it; ``lend`` and ``take_back`` around them."""
@@ -129,7 +133,7 @@ class Pages:
                 self._writers[id(block)].set_state(state, reason)
                 changed = True
         if changed:
-            self._told(state, reason)
+            self._told(blocks, state, reason)
 
     def is_good(self, blocks: Sequence[AnyBlock]) -> bool:
         """Whether all these blocks have a good link."""

@@ -35,8 +35,9 @@ from sioms.protocol.text import printable
 from sioms.protocol.verbs import Message, take
 from sioms.turns import Turns
 
+from .alarms import AlarmWatch
 from .attachments import SHARES, Attachments
-from .blocks import AnyBlock, AxisBlock, set_alarms
+from .blocks import AnyBlock, AxisBlock
 from .driver import Driver, LineDriver, StreamDriver, TickDriver
 from .effects import Effects
 from .engine import Engine
@@ -141,7 +142,6 @@ class Runtime:
         self._ticked_ns = 0
         self.driver = driver.variant(settings)(device, settings, self)
         self.blocks = list(self.driver.blocks)
-        set_alarms(self.blocks, options["alarms"])
         self._kept = keep_positions(str(options["state_folder"]), device, self.blocks, self.log)
         lease_ns = int(float(options.get("lease_s") or description.lease_s) * 1e9)
         self.pages = Pages(device, self.blocks, lease_ns, generation, self._link_changed)
@@ -151,6 +151,8 @@ class Runtime:
             self.latch, request, StopJournal(fds[5]), options["stop_sources"],
             self.journal,
         )  # fmt: skip
+        self.alarms = AlarmWatch(self.blocks, options["alarms"], self.tell, self.stops.stop_by_alarm)
+        self.pages.watch = self.alarms.look if options["alarms"] else None
         parts = Parts(self, self.blocks, self.outputs, self.effects, self.waits, self.pages, self.stops, self.log)
         self.engine = self.stops.engine = self._make_engine(parts)
         service = Service(
@@ -164,8 +166,7 @@ class Runtime:
         self._stops_workcell = bool(options["stop_sources"])
         self._is_used = False
         self._lead_ns = self.engine.lead_ns if isinstance(self.engine, TickEngine) else 0
-        self._announced = self._slack_ns = 0
-        self._spare_until_ns = 0
+        self._announced = self._slack_ns = self._spare_until_ns = 0
         self._expired, self._sees_requests = 0, False
         self._quiet: QuietRun | None = None
 
@@ -217,15 +218,17 @@ class Runtime:
             self._line_due_ns = when_ns
             self._line_timer.set(0 if when_ns is None else max(when_ns, 1))
 
-    def _link_changed(self, state: PageState, reason: str) -> None:
+    def _link_changed(self, blocks: Sequence[AnyBlock], state: PageState, reason: str) -> None:
         self.journal.note(Note.LINK, time.monotonic_ns(), state.name, printable(reason))
         self.tell(driver_verbs.LinkChanged(int(state), printable(reason)))
+        self.alarms.lose(blocks, state, printable(reason))
 
     def after_publication(self, now_ns: int, shown: Sequence[AnyBlock]) -> None:
         """Look at what a publication of some blocks may have brought about."""
         self.stops.take_events()
         self.waits.check(now_ns, shown)
         self.stops.look_at_inputs()
+        self.alarms.react()
 
     # --- life ------------------------------------------------------------------------------------
 
@@ -265,7 +268,7 @@ class Runtime:
 
     def _make_quiet(self) -> QuietRun | None:
         """Return what ticks by compiled steps; None where a tick has to look at more than they do."""
-        if self._lead_ns or self._stops_workcell or not self._sees_requests:
+        if self._lead_ns or self._stops_workcell or self.pages.watch or not self._sees_requests:
             return None
         return quiet_run(
             self.driver, self._epoll.fileno(), self._timer.fd, self._latch_words, self.period_ns, self._daemon_lease_ns,

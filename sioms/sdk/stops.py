@@ -16,14 +16,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sioms.motion import EventKind
-from sioms.protocol.driver_verbs import Stopped
-from sioms.protocol.flags import PageState
+from sioms.protocol.driver_verbs import AlarmChanged, Stopped
+from sioms.protocol.flags import PageState, Reaction, Severity
 from sioms.protocol.journal import JournalWriter, Note
 from sioms.protocol.latch import Latch
 from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.stopjournal import StopJournal, channels_and_bits, node_entry, parts_of, workcell_entry
 from sioms.protocol.verbs import Message
 
+from .alarms import Rule
 from .blocks import AnyBlock, AxisBlock, BinaryBlock
 from .effects import Effects
 from .engine import Engine
@@ -99,6 +100,7 @@ class Stops:
     ) -> None:  # fmt: skip
         self.stopped = False
         self.latched_outputs: dict[tuple[int, int, int], str] = {}
+        self._faulty: set[tuple[int, int]] = set()
         self._unsafe: dict[int, tuple[int, int]] = {}
         """Blocks with safe values that could not be set: when that was logged, and failures since."""
         self._device, self._blocks = device, blocks
@@ -262,6 +264,19 @@ class Stops:
                         names = ", ".join(block.spec.channels[a].name for a in event.axes[:4])
                         self._events.note(Note.FAULT, time.monotonic_ns(), names, event.text)
                         self._log("error", f"fault of {names}: {event.text}")
+                        for axis in event.axes:
+                            self._tell_fault(block, int(axis), Severity.MAJOR, event.text)
+
+    def _tell_fault(self, block: AxisBlock, axis: int, severity: Severity, text: str) -> None:
+        """Tell the daemon that an axis is in fault, or is not any more."""
+        if severity:
+            self._faulty.add((id(block), axis))
+        elif (id(block), axis) not in self._faulty:
+            return
+        else:
+            self._faulty.discard((id(block), axis))
+        number = next(i for i, each in enumerate(self._blocks) if each is block)
+        self._tell(AlarmChanged(number, axis, -1, "fault", severity, text))
 
     def _stop_axes(self, reason: Reason, parts: Iterable[Part]) -> None:
         now_ns = time.monotonic_ns()
@@ -318,6 +333,23 @@ class Stops:
         what = f"emergency stop of {handle.node}" if stop else f"reset of {handle.node}"
         self._log("warning", f"{what} by {handle.who}")
         self._note(node_entry(handle.node, self._device, spec.name, parts, source, stop=stop, pid=os.getpid()))
+
+    def stop_by_alarm(self, reaction: Reaction, block: AnyBlock, rule: Rule, why: str) -> None:
+        """Stop what an alarm is to stop: the node that it watches, the whole device, or the workcell."""
+        source = f"alarm of {rule.node}: {why}"
+        if reaction is Reaction.STOP_WORKCELL:
+            self.stop_workcell(source)
+            return
+        whole = [(each, range(each.n), -1, self._name(each)) for each in self._blocks]
+        node = [(block, rule.stops, rule.bit, rule.node)]
+        for each, channels, bit, name in node if reaction is Reaction.STOP_NODE else whole:
+            if not isinstance(each, AxisBlock) and not each.spec.writable:
+                continue
+            self.stop_node(each, channels, bit, source)
+            spec = each.spec
+            parts = [part for c in channels for part in parts_of(int(c), bit, spec.channels[c].width)]
+            self._log("warning", f"emergency stop of {name} by {source}")
+            self._note(node_entry(name, self._device, spec.name, parts, source, stop=True, pid=os.getpid()))
 
     def restore(self, stopped: Iterable[tuple[str, list[list[int]], str, str]]) -> None:
         """Stop what was stopped when the process before this one ended, before anything can move.
@@ -415,6 +447,8 @@ class Stops:
         return ".".join(part for part in (self._device, block.spec.name) if part)
 
     def _reset_axes(self, block: AxisBlock, channels: Any) -> None:
+        for axis in channels:
+            self._tell_fault(block, int(axis), Severity.NONE, "it has been reset")
         block.bank.reset(np.array(channels, dtype=np.intp))
         self.engine.commands_written(block)
 

@@ -14,6 +14,7 @@ from sioms.protocol.driver_verbs import (
     FROM_DRIVER,
     TO_DRIVER,
     TO_FORK_SERVER,
+    AlarmChanged,
     Attach,
     Describe,
     Detach,
@@ -63,6 +64,8 @@ from sioms.protocol.text import MAX_TEXT
 from sioms.protocol.verbs import (
     FROM_CLIENT,
     ON_HANDLE,
+    Acknowledge,
+    Alarms,
     Cancel,
     CancelOnHandle,
     Close,
@@ -124,6 +127,8 @@ RECORDED: list[tuple[Message, str]] = [
     (Status(), "920605"),
     (Journal("mod0"), "930805a46d6f6430"),
     (Report("info", "well"), "940905a4696e666fa477656c6c"),
+    (Alarms(), "921705"),
+    (Acknowledge("mod0", "seen"), "941805a46d6f6430a47365656e"),
     (ReserveMarker(2, True), "940a0502c3"),
     (FreeMarker(562949953421312), "930b05cf0002000000000000"),
     (SignalMarker(7), "930c0507"),
@@ -157,6 +162,7 @@ RECORDED: list[tuple[Message, str]] = [
     (MarkerSignalled(9), "93160509"),
     (Stopped("io0.bit3"), "931705a8696f302e62697433"),
     (LinkChanged(2, "unplugged"), "94180502a9756e706c7567676564"),
+    (AlarmChanged(0, 1, -1, "fault", 2, "stalled"), "981a050001ffa56661756c7402a77374616c6c6564"),
     (LogLine("error", "no"), "941905a56572726f72a26e6f"),
     (
         Describe("mod0", "sim-axis", {"a": [1, True]}, "/etc"),

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from sioms.daemon import clients as clients_module
+from sioms.daemon.alarm_keeper import AlarmKeeper
 from sioms.daemon.clients import Clients
 from sioms.daemon.config import GrantTable, NodeTable, QuotaTable, WorkcellTable
 from sioms.daemon.devices import State
@@ -84,6 +85,7 @@ class Workcell:
             load=lambda done, begin: self.loads.append((done, begin)),
             is_replaced=lambda _name: self.is_replaced, look_at_use=lambda: None,
         )  # fmt: skip
+        self.server.alarms = AlarmKeeper(self.server, "/nowhere/alarms")
         self.listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.clients = Clients(self.server, self.listener, "test.sock")
         self.sessions: dict[str, Session] = {}
@@ -154,6 +156,7 @@ ON_NODES: dict[str, tuple[Callable[[Workcell, str], int | None], list[Right]]] =
     "info": (lambda c, node: c.ask("eva", ClientVerb.INFO, node), [Right.READ]),
     "stop": (lambda c, node: c.ask("eva", ClientVerb.EMERGENCY_STOP, node, ""), [Right.STOP]),
     "reset": (lambda c, node: c.ask("eva", ClientVerb.RESET, node), [EITHER]),
+    "acknowledge": (lambda c, node: c.ask("eva", ClientVerb.ACKNOWLEDGE, node, ""), [EITHER]),
 }
 """What is asked for on a node, and the rights that it takes: one of each entry."""
 ON_ALL: dict[str, tuple[Callable[[Workcell], int | None], Right]] = {
@@ -173,6 +176,7 @@ FREE: dict[ClientVerb, tuple[list[object], int]] = {
     ClientVerb.HELLO: ([PROTOCOL_VERSION, "test"], 0),
     ClientVerb.LIST: ([], 0),
     ClientVerb.STATUS: ([], 0),
+    ClientVerb.ALARMS: ([], 0),
     ClientVerb.CANCEL: ([77], 0),
     ClientVerb.CLOSE: ([77], errno.EBADF),
     ClientVerb.FREE_MARKER: ([5], errno.EINVAL),
@@ -188,6 +192,7 @@ def test_no_verb_is_left_out() -> None:
         ClientVerb.INFO,
         ClientVerb.EMERGENCY_STOP,
         ClientVerb.RESET,
+        ClientVerb.ACKNOWLEDGE,
         ClientVerb.RELOAD,
         ClientVerb.JOURNAL,
     }
@@ -226,6 +231,22 @@ def test_a_verb_on_the_workcell_takes_its_right_on_every_node(cell: Workcell, ri
             shown = [entry[0] for entry in cell.value]
             wanted = [n for n in cell.server.names.nodes if fnmatch.fnmatchcase(n, pattern)]
             assert shown == (wanted if granted & Right.READ else [])
+
+
+def test_alarms_are_seen_and_acknowledged_by_who_has_the_rights(cell: Workcell) -> None:
+    cell.grant((["read"], "eva", "*"), (["write"], "eva", "io0.bit1"), (["write"], "eva", "grip"))
+    for bit in (0, 1):
+        cell.server.alarms.take(f"io0.bit{bit}", "io0", "data", 2, "it reads 1")
+    cell.server.alarms.of_device("io0", "link", "unplugged")
+    assert cell.ask("tom", ClientVerb.ALARMS) == 0 and cell.value == []
+    assert cell.ask("eva", ClientVerb.ALARMS) == 0 and len(cell.value) == 3
+    assert cell.ask("tom", ClientVerb.ACKNOWLEDGE, "", "") == errno.EPERM
+    assert cell.ask("eva", ClientVerb.ACKNOWLEDGE, "io9", "") == errno.ENOENT
+    assert cell.ask("eva", ClientVerb.ACKNOWLEDGE, "io0", "") == errno.EPERM, "it is more than the two bits"
+    assert cell.ask("eva", ClientVerb.ACKNOWLEDGE, "grip", "looked at it") == 0
+    assert [(a["node"], a["state"], a["note"]) for a in cell.value] == [("io0.bit0", "acknowledged", "looked at it")]
+    assert "eva" in cell.value[0]["by"]
+    assert cell.ask("eva", ClientVerb.ACKNOWLEDGE, "", "") == 0 and [a["node"] for a in cell.value] == ["io0.bit1"]
 
 
 @pytest.mark.parametrize("taken", ["write", "stop", "administer", "read"])

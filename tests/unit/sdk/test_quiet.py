@@ -42,7 +42,7 @@ class Cell:
         ]
         settings = msgspec.convert({"axis": axes}, SimAxes.Settings)
         self.driver = SimAxes("mod0", settings, Kit())
-        self.pages = Pages("mod0", self.driver.blocks, 10**9, 1, lambda state, reason: None)
+        self.pages = Pages("mod0", self.driver.blocks, 10**9, 1, lambda blocks, state, reason: None)
         self.instants = np.zeros(2, dtype=np.int64)
         steps = self.driver.quiet_steps(self.pages, self.instants)
         self.steps = steps if by_steps else None

@@ -194,3 +194,21 @@ def test_a_dumb_terminal_is_not_painted(monkeypatch: pytest.MonkeyPatch, term: s
     monkeypatch.setattr("sioms.tools.monitor.sys", SimpleNamespace(stdout=terminal, stdin=terminal))
     monkeypatch.setenv("TERM", term)
     assert monitor._can_paint() is paints
+
+
+def test_alarms_stand_in_the_head_those_first_that_want_attention():
+    alarm = {"node": "mod0.xaxis", "what": "force", "text": "force 12 N has reached 10 N", "since": 1.0, "by": "",
+             "note": "", "worst": 2, "severity": 2, "state": "unacknowledged"}  # fmt: skip
+    alarms = [
+        {**alarm, "state": "acknowledged", "by": "eva", "note": "seen"},
+        {**alarm, "what": "fault"},
+        {**alarm, "what": "position", "severity": 0, "state": "returned"},
+        alarm,
+    ]
+    lines = head(View(status(), [], "", "", 0, alarms=alarms))[1:-1]
+    assert [line.text for line in lines] == [
+        "unacknowledged major alarm of mod0.xaxis force: force 12 N has reached 10 N",
+        "returned major alarm of mod0.xaxis position: force 12 N has reached 10 N",
+        "acknowledged major alarm of mod0.xaxis force: force 12 N has reached 10 N [acknowledged by eva: seen]",
+    ]
+    assert [line.style for line in lines] == [Style.ALARM, Style.WARN, Style.WARN]

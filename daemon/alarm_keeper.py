@@ -1,0 +1,136 @@
+"""The daemon's alarms: what drivers tell and what it sees itself, in the list, in the log, and kept over its end.
+
+Concurrency: everything runs in the daemon's loop.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from sioms.protocol.flags import Reaction, Severity
+
+from .alarms import Alarm, AlarmFile, AlarmList
+from .devices import DriverProcess, State
+from .names import Node, part_name
+
+if TYPE_CHECKING:
+    from .loading import Plan
+    from .server import Server
+
+KEPT_S = 0.1
+"""How long a change may wait to be kept [s]."""
+OF_DEVICES = ("driver", "fault", "link")
+"""Alarms that nobody configures."""
+
+
+class AlarmKeeper:
+    """All alarms of a workcell.
+
+    Args:
+        server: the daemon.
+        path: of the file in which they are kept.
+    """
+
+    def __init__(self, server: Server, path: str) -> None:
+        self._server = server
+        self._list = AlarmList(self._changed)
+        self._file = AlarmFile(path)
+        self._is_kept = True
+        try:
+            self._list.restore(self._file.load())
+        except (OSError, ValueError, TypeError) as error:
+            server.log("error", "alarms of before lost", path=path, why=str(error))
+        for alarm in self:  # of all others their drivers tell soon what is the matter now
+            if alarm.what == "fault":
+                self.take(alarm.node, alarm.device, "fault", Severity.NONE, "")
+
+    def __iter__(self) -> Iterator[Alarm]:
+        return iter(self._list)
+
+    def take(self, node: str, device: str, what: str, severity: int, text: str) -> None:
+        """Take what a condition is now; see AlarmList."""
+        self._list.take(node, device, what, severity, text, time.time())
+
+    def acknowledge(self, alarms: Iterable[Alarm], by: str, note: str) -> list[Alarm]:
+        """Acknowledge alarms; return those that nobody had acknowledged before."""
+        return self._list.acknowledge(alarms, by, note, time.time())
+
+    def of_device(self, device: str, what: str, why: str) -> None:
+        """Take what is wrong with the link to a device, or with its driver; '' = nothing."""
+        self.take(device, device, what, Severity.MAJOR if why else Severity.NONE, why)
+
+    def look_at_plan(self, plan: Plan) -> None:
+        """Take for over what nobody watches any more by the configuration of now."""
+        watched = {
+            (part_name(plan.names.devices[device], block, channel, bit), what)
+            for device, rules in plan.alarms.items() for block, channel, bit, what, *_ in rules
+        }  # fmt: skip
+        for alarm in self:
+            of_device = alarm.what in OF_DEVICES and alarm.device in plan.config.devices
+            if not of_device and (alarm.node, alarm.what) not in watched:
+                self.take(alarm.node, alarm.device, alarm.what, Severity.NONE, "")
+
+    def hung(self, device: DriverProcess, reason: str) -> None:
+        """Take a driver for one that does not watch."""
+        self.of_device(device.name, "driver", reason)
+        self._react(device, reason)
+
+    def gone(self, device: DriverProcess, reason: str) -> None:
+        """Take what a driver has watched for unknown; of one that was told to end, its successor tells."""
+        if device.state is State.DOWN:
+            for alarm in self:
+                if alarm.device == device.name and alarm.what in OF_DEVICES:
+                    self.take(alarm.node, alarm.device, alarm.what, Severity.NONE, "")
+            return
+        self.of_device(device.name, "driver", reason)
+        self._list.lose(device.name, f"its driver does not watch it: {reason}", time.time())
+        for block, channel, bit, what, *_ in device.options.get("alarms", ()):
+            node = part_name(device.info, block, channel, bit)
+            self.take(node, device.name, what, Severity.INVALID, f"its driver does not watch it: {reason}")
+        if not device.hung:
+            self._react(device, reason)
+
+    def _react(self, device: DriverProcess, reason: str) -> None:
+        """Stop what alarms stop that cannot be judged: their driver does not."""
+        server = self._server
+        for *_, reaction, name, _ in device.options.get("alarms", ()):
+            source = f"alarm of {name}: its driver does not watch it: {reason}"
+            nodes: list[Node] = []
+            match Reaction(reaction):
+                case Reaction.STOP_WORKCELL:
+                    server.stop_workcell(source)
+                case Reaction.STOP_NODE:
+                    nodes = [server.names.nodes[name]] if name in server.names.nodes else []
+                case Reaction.STOP_DEVICE:
+                    nodes = [
+                        Node(device.name, device.name, i, tuple(range(len(block.channels))), -1, False)
+                        for i, block in enumerate(device.info.blocks) if block.writable
+                    ]  # fmt: skip
+            for node in nodes:
+                with suppress(OSError):  # it is noted, and holds when the driver is there again
+                    server.stop_node(node, source)
+
+    def _changed(self, event: str, alarm: Alarm) -> None:
+        by = {"by": alarm.by, "note": alarm.note} if event == "acknowledged" else {}
+        self._server.log(
+            "warning" if event == "raised" else "info", "alarm", device=alarm.device, node=alarm.node, what=alarm.what,
+            change=event, severity=Severity(alarm.severity).name.lower(), text=alarm.text, **by,
+        )  # fmt: skip
+        if self._is_kept:
+            self._is_kept = False
+            self._server.loop.after(KEPT_S, self._keep)
+
+    def _keep(self) -> None:
+        self._is_kept = True
+        try:
+            self._file.keep(self._list.entries())
+        except OSError as error:
+            self._server.log("error", "not kept", what="alarms", path=self._file.path, why=error.strerror)
+
+    def close(self) -> None:
+        """Keep what has changed last."""
+        if not self._is_kept:
+            self._keep()
