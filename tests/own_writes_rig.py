@@ -7,12 +7,14 @@ the operating system does is replaced: the clock, the timers, the sleep of a rea
 from __future__ import annotations
 
 import _socket
+import importlib.util
 import os
 import random
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from types import ModuleType
 from typing import Any
 
 import msgspec
@@ -20,7 +22,9 @@ import numpy as np
 import pytest
 
 import sioms.client.node_core
+import sioms.native.language
 import sioms.sdk.connected
+import sioms.sdk.quiet
 from sioms.client import shown
 from sioms.client.channel import Call, Channel
 from sioms.client.local import LocalPage
@@ -35,11 +39,13 @@ from sioms.protocol.messages import encode
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BinaryBlock, BlockSpec, Description
 from sioms.sdk.drive_axes import AxesUnit
-from sioms.sdk.driver import Driver, Kit, LineDriver, LineUnit, StreamDriver
+from sioms.sdk.driver import Driver, Kit, LineDriver, LineUnit, StreamDriver, TickDriver
 from sioms.sdk.exchange import Exchange, Steps
+from sioms.sdk.quiet import QuietRun
 from sioms.sdk.runtime import Runtime
 from sioms.sdk.settings import LineSettings
 
+SEED = int(os.environ.get("SIOMS_SEED", "0"))
 Done = Callable[[Any], None]
 
 
@@ -102,6 +108,10 @@ class World:
         table: its settings.
         chance: of the order.
         device: replies to what the driver sends on its line; None for a driver without.
+
+    Attributes:
+        between: what others do while a tick is under way: called at some of its looks at the clock.
+        quiet: how many ticks were done by the quiet steps.
     """
 
     def __init__(
@@ -130,7 +140,9 @@ class World:
         self.runtime._scheduled_ns = time.monotonic_ns()
         self.runtime.looked_ns = time.monotonic_ns()
         self.page_fds = list(self.runtime.pages.fds)
-        self.ticks = 0
+        self.ticks = self.quiet = 0
+        self.between: Callable[[], object] | None = None
+        self._run = self._quiet_run()
         for _ in range(400):
             self.turn(calm=True)
             if self.runtime.pages.is_good(self.runtime.blocks) and all(
@@ -141,7 +153,8 @@ class World:
 
     def open(self, block: int, channels: Sequence[int], *, exclusive: bool, bit: int = -1, uid: int = 1000) -> Client:
         """Open a node as the daemon does."""
-        number = len(self.clients) + 1
+        self.runtime._wake()
+        number = max((client.node.handle for client in self.clients), default=0) + 1
         shown_block = self.runtime.blocks[block]
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         readable, wake = os.pipe2(os.O_NONBLOCK)
@@ -174,6 +187,13 @@ class World:
         self.clients.append(Client(self, node, channel))
         return self.clients[-1]
 
+    def close_node(self, client: Client) -> None:
+        """Close a node as the daemon does when its client has."""
+        self.runtime._wake()
+        self.clients.remove(client)
+        client.node.release()
+        self.runtime.clients.drop(self.runtime.clients.handles[client.node.handle])
+
     def serve(self, client: Client) -> None:
         """Let the driver serve what a client has sent."""
         handle = self.runtime.clients.handles[client.node.handle]
@@ -186,15 +206,58 @@ class World:
         CLOCK.now_ns = max(CLOCK.now_ns, runtime._scheduled_ns + step_ns * (skipped + 1))
         runtime._timer.expired = skipped + 1  # type: ignore[attr-defined]
         self.ticks += 1
-        runtime._on_timer()
+        CLOCK.intrude = self._intrude if self.between else None
+        if not self._tick_quietly():
+            runtime._on_timer()
         if runtime._announced:
             runtime._on_line_timer()
+        CLOCK.intrude = None
         self.latch.daemon_alive(CLOCK.now_ns)
         while True:
             try:
                 self.control.recv(1 << 16)
             except BlockingIOError:
                 return
+
+    def _intrude(self) -> None:
+        if self.between and self.chance.random() < 0.02:
+            CLOCK.intrude = None
+            self.between()
+            CLOCK.intrude = self._intrude
+
+    def _quiet_run(self) -> QuietRun | None:
+        """Return what ticks by steps, if the driver has any: a copy in Python with the rig's clock and events."""
+        runtime = self.runtime
+        if not isinstance(runtime.driver, TickDriver) or any(block.spec.writable for block in runtime.blocks):
+            return None
+        instants = np.zeros(2, dtype=np.int64)
+        steps = runtime.driver.quiet_steps(runtime.pages, instants)
+        if steps is None:
+            return None
+        with _in_python("sioms.sdk.quiet_step") as module:
+            module.clock_ns, module.wait_for = CLOCK, self._wait_for
+            module.expirations = lambda _: runtime._timer.expirations()
+            self.run_quietly = module.run
+            return QuietRun(
+                steps, 0, 1, runtime._latch_words, runtime.period_ns, runtime._daemon_lease_ns, instants,
+                runtime.pages, runtime.stops, runtime.waits, runtime.clients, runtime.statistics,
+            )  # fmt: skip
+
+    def _wait_for(self, poll: int, ready: Any) -> int:
+        """Say that the timer is due, until that has been heard; then that a signal has ended the wait."""
+        ready[0] = 1
+        return 1 if self.runtime._timer.expired else 0  # type: ignore[attr-defined]
+
+    def _tick_quietly(self) -> bool:
+        """Tick by steps; False when the tick is the loop's."""
+        if self._run is None or not self.runtime.clients.handles or self.runtime._idling.periods > 1:
+            return False
+        ready = self._run.wait(self.runtime._scheduled_ns, self.runtime.tick)
+        if ready is None:
+            return False
+        self.runtime._resume(self._run.record)
+        self.quiet += self._run.record.done
+        return not ready
 
     def turn(self, *, calm: bool = False) -> None:
         """Let one thing happen: a tick, perhaps a late one, or something on the line."""
@@ -239,10 +302,26 @@ class World:
         self.control.close()
 
 
+@contextmanager
+def _in_python(name: str) -> Iterator[ModuleType]:
+    """Load a module of steps once more, as Python, and have the kit make its records of it."""
+    spec = importlib.util.find_spec(name)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sioms.native.language, "library", None)
+        spec.loader.exec_module(module)
+        patch.setattr(sioms.sdk.quiet, "Quiet", module.Quiet)
+        yield module
+
+
 class _Clock:
     now_ns = 10_000_000_000
+    intrude: Callable[[], None] | None = None
 
     def __call__(self) -> int:
+        if self.intrude:
+            self.intrude()
         self.now_ns += 1
         return self.now_ns
 
@@ -262,6 +341,7 @@ def own_time(world: list[World]) -> Iterator[None]:
         patch.setattr(sioms.client.node_core, "monotonic_ns", CLOCK)
         patch.setattr(sioms.client.node_core, "sleep", sleep)
         patch.setattr("sioms.sdk.runtime.TimerFd", _Timer)
+        patch.setattr(sioms.sdk.quiet, "run", lambda record: world[0].run_quietly(record))
         patch.setattr(sioms.sdk.connected, "open_connection", lambda settings, _: world_device(world, settings))
         yield
 
@@ -276,7 +356,7 @@ def worlds() -> Iterator[Callable[..., World]]:
 
         def make(driver: type[Driver], table: dict[str, Any], seed: int, device: Device | None = None) -> World:
             made[:] = [World.__new__(World)]
-            made[0].__init__(driver, table, random.Random(seed), device)  # type: ignore[misc]
+            made[0].__init__(driver, table, random.Random(seed + 1000 * SEED), device)  # type: ignore[misc]
             return made[0]
 
         yield make

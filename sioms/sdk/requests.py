@@ -24,7 +24,7 @@ from .driver import Awaited, Refusal
 from .handles import LATER, Handle, Wait
 from .parts import Service
 from .stops import Reason, Stop
-from .writing import check_link
+from .writing import check_link, end_writes
 
 FEW_TICKS = 1000
 """Ticks that statistics are told of when nobody asks for more."""
@@ -135,7 +135,7 @@ def _axis_request(
     bank, axes, now_ns = handle.block.bank, handle.channels, service.loop.now_ns()  # type: ignore[union-attr]
     match request:
         case Request.WAIT_UNTIL_IDLE:
-            if bank.is_idle(axes):
+            if bank.is_idle(axes) and not handle.writing:
                 if not service.engine.publishes:  # it may have learned so since the last publication
                     service.effects.note()
                 return None
@@ -143,8 +143,8 @@ def _axis_request(
             service.waits.add(
                 Wait(
                     handle, number, what, service.loop.deadline(timeout_s),
-                    lambda: (None,) if service.waits.is_idle(block, channels) else None, channels, looks=True,
-                    on_events=True,
+                    lambda: (None,) if not handle.writing and service.waits.is_idle(block, channels) else None,
+                    channels, looks=True, on_events=not handle.writing,
                 )
             )  # fmt: skip
             return LATER
@@ -170,6 +170,7 @@ def _axis_request(
             reason = Reason(Stop.CONTROLLED, f"stopped by {handle.who}", errno.ECANCELED)
             service.stops.safe_stop(reason, [(handle.block, handle.axes, -1)])
         case Request.FLUSH:
+            end_writes(service, handle.writing, "flushed")
             bank.flush(axes)
         case Request.HOME:
             check_link(service, handle, what)

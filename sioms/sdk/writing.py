@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import errno
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from sioms.protocol.flags import NodeClass, WriteFlag
 from sioms.protocol.records import WRITE_STRUCT, numpy_dtype
 
 from .blocks import AnyBlock, AxisBlock, BinaryBlock
-from .handles import LATER, Handle, Wait
+from .handles import LATER, Handle, Wait, Writing
 from .outputs import WHOLE, Change, safe_of
 from .parts import Service
 
@@ -172,15 +172,18 @@ class AxesWrite:
     def _end_older(self) -> None:
         """What replaces the buffer also replaces what is on its way into it."""
         writing = self._handle.writing
-        older = writing[: writing.index(self)] if self in writing else list(writing)
-        if older:
-            leaving = [write.leave for write in older]
-            self._service.waits.end_where(
-                lambda w: w.cancelled in leaving, errno.ECANCELED, "replaced by a later write"
-            )
+        older = writing[: writing.index(self)] if self in writing else writing
+        end_writes(self._service, older, "replaced by a later write")
 
     def _refusal(self, errno_: int, text: str) -> OSError:
         return OSError(errno_, f"write {self._handle.node}: {text}")
+
+
+def end_writes(service: Service, writes: Sequence[Writing], text: str) -> None:
+    """Refuse writes that are on their way into the buffers."""
+    if writes:
+        leaving = [write.leave for write in writes]
+        service.waits.end_where(lambda w: w.cancelled in leaving, errno.ECANCELED, text)
 
 
 def _next(judgement: Judgement) -> Judged | None:

@@ -1,7 +1,7 @@
 """Whatever the order of requests, readings, ticks and replies: no reading is older than what was acknowledged.
 
 The suite tries a few thousand orders; ``SIOMS_INTERLEAVINGS=1000000 pytest tests/properties/test_own_writes.py`` a
-million.
+million, with SIOMS_SEED=2 others.
 """
 
 from __future__ import annotations
@@ -65,6 +65,11 @@ class Promises:
 
         return done
 
+    def glance(self, node: NodeCore) -> None:
+        """Read if that need not wait."""
+        if node.is_shown():
+            self.read(node)
+
     def read(self, node: NodeCore) -> None:
         """Read, and look whether all shows that was promised before, and has not been touched since."""
         before = dict(self.held)
@@ -95,7 +100,7 @@ def make_world() -> Any:
 def _axis_acts(
     world: World, promises: Promises, owner: Client, other: Client | None, number: int
 ) -> list[Callable[[], None]]:
-    """Return all that can be asked of an axis, and of the workcell it is in."""
+    """Return all that can be asked of an axis, and of the workcell it is in; some of it in the middle of a tick, too."""
     chance = world.chance
     markers: list[tuple[int, int]] = []
     gates = [0]  # written since the axis was told to stop
@@ -225,6 +230,9 @@ def _axis_acts(
     acts += [lambda b=b: stop_node(b) for b in (False, True)]  # type: ignore[misc]
     acts += [lambda b=b: reset_node(b) for b in (False, True)] * 2  # type: ignore[misc]
     acts += [stop_all, reset_all, reset_all, reset_all]
+    between = [stop_all, signal, lambda: stop_node(True), lambda: reset_node(True)]
+    between += [lambda: promises.glance(owner.node)] * 12
+    world.between = lambda: chance.choice(between)()
     return acts if isinstance(world.runtime.driver, OnLine) else [*acts, gains]
 
 
@@ -236,6 +244,7 @@ def test_axes_whose_loop_is_closed_here(make_world: Any) -> None:
     eyes = [owner.node, world.open(0, [0, 1], exclusive=False).node, world.open(0, [0], exclusive=False).node]
     promises = Promises()
     _play(world, promises, eyes, _axis_acts(world, promises, owner, other, 0), STEPS)
+    assert world.ticks / 4 < world.quiet < world.ticks * 0.9, "ticks of both kinds"
 
 
 def test_a_drive_and_outputs_on_a_line(make_world: Any) -> None:
@@ -347,3 +356,27 @@ def test_a_line_that_is_lost_while_a_reading_waits(make_world: Any) -> None:
     with pytest.raises(OSError, match="unplugged") as caught:
         out.node.read()
     assert caught.value.errno == errno.EIO and DEVICE
+
+
+def test_what_is_asked_behind_a_write_that_is_on_its_way(make_world: Any) -> None:
+    """A flush ends it; who waits until the axis is idle waits for it."""
+    world = make_world(OnLine, {}, 10, Device(random.Random(11)))
+    axis = world.open(0, [0], exclusive=True)
+    answers: list[Any] = []
+    long = command(velocity=1e-3) * 40
+    world.runtime._spare_until_ns = 0
+    axis.write(long, answers.append)
+    axis.ioctl(Request.FLUSH, None, answers.append)
+    refused, flushed = answers
+    assert refused.errno == errno.ECANCELED and "flushed" in refused.strerror and flushed is None
+    for _ in range(20):
+        world.turn()
+        assert axis.node.read().buffered[0] == 0
+
+    world.runtime._spare_until_ns = 0
+    axis.write(long + command(velocity=0.0), lambda _: answers.append("written"))
+    axis.ioctl(Request.WAIT_UNTIL_IDLE, None, lambda _: answers.append("idle"))
+    assert len(answers) == 2
+    while "idle" not in answers:
+        world.turn()
+    assert answers[2:] == ["written", "idle"]
