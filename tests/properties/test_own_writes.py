@@ -100,7 +100,7 @@ def make_world() -> Any:
 def _axis_acts(
     world: World, promises: Promises, owner: Client, other: Client | None, number: int
 ) -> list[Callable[[], None]]:
-    """Return all that can be asked of an axis, and of the workcell it is in; some of it in the middle of a tick, too."""
+    """Return all that can be asked of an axis, and of its workcell; some of it in the middle of a tick, too."""
     chance = world.chance
     markers: list[tuple[int, int]] = []
     gates = [0]  # written since the axis was told to stop
