@@ -35,7 +35,7 @@ from sioms.protocol.text import printable
 from sioms.protocol.verbs import Message, take
 from sioms.turns import Turns
 
-from .alarms import AlarmWatch
+from .alarm_watch import AlarmWatch
 from .attachments import SHARES, Attachments
 from .blocks import AnyBlock, AxisBlock
 from .driver import Driver, LineDriver, StreamDriver, TickDriver

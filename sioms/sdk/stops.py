@@ -24,7 +24,7 @@ from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.stopjournal import StopJournal, channels_and_bits, node_entry, parts_of, workcell_entry
 from sioms.protocol.verbs import Message
 
-from .alarms import Rule
+from .alarm_watch import Rule
 from .blocks import AnyBlock, AxisBlock, BinaryBlock
 from .effects import Effects
 from .engine import Engine

@@ -39,8 +39,8 @@ WRONG: dict[str, list[Any]] = {
     "Request": [5, None, "HOME", [], 1 << 70],
     "Any": ["1", [], {}, object()],
 }
-ANY_TEXT = {"why", "text"}
-"""A stop is not refused for what it says."""
+ANY_TEXT = {"why", "text", "note"}
+"""A stop or an acknowledgement is not refused for what it says."""
 FLAGS = {"replace", "persist", "gone"}
 WORDS = {
     "position",

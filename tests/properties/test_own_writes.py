@@ -374,7 +374,7 @@ def test_what_is_asked_behind_a_write_that_is_on_its_way(make_world: Any) -> Non
         assert axis.node.read().buffered[0] == 0
 
     world.runtime._spare_until_ns = 0
-    axis.write(long + command(velocity=0.0), lambda _: answers.append("written"))
+    axis.write(long + command(position=0.0), lambda _: answers.append("written"))
     axis.ioctl(Request.WAIT_UNTIL_IDLE, None, lambda _: answers.append("idle"))
     assert len(answers) == 2
     while "idle" not in answers:

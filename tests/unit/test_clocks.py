@@ -9,6 +9,7 @@ import pytest
 
 TREE = Path(__file__).resolve().parents[2]
 SHOWN = {
+    "daemon/alarm_keeper.py": "since when there has been an alarm, and when it was acknowledged",
     "daemon/log.py": "the stamp of a line",
     "daemon/server.py": "since when something has been stopped, as text",
     "daemon/stop_record.py": "since when something has been stopped",

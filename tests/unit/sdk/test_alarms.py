@@ -12,7 +12,8 @@ from sioms.protocol.flags import AnalogStatus as A
 from sioms.protocol.flags import AxisStatus as S
 from sioms.protocol.flags import NodeClass, PageState
 from sioms.protocol.nodeinfo import ChannelInfo
-from sioms.sdk.alarms import Alarms, AlarmWatch
+from sioms.sdk.alarm_watch import AlarmWatch
+from sioms.sdk.alarms import Alarms
 from sioms.sdk.blocks import AnalogBlock, BinaryBlock, BlockSpec
 
 INF = math.inf
