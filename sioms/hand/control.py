@@ -15,6 +15,8 @@ from dataclasses import dataclass
 
 from sioms.hand.kinematics import Six
 
+_ACROSS = 0.5  # sine of the finger angle below which a link hardly moves its finger along the line of centres
+
 
 @dataclass(frozen=True, slots=True)
 class Gains:
@@ -29,6 +31,8 @@ class Gains:
             400 Hz long before the quasi-static limit.
         opening_max: largest |d'| [m/s].
         contact_n: force from which on there is contact [N], >= 0.
+        link_m: in contact the links alone squeeze: d' turns them instead of moving the carriages, so that a finger does
+            not turn on the object while the soft axis takes up the force. 0 for carriages that squeeze.
     """
 
     position: float = 5.0
@@ -38,10 +42,11 @@ class Gains:
     filter_s: float = 0.02
     opening_max: float = 0.1
     contact_n: float = 0.02
+    link_m: float = 0.0
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
-            value, least = getattr(self, name), name in ("filter_s", "contact_n")
+            value, least = getattr(self, name), name in ("filter_s", "contact_n", "link_m")
             if not ((value >= 0.0 if least else value > 0.0) and value < math.inf):
                 wanted = "0 or more" if least else "more than 0"
                 raise ValueError(f"describe gains of a hand: {name} is {value}; want {wanted}, finite")
@@ -79,17 +84,31 @@ class Controller:
         share = 1.0 if gains.filter_s == 0.0 else -math.expm1(-sample_s / gains.filter_s)
         self.felt += share * (force - self.felt)
         error = wanted - self.felt
-        if force > gains.contact_n or self.felt > gains.contact_n:
+        touches = force > gains.contact_n or self.felt > gains.contact_n
+        if touches:
             opening = -gains.damper * error
         else:
             opening = along[3] + gains.spring_rate * (goal[3] - now[3] - error / gains.spring)
         opening = min(max(opening, -gains.opening_max), gains.opening_max)
         k = gains.position
+        x, y, psi, turn1, turn2 = self._by_links(opening, now) if touches and gains.link_m else (0.0,) * 5
         return (
-            along[0] + k * (goal[0] - now[0]),
-            along[1] + k * (goal[1] - now[1]),
-            along[2] + k * math.remainder(goal[2] - now[2], math.tau),
+            along[0] + k * (goal[0] - now[0]) + x,
+            along[1] + k * (goal[1] - now[1]) + y,
+            along[2] + k * math.remainder(goal[2] - now[2], math.tau) + psi,
             opening,
-            along[4] + k * math.remainder(goal[4] - now[4], math.tau),
-            along[5] + k * math.remainder(goal[5] - now[5], math.tau),
+            along[4] + k * math.remainder(goal[4] - now[4], math.tau) + turn1,
+            along[5] + k * math.remainder(goal[5] - now[5], math.tau) + turn2,
         )
+
+    def _by_links(self, opening: float, now: Sequence[float]) -> tuple[float, float, float, float, float]:
+        """Return what to add to the rates of x, y, psi, phi1, phi2, so that the carriages stay and the links open."""
+        _, _, psi, d, phi1, phi2 = now
+        length, half = self.gains.link_m, 0.5 * opening
+        sin1, sin2 = max(math.sin(phi1), _ACROSS), max(math.sin(phi2), _ACROSS)
+        side1, side2 = -half * math.cos(phi1) / sin1, half * math.cos(phi2) / sin2  # of the fingers, across the line
+        shift, turn = 0.5 * (side1 + side2), (side2 - side1) / d
+        return (
+            -shift * math.sin(psi), shift * math.cos(psi), turn,
+            turn + half / (length * sin1), turn + half / (length * sin2),
+        )  # fmt: skip

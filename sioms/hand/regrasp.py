@@ -12,6 +12,7 @@ from sioms.hand.contacts import FINGER_M, Grasp
 from sioms.hand.kinematics import Six, wrap
 
 NEUTRAL = 0.5 * math.pi  # finger angle at which the link is across the line of contacts and its soft axis takes force
+_FLAT = 1e-3  # 1/m: flatter than this is a side
 
 
 def disk_radii(grasp: Grasp) -> tuple[float, float]:
@@ -41,3 +42,28 @@ def regrasp_rectangle(grasp: Grasp, finger_m: float = FINGER_M) -> Six:
     (x1, y1), (x2, y2) = grasp.contact1, grasp.contact2
     width = grasp.apart_m * math.cos(grasp.direction - psi)
     return 0.5 * (x1 + x2), 0.5 * (y1 + y2), wrap(psi), width + 2.0 * finger_m, NEUTRAL, NEUTRAL
+
+
+def regrasp_convex(grasp: Grasp, curvatures: tuple[float, float], finger_m: float = FINGER_M) -> Six:
+    """Return hand coordinates of the parallel grasp of two arcs: those that touch with these curvatures now.
+
+    The line through both centres of curvature is a double normal of the two arcs. Of a disk the centres coincide, of a
+    rectangle they are infinitely far away: there `regrasp_disk` and `regrasp_rectangle` know better.
+
+    Args:
+        grasp: the present one.
+        curvatures: 1/rc at contact 1 and 2 [1/m]; 0 for a side, infinite for a corner.
+        finger_m: rb.
+    """
+    bend1, bend2 = (max(bend, _FLAT) for bend in curvatures)
+    middles = []
+    for (x, y), normal, bend in ((grasp.contact1, grasp.normal1, bend1), (grasp.contact2, grasp.normal2, bend2)):
+        middles.append((x + math.cos(normal) / bend, y + math.sin(normal) / bend))
+    (x1, y1), (x2, y2) = middles
+    psi = math.atan2(y2 - y1, x2 - x1)
+    if math.cos(psi - grasp.direction) < 0.0:
+        psi = wrap(psi + math.pi)
+    ux, uy = math.cos(psi), math.sin(psi)
+    fx, fy, gx, gy = x1 - ux / bend1, y1 - uy / bend1, x2 + ux / bend2, y2 + uy / bend2
+    apart = (gx - fx) * ux + (gy - fy) * uy
+    return 0.5 * (fx + gx), 0.5 * (fy + gy), psi, apart + 2.0 * finger_m, NEUTRAL, NEUTRAL

@@ -16,6 +16,8 @@ from sioms.hand.contacts import FINGER_M, Grasp, Likeness, grasp_of
 from sioms.hand.kinematics import Hand
 from sioms.plant.outline import Outline
 
+_DAMPING = 0.15**2
+
 
 def normal_rate(link_rate: float, spin: float, radius_m: float, finger_m: float = FINGER_M) -> float:
     """Return a' [rad/s]: how fast the normal turns where a finger rolls.
@@ -43,6 +45,66 @@ def rolling_law(likeness: Likeness, eta1: float, eta2: float, speed: float) -> t
     """
     sign = {Likeness.DISK: -speed, Likeness.RECTANGLE: speed, Likeness.PARALLEL: 0.0}[likeness]
     return math.copysign(sign, sign * eta1), math.copysign(sign, sign * eta2)
+
+
+def correcting_law(eta1: float, eta2: float, gain: float, most: float) -> tuple[float, float]:
+    """Return (phi1', phi2') [rad/s] that roll a convex object towards a parallel grasp: gain times the OTHER's eta.
+
+    The part of the friction angles that is opposite translates as a disk asks for, the part that is equal turns as a
+    rectangle does: so no class is needed.
+
+    Args:
+        eta1, eta2: friction angles [rad].
+        gain: [1/s].
+        most: largest rate [rad/s]; both are reduced alike.
+    """
+    rate1, rate2 = gain * eta2, gain * eta1
+    share = min(1.0, most / max(abs(rate1), abs(rate2), 1e-300))
+    return share * rate1, share * rate2
+
+
+def friction_angle_rates(
+    apart_m: float, curvatures: Sequence[float], finger_m: float = FINGER_M
+) -> tuple[float, float, float, float]:
+    """Return d eta_i/d phi_j, by rows, of a nearly parallel grasp whose x, y and psi are held.
+
+    From the no-slip equations: w = rb (phi1' + phi2')/L, a_i' = (w - kappa_i rb phi_i')/(1 + kappa_i rb),
+    eta_i' = -rb (a_1' + a_2')/L - a_i'. Its first part, of equal rates, changes sign where the radii at the contacts
+    add up to L: there the smallest diameter becomes the largest.
+
+    Args:
+        apart_m: L, distance of the contacts.
+        curvatures: kappa, 1/rc of the object at the contacts [1/m], >= 0.
+        finger_m: rb.
+    """
+    across = finger_m / apart_m
+    share1, share2 = (1.0 / (1.0 + max(bend, 0.0) * finger_m) for bend in curvatures)
+    own1, own2 = 1.0 - share1, 1.0 - share2  # of a finger's own turn in that of its normal
+    a11, a12, a21, a22 = share1 * across - own1, share1 * across, share2 * across, share2 * across - own2
+    first, second = across * (a11 + a21), across * (a12 + a22)
+    return -first - a11, -second - a12, -first - a21, -second - a22
+
+
+def nearest_law(
+    eta: Sequence[float], apart_m: float, curvatures: Sequence[float], gain: float, most: float
+) -> tuple[float, float]:
+    """Return (phi1', phi2') [rad/s] that roll a convex object towards the nearest parallel grasp, smallest or largest.
+
+    The damped inverse of `friction_angle_rates`: what rolling cannot change, as the wedge of two sides, it leaves.
+
+    Args:
+        eta: both friction angles [rad].
+        apart_m, curvatures: as there.
+        gain: [1/s].
+        most: largest rate [rad/s]; both are reduced alike.
+    """
+    a, b, c, d = friction_angle_rates(apart_m, curvatures)
+    u, v = -gain * (a * eta[0] + c * eta[1]), -gain * (b * eta[0] + d * eta[1])
+    p, q, r = a * a + c * c + _DAMPING, a * b + c * d, b * b + d * d + _DAMPING
+    det = p * r - q * q
+    rate1, rate2 = (r * u - q * v) / det, (p * v - q * u) / det
+    share = min(1.0, most / max(abs(rate1), abs(rate2), 1e-300))
+    return share * rate1, share * rate2
 
 
 def disk_time(eta: float, radius_m: float, speed: float, finger_m: float = FINGER_M) -> float:

@@ -1,0 +1,548 @@
+"""What a hand can do with an unknown object: close on it, feel it, regrasp it, roll it, hold it.
+
+Each skill is a generator: it yields a `Setpoint` a tick, is sent the `Reading` of the next, and returns what it found.
+So it is deterministic, knows no clock, and runs alike on a simulated plane (`plane.PlaneHand.run`) and on a node.
+
+    skills = Skills(hand, first_reading)
+    found = plane.run(skills.hold_parallel(5.0))
+
+The states are OPEN, CLOSE, SENSE, CLASSIFY, REGRASP, ROLL, HOLD, FAULT. What goes wrong is a `Fault`: the hand opens or
+freezes, `events` says which and why, and `Failed` is raised. What will probably go wrong is said before, as an event.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Sequence
+
+from sioms.hand.contacts import FINGER_M, Grasp, Likeness, classify, friction_angle_deviation, grasp
+from sioms.hand.kinematics import Hand, Six
+from sioms.hand.regrasp import NEUTRAL, disk_radii, regrasp_convex, regrasp_disk, regrasp_rectangle
+from sioms.hand.rolling import correcting_law, friction_angle_rates, nearest_law
+from sioms.hand.touch import Event, Failed, Fault, Manner, Reading, Sensed, Setpoint, State
+
+Ticks = Generator[Setpoint, Reading, None]
+STILL: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+_LETTING_GO_N = -0.1
+
+
+class Skills:
+    """Skills of one hand.  One at a time.
+
+    Args:
+        hand: its modules.
+        first: what is read of it at the start.
+        manner: how it does it.
+
+    Attributes:
+        state: where it is.
+        events: what it had to say.
+        now: the last reading.
+        regrasps, rolls: how many it made.
+        sensed: called after each grasp that was sensed.
+    """
+
+    def __init__(self, hand: Hand, first: Reading, manner: Manner | None = None) -> None:
+        self.hand, self.manner, self.now = hand, manner or Manner(), first
+        self.state, self.events = State.IDLE, list[Event]()
+        self.regrasps = self.rolls = 0
+        self.sensed: Callable[[], None] | None = None
+        self._goal: list[float] = list(hand.forward(first.joints))
+        self._held, self._what = False, ""
+        self._missing = [0.0, 0.0]
+        self._warned = False
+        self._past: tuple[Six, Sensed] | None = None
+        self._radii = [FINGER_M, FINGER_M]
+
+    def say(self, text: str, fault: Fault | None = None) -> None:
+        """Add an event."""
+        self.events.append(Event(self.now.time_s, self.state, text, fault))
+
+    def felt_force(self) -> float:
+        """Return the internal force that both fingers tell [N]: 0 unless both are touched."""
+        one, two = self.now.fingers
+        return 0.5 * (one.force + two.force) if one.touched and two.touched else 0.0
+
+    @property
+    def holds(self) -> bool:
+        """Return whether the object is meant to be between both fingers now."""
+        return self._held
+
+    # what a user calls
+
+    def hold_parallel(self, time_s: float) -> Generator[Setpoint, Reading, Sensed]:
+        """Grasp whatever is between the fingers, bring it into a parallel grasp, hold it for a time [s].
+
+        Raises:
+            Failed: as the fault says; the hand has opened or is frozen.
+        """
+        return self._guarded("hold", self._hold_parallel(time_s))
+
+    def grasp(self) -> Generator[Setpoint, Reading, Sensed]:
+        """Close on whatever is between the fingers and feel it.
+
+        Raises:
+            Failed: nothing there, too small, too large, no reach, or a sensor that is not to be relied on.
+        """
+        return self._guarded("grasp", self._grasp())
+
+    def regrasp(self, found: Sensed) -> Generator[Setpoint, Reading, Sensed]:
+        """Open, go to the parallel grasp that `found` lets expect, close and feel again; raises as `grasp`."""
+        return self._guarded("regrasp", self._regrasp(found))
+
+    def roll(self) -> Generator[Setpoint, Reading, Sensed]:
+        """Roll what is held until it is held parallel, or until an array ends; raises as `hold`."""
+        return self._guarded("roll", self._roll())
+
+    def hold(self, time_s: float) -> Generator[Setpoint, Reading, Sensed]:
+        """Hold for a time [s], correcting the friction angles by rolling.
+
+        Raises:
+            Failed: contact lost, cone, end of the array, overload or a stale sensor.
+        """
+        return self._guarded("hold", self._hold(time_s))
+
+    def release(self) -> Generator[Setpoint, Reading, None]:
+        """Open by the clearance."""
+        yield from self._open()
+        self.state = State.IDLE
+
+    # the state machine
+
+    def _guarded(self, what: str, ticks: Generator[Setpoint, Reading, Sensed]) -> Generator[Setpoint, Reading, Sensed]:
+        self._what, self.state = f"{what} object", State.IDLE
+        try:
+            return (yield from ticks)
+        except Failed as failed:
+            self.say(str(failed), failed.fault)
+            self.state, self._held = State.FAULT, False
+            if failed.fault.opens:
+                yield from self._let_go()
+            yield Setpoint(self.hand.forward(self.now.joints), STILL, 0.0, frozen=True)
+            raise
+
+    def _hold_parallel(self, time_s: float) -> Generator[Setpoint, Reading, Sensed]:
+        found = yield from self._grasp()
+        while found.grasp.quality > self.manner.tolerance_rad:
+            if self.regrasps != 1 and self._can_roll(found) and found.force > 0.5 * self.manner.force_n:
+                found = yield from self._roll()
+                continue
+            if self.regrasps >= self.manner.regrasps:
+                break
+            found = yield from self._regrasp(found)
+        if found.force < 0.5 * self.manner.force_n:
+            raise Failed(
+                Fault.NOT_PARALLEL,
+                f"hold object: after {self.regrasps} regrasps the friction angles are still {_degrees(found.grasp)}; "
+                f"want less than {math.degrees(self.manner.light_rad):.0f} degrees to squeeze it",
+            )
+        return (yield from self._hold(time_s))
+
+    def _grasp(self) -> Generator[Setpoint, Reading, Sensed]:
+        self._check_sensors("grasp object")
+        self._check_reach("grasp object", self._goal)
+        if any(finger.touched for finger in self.now.fingers):
+            raise Failed(
+                Fault.TOO_LARGE,
+                f"grasp object: a finger touches it with the hand open to {1e3 * self._goal[3]:.0f} mm; want an object "
+                "that leaves both free",
+            )
+        yield from self._close()
+        return (yield from self._squeeze())
+
+    def _squeeze(self) -> Generator[Setpoint, Reading, Sensed]:
+        """Feel the touch lightly; squeeze what will not slip away, and feel it again."""
+        manner = self.manner
+        yield from self._settle(manner.light_n, 0.25)
+        found = yield from self._sense(manner.light_n)
+        if found.grasp.quality > manner.light_rad:
+            self.say(f"near the friction cone: {_degrees(found.grasp)}; not squeezed", Fault.CONE)
+            return found
+        yield from self._settle(manner.force_n, 0.6)
+        return (yield from self._sense(manner.force_n))
+
+    def _regrasp(self, found: Sensed) -> Generator[Setpoint, Reading, Sensed]:
+        self.state = State.REGRASP
+        target = self.plan(found)
+        self.regrasps += 1
+        self._past = (self.hand.forward(self.now.joints), found)
+        self.say(f"{found.likeness.value}-like, {_degrees(found.grasp)}: regrasp")
+        clear = 2.0 * self.manner.clearance_m
+        opened = max(target[3], self._goal[3]) + clear
+        self._check_reach("regrasp object", (*target[:3], opened, *target[4:]))
+        yield from self._open()
+        yield from self._move((*target[:3], opened, *target[4:]))
+        yield from self._close()
+        return (yield from self._squeeze())
+
+    def plan(self, found: Sensed) -> Six:
+        """Return where the hand goes for a parallel grasp: by the law of the class where both curvatures agree with it,
+        else by the arcs that touch.
+        """
+        held = found.grasp
+        radius = 0.5 * sum(disk_radii(held))
+        for likeness, bend in ((Likeness.DISK, 1.0 / radius), (Likeness.RECTANGLE, 0.0)):
+            agrees = all(
+                abs(seen - bend) < 3.0 * deviation + 2.0
+                for seen, deviation in zip(found.curvatures, found.curvature_deviations, strict=True)
+            )
+            twist = held.eta1 + held.eta2 if likeness is Likeness.DISK else held.eta1 - held.eta2
+            if agrees and found.likeness is likeness and abs(twist) < 4.0 * found.deviation + math.radians(1.0):
+                return regrasp_disk(held, radius) if likeness is Likeness.DISK else regrasp_rectangle(held)
+        if (between := self._between(found)) is not None:
+            return between
+        if found.likeness is not Likeness.PARALLEL and all(
+            deviation < _TOLD or seen > 3.0 * deviation
+            for seen, deviation in zip(found.curvatures, found.curvature_deviations, strict=True)
+        ):
+            target = regrasp_convex(held, found.curvatures)
+            turned = abs(math.remainder(target[2] - held.direction, math.tau))
+            x, y = ((a + b) / 2.0 for a, b in zip(held.contact1, held.contact2, strict=True))
+            shift = math.hypot(target[0] - x, target[1] - y)
+            low, high = self.manner.opening
+            if turned < _MOST_TURN and shift < 0.5 * held.apart_m and low < target[3] < high - 2e-2:
+                return target
+        return regrasp_disk(held, radius) if found.likeness is Likeness.DISK else regrasp_rectangle(held)
+
+    def _between(self, found: Sensed) -> Six | None:
+        """Return where, on the way from the last grasp to this one, the friction angles would be 0: the object has not
+        moved meanwhile. None where it tells nothing.
+        """
+        if self._past is None:
+            return None
+        was, before = self._past
+        now = self.hand.forward(self.now.joints)
+        start = before.grasp.eta1, before.grasp.eta2
+        change = found.grasp.eta1 - start[0], found.grasp.eta2 - start[1]
+        size = change[0] ** 2 + change[1] ** 2
+        share = -(start[0] * change[0] + start[1] * change[1]) / max(size, 1e-9)
+        left = math.hypot(start[0] + share * change[0], start[1] + share * change[1])
+        if not 0.2 < share < 1.5 or left > _SECANT * math.hypot(found.grasp.eta1, found.grasp.eta2):
+            return None
+        x, y, d = (was[i] + share * (now[i] - was[i]) for i in (0, 1, 3))
+        psi = was[2] + share * math.remainder(now[2] - was[2], math.tau)
+        return x, y, psi, d, NEUTRAL, NEUTRAL
+
+    def _can_roll(self, found: Sensed) -> bool:
+        """Return whether rolling leads to a parallel grasp before an array ends, as far as the curvatures tell: each
+        contact travels L sin(eta)/2 on disk and rectangle alike.
+        """
+        held = found.grasp
+        travel = 0.5 * held.apart_m * math.sin(held.quality) / FINGER_M
+        low, high = self.manner.arc
+        if self.rolls > self.regrasps:  # it has been tried
+            return False
+        bends = tuple(max(bend, 0.0) for bend in found.curvatures)
+        first, second = nearest_law((held.eta1, held.eta2), held.apart_m, bends, 1.0, math.inf)
+        a, b, c, d = friction_angle_rates(held.apart_m, bends)
+        left = math.hypot(held.eta1 + a * first + b * second, held.eta2 + c * first + d * second)
+        return (
+            left < 0.5 * held.quality + self.manner.tolerance_rad
+            and max(abs(first), abs(second)) < _MOST_TURN
+            and all(low + travel < place < high - travel for place in found.places)
+        )
+
+    def _roll(self) -> Generator[Setpoint, Reading, Sensed]:
+        self.state = State.ROLL
+        self.rolls += 1
+        self._past = None  # the object moves
+        manner, since, low, high = self.manner, self.now.time_s, *self.manner.arc
+        self.say(f"roll from {_degrees(self._seen())}")
+        filtered: tuple[float, float] | None = None
+        while self.now.time_s - since < 0.15:
+            last_s = self.now.time_s
+            seen = self._seen()
+            filtered = _mixed(filtered, (seen.eta1, seen.eta2), 0.1)
+            yield from self._tick(self._law(filtered))
+            if max(map(abs, filtered)) > 0.5 * manner.tolerance_rad:
+                since = self.now.time_s
+            if not all(low < finger.phi < high for finger in self.now.fingers if finger.touched):
+                self.say("the array ends", Fault.ARRAY_END)
+                break
+            if self.now.time_s - last_s <= 0.0:
+                raise Failed(Fault.STALE, "roll object: readings do not go on in time")
+        return (yield from self._sense(manner.force_n))
+
+    def _law(self, eta: tuple[float, float]) -> tuple[float, float]:
+        """Return the rates of rolling [rad/s]."""
+        manner = self.manner
+        if manner.smallest:
+            return correcting_law(*eta, manner.gain, manner.rolling)
+        bends = []
+        for i, finger in enumerate(self.now.fingers):
+            if finger.touched and not finger.doubt:
+                self._radii[i] += 0.05 * (finger.radius_m - self._radii[i])
+            bends.append(1.0 / min(max(self._radii[i], 1e-4), FINGER_M) - 1.0 / FINGER_M)
+        return nearest_law(eta, self._seen().apart_m, bends, manner.gain, manner.rolling)
+
+    def _hold(self, time_s: float) -> Generator[Setpoint, Reading, Sensed]:
+        self.state, self._held = State.HOLD, True
+        self._goal[3] = self.hand.forward(self.now.joints)[3]
+        end, filtered = self.now.time_s + time_s, None
+        while self.now.time_s < end:
+            seen = self._seen()
+            filtered = _mixed(filtered, (seen.eta1, seen.eta2), 0.05)
+            self._watch_cone(max(map(abs, filtered)))
+            yield from self._tick(self._law(filtered))
+        return (yield from self._sense(self.manner.force_n))
+
+    def _sense(self, force: float) -> Generator[Setpoint, Reading, Sensed]:
+        """Average frames; the hand keeps still."""
+        before, self.state = self.state, State.SENSE
+        count = self.manner.frames
+        joints, places, radii = [0.0] * 6, [0.0, 0.0], [0.0, 0.0]
+        variances, widths, doubts = [0.0, 0.0], [0.0, 0.0], ["", ""]
+        doubtful, felt, first = [0, 0], 0.0, self.now.joints
+        for _ in range(count):
+            yield from self._tick((0.0, 0.0), force)
+            felt += self.felt_force() / count
+            joints = [at + (now - was) / count for at, now, was in zip(joints, self.now.joints, first, strict=True)]
+            for i, finger in enumerate(self.now.fingers):
+                if not finger.touched or finger.doubt:
+                    doubtful[i], doubts[i] = doubtful[i] + 1, finger.doubt or "no contact"
+                    continue
+                places[i] += finger.phi
+                variances[i] += finger.phi_deviation**2
+                radii[i] += finger.radius_m
+                widths[i] += finger.radius_deviation_m**2
+        for i in (0, 1):
+            if doubtful[i] > count // 2:
+                raise Failed(
+                    Fault.DOUBTFUL,
+                    f"sense object: finger {i + 1} says {doubts[i]!r} in {doubtful[i]} of {count} frames; want a "
+                    "contact that its array covers",
+                )
+        good = [count - many for many in doubtful]
+        phi = places[0] / good[0], places[1] / good[1]
+        held = grasp([at + was for at, was in zip(joints, first, strict=True)], phi, self.hand)
+        place = max(math.sqrt(variance) / many for variance, many in zip(variances, good, strict=True))
+        deviation = friction_angle_deviation(held.apart_m, math.hypot(place, _PLACE_RAD))
+        bends, spreads = [], []
+        for i in (0, 1):
+            self._radii[i] = radii[i] / good[i]
+            radius = max(radii[i] / good[i], 1e-6)
+            bends.append(1.0 / radius - 1.0 / FINGER_M)
+            spreads.append(math.sqrt(widths[i]) / good[i] / radius**2)
+        self.state = State.CLASSIFY
+        found = Sensed(
+            held, deviation, (bends[0], bends[1]), (spreads[0], spreads[1]), phi, felt,
+            classify(held.eta1, held.eta2, deviation),
+        )  # fmt: skip
+        hollow = max(-bend - 5.0 * spread for bend, spread in zip(bends, spreads, strict=True))
+        if hollow > _HOLLOW and felt > 0.5 * self.manner.force_n:
+            raise Failed(
+                Fault.NOT_CONVEX,
+                f"sense object: it feels hollow, curvatures {bends[0]:.0f} and {bends[1]:.0f} 1/m; want one that is "
+                "convex where it is touched",
+            )
+        self.state = before
+        if self.sensed is not None:
+            self.sensed()
+        return found
+
+    # motions
+
+    def _close(self) -> Ticks:
+        """Close until both fingers are touched; the finger that is touched first waits for the other."""
+        self.state, self._held = State.CLOSE, False
+        manner, speed = self.manner, self.manner.closing
+        self._goal = list(self.hand.forward(self.now.joints)[:4]) + self._goal[4:]
+        pressed_s, since = 0.0, [math.inf, math.inf]  # since when each finger has felt nothing
+        while pressed_s < _MET_S:
+            one, two = (gone_s < _MET_S for gone_s in since)
+            before_s, both = self.now.time_s, one and two
+            drift = 0.0 if one == two else (-0.5 if one else 0.5) * speed
+            shut = 0.0 if both else -speed
+            u, v = math.cos(self._goal[2]), math.sin(self._goal[2])
+            yield from self._follow((drift * u, drift * v, 0.0, shut, 0.0, 0.0), manner.light_n if both else 0.0)
+            gone_s, apart = self.now.time_s - before_s, self.hand.forward(self.now.joints)[3]
+            # light fingers bounce: the goal does not run away from where they are
+            self._goal[3] = apart if both else max(self._goal[3], apart - _AHEAD_M)
+            pressed_s = pressed_s + gone_s if both else 0.0
+            since = [
+                0.0 if finger.touched else past + gone_s for finger, past in zip(self.now.fingers, since, strict=True)
+            ]
+            if self._goal[3] < manner.opening[0] and not both:
+                raise Failed(
+                    Fault.TOO_SMALL if one or two else Fault.NOTHING_THERE,
+                    f"grasp object: {'one finger is' if one or two else 'nothing is'} touched with the fingers' "
+                    f"centres {1e3 * self._goal[3]:.0f} mm apart; want an object between them, wider than "
+                    f"{1e3 * (manner.opening[0] - 2.0 * FINGER_M):.0f} mm",
+                )
+        self._held = True
+        self._missing = [0.0, 0.0]
+
+    def _settle(self, force: float, time_s: float) -> Ticks:
+        """Wait until the force is within a tenth of what is wanted, and then for a time [s]; five seconds at most."""
+        since, start = self.now.time_s, self.now.time_s
+        while self.now.time_s - since < time_s and self.now.time_s - start < 5.0:
+            yield from self._tick((0.0, 0.0), force)
+            if self._seen().quality > self.manner.light_rad and force > self.manner.light_n:
+                return
+            if abs(self.felt_force() - force) > 0.1 * force:
+                since = self.now.time_s
+
+    def _open(self) -> Ticks:
+        """Let go and leave the object by the clearance."""
+        self.state, self._held = State.OPEN, False
+        at = self.hand.forward(self.now.joints)
+        self._goal = [*at[:4], *self._goal[4:]]
+        end = at[3] + 2.0 * self.manner.clearance_m
+        start = self.now.time_s
+        while self.felt_force() > 0.5 * self.manner.light_n and self.now.time_s - start < 2.0:
+            yield from self._follow(STILL, 0.25 * self.manner.light_n)
+        yield from self._let_go()
+        while self._goal[3] < end:
+            yield from self._follow((0.0, 0.0, 0.0, self.manner.moving, 0.0, 0.0), _LETTING_GO_N)
+
+    def _let_go(self) -> Ticks:
+        """Open until nothing is touched, two seconds at most."""
+        start = self.now.time_s
+        while any(finger.touched for finger in self.now.fingers) and self.now.time_s - start < 2.0:
+            self._goal[3] = max(self._goal[3], self.hand.forward(self.now.joints)[3] + 1e-3)
+            yield from self._follow(STILL, _LETTING_GO_N)
+
+    def _move(self, target: Sequence[float]) -> Ticks:
+        """Go to hand coordinates in free space, evenly; what is touched on the way makes the hand open further."""
+        start, manner = list(self._goal), self.manner
+        way = [to - at for to, at in zip(target, start, strict=True)]
+        way[2] = math.remainder(way[2], math.tau)
+        time_s = max(
+            math.hypot(way[0], way[1]) / manner.moving, abs(way[3]) / manner.moving,
+            *(abs(way[i]) / manner.turning for i in (2, 4, 5)), 1e-3,
+        ) * 1.5  # fmt: skip
+        begin, more = self.now.time_s, 0.0
+        while (gone := (self.now.time_s - begin) / time_s) < 1.0:
+            share, pace = gone * gone * (3.0 - 2.0 * gone), 6.0 * gone * (1.0 - gone) / time_s
+            if any(finger.touched for finger in self.now.fingers):
+                more += 2e-4
+                self._check_reach("move to object", (*start[:3], start[3] + more, *start[4:]))
+            self._goal = [at + share * by for at, by in zip(start, way, strict=True)]
+            self._goal[3] += more
+            yield from self._follow([pace * by for by in way], _LETTING_GO_N, advance=False)
+        for _ in range(_ARRIVE):
+            yield from self._follow(STILL, _LETTING_GO_N)
+
+    # one tick
+
+    def _tick(self, rolling: tuple[float, float], force: float | None = None) -> Ticks:
+        """Hold on for a tick while the fingers roll at these rates [rad/s]."""
+        wanted = self.manner.force_n if force is None else force
+        yield from self._follow((0.0, 0.0, 0.0, 0.0, *rolling), wanted)
+
+    def _follow(self, along: Sequence[float], force: float, advance: bool = True) -> Ticks:
+        last_s = self.now.time_s
+        goal: Six = tuple(self._goal)  # type: ignore[assignment]
+        rates: Six = tuple(along)  # type: ignore[assignment]
+        self.now = yield Setpoint(goal, rates, force)
+        gone_s = self.now.time_s - last_s
+        if advance:
+            self._goal = [at + gone_s * rate for at, rate in zip(self._goal, along, strict=True)]
+        self._watch(gone_s)
+
+    def _seen(self) -> Grasp:
+        """Return the grasp of this tick; of a finger without contact its last place counts."""
+        one, two = (finger.phi if math.isfinite(finger.phi) else NEUTRAL for finger in self.now.fingers)
+        return grasp(self.now.joints, (one, two), self.hand)
+
+    # what is watched
+
+    def _watch(self, gone_s: float) -> None:
+        if self.state is State.FAULT:  # it is letting go, of whatever
+            return
+        manner = self.manner
+        what = self._what
+        for i, (finger, age_s) in enumerate(zip(self.now.fingers, self.now.ages_s, strict=True)):
+            if age_s > manner.stale_s or finger.touched is None:
+                why = f"its frame is {age_s:.2f} s old" if age_s > manner.stale_s else "it is blind"
+                raise Failed(
+                    Fault.STALE,
+                    f"{what}: finger {i + 1} cannot be relied on: {why}; want a frame every {manner.stale_s:g} s",
+                )
+            if finger.force > manner.most_n:
+                raise Failed(
+                    Fault.OVERLOAD,
+                    f"{what}: finger {i + 1} bears {finger.force:.1f} N; want at most {manner.most_n:g} N",
+                )
+            self._missing[i] = 0.0 if finger.touched else self._missing[i] + gone_s
+            if self._held and self._missing[i] > manner.lost_s:
+                raise Failed(
+                    Fault.LOST_CONTACT,
+                    f"{what}: finger {i + 1} has felt nothing for {self._missing[i]:.2f} s; the other may still touch",
+                )
+        if self._held and self.state is not State.CLOSE:
+            self._watch_arrays(what)
+
+    def _watch_arrays(self, what: str) -> None:
+        low, high = self.manner.arc
+        margin = _END_RAD
+        for i, finger in enumerate(self.now.fingers):
+            if finger.touched and not low - margin < finger.phi < high + margin:
+                raise Failed(
+                    Fault.ARRAY_END,
+                    f"{what}: finger {i + 1} is touched at {math.degrees(finger.phi):.0f} degrees; its array ends at "
+                    f"{math.degrees(low - margin):.0f} and {math.degrees(high + margin):.0f} degrees",
+                )
+
+    def _watch_cone(self, eta: float) -> None:
+        """Warn of friction angles that grow; let go beyond the cone."""
+        manner = self.manner
+        if eta > math.atan(manner.friction):
+            raise Failed(
+                Fault.CONE,
+                f"hold object: a friction angle of {math.degrees(eta):.1f} degrees; want less than "
+                f"{math.degrees(math.atan(manner.friction)):.1f}, or it slides",
+            )
+        if eta > manner.light_rad and not self._warned:
+            self.say(f"near the friction cone: {math.degrees(eta):.1f} degrees", Fault.CONE)
+        self._warned = eta > manner.light_rad
+
+    def _check_sensors(self, what: str) -> None:
+        for i, calibrated in enumerate(self.now.calibrated):
+            if not calibrated:
+                raise Failed(
+                    Fault.UNCALIBRATED,
+                    f"{what}: finger {i + 1} has no calibration; want one for each finger (sioms tactile calibrate)",
+                )
+        self._watch(0.0)
+
+    def _check_reach(self, what: str, coordinates: Sequence[float]) -> None:
+        """Refuse coordinates that the modules do not reach."""
+        low, high = self.manner.opening
+        d = coordinates[3]
+        if not math.isfinite(sum(coordinates)) or d < self.hand.least_m:
+            raise Failed(Fault.SINGULAR, f"{what}: the fingers' centres would coincide; want d of {1e3 * low:.0f} mm")
+        if d > high:
+            raise Failed(
+                Fault.TOO_LARGE, f"{what}: it needs the hand open to {1e3 * d:.0f} mm; want at most {1e3 * high:.0f} mm"
+            )
+        x1, y1, _, x2, y2, _ = self.hand.inverse(coordinates)
+        left, right, bottom, top = self.manner.reach
+        for i, (x, y) in enumerate(((x1, y1), (x2, y2))):
+            if not (left <= x <= right and bottom <= y <= top):
+                raise Failed(
+                    Fault.OUT_OF_REACH,
+                    f"{what}: module {i + 1} would have to be at {1e3 * x:.0f}, {1e3 * y:.0f} mm; its platen reaches "
+                    f"from {1e3 * left:.0f}, {1e3 * bottom:.0f} to {1e3 * right:.0f}, {1e3 * top:.0f} mm",
+                )
+
+
+_PLACE_RAD = math.radians(0.02)  # what averaging does not take from a place: of the axes' and the array's own
+_HOLLOW = 15.0  # 1/m
+_END_RAD = math.radians(6.0)
+_SECANT = 0.5  # of the friction angles now, that may be left between two grasps
+_TOLD = 30.0  # 1/m: curvatures that are known worse are not used
+_MOST_TURN = math.radians(50.0)
+_ARRIVE = 40  # ticks
+_MET_S = 0.1  # how long a finger that bounces counts as touched
+_AHEAD_M = 1e-3
+
+
+def _mixed(last: tuple[float, float] | None, new: tuple[float, float], share: float) -> tuple[float, float]:
+    if last is None:
+        return new
+    return last[0] + share * (new[0] - last[0]), last[1] + share * (new[1] - last[1])
+
+
+def _degrees(held: Grasp) -> str:
+    return f"{math.degrees(held.eta1):.1f} and {math.degrees(held.eta2):.1f} degrees"

@@ -1,0 +1,211 @@
+"""What a skill sees of a hand and what it asks of it, tick by tick; how it may do it, and how it fails.
+
+A skill runs alike on a simulated plane and on a node: it takes a `Reading` a tick and answers with a `Setpoint`, for
+which `control.Controller` computes the joints' rates. Neither knows a process or a clock.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+from sioms.hand.contacts import FINGER_M, LEAST_FRICTION, Grasp, Likeness
+from sioms.hand.kinematics import Six
+
+
+@dataclass(frozen=True, slots=True)
+class Felt:
+    """What one finger feels; immutable.
+
+    Args:
+        touched: whether something touches; None while that is not known.
+        phi: place of the contact in the finger's own angle [rad]; nan without contact.
+        phi_deviation: its standard deviation [rad].
+        force: of the contact, along its normal [N]; 0 without contact.
+        radius_m: R of the contact, 1/R = 1/rb + 1/rc; nan without contact.
+        radius_deviation_m: its standard deviation.
+        doubt: why the numbers are not to be relied on; empty when they are.
+    """
+
+    touched: bool | None
+    phi: float = math.nan
+    phi_deviation: float = math.nan
+    force: float = 0.0
+    radius_m: float = math.nan
+    radius_deviation_m: float = math.nan
+    doubt: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What is known of the hand at a tick; immutable.
+
+    Args:
+        time_s: since some start.
+        joints: x1, y1, th1, x2, y2, th2 as the axes' encoders read them [m, m, rad].
+        fingers: what each feels.
+        ages_s: of the two frames from which that comes, at this tick.
+        calibrated: whether each finger has a calibration.
+    """
+
+    time_s: float
+    joints: Six
+    fingers: tuple[Felt, Felt]
+    ages_s: tuple[float, float] = (0.0, 0.0)
+    calibrated: tuple[bool, bool] = (True, True)
+
+
+@dataclass(frozen=True, slots=True)
+class Setpoint:
+    """What the hand shall do until the next tick; immutable.
+
+    Args:
+        goal: the six coordinates [m, rad]; d counts in free space only.
+        along: the rates at which the goal moves [m/s, rad/s].
+        force: internal force [N]; below 0 lets go.
+        frozen: the joints stay where they are, whatever the rest says.
+    """
+
+    goal: Six
+    along: Six
+    force: float
+    frozen: bool = False
+
+
+class State(Enum):
+    """Where a skill is."""
+
+    IDLE = "idle"
+    OPEN = "open"
+    CLOSE = "close"
+    SENSE = "sense"
+    CLASSIFY = "classify"
+    REGRASP = "regrasp"
+    ROLL = "roll"
+    HOLD = "hold"
+    FAULT = "fault"
+
+
+class Fault(Enum):
+    """Why a skill ended or was refused."""
+
+    LOST_CONTACT = "lost contact"
+    CONE = "friction cone"
+    ARRAY_END = "end of the array"
+    OVERLOAD = "overload"
+    STALE = "stale sensor"
+    DOUBTFUL = "doubtful sensor"
+    UNCALIBRATED = "not calibrated"
+    NOTHING_THERE = "nothing there"
+    TOO_LARGE = "too large"
+    TOO_SMALL = "too small"
+    NOT_CONVEX = "not convex"
+    OUT_OF_REACH = "out of reach"
+    SINGULAR = "singular"
+    NOT_PARALLEL = "not parallel"
+
+    @property
+    def opens(self) -> bool:
+        """Whether the hand lets go; else it freezes where it is."""
+        return self in (Fault.CONE, Fault.OVERLOAD, Fault.TOO_SMALL, Fault.NOTHING_THERE)
+
+
+class Failed(Exception):
+    """A skill cannot go on, or is refused.
+
+    Args:
+        fault: why.
+        text: one sentence: what was attempted, what is wrong, what would be right.
+    """
+
+    def __init__(self, fault: Fault, text: str) -> None:
+        super().__init__(text)
+        self.fault = fault
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that a skill has to say; immutable.
+
+    Args:
+        time_s: of the reading.
+        state: of the skill.
+        text: what happened.
+        fault: what it warns of, or why the skill ended.
+    """
+
+    time_s: float
+    state: State
+    text: str
+    fault: Fault | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Manner:
+    """How the skills do it; immutable.  The source gives none of these numbers.
+
+    Args:
+        force_n: internal force of a grasp [N].
+        light_n: with which a grasp is felt before it is squeezed [N].
+        closing: speed of the closing finger [m/s].
+        moving, turning: speeds in free space [m/s, rad/s].
+        rolling: largest |phi'| while an object is rolled [rad/s].
+        gain: of the rolling law, towards the end [1/s].
+        clearance_m: by which each finger leaves the object before it moves.
+        tolerance_rad: |eta| of a grasp that counts as parallel.
+        frames: averaged where a grasp is sensed.
+        light_rad: |eta| from which on a touch is not squeezed, but regrasped as it is.
+        friction: coefficient that is relied on.
+        arc: places of contact between which a finger may be rolled [rad].
+        most_n: force beyond which the hand lets go [N].
+        lost_s, stale_s: how long a contact may be missing, a frame old [s].
+        regrasps: at most so many.
+        smallest: roll towards the smallest diameter, as the source does; else towards the nearest parallel grasp.
+        opening: least and largest d [m].
+        reach: of the carriages, x and y from and to [m].
+    """
+
+    force_n: float = 1.0
+    light_n: float = 0.2
+    closing: float = 0.02
+    moving: float = 0.06
+    turning: float = 1.0
+    rolling: float = 0.35
+    gain: float = 2.5
+    clearance_m: float = 8e-3
+    tolerance_rad: float = math.radians(0.3)
+    frames: int = 40
+    light_rad: float = math.radians(30.0)
+    friction: float = LEAST_FRICTION
+    arc: tuple[float, float] = (math.radians(14.0), math.radians(134.0))
+    most_n: float = 4.0
+    lost_s: float = 0.15
+    stale_s: float = 0.1
+    regrasps: int = 4
+    smallest: bool = False
+    opening: tuple[float, float] = (2.0 * FINGER_M + 5e-3, 0.2)
+    reach: tuple[float, float, float, float] = (-0.4, 0.4, -0.6, 0.6)
+
+
+@dataclass(frozen=True, slots=True)
+class Sensed:
+    """What a grasp is like; immutable.
+
+    Args:
+        grasp: contacts and friction angles, of the mean of the frames.
+        deviation: standard deviation of a friction angle [rad].
+        curvatures: 1/rc of the object at each contact [1/m], as its sensor says it; 0 for a side.
+        curvature_deviations: their standard deviations.
+        places: phi_c [rad].
+        force: internal force [N].
+        likeness: what the object answers like.
+    """
+
+    grasp: Grasp
+    deviation: float
+    curvatures: tuple[float, float]
+    curvature_deviations: tuple[float, float]
+    places: tuple[float, float]
+    force: float
+    likeness: Likeness
