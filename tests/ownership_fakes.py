@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import socket
@@ -80,7 +81,9 @@ class Axis(TickDriver):
 
     def __init__(self, name: str, settings: Table, kit: Kit) -> None:
         super().__init__(name, settings, kit)
-        axis = AxisSettings("x", velocity_max=1.0, acceleration_max=1e6, force_max=1.0, k=1.0)
+        axis = AxisSettings(
+            "x", velocity_max=1.0, acceleration_max=1e6, force_max=1.0, k=1.0, following_error_max=math.inf
+        )
         self.bank = AxisBank([axis], tick_s=1 / TICK_HZ, markers=kit.markers, late_max_s=1e6, capacity=16)
         self._block = AxisBlock(_AXIS, self.bank)
 

@@ -36,6 +36,8 @@ FORCE: Final = 3
 BRAKE: Final = 4
 STOP: Final = 5
 """A brake that was asked for or forced by a limit."""
+SETTLING: Final = 6
+"""The set-point is at rest, the axis is still on its way there."""
 
 # What a tick has found.
 NOT_FINITE: Final = 1
@@ -46,11 +48,17 @@ FOLLOWS_BADLY: Final = 16
 ON_SWITCH: Final = 32
 LATE: Final = 64
 ENDS: Final = 128
+SETTLED: Final = 256
 
 REST: Final = 0.01
 """Part of the velocity limit below which an axis may be at rest."""
 BACK: Final = 0.1
 """Part of the force limit with which an axis that is thrown back may be braked in any case."""
+
+SLOW: Final = 0.1
+"""Part of the velocity limit below which an axis that is within its tolerance has settled."""
+REST_NS: Final = 50_000_000
+"""So long an axis stands before it is at rest, wherever that is [ns]."""
 
 LOOK_NS: Final = 10_000_000
 AGAINST: Final = 3.0
@@ -67,7 +75,8 @@ class Loop(Record):
     ``position`` is raw + ``offset``; ``velocity`` filtered with the time constant ``filter_s``.
 
     Plans: ``present`` (6 n) coefficients of the polynomials, begun at ``segment_ns``; the next ends at ``next_ns``.
-    ``kind`` of each, ``guard`` where soft limits are watched; ``begun`` commands since the last tick.
+    ``kind`` of each, ``guard`` where soft limits are watched; ``begun`` commands since the last tick. Axes that settle
+    were seen to move last at ``moved_ns``; ``settled`` tells which have done so in this tick.
 
     Law: gains, ``force_offset`` and limits; ``error``, ``integral``, ``output``, ``saturated`` its state; of steppers
     ``slewed``, ``anchor``, ``start_velocity``, ``last_velocity``; ``direction``, ``most``, ``asked``, ``presses`` of
@@ -101,6 +110,8 @@ class Loop(Record):
     kind: Integers
     guard: Flags
     begun: Integers
+    moved_ns: Integers
+    settled: Flags
     minimum: Floats
     maximum: Floats
     speed_most: Floats
@@ -373,8 +384,22 @@ def control(a: Loop) -> int:
 
 
 @step
+def settle(a: Loop, i: int) -> int:
+    """Look at an axis whose set-point is at rest: returns SETTLED when it is there, or stands somewhere else."""
+    speed = abs(a.output[i] if a.stepper[i] else a.velocity[i])
+    limit = a.velocity_limit[i]
+    if speed > REST * limit:
+        a.moved_ns[i] = a.last_ns
+    there = abs(a.error[i]) <= a.tolerance[i] and speed <= SLOW * limit and not a.limp[i]
+    a.settled[i] = there or a.last_ns - a.moved_ns[i] > REST_NS
+    return SETTLED if a.settled[i] else 0
+
+
+@step
 def follow(a: Loop) -> int:
-    """Fill the answer and the following errors. Returns FOLLOWS_BADLY and ON_SWITCH where an axis has to stop."""
+    """Fill the answer and the following errors. Returns FOLLOWS_BADLY and ON_SWITCH where an axis has to stop, and
+    SETTLED where one has come to rest.
+    """
     found = 0
     for i in range(a.n):
         if a.limp[i]:
@@ -393,8 +418,11 @@ def follow(a: Loop) -> int:
         a.following[i] = a.desired[i] - a.position[i]
         if abs(a.following[i]) > a.error_max[i] and not a.limp[i]:
             found = found | FOLLOWS_BADLY
+        if a.kind[i] == SETTLING:
+            found = found | settle(a, i)
         if a.has_switches and a.switches[i] & (SWITCH_MINUS | SWITCH_PLUS):
-            v = a.desired_velocity[i]
+            # an axis that is far behind goes to its set-point, wherever that goes
+            v = a.error[i] if abs(a.error[i]) > a.tolerance[i] else a.desired_velocity[i]
             onto = (a.switches[i] & SWITCH_MINUS and v < 0.0) or (a.switches[i] & SWITCH_PLUS and v > 0.0)
             free = a.kind[i] == STOP or a.kind[i] == HOLD or a.latched[i] & AxisStatus.HOMING != 0
             if onto and not free:
@@ -420,8 +448,8 @@ def show(a: Loop) -> int:
 def quiet_tick(a: Loop, now_ns: int) -> int:
     """Do a whole tick in which nothing begins, ends or is out of order. Returns 0, or what the bank has to see to.
 
-    LATE, ENDS, NOT_FINITE, WIDE and ODD: the bank does the tick. AT_LIMIT, FOLLOWS_BADLY and ON_SWITCH: so much of it
-    has been done as comes before that, and the bank goes on from there.
+    LATE, ENDS, NOT_FINITE, WIDE and ODD: the bank does the tick. AT_LIMIT, FOLLOWS_BADLY, ON_SWITCH and SETTLED: so
+    much of it has been done as comes before that, and the bank goes on from there.
     """
     if now_ns - a.last_ns > a.late_ns:
         return LATE

@@ -19,10 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .axis_step import REST
-
-REST_NS = 50_000_000
-"""So long it must be so [ns]."""
+from .axis_step import REST, REST_NS
 
 
 class ForceEnds:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import AxisStatus
 
 from . import axis_step
-from .axis_step import FORCE, HOLD, STOP
+from .axis_step import FORCE, HOLD, SETTLING, STOP
 from .bank import FAULT, Axes, Bank
 from .guard import LimitGuard
 from .homing import HomingRuns
@@ -143,6 +143,7 @@ class AxisBank(Bank):
     def _set_limp(self, axes: Axes) -> None:
         self._limp[axes] = True
         self._any_limp = bool(self._limp.any())
+        self._sequencer.settle(axes, self._last_ns)
 
     def _recover(self, axes: Axes, latched: Axes) -> None:
         lost = axes[self.stepper[axes] & ((latched & FOLLOWING_ERROR) != 0)]
@@ -155,7 +156,11 @@ class AxisBank(Bank):
         if limp.size:
             self._limp[limp] = False
             self._any_limp = bool(self._limp.any())
-            self._sequencer.hold(limp, self._position[limp], self._last_ns)
+            moves = self._law.moves(limp)
+            rests, moving = limp[~moves], limp[moves]
+            self._sequencer.hold(rests, self._position[rests], self._last_ns)
+            if moving.size:
+                self._sequencer.brake(moving, np.stack(self._law.actual(moving), axis=1), self._last_ns)
 
     def _is_too_late(self, start_ns: int, now_ns: int) -> bool:
         return now_ns - start_ns > self._tick_s * 1e9
@@ -170,7 +175,7 @@ class AxisBank(Bank):
         held = self._queue.limits
         self._law.velocity_limit[axes] = held.velocity[axes]
         self._law.acceleration_limit[axes] = held.acceleration[axes]
-        self._law.force_limit[axes] = held.force[axes]
+        self._law.limit_force(axes, held.force[axes])
 
     def _home(self, axes: Axes, now_ns: int) -> None:
         self._homing.begin(axes, now_ns)
@@ -195,8 +200,7 @@ class AxisBank(Bank):
 
     def brake(self, axis: int, now_ns: int) -> None:
         """Stop at maximum deceleration."""
-        one = np.array([axis])
-        self._sequencer.brake(one, self._sequencer.state(one, now_ns), now_ns)
+        self._sequencer.stop(np.array([axis]), now_ns, now_ns)
 
     def stands(self, axis: int) -> bool:
         """Tell whether an axis holds still."""
@@ -296,15 +300,15 @@ class AxisBank(Bank):
     def _stop_late(self, last_ns: int, now_ns: int) -> None:
         """Stop what moved, from the state of the last tick: a late tick never catches up."""
         sequencer = self._sequencer
-        moving = np.flatnonzero((sequencer.kind != HOLD) | (sequencer.store.cut_ns <= now_ns))
+        behind = self._law.is_behind(np.arange(self.n))
+        moving = np.flatnonzero((sequencer.kind != HOLD) | (sequencer.store.cut_ns <= now_ns) | behind)
         if not moving.size:
             return
         after, most = (now_ns - last_ns) * 1e-6, self._late_ns * 1e-6
         text = f"the tick came {after:.1f} ms after the last; at most {most:g} ms"
         self._homing.cancel(moving)
-        state = sequencer.state(moving, last_ns)
         sequencer.drop(moving)
-        sequencer.brake(moving, state, now_ns)
+        sequencer.stop(moving, last_ns, now_ns)
         self._queue.emit(EventKind.DROPPED, moving, now_ns, errno.ETIME, text)
         self._queue.latch_fault(moving, text, now_ns, errno.ETIME)
         sequencer.refresh(moving)
@@ -358,6 +362,9 @@ class AxisBank(Bank):
         loop = self.loop
         if found & axis_step.FOLLOWS_BADLY:
             self._lose(np.flatnonzero((np.abs(self._following) > self._error_max) & ~self._limp), now_ns)
+        if found & axis_step.SETTLED:
+            settled = self._law.settled & (self._sequencer.kind == SETTLING)
+            self._sequencer.settled(np.flatnonzero(settled), now_ns)
         if found & axis_step.ON_SWITCH:
             self._keep_switches(self._switches, now_ns)
         if self._homing.active:
@@ -381,7 +388,8 @@ class AxisBank(Bank):
 
     def _keep_switches(self, switches: NDArray[np.int64], now_ns: int) -> None:
         """Stop axes that run onto an end switch; leaving it is free."""
-        v, kind = self._desired_velocity, self._sequencer.kind
+        error, kind = self._law.arrays["error"], self._sequencer.kind
+        v = np.where(np.abs(error) > self._law.arrays["tolerance"], error, self._desired_velocity)
         hit = ((switches & SWITCH_MINUS) != 0) & (v < 0) | ((switches & SWITCH_PLUS) != 0) & (v > 0)
         hit &= (kind != STOP) & (kind != HOLD) & ((self._queue.latched & HOMING) == 0)
         if hit.any():

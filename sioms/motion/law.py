@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from sioms.native.language import ARRAYS
 
-from .axis_step import Loop
+from .axis_step import FORCE, REST, Loop
 from .force_end import ForceEnds
 from .settings import AxisKind, AxisSettings
 from .store import NEVER_NS
 
 Vector = NDArray[np.float64]
+FOLLOWS_S = 0.5
+"""What its velocity limit covers in this time, an axis may be behind that has no following_error_max of its own [s]."""
 
 
 class ControlLaw:
@@ -57,7 +59,10 @@ class ControlLaw:
         for field, name in (("force", "force_max"), ("velocity", "velocity_max"), ("acceleration", "acceleration_max")):
             arrays[f"{field}_limit"][:] = [getattr(s, name) for s in settings]
         arrays["filter_s"][:] = [s.velocity_filter_s for s in settings]
-        arrays["error_max"][:] = [np.inf if s.following_error_max is None else s.following_error_max for s in settings]
+        told = [s.following_error_max for s in settings]
+        self._told_error = np.array([np.nan if most is None else most for most in told])
+        self._usual_error = np.array([FOLLOWS_S * s.velocity_max for s in settings])
+        self._force_max = np.array([s.force_max for s in settings])
         numbers = dict.fromkeys((f for f, kind in Loop.kinds.items() if kind is int), 0)
         numbers |= {"n": n, "next_ns": NEVER_NS, "any_integral": int(arrays["ki"].any())}
         self.loop = Loop(**arrays, **numbers, tick_s=tick_s, dt=tick_s, bound=np.inf)
@@ -81,8 +86,15 @@ class ControlLaw:
         self.event_status: NDArray[np.int64] = arrays["event_status"]
         self.limp: NDArray[np.bool_] = arrays["limp"]
         self.actuator: Vector = arrays["actuator"]
+        self.moved_ns: NDArray[np.int64] = arrays["moved_ns"]
+        self.settled: NDArray[np.bool_] = arrays["settled"]
+        self._position: Vector = arrays["position"]
+        self._velocity: Vector = arrays["velocity"]
+        self._tolerance: Vector = arrays["tolerance"]
+        self._error_max: Vector = arrays["error_max"]
         self._error: Vector = arrays["error"]
         self._integral: Vector = arrays["integral"]
+        self.limit_force(np.arange(n), self.force_limit)
 
     def anchor_at(self, axis: int, position: float) -> None:
         """Call the place at which a stepper stands ``position``; the raw output does not change."""
@@ -93,6 +105,52 @@ class ControlLaw:
         """Add to the coordinate of an axis; the raw output does not change."""
         self.slewed[axis] += by
         self.anchor[axis] += by
+
+    def limit_force(self, axes: NDArray[np.int64], most: Vector | float) -> None:
+        """Put limits of the force in force [N or N*m].
+
+        A servo that may use all its force has to follow; one that is held back on purpose may meet something.
+        """
+        self.force_limit[axes] = most
+        follows = ~self.stepper[axes] & (self.force_limit[axes] >= self._force_max[axes])
+        usual = np.where(follows, self._usual_error[axes], np.inf)
+        told = self._told_error[axes]
+        self._error_max[axes] = np.where(np.isnan(told), usual, told)
+
+    def actual(self, axes: NDArray[np.int64]) -> tuple[Vector, Vector]:
+        """Return where axes are and how fast they go: measured of servos, put out of steppers (m,) each."""
+        stepper = self.stepper[axes]
+        position = np.where(stepper, self.slewed[axes], self._position[axes])
+        return position, np.where(stepper, self.output[axes], self._velocity[axes])
+
+    def is_on_its_way(self, axes: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Tell which axes move, and are far from their set-points or have been let go."""
+        on_its_way: NDArray[np.bool_] = (np.abs(self._error[axes]) > self._tolerance[axes]) | self.limp[axes]
+        return on_its_way & self.moves(axes)
+
+    def moves(self, axes: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Tell which axes move."""
+        moving: NDArray[np.bool_] = np.abs(self.actual(axes)[1]) > REST * self.velocity_limit[axes]
+        return moving
+
+    def is_behind(self, axes: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Tell which axes cannot follow: all their force does not bring them to the set-points that have run ahead.
+
+        An axis that runs ahead of its set-point is braked by its error, and is not behind.
+        """
+        error, (_, velocity) = self._error[axes], self.actual(axes)
+        behind: NDArray[np.bool_] = (np.abs(error) > self._tolerance[axes]) & (self.kind[axes] != FORCE)
+        behind &= self.saturated[axes] | (np.abs(error) > self.full_error(axes))
+        behind &= (error * velocity >= 0.0) | ~self.moves(axes)
+        return behind
+
+    def full_error(self, axes: NDArray[np.int64]) -> Vector:
+        """Return the error at which the law asks for all the force of a servo, at its velocity; inf of a stepper."""
+        gain = self.k[axes] * (1.0 + self.kz[axes])
+        force = self.force_limit[axes] * (1.0 + np.abs(self.kp[axes])) + np.abs(self.kb[axes] * self._velocity[axes])
+        error: Vector = np.full(len(axes), np.inf)
+        np.divide(force, gain, out=error, where=(gain > 0.0) & ~self.stepper[axes])
+        return error
 
     def give_way(self, axes: NDArray[np.int64]) -> None:
         """Forget the error of axes whose set-point has yielded: what it was before must not push back."""

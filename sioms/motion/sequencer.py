@@ -1,6 +1,8 @@
 """Sequencer: which plan every axis runs, and what follows when one ends.
 
-An axis always runs exactly one plan: a hold at rest, a command, or a brake. The plan of the next
+An axis always runs exactly one plan: a hold at rest, a command, or a brake. It begins where the one before ended, but
+for axes that cannot follow: their stops begin where they are, and commands that break off others no farther ahead than
+their force reaches. The plan of the next
 command is made ahead, in the slack between ticks, when the state it begins in is known; then its
 start is a few array operations for all axes that start together, a thousand as well as one.
 Concurrency: that of the bank.
@@ -19,7 +21,7 @@ from sioms.protocol.flags import AxisStatus
 
 from . import modes
 from .arrival import Approach, Arrivals, plan_point
-from .axis_step import BRAKE, FORCE, HOLD, POSITION, RATE, STOP
+from .axis_step import BRAKE, FORCE, HOLD, POSITION, RATE, SETTLING, STOP
 from .commands import Command, is_point_move
 from .law import ControlLaw
 from .profile import Bounds, InfeasibleError, Plan, Planner, State
@@ -47,6 +49,7 @@ _KIND_STATUS = np.array(
         AxisStatus.MOVING | AxisStatus.FORCE_MODE,
         AxisStatus.MOVING,
         AxisStatus.MOVING | AxisStatus.STOPPING,
+        AxisStatus.MOVING,
     ],
     dtype=np.int64,
 )
@@ -186,8 +189,8 @@ class Sequencer:
         return idle
 
     def rest_positions(self) -> Floats:
-        """Return where idle axes rest, NaN for the others (n,)."""
-        idle = (self.kind == HOLD) & ~self._queue.has_head
+        """Return where axes without commands rest, NaN for the others (n,)."""
+        idle = np.isin(self.kind, (HOLD, SETTLING)) & ~self._queue.has_head
         rest: Floats = np.where(idle, self.store.final[self.store.row, 0], np.nan)
         return rest
 
@@ -204,13 +207,24 @@ class Sequencer:
         """Drop the commands and brake at maximum deceleration from the present state."""
         waited = axes[(self.kind[axes] == HOLD) & self._queue.has_head[axes]]
         self.drop(axes)
-        moving = axes[(self.kind[axes] != HOLD) & (self.kind[axes] != STOP)]
+        moving = axes[(self.kind[axes] != HOLD) & (self.kind[axes] != STOP) | self._law.is_behind(axes)]
         if moving.size:
-            self.brake(moving, self.state(moving, now_ns), now_ns)
+            self.stop(moving, now_ns, now_ns)
             self.advance(now_ns)
         if waited.size:
             self._queue.emit(EventKind.IDLE, waited[self.is_idle(waited)], now_ns)
         self.refresh(axes)
+
+    def stop(self, axes: Axes, seen_ns: int, start_ns: int) -> None:
+        """Stop at maximum deceleration, beginning at start_ns, from the state of seen_ns: that of the set-points, or
+        the actual one of axes that cannot follow them.
+        """
+        state, behind = self.state(axes, seen_ns), self._law.is_behind(axes)
+        if behind.any():
+            late = axes[behind]
+            state[behind, 0], state[behind, 1] = self._law.actual(late)
+            self._law.give_way(late)
+        self.brake(axes, state, start_ns)
 
     def brake(self, axes: Axes, state: Floats, start_ns: int) -> None:
         """Stop from state (m, 2 or 3) at maximum deceleration, beginning at start_ns."""
@@ -245,6 +259,21 @@ class Sequencer:
         """Return the set-point state (m, 3) at now; of axes in force mode the measured one."""
         return self._actual_of_force(axes, self.store.state(axes, now_ns))
 
+    def _end_state(self, axes: Axes) -> Floats:
+        """Return the state (m, 3) in which what follows the plans that have just ended begins."""
+        store, law = self.store, self._law
+        state = self._actual_of_force(axes, store.final[store.row[axes]])
+        broken = np.flatnonzero(store.cut_ns[axes] != UNCUT_NS)
+        behind = broken[law.is_behind(axes[broken])] if broken.size else broken
+        if behind.size:
+            late = axes[behind]
+            position, velocity = law.actual(late)
+            reach = np.minimum(np.abs(state[behind, 0] - position), law.full_error(late))
+            state[behind, 0] = position + np.copysign(reach, state[behind, 0] - position)
+            state[behind, 1], state[behind, 2] = velocity, 0.0
+            self._ready[late] = False  # what was planned ahead would begin somewhere else
+        return state
+
     def _actual_of_force(self, axes: Axes, state: Floats) -> Floats:
         if self.any_force:
             force = self.kind[axes] == FORCE
@@ -274,7 +303,7 @@ class Sequencer:
         store, queue = self.store, self._queue
         rows = store.row[axes]
         start_ns, fraction = store.ended_at(axes)
-        state = self._actual_of_force(axes, store.final[rows])
+        state = self._end_state(axes)
         kind = self._row_kind[rows]
         queue.emit(EventKind.ENDED, axes[(kind >= POSITION) & (kind <= FORCE)], now_ns)
         for row in rows[self._row_signals[rows]].tolist():
@@ -394,7 +423,7 @@ class Sequencer:
         if mode & modes.FORCE_OFFSET:
             law.offset[axis] = command.force_offset
         if mode & modes.MAX_FORCE:
-            law.force_limit[axis] = command.max_force
+            law.limit_force(np.array([axis]), command.max_force)
         if mode & modes.MAX_VEL_ACC:
             self._velocity_limit[axis], self._acceleration_limit[axis] = (
                 command.max_velocity,
@@ -410,6 +439,7 @@ class Sequencer:
             came = chosen[self.kind[chosen] != HOLD]
             store.put_hold(store.row[chosen], state[still, 0])
             self._set_kind(chosen, HOLD)
+            self.settle(came, now_ns)
             store.begin(chosen, start_ns[still], fraction[still])
             self._queue.emit(EventKind.IDLE, came[self.is_idle(came)], now_ns)
         chosen = axes[~still]
@@ -421,6 +451,20 @@ class Sequencer:
             self._todo.update(dict.fromkeys(chosen.tolist()))
             store.begin(chosen, start_ns[~still], fraction[~still])
         self._settle_masks()
+        self.refresh(axes)
+
+    def settle(self, axes: Axes, now_ns: int) -> None:
+        """Of these axes, whose set-points rest, wait for those that are still on their way."""
+        settling = axes[(self.kind[axes] == HOLD) & self._law.is_on_its_way(axes)]
+        if settling.size:
+            self._set_kind(settling, SETTLING)
+            self._law.moved_ns[settling] = now_ns
+            self.refresh(settling)
+
+    def settled(self, axes: Axes, now_ns: int) -> None:
+        """These axes have come to rest behind their set-points."""
+        self._set_kind(axes, HOLD)
+        self._queue.emit(EventKind.IDLE, axes[self.is_idle(axes)], now_ns)
         self.refresh(axes)
 
     def _set_kind(self, axes: Axes, kind: int) -> None:

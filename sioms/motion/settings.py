@@ -197,7 +197,8 @@ class AxisSettings:
         force_max: > 0 [N or N*m]; servo only.
         ki: integral gain beside that law [N/(m s) or N*m/(rad s)]; servo only.
         velocity_filter_s: time constant of the velocity filter [s].
-        following_error_max: [unit], None when not watched.
+        following_error_max: [unit], None: what velocity_max covers in 0.5 s for servos that may use all their force,
+            not watched for others.
         homing: None when the axis cannot be homed.
         backlash: take-up of play at the end of point moves, None when there is none.
         arrival: when point moves count as done, None: when the set-point has arrived.

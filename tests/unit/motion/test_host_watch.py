@@ -24,6 +24,7 @@ class Shoved(Rig):
     def _follow(self, output, dt):
         self.shoved += self.shove * dt
         bank = self.bank
+        self.shoved[bank._limp] = self.shove[bank._limp] * dt  # it is commanded to be where it is
         return (
             self.turned * np.where(bank.stepper, output, bank.rows["commanded_position"] - bank._offset) + self.shoved
         )
