@@ -32,6 +32,8 @@ from .rigs import Axis, Output, Rig
 ANSWER_S = 5.0
 START_S = 30.0
 UP_S = 15.0
+LOGGED_S = 1.0
+"""Longest time until the daemon has written down what a driver has told it; the node shows it at once [s]."""
 PRIORITY = 15
 """Of simulators and wires, where real-time priorities are allowed; the drivers' lies above."""
 
@@ -153,6 +155,7 @@ class Station:
         self.cell: Workcell
         self.port = ""
         self._verbs: frozenset[str] | None = None
+        self._log_of_before = 0  # characters of the daemon's log that were written before the last calm
         try:
             if rig.simulator:
                 self._connect(paced, wired)
@@ -211,6 +214,7 @@ class Station:
             text,
         )
         self.daemon = Daemon('[workcell]\nname = "check"\n' + text)
+        self._log_of_before = 0
         self.cell = self.daemon.cell("check")
 
     def end_daemon(self, *, kill: bool = False) -> None:
@@ -308,10 +312,17 @@ class Station:
                     return (time.monotonic_ns() - began_ns) / 1e9
 
     def last_fault(self) -> str:
-        """Return the last fault of an axis that the daemon has logged, '' when there is none."""
-        log = self.daemon.log() if self.daemon is not None else ""
-        found = re.findall(r'text="(fault of .*)"$', log, re.MULTILINE)
-        return str(found[-1]) if found else ""
+        """Return the last fault of an axis since all was calm, as the daemon logs it; '' when it logs none in time.
+
+        An axis shows its fault in the tick that finds it, and its reason comes to the log behind that.
+        """
+
+        def told() -> str:
+            log = self.daemon.log() if self.daemon is not None else ""
+            found = re.findall(r'text="(fault of .*)"$', log[self._log_of_before :], re.MULTILINE)
+            return str(found[-1]) if found else ""
+
+        return str(wait_for(told, LOGGED_S))
 
     def has(self, mode: ControlMode) -> bool:
         """Whether the first axis has a control mode."""
@@ -392,6 +403,7 @@ class Station:
             with contextlib.suppress(OSError), self.cell.open(axis.node, "rw", timeout=2.0) as node:
                 node.reset()
                 _wait_sound(node)
+        self._log_of_before = len(self.daemon.log()) if self.daemon is not None else 0
 
     def start_client(self, script: str, *words: str) -> Client:
         """Start a client in a process of its own; it must print a line when it is ready."""

@@ -1,8 +1,11 @@
-"""What the driver check says of a driver that does not come up."""
+"""What the driver check says of a driver that does not come up, and of one whose axis falls into fault."""
 
 from __future__ import annotations
 
-from sioms.check.station import _crash
+from collections.abc import Iterator
+from typing import Any
+
+from sioms.check.station import Station, _crash
 
 LOG = r"""time=1 level=info event="device up" device=stage pid=7
 time=2 level=error event=driver device=stage text="driver failed: KeyError(8):   File \"a.py\", line 1, in poll     x = y[8]     ~^^^ KeyError: 8 "
@@ -14,3 +17,35 @@ time=4 level=error event="device lost" device=stage reason="its driver process e
 def test_the_last_crash_is_told_alone() -> None:
     assert _crash(LOG) == 'driver failed: KeyError(9): File "a.py", line 2, in poll x = y[9] KeyError: 9'
     assert _crash(LOG.splitlines()[0]) == ""
+
+
+FAULT = 'time=5 level=error event=driver device=stage text="fault of x: alarm 0x85"\n'
+
+
+class Logging:
+    """A daemon whose log grows with each look at it."""
+
+    def __init__(self, *parts: str) -> None:
+        self._parts: Iterator[str] = iter(parts)
+        self._text = ""
+
+    def log(self) -> str:
+        self._text += next(self._parts, "")
+        return self._text
+
+
+def station(*parts: str, before: int = 0) -> Station:
+    """Return a station of which nothing runs; so many characters of its log are of before the last calm."""
+    made: Any = Station.__new__(Station)
+    made.daemon, made._log_of_before = Logging(*parts), before
+    assert isinstance(made, Station)
+    return made
+
+
+def test_the_reason_of_a_fault_is_waited_for_as_it_is_logged_behind_what_the_axis_shows() -> None:
+    assert station(LOG, "", FAULT).last_fault() == "fault of x: alarm 0x85"
+
+
+def test_a_fault_of_before_the_last_calm_is_not_taken_for_this_one() -> None:
+    assert station(FAULT, before=len(FAULT)).last_fault() == ""
+    assert station(FAULT, "", FAULT.replace("85", "10"), before=len(FAULT)).last_fault() == "fault of x: alarm 0x10"
