@@ -7,7 +7,7 @@ import os
 import select
 import socket
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import msgpack
@@ -19,6 +19,7 @@ from sioms.motion import AxisBank, AxisSettings
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.messages import MAX_PACKET, ClientVerb, decode, encode
 from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.protocol.stopjournal import PID
 from sioms.sdk.blocks import AnyBlock, AxisBlock, BinaryBlock, BlockSpec, Description
 from sioms.sdk.driver import Driver, Kit, TickDriver
 from sioms.sdk.runtime import Runtime
@@ -280,7 +281,14 @@ class Process:
         self._fds = [os.dup(fd) for fd in fds]
         self.runtime = Runtime(driver, device, settings, generation, self.options, self._fds)
         self.fds = list(self.runtime.pages.fds)
+        journal = self.runtime.stops._journal
+        self._append = journal.append
+        journal.append = self._note  # type: ignore[method-assign]
         self.runtime.start()
+
+    def _note(self, entry: Mapping[str, Any], now_s: float) -> None:
+        """Note a stop as of this process: the daemon passes on to a driver what it has not noted itself."""
+        self._append({**entry, PID: self.pid} if PID in entry else entry, now_s)
 
     @property
     def device(self) -> int:

@@ -43,6 +43,7 @@ SCHEDULES = [
     "open 0 0, hear 0, move 0 0, lapse 0",
     "request_stop 0, tick 0, reset 1, tick 1, request_stop 0, reset 1",
     "request_stop 0, beat, reset 1, crash, hear 0, leave 0, hear 1, leave 1, boot",
+    "open 1 1, hear 1, stop_by_handle 1 1, close 1 1, beat, move 1 1",
     "stop_node 0 0, stop 1, crash, kill 0, kill 1, boot, listen 0, connect 0, open 0 0, hear 0, move 0 0",
 ]
 """Each has broken a promise once, or would with a slip of the pen."""
