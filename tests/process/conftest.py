@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from daemon_rig import Client, Daemon, daemons
+from shell_rig import Shell, run_line
 
 import sioms
 
@@ -39,6 +42,16 @@ def cell(daemon: Daemon) -> Iterator[sioms.Workcell]:
     """A session with the module's daemon."""
     with daemon.cell("tester") as opened:
         yield opened
+
+
+@pytest.fixture
+def shell(daemon: Daemon, tmp_path: Path) -> Shell:
+    """Run lines of bash with the tools on their path, in a fresh folder: ``shell(line, text="", socket=...)``."""
+
+    def run(line: str, text: str = "", socket: str = daemon.socket) -> subprocess.CompletedProcess[str]:
+        return run_line(line, text, socket, tmp_path)
+
+    return run
 
 
 @pytest.fixture
