@@ -17,8 +17,9 @@ from collections.abc import Callable, Generator, Sequence
 
 from sioms.hand.contacts import FINGER_M, Grasp, Likeness, classify, friction_angle_deviation, grasp
 from sioms.hand.kinematics import Hand, Six
-from sioms.hand.regrasp import NEUTRAL, disk_radii, regrasp_convex, regrasp_disk, regrasp_rectangle
+from sioms.hand.regrasp import NEUTRAL, disk_radii, regrasp_disk, regrasp_rectangle
 from sioms.hand.rolling import correcting_law, friction_angle_rates, nearest_law
+from sioms.hand.shape import Touch, expected
 from sioms.hand.touch import Event, Failed, Fault, Manner, Reading, Sensed, Setpoint, State
 
 Ticks = Generator[Setpoint, Reading, None]
@@ -51,7 +52,7 @@ class Skills:
         self._held, self._what = False, ""
         self._missing = [0.0, 0.0]
         self._warned = False
-        self._past: tuple[Six, Sensed] | None = None
+        self._past: list[Sensed] = []
         self._radii = [FINGER_M, FINGER_M]
 
     def say(self, text: str, fault: Fault | None = None) -> None:
@@ -134,7 +135,7 @@ class Skills:
             raise Failed(
                 Fault.NOT_PARALLEL,
                 f"hold object: after {self.regrasps} regrasps the friction angles are still {_degrees(found.grasp)}; "
-                f"want less than {math.degrees(self.manner.light_rad):.0f} degrees to squeeze it",
+                f"want less than {math.degrees(self.manner.squeeze_rad):.0f} degrees to squeeze it",
             )
         return (yield from self._hold(time_s))
 
@@ -156,16 +157,17 @@ class Skills:
         yield from self._settle(manner.light_n, 0.25)
         found = yield from self._sense(manner.light_n)
         if found.grasp.quality > manner.light_rad:
-            self.say(f"near the friction cone: {_degrees(found.grasp)}; not squeezed", Fault.CONE)
-            return found
+            self.say(f"near the friction cone: {_degrees(found.grasp)}", Fault.CONE)
+        if found.grasp.quality > manner.squeeze_rad:
+            return (yield from self._sense(manner.light_n, _LIGHTLY * manner.frames))
         yield from self._settle(manner.force_n, 0.6)
         return (yield from self._sense(manner.force_n))
 
     def _regrasp(self, found: Sensed) -> Generator[Setpoint, Reading, Sensed]:
         self.state = State.REGRASP
+        self._past.append(found)
         target = self.plan(found)
         self.regrasps += 1
-        self._past = (self.hand.forward(self.now.joints), found)
         self.say(f"{found.likeness.value}-like, {_degrees(found.grasp)}: regrasp")
         clear = 2.0 * self.manner.clearance_m
         opened = max(target[3], self._goal[3]) + clear
@@ -189,39 +191,17 @@ class Skills:
             twist = held.eta1 + held.eta2 if likeness is Likeness.DISK else held.eta1 - held.eta2
             if agrees and found.likeness is likeness and abs(twist) < 4.0 * found.deviation + math.radians(1.0):
                 return regrasp_disk(held, radius) if likeness is Likeness.DISK else regrasp_rectangle(held)
-        if (between := self._between(found)) is not None:
-            return between
-        if found.likeness is not Likeness.PARALLEL and all(
-            deviation < _TOLD or seen > 3.0 * deviation
-            for seen, deviation in zip(found.curvatures, found.curvature_deviations, strict=True)
-        ):
-            target = regrasp_convex(held, found.curvatures)
-            turned = abs(math.remainder(target[2] - held.direction, math.tau))
-            x, y = ((a + b) / 2.0 for a, b in zip(held.contact1, held.contact2, strict=True))
-            shift = math.hypot(target[0] - x, target[1] - y)
-            low, high = self.manner.opening
-            if turned < _MOST_TURN and shift < 0.5 * held.apart_m and low < target[3] < high - 2e-2:
-                return target
+        known = [touch for sensed in self._past for touch in _touches(sensed)]
+        low, high = self.manner.opening
+        for one in expected(known, held):
+            shift = math.hypot(
+                one.x - 0.5 * (held.contact1[0] + held.contact2[0]), one.y - 0.5 * (held.contact1[1] + held.contact2[1])
+            )
+            d = one.apart_m + 2.0 * FINGER_M
+            turned = abs(math.remainder(one.direction - held.direction, math.tau))
+            if turned < _MOST_TURN and shift < 0.75 * held.apart_m and low < d < high - 2e-2:
+                return one.x, one.y, one.direction, d, NEUTRAL, NEUTRAL
         return regrasp_disk(held, radius) if found.likeness is Likeness.DISK else regrasp_rectangle(held)
-
-    def _between(self, found: Sensed) -> Six | None:
-        """Return where, on the way from the last grasp to this one, the friction angles would be 0: the object has not
-        moved meanwhile. None where it tells nothing.
-        """
-        if self._past is None:
-            return None
-        was, before = self._past
-        now = self.hand.forward(self.now.joints)
-        start = before.grasp.eta1, before.grasp.eta2
-        change = found.grasp.eta1 - start[0], found.grasp.eta2 - start[1]
-        size = change[0] ** 2 + change[1] ** 2
-        share = -(start[0] * change[0] + start[1] * change[1]) / max(size, 1e-9)
-        left = math.hypot(start[0] + share * change[0], start[1] + share * change[1])
-        if not 0.2 < share < 1.5 or left > _SECANT * math.hypot(found.grasp.eta1, found.grasp.eta2):
-            return None
-        x, y, d = (was[i] + share * (now[i] - was[i]) for i in (0, 1, 3))
-        psi = was[2] + share * math.remainder(now[2] - was[2], math.tau)
-        return x, y, psi, d, NEUTRAL, NEUTRAL
 
     def _can_roll(self, found: Sensed) -> bool:
         """Return whether rolling leads to a parallel grasp before an array ends, as far as the curvatures tell: each
@@ -239,13 +219,16 @@ class Skills:
         return (
             left < 0.5 * held.quality + self.manner.tolerance_rad
             and max(abs(first), abs(second)) < _MOST_TURN
-            and all(low + travel < place < high - travel for place in found.places)
+            and all(
+                low + _SPARE * max(travel, abs(rate)) < place < high - _SPARE * max(travel, abs(rate))
+                for place, rate in zip(found.places, (first, second), strict=True)
+            )
         )
 
     def _roll(self) -> Generator[Setpoint, Reading, Sensed]:
         self.state = State.ROLL
         self.rolls += 1
-        self._past = None  # the object moves
+        self._past.clear()  # the object moves
         manner, since, low, high = self.manner, self.now.time_s, *self.manner.arc
         self.say(f"roll from {_degrees(self._seen())}")
         filtered: tuple[float, float] | None = None
@@ -286,10 +269,10 @@ class Skills:
             yield from self._tick(self._law(filtered))
         return (yield from self._sense(self.manner.force_n))
 
-    def _sense(self, force: float) -> Generator[Setpoint, Reading, Sensed]:
+    def _sense(self, force: float, frames: int = 0) -> Generator[Setpoint, Reading, Sensed]:
         """Average frames; the hand keeps still."""
         before, self.state = self.state, State.SENSE
-        count = self.manner.frames
+        count = frames or self.manner.frames
         joints, places, radii = [0.0] * 6, [0.0, 0.0], [0.0, 0.0]
         variances, widths, doubts = [0.0, 0.0], [0.0, 0.0], ["", ""]
         doubtful, felt, first = [0, 0], 0.0, self.now.joints
@@ -352,13 +335,14 @@ class Skills:
             one, two = (gone_s < _MET_S for gone_s in since)
             before_s, both = self.now.time_s, one and two
             drift = 0.0 if one == two else (-0.5 if one else 0.5) * speed
-            shut = 0.0 if both else -speed
+            pressed = all(finger.touched for finger in self.now.fingers)
+            shut = 0.0 if pressed else -_CREEP * speed if both else -speed
             u, v = math.cos(self._goal[2]), math.sin(self._goal[2])
             yield from self._follow((drift * u, drift * v, 0.0, shut, 0.0, 0.0), manner.light_n if both else 0.0)
             gone_s, apart = self.now.time_s - before_s, self.hand.forward(self.now.joints)[3]
             # light fingers bounce: the goal does not run away from where they are
             self._goal[3] = apart if both else max(self._goal[3], apart - _AHEAD_M)
-            pressed_s = pressed_s + gone_s if both else 0.0
+            pressed_s = (pressed_s + gone_s * pressed) if both else 0.0
             since = [
                 0.0 if finger.touched else past + gone_s for finger, past in zip(self.now.fingers, since, strict=True)
             ]
@@ -377,7 +361,7 @@ class Skills:
         since, start = self.now.time_s, self.now.time_s
         while self.now.time_s - since < time_s and self.now.time_s - start < 5.0:
             yield from self._tick((0.0, 0.0), force)
-            if self._seen().quality > self.manner.light_rad and force > self.manner.light_n:
+            if self._seen().quality > self.manner.squeeze_rad and force > self.manner.light_n:
                 return
             if abs(self.felt_force() - force) > 0.1 * force:
                 since = self.now.time_s
@@ -530,12 +514,34 @@ class Skills:
 _PLACE_RAD = math.radians(0.02)  # what averaging does not take from a place: of the axes' and the array's own
 _HOLLOW = 15.0  # 1/m
 _END_RAD = math.radians(6.0)
-_SECANT = 0.5  # of the friction angles now, that may be left between two grasps
-_TOLD = 30.0  # 1/m: curvatures that are known worse are not used
 _MOST_TURN = math.radians(50.0)
+_SPARE = 1.2  # of an array's arc, where rolling is begun
 _ARRIVE = 40  # ticks
+_LIGHT_N = 0.5  # below which curvatures are felt badly
+_SHARP, _FLAT = 90.0, 0.1  # 1/m
+_CORNER_M = 2e-3
+_LIGHTLY = 10  # times the frames, where it is only felt lightly
+_CREEP = 0.1  # of the closing speed, while both fingers have met it and press too lightly to be felt
 _MET_S = 0.1  # how long a finger that bounces counts as touched
 _AHEAD_M = 1e-3
+
+
+def _touches(found: Sensed) -> list[Touch]:
+    """Return what a grasp tells of the outline.
+
+    A light touch feels a corner rounder than it is, and a side next to it no better than its deviation.
+    """
+    held, touches, light = found.grasp, [], found.force < _LIGHT_N
+    sharp = [light and bend > _SHARP for bend in found.curvatures]
+    for i, (point, normal) in enumerate(((held.contact1, held.normal1), (held.contact2, held.normal2))):
+        bend, deviation = found.curvatures[i], found.curvature_deviations[i]
+        if sharp[i]:
+            touches.append(Touch(point, normal + math.pi, _CORNER_M, _CORNER_M))
+            continue
+        straight = light and sharp[1 - i] and bend < 3.0 * deviation
+        radius = 1.0 / (_FLAT if straight else max(bend, 2.0 * deviation, _FLAT))
+        touches.append(Touch(point, normal + math.pi, radius, radius**2 * deviation + 0.03 * radius + 1e-4))
+    return touches
 
 
 def _mixed(last: tuple[float, float] | None, new: tuple[float, float], share: float) -> tuple[float, float]:

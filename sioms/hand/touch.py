@@ -155,7 +155,8 @@ class Manner:
         clearance_m: by which each finger leaves the object before it moves.
         tolerance_rad: |eta| of a grasp that counts as parallel.
         frames: averaged where a grasp is sensed.
-        light_rad: |eta| from which on a touch is not squeezed, but regrasped as it is.
+        light_rad: |eta| from which on it warns of the friction cone.
+        squeeze_rad: |eta| from which on a touch is not squeezed, but regrasped as it is.
         friction: coefficient that is relied on.
         arc: places of contact between which a finger may be rolled [rad].
         most_n: force beyond which the hand lets go [N].
@@ -177,6 +178,7 @@ class Manner:
     tolerance_rad: float = math.radians(0.3)
     frames: int = 40
     light_rad: float = math.radians(30.0)
+    squeeze_rad: float = math.radians(45.0)
     friction: float = LEAST_FRICTION
     arc: tuple[float, float] = (math.radians(14.0), math.radians(134.0))
     most_n: float = 4.0

@@ -1,0 +1,106 @@
+"""What touches tell of an outline: ellipses, triangles and rectangles, whose parallel grasps are known by geometry."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from sioms.hand.contacts import Grasp, grasp_of
+from sioms.hand.shape import Shape, Touch, across_sides, expected
+
+A, B = 0.035, 0.022
+FINGER = 12.7e-3
+
+
+def on_ellipse(normal: float, radius_deviation_m: float = 1e-3) -> Touch:
+    """Touch an ellipse with axes along x and y where its outward normal is this [rad]."""
+    c, s = math.cos(normal), math.sin(normal)
+    h = math.hypot(A * c, B * s)
+    return Touch((A * A * c / h, B * B * s / h), normal, A * A * B * B / h**3, radius_deviation_m)
+
+
+def held(one: Touch, two: Touch) -> Grasp:
+    """Return the grasp by two fingers that touch there."""
+    centres = [
+        (touch.point[0] + FINGER * math.cos(touch.normal), touch.point[1] + FINGER * math.sin(touch.normal))
+        for touch in (one, two)
+    ]
+    return grasp_of(centres[0], centres[1], one.normal + math.pi, two.normal + math.pi)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7, 2.0])
+@pytest.mark.parametrize("at", [20.0, 40.0, 70.0])
+def test_four_touches_of_an_ellipse_tell_an_axis(turn: float, at: float) -> None:
+    angles = [math.radians(one) for one in (at, at + 170.0, 0.5 * at, 0.5 * at + 184.0)]
+    touches = []
+    for one in map(on_ellipse, angles):
+        x, y = one.point
+        c, s = math.cos(turn), math.sin(turn)
+        touches.append(Touch((c * x - s * y + 0.1, s * x + c * y), one.normal + turn, one.radius_m, 1e-3))
+    found = min(Shape(touches).parallels(turn + angles[2]), key=lambda one: one.deviation)
+    nearest = 0.5 * math.pi * round((found.direction - turn) / (0.5 * math.pi))
+    wrong = found.direction - turn - nearest
+    size = B if round(nearest / (0.5 * math.pi)) % 2 else A
+    # its friction angle there, from the ellipse itself: eta = w'/w of w = 2 sqrt(a^2 cos^2 + b^2 sin^2)
+    assert abs((A**2 - B**2) * math.sin(wrong) / size**2) < 2.0 * found.deviation < math.radians(6.0)
+    assert found.apart_m == pytest.approx(2.0 * size, abs=0.5e-3)
+    assert (found.x, found.y) == pytest.approx((0.1, 0.0), abs=0.5e-3)
+
+
+def test_what_is_expected_has_its_uncertainty() -> None:
+    far = [on_ellipse(math.radians(one)) for one in (40.0, 215.0)]
+    near = [on_ellipse(math.radians(one)) for one in (88.0, 271.0)]
+    one, two = (
+        min(Shape(known).parallels(0.5 * math.pi), key=lambda p: abs(p.direction - 0.5 * math.pi))
+        for known in (far, far + near)
+    )
+    assert two.deviation < 0.3 * one.deviation
+    assert abs(two.direction - 0.5 * math.pi) < math.radians(1.0)
+
+
+def sides(points: np.ndarray, shares: list[float]) -> list[Touch]:
+    """Touch the sides of a polygon, anti-clockwise, each at a share of its length."""
+    touched = []
+    for point, after, share in zip(points, np.roll(points, -1, axis=0), shares, strict=True):
+        way = after - point
+        x, y = point + share * way
+        touched.append(Touch((float(x), float(y)), math.atan2(-way[0], way[1]), 10.0, 1.0))
+    return touched
+
+
+def test_a_triangle_is_held_across_a_height() -> None:
+    points = np.array([[0.0, 0.0], [0.05, 0.0], [0.02, 0.04]])
+    found = across_sides(sides(points, [0.3, 0.5, 0.6]), math.radians(-90.0))[0]
+    assert math.remainder(found.direction + 0.5 * math.pi, math.pi) == pytest.approx(0.0, abs=1e-9)
+    assert (found.x, found.y) == pytest.approx((0.02, 0.02))
+    assert found.apart_m == pytest.approx(0.04)
+
+
+def test_a_corner_that_nobody_has_touched_is_not_relied_on() -> None:
+    points = np.array([[0.0, 0.0], [0.05, 0.0], [0.02, 0.04]])
+    assert across_sides(sides(points, [0.3, 0.5, 0.6])[:2], 0.0) == []
+
+
+def test_parallel_sides_are_held_in_the_middle_of_where_they_were_touched() -> None:
+    one = Touch((0.0, 0.01), math.pi, 10.0, 1.0)
+    two = Touch((0.03, -0.02), math.radians(0.2), 10.0, 1.0)
+    found = expected([one, two], held(one, two))[0]
+    assert (found.x, found.y) == pytest.approx((0.015, -0.005))
+    assert math.remainder(found.direction, math.tau) == pytest.approx(math.radians(0.1))
+    assert found.apart_m == pytest.approx(0.03, abs=1e-4)
+
+
+def test_a_side_and_a_corner_are_held_along_the_normal_of_the_side() -> None:
+    side, corner = Touch((0.0, 0.01), math.pi, 10.0, 1.0), Touch((0.03, -0.005), math.radians(10.0), 1e-3, 1e-3)
+    found = expected([side, corner], held(side, corner))[0]
+    assert found.direction == pytest.approx(0.0, abs=math.radians(0.2))
+    assert found.y == pytest.approx(corner.point[1] - 1e-3 * math.sin(corner.normal), abs=1e-4)
+
+
+def test_two_sides_that_form_a_wedge_are_touched_next_towards_its_thick_end() -> None:
+    tilt = math.radians(10.0)  # x from 0 on the left, and 0.03 + y tan(10 degrees) on the right
+    left, right = Touch((0.0, 0.0), math.pi, 10.0, 1.0), Touch((0.03, 0.0), -tilt, 10.0, 1.0)
+    found = expected([left, right], held(left, right))[0]
+    assert found.y > 0.005
