@@ -5,6 +5,7 @@ Pure.
 from __future__ import annotations
 
 import argparse
+import errno
 import math
 from collections.abc import Callable
 
@@ -33,3 +34,17 @@ def positive(text: str) -> float:
     if not 0.0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is no number above 0")
     return value
+
+
+def place(text: str, example: str) -> tuple[str, int]:
+    """Take a place to listen at, ``HOST:PORT``, apart; an address of IPv6 stands in brackets.
+
+    Raises:
+        OSError: EINVAL, none.
+    """
+    host, colon, port = text.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65535:
+        other = example.rpartition(":")[2]
+        raise OSError(errno.EINVAL, f"listen on {text}: want HOST:PORT, as {example} or *:{other}")
+    return host, int(port)

@@ -47,6 +47,7 @@ COMMANDS: dict[str, Command] = {
     "check": Command("sioms.tools.cell", "check a configuration"),
     "service": Command("sioms.tools.service", "install the daemon as a service of this machine"),
     "serve": Command("sioms.gateway.command", "let clients on other machines use the workcell"),
+    "metrics": Command("sioms.bridges.metrics", "serve values, states and alarms to Prometheus"),
     "key": Command("sioms.gateway.command", "make, allow, list and revoke the keys of remote clients"),
     "driver": Command("sioms.tools.driver", "list, check, trace and replay drivers"),
     "bench": Command("sioms.bench", "measure latencies and throughput on this machine"),
@@ -69,7 +70,10 @@ def main(words: Sequence[str] | None = None) -> int:
     wanted = next((word for word in words if not word.startswith("-")), "")
     module: Any = None
     if wanted in there:
-        module = import_module(there[wanted].module)
+        try:
+            module = import_module(there[wanted].module)
+        except ModuleNotFoundError as error:
+            return _lacks(wanted, error)
         module.add_parser(subparsers)
     else:
         for name, command in there.items():
@@ -86,7 +90,9 @@ def main(words: Sequence[str] | None = None) -> int:
     return _guarded(wanted, module, args)
 
 
-EXTRAS = {"gpiod": "gpio", "matplotlib": "report", "numba": "fast", "zstandard": "record"}
+EXTRAS = {
+    "gpiod": "gpio", "matplotlib": "report", "numba": "fast", "prometheus_client": "metrics", "zstandard": "record",
+}  # fmt: skip
 """Packages that not everybody needs, and the extra of SIOMS that brings each."""
 
 
@@ -144,14 +150,7 @@ def _guarded(name: str, module: Any, args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
     except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
-        if package not in EXTRAS:
-            raise
-        print(
-            f"sioms {name}: {package} is not installed; run: pip install 'sioms[{EXTRAS[package]}]'",
-            file=sys.stderr,
-        )
-        return 1
+        return _lacks(name, error)
     except OSError as error:
         if error.errno in (errno.EBADF, errno.ENOSPC) and not error.filename:
             error.strerror = f"write standard output: {(error.strerror or '').lower()}"
@@ -162,6 +161,15 @@ def _guarded(name: str, module: Any, args: argparse.Namespace) -> int:
             text = f"{error.filename}: {text.lower()}"
         print(f"sioms {name}: {text}", file=sys.stderr)
         return 1
+
+
+def _lacks(name: str, error: ModuleNotFoundError) -> int:
+    """Say which extra brings what is not installed; return the exit status."""
+    package = (error.name or "").partition(".")[0]
+    if package not in EXTRAS:
+        raise error
+    print(f"sioms {name}: {package} is not installed; run: pip install 'sioms[{EXTRAS[package]}]'", file=sys.stderr)
+    return 1
 
 
 if __name__ == "__main__":

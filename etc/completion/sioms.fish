@@ -76,6 +76,7 @@ complete -c sioms -n __fish_use_subcommand -a blackbox -d 'tell what went wrong;
 complete -c sioms -n __fish_use_subcommand -a check -d 'check a configuration'
 complete -c sioms -n __fish_use_subcommand -a service -d 'install the daemon as a service of this machine'
 complete -c sioms -n __fish_use_subcommand -a serve -d 'let clients on other machines use the workcell'
+complete -c sioms -n __fish_use_subcommand -a metrics -d 'serve values, states and alarms to Prometheus'
 complete -c sioms -n __fish_use_subcommand -a key -d 'make, allow, list and revoke the keys of remote clients'
 complete -c sioms -n __fish_use_subcommand -a driver -d 'list, check, trace and replay drivers'
 complete -c sioms -n __fish_use_subcommand -a bench -d 'measure latencies and throughput on this machine'

@@ -9,6 +9,7 @@ import ipaddress
 import sys
 from typing import Any
 
+from sioms.arguments import place
 from sioms.client.keys import Folder
 from sioms.client.remote import SCHEME, place_of
 from sioms.protocol.socketpath import socket_path
@@ -73,15 +74,12 @@ def _list(folder: Folder) -> None:
     print(f"own      {own.name} {own.public}" if own else "own      none; make one with: sioms key new")
     for one in folder.allowed():
         print(f"allowed  {one.name} {one.public} {','.join(one.groups)}".rstrip())
-    for place, public in folder.trusted().items():
-        print(f"trusted  {place} {public}")
+    for gateway, public in folder.trusted().items():
+        print(f"trusted  {gateway} {public}")
 
 
 def _serve(args: argparse.Namespace, folder: Folder) -> None:
-    host, colon, port = args.listen.rpartition(":")
-    host = host.removeprefix("[").removesuffix("]")
-    if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65535:
-        raise OSError(errno.EINVAL, f"listen on {args.listen}: want HOST:PORT, as {PLACE} or *:5770")
+    host, port = place(args.listen, PLACE)
     if not folder.allowed():
         hint = f"nobody may come in by the keys in {folder.path}; run: sioms key allow NAME KEY"
         if not _is_loopback(host):
@@ -89,7 +87,7 @@ def _serve(args: argparse.Namespace, folder: Folder) -> None:
         print(f"sioms serve: {hint}", file=sys.stderr)
     from .serve import serve
 
-    serve(args.socket or socket_path(), host, int(port), folder)
+    serve(args.socket or socket_path(), host, port, folder)
 
 
 def _is_loopback(host: str) -> bool:

@@ -6,7 +6,7 @@ import argparse
 
 import pytest
 
-from sioms.arguments import positive, whole
+from sioms.arguments import place, positive, whole
 from sioms.reconcile.command import main
 
 
@@ -26,6 +26,17 @@ def test_what_is_no_count_is_refused(text: str) -> None:
 def test_what_is_no_size_is_refused(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="above 0"):
         positive(text)
+
+
+def test_places_to_listen_at_are_read() -> None:
+    assert place("*:5770", "") == ("*", 5770)
+    assert place("[::1]:80", "") == ("::1", 80)
+
+
+@pytest.mark.parametrize("text", ["5770", ":5770", "a:0", "a:65535", "a:-1", "a:x", ""])
+def test_what_is_no_place_is_refused(text: str) -> None:
+    with pytest.raises(OSError, match=r"want HOST:PORT, as 127.0.0.1:1 or \*:1"):
+        place(text, "127.0.0.1:1")
 
 
 @pytest.mark.parametrize(
