@@ -41,6 +41,10 @@ class DeviceInfo:
     claims: tuple[str, ...] = ()
     made_of: str = ""
     """A digest of the driver's file and of those that its table names."""
+    kind: str = "tick"
+    """Of its driver: compiled, tick, line or stream; see needs.py."""
+    realtime_priority: int = 0
+    """That its driver asks for unless the configuration says otherwise; 0: none."""
 
     def facts(self) -> list[object]:
         """Return all it tells as plain values, to be compared."""
@@ -60,7 +64,7 @@ class DeviceInfo:
     @classmethod
     def unpack(cls, name: str, driver: str, packed: list) -> DeviceInfo:  # type: ignore[type-arg]
         """Make it from the fork server's reply."""
-        blocks, tick_hz, inputs, lease_s, claims, made_of = packed
+        blocks, tick_hz, inputs, lease_s, claims, made_of, kind, realtime_priority = packed
         return cls(
             name,
             driver,
@@ -73,6 +77,8 @@ class DeviceInfo:
             lease_s,
             tuple(claims),
             made_of,
+            kind,
+            realtime_priority,
         )
 
 

@@ -32,6 +32,7 @@ from .loading import Loader, Plan, mistake
 from .log import Log
 from .loop import Loop
 from .names import NameTable, Node, part_name
+from .needs import this_machine, told
 from .realtime import LOOK_S, Budget, make_ordinary, realtime_use
 from .rights import Rights
 from .shared import Shared
@@ -408,6 +409,10 @@ class Server:
             why = f"{error.filename or 'the stop-request file'}: {error.strerror}"
         if why:
             self.log("warning", "stop without the daemon", why=why)
+        needed, shortages = told(plan.names.devices, plan.config, this_machine())
+        self.log("debug", "processors", needed=needed)
+        for shortage in shortages:
+            self.log("warning", "does not fit", why=shortage)
         if first and plan.config.workcell.start_stopped:
             self.stop_workcell("started stopped, as configured")
         for name, device in list(self.devices.items()):

@@ -20,6 +20,7 @@ from .listening import Listening
 from .loading import Loader, NotDescribed, Plan
 from .log import Log
 from .loop import Loop
+from .needs import this_machine, told
 from .realtime import end_promptly
 from .server import Server
 from .stop_record import StopRecord
@@ -110,6 +111,10 @@ def check(path: str, process: ForkServerProcess) -> int:
             plan.fork_server.close()
             kinds = len(plan.names.nodes)
             print(f"{path}: ok; {len(plan.config.devices)} devices, {kinds} nodes")
+            needed, shortages = told(plan.names.devices, plan.config, this_machine())
+            print(f"{path}: {needed}")
+            for shortage in shortages:
+                print(f"{path}: warning: {shortage}", file=sys.stderr)
 
     def died(fork_server: ForkServer) -> None:
         """Nothing to do: the loader's requests have been answered with the death."""

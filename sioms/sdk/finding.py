@@ -223,9 +223,26 @@ def describe(
         ]
         for b in description.blocks
     ]  # fmt: skip
-    claims = list(driver.variant(settings).claims(settings))
-    facts = [blocks, description.tick_hz, list(description.inputs), description.lease_s, claims, made_of]
+    variant = driver.variant(settings)
+    facts = [
+        blocks, description.tick_hz, list(description.inputs), description.lease_s, list(variant.claims(settings)),
+        made_of, _cost_kind(variant), variant.realtime_priority,
+    ]  # fmt: skip
     return facts, errors
+
+
+def kind_of(driver: type[Driver]) -> str:
+    """Return how a driver works: "tick", "line" or "stream"."""
+    if issubclass(driver, StreamDriver):
+        return "stream"
+    return "line" if issubclass(driver, LineDriver) else "tick"
+
+
+def _cost_kind(driver: type[Driver]) -> str:
+    """Return the kind of a driver for what its ticks cost: "compiled" where quiet ones need no Python."""
+    if issubclass(driver, TickDriver) and driver.quiet_steps is not TickDriver.quiet_steps:
+        return "compiled"
+    return kind_of(driver)
 
 
 MOST_HISTORY = 1 << 20

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from .driver import Driver, LineDriver, StreamDriver
-from .finding import DriverNotFound, find_driver, read_settings
+from .driver import Driver
+from .finding import DriverNotFound, find_driver, kind_of, read_settings
 from .golden import try_golden
 
 
@@ -28,7 +28,7 @@ def main(words: Sequence[str]) -> int:
     except (DriverNotFound, ValueError) as error:
         print(error, file=sys.stderr)
         return 1
-    print(json.dumps({"kind": _kind(driver), "rig": dict(driver.rig), "golden": outcomes}))
+    print(json.dumps({"kind": kind_of(driver), "rig": dict(driver.rig), "golden": outcomes}))
     return 0
 
 
@@ -37,12 +37,6 @@ def _settings(driver: type[Driver], table: dict[str, Any], folder: str) -> Any:
     if errors:
         raise ValueError("; ".join(errors))
     return settings
-
-
-def _kind(driver: type[Driver]) -> str:
-    if issubclass(driver, StreamDriver):
-        return "stream"
-    return "line" if issubclass(driver, LineDriver) else "tick"
 
 
 if __name__ == "__main__":

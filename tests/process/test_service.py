@@ -202,6 +202,12 @@ def test_sighup_reloads(start_daemon: Callable[..., Daemon]) -> None:
     daemon.running.signal(signal.SIGHUP)
     daemon.said("event=reload errors=0")
     daemon.wait_up("io1")
+    assert 'event="does not fit"' not in "\n".join(daemon.running.lines)
+    daemon.configure(
+        '[device.io0]\ndriver = "sim-io"\ninputs = 1\n[device.io1]\ndriver = "sim-tactile"\ntick_hz = 20000\n'
+    )
+    daemon.running.signal(signal.SIGHUP)
+    daemon.said('event="does not fit" why="device io1 needs about 1.')
     daemon.configure("[device.io0]\n")
     daemon.running.signal(signal.SIGHUP)
     daemon.said("event=reload errors=1")

@@ -273,12 +273,20 @@ def test_sioms_tells_about_the_workcell(shell: Shell) -> None:
 
 
 def test_sioms_checks_a_configuration(shell: Shell, daemon: Daemon, tmp_path: Path) -> None:
-    assert "ok" in good(shell(f"sioms check {daemon.config}"))
+    text = good(shell(f"sioms check {daemon.config}"))
+    assert "ok" in text and re.search(r"its drivers need about 0\.\d\d of \d+ processors?: ", text)
     (tmp_path / "bad.toml").write_text('[device.mod0]\ndriver = "sim-axis"\n[device.b]\ndriver = "sim-io"\n')
     result = shell("sioms check bad.toml")
     assert result.returncode == 2
     assert "did you mean sim-axes" in result.stderr
     assert "[device.b]" in result.stderr
+    much = "".join(
+        f'[device.d{i}]\ndriver = "sim-tactile"\ntick_hz = 20000\n' for i in range(2 * (os.cpu_count() or 1))
+    )
+    (tmp_path / "much.toml").write_text(f'[workcell]\nname = "much"\n{much}')
+    result = shell("sioms check much.toml")
+    assert result.returncode == 0 and "warning: device d0 needs about 1." in result.stderr
+    assert re.search(r"warning: these devices need about \d+\.\d\d of \d+ processors?: d0 1\.", result.stderr)
 
 
 def test_sioms_reloads(shell: Shell) -> None:
