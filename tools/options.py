@@ -346,7 +346,7 @@ def _number_end(word: str, at: int) -> int:
     return end
 
 
-_BOUNDS = {
+BOUNDS = {
     INDEX: (0, 1 << 20, "an index from 0"),
     COUNT: (-1, 1 << 53, "a count from 0, or -1 for no end"),
     SECONDS: (1e-6, 1e6, "seconds from 0.000001 to 1000000"),
@@ -355,7 +355,7 @@ _BOUNDS = {
 
 
 def _value(option: Option, shown: str, text: str) -> float:
-    low, high, want = _BOUNDS[option.value]
+    low, high, want = BOUNDS[option.value]
     try:
         value = number(text)
         if not low <= value <= high or (option.value != SECONDS and value != int(value)):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _AXIS = (("m", "in_motion", None), ("p", "position", 4), ("v", "velocity", 4), ("f", "force", 2))
 _ANALOG = (("p", "data", 2),)
 _BINARY = (("p", "data", None),)
-_FIELDS: dict[NodeClass, tuple[tuple[str, str, int | None], ...]] = {
+FIELDS: dict[NodeClass, tuple[tuple[str, str, int | None], ...]] = {
     NodeClass.AXIS: _AXIS, NodeClass.ANALOG: _ANALOG, NodeClass.BINARY: _BINARY,
 }  # fmt: skip
 _CHOICE = "pvfmN"
@@ -49,7 +49,7 @@ class Rows:
         chosen = [letter for letter in choice if letter in flags] or list(choice)
         self.verbose = "V" in flags and not timed
         self.lines = "N" in chosen
-        fields = [field for field in _FIELDS[info.node_class] if field[0] in chosen]
+        fields = [field for field in FIELDS[info.node_class] if field[0] in chosen]
         self._names = [name for _, name, _ in fields]
         formats = [_format(places, digits) for _, _, places in fields]
         if self.lines:

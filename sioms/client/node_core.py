@@ -37,6 +37,13 @@ if TYPE_CHECKING:
 else:
     S = None
 
+UNREADABLE = {
+    PageState.STALE: "its driver is gone or hung",
+    PageState.STARTING: "its device is starting",
+    PageState.LINK_LOST: "the link to its device is lost",
+    PageState.CLOSED: "its driver has ended",
+}
+"""What is wrong with a page, by its state, where the name of that does not say it."""
 _SHOWN = 8
 """Channels that the representation of a node names."""
 _JUDGED_S = 0.1
@@ -363,13 +370,7 @@ class NodeCore(Generic[S]):
             return OSError(errno.EBADF, f"read {self.name}: it is closed")
         if isinstance(error, NotReadable):
             why = error.reason.removeprefix(f"{self.info.device}: ") or "no reason given"
-            state = {
-                PageState.STALE: "its driver is gone or hung",
-                PageState.STARTING: "its device is starting",
-                PageState.LINK_LOST: "the link to its device is lost",
-                PageState.CLOSED: "its driver has ended",
-            }
-            what = state.get(error.state, f"its device is in {error.state.name.lower().replace('_', ' ')}")
+            what = UNREADABLE.get(error.state, f"its device is in {error.state.name.lower().replace('_', ' ')}")
             return OSError(errno.EIO, f"read {self.name}: {what}: {why}")
         raise error
 

@@ -1,4 +1,5 @@
-"""Makes the library of the compiled steps: ``python -m sioms.native.build [-o FILE] [COMPILER...]``.
+"""Makes the library of the compiled steps, and the compiled ``devin`` beside it:
+``python -m sioms.native.build [-o FOLDER] [COMPILER...]``.
 
 A compiler is any command that takes the options of cc: ``cc``, or ``python -m ziglang cc`` of the package ziglang,
 which brings all it needs. No header and no library of Python is wanted, so one library serves all versions of it.
@@ -7,6 +8,7 @@ which brings all it needs. No header and no library of Python is wanted, so one 
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import subprocess
 import sys
@@ -16,33 +18,39 @@ from pathlib import Path
 from . import language
 from .translate import translate
 
-OPTIONS = ("-std=gnu11", "-O2", "-fPIC", "-shared", "-ffp-contract=off", "-fno-fast-math", "-fvisibility=default")
+OPTIONS = ("-std=gnu11", "-O2", "-ffp-contract=off", "-fno-fast-math", "-fvisibility=default")
+DEVIN, DEVIN_SOURCE = "_devin", "sioms.tools.compiled"
 
 
-def build(target: Path, compiler: list[str]) -> None:
-    """Make the library.
+def build(folder: Path, compiler: list[str]) -> None:
+    """Make both.
 
     Args:
-        target: where to; it appears whole or not at all.
+        folder: where to; each appears whole or not at all.
         compiler: command that takes the options of cc.
 
     Raises:
         OSError, subprocess.CalledProcessError: the compiler is not there, or refuses.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        source, made = Path(folder) / "steps.c", Path(folder) / "steps.so"
-        source.write_text(translate(language.MODULES))
-        subprocess.run([*compiler, *OPTIONS, str(source), "-o", str(made), "-lm"], check=True)
-        fresh = target.with_name(f"{target.name}.{os.getpid()}")
-        fresh.write_bytes(made.read_bytes())
-        fresh.chmod(0o755)
-        fresh.replace(target)
+    devin: str = importlib.import_module(DEVIN_SOURCE).source()  # it stands above: it knows the tool's options
+    for target, text, shared in (
+        (folder / language.LIBRARY.name, translate(language.MODULES), ("-fPIC", "-shared")),
+        (folder / DEVIN, devin, ()),
+    ):
+        with tempfile.TemporaryDirectory() as place:
+            source, made = Path(place) / "source.c", Path(place) / "made"
+            source.write_text(text)
+            subprocess.run([*compiler, *OPTIONS, *shared, str(source), "-o", str(made), "-lm"], check=True)
+            fresh = target.with_name(f"{target.name}.{os.getpid()}")
+            fresh.write_bytes(made.read_bytes())
+            fresh.chmod(0o755)
+            fresh.replace(target)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m sioms.native.build", description="compile the steps")
-    parser.add_argument("-o", "--output", type=Path, default=language.LIBRARY, metavar="FILE")
-    parser.add_argument("--show", action="store_true", help="print the C file instead")
+    parser = argparse.ArgumentParser(prog="python -m sioms.native.build", description="compile the steps and devin")
+    parser.add_argument("-o", "--output", type=Path, default=language.LIBRARY.parent, metavar="FOLDER")
+    parser.add_argument("--show", action="store_true", help="print the C of the steps instead")
     parser.add_argument("compiler", nargs="*", default=["cc"])
     options = parser.parse_args()
     if options.show:

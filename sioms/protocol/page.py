@@ -43,7 +43,13 @@ REASON_OFFSET = 96
 REASON_SIZE = 160
 _GOOD = PageState.GOOD | PageState.GOOD << 32
 _HEAD, _ALIVE, _LEASE, _STATES, _DEVICE = 72 // 8, 80 // 8, 48 // 8, 64 // 8, 88 // 8
-_HEADER = Struct("<8sIIIIQQQQQII")
+HEADER_FIELDS = {
+    "magic": "8s", "version": "I", "node_class": "I", "channels": "I", "fields": "I", "slots": "Q", "slot_size": "Q",
+    "first_slot": "Q", "lease_ns": "Q", "generation": "Q", "driver_state": "I", "daemon_state": "I", "head": "Q",
+    "alive_ns": "Q", "device": "Q", "reason": f"{REASON_SIZE}s",
+}  # fmt: skip
+"""The header, field by field, in codes of struct."""
+_HEADER = Struct("<" + "".join([*HEADER_FIELDS.values()][:12]))
 _SLOT = Struct("<QQQQ")
 _AS_OF = Struct("<Q")
 

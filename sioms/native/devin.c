@@ -1,0 +1,633 @@
+/* devin for the usual line: text out of readings that are in shared memory, without an interpreter.
+ *
+ * Whatever is not usual (a long option, a path, a refusal, a gateway) is left to the tool in Python, which is
+ * the reference: this program then becomes the command in its own arguments, before it has written anything. What it
+ * shares with that tool (layout of pages and records, messages, options, formats) is in what sioms.tools.compiled puts
+ * before this text when it is compiled. Why so: docs/decisions/0285-devin-without-an-interpreter.md.
+ */
+#include <errno.h>
+#include <fcntl.h>
+#include <math.h>
+#include <poll.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/prctl.h>
+#include <sys/socket.h>
+#include <sys/stat.h>
+#include <sys/un.h>
+#include <time.h>
+#include <unistd.h>
+
+enum { MOST_TARGETS = 32, MOST_NAME = 200, MOST_DEPTH = 16, FIRST_WORD = 8, PATIENCE_S = 1 };
+
+static char **arguments;
+
+/* Become the tool in Python. Every descriptor of ours is closed by that. */
+static _Noreturn void leave_to_python(void)
+{
+    execvp(arguments[1], arguments + 1);
+    _exit(127);
+}
+
+static void *take(size_t size)
+{
+    void *memory = calloc(1, size);
+    if (!memory)
+        leave_to_python();
+    return memory;
+}
+
+static int64_t now_ns(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return t.tv_sec * INT64_C(1000000000) + t.tv_nsec;
+}
+
+/* Say one line, its blanks made single, and end. */
+static _Noreturn void fail(const char *text)
+{
+    char line[1024] = "devin:";
+    size_t n = 6;
+    for (const char *c = text; *c && n < sizeof line - 2; c++) {
+        if (*c != ' ' && (c == text || c[-1] == ' '))
+            line[n++] = ' ';
+        if (*c != ' ')
+            line[n++] = *c;
+    }
+    line[n++] = '\n';
+    if (write(2, line, n) < 0)
+        _exit(1);
+    _exit(1);
+}
+
+/* ---- the sources that this was made of ------------------------------------------------------ */
+
+static uint32_t crc_of(uint32_t crc, const uint8_t *data, size_t size)
+{
+    static uint32_t table[256];
+    for (uint32_t i = 0; !table[255] && i < 256; i++) {
+        table[i] = i;
+        for (int bit = 0; bit < 8; bit++)
+            table[i] = table[i] & 1 ? table[i] >> 1 ^ 0xEDB88320u : table[i] >> 1;
+    }
+    crc = ~crc;
+    while (size--)
+        crc = table[(crc ^ *data++) & 255] ^ crc >> 8;
+    return ~crc;
+}
+
+/* Whether the tree around this program still has the sources that it was made of. */
+static int is_of_these_sources(void)
+{
+    static uint8_t text[MOST_SOURCE + 1];
+    char place[4096];
+    ssize_t length = readlink("/proc/self/exe", place, sizeof place - 128);
+    uint32_t crc = 0;
+    if (length <= 0)
+        return 0;
+    place[length] = 0;
+    for (int up = 0; up < 3; up++) {
+        char *slash = strrchr(place, '/');
+        if (!slash)
+            return 0;
+        *slash = 0;
+    }
+    char *end = place + strlen(place);
+    for (size_t i = 0; i < sizeof SOURCES / sizeof *SOURCES; i++) {
+        snprintf(end, 128, "/%s", SOURCES[i]);
+        int fd = open(place, O_RDONLY | O_CLOEXEC);
+        ssize_t size = fd < 0 ? -1 : read(fd, text, sizeof text);
+        if (size < 0)
+            return 0;
+        close(fd);
+        crc = crc_of(crc, text, size);
+    }
+    return crc == CHECKSUM;
+}
+
+/* ---- the command line ------------------------------------------------------------------------ */
+
+struct target {
+    const char *name;
+    int given[128];
+    double value[128];
+    char opened[MOST_NAME + 16], device[MOST_NAME];
+    const uint8_t *page;
+    uint8_t *raw;
+    int64_t *channels;
+    int64_t count, low, high, bit, class;
+    int lines, fields;
+    const struct field *field[8];
+};
+
+static struct target targets[MOST_TARGETS + 1], all; /* after the last: flags that nothing follows; all: of the line */
+static int target_count, timed;
+
+static int is_numeric(const char *word)
+{
+    word += *word == '+' || *word == '-';
+    word += *word == '.';
+    return *word >= '0' && *word <= '9';
+}
+
+static const char *number_end(const char *at)
+{
+    const char *end = at + (*at == '+' || *at == '-'), *start = end;
+    while ((*end >= '0' && *end <= '9') || *end == '.')
+        end++;
+    if (end > start && (*end == 'e' || *end == 'E')) {
+        const char *exponent = end + 1 + (end[1] == '+' || end[1] == '-');
+        if (*exponent >= '0' && *exponent <= '9')
+            for (end = exponent; *end >= '0' && *end <= '9'; end++)
+                ;
+    }
+    return end;
+}
+
+static void take_group(const char *at, struct target *next)
+{
+    if (!*at)
+        leave_to_python();
+    while (*at) {
+        const struct option *option = OPTIONS;
+        while (option->letter && option->letter != *at)
+            option++;
+        if (!option->letter)
+            leave_to_python();
+        double value = 0;
+        const char *end = ++at;
+        if (option->valued) {
+            char *parsed;
+            end = number_end(at);
+            value = strtod(at, &parsed);
+            if (end == at || parsed != end || !(value >= option->low && value <= option->high)
+                || (option->whole && value != floor(value)))
+                leave_to_python();
+        }
+        at = end;
+        struct target *owner = option->for_all ? &all : next;
+        owner->given[(int)option->letter] = 1;
+        owner->value[(int)option->letter] = value;
+    }
+}
+
+static void take_line(char **words)
+{
+    for (; *words; words++) {
+        const char *word = *words;
+        struct target *next = &targets[target_count];
+        struct stat found;
+        if (word[0] == '-' && word[1] != '-' && !is_numeric(word)) {
+            take_group(word + 1, next);
+            continue;
+        }
+        if (!*word || *word == '-' || is_numeric(word) || strlen(word) >= MOST_NAME || target_count == MOST_TARGETS)
+            leave_to_python();
+        for (const char *c = word; *c; c++)
+            if (*c == '/' || *c <= ' ' || *c > '~')
+                leave_to_python();
+        if (!lstat(word, &found) && S_ISLNK(found.st_mode))
+            leave_to_python();
+        next->name = word;
+        target_count++;
+    }
+    timed = all.given['r'] || all.given['t'] || all.given['L'];
+    for (int letter = 0; letter < 128; letter++)
+        if (targets[target_count].given[letter] && !(letter == 'N' && timed))
+            leave_to_python();
+    if (!target_count)
+        leave_to_python();
+}
+
+/* Choose structures and columns; whoever names one that there is not hears of it from the tool in Python. */
+static void choose(struct target *t)
+{
+    const int *given = t->given;
+    const char *choice = timed ? "pvfm" : "pvfmN";
+    int some = 0;
+    if (given['V'] && !timed)
+        leave_to_python();
+    if (given['n'] && (given['l'] || given['h']))
+        leave_to_python();
+    t->low = given['n'] ? t->value['n'] : given['l'] ? t->value['l'] : 0;
+    t->high = given['n'] ? t->value['n'] : given['h'] ? t->value['h'] : t->count - 1;
+    if (t->low < 0 || t->low > t->high || t->high >= t->count)
+        leave_to_python();
+    for (const char *c = choice; *c; c++)
+        some |= given[(int)*c];
+    t->lines = !timed && (!some || given['N']);
+    for (const struct field *f = FIELDS; f->letter; f++)
+        if (f->class == t->class && (!some || given[(int)f->letter]))
+            t->field[t->fields++] = f;
+}
+
+/* ---- messages: MessagePack, of which only what answers hold is known --------------------------- */
+
+struct message {
+    const uint8_t *at, *end;
+};
+
+static uint64_t take_bytes(struct message *m, int size)
+{
+    uint64_t value = 0;
+    if (m->end - m->at < size)
+        leave_to_python();
+    while (size--)
+        value = value << 8 | *m->at++;
+    return value;
+}
+
+static int64_t take_integer(struct message *m)
+{
+    int kind = take_bytes(m, 1);
+    if (kind < 0x80)
+        return kind;
+    if (kind >= 0xE0)
+        return kind - 0x100;
+    if (kind >= 0xCC && kind <= 0xCF)
+        return take_bytes(m, 1 << (kind - 0xCC));
+    if (kind < 0xD0 || kind > 0xD3)
+        leave_to_python();
+    int size = 1 << (kind - 0xD0), unused = 64 - 8 * size;
+    return (int64_t)(take_bytes(m, size) << unused) >> unused;
+}
+
+static int64_t take_array(struct message *m)
+{
+    int kind = take_bytes(m, 1);
+    if (kind >= 0x90 && kind < 0xA0)
+        return kind & 15;
+    if (kind != 0xDC && kind != 0xDD)
+        leave_to_python();
+    return take_bytes(m, kind == 0xDC ? 2 : 4);
+}
+
+static void pass(struct message *m, int depth)
+{
+    int kind = take_bytes(m, 1);
+    uint64_t bytes = 0, values = 0;
+    if (depth > MOST_DEPTH || kind == 0xC1 || (kind >= 0xC7 && kind <= 0xC9) || (kind >= 0xD4 && kind <= 0xD8))
+        leave_to_python();
+    if (kind >= 0x80 && kind < 0x90)
+        values = 2 * (kind & 15);
+    else if (kind >= 0x90 && kind < 0xA0)
+        values = kind & 15;
+    else if (kind >= 0xA0 && kind < 0xC0)
+        bytes = kind & 31;
+    else if (kind >= 0xC4 && kind <= 0xC6)
+        bytes = take_bytes(m, 1 << (kind - 0xC4));
+    else if (kind == 0xCA || kind == 0xCB)
+        bytes = kind == 0xCA ? 4 : 8;
+    else if (kind >= 0xCC && kind <= 0xD3)
+        bytes = 1 << (kind & 3);
+    else if (kind >= 0xD9 && kind <= 0xDB)
+        bytes = take_bytes(m, 1 << (kind - 0xD9));
+    else if (kind >= 0xDC && kind < 0xE0)
+        values = take_bytes(m, kind & 1 ? 4 : 2) * (kind >= 0xDE ? 2 : 1);
+    if (bytes > (uint64_t)(m->end - m->at) || values > (uint64_t)(m->end - m->at))
+        leave_to_python();
+    m->at += bytes;
+    while (values--)
+        pass(m, depth + 1);
+}
+
+static void take_text(struct message *m, char *text, size_t room)
+{
+    int kind = take_bytes(m, 1);
+    size_t length = kind >= 0xA0 && kind < 0xC0 ? (size_t)(kind & 31) : kind == 0xD9 ? take_bytes(m, 1) : room;
+    if (length >= room || length > (size_t)(m->end - m->at))
+        leave_to_python();
+    memcpy(text, m->at, length);
+    text[length] = 0;
+    m->at += length;
+}
+
+/* ---- the daemon ------------------------------------------------------------------------------- */
+
+static const char *own_path(void)
+{
+    static char path[4096];
+    const char *runtime = getenv("XDG_RUNTIME_DIR");
+    if (runtime && *runtime)
+        snprintf(path, sizeof path, "%s/sioms/siomsd.sock", runtime);
+    else
+        snprintf(path, sizeof path, "/tmp/sioms-%u/sioms/siomsd.sock", getuid());
+    return path;
+}
+
+static int may_serve(uid_t uid, const char *path)
+{
+    char folder[sizeof(struct sockaddr_un)];
+    struct stat found;
+    if (uid == 0 || uid == getuid())
+        return 1;
+    snprintf(folder, sizeof folder, "%s", path);
+    char *slash = strrchr(folder, '/');
+    if (!slash || slash == folder || !strcmp(path, own_path()))
+        return 0;
+    *slash = 0;
+    return !stat(folder, &found) && uid == found.st_uid;
+}
+
+static int connect_to_daemon(void)
+{
+    const char *path = getenv(CELL_VARIABLE);
+    if (!path || !*path)
+        path = getenv(SOCKET_VARIABLE);
+    if (!path || !*path)
+        path = access(SYSTEM_PATH, F_OK) ? own_path() : SYSTEM_PATH;
+    struct sockaddr_un address = {.sun_family = AF_UNIX};
+    struct timeval patience = {.tv_sec = PATIENCE_S};
+    struct ucred peer;
+    socklen_t size = sizeof peer;
+    int sock = socket(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC, 0);
+    if (sock < 0 || strlen(path) >= sizeof address.sun_path || strstr(path, "://"))
+        leave_to_python();
+    strcpy(address.sun_path, path);
+    setsockopt(sock, SOL_SOCKET, SO_SNDTIMEO, &patience, sizeof patience);
+    setsockopt(sock, SOL_SOCKET, SO_RCVTIMEO, &patience, sizeof patience);
+    if (connect(sock, (struct sockaddr *)&address, sizeof address)
+        || getsockopt(sock, SOL_SOCKET, SO_PEERCRED, &peer, &size) || !may_serve(peer.uid, path))
+        leave_to_python();
+    return sock;
+}
+
+/* Send a request and return the errno of its answer, whose value begins where the message is left. */
+static int ask(int sock, const void *packet, size_t size, int64_t number, struct message *m, int *fds, int *fd_count)
+{
+    static uint8_t answer[MAX_PACKET];
+    union {
+        char bytes[CMSG_SPACE(4 * sizeof(int))];
+        struct cmsghdr align;
+    } control;
+    struct iovec part = {answer, sizeof answer};
+    struct msghdr head = {.msg_iov = &part, .msg_iovlen = 1, .msg_control = &control, .msg_controllen = sizeof control};
+    if (send(sock, packet, size, MSG_NOSIGNAL) != (ssize_t)size)
+        leave_to_python();
+    ssize_t got = recvmsg(sock, &head, MSG_CMSG_CLOEXEC);
+    if (got <= 0)
+        leave_to_python();
+    *fd_count = 0;
+    for (struct cmsghdr *c = CMSG_FIRSTHDR(&head); c; c = CMSG_NXTHDR(&head, c))
+        if (c->cmsg_level == SOL_SOCKET && c->cmsg_type == SCM_RIGHTS) {
+            *fd_count = (c->cmsg_len - CMSG_LEN(0)) / sizeof(int);
+            memcpy(fds, CMSG_DATA(c), *fd_count * sizeof(int));
+        }
+    *m = (struct message){answer, answer + got};
+    int64_t parts = take_array(m);
+    if (parts < 4 || parts > 6 || take_integer(m) != 0 || take_integer(m) != number)
+        leave_to_python();
+    int refused = take_integer(m);
+    struct message rest = *m;
+    pass(&rest, 0);
+    if (parts > 4 && (rest.at >= rest.end || *rest.at != 0xC2)) /* compressed: of thousands of channels */
+        leave_to_python();
+    return refused;
+}
+
+static int ask_open(int sock, const char *name, struct message *m, int *fds, int *fd_count)
+{
+    static int64_t number = OPEN_NUMBER;
+    uint8_t packet[sizeof OPEN_HEAD + sizeof OPEN_TAIL + MOST_NAME + 16];
+    size_t n = sizeof OPEN_HEAD, length = strlen(name);
+    memcpy(packet, OPEN_HEAD, n);
+    packet[n++] = 0xD9;
+    packet[n++] = length;
+    memcpy(packet + n, name, length);
+    n += length;
+    memcpy(packet + n, OPEN_TAIL, sizeof OPEN_TAIL);
+    return ask(sock, packet, n + sizeof OPEN_TAIL, number, m, fds, fd_count);
+}
+
+static void open_target(int sock, struct target *t)
+{
+    struct message m;
+    int fds[8], fd_count;
+    char name[MOST_NAME + 16];
+    size_t length = strlen(t->name), end = sizeof READONLY - 1;
+    int is_companion = length >= end && !strcmp(t->name + length - end, READONLY);
+    snprintf(name, sizeof name, "%s%s", t->name, is_companion ? "" : READONLY);
+    int refused = ask_open(sock, name, &m, fds, &fd_count);
+    if (refused == ENOENT && !is_companion)
+        refused = ask_open(sock, t->name, &m, fds, &fd_count);
+    struct stat found;
+    if (refused || fd_count != 3 || fstat(fds[0], &found) || take_array(&m) != 5)
+        leave_to_python();
+    pass(&m, 0); /* handle */
+    if (take_array(&m) != NODE_INFO)
+        leave_to_python();
+    take_text(&m, t->opened, sizeof t->opened);
+    t->class = take_integer(&m);
+    pass(&m, 0); /* read only */
+    t->count = take_array(&m);
+    for (int64_t i = 0; i < t->count; i++)
+        pass(&m, 0); /* a channel */
+    for (int i = 0; i < 3; i++)
+        pass(&m, 0); /* bit, rate, capacity */
+    take_text(&m, t->device, sizeof t->device);
+    pass(&m, 0); /* driver */
+    pass(&m, 0); /* version */
+    if (take_array(&m) != t->count || !t->count)
+        leave_to_python();
+    t->channels = take(t->count * sizeof *t->channels);
+    for (int64_t i = 0; i < t->count; i++)
+        t->channels[i] = take_integer(&m);
+    t->bit = take_integer(&m);
+    t->page = mmap(NULL, found.st_size, PROT_READ, MAP_SHARED, fds[0], 0);
+    if (t->page == MAP_FAILED || found.st_size < PAGE_HEADER)
+        leave_to_python();
+    const struct page *page = (const struct page *)t->page;
+    uint64_t size = page->slot_size;
+    if (memcmp(page->magic, MAGIC, sizeof page->magic) || page->version != PAGE_VERSION
+        || PAGE_HEADER + page->slots * size > (uint64_t)found.st_size
+        || SLOT_HEADER + UINT64_C(8) * page->fields * page->channels > size)
+        leave_to_python();
+    for (int64_t i = 0; i < t->count; i++)
+        if (t->channels[i] < 0 || t->channels[i] >= page->channels)
+            leave_to_python();
+    t->raw = take(size);
+}
+
+/* ---- readings ---------------------------------------------------------------------------------- */
+
+static _Noreturn void unreadable(const struct target *t, uint32_t state, const char *reason)
+{
+    char text[1024];
+    size_t device = strlen(t->device);
+    const char *what = "its device is in fault";
+    for (size_t i = 0; i < sizeof STATES / sizeof *STATES; i++)
+        if (STATES[i].state == state)
+            what = STATES[i].text;
+    if (!strncmp(reason, t->device, device) && !strncmp(reason + device, ": ", 2))
+        reason += device + 2;
+    snprintf(text, sizeof text, "read %s: %s: %s", t->opened, what, *reason ? reason : "no reason given");
+    fail(text);
+}
+
+static void check(const struct target *t, const struct page *page, int64_t now)
+{
+    uint32_t driver = __atomic_load_n(&page->driver_state, __ATOMIC_ACQUIRE);
+    uint32_t daemon = __atomic_load_n(&page->daemon_state, __ATOMIC_ACQUIRE);
+    int64_t age = now - (int64_t)__atomic_load_n(&page->alive_ns, __ATOMIC_ACQUIRE);
+    char reason[sizeof page->reason + 1] = "";
+    if (driver == GOOD && daemon == GOOD && age <= (int64_t)page->lease_ns)
+        return;
+    memcpy(reason, page->reason, sizeof page->reason);
+    for (char *c = reason; *c; c++)
+        if ((unsigned char)*c < ' ' || *c == 127)
+            *c = '?';
+    if (daemon != GOOD)
+        unreadable(t, daemon, reason);
+    if (driver != GOOD)
+        unreadable(t, driver, reason);
+    snprintf(reason, sizeof reason, "its driver has not ticked for %.3f s (lease %.3f s)", age / 1e9,
+             page->lease_ns / 1e9);
+    unreadable(t, STALE, reason);
+}
+
+/* Copy the newest snapshot; the writer may lap us meanwhile, and clears the number before it writes. */
+static void read_latest(struct target *t)
+{
+    const struct page *page = (const struct page *)t->page;
+    check(t, page, now_ns());
+    for (;;) {
+        uint64_t number = __atomic_load_n(&page->head, __ATOMIC_ACQUIRE);
+        if (!number)
+            unreadable(t, STARTING, "nothing published yet");
+        const uint8_t *slot = t->page + PAGE_HEADER + (number & (page->slots - 1)) * page->slot_size;
+        if (__atomic_load_n((const uint64_t *)slot, __ATOMIC_ACQUIRE) != number)
+            continue;
+        memcpy(t->raw, slot, page->slot_size);
+        __atomic_thread_fence(__ATOMIC_ACQUIRE);
+        if (__atomic_load_n((const uint64_t *)slot, __ATOMIC_RELAXED) == number)
+            return;
+    }
+}
+
+static char *put_value(char *at, const struct target *t, const struct field *f, int64_t channel)
+{
+    const struct page *page = (const struct page *)t->page;
+    const uint8_t *place = t->raw + SLOT_HEADER + 8 * (f->row * (int64_t)page->channels + t->channels[channel]);
+    int64_t whole;
+    double real;
+    if (f->real) {
+        memcpy(&real, place, 8);
+        return at + (isnan(real) ? sprintf(at, "nan") : sprintf(at, "%.*e", f->digits, real));
+    }
+    memcpy(&whole, place, 8);
+    if (t->class == BINARY && t->bit >= 0)
+        whole = whole >> t->bit & 1;
+    return at + sprintf(at, "%lld", (long long)whole);
+}
+
+static char *put_rows(char *at, struct target *t)
+{
+    read_latest(t);
+    for (int64_t channel = t->low; channel <= t->high; channel++) {
+        if (t->lines)
+            at += sprintf(at, "%lld", (long long)channel);
+        for (int i = 0; i < t->fields; i++) {
+            if (t->lines)
+                *at++ = ' ';
+            at = put_value(at, t, t->field[i], channel);
+            if (!t->lines)
+                *at++ = ' ';
+        }
+        if (t->lines)
+            *at++ = '\n';
+    }
+    return at;
+}
+
+static void write_all(const char *data, size_t size)
+{
+    while (size) {
+        ssize_t out = write(1, data, size);
+        if (out >= 0) {
+            data += out;
+            size -= out;
+        } else if (errno == EAGAIN) {
+            struct pollfd ready = {1, POLLOUT, 0};
+            poll(&ready, 1, -1);
+        } else if (errno != EINTR) {
+            char text[256];
+            int n = snprintf(text, sizeof text, "write standard output: ");
+            snprintf(text + n, sizeof text - n, "%s", strerror(errno));
+            for (char *c = text; *c; c++)
+                if (*c >= 'A' && *c <= 'Z')
+                    *c += 'a' - 'A';
+            fail(text);
+        }
+    }
+}
+
+/* Sample k is taken k periods after the first; one whose time has passed is left out, its number with it. */
+static void repeat(char *text, int numbered)
+{
+    int64_t period = nearbyint((all.given['t'] ? all.value['t'] : 1.0) * 1e9), start = now_ns(), number = 0;
+    double count = all.given['L'] ? all.value['L'] : DEFAULT_COUNT;
+    if (period < 1)
+        period = 1;
+    prctl(PR_SET_TIMERSLACK, 1);
+    for (double printed = 0; printed != count; printed++) {
+        if (printed) {
+            int64_t due = start + number * period;
+            struct timespec until = {due / 1000000000, due % 1000000000};
+            while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &until, NULL) == EINTR)
+                ;
+        }
+        char *at = text;
+        if (numbered)
+            at += sprintf(at, "%.6f %lld ", (now_ns() - start) / 1e9, (long long)number);
+        char *values = at;
+        for (int i = 0; i < target_count; i++)
+            at = put_rows(at, &targets[i]);
+        if (numbered) {
+            while (at > values && at[-1] == ' ')
+                at--;
+            *at++ = '\n';
+        }
+        write_all(text, at - text);
+        int64_t passed = (now_ns() - start) / period;
+        number = passed > number ? passed : number + 1;
+    }
+}
+
+/* argv: this program, then the command that the tool in Python is, of which the words begin at FIRST_WORD. */
+int main(int argc, char **argv)
+{
+    arguments = argv;
+    if (argc < FIRST_WORD || !is_of_these_sources())
+        leave_to_python();
+    take_line(argv + FIRST_WORD);
+    signal(SIGINT, SIG_DFL);
+    signal(SIGPIPE, SIG_DFL);
+    prctl(PR_SET_NAME, "devin");
+    for (int fd = 0; fd < 3; fd++)
+        if (fcntl(fd, F_GETFD) < 0 && open("/dev/null", fd ? fd == 1 ? O_RDONLY : O_RDWR : O_WRONLY) < 0)
+            leave_to_python();
+    struct message m;
+    int fds[8], fd_count, sock = connect_to_daemon(), numbered = 0;
+    if (ask(sock, HELLO, sizeof HELLO, HELLO_NUMBER, &m, fds, &fd_count))
+        leave_to_python();
+    size_t room = 128;
+    for (int i = 0; i < target_count; i++) {
+        open_target(sock, &targets[i]);
+        choose(&targets[i]);
+        numbered |= targets[i].given['N'];
+        room += (targets[i].high - targets[i].low + 1) * (targets[i].fields + 1) * 32;
+    }
+    char *text = take(room), *at = text;
+    if (timed) {
+        repeat(text, numbered || targets[target_count].given['N']);
+        return 0;
+    }
+    for (int i = 0; i < target_count; i++)
+        at = put_rows(at, &targets[i]);
+    write_all(text, at - text);
+    return 0;
+}
