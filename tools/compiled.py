@@ -1,11 +1,12 @@
 """What the compiled ``devin`` shares with the tool in Python, as C: layouts, messages, options and formats.
 
 Made of the tables that everything else uses, so that nothing is said twice; ``sioms.native.build`` compiles it together
-with ``sioms/native/devin.c``.
+with ``sioms/native/attach.c`` and ``devin.c``.
 """
 
 from __future__ import annotations
 
+import sys
 import zlib
 from pathlib import Path
 
@@ -23,9 +24,10 @@ from . import devin, options, rows
 TREE = Path(__file__).absolute().parents[1]
 if TREE.name == "sioms":  # installed, or imported through the tree's link
     TREE = TREE.parent
-_PROTOCOL = ("flags", "messages", "nodeinfo", "page", "records", "socketpath", "verbs")
+_PROTOCOL = ("flags", "messages", "nodeinfo", "page", "records", "socketpath", "text", "verbs")
+_PROGRAM = ("sioms/native/attach.c", "sioms/native/devin.c")
 SOURCES = (
-    "sioms/native/devin.c",
+    *_PROGRAM,
     *(f"sioms/protocol/{name}.py" for name in _PROTOCOL),
     "sioms/client/node_core.py",
     *(f"sioms/tools/{name}.py" for name in ("compiled", "devin", "options", "pipe", "rows")),
@@ -61,12 +63,13 @@ def source() -> str:
         f"static const char *const SOURCES[] = {{{', '.join(map(_text, SOURCES))}}};",
         f"struct page {{\n{''.join(map(_member, page.HEADER_FIELDS.items()))}}};",
         f"static const struct {{ uint32_t state; const char *text; }} STATES[] = {{{_states()}}};",
+        f"static const struct {{ uint32_t first, last; }} UNPRINTABLE[] = {{{_unprintable()}{{~0u, ~0u}}}};",
         "struct field { char letter; int class, row, real, digits; };",
         f"static const struct field FIELDS[] = {{{_fields()}{{0}}}};",
         "static const struct option { char letter; int valued, for_all, whole; double low, high; } OPTIONS[] = {"
         f"{_options()}{{0}}}};",
     ]
-    return "\n".join([*lines, texts[0].decode()])
+    return "\n".join([*lines, *(text.decode() for text in texts[: len(_PROGRAM)])])
 
 
 def _text(text: str) -> str:
@@ -84,6 +87,17 @@ def _member(field: tuple[str, str]) -> str:
 
 def _states() -> str:
     return ", ".join(f"{{{int(state)}, {_text(text)}}}" for state, text in UNREADABLE.items())
+
+
+def _unprintable() -> str:
+    found, begin = "", -1
+    for code in range(sys.maxunicode + 2):
+        hidden = code <= sys.maxunicode and not chr(code).isprintable()
+        if hidden and begin < 0:
+            begin = code
+        elif not hidden and begin >= 0:
+            found, begin = f"{found}{{{begin}, {code - 1}}}, ", -1
+    return found
 
 
 def _fields() -> str:

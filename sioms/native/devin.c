@@ -3,110 +3,15 @@
  * Whatever is not usual (a long option, a path, a refusal, a gateway) is left to the tool in Python, which is
  * the reference: this program then becomes the command in its own arguments, before it has written anything. What it
  * shares with that tool (layout of pages and records, messages, options, formats) is in what sioms.tools.compiled puts
- * before this text when it is compiled. Why so: docs/decisions/0285-devin-without-an-interpreter.md.
+ * before this text and attach.c when they are compiled. Why so: docs/decisions/0285-devin-without-an-interpreter.md.
  */
-#include <errno.h>
-#include <fcntl.h>
-#include <math.h>
-#include <poll.h>
-#include <signal.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-#include <sys/mman.h>
-#include <sys/prctl.h>
-#include <sys/socket.h>
-#include <sys/stat.h>
-#include <sys/un.h>
-#include <time.h>
-#include <unistd.h>
-
-enum { MOST_TARGETS = 32, MOST_NAME = 200, MOST_DEPTH = 16, FIRST_WORD = 8, PATIENCE_S = 1 };
-
-static char **arguments;
-
-/* Become the tool in Python. Every descriptor of ours is closed by that. */
-static _Noreturn void leave_to_python(void)
-{
-    execvp(arguments[1], arguments + 1);
-    _exit(127);
-}
-
-static void *take(size_t size)
-{
-    void *memory = calloc(1, size);
-    if (!memory)
-        leave_to_python();
-    return memory;
-}
+enum { MOST_TARGETS = 32, MOST_NAME = 200 };
 
 static int64_t now_ns(void)
 {
     struct timespec t;
     clock_gettime(CLOCK_MONOTONIC, &t);
     return t.tv_sec * INT64_C(1000000000) + t.tv_nsec;
-}
-
-/* Say one line, its blanks made single, and end. */
-static _Noreturn void fail(const char *text)
-{
-    char line[1024] = "devin:";
-    size_t n = 6;
-    for (const char *c = text; *c && n < sizeof line - 2; c++) {
-        if (*c != ' ' && (c == text || c[-1] == ' '))
-            line[n++] = ' ';
-        if (*c != ' ')
-            line[n++] = *c;
-    }
-    line[n++] = '\n';
-    if (write(2, line, n) < 0)
-        _exit(1);
-    _exit(1);
-}
-
-/* ---- the sources that this was made of ------------------------------------------------------ */
-
-static uint32_t crc_of(uint32_t crc, const uint8_t *data, size_t size)
-{
-    static uint32_t table[256];
-    for (uint32_t i = 0; !table[255] && i < 256; i++) {
-        table[i] = i;
-        for (int bit = 0; bit < 8; bit++)
-            table[i] = table[i] & 1 ? table[i] >> 1 ^ 0xEDB88320u : table[i] >> 1;
-    }
-    crc = ~crc;
-    while (size--)
-        crc = table[(crc ^ *data++) & 255] ^ crc >> 8;
-    return ~crc;
-}
-
-/* Whether the tree around this program still has the sources that it was made of. */
-static int is_of_these_sources(void)
-{
-    static uint8_t text[MOST_SOURCE + 1];
-    char place[4096];
-    ssize_t length = readlink("/proc/self/exe", place, sizeof place - 128);
-    uint32_t crc = 0;
-    if (length <= 0)
-        return 0;
-    place[length] = 0;
-    for (int up = 0; up < 3; up++) {
-        char *slash = strrchr(place, '/');
-        if (!slash)
-            return 0;
-        *slash = 0;
-    }
-    char *end = place + strlen(place);
-    for (size_t i = 0; i < sizeof SOURCES / sizeof *SOURCES; i++) {
-        snprintf(end, 128, "/%s", SOURCES[i]);
-        int fd = open(place, O_RDONLY | O_CLOEXEC);
-        ssize_t size = fd < 0 ? -1 : read(fd, text, sizeof text);
-        if (size < 0)
-            return 0;
-        close(fd);
-        crc = crc_of(crc, text, size);
-    }
-    return crc == CHECKSUM;
 }
 
 /* ---- the command line ------------------------------------------------------------------------ */
@@ -225,169 +130,7 @@ static void choose(struct target *t)
             t->field[t->fields++] = f;
 }
 
-/* ---- messages: MessagePack, of which only what answers hold is known --------------------------- */
-
-struct message {
-    const uint8_t *at, *end;
-};
-
-static uint64_t take_bytes(struct message *m, int size)
-{
-    uint64_t value = 0;
-    if (m->end - m->at < size)
-        leave_to_python();
-    while (size--)
-        value = value << 8 | *m->at++;
-    return value;
-}
-
-static int64_t take_integer(struct message *m)
-{
-    int kind = take_bytes(m, 1);
-    if (kind < 0x80)
-        return kind;
-    if (kind >= 0xE0)
-        return kind - 0x100;
-    if (kind >= 0xCC && kind <= 0xCF)
-        return take_bytes(m, 1 << (kind - 0xCC));
-    if (kind < 0xD0 || kind > 0xD3)
-        leave_to_python();
-    int size = 1 << (kind - 0xD0), unused = 64 - 8 * size;
-    return (int64_t)(take_bytes(m, size) << unused) >> unused;
-}
-
-static int64_t take_array(struct message *m)
-{
-    int kind = take_bytes(m, 1);
-    if (kind >= 0x90 && kind < 0xA0)
-        return kind & 15;
-    if (kind != 0xDC && kind != 0xDD)
-        leave_to_python();
-    return take_bytes(m, kind == 0xDC ? 2 : 4);
-}
-
-static void pass(struct message *m, int depth)
-{
-    int kind = take_bytes(m, 1);
-    uint64_t bytes = 0, values = 0;
-    if (depth > MOST_DEPTH || kind == 0xC1 || (kind >= 0xC7 && kind <= 0xC9) || (kind >= 0xD4 && kind <= 0xD8))
-        leave_to_python();
-    if (kind >= 0x80 && kind < 0x90)
-        values = 2 * (kind & 15);
-    else if (kind >= 0x90 && kind < 0xA0)
-        values = kind & 15;
-    else if (kind >= 0xA0 && kind < 0xC0)
-        bytes = kind & 31;
-    else if (kind >= 0xC4 && kind <= 0xC6)
-        bytes = take_bytes(m, 1 << (kind - 0xC4));
-    else if (kind == 0xCA || kind == 0xCB)
-        bytes = kind == 0xCA ? 4 : 8;
-    else if (kind >= 0xCC && kind <= 0xD3)
-        bytes = 1 << (kind & 3);
-    else if (kind >= 0xD9 && kind <= 0xDB)
-        bytes = take_bytes(m, 1 << (kind - 0xD9));
-    else if (kind >= 0xDC && kind < 0xE0)
-        values = take_bytes(m, kind & 1 ? 4 : 2) * (kind >= 0xDE ? 2 : 1);
-    if (bytes > (uint64_t)(m->end - m->at) || values > (uint64_t)(m->end - m->at))
-        leave_to_python();
-    m->at += bytes;
-    while (values--)
-        pass(m, depth + 1);
-}
-
-static void take_text(struct message *m, char *text, size_t room)
-{
-    int kind = take_bytes(m, 1);
-    size_t length = kind >= 0xA0 && kind < 0xC0 ? (size_t)(kind & 31) : kind == 0xD9 ? take_bytes(m, 1) : room;
-    if (length >= room || length > (size_t)(m->end - m->at))
-        leave_to_python();
-    memcpy(text, m->at, length);
-    text[length] = 0;
-    m->at += length;
-}
-
-/* ---- the daemon ------------------------------------------------------------------------------- */
-
-static const char *own_path(void)
-{
-    static char path[4096];
-    const char *runtime = getenv("XDG_RUNTIME_DIR");
-    if (runtime && *runtime)
-        snprintf(path, sizeof path, "%s/sioms/siomsd.sock", runtime);
-    else
-        snprintf(path, sizeof path, "/tmp/sioms-%u/sioms/siomsd.sock", getuid());
-    return path;
-}
-
-static int may_serve(uid_t uid, const char *path)
-{
-    char folder[sizeof(struct sockaddr_un)];
-    struct stat found;
-    if (uid == 0 || uid == getuid())
-        return 1;
-    snprintf(folder, sizeof folder, "%s", path);
-    char *slash = strrchr(folder, '/');
-    if (!slash || slash == folder || !strcmp(path, own_path()))
-        return 0;
-    *slash = 0;
-    return !stat(folder, &found) && uid == found.st_uid;
-}
-
-static int connect_to_daemon(void)
-{
-    const char *path = getenv(CELL_VARIABLE);
-    if (!path || !*path)
-        path = getenv(SOCKET_VARIABLE);
-    if (!path || !*path)
-        path = access(SYSTEM_PATH, F_OK) ? own_path() : SYSTEM_PATH;
-    struct sockaddr_un address = {.sun_family = AF_UNIX};
-    struct timeval patience = {.tv_sec = PATIENCE_S};
-    struct ucred peer;
-    socklen_t size = sizeof peer;
-    int sock = socket(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC, 0);
-    if (sock < 0 || strlen(path) >= sizeof address.sun_path || strstr(path, "://"))
-        leave_to_python();
-    strcpy(address.sun_path, path);
-    setsockopt(sock, SOL_SOCKET, SO_SNDTIMEO, &patience, sizeof patience);
-    setsockopt(sock, SOL_SOCKET, SO_RCVTIMEO, &patience, sizeof patience);
-    if (connect(sock, (struct sockaddr *)&address, sizeof address)
-        || getsockopt(sock, SOL_SOCKET, SO_PEERCRED, &peer, &size) || !may_serve(peer.uid, path))
-        leave_to_python();
-    return sock;
-}
-
-/* Send a request and return the errno of its answer, whose value begins where the message is left. */
-static int ask(int sock, const void *packet, size_t size, int64_t number, struct message *m, int *fds, int *fd_count)
-{
-    static uint8_t answer[MAX_PACKET];
-    union {
-        char bytes[CMSG_SPACE(4 * sizeof(int))];
-        struct cmsghdr align;
-    } control;
-    struct iovec part = {answer, sizeof answer};
-    struct msghdr head = {.msg_iov = &part, .msg_iovlen = 1, .msg_control = &control, .msg_controllen = sizeof control};
-    if (send(sock, packet, size, MSG_NOSIGNAL) != (ssize_t)size)
-        leave_to_python();
-    ssize_t got = recvmsg(sock, &head, MSG_CMSG_CLOEXEC);
-    if (got <= 0)
-        leave_to_python();
-    *fd_count = 0;
-    for (struct cmsghdr *c = CMSG_FIRSTHDR(&head); c; c = CMSG_NXTHDR(&head, c))
-        if (c->cmsg_level == SOL_SOCKET && c->cmsg_type == SCM_RIGHTS) {
-            *fd_count = (c->cmsg_len - CMSG_LEN(0)) / sizeof(int);
-            memcpy(fds, CMSG_DATA(c), *fd_count * sizeof(int));
-        }
-    *m = (struct message){answer, answer + got};
-    int64_t parts = take_array(m);
-    if (parts < 4 || parts > 6 || take_integer(m) != 0 || take_integer(m) != number)
-        leave_to_python();
-    int refused = take_integer(m);
-    struct message rest = *m;
-    pass(&rest, 0);
-    if (parts > 4 && (rest.at >= rest.end || *rest.at != 0xC2)) /* compressed: of thousands of channels */
-        leave_to_python();
-    return refused;
-}
+/* ---- opening ------------------------------------------------------------------------------------ */
 
 static int ask_open(int sock, const char *name, struct message *m, int *fds, int *fd_count)
 {
@@ -456,7 +199,7 @@ static void open_target(int sock, struct target *t)
 
 static _Noreturn void unreadable(const struct target *t, uint32_t state, const char *reason)
 {
-    char text[1024];
+    char text[2048];
     size_t device = strlen(t->device);
     const char *what = "its device is in fault";
     for (size_t i = 0; i < sizeof STATES / sizeof *STATES; i++)
@@ -473,13 +216,11 @@ static void check(const struct target *t, const struct page *page, int64_t now)
     uint32_t driver = __atomic_load_n(&page->driver_state, __ATOMIC_ACQUIRE);
     uint32_t daemon = __atomic_load_n(&page->daemon_state, __ATOMIC_ACQUIRE);
     int64_t age = now - (int64_t)__atomic_load_n(&page->alive_ns, __ATOMIC_ACQUIRE);
-    char reason[sizeof page->reason + 1] = "";
+    char raw[sizeof page->reason + 1] = "", reason[4 * sizeof raw];
     if (driver == GOOD && daemon == GOOD && age <= (int64_t)page->lease_ns)
         return;
-    memcpy(reason, page->reason, sizeof page->reason);
-    for (char *c = reason; *c; c++)
-        if ((unsigned char)*c < ' ' || *c == 127)
-            *c = '?';
+    memcpy(raw, page->reason, sizeof page->reason);
+    put_printable(reason, raw);
     if (daemon != GOOD)
         unreadable(t, daemon, reason);
     if (driver != GOOD)

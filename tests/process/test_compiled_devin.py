@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -14,7 +16,8 @@ import pytest
 from daemon_rig import FORCE, Daemon, axes, daemons, wait_for
 
 from sioms.native.language import LIBRARY
-from sioms.protocol.page import HEADER_FIELDS
+from sioms.protocol.flags import PageState
+from sioms.protocol.page import HEADER_FIELDS, MAGIC, REASON_OFFSET
 
 TOOL = Path(sys.prefix) / "bin" / "devin"
 PROGRAM = LIBRARY.with_name("_devin")
@@ -115,6 +118,52 @@ def test_a_device_that_hangs_is_told_by_its_age(daemon: Daemon) -> None:
     with daemon.frozen(daemon.device("lord1")["pid"]):
         said = [re.sub(r"\d+\.\d+ s \(", "AGE (", p.communicate(timeout=5)[1].decode()) for p in running]
     assert "has not ticked for AGE (lease" in said[0] and said[0] == said[1]
+
+
+def is_page(fd: int) -> bool:
+    try:
+        return os.pread(fd, len(MAGIC), 0) == MAGIC
+    except OSError:
+        return False
+
+
+def pass_on(listener: socket.socket, daemon: Daemon, reason: bytes) -> None:
+    """Stand between two clients and the daemon, and hand out pages of a device in fault."""
+    for _ in range(2):
+        client, server = listener.accept()[0], socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        server.connect(daemon.socket)
+        while request := client.recv(65536):
+            server.send(request)
+            answer, fds, _, _ = socket.recv_fds(server, 65536, 8)
+            for fd in filter(is_page, fds):
+                page = bytearray(os.pread(fd, 1 << 24, 0))
+                page[64:68] = int(PageState.FAULT).to_bytes(4, "little")
+                page[REASON_OFFSET : REASON_OFFSET + len(reason) + 1] = reason + b"\0"
+                os.dup2(os.memfd_create("page"), fd)
+                os.pwrite(fd, page, 0)
+            socket.send_fds(client, [answer], fds)
+
+
+def test_a_reason_that_no_terminal_should_see_is_shown_as_its_escapes(
+    both: Both, daemon: Daemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reason = "\x1b[2J\t  \x7f\xa0é🦾\u202e\U000e0001".encode() + b"\xff\xe2\x82x\xed\xa0\x80\xf0\x9f"
+    path = str(tmp_path / "between.sock")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(path)
+        listener.listen()
+        threading.Thread(target=pass_on, args=(listener, daemon, reason), daemon=True).start()
+        monkeypatch.setenv("SIOMS_CELL", path)
+        compiled, python = both(["lord1"], stdout=subprocess.PIPE)
+    assert compiled.stderr == python.stderr
+    assert r": \x1b[2J\t \x7f\xa0é🦾\u202e\U000e0001��x����" in python.stderr.decode()
+
+
+def test_a_daemon_that_hangs_is_told_as_soon_as_by_the_tool_in_python(both: Both, daemon: Daemon) -> None:
+    with daemon.frozen(daemon.pid):
+        compiled, python = both(["lord1"], stdout=subprocess.PIPE)
+    assert (compiled.returncode, compiled.stderr) == (python.returncode, python.stderr)
+    assert b"hung" in python.stderr
 
 
 def test_with_other_sources_than_it_was_made_of_the_tool_in_python_runs(tmp_path: Path) -> None:
