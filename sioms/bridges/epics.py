@@ -1,0 +1,253 @@
+"""``sioms epics``: nodes as process variables of EPICS PV Access, with alarms and units; stops may be put.
+
+One thread reads the pages and posts what has changed; the library's threads serve clients and carry out puts, so that
+no client is waited for. Set-points are shown, and not taken: docs/decisions/0336-pv-access-shows-and-stops.md
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from time import monotonic
+from typing import Any
+
+from p4p.nt import NTScalar
+from p4p.server import Server, StaticProvider
+from p4p.server.thread import SharedPV
+
+from sioms.arguments import place, positive
+from sioms.client.workcell import Workcell, is_part
+from sioms.protocol.flags import READONLY, AnalogStatus, AxisStatus, NodeClass, Severity
+from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
+
+PLACE = "127.0.0.1:5075"
+ASK_S = 0.5
+"""How often nodes and alarms are asked for [s]."""
+GONE = "cannot be read"
+_NUMBER, _WHOLE, _TEXT = NTScalar("d", display=True, control=True), NTScalar("l", display=True), NTScalar("s")
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        "epics",
+        help="show nodes to EPICS clients, and let them stop axes",
+        description="A bridge to EPICS PV Access: an ordinary client of the daemon that shows axes as motors, with "
+        "read-back, set-point, limits, done-moving and alarm, and analog and binary channels. Whoever reaches the port "
+        "may read, and stop axes by a put to STOP; nothing else can be put.",
+    )
+    parser.add_argument("--listen", metavar="HOST:PORT", default=PLACE, help=f"where; default {PLACE}, *:5075 for all")
+    parser.add_argument("--prefix", metavar="TEXT", default="", help="what the names of all variables begin with")
+    parser.add_argument("--rate", metavar="HZ", type=positive, default=10.0, help="how often to look; default 10 Hz")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until told to end."""
+    host, port = place(args.listen, PLACE)
+    bridge = Bridge(args.prefix)
+    with serve(bridge.provider, host, port):
+        print(f"listening on {args.listen}", file=sys.stderr, flush=True)
+        ended = threading.Event()
+        while not ended.wait(1.0 / args.rate):
+            bridge.look()
+    return 0
+
+
+def serve(provider: StaticProvider, host: str, port: int) -> Server:
+    """Return a server of the variables at one place; port 0 for any, and searches by broadcast only where it is seen.
+
+    Raises:
+        OSError: EINVAL, one cannot listen there.
+    """
+    seen = host == "*"
+    conf = {
+        "EPICS_PVAS_INTF_ADDR_LIST": "0.0.0.0" if seen else host,
+        "EPICS_PVAS_SERVER_PORT": str(port),
+        "EPICS_PVAS_BROADCAST_PORT": str(port + 1 if port else 0),
+        "EPICS_PVAS_AUTO_BEACON_ADDR_LIST": "YES" if seen else "NO",
+        "EPICS_PVAS_BEACON_ADDR_LIST": "" if seen else host,
+    }
+    try:
+        return Server(providers=[provider], conf=conf, useenv=False)
+    except RuntimeError as error:
+        raise OSError(errno.EINVAL, f"listen on {host}:{port}: {error}") from None
+
+
+class Shown:
+    """One process variable.
+
+    Args:
+        kind: type of its value.
+        channel: whose units, limits and description clients see.
+        stop: what a put of anything but 0 does; None: nothing can be put.
+    """
+
+    def __init__(self, kind: NTScalar, channel: ChannelInfo, stop: Callable[[], None] | None = None) -> None:
+        self._kind, self._channel, self._stop = kind, channel, stop
+        self._last: tuple[str, int, str] | None = None
+        self.pv = SharedPV(nt=kind, handler=self)
+
+    def put(self, pv: SharedPV, op: Any) -> None:
+        """Carry out a put of a client (called in a thread of the library)."""
+        if self._stop is None:
+            op.done(error=f"put to {op.name()}: it is shown only; only STOP can be put")
+            return
+        try:
+            if int(op.value()):
+                self._stop()
+        except (OSError, ValueError) as error:
+            op.done(error=f"stop: {getattr(error, 'strerror', None) or error}")
+        else:
+            op.done()
+
+    def post(self, value: Any, severity: int, message: str, stamp_s: float | None) -> None:
+        """Show a value where it, or its alarm, is another one; None: the last one."""
+        now = (str(value), severity, message)
+        if now == self._last or (value is None and self._last and now[1:] == self._last[1:]):
+            return
+        words: dict[str, Any] = {"severity": severity, "message": message}
+        if stamp_s is not None:
+            words["timestamp"] = stamp_s
+        if self._last is None:
+            self.pv.open(self._described(value), **words)
+        else:
+            self.pv.post({} if value is None else {"value": value}, **words)
+        self._last = now
+
+    def _described(self, value: Any) -> dict[str, Any]:
+        told: dict[str, Any] = {"value": value}
+        if self._kind is not _TEXT:
+            told["display"] = {"description": self._channel.description}
+        if self._kind is _NUMBER:
+            low, high = self._channel.minimum, self._channel.maximum
+            limits = {"limitLow": low or 0.0, "limitHigh": high or 0.0}  # both 0: none, as EPICS has it
+            told["display"] |= {"units": self._channel.unit, **limits}
+            told["control"] = limits
+        return told
+
+
+def values(info: NodeInfo, channel: ChannelInfo, reading: Any) -> Iterator[tuple[str, NTScalar, Any]]:
+    """Return what is shown of a channel: what follows its name, type and value."""
+    match info.node_class:
+        case NodeClass.AXIS:
+            moving = bool(reading.in_motion)
+            for field in ("", ".VAL"):
+                yield field, _NUMBER, reading.commanded_position
+            yield ".RBV", _NUMBER, reading.position
+            yield ".VELO", _NUMBER, channel.limits.get("velocity", 0.0)
+            yield ".DIFF", _NUMBER, reading.following_error
+            yield ".LLM", _NUMBER, channel.minimum or 0.0
+            yield ".HLM", _NUMBER, channel.maximum or 0.0
+            yield ".DMOV", _WHOLE, int(not moving)
+            yield ".MOVN", _WHOLE, int(moving)
+            yield ".MSTA", _WHOLE, reading.status
+            yield ".EGU", _TEXT, channel.unit
+            yield ".DESC", _TEXT, channel.description
+        case NodeClass.ANALOG | NodeClass.BINARY:
+            yield "", _NUMBER if info.node_class is NodeClass.ANALOG else _WHOLE, reading.data
+
+
+def severity_of(node_class: NodeClass, reading: Any) -> tuple[int, str]:
+    """Return how bad a reading is by its own status, and why in words."""
+    if node_class is NodeClass.BINARY:
+        return 0, ""
+    status = AxisStatus(reading.status) if node_class is NodeClass.AXIS else AnalogStatus(reading.flags)
+    bad = [str(flag.name) for flag in type(status) if status & flag and flag.severity]
+    return status.severity, ", ".join(bad)
+
+
+def worst(alarms: Iterable[dict[str, Any]], node: str, device: str, channel: str) -> tuple[int, str]:
+    """Return the severity and the sentence of the worst alarm on a channel, its node or its device; 0, '' for none."""
+    names = {f"{node}.{channel}", node, device}
+    found = [(a["severity"], a["text"]) for a in alarms if a["severity"] and a["node"] in names]
+    return max(found, default=(0, ""), key=lambda one: one[0])
+
+
+class Bridge:
+    """Shows what is in a workcell.
+
+    Attributes:
+        provider: of the process variables.
+
+    Concurrency: ``look`` in one thread; stops in any.
+    """
+
+    def __init__(self, prefix: str) -> None:
+        self.provider = StaticProvider("sioms")
+        self._prefix = prefix
+        self._shown: dict[str, Shown] = {}
+        self._of_node: dict[str, set[str]] = {}
+        self._cell: Workcell | None = None
+        self._nodes: dict[str, Any] = {}
+        self._names: dict[str, str] = {}
+        self._alarms: list[dict[str, Any]] = []
+        self._asked_s = -ASK_S
+
+    def look(self) -> None:
+        """Post what has changed; what cannot be read is INVALID."""
+        if monotonic() > self._asked_s + ASK_S:
+            try:
+                self._ask()
+            except OSError:
+                if self._cell is not None:
+                    self._cell.close()
+                self._cell, self._nodes, self._names = None, {}, {}
+            self._asked_s = monotonic()
+        for name in self._names.keys() | self._of_node.keys():
+            try:
+                self._show(name)
+            except OSError as error:
+                if (node := self._nodes.pop(name, None)) is not None:
+                    node.release()
+                for shown in self._of_node.get(name, ()):
+                    self._shown[shown].post(None, int(Severity.INVALID), error.strerror or GONE, None)
+
+    def _ask(self) -> None:
+        cell = self._cell = self._cell or Workcell(name="sioms epics")
+        entries = cell.nodes()
+        self._alarms = cell.alarms()
+        self._names = {e.name: e.name if e.read_only else e.name + READONLY for e in entries if not is_part(e, entries)}
+
+    def _node(self, name: str) -> Any:
+        if name not in self._names or self._cell is None:
+            raise OSError(errno.EIO, GONE)
+        if name not in self._nodes:
+            self._nodes[name] = self._cell.open(self._names[name])
+        return self._nodes[name]
+
+    def _show(self, name: str) -> None:
+        node = self._node(name)
+        snapshot, info = node.read(), node.info
+        stamp_s = snapshot.utc.ns / 1e9
+        for channel, reading in zip(info.channels, snapshot, strict=True):
+            alarm = max(severity_of(info.node_class, reading), worst(self._alarms, name, info.device, channel.name))
+            for field, kind, value in values(info, channel, reading):
+                self._post(name, f"{channel.name}{field}", Shown, kind, channel).post(value, *alarm, stamp_s)
+            if info.node_class is NodeClass.AXIS:
+                self._post(name, f"{channel.name}.STOP", self._stopper(name), _WHOLE, channel).post(0, 0, "", stamp_s)
+
+    def _stopper(self, name: str) -> Callable[[NTScalar, ChannelInfo], Shown]:
+        return lambda kind, channel: Shown(kind, channel, lambda: self._stop(name))
+
+    def _post(self, node: str, what: str, make: Callable[..., Shown], *words: Any) -> Shown:
+        """Return the variable of a name, made where there is none yet."""
+        name = f"{self._prefix}{node}:{what}"
+        if name not in self._shown:
+            self._shown[name] = make(*words)
+            self._of_node.setdefault(node, set()).add(name)
+            self.provider.add(name, self._shown[name].pv)
+        return self._shown[name]
+
+    def _stop(self, name: str) -> None:
+        """Stop a node, also one whose readings are lost for now."""
+        cell, node = self._cell, self._nodes.get(name)
+        if node is not None:
+            node.stop()
+        elif cell is None or name not in self._names:
+            raise OSError(errno.EIO, f"{name}: {GONE}")
+        else:
+            with cell.open(self._names[name]) as opened:
+                opened.stop()

@@ -1,0 +1,145 @@
+"""The bridge to EPICS: what its clients see, by the library's own client over loopback."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("p4p", reason="needs the extra epics")
+
+from p4p.client.thread import Context, RemoteError
+
+from sioms.bridges import epics
+from sioms.protocol.flags import AxisStatus, NodeClass
+from sioms.protocol.nodeinfo import NodeInfo
+
+
+class Node:
+    """An axis at rest, or that cannot be read."""
+
+    def __init__(self, name: str) -> None:
+        channel = ["xaxis", "m", -0.5, 0.5, 0, 0, {"velocity": 0.25}, "the slide"]
+        self.info = NodeInfo([name, int(NodeClass.AXIS), True, [channel], -1, 1e3, 16, "mod0", "sim", 2])
+        self.lost, self.stops, self.moving, self.status = "", 0, 1, 0
+
+    def read(self) -> Any:
+        if self.lost:
+            raise OSError(5, self.lost)
+        reading = SimpleNamespace(
+            position=0.125, commanded_position=0.25, following_error=0.0, in_motion=self.moving, status=self.status
+        )
+        return Snapshot([reading])
+
+    def stop(self) -> None:
+        if self.status:
+            raise OSError(1, "stop mod0.readonly: no right to")
+        self.stops, self.moving = self.stops + 1, 0
+
+    def release(self) -> None:
+        pass
+
+    def __enter__(self) -> Node:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+class Snapshot(list[Any]):
+    utc = SimpleNamespace(ns=1_000_000_000_500_000_000)
+
+
+class Cell:
+    """A workcell of one axis."""
+
+    def __init__(self, node: Node) -> None:
+        self.node, self.raised = node, [dict.fromkeys(("node", "text"), "mod0.yaxis") | {"severity": 2}]
+
+    def nodes(self) -> list[Any]:
+        return [SimpleNamespace(name="mod0", read_only=False, device="mod0", node_class=3, channels=1, bit=-1)]
+
+    def alarms(self) -> list[dict[str, Any]]:
+        return self.raised
+
+    def open(self, name: str) -> Node:
+        assert name == "mod0.readonly"
+        return self.node
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def cell(monkeypatch: pytest.MonkeyPatch) -> Cell:
+    made = Cell(Node("mod0.readonly"))
+    monkeypatch.setattr(epics, "Workcell", lambda name: made)
+    monkeypatch.setattr(epics, "ASK_S", 0.0)
+    return made
+
+
+@pytest.fixture
+def bridge(cell: Cell) -> epics.Bridge:
+    made = epics.Bridge("lab:")
+    made.look()
+    return made
+
+
+@pytest.fixture
+def client(bridge: epics.Bridge) -> Iterator[Context]:
+    with epics.serve(bridge.provider, "127.0.0.1", 0) as server:
+        place = f"127.0.0.1:{server.conf()['EPICS_PVAS_SERVER_PORT']}"
+        conf = {"EPICS_PVA_NAME_SERVERS": place, "EPICS_PVA_ADDR_LIST": "", "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
+        with Context("pva", conf=conf, useenv=False) as context:
+            yield context
+
+
+def test_an_axis_is_seen_as_a_motor_with_alarms_and_stopped_by_a_put(
+    client: Context, bridge: epics.Bridge, cell: Cell
+) -> None:
+    def get(field: str) -> Any:
+        return client.get(f"lab:mod0:xaxis{field}", timeout=5.0)
+
+    seen = {field: get(field) for field in (".RBV", ".VAL", "", ".VELO", ".LLM", ".HLM", ".DMOV", ".MOVN", ".EGU")}
+    assert [*seen.values()] == [0.125, 0.25, 0.25, 0.25, -0.5, 0.5, 0, 1, "m"]
+    raw = seen[".RBV"].raw
+    assert (raw["display.units"], raw["display.description"]) == ("m", "the slide")
+    assert (raw["control.limitLow"], raw["control.limitHigh"]) == (-0.5, 0.5)
+    assert (seen[".RBV"].severity, seen[".RBV"].timestamp) == (0, 1_000_000_000.5)
+
+    for field in ("", ".VAL", ".VELO", ".HLM"):
+        with pytest.raises(RemoteError, match="only STOP can be put"):
+            client.put(f"lab:mod0:xaxis{field}", 0.3, timeout=5.0)
+    client.put("lab:mod0:xaxis.STOP", 0, timeout=5.0)
+    assert cell.node.stops == 0
+    client.put("lab:mod0:xaxis.STOP", 1, timeout=5.0)
+    assert cell.node.stops == 1
+    bridge.look()
+    assert get(".DMOV") == 1
+
+    cell.raised.append({"node": "mod0.xaxis", "severity": 1, "text": "too warm"})
+    bridge.look()
+    assert (get(".RBV").severity, get(".RBV").raw["alarm.message"]) == (1, "too warm")
+    cell.node.status = int(AxisStatus.FAULT)
+    bridge.look()
+    assert (get(".RBV").severity, get(".RBV").raw["alarm.message"]) == (2, "FAULT")
+    with pytest.raises(RemoteError, match=r"stop: stop mod0.readonly: no right to"):
+        client.put("lab:mod0:xaxis.STOP", 1, timeout=5.0)
+
+    cell.node.lost = "its driver is gone"
+    bridge.look()
+    assert (get(".RBV").severity, get(".RBV").raw["alarm.message"]) == (3, "its driver is gone")
+    assert get(".RBV") == 0.125
+    cell.node.status = 0
+    client.put("lab:mod0:xaxis.STOP", 1, timeout=5.0)
+    assert cell.node.stops == 2, "also where it cannot be read"
+    cell.node.lost = ""
+    bridge.look()
+    assert get(".RBV").severity == 1, "the alarm still stands"
+
+
+def test_where_one_cannot_listen_is_told(bridge: epics.Bridge) -> None:
+    with pytest.raises(OSError, match=r"listen on no\.such\.address:5999: "):
+        epics.serve(bridge.provider, "no.such.address", 5999)
