@@ -297,7 +297,9 @@ class Process:
     def turn(self) -> None:
         """Serve what the daemon has sent."""
         control = self.runtime._control
-        while self.runtime._callbacks.get(control.fileno()) and select.select([control], [], [], 0)[0]:
+        while control.is_behind or (
+            self.runtime._callbacks.get(control.fileno()) and select.select([control], [], [], 0)[0]
+        ):
             self.runtime._control_readable()
 
     def tick(self, after_ns: int = 0) -> None:

@@ -31,6 +31,7 @@ OPEN, CLOSING, TOLD, ORPHAN = "open", "closing", "told", "orphan"
 """A handle, as the daemon sees it: its client closes it; its driver was told to end it; its session has ended."""
 ATTACH, DETACH, END, STOP, RESET, VOID = "attach", "detach", "end", "stop", "reset", "void"
 """Messages to a driver; VOID: an order that a later reset of the workcell has overtaken."""
+ORDERS = (STOP, RESET, VOID)
 READY, DETACHED = "ready", "detached"
 NOBODY: tuple[()] = ()
 Held: TypeAlias = tuple[int, str] | tuple[()]
@@ -285,7 +286,13 @@ class Step:
     def hear(self, d: int) -> None:
         driver = self.devices[d].driver[0]
         self._drive(d, inbox=())
-        for verb, client, mark in driver.inbox:
+        self._obey(d, driver.inbox)
+        if driver.cut:
+            self._end_driver(d)
+        self._heed(d)
+
+    def _obey(self, d: int, messages: tuple[tuple[str, int, str], ...]) -> None:
+        for verb, client, mark in messages:
             if verb in (STOP, RESET):
                 self._heed(d)
             match verb:
@@ -300,13 +307,12 @@ class Step:
                 case "reset":
                     if not self.devices[d].driver[0].stopped:
                         self._drive(d, node_stop=False)
-        if driver.cut:
-            self._end_driver(d)
-        self._heed(d)
 
     def tick(self, d: int) -> None:
-        if {STOP, RESET, VOID}.intersection(message[0] for message in self.devices[d].driver[0].inbox):
-            self.hear(d)
+        """Heed orders, which overtake all else that is in the inbox, and what is said in pages."""
+        inbox = self.devices[d].driver[0].inbox
+        self._drive(d, inbox=tuple(message for message in inbox if message[0] not in ORDERS))
+        self._obey(d, tuple(message for message in inbox if message[0] in ORDERS))
         self._heed(d)
 
     def _heed(self, d: int) -> None:

@@ -12,7 +12,6 @@ import errno
 import mmap
 import os
 import select
-import socket
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -21,23 +20,22 @@ from typing import Any
 
 import numpy as np
 
-from sioms.descriptors import receive
 from sioms.motion import CommandError
 from sioms.protocol import driver_verbs
 from sioms.protocol.flags import PageState
 from sioms.protocol.journal import HEADER, JOURNAL_SIZE, JournalWriter, Note
 from sioms.protocol.latch import LATCH_SIZE, Latch
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
-from sioms.protocol.messages import MAX_PACKET, MAX_UNPACKED
 from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.stopjournal import StopJournal
 from sioms.protocol.text import printable
-from sioms.protocol.verbs import Message, take
+from sioms.protocol.verbs import Message
 from sioms.turns import Turns
 
 from .alarm_watch import AlarmWatch
 from .attachments import SHARES, Attachments
 from .blocks import AnyBlock, AxisBlock
+from .control import Control
 from .driver import Driver, LineDriver, StreamDriver, TickDriver
 from .effects import Effects
 from .engine import Engine
@@ -65,8 +63,6 @@ SETTLE_NS = 20_000_000
 """An axis whose loop is closed here follows its command by so much; only then is the loop given up."""
 FAIL_GRACE_NS = 500_000_000
 """How long a failed driver's line may take to send the stops."""
-MOST_ORDERS = 512
-"""More messages than the daemon's socket holds: what is behind them has been sent since they were begun with."""
 SURE = 4
 """One tick in so many leaves time for clients' work however long it took."""
 
@@ -116,8 +112,8 @@ class Runtime:
         self.looked_ns = 0
         self.outputs = Outputs()
         self.statistics = TickStatistics()
-        self._control = socket.socket(fileno=fds[0])
-        self._control.setblocking(False)
+        self._control = Control(fds[0])
+        self.tell = self._control.tell
         latch = mmap.mmap(fds[1], LATCH_SIZE)
         self.latch, self._latch_words = Latch(memoryview(latch)), np.frombuffer(latch, dtype=np.int64, count=8)
         request, self._request_fd = StopRequest(fds[2], fds[3]), fds[2]
@@ -301,10 +297,12 @@ class Runtime:
                 else:
                     turns.mark(fd)
             turns.serve()  # one request, after all that is due
+            if self._control.is_behind:
+                self._control_readable()
 
     def _wait(self) -> list[int]:
         """Wait for events; return the descriptors that are ready."""
-        pause_s = self.turns.pause_s
+        pause_s = 0.0 if self._control.is_behind else self.turns.pause_s
         looked_at = self.clients.handles or self._is_used  # else it is soon idle
         ready = None
         if self._quiet and looked_at and pause_s is None and not self._ending_ns and not self._daemon_late:
@@ -431,9 +429,9 @@ class Runtime:
     def heed(self) -> None:
         """Heed the daemon's orders, then the latch and the stop-request file; cheap when there is nothing new."""
         if self.stops.heed_orders():
-            for _ in range(MOST_ORDERS):
-                if not self.running or not self._take_order():
-                    break
+            for order in self._control.orders():
+                self._wake()
+                self._obey(order, [])
         self.stops.heed()
 
     def _tick_and_publish(self, scheduled_ns: int) -> int:
@@ -534,38 +532,22 @@ class Runtime:
 
     # --- the daemon ------------------------------------------------------------------------------
 
-    def tell(self, message: Message) -> None:
-        try:
-            self._control.send(message.packed())
-        except OSError:
-            return  # a daemon that is gone is noticed by its end of file, a hung one by its lease
-
     def _tell_ready(self) -> None:
-        socket.send_fds(self._control, [driver_verbs.Ready(len(self.blocks)).packed()], self.pages.fds)
+        self._control.tell_ready(self.pages.fds)
         for fd in self.pages.fds:
             os.close(fd)
 
     def _control_readable(self) -> None:
-        self._take_order()  # one; the tick has its turn before the next
-
-    def _take_order(self) -> bool:
-        """Obey one message of the daemon; return whether there was one."""
+        """Obey one message of the daemon; the tick has its turn before the next."""
         try:
-            packet, fds = receive(self._control, MAX_PACKET, 8)
-        except BlockingIOError:
-            return False
-        except ConnectionResetError:
-            return self._take_order()  # it is reported once, ahead of what is still there to read
-        except OSError:
-            packet, fds = b"", []
-        if not packet:
+            received = self._control.take()
+        except EOFError:
             self.unwatch(self._control.fileno())
             self.end("the daemon has gone")
-            return False
-        _, message = take(packet, driver_verbs.TO_DRIVER, values=MAX_UNPACKED)
-        self._wake()
-        self._obey(message, fds)
-        return True
+            return
+        if received is not None:
+            self._wake()
+            self._obey(*received)
 
     def _obey(self, message: Message, fds: list[int]) -> None:
         match message:

@@ -31,7 +31,7 @@ def rested(driver: type[Driver], table: dict[str, Any], made: list[World], *, us
     made[:] = [World(driver, table, random.Random(1))]
     world = made[0]
     world.order(DriverVerb.IN_USE, used)
-    world.runtime.heed()
+    world.runtime._control_readable()
     for _ in range(ticks):
         world.tick()
     return world

@@ -1,0 +1,99 @@
+"""The driver's end of its socket to the daemon: orders overtake what else the daemon has sent.
+
+Concurrency: the one thread of the driver process.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections import deque
+from collections.abc import Iterator, Sequence
+from typing import TypeAlias
+
+from sioms.descriptors import receive
+from sioms.protocol import driver_verbs
+from sioms.protocol.messages import MAX_PACKET, MAX_UNPACKED
+from sioms.protocol.verbs import Message, take
+
+MOST_AHEAD = 512
+"""More messages than the daemon's socket holds: what is behind them has been sent since they were begun with."""
+Order: TypeAlias = driver_verbs.NodeStop | driver_verbs.NodeReset
+Received: TypeAlias = tuple[Message, list[int]]
+
+
+class Control:
+    """The control socket of a driver process.
+
+    Args:
+        fd: its descriptor.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self._sock = socket.socket(fileno=fd)
+        self._sock.setblocking(False)
+        self._kept: deque[Received] = deque()
+
+    def fileno(self) -> int:
+        return self._sock.fileno()
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether there are messages to take that orders have overtaken: the descriptor tells nothing of them."""
+        return bool(self._kept)
+
+    def tell(self, message: Message) -> None:
+        """Send the daemon a message."""
+        try:
+            self._sock.send(message.packed())
+        except OSError:
+            return  # a daemon that is gone is noticed by its end of file, a hung one by its lease
+
+    def tell_ready(self, pages: Sequence[int]) -> None:
+        """Tell the daemon that publishing has begun, with the descriptors of the pages."""
+        socket.send_fds(self._sock, [driver_verbs.Ready(len(pages)).packed()], pages)
+
+    def orders(self) -> Iterator[Order]:
+        """Give the orders that have come; what lies before and between them is kept for ``take``.
+
+        Whose request waits for it waits for receiving only, not for what the other messages have the driver do.
+        """
+        for _ in range(MOST_AHEAD):
+            try:
+                received = self._receive()
+            except EOFError:
+                return  # it shows again, behind what is kept
+            if received is None:
+                return
+            if isinstance(received[0], Order):
+                yield received[0]
+            else:
+                self._kept.append(received)
+
+    def take(self) -> Received | None:
+        """Return the next message and its descriptors; None when there is none.
+
+        Raises:
+            EOFError: the daemon has gone.
+        """
+        return self._kept.popleft() if self._kept else self._receive()
+
+    def close(self) -> None:
+        """Close the socket, and the descriptors of what has not been taken."""
+        self._sock.close()
+        for _, fds in self._kept:
+            for fd in fds:
+                os.close(fd)
+
+    def _receive(self) -> Received | None:
+        try:
+            packet, fds = receive(self._sock, MAX_PACKET, 8)
+        except BlockingIOError:
+            return None
+        except ConnectionResetError:
+            return self._receive()  # it is reported once, ahead of what is still there to read
+        except OSError:
+            packet, fds = b"", []
+        if not packet:
+            raise EOFError
+        return take(packet, driver_verbs.TO_DRIVER, values=MAX_UNPACKED)[1], fds
