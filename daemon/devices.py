@@ -130,6 +130,17 @@ class DriverProcess:
         return self._sock is not None
 
     @property
+    def contact(self) -> tuple[socket.socket, int] | None:
+        """The socket to the process and its pidfd, while it is up and ticks and both are known."""
+        there = self.state is State.UP and not self.hung and self._pidfd >= 0
+        return (self._sock, self._pidfd) if there and self._sock is not None else None
+
+    @property
+    def lease_s(self) -> float:
+        """How long the process may be silent before it counts as hung [s]."""
+        return self._lease_s
+
+    @property
     def settled(self) -> bool:
         """Whether the first start has succeeded or failed for good."""
         return self.state not in (State.DOWN, State.STARTING)

@@ -45,6 +45,8 @@ class DeviceInfo:
     """Of its driver: compiled, tick, line or stream; see needs.py."""
     realtime_priority: int = 0
     """That its driver asks for unless the configuration says otherwise; 0: none."""
+    holds: tuple[str, ...] = ()
+    """Axis nodes of other devices that are this one's own; they are among ``inputs``, too."""
 
     def facts(self) -> list[object]:
         """Return all it tells as plain values, to be compared."""
@@ -59,12 +61,12 @@ class DeviceInfo:
             ]
             for b in self.blocks
         ]
-        return [self.driver, blocks, self.tick_hz, self.inputs, self.lease_s, self.made_of]
+        return [self.driver, blocks, self.tick_hz, self.inputs, self.lease_s, self.made_of, self.holds]
 
     @classmethod
     def unpack(cls, name: str, driver: str, packed: list) -> DeviceInfo:  # type: ignore[type-arg]
         """Make it from the fork server's reply."""
-        blocks, tick_hz, inputs, lease_s, claims, made_of, kind, realtime_priority = packed
+        blocks, tick_hz, inputs, lease_s, claims, made_of, kind, realtime_priority, holds = packed
         return cls(
             name,
             driver,
@@ -79,6 +81,7 @@ class DeviceInfo:
             made_of,
             kind,
             realtime_priority,
+            tuple(holds),
         )
 
 
@@ -144,7 +147,8 @@ class NameTable:
     Attributes:
         nodes: by name, in the order of the configuration.
         devices: descriptions by device name.
-        errors: sentences about aliases and inputs that name nothing.
+        holders: the device that has a channel (device, block, channel) as its own.
+        errors: sentences about aliases and inputs that name nothing, and devices that cannot be made of devices so.
     """
 
     def __init__(self, devices: Mapping[str, DeviceInfo], aliases: Mapping[str, NodeTable]) -> None:
@@ -168,6 +172,41 @@ class NameTable:
                         f"[device.{device.name}]: reads node {wanted}, which does not "
                         f"exist{did_you_mean(wanted, self.nodes)}"
                     )
+        self.holders: dict[tuple[str, int, int], str] = {}
+        for device in devices.values():
+            self.errors += [f"[device.{device.name}]: {error}" for error in self._hold(device)]
+
+    def _hold(self, device: DeviceInfo) -> Iterator[str]:
+        """Note what a device holds; yield a sentence for each node that it cannot."""
+        for name in device.holds:
+            node = self.nodes.get(name)
+            if node is None:
+                continue  # told as an input
+            if node.read_only or self.block(node).node_class is not NodeClass.AXIS:
+                yield f"holds node {name}, which takes no motion commands; want a node of axes"
+            elif device.name in self._held_by(node.device):
+                yield f"holds node {name} of device {node.device}, which is made of this one; want no ring of devices"
+            else:
+                for claim in node.claims():
+                    owner = self.holders.setdefault(claim[:3], device.name)
+                    if owner != device.name:
+                        axis = self.block(node).channels[claim[2]].name
+                        yield f"holds axis {axis} of node {name}, which device {owner} holds; want one holder an axis"
+                        break
+
+    def _held_by(self, device: str) -> set[str]:
+        """Return a device, and all whose axes it holds, directly or not."""
+        found, new = {device}, [device]
+        while new:
+            info = self.devices.get(new.pop())
+            targets = {self.nodes[name].device for name in info.holds if name in self.nodes} if info else set()
+            new += targets - found
+            found |= targets
+        return found
+
+    def holder(self, node: Node) -> str:
+        """Return the device to which an axis of this node belongs by the configuration, '' where none does."""
+        return next((owner for c in node.claims() if (owner := self.holders.get(c[:3]))), "")
 
     def block(self, node: Node) -> BlockInfo:
         """Return the block a node shows."""

@@ -142,9 +142,20 @@ class NodeVerbs:
             )
         return node
 
-    def _obstacle(self, node: Node) -> Refused | None:
-        """Return why a node cannot be opened now, or None."""
+    def _obstacle(self, node: Node, device_of: str = "") -> Refused | None:
+        """Return why a node cannot be opened now, or None.
+
+        Args:
+            node: it.
+            device_of: the device that is to hold it; '' for a client.
+        """
         holder = self._claims.holder(node)
+        owner = self._server.names.holder(node)
+        if holder is None and owner and owner != device_of:
+            return Refused(
+                errno.EBUSY,
+                f"open {node.name}: device {owner} drives it; command {owner}, or use {node.name}{READONLY} to observe",
+            )
         if holder is not None:
             held_s = (time.monotonic_ns() - holder.since_ns) / 1e9
             other = "" if holder.node.name == node.name else f" through {holder.node.name}"
@@ -172,7 +183,33 @@ class NodeVerbs:
         device = self._server.devices.get(node.device)
         return self._server.is_replaced(node.device) or (device is not None and device.state is State.STARTING)
 
+    def hold(self, session: Session, holder: str, node: Node, lease_s: float) -> tuple[Handle, socket.socket] | None:
+        """Give a device a node as its own, if that is free; the caller sends it the socket, and closes it here."""
+        if self._obstacle(node, holder) is not None:
+            return None
+        handle, ours, readable = self._attach(session, node, Access.READ | Access.WRITE, lease_s)
+        os.close(readable)
+        return handle, ours
+
     def _grant(self, session: Session, number: int, node: Node, access: Access, lease_s: float) -> None:
+        device = self._server.devices[node.device]
+        handle, ours, readable = self._attach(session, node, access, lease_s)
+        try:
+            behind = [os.getpid(), device.pid]
+            value = [handle.number, self._server.names.pack(node), node.channels, node.bit, behind]
+            self._clients.send(session, reply(number, value), [device.page_fds[node.block], readable, ours.fileno()])
+        finally:
+            os.close(readable)
+            ours.close()
+
+    def _attach(
+        self, session: Session, node: Node, access: Access, lease_s: float
+    ) -> tuple[Handle, socket.socket, int]:
+        """Have a driver serve a handle; return it, the client's end of its socket, and that of the wake pipe.
+
+        Raises:
+            Refused: EIO, the driver takes no messages.
+        """
         device = self._server.devices[node.device]
         rights = self._clients.rights.on_node(session.peer, node.name)
         now_ns = time.monotonic_ns()
@@ -201,14 +238,14 @@ class NodeVerbs:
             self._open[node.device] += 1
             if self._open[node.device] == 1:
                 self._server.look_at_use()
-            behind = [os.getpid(), device.pid]
-            value = [handle.number, self._server.names.pack(node), node.channels, node.bit, behind]
-            self._clients.send(session, reply(number, value), [device.page_fds[node.block], readable, ours.fileno()])
-        finally:
+        except BaseException:
             os.close(readable)
-            os.close(wake)
             ours.close()
+            raise
+        finally:
+            os.close(wake)
             theirs.close()
+        return handle, ours, readable
 
     def retry_opens(self) -> None:
         """Try the waiting opens again, the oldest first, and ask again whether they may."""

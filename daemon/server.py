@@ -27,6 +27,7 @@ from .config import Config
 from .devices import DriverProcess, State
 from .fork_server import ForkServer
 from .fork_server_process import ForkServerProcess
+from .holds import Holds
 from .listening import Listening
 from .loading import Loader, Plan, mistake
 from .log import Log
@@ -71,6 +72,7 @@ class Server:
         self._first_process = process
         self._options: dict[str, dict[str, Any]] = {}
         self._watched_inputs: dict[str, dict[int, str]] = {}
+        self._holds = Holds()
         self._leaving: dict[str, DriverProcess] = {}
         self._loader: Loader | None = None
         self._asked: list[tuple[Callable[[list[str]], None], Callable[[], bool]]] = []
@@ -288,8 +290,12 @@ class Server:
                 if other is device or self.names.nodes[name].device == device.name:
                     self._send_input(other, name)
         self.look_at_use()
+        self._look_at_holds()
         self.clients.nodes.retry_opens()
         self._maybe_ready()
+
+    def _look_at_holds(self) -> None:
+        self._holds.look(self.devices, self.names, self.clients.nodes)
 
     def look_at_use(self) -> None:
         """Tell drivers whether somebody reads them through other devices, directly or not.
@@ -311,6 +317,7 @@ class Server:
     def device_gone(self, device: DriverProcess, reason: str) -> None:
         """Void the handles of a process that is no more, and stop what is tied to it."""
         device.trouble = ""
+        self._holds.device_gone(device, self.clients.nodes)
         self.clients.nodes.device_gone(device, reason)
         self.alarms.gone(device, reason)
         if device.state is not State.DOWN and device.device.common.on_loss == "stop":
@@ -521,6 +528,7 @@ class Server:
         if (source := self.shared.record.state.workcell) and not self.shared.latch.stopped_ns:
             self.stop_workcell(source)  # a driver could not keep a stop
         self._pass_on_stops()
+        self._look_at_holds()
         for device in list(self.devices.values()):
             device.check(now)
         if self._fork_server is not None and (why := self._fork_server.check(now / 1e9)):

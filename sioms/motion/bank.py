@@ -158,6 +158,12 @@ class Bank(ABC):
             self._begin(self._queue.append(judged), now_ns, replace=judged.replace)
         return True
 
+    def ends(self) -> list[float]:
+        """Return where the commands in hand will leave each axis; NaN where there are none, or it is not known."""
+        self._settle()
+        busy = ~self._idle(np.arange(self.n))
+        return [float(end) for end in np.where(busy, self._queue.tail.state[:, 0], np.nan)]
+
     def room(self, axes: AxesLike) -> int:
         """Return how many further commands fit into the fullest buffer of these axes."""
         self._settle()
@@ -249,6 +255,10 @@ class Bank(ABC):
         self._abandon(chosen, stamp, errno.EIO, text, fastest=True)
         self._let_go(chosen)
 
+    def let_go(self, axes: AxesLike) -> None:
+        """Press no more with these axes, however far from their set-points; reset() has them hold where they are."""
+        self._let_go(np.asarray(axes, dtype=np.int64))
+
     def lose_place(self, axes: AxesLike, text: str, now_ns: int | None = None) -> None:
         """Put axes in fault whose device does not know where they are: it restarted, or says so itself.
 
@@ -282,6 +292,10 @@ class Bank(ABC):
         self._forget(axes)
         self._queue.emit(EventKind.DROPPED, axes[~self._idle(axes)], now_ns, errno_, text)
         self._halt(axes, self._instant(now_ns), fastest=fastest)
+
+    def abandon(self, axes: AxesLike, now_ns: int, errno_: int, text: str) -> None:
+        """Empty the buffers and stop, for a reason that is not the writer's; those who wait are told it."""
+        self._abandon(np.asarray(axes, dtype=np.int64), now_ns, errno_, text)
 
     # -- coordinates, limits, homing ----------------------------------------------------------
 

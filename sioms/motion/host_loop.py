@@ -41,6 +41,7 @@ class AxisBank(Bank):
         capacity: commands that each axis' buffer holds.
         late_max_s: a tick that comes later than this after its predecessor stops all motion [s].
 
+    ``arrays`` are those of the loop by name (``axis_step.Loop``), to be read.
     ``stepper`` (n,) tells which entries of tick()'s answer are raw output positions; the others are forces or torques.
 
     Concurrency: one thread.
@@ -82,7 +83,7 @@ class AxisBank(Bank):
         self._guard = LimitGuard(self._queue, self._sequencer)
         self._homing = HomingRuns(settings, self._queue, self)
         self._motion_watch = HostWatch(settings, tick_s, self._law)
-        arrays = self._law.arrays
+        arrays = self.arrays = self._law.arrays
         self._limp, self._actuator, self._last_raw = self._law.limp, self._law.actuator, arrays["last_raw"]
         self._measured, self._switches, self._error_max = arrays["measured"], arrays["switches"], arrays["error_max"]
         self._any_limp = False

@@ -24,6 +24,7 @@ class DriverVerb(IntEnum):
     NODE_STOP = 6
     NODE_RESET = 7
     IN_USE = 8
+    HELD = 9
     READY = 20
     DETACHED = 21
     MARKER_SIGNALLED = 22
@@ -115,6 +116,16 @@ class InUse(Message, on=TO_DRIVER, verb=DriverVerb.IN_USE, notice=True):
     """Whether somebody reads this device through another one; a device of whom nobody reads may tick seldom."""
 
     used: Flag
+
+
+class Held(Message, on=TO_DRIVER, verb=DriverVerb.HELD, notice=True, states=("up", "ending")):
+    """A node that this device holds is its own from now on; descriptor: the socket of its handle.
+
+    ``channels`` are packed as ChannelInfo.
+    """
+
+    name: Text
+    channels: Array
 
 
 # --- from a driver to the daemon -----------------------------------------------------------------

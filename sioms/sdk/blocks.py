@@ -8,8 +8,9 @@ Concurrency: owned by the one thread of the driver process.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,12 +59,20 @@ class Description:
         inputs: names of nodes of other devices that the driver reads (simulated coupling, load
             information); the kit opens them and reopens them when their device comes back.
         lease_s: a reader calls the driver hung when it has not ticked for this long [s].
+        holds: names of axis nodes of other devices that are this device's own: it reads and commands them, and nobody
+            else can open them. They halt when this device ends, hangs or is lost.
     """
 
     blocks: tuple[BlockSpec, ...]
     tick_hz: float
     inputs: tuple[str, ...] = ()
     lease_s: float = 0.1
+    holds: tuple[str, ...] = ()
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """The nodes that it reads, those that it holds among them."""
+        return tuple(dict.fromkeys((*self.inputs, *self.holds)))
 
 
 class Block:
@@ -195,12 +204,15 @@ class AxisBlock:
     Attributes:
         stamp_ns: time the readings hold for [ns, CLOCK_MONOTONIC].
         asked_ns: when the poll began that brought them, 0: not known.
+        admits: asked before a write is taken, with its records and the bank axis of each node-local index; raises
+            CommandError. None: the bank alone judges.
     """
 
     spec: BlockSpec
     bank: Bank
     stamp_ns: int = 0
     asked_ns: int = 0
+    admits: Callable[[Sequence[tuple[Any, ...]], Sequence[int]], None] | None = None
     n: int = field(init=False)
 
     def __post_init__(self) -> None:

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sioms.motion import DriveAction, MarkerPort
+    from sioms.protocol.nodeinfo import ChannelInfo
 
     from .pages import Pages
 
@@ -61,6 +62,36 @@ class InputNode(Protocol):
         """Time stamp of what was returned last [ns]."""
 
 
+class HeldNode(Protocol):
+    """An axis node of another device that is this device's own (``Description.holds``)."""
+
+    @property
+    def name(self) -> str:
+        """Name of the node."""
+
+    @property
+    def channels(self) -> Sequence[ChannelInfo]:
+        """Its axes with their limits; empty while it is not held."""
+
+    @property
+    def is_there(self) -> bool:
+        """Whether it is held now."""
+
+    def drive(self, velocities: Sequence[float]) -> None:
+        """Have the axes go at velocities [unit/s] from now until the next command."""
+
+    def stop(self) -> None:
+        """Stop the axes at their greatest deceleration."""
+
+    def reset(self) -> None:
+        """Reset the axes after a stop or a fault."""
+
+    def trouble(self) -> OSError | None:
+        """Return why it has not done as it was told since the last call: refused, stopped, in fault, gone; None: it
+        has.
+        """
+
+
 class Kit(Protocol):
     """What the kit offers a driver."""
 
@@ -70,7 +101,11 @@ class Kit(Protocol):
 
     @property
     def inputs(self) -> Mapping[str, InputNode]:
-        """The nodes named in ``Description.inputs``."""
+        """The nodes named in ``Description.inputs`` and in ``Description.holds``."""
+
+    @property
+    def held(self) -> Mapping[str, HeldNode]:
+        """The nodes named in ``Description.holds``."""
 
     def log(self, level: str, text: str) -> None:
         """Write a line to the daemon's log; level is debug, info, warning or error."""

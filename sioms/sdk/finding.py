@@ -225,8 +225,8 @@ def describe(
     ]  # fmt: skip
     variant = driver.variant(settings)
     facts = [
-        blocks, description.tick_hz, list(description.inputs), description.lease_s, list(variant.claims(settings)),
-        made_of, _cost_kind(variant), variant.realtime_priority,
+        blocks, description.tick_hz, list(description.reads), description.lease_s, list(variant.claims(settings)),
+        made_of, _cost_kind(variant), variant.realtime_priority, list(description.holds),
     ]  # fmt: skip
     return facts, errors
 

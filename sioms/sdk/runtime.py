@@ -41,6 +41,7 @@ from .effects import Effects
 from .engine import Engine
 from .exchange import HookError
 from .handles import LOOKS_A_MS, Handle, Waits
+from .held import Held
 from .idling import Idling
 from .inputs import Input
 from .line_engine import LineEngine
@@ -120,7 +121,8 @@ class Runtime:
         table = MarkerTable(memoryview(mmap.mmap(fds[4], TABLE_SIZE)))
         self.markers = Markers(table, lambda number: self.tell(driver_verbs.MarkerSignalled(number)))
         description = driver.describe(device, settings)
-        self.inputs: dict[str, Input] = {name: Input(name) for name in description.inputs}
+        self.inputs: dict[str, Input] = {name: Input(name) for name in description.reads}
+        self.held: dict[str, Held] = {name: Held(name) for name in description.holds}
         self._description = description
         self._epoll = select.epoll()
         self._callbacks: dict[int, Callable[[], None]] = {}
@@ -140,6 +142,7 @@ class Runtime:
         self.blocks = list(self.driver.blocks)
         self._kept = keep_positions(str(options["state_folder"]), device, self.blocks, self.log)
         lease_ns = int(float(options.get("lease_s") or description.lease_s) * 1e9)
+        self._keep_ns, self._kept_ns = lease_ns // 4, 0
         self.pages = Pages(device, self.blocks, lease_ns, generation, self._link_changed)
         handles: dict[int, Handle] = {}
         self.stops = Stops(
@@ -378,6 +381,10 @@ class Runtime:
         elif self._daemon_late:
             self._daemon_late = False
         self.clients.check_leases(began_ns)
+        if self.held and began_ns - self._kept_ns > self._keep_ns:
+            self._kept_ns = began_ns
+            for held in self.held.values():
+                held.keep()
         ticked_ns = self._tick_and_publish(scheduled_ns)
         self._spare_until_ns = self._spare_until(ticked_ns)
         self.after_publication(ticked_ns, self.blocks if engine.publishes else ())
@@ -566,6 +573,11 @@ class Runtime:
                     self.log("error", f"{name} cannot be read: too many open descriptors")
                     return
                 self.inputs[name].attach(fds[0], channels, bit)
+            case driver_verbs.Held(name, channels):
+                if not fds:
+                    self.log("error", f"{name} cannot be held: too many open descriptors")
+                    return
+                self.held[name].attach(fds[0], channels)
             case driver_verbs.NodeStop() | driver_verbs.NodeReset():
                 block, channels, bit, text, resets = message
                 self.stops.heed()  # a reset that came before it must not come after it

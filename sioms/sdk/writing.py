@@ -60,6 +60,11 @@ def write(service: Service, handle: Handle, number: int, flags: int, timeout_s: 
         raise OSError(errno.EPERM, f"{what}: stopped by emergency stop ({service.stops.source}); reset first")
     check_link(service, handle, what)
     if isinstance(block, AxisBlock):
+        if block.admits is not None:
+            try:
+                block.admits(list(record.iter_unpack(data)), handle.axes)
+            except CommandError as error:
+                raise OSError(error.errno, f"{what}: {error}") from None
         # One or a few records need no array; behind an earlier write that is not taken yet they wait their turn.
         if len(data) <= _AT_ONCE * size and not handle.writing:
             short = list(record.iter_unpack(data))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import inspect
 from collections.abc import Callable
 from typing import Any
@@ -26,6 +27,9 @@ VERBS: dict[str, Verb] = {
     "stop": lambda bank, now: bank.stop([0], now),
     "emergency_stop": lambda bank, now: bank.emergency_stop([0], now),
     "fault": lambda bank, now: bank.fault([0], "tried", now),
+    "abandon": lambda bank, now: bank.abandon([0], now, errno.ERANGE, "tried"),
+    "let_go": lambda bank, now: bank.let_go([1]),
+    "ends": lambda bank, now: bank.ends()[1:],
     "lose_place": lambda bank, now: bank.lose_place([0], "tried", now),
     "fault_text": lambda bank, now: bank.fault_text(0),
     "reset": lambda bank, now: bank.reset([1]),

@@ -1,0 +1,67 @@
+"""Devices that are made of devices: the daemon opens for them the nodes that they hold, with its own authority.
+
+Concurrency: everything runs in the daemon's loop.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from sioms.protocol.driver_verbs import Held
+
+from .rights import Peer
+from .sessions import Refused, Session
+
+if TYPE_CHECKING:
+    from .devices import DriverProcess
+    from .names import NameTable
+    from .node_verbs import NodeVerbs
+
+
+class Holds:
+    """Handles of devices on nodes of other devices; to the drivers that serve them they are clients as any other."""
+
+    def __init__(self) -> None:
+        self._sessions: dict[str, Session] = {}
+
+    def look(self, devices: Mapping[str, DriverProcess], names: NameTable, nodes: NodeVerbs) -> None:
+        """Give each device what it holds and does not have yet, as far as that is there and free."""
+        for device in devices.values():
+            contact = device.contact if device.info.holds else None
+            if contact is None:
+                continue
+            session = self._session(device, *contact)
+            has = {handle.node.name for handle in session.handles.values()}
+            for name in device.info.holds:
+                node = names.nodes.get(name)
+                if name in has or node is None:
+                    continue
+                try:
+                    held = nodes.hold(session, device.name, node, device.lease_s)
+                except Refused:
+                    continue  # its driver is about to be lost; the next look finds another
+                if held is None:
+                    continue
+                handle, ours = held
+                channels = [names.block(node).channels[channel].pack() for channel in node.channels]
+                with ours:
+                    try:
+                        device.send(Held(name, channels), [ours.fileno()])
+                    except OSError:
+                        nodes.detach(handle)  # the end of the socket here does the same, a little later
+
+    def device_gone(self, device: DriverProcess, nodes: NodeVerbs) -> None:
+        """End what a process that is no more has held."""
+        session = self._sessions.pop(device.name, None)
+        for handle in list(session.handles.values()) if session is not None else ():
+            nodes.detach(handle)
+
+    def _session(self, device: DriverProcess, sock: socket.socket, pidfd: int) -> Session:
+        session = self._sessions.get(device.name)
+        if session is None:
+            peer = Peer(device.pid, os.getuid(), f"device {device.name}", frozenset())
+            session = self._sessions[device.name] = Session(sock, peer, pidfd)
+        return session

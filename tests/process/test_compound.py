@@ -1,0 +1,139 @@
+"""Devices made of devices, over real processes: they drive what they hold, alone, and all halt together."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import time
+from collections.abc import Callable
+
+import numpy as np
+from daemon_rig import Daemon, axes, raises, wait_for
+
+import sioms
+
+COORDINATE = """
+[[device.bridge.axis]]
+name = "{}"
+velocity_max = {}
+acceleration_max = {}
+"""
+CELL = (
+    '[workcell]\nname = "gantry"\n'
+    + axes("mod0", "x", "y1")
+    + axes("mod1", "y2")
+    + """
+[device.bridge]
+driver = "gantry"
+axes = ["mod0", "mod1.y2"]
+span_m = 1.0
+late_max_s = 0.5
+history = 4096
+"""
+    + COORDINATE.format("x", 0.5, 4.0)
+    + COORDINATE.format("y", 0.5, 4.0)
+    + COORDINATE.format("skew", 0.1, 1.0)
+)
+
+
+def go(node: sioms.Node, **fields: list[float]) -> None:
+    """Write a command to each coordinate."""
+    node.write([sioms.command(i, **{name: values[i] for name, values in fields.items()}) for i in range(3)])
+
+
+def _good(node: sioms.Node) -> bool:
+    try:
+        return not int(np.bitwise_or.reduce(node.read().status)) & 0xC0
+    except OSError:
+        return False
+
+
+def _recovered(cell: sioms.Workcell) -> sioms.Node:
+    """Open the bridge again, reset it and wait until it is good."""
+    node = cell.open("bridge", "rw", timeout=10.0)
+    wait_for(lambda: _reads(node), "the bridge has found its axes")
+    node.reset()
+    wait_for(lambda: _good(node), "the bridge is good")
+    return node
+
+
+def _reads(node: sioms.Node) -> bool:
+    try:
+        node.read()
+    except OSError:
+        return False
+    return True
+
+
+def test_a_gantry_drives_what_it_holds_and_all_halt_together(start_daemon: Callable[..., Daemon]) -> None:
+    daemon = start_daemon(CELL)
+    with daemon.cell() as cell:
+        daemon.wait_up("bridge")
+        bridge = cell.open("bridge", "rw")
+        with raises(errno.EBUSY, "mod0", "bridge"):
+            cell.open("mod0", "rw", timeout=0.0)
+        with cell.open("mod0.readonly", "r") as below, cell.open("mod1.readonly", "r") as beside:
+            # motion through the map
+            go(bridge, position=[0.2, 0.1, 0.005])
+            bridge.wait_until_idle(10.0)
+            time.sleep(0.3)
+            x, y1 = below.read().position
+            (y2,) = beside.read().position
+            half = 0.5 * np.tan(0.005)
+            assert np.allclose([x, y1, y2], [0.2, 0.1 - half, 0.1 + half], atol=1e-4)
+            assert np.allclose(bridge.read().position, [0.2, 0.1, 0.005], atol=1e-4)
+            # refused before anything moves: out of the reach of a held axis, and of the map
+            with raises(errno.ERANGE, "mod0: x", "1.5"):
+                go(bridge, position=[1.5, 0.1, 0.0])
+            with raises(errno.ERANGE, "jam"):
+                go(bridge, position=[0.2, 0.1, 0.02])
+            # a velocity ends before the reach does
+            go(bridge, position=[0.6, 0.1, 0.0])
+            bridge.wait_until_idle(10.0)
+            cell.open("bridge.x.readonly", "r").close()
+            go(bridge, velocity=[0.5, 0.0, 0.0])
+            with raises(errno.ERANGE, "end of reach", "mod0: x"):
+                bridge.wait_until_idle(10.0)
+            time.sleep(0.5)
+            assert 0.9 < below.read().position[0] <= 1.0005
+            # an emergency stop of one held axis halts all; a reset of the bridge resets it, too
+            go(bridge, velocity=[-0.1, -0.05, 0.0])
+            time.sleep(0.2)
+            cell.emergency_stop("mod1")
+            wait_for(lambda: not _good(bridge), "the bridge is in fault")
+            with raises(errno.EIO, "mod1", "emergency stop"):
+                go(bridge, position=[0.5, 0.0, 0.0])
+            wait_for(lambda: max(map(abs, below.read().velocity)) < 1e-3, "all halt")
+            bridge.close()
+            bridge = _recovered(cell)
+            go(bridge, position=[0.5, 0.0, 0.0])
+            bridge.wait_until_idle(10.0)
+            # a client that goes away, and a driver that is killed
+            go(bridge, velocity=[0.1, 0.1, 0.0])
+            time.sleep(0.2)
+            bridge.close()
+            wait_for(lambda: max(map(abs, below.read().velocity)) < 1e-3, "all halt without their client")
+            bridge = cell.open("bridge", "rw", timeout=5.0)
+            go(bridge, velocity=[0.1, 0.1, 0.0])
+            time.sleep(0.2)
+            before = daemon.device("bridge")
+            os.kill(before["pid"], signal.SIGKILL)
+            wait_for(lambda: max(map(abs, below.read().velocity)) < 1e-3, "all halt without what holds them", 1.0)
+            daemon.wait_up("bridge", before["generation"] + 1)
+            bridge.close()
+            bridge = _recovered(cell)
+            go(bridge, position=[0.5, 0.0, 0.0])
+            bridge.wait_until_idle(10.0)
+            go(bridge, velocity=[0.1, 0.0, 0.0])
+            time.sleep(0.2)
+            before = daemon.device("mod1")
+            os.kill(before["pid"], signal.SIGKILL)
+            wait_for(lambda: not _good(bridge), "the bridge is lost")
+            with raises(errno.EIO, "mod1"):
+                go(bridge, position=[0.5, 0.0, 0.0])
+            wait_for(lambda: max(map(abs, below.read().velocity)) < 1e-3, "the others halt")
+            bridge.close()
+        daemon.wait_up("mod1", before["generation"] + 1)
+        bridge = _recovered(cell)
+        bridge.close()
