@@ -48,7 +48,7 @@ COMMANDS: dict[str, Command] = {
     "service": Command("sioms.tools.service", "install the daemon as a service of this machine"),
     "serve": Command("sioms.gateway.command", "let clients on other machines use the workcell"),
     "metrics": Command("sioms.bridges.metrics", "serve values, states and alarms to Prometheus"),
-    "epics": Command("sioms.bridges.epics", "show nodes to EPICS clients, and let them stop axes"),
+    "epics": Command("sioms.bridges.epics", "show nodes to EPICS clients, and let them stop and move axes"),
     "key": Command("sioms.gateway.command", "make, allow, list and revoke the keys of remote clients"),
     "driver": Command("sioms.tools.driver", "list, check, trace and replay drivers"),
     "bench": Command("sioms.bench", "measure latencies and throughput on this machine"),

@@ -1,13 +1,15 @@
 """``sioms epics``: nodes as process variables of EPICS PV Access, with alarms and units; stops may be put.
 
 One thread reads the pages and posts what has changed; the library's threads serve clients and carry out puts, so that
-no client is waited for. Set-points are shown, and not taken: docs/decisions/0336-pv-access-shows-and-stops.md
+no client is waited for. Set-points are taken only on request, and under a lease that the writer renews:
+docs/decisions/0336-pv-access-shows-and-stops.md, 0395-epics-clients-move-axes-under-a-lease.md
 """
 
 from __future__ import annotations
 
 import argparse
 import errno
+import ipaddress
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -19,9 +21,11 @@ from p4p.server import Server, StaticProvider
 from p4p.server.thread import SharedPV
 
 from sioms.arguments import place, positive
+from sioms.bridges.leases import LEASE_S, Leases
 from sioms.client.workcell import Workcell, is_part
 from sioms.protocol.flags import READONLY, AnalogStatus, AxisStatus, NodeClass, Severity
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
+from sioms.protocol.text import printable
 
 PLACE = "127.0.0.1:5075"
 ASK_S = 0.5
@@ -34,20 +38,27 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
         "epics",
-        help="show nodes to EPICS clients, and let them stop axes",
+        help="show nodes to EPICS clients, and let them stop and move axes",
         description="A bridge to EPICS PV Access: an ordinary client of the daemon that shows axes as motors, with "
         "read-back, set-point, limits, done-moving and alarm, and analog and binary channels. Whoever reaches the port "
-        "may read, and stop axes by a put to STOP; nothing else can be put.",
+        "may read, and stop axes by a put to STOP. With --move, clients on this machine may also move axes, each while "
+        "it renews its lease by puts to LEASE.",
     )
     parser.add_argument("--listen", metavar="HOST:PORT", default=PLACE, help=f"where; default {PLACE}, *:5075 for all")
     parser.add_argument("--prefix", metavar="TEXT", default="", help="what the names of all variables begin with")
     parser.add_argument("--rate", metavar="HZ", type=positive, default=10.0, help="how often to look; default 10 Hz")
+    parser.add_argument("--move", action="store_true", help="let clients on this machine move axes, under a lease")
 
 
 def run(args: argparse.Namespace) -> int:
     """Serve until told to end."""
     host, port = place(args.listen, PLACE)
-    bridge = Bridge(args.prefix)
+    if args.move and not is_loopback(host):
+        text = (
+            f"listen on {args.listen} with --move: whoever reaches the port could move axes, because PV Access has no"
+        )
+        raise OSError(errno.EINVAL, f"{text} passwords; want a loopback address, as 127.0.0.1, and a tunnel to it")
+    bridge = Bridge(args.prefix, Leases() if args.move else None)
     with serve(bridge.provider, host, port):
         print(f"listening on {args.listen}", file=sys.stderr, flush=True)
         ended = threading.Event()
@@ -56,11 +67,19 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def is_loopback(host: str) -> bool:
+    """Tell whether a host, by name or address, is reached from this machine only."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
 def serve(provider: StaticProvider, host: str, port: int) -> Server:
     """Return a server of the variables at one place; port 0 for any, and searches by broadcast only where it is seen.
 
     Raises:
-        OSError: EINVAL, one cannot listen there.
+        OSError: EINVAL, one cannot listen there; EADDRINUSE, somebody else does.
     """
     seen = host == "*"
     conf = {
@@ -71,9 +90,14 @@ def serve(provider: StaticProvider, host: str, port: int) -> Server:
         "EPICS_PVAS_BEACON_ADDR_LIST": "" if seen else host,
     }
     try:
-        return Server(providers=[provider], conf=conf, useenv=False)
+        server = Server(providers=[provider], conf=conf, useenv=False)
     except RuntimeError as error:
-        raise OSError(errno.EINVAL, f"listen on {host}:{port}: {error}") from None
+        ports = f"{port}, and {port + 1} for searches" if port else "any port"
+        raise OSError(errno.EINVAL, f"listen on {host}:{port}: want {ports}: {error}") from None
+    if port and int(server.conf()["EPICS_PVAS_SERVER_PORT"]) != port:  # the library has silently taken another one
+        server.stop()
+        raise OSError(errno.EADDRINUSE, f"listen on {host}:{port}: another program does; choose another port")
+    return server
 
 
 class Shown:
@@ -82,24 +106,23 @@ class Shown:
     Args:
         kind: type of its value.
         channel: whose units, limits and description clients see.
-        stop: what a put of anything but 0 does; None: nothing can be put.
+        act: what a put does, with the value and the client; None: nothing can be put.
     """
 
-    def __init__(self, kind: NTScalar, channel: ChannelInfo, stop: Callable[[], None] | None = None) -> None:
-        self._kind, self._channel, self._stop = kind, channel, stop
+    def __init__(self, kind: NTScalar, channel: ChannelInfo, act: Callable[[float, str], None] | None = None) -> None:
+        self._kind, self._channel, self._act = kind, channel, act
         self._last: tuple[str, int, str] | None = None
         self.pv = SharedPV(nt=kind, handler=self)
 
     def put(self, pv: SharedPV, op: Any) -> None:
         """Carry out a put of a client (called in a thread of the library)."""
-        if self._stop is None:
-            op.done(error=f"put to {op.name()}: it is shown only; only STOP can be put")
+        if self._act is None:
+            op.done(error=f"put to {op.name()}: it is shown only; only STOP can be put, and with --move LEASE and VAL")
             return
         try:
-            if int(op.value()):
-                self._stop()
-        except (OSError, ValueError) as error:
-            op.done(error=f"stop: {getattr(error, 'strerror', None) or error}")
+            self._act(float(op.value()), f"{printable(op.account(), 32)}@{op.peer()}")
+        except (OSError, ValueError, TypeError) as error:
+            op.done(error=f"put to {op.name()}: {getattr(error, 'strerror', None) or error}")
         else:
             op.done()
 
@@ -172,14 +195,20 @@ class Bridge:
     Attributes:
         provider: of the process variables.
 
-    Concurrency: ``look`` in one thread; stops in any.
+    Args:
+        prefix: what the names of all variables begin with.
+        leases: by which clients hold nodes; None: they move nothing.
+
+    Concurrency: ``look`` in one thread; puts in any.
     """
 
-    def __init__(self, prefix: str) -> None:
+    def __init__(self, prefix: str, leases: Leases | None = None) -> None:
+        self._leases = leases
         self.provider = StaticProvider("sioms")
         self._prefix = prefix
         self._shown: dict[str, Shown] = {}
         self._of_node: dict[str, set[str]] = {}
+        self._made_of: dict[str, object] = {}
         self._cell: Workcell | None = None
         self._nodes: dict[str, Any] = {}
         self._names: dict[str, str] = {}
@@ -196,6 +225,8 @@ class Bridge:
                     self._cell.close()
                 self._cell, self._nodes, self._names = None, {}, {}
             self._asked_s = monotonic()
+        if self._leases is not None:
+            self._leases.sweep()
         for name in self._names.keys() | self._of_node.keys():
             try:
                 self._show(name)
@@ -210,12 +241,26 @@ class Bridge:
         entries = cell.nodes()
         self._alarms = cell.alarms()
         self._names = {e.name: e.name if e.read_only else e.name + READONLY for e in entries if not is_part(e, entries)}
+        for gone in self._of_node.keys() - self._names.keys():
+            self._remove(gone)
+
+    def _remove(self, node: str) -> None:
+        """Take the variables of a node away: it is not in the workcell any more, or is another one."""
+        if (opened := self._nodes.pop(node, None)) is not None:
+            opened.release()
+        for name in self._of_node.pop(node, ()):
+            self.provider.remove(name)
+            self._shown.pop(name).pv.close(destroy=True)
 
     def _node(self, name: str) -> Any:
         if name not in self._names or self._cell is None:
             raise OSError(errno.EIO, GONE)
         if name not in self._nodes:
-            self._nodes[name] = self._cell.open(self._names[name])
+            opened = self._cell.open(self._names[name])
+            made_of = [(c.name, c.unit, c.minimum, c.maximum, c.description) for c in opened.info.channels]
+            if self._made_of.get(name, made_of) != made_of:
+                self._remove(name)  # a reload has changed what clients are told once
+            self._nodes[name], self._made_of[name] = opened, made_of
         return self._nodes[name]
 
     def _show(self, name: str) -> None:
@@ -225,25 +270,37 @@ class Bridge:
         for channel, reading in zip(info.channels, snapshot, strict=True):
             alarm = max(severity_of(info.node_class, reading), worst(self._alarms, name, info.device, channel.name))
             for field, kind, value in values(info, channel, reading):
-                self._post(name, f"{channel.name}{field}", Shown, kind, channel).post(value, *alarm, stamp_s)
+                moves = field in ("", ".VAL") and info.node_class is NodeClass.AXIS
+                act = self._mover(name, channel.name) if moves else None
+                self._post(name, f":{channel.name}{field}", kind, channel, act).post(value, *alarm, stamp_s)
             if info.node_class is NodeClass.AXIS:
-                self._post(name, f"{channel.name}.STOP", self._stopper(name), _WHOLE, channel).post(0, 0, "", stamp_s)
+                stop = self._post(name, f":{channel.name}.STOP", _WHOLE, channel, lambda on, _: self._stop(name, on))
+                stop.post(0, 0, "", stamp_s)
+        if self._leases is not None and info.node_class is NodeClass.AXIS:
+            of = ChannelInfo("", "s", *LEASE_S, description="put again in time by who moves the node; 0: let go")
+            leases = self._leases
+            lease = self._post(name, ".LEASE", _NUMBER, of, lambda seconds, who: leases.put(name, who, seconds))
+            lease.post(*leases.shown(name), stamp_s)
 
-    def _stopper(self, name: str) -> Callable[[NTScalar, ChannelInfo], Shown]:
-        return lambda kind, channel: Shown(kind, channel, lambda: self._stop(name))
+    def _mover(self, node: str, channel: str) -> Callable[[float, str], None] | None:
+        if (leases := self._leases) is None:
+            return None
+        return lambda position, who: leases.move(node, who, channel, position)
 
-    def _post(self, node: str, what: str, make: Callable[..., Shown], *words: Any) -> Shown:
+    def _post(self, node: str, what: str, *words: Any) -> Shown:
         """Return the variable of a name, made where there is none yet."""
-        name = f"{self._prefix}{node}:{what}"
+        name = f"{self._prefix}{node}{what}"
         if name not in self._shown:
-            self._shown[name] = make(*words)
+            self._shown[name] = Shown(*words)
             self._of_node.setdefault(node, set()).add(name)
             self.provider.add(name, self._shown[name].pv)
         return self._shown[name]
 
-    def _stop(self, name: str) -> None:
-        """Stop a node, also one whose readings are lost for now."""
+    def _stop(self, name: str, on: float) -> None:
+        """Stop a node, also one whose readings are lost for now, unless 0 is put."""
         cell, node = self._cell, self._nodes.get(name)
+        if on == 0:
+            return
         if node is not None:
             node.stop()
         elif cell is None or name not in self._names:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
@@ -56,9 +58,12 @@ class Cell:
     """A workcell of one axis."""
 
     def __init__(self, node: Node) -> None:
+        self.empty = False
         self.node, self.raised = node, [dict.fromkeys(("node", "text"), "mod0.yaxis") | {"severity": 2}]
 
     def nodes(self) -> list[Any]:
+        if self.empty:
+            return []
         return [SimpleNamespace(name="mod0", read_only=False, device="mod0", node_class=3, channels=1, bit=-1)]
 
     def alarms(self) -> list[dict[str, Any]]:
@@ -87,13 +92,19 @@ def bridge(cell: Cell) -> epics.Bridge:
     return made
 
 
-@pytest.fixture
-def client(bridge: epics.Bridge) -> Iterator[Context]:
+@contextmanager
+def serving(bridge: epics.Bridge) -> Iterator[Context]:
     with epics.serve(bridge.provider, "127.0.0.1", 0) as server:
         place = f"127.0.0.1:{server.conf()['EPICS_PVAS_SERVER_PORT']}"
         conf = {"EPICS_PVA_NAME_SERVERS": place, "EPICS_PVA_ADDR_LIST": "", "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
         with Context("pva", conf=conf, useenv=False) as context:
             yield context
+
+
+@pytest.fixture
+def client(bridge: epics.Bridge) -> Iterator[Context]:
+    with serving(bridge) as context:
+        yield context
 
 
 def test_an_axis_is_seen_as_a_motor_with_alarms_and_stopped_by_a_put(
@@ -125,7 +136,7 @@ def test_an_axis_is_seen_as_a_motor_with_alarms_and_stopped_by_a_put(
     cell.node.status = int(AxisStatus.FAULT)
     bridge.look()
     assert (get(".RBV").severity, get(".RBV").raw["alarm.message"]) == (2, "FAULT")
-    with pytest.raises(RemoteError, match=r"stop: stop mod0.readonly: no right to"):
+    with pytest.raises(RemoteError, match=r"put to lab:mod0:xaxis.STOP: stop mod0.readonly: no right to"):
         client.put("lab:mod0:xaxis.STOP", 1, timeout=5.0)
 
     cell.node.lost = "its driver is gone"
@@ -140,6 +151,49 @@ def test_an_axis_is_seen_as_a_motor_with_alarms_and_stopped_by_a_put(
     assert get(".RBV").severity == 1, "the alarm still stands"
 
 
+def test_nan_stops_and_what_is_reloaded_or_gone_is_not_shown_as_before(
+    client: Context, bridge: epics.Bridge, cell: Cell
+) -> None:
+    client.put("lab:mod0:xaxis.STOP", float("nan"), timeout=5.0)
+    assert cell.node.stops == 1
+    with pytest.raises(RemoteError, match="with --move LEASE and VAL"):
+        client.put("lab:mod0:xaxis.VAL", 0.1, timeout=5.0)
+
+    cell.node.lost = "its driver is gone"
+    bridge.look()
+    cell.node.lost = ""
+    cell.node.info.channels[0].unit = "rad"
+    bridge.look()
+    assert client.get("lab:mod0:xaxis.RBV", timeout=5.0).raw["display.units"] == "rad"
+    cell.empty = True
+    bridge.look()
+    with pytest.raises(TimeoutError):
+        client.get("lab:mod0:xaxis.RBV", timeout=0.1)
+    cell.empty = False
+    bridge.look()
+    assert client.get("lab:mod0:xaxis.RBV", timeout=5.0) == 0.125
+
+
+def test_axes_are_moved_only_on_request_and_only_from_this_machine(cell: Cell) -> None:
+    calls: list[Any] = []
+    held = SimpleNamespace(
+        put=lambda *words: calls.append(words), move=lambda *words: calls.append(words), shown=lambda _: (0.5, 0, "x"),
+        sweep=lambda: None,
+    )  # fmt: skip
+    bridge = epics.Bridge("", held)  # type: ignore[arg-type]
+    bridge.look()
+    with serving(bridge) as client:
+        client.put("mod0.LEASE", 0.5, timeout=5.0)
+        client.put("mod0:xaxis.VAL", 0.1, timeout=5.0)
+        assert client.get("mod0.LEASE", timeout=5.0) == 0.5
+    who = calls[0][1]
+    assert "@127.0.0.1:" in who
+    assert calls == [("mod0", who, 0.5), ("mod0", who, "xaxis", 0.1)]
+    assert [epics.is_loopback(host) for host in ("127.0.0.1", "::1", "localhost", "*", "10.0.0.1")] == [1, 1, 1, 0, 0]
+
+
 def test_where_one_cannot_listen_is_told(bridge: epics.Bridge) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(OSError, match="another program does"):
+        epics.serve(bridge.provider, "127.0.0.1", taken.getsockname()[1])
     with pytest.raises(OSError, match=r"listen on no\.such\.address:5999: "):
         epics.serve(bridge.provider, "no.such.address", 5999)
