@@ -18,7 +18,7 @@ from typing import Protocol
 from sioms.protocol import link, verbs
 from sioms.protocol.clock import Wall
 from sioms.protocol.link import Down, MalformedFrame, PageShape, Up, Update
-from sioms.protocol.messages import MalformedMessage, decode_reply, refusal, value_of
+from sioms.protocol.messages import MalformedMessage, decode_reply, refusal, reply, value_of
 
 OWN_NUMBERS = 1 << 52
 """Message numbers from here on are the gateway's own requests."""
@@ -318,6 +318,8 @@ class Gateway:
             text = "read a journal: it is a file of the workcell's machine; read it there"
             self._send(session, Down.PACKET, body=refusal(number, errno.EPERM, text))
             return
+        if isinstance(message, verbs.Cancel) and self._cancelled(session, number, message.number):
+            return
         if isinstance(message, verbs.Open):
             if not (message.lease_s == 0 or link.SHORTEST_LEASE_S <= message.lease_s <= link.LONGEST_LEASE_S):
                 text = f"open {message.node}: lease {message.lease_s:g} s; from another machine want"
@@ -329,6 +331,17 @@ class Gateway:
             session.asked[self._own] = (number, message)
             packet = verbs.Info(message.node).packed(self._own)
         self._to_line(session, packet)
+
+    def _cancelled(self, session: Session, number: int, cancelled: int) -> bool:
+        """Drop an open that has not reached the daemon yet, which would not find it; return whether there was one."""
+        for own, (asked, message) in session.asked.items():
+            if asked == cancelled:
+                del session.asked[own]
+                text = f"open {message.node}: cancelled"
+                self._send(session, Down.PACKET, body=refusal(asked, errno.ECANCELED, text))
+                self._send(session, Down.PACKET, body=reply(number, True))
+                return True
+        return False
 
     def _to_line(self, session: Session, packet: bytes) -> None:
         try:
@@ -392,6 +405,8 @@ class Gateway:
 
     def _informed(self, session: Session, own: int, message: Sequence[object]) -> None:
         """Send an open on, now that it is known whether the node can be written."""
+        if own not in session.asked:
+            return  # cancelled meanwhile
         number, asked = session.asked.pop(own)
         read_only = not message[2] and bool(value_of(list(message))[2])
         lease_s = 0.0 if read_only else asked.lease_s or link.DEFAULT_LEASE_S

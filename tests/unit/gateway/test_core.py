@@ -210,6 +210,19 @@ def test_a_lease_of_a_reader_is_none_and_one_that_is_too_long_is_refused(world: 
     assert decode_reply(world.last(b"a", Down.PACKET)[1])[1:3] == [9, errno.EINVAL]
 
 
+def test_an_open_that_is_cancelled_before_it_reached_the_daemon_opens_nothing(world: World) -> None:
+    line = world.begin(b"a")
+    world.ask(b"a", 9, verbs.Open("mod0", 3, 0.0, 0.0))
+    info = line.got[-1]
+    world.ask(b"a", 10, verbs.Cancel(9))
+    answers = [decode_reply(body)[1:3] for kind, _, _, _, body in world.sent[b"a"] if kind == Down.PACKET]
+    assert answers[-2:] == [[9, errno.ECANCELED], [10, 0]]
+    world.gateway.daemon_packet(world.session(b"a"), reply(decode(info)[1], ["mod0", 3, False, []]))
+    assert line.got[-1] == info, "the open does not follow its cancellation"
+    world.ask(b"a", 11, verbs.Cancel(8))
+    assert line.got[-1] == verbs.Cancel(8).packed(11), "what the daemon has is the daemon's to cancel"
+
+
 def test_a_lease_runs_from_what_the_client_had_been_told_so_a_late_burst_renews_nothing(world: World) -> None:
     world.begin(b"a")
     node = world.open(b"a", 5)
