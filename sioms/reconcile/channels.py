@@ -24,6 +24,12 @@ LATTICE_SHARE = 0.998
 SIGNIFICANT = 5.0
 #: ... and explain at least this share of what the drive residual holds.
 DRIVE_GAIN = 0.05
+#: A measured force of which the best delay, lag and limit leave more than this share does not come from the command.
+FOREIGN_FORCE = 0.5
+#: Longest delay or lag of a drive that is searched for, in samples; one that is found there may be any longer one.
+LATEST = 20.0
+#: First samples of a record, not compared: what was commanded before them is not known.
+UNSETTLED = 20
 #: Step of a slope over a time, in samples.
 STEP = 0.05
 
@@ -161,14 +167,18 @@ def drive_output(force: Array, delay: float, lag: float, limit: float, dt: float
 
 
 def drive(session: Session, model: AxisModel) -> list[Finding]:
-    """Compare measured with commanded force: delay, lag, saturation, the fewest that explain it."""
+    """Compare measured with commanded force: delay, lag, saturation, the fewest that explain it.
+
+    Raises:
+        BadInputError: the measured force does not follow the commanded one, or later than is searched for.
+    """
     records = [r for r in session.records if r.force_measured is not None]
     if not records:
         return []
     dt = model.sample_time_s
     noise = _white(records)
     limit, at_limit = _plateau(records, noise)
-    n = sum(len(r) - 20 for r in records)
+    n = sum(len(r) - UNSETTLED for r in records)
     late = _latest(records, np.inf, dt)
     found = []
     if at_limit:
@@ -184,6 +194,7 @@ def drive(session: Session, model: AxisModel) -> list[Finding]:
                     "while the command goes on",
                 )
             )
+    _check_follows(records, late, dt)
     if late.value > max(SIGNIFICANT * late.error, 1e-3 * dt) and late.left < (1.0 - DRIVE_GAIN) * late.none:
         other = "lag" if late.name == "delay" else "delay"
         found.append(
@@ -196,6 +207,28 @@ def drive(session: Session, model: AxisModel) -> list[Finding]:
             )
         )
     return found
+
+
+def _check_follows(records: list[Record], late: _Late, dt: float) -> None:
+    """Refuse a measured force that is not that of the drive: any delay that lowers its misfit by chance would be named.
+
+    Raises:
+        BadInputError: see `drive`.
+    """
+    measured = np.concatenate([r.force_measured[UNSETTLED:] for r in records if r.force_measured is not None])
+    left = late.left / max(float(np.sum((measured - measured.mean()) ** 2)), 1e-300)
+    if left > FOREIGN_FORCE:
+        share = 100.0 * min(left, 10.0)
+        raise BadInputError(
+            f"compare force_measured with force: with the best delay, lag and limit {share:.0f} % of its "
+            "variance does not follow the commanded force; needs the drive's measured force of the same samples, or no "
+            "such column"
+        )
+    if late.value > 0.98 * LATEST * dt and late.left < (1.0 - DRIVE_GAIN) * late.none:
+        raise BadInputError(
+            f"compare force_measured with force: it follows {LATEST:.0f} samples late or more, which is as far as is "
+            "searched; needs columns of the same clock (or a longer sample_time_s), or no such column"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +254,7 @@ def _latest(records: list[Record], limit: float, dt: float) -> _Late:
             - drive_output(r.force, max(delay, 0.0), max(lag, 0.0), limit, dt)
             for r in records
         ]
-        return np.concatenate([e[20:] for e in parts])
+        return np.concatenate([e[UNSETTLED:] for e in parts])
 
     def misfit(delay: float, lag: float) -> float:
         e = off(delay, lag)
@@ -231,7 +264,7 @@ def _latest(records: list[Record], limit: float, dt: float) -> _Late:
     lag = dt * float(
         minimize_scalar(
             lambda p: misfit(0.0, float(p) * dt),
-            bounds=(0.0, 20.0),
+            bounds=(0.0, LATEST),
             method="bounded",
             options={"maxiter": 25},
         ).x
@@ -249,7 +282,7 @@ def _latest(records: list[Record], limit: float, dt: float) -> _Late:
 
 def _delay(misfit: Callable[[float, float], float], dt: float) -> float:
     """Search half samples first, then between."""
-    grid = np.arange(0.0, 20.5, 0.5) * dt
+    grid = np.arange(0.0, LATEST + 0.5, 0.5) * dt
     start = float(grid[int(np.argmin([misfit(float(d), 0.0) for d in grid]))] / dt)
     best = minimize_scalar(
         lambda p: misfit(float(p) * dt, 0.0),

@@ -16,6 +16,7 @@ from sioms.reconcile.bounces import bent, deepest
 from sioms.reconcile.channels import drive, drive_output, index_fit, lattice
 from sioms.reconcile.descent import descend
 from sioms.reconcile.engine.fit import get
+from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.evidence import spans_of
 from sioms.reconcile.excitation import common, gate
 from sioms.reconcile.experiment import Envelope, catalogue, demands, one_speed, repeated, separate
@@ -102,6 +103,22 @@ def test_the_drive_is_judged_by_its_current(effect: str, symbol: str, value: flo
 
 def test_a_good_drive_shows_nothing() -> None:
     assert drive(session(), AXIS) == []
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_measured_force_that_does_not_follow_the_command_is_refused_not_named(seed: int) -> None:
+    """White noise in the column: some delay always lowers the misfit a little, or takes the command away."""
+    rng = np.random.default_rng(seed)
+    place, force, measured = rng.standard_normal((3, 2000))
+    with pytest.raises(BadInputError, match=r"variance does not follow the commanded force; needs"):
+        drive(Session((Record("noise", place, force, place, measured),)), AXIS)
+
+
+def test_a_drive_later_than_is_searched_is_refused_not_named_by_the_bound() -> None:
+    force = np.cumsum(np.random.default_rng(4).standard_normal(2000)) * 1e-2
+    place = 1e-3 * np.arange(2000)
+    with pytest.raises(BadInputError, match=r"follows 20 samples late or more"):
+        drive(Session((Record("late", place, force, place, drive_output(force, 0.0, 31e-3, np.inf, 1e-3)),)), AXIS)
 
 
 @pytest.mark.parametrize("lag_s", [2e-3, 5e-3])
