@@ -4,9 +4,13 @@ here.
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import re
+import runpy
+import subprocess
 import tomllib
+import zipfile
 from collections import defaultdict
 from pathlib import Path
 
@@ -17,11 +21,8 @@ from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 TREE = Path(__file__).resolve().parents[2]
-PROFILES = {
-    "service": ["gpio"],
-    "run": ["fast", "gpio", "report"],
-    "test": ["fast", "gpio", "report", "test"],
-}
+DEV = runpy.run_path(str(TREE / "dev"))
+PROFILES = DEV["EXTRAS"]
 AGAIN = "run ./dev lock"
 Pins = dict[str, list[tuple[Version, Marker | None, int]]]
 
@@ -86,3 +87,43 @@ def test_the_smaller_ones_take_the_versions_of_the_tests() -> None:
     for profile in ("service", "run"):
         for name, lines in pinned(profile).items():
             assert {version for version, _, _ in lines} <= {version for version, _, _ in tested[name]}, name
+
+
+def wheel(folder: Path, name: str, version: str, *more: str) -> str:
+    """Write a package without any module; return its hash."""
+    info = f"{name}-{version}.dist-info"
+    path = folder / f"{name}-{version}-py3-none-any.whl"
+    about = ["Metadata-Version: 2.1", f"Name: {name}", f"Version: {version}", *more]
+    form = ["Wheel-Version: 1.0", "Generator: test", "Root-Is-Purelib: true", "Tag: py3-none-any"]
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr(f"{info}/METADATA", "\n".join(about) + "\n")
+        file.writestr(f"{info}/WHEEL", "\n".join(form) + "\n")
+        file.writestr(f"{info}/RECORD", "")
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_a_newer_release_of_what_is_needed_with_an_extra_changes_nothing(tmp_path: Path) -> None:
+    """The installation was refused the day that `coverage` had a release after the one locked."""
+    above = wheel(tmp_path, "above", "1.0", "Requires-Dist: below[more]>=1.0")
+    below = wheel(tmp_path, "below", "1.0", "Provides-Extra: more")
+    wheel(tmp_path, "below", "1.1", "Provides-Extra: more")
+    locked = tmp_path / "locked.txt"
+    locked.write_text(f"above==1.0 --hash=sha256:{above}\nbelow==1.0 --hash=sha256:{below}\n")
+    pip = DEV["find_pip"]()
+    place = tmp_path / "place"
+    command = [*pip, "install", "--isolated", "--no-index", f"--find-links={tmp_path}", f"--target={place}"]
+    done = subprocess.run([*command, *DEV["just"](locked)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in place.glob("*.dist-info")) == ["above-1.0.dist-info", "below-1.0.dist-info"]
+
+
+def test_every_installation_of_a_list_that_is_documented_takes_it_alone() -> None:
+    pages = [TREE / "README.md", *(TREE / "docs").glob("*.md")]
+    commands = [
+        line
+        for page in pages
+        for line in page.read_text().replace("\\\n", " ").splitlines()
+        if "install" in line and "-r etc/locked" in line
+    ]
+    assert commands
+    assert [line for line in commands if "--no-deps" not in line or "--require-hashes" not in line] == []
