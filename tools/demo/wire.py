@@ -9,6 +9,7 @@ from importlib.resources import files
 import sioms
 from sioms.children import PATIENCE_S, Process, daemon
 
+from .pace import patient
 from .rig import bold
 
 PORTS = {"/dev/ttyUSB0": "drives", "/dev/ttyACM0": "finger", "192.168.127.254:502": "io"}
@@ -16,14 +17,14 @@ PORTS = {"/dev/ttyUSB0": "drives", "/dev/ttyACM0": "finger", "192.168.127.254:50
 
 
 def bench(folder: str, stack: ExitStack) -> str:
-    """Start the simulators; return the path of the configuration with their port names in it."""
+    """Start the simulators; return the path of the configuration with their port names and patience in it."""
     drives, finger = f"{folder}/ttyUSB0", f"{folder}/ttyACM0"
     base = "sioms.drivers"
     io = Process([f"{base}.modbus.simulated.moxa", "--model", "E1212", "--port", "0"], "ready")
     stack.callback(io.end)
     stack.callback(Process([f"{base}.modbus.simulated.leadshine", "--link", drives, "--units", "1"], "ready").end)
     stack.callback(Process([f"{base}.framed_adc.simulator", "--link", finger, "--channels", "16"], "ready").end)
-    text = files("sioms.tools.demo").joinpath("bench-modbus.toml").read_text()
+    text = patient(files("sioms.tools.demo").joinpath("bench-modbus.toml").read_text())
     names = {"drives": drives, "finger": finger, "io": io.ready_line.split()[-1]}
     for port, simulator in PORTS.items():
         text = text.replace(port, names[simulator])

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import tomllib
 from importlib.resources import files
+from pathlib import Path
 
 import msgspec
 import pytest
 
+from sioms.daemon.config import parse
+from sioms.drivers.modbus.axis import ModbusAxis, ModbusAxisSettings
+from sioms.drivers.modbus.io import ModbusIo, ModbusIoSettings
 from sioms.drivers.sim.axes import SimAxes
-from sioms.tools.demo.pace import RATES, paced, rate_for
+from sioms.tools.demo.pace import RATES, paced, patient, rate_for
 
 CONFIG = files("sioms.tools.demo").joinpath("demo.toml").read_text()
 
@@ -30,3 +34,16 @@ def test_every_rate_makes_a_configuration_that_the_driver_takes(rate_hz: float) 
 def test_less_of_a_processor_means_slower_ticks() -> None:
     rates = [rate_for(share / 100) for share in range(101)]
     assert rates == sorted(rates) and rates[0] == 200.0 and rates[-1] == 1000.0
+
+
+def test_simulated_boards_may_be_silent_for_long_on_a_busy_machine(tmp_path: Path) -> None:
+    """A drive that had to wait for a processor was taken for lost, and the demo ended with an error."""
+    text = patient(files("sioms.tools.demo").joinpath("bench-modbus.toml").read_text())
+    config, errors = parse(text, str(tmp_path))
+    assert config is not None and errors == []
+    assert config.workcell.daemon_lease_s >= 10.0
+    assert len(config.devices) == 3 and all(device.common.lease_s >= 10.0 for device in config.devices.values())
+    slide = msgspec.convert(config.devices["slide0"].settings, ModbusAxisSettings)
+    assert ModbusAxis.describe("slide0", slide) and slide.axis[0].override["turnaround_s"] >= 1.0
+    block = msgspec.convert(config.devices["io0"].settings, ModbusIoSettings)
+    assert ModbusIo.describe("io0", block) and block.override["turnaround_s"] >= 1.0
