@@ -394,12 +394,21 @@ def _modes(axis: Any) -> ControlMode:
     return MODES | ControlMode.FORCE if axis.force_node else MODES
 
 
+def _k(axis: Any) -> float:
+    """Return the gain with which the bank's law is at the end of its force where ``gain`` is at that of the velocity.
+
+    The held axes are driven by velocities, not by that force; but it tells when a coordinate cannot follow any more,
+    and a stop has to begin where it is instead of where its set-point has run to.
+    """
+    return float(axis.force_max * axis.gain / axis.velocity_max) if axis.velocity_max > 0.0 else 0.0
+
+
 def _settings(kind: type[Compound], settings: Any) -> list[AxisSettings]:
     return [
         from_table(
             AxisSettings,
             axis,
-            {"kind": AxisKind.SERVO, "unit": kind.COORDINATES[axis.name], "modes": _modes(axis), "k": 0.0},
+            {"kind": AxisKind.SERVO, "unit": kind.COORDINATES[axis.name], "modes": _modes(axis), "k": _k(axis)},
         )
         for axis in settings.axis
     ]
