@@ -40,7 +40,8 @@ from sioms.sdk.tables import from_table, table_type
 
 from .drive import DriveUnit
 from .registers import Gearing
-from .regmap import RegisterMap, named_map
+from .regmap import RegisterMap
+from .regmap_files import named_map
 from .unit import MappedUnit, Misfit, golden_of, unit_on
 
 MAPS = Path(__file__).parent / "maps"

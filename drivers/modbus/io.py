@@ -35,7 +35,8 @@ from sioms.wording import did_you_mean
 
 from .guard import Guard
 from .registers import UNITS, to_words, width
-from .regmap import Port, RegisterMap, Signal, named_map
+from .regmap import Port, RegisterMap, Signal
+from .regmap_files import named_map
 from .unit import MappedUnit, golden_of, unit_on
 
 MAPS = Path(__file__).parent / "maps"

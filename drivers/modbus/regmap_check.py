@@ -6,7 +6,7 @@ import types
 import typing
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
@@ -14,9 +14,7 @@ from sioms.sdk.codec.modbus_pdu import MAX_READ_BITS, MAX_READ_REGISTERS, MAX_WR
 from sioms.wording import did_you_mean
 
 from .registers import RANGES, UNITS, Per, to_words, width
-
-if TYPE_CHECKING:
-    from .regmap import Command, Item, Proof, RegisterMap, Signal, Write
+from .regmap import Command, Item, Proof, RegisterMap, Signal, Write
 
 MODES = ("POSITION", "VELOCITY", "FORCE")
 POLL_GROUPS = ("always", "seldom", "open")

@@ -32,7 +32,7 @@ from sioms.drivers.framed_adc.cobs import FrameReceiver
 from sioms.drivers.framed_adc.codec import parse_samples
 from sioms.drivers.ft300.codec import RecordReceiver
 from sioms.drivers.iio.codec import Element, Layout, ScanReceiver, parse_type
-from sioms.drivers.modbus.regmap import RegisterMapError, parse_map
+from sioms.drivers.modbus.regmap_files import RegisterMapError, parse_map
 from sioms.drivers.schunk_ft.codec import parse as parse_schunk
 from sioms.gateway.core import OWN_NUMBERS, Gateway, Principal
 from sioms.lab.arrays import UnreadableError, read_mat, read_npz

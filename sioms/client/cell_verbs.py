@@ -16,8 +16,8 @@ from sioms.protocol.text import printable, shown
 
 from .arguments import number as as_number
 from .channel import Call, Channel
-from .faces import Generic, verb
 from .local import RENEWED_NS, node_parts
+from .marks import Generic, verb
 from .shown import acknowledged_by_daemon
 
 TYPE_CHECKING = False

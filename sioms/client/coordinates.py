@@ -9,7 +9,8 @@ Concurrency: as the node that it looks at.
 from __future__ import annotations
 
 from .arguments import integer, number
-from .faces import Awaiting, Blocking, verb
+from .faces import Awaiting, Blocking
+from .marks import verb
 from .node_verbs import AxisVerbs
 
 TYPE_CHECKING = False

@@ -14,25 +14,11 @@ from time import sleep
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Iterator
-    from typing import Any
+    from typing import Any, TypeVar
 
     from .channel import Answer, Call, Channel
-    from .typed_faces import Generic as Generic
-    from .typed_faces import R
-    from .typed_faces import stream as stream
-    from .typed_faces import verb as verb
-else:
 
-    class Generic:
-        """``typing.Generic``, as far as a running program needs it: its module is a fifth of a shell tool's start."""
-
-        __class_getitem__ = classmethod(lambda cls, _parameters: cls)
-
-    def verb(function):
-        """Mark a verb: type checkers see that of the face."""
-        return function
-
-    stream = verb
+    R = TypeVar("R")
 
 _COROUTINE, _ASYNC_GENERATOR = 0x80, 0x200
 _FUNCTION = type(lambda: None)

@@ -19,7 +19,7 @@ from sioms.protocol.verbs import Ioctl, Write
 from . import shown
 from .arguments import integer, number, numbers
 from .channel import Call, Channel
-from .faces import Generic
+from .marks import Generic
 from .snapshot import SNAPSHOT, BinarySnapshot, Layout
 
 TYPE_CHECKING = False

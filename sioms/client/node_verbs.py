@@ -16,7 +16,7 @@ from .arguments import integer, numbers, seconds
 from .cell_verbs import WorkcellVerbs
 from .channel import Call
 from .command import command
-from .faces import stream, verb
+from .marks import stream, verb
 from .node_core import Edges, Event, NodeCore, S
 from .snapshot import AnalogSnapshot, AxisSnapshot, BinarySnapshot
 

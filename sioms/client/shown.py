@@ -16,16 +16,25 @@ from _thread import allocate_lock
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from typing import Protocol
 
     from sioms.protocol.clock import Clock
 
-    from .node_core import NodeCore
+    class Owing(Protocol):
+        """A node, as far as it owes something."""
+
+        owed_ns: int
+
+        @property
+        def clock(self) -> Clock | None:
+            """That of its stamps, None for that of this machine."""
+
 
 MOST_DEVICES = 256
 """Driver processes remembered without an open node; those of before a restart are of no use any more."""
 
 _lock = allocate_lock()
-_nodes: dict[int, list[NodeCore]] = {}
+_nodes: dict[int, list[Owing]] = {}
 _last_ns: dict[int, int] = {}
 _everywhere_ns = 0
 
@@ -39,7 +48,7 @@ def _unlock() -> None:
 os.register_at_fork(after_in_child=_unlock)
 
 
-def join(node: NodeCore, device: int) -> None:
+def join(node: Owing, device: int) -> None:
     """Let an open node of a driver process owe what has been acknowledged so far."""
     with _lock:
         _nodes.setdefault(device, []).append(node)
@@ -47,7 +56,7 @@ def join(node: NodeCore, device: int) -> None:
         node.owed_ns = max(_last_ns.get(device, 0), everywhere_ns)
 
 
-def leave(node: NodeCore, device: int) -> None:
+def leave(node: Owing, device: int) -> None:
     """Forget a node that is closed."""
     with _lock:
         nodes = _nodes.get(device, [])
@@ -88,7 +97,7 @@ def clock_acknowledged(clock: Clock) -> Callable[[int], None]:
     return lambda as_of_ns: acknowledged_by_daemon(as_of_ns, clock)
 
 
-def paid(node: NodeCore, as_of_ns: int) -> None:
+def paid(node: Owing, as_of_ns: int) -> None:
     """Note that a node has a snapshot that shows everything before an instant."""
     with _lock:
         if node.owed_ns <= as_of_ns:

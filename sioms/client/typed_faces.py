@@ -1,4 +1,4 @@
-"""What type checkers see of ``faces``; nothing of it is loaded by a running program."""
+"""What type checkers see of ``marks``; nothing of it is loaded by a running program."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sioms.daemon.config import parse
 from sioms.documents import DEEPEST, MOST_BYTES, json_of, read_bytes, read_text, toml_of
-from sioms.drivers.modbus.regmap import RegisterMapError, load_map
+from sioms.drivers.modbus.regmap_files import RegisterMapError, load_map
 from sioms.plant.effects import EffectsError, parse_effects
 from sioms.tactile.finger import from_toml
 

@@ -12,7 +12,7 @@ import pytest
 from modbus_rig import RIGS, Rig, az_rig, leadshine_rig
 
 from sioms.drivers.modbus.axis import MAPS, ModbusAxis
-from sioms.drivers.modbus.regmap import named_map
+from sioms.drivers.modbus.regmap_files import named_map
 from sioms.motion import CommandError
 from sioms.protocol.flags import AxisStatus, ControlMode
 from sioms.sdk.exchange import DeviceError

@@ -9,7 +9,7 @@ import pytest
 
 import sioms.drivers
 from sioms.drivers.modbus.registers import Gearing
-from sioms.drivers.modbus.regmap import load_map
+from sioms.drivers.modbus.regmap_files import load_map
 from sioms.drivers.modbus.unit import MappedUnit
 from sioms.sdk.codec.modbus import RtuUnit, SerialLine, TcpUnit, frame_rtu, frame_tcp
 from sioms.sdk.exchange import DeviceError, Exchange, Pause, Steps

@@ -9,7 +9,7 @@ import pytest
 
 import sioms.drivers
 from sioms.drivers.modbus.axis import ModbusAxis
-from sioms.drivers.modbus.regmap import RegisterMapError, load_map, parse_map
+from sioms.drivers.modbus.regmap_files import RegisterMapError, load_map, parse_map
 from sioms.protocol.flags import ControlMode
 
 MAPS = Path(sioms.drivers.__file__).parent / "modbus" / "maps"
