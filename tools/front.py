@@ -52,6 +52,7 @@ COMMANDS: dict[str, Command] = {
     "key": Command("sioms.gateway.command", "make, allow, list and revoke the keys of remote clients"),
     "driver": Command("sioms.tools.driver", "list, check, trace and replay drivers"),
     "bench": Command("sioms.bench", "measure latencies and throughput on this machine"),
+    "hand": Command("sioms.hand.command", "grasp, regrasp, roll and hold unknown objects by touch"),
     "tactile": Command("sioms.tactile.command", "design, calibrate and measure elastic fingers"),
     "reconcile": Command("sioms.reconcile.command", "identify missing effects of a model from measurements"),
 }

@@ -81,6 +81,7 @@ complete -c sioms -n __fish_use_subcommand -a epics -d 'show nodes to EPICS clie
 complete -c sioms -n __fish_use_subcommand -a key -d 'make, allow, list and revoke the keys of remote clients'
 complete -c sioms -n __fish_use_subcommand -a driver -d 'list, check, trace and replay drivers'
 complete -c sioms -n __fish_use_subcommand -a bench -d 'measure latencies and throughput on this machine'
+complete -c sioms -n __fish_use_subcommand -a hand -d 'grasp, regrasp, roll and hold unknown objects by touch'
 complete -c sioms -n __fish_use_subcommand -a tactile -d 'design, calibrate and measure elastic fingers'
 complete -c sioms -n __fish_use_subcommand -a reconcile -d 'identify missing effects of a model from measurements'
 complete -c sioms -n '__fish_seen_subcommand_from info monitor reset stop' -f -a '(sioms list --names 2>/dev/null)'

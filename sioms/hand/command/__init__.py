@@ -1,0 +1,51 @@
+"""``sioms hand``: the two-fingered hand from the shell.
+
+Each sub-command is a module of this package, loaded only when it is called: ``add_arguments(parser)`` adds its
+arguments, ``run(args) -> int`` carries it out and returns the exit status.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+from sioms.hand.touch import Failed
+
+
+@dataclass(frozen=True, slots=True)
+class Verb:
+    """A sub-command: its module within this package, and one line for the overview."""
+
+    module: str
+    text: str
+
+
+VERBS: dict[str, Verb] = {
+    "trials": Verb("trials", "grasp random convex objects in a simulated plane and count what becomes of them"),
+}
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the `hand` command to the `sioms` parser."""
+    parser = subparsers.add_parser("hand", help="grasp, regrasp, roll and hold unknown objects by touch")
+    verbs = parser.add_subparsers(dest="hand_command", required=True, metavar="COMMAND")
+    for name, verb in VERBS.items():
+        _module(verb).add_arguments(verbs.add_parser(name, help=verb.text, description=verb.text.capitalize() + "."))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the chosen sub-command; return the exit status, 1 with a sentence for what the user can mend."""
+    try:
+        return int(_module(VERBS[args.hand_command]).run(args))
+    except Failed as failed:
+        print(f"sioms hand {args.hand_command}: {failed.fault.value}: {failed}", file=sys.stderr)
+    except ValueError as error:
+        print(f"sioms hand {args.hand_command}: {error}", file=sys.stderr)
+    return 1
+
+
+def _module(verb: Verb) -> Any:
+    return import_module(f"{__name__}.{verb.module}")

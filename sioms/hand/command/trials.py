@@ -1,0 +1,40 @@
+"""``sioms hand trials``: random convex objects in a simulated plane, and what becomes of each grasp.
+
+The physics is imported when the command runs, not before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument("--count", type=int, default=10, metavar="N", help="objects (default 10)")
+    parser.add_argument("--first", type=int, default=0, metavar="N", help="number of the first one (default 0)")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the draw (default 1)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out the trials; print a line for each, and the share of every family."""
+    from sioms.hand.trials import SHAPES, WITHIN_RAD, carry_out, draw, share
+
+    if args.count < 1 or args.first < 0:
+        raise ValueError(f"try {args.count} objects from number {args.first}: want 1 or more, from 0 on")
+    outcomes = []
+    print(f"{'object':>6} {'shape':9} {'friction':>8} {'eta first':>9} {'eta last':>8} regrasps rolls  outcome")
+    for number in range(args.first, args.first + args.count):
+        one = carry_out(draw(number, args.seed))
+        outcomes.append(one)
+        how = one.fault.value if one.fault else "held"
+        print(
+            f"{one.number:6d} {one.shape:9} {one.friction:8.2f} {math.degrees(one.first_rad):9.2f} "
+            f"{math.degrees(one.last_rad):8.2f} {one.regrasps:8d} {one.rolls:5d}  {how}{' dropped' * one.dropped}",
+            flush=True,
+        )
+    print(f"friction angle within {math.degrees(WITHIN_RAD):g} degree after at most two regrasps or one roll:")
+    for shape in (*SHAPES, ""):
+        if any(one.shape == shape or not shape for one in outcomes):
+            print(f"{shape or 'all':9} {100 * share(outcomes, shape):5.1f} %")
+    return 0
