@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
     from typing import Any, ClassVar, Self, TypeVar
 
+    from sioms.protocol.clock import Clock
+
     from .node_verbs import AxisVerbs, NodeVerbs
     from .typed_faces import Waiter
 
@@ -280,6 +282,24 @@ class WorkcellVerbs(Generic[M]):
     async def info(self, name: str) -> NodeInfo:
         """Return what a node is, without opening it."""
         return NodeInfo(await self._ask(f"get information of {name}", verbs.Info(name)))
+
+    @property
+    def address(self) -> str:
+        """Where it is reached: the path of a socket, or ``zmq://HOST:PORT`` of a gateway."""
+        return self._path
+
+    @property
+    def clock(self) -> Clock:
+        """The clock of the cell's machine beside that of this one, and beside UTC."""
+        if self._channel.clock is not None:
+            return self._channel.clock
+        from sioms.protocol.clock import Clock
+
+        from .wall import wall
+
+        clock = Clock()
+        clock.wall = wall()
+        return clock
 
     def _here(self, there_ns: int) -> int:
         """Return an instant of the cell's clock in that of this machine."""

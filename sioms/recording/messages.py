@@ -9,7 +9,7 @@ whose columns are arrays of fixed length, so that the bytes are taken as they ar
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from struct import pack, unpack_from
 from typing import Any
 
@@ -78,6 +78,10 @@ class Event:
     text: str = ""
     data: dict[str, Any] | None = None
     raw: bytes = b""
+
+    def moved(self, shift_ns: int) -> Event:
+        """Return the same event at another time [ns]."""
+        return self if not shift_ns else replace(self, stamp_ns=self.stamp_ns + shift_ns)
 
     def packed(self) -> bytes:
         """Return the CDR message."""
@@ -252,6 +256,19 @@ class NodeFormat:
         self._template = np.frombuffer(template, self._dtype)
         self._second = second is not None
 
+    def _shifted(self, slots: NDArray[np.uint64], shift_ns: int) -> NDArray[np.uint64]:
+        """Return snapshots whose instants are later."""
+        moved = slots.copy()
+        count = len(self.info.channels)
+        words = [SLOT_WORDS.index("stamp_ns"), SLOT_WORDS.index("as_of_ns")]
+        for row, name in enumerate(READ[self.info.node_class]):
+            if name.endswith("_ns"):
+                words += range(len(SLOT_WORDS) + row * count, len(SLOT_WORDS) + (row + 1) * count)
+        for word in words:
+            known = moved[:, word] != 0  # 0: there was none
+            moved[known, word] += np.uint64(shift_ns % (1 << 64))
+        return moved
+
     def _joint_state(self, body: Cdr) -> tuple[Any, list[tuple[str, Any, int]]]:
         parts = self._stamp(body)
         body.align(4)
@@ -278,12 +295,15 @@ class NodeFormat:
         body.text("" if self.info.node_class is NodeClass.AXIS else self.info.name)
         return parts
 
-    def messages(self, slots: NDArray[np.uint64]) -> bytes:
+    def messages(self, slots: NDArray[np.uint64], shift_ns: int = 0) -> bytes:
         """Return the records of snapshots.
 
         Args:
             slots: shape (snapshots, size / 8): each as it is in the page, of the node's channels alone.
+            shift_ns: what is added to their instants [ns].
         """
+        if shift_ns:
+            slots = self._shifted(slots, shift_ns)
         out: Any = np.empty(len(slots), self._dtype)
         raw = out.view(np.uint8).reshape(len(slots), -1)
         raw[:] = np.frombuffer(self._template, np.uint8)

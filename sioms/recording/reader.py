@@ -44,8 +44,8 @@ class Piece:
     data: Any
     by_channel: dict[int, list[int]]
 
-    def rows(self, channel: int, size: int) -> NDArray[np.uint8]:
-        """Return the messages of a channel as rows of bytes, those of another size left out."""
+    def rows(self, channel: int, size: int) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """Return the messages of a channel, those of another size left out: log times [ns, UTC], and rows of bytes."""
         offsets = np.array(self.by_channel.get(channel, ()), np.int64)
         places = np.frombuffer(self.data, np.uint8)
         start, whole = mcap.HEAD + mcap.MESSAGE_HEAD, mcap.MESSAGE_HEAD + size
@@ -55,15 +55,16 @@ class Piece:
             else offsets
         )
         if not len(offsets):
-            return np.empty((0, size), np.uint8)
+            return np.empty(0, np.int64), np.empty((0, size), np.uint8)
         windows = np.lib.stride_tricks.sliding_window_view(places, size)
-        return np.array(windows[offsets + start])
+        return mcap.times(self.data, offsets).astype(np.int64), np.array(windows[offsets + start])
 
-    def messages(self, channel: int) -> Iterator[bytes]:
-        """Yield the messages of a channel."""
+    def messages(self, channel: int) -> Iterator[tuple[int, bytes]]:
+        """Yield the messages of a channel with their log times [ns, UTC]."""
         for at in self.by_channel.get(channel, ()):
             (size,) = unpack_from("<Q", self.data, at + 1)
-            yield bytes(self.data[at + mcap.HEAD + mcap.MESSAGE_HEAD : at + mcap.HEAD + size])
+            when = mcap.message_at(self.data, at)[2]
+            yield when, bytes(self.data[at + mcap.HEAD + mcap.MESSAGE_HEAD : at + mcap.HEAD + size])
 
 
 @dataclass(slots=True)
@@ -178,12 +179,16 @@ class Recording:
 
     @property
     def about(self) -> dict[str, str]:
-        """What the recorder says of the recording: workcell, host, start, clock."""
-        return {key: value for name, values in self.metadata if name == "sioms" for key, value in values.items()}
+        """What the recorder says of the recording: workcell, host, start, clock; of several, the first one's word."""
+        return {key: val for name, values in self.metadata[::-1] if name == "sioms" for key, val in values.items()}
 
     @property
     def offset_ns(self) -> int:
-        """UTC minus CLOCK_MONOTONIC [ns]; 0 where the file does not tell."""
+        """UTC minus CLOCK_MONOTONIC of the cell's machine [ns]; 0 where the file does not tell.
+
+        Of a recording that was merged of several, that of the first: instants of the others, whose machine may be
+        another, or have been started anew, are told in the same clock by way of UTC.
+        """
         return _offset_of(self.about) or 0
 
     def _head(self) -> None:
@@ -320,9 +325,10 @@ class Recording:
             list(self.pieces(()))  # its channel may stand later in the file
         found = []
         for piece in self.pieces([self._events]):
-            for data in piece.messages(self._events):
+            for when, data in piece.messages(self._events):
                 try:
-                    found.append(Event.of(data))
+                    event = Event.of(data)
+                    found.append(event.moved(when - self.offset_ns - event.stamp_ns))
                 except mcap.Damaged as problem:
                     self.damage.append(str(problem))
         return sorted(found, key=lambda event: event.stamp_ns)
@@ -339,11 +345,16 @@ class Recording:
 
     def slots(self, name: str) -> Iterator[NDArray[np.uint64]]:
         """Yield the snapshots of a node in the order of the file: arrays of shape (snapshots, words)."""
+        for _, slots in self._timed(name):
+            yield slots
+
+    def _timed(self, name: str) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint64]]]:
+        """Yield the snapshots of a node with their times by UTC [ns]."""
         node = self.node(name)
         for piece in self.pieces([node.channel]):
-            rows = piece.rows(node.channel, 4 + node.size)
+            when, rows = piece.rows(node.channel, 4 + node.size)
             if len(rows):
-                yield np.ascontiguousarray(rows[:, len(CDR) :]).view("<u8")
+                yield when, np.ascontiguousarray(rows[:, len(CDR) :]).view("<u8")
 
     def table(self, name: str, columns: Iterable[str] | None = None, start_ns: int = 0, end_ns: int = 1 << 62) -> Table:
         """Return columns of a node.
@@ -363,26 +374,27 @@ class Recording:
             if column not in known:
                 raise OSError(22, f"{self.path}: {name} has no column {column}; there are: {', '.join(known)}")
         count, order = len(node.info.channels), list(known)
-        heads: list[NDArray[np.uint64]] = []
+        heads: list[NDArray[np.int64]] = []
         kept: dict[str, list[NDArray[np.uint64]]] = {column: [] for column in wanted}
-        for slots in self.slots(name):
-            inside = (slots[:, 1] >= start_ns) & (slots[:, 1] < end_ns)
+        for when, slots in self._timed(name):
+            stamps = when - self.offset_ns
+            inside = (stamps >= start_ns) & (stamps < end_ns)
             chosen = slots[inside]
-            heads.append(chosen[:, :2].copy())
+            heads.append(np.stack([chosen[:, 0].view(np.int64), stamps[inside]], axis=1))
             for column in wanted:
                 first = 4 + order.index(column) * count
                 kept[column].append(chosen[:, first : first + count].copy())
-        head = np.concatenate(heads) if heads else np.empty((0, 2), "<u8")
+        head = np.concatenate(heads) if heads else np.empty((0, 2), np.int64)
         values: dict[str, NDArray[Any]] = {}
         for column in wanted:
             joined = np.concatenate(kept[column]) if heads else np.empty((0, count), "<u8")
             values[column] = joined.view("<f8" if known[column].code == "d" else "<i8")
         if node.bit >= 0 and "data" in values:
             values["data"] = values["data"] >> node.bit & 1
-        if node.info.node_class is NodeClass.BINARY and (np.diff(head[:, 1].astype(np.int64)) < 0).any():
+        if node.info.node_class is NodeClass.BINARY and (np.diff(head[:, 1]) < 0).any():
             order_ns = np.argsort(head[:, 1], kind="stable")
             head, values = head[order_ns], {name: value[order_ns] for name, value in values.items()}
-        return Table(head[:, 1].astype(np.int64), head[:, 0].astype(np.int64), values)
+        return Table(head[:, 1], head[:, 0], values)
 
     def span(self) -> tuple[int, int, dict[int, int]]:
         """Return first and last time [ns, UTC] and the number of messages of each channel."""

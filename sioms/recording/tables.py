@@ -67,7 +67,7 @@ def export(columns: dict[str, NDArray[Any]], path: Path) -> None:
         case ".npz":
             np.savez_compressed(path, **columns)  # type: ignore[arg-type]
         case ".parquet":
-            import pyarrow  # type: ignore[import-not-found]
+            import pyarrow
             from pyarrow import parquet
 
             parquet.write_table(pyarrow.table(columns), path)

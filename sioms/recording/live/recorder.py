@@ -22,6 +22,7 @@ from sioms.recording.messages import Event, NodeFormat
 
 from .files import Sink
 from .taps import JournalTap, NodeTap
+from .times import CellTime
 
 PERIOD_S = (0.004, 0.02)
 """Least and longest time between two looks [s]; a third of the time that snapshots stay in the shortest ring."""
@@ -56,7 +57,6 @@ class Recorder:
         self.lost: dict[str, int] = {}
         self._sink, self._connect, self._wanted = sink, connect, list(wanted)
         self._seen, self._log, self._past = seen, log, past
-        self._offset_ns = time.time_ns() - time.monotonic_ns()
         self._schemas: dict[tuple[str, str], int] = {}
         self._channels = 0
         self._taps: dict[str, tuple[NodeTap, NodeFormat]] = {}
@@ -68,12 +68,8 @@ class Recorder:
         self._may_hear = True
         self._gone: list[Workcell] = []
         self.cell: Workcell | None = connect()
-        about = {
-            "workcell": self.cell.name, "host": socket.gethostname(), "offset_ns": str(self._offset_ns),
-            "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), "boot": _boot(),
-            "clock": "UTC = CLOCK_MONOTONIC + offset_ns",
-        }  # fmt: skip
-        self._sink.define(mcap.metadata("sioms", about))
+        self._time = CellTime(self.cell.clock)
+        self._sink.define(mcap.metadata("sioms", _about(self.cell) | self._time.about()))
         self._events = self._channel(messages.EVENT, messages.EVENTS)
         try:
             self._sink.define(mcap.metadata("status", {"json": json.dumps(self.cell.status(), default=str)}))
@@ -139,7 +135,7 @@ class Recorder:
         self._poll.register(cell.fileno(), POLLIN)
 
     def _add(self, name: str, tap: NodeTap) -> None:
-        form = NodeFormat(tap.info, tap.bit, self._channels + 1, self._schema, self._offset_ns)
+        form = NodeFormat(tap.info, tap.bit, self._channels + 1, self._schema, self._time.offset_ns)
         self._channels += len(form.channels)
         for channel in form.channels:
             self._sink.define(channel.packed())
@@ -148,7 +144,7 @@ class Recorder:
 
     def _tell(self, kind: str, node: str = "", text: str = "", **data: Any) -> None:
         """Record something about the recording itself."""
-        self._pending.append(Event(time.monotonic_ns(), 0, "recorder", kind, node, text=text, data=data or None))
+        self._pending.append(Event(self._time.now_ns(), 0, "recorder", kind, node, text=text, data=data or None))
 
     @property
     def period_s(self) -> float:
@@ -172,17 +168,18 @@ class Recorder:
                 self._tell("lost", name, text, snapshots=lost, before=last)
             if slots is not None and len(slots):
                 counts[name] = len(slots)
-                parts.append(form.messages(slots))
+                parts.append(form.messages(slots, self._time.shift_ns))
         events, self._pending = self._pending, []
         for source, journal in self._journals.items():
             found, lost = journal.take()
-            events += found
+            events += [event.moved(self._time.shift_ns) for event in found]
             if lost:
                 text = f"{lost} events of {source or 'the daemon'} were overwritten before they were taken"
-                events.append(Event(time.monotonic_ns(), 0, "recorder", "lost", text=text, data={"events": lost}))
+                events.append(Event(self._time.now_ns(), 0, "recorder", "lost", text=text, data={"events": lost}))
         for event in events:
             self._sequence += 1
-            parts.append(mcap.message(self._events, self._sequence, event.stamp_ns + self._offset_ns, event.packed()))
+            when_ns = event.stamp_ns + self._time.offset_ns
+            parts.append(mcap.message(self._events, self._sequence, when_ns, event.packed()))
         if parts:
             self._sink.append(b"".join(parts))
         for name, count in counts.items():
@@ -212,6 +209,8 @@ class Recorder:
         if self.cell is None:
             with suppress(OSError):
                 self.cell = self._connect()
+                if self._time.resume(self.cell.clock):
+                    self._tell("clock anew", text="the workcell's machine was started anew; stamps go on from before")
                 self._tell("daemon back", text=f"connected to the daemon of {self.cell.name} again")
                 for journal in self._journals.values():
                     journal.release()
@@ -250,6 +249,15 @@ class Recorder:
         for cell in [*self._gone, *([self.cell] if self.cell is not None else [])]:
             cell.close()
         self.cell = None
+
+
+def _about(cell: Workcell) -> dict[str, str]:
+    """Return what a recording says of where it was made."""
+    here = "://" not in cell.address
+    return {
+        "workcell": cell.name, "host": socket.gethostname() if here else cell.address, "recorder": socket.gethostname(),
+        "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), "boot": _boot() if here else "",
+    }  # fmt: skip
 
 
 def _boot() -> str:

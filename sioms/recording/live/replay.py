@@ -115,15 +115,15 @@ class Replay:
     # --- time ------------------------------------------------------------------------------------
 
     def _snapshots(self) -> Iterator[tuple[int, Served, Any]]:
-        """Yield the snapshots of all nodes in the order of their stamps, within each piece of the file."""
+        """Yield the snapshots of all nodes in the order of their times, within each piece of the file."""
         by_channel = {served.record.channel: served for served in self._nodes.values()}
         for piece in self._recording.pieces(by_channel):
             batch = []
             for channel, served in by_channel.items():
-                rows = piece.rows(channel, 4 + served.record.size)
+                when, rows = piece.rows(channel, 4 + served.record.size)
                 if len(rows):
                     words = rows[:, 4:].copy().view("<u8")
-                    batch += [(int(row[1]), served, row) for row in words]
+                    batch += [(stamp_ns, served, row) for stamp_ns, row in zip(when.tolist(), words, strict=True)]
             batch.sort(key=lambda each: each[0])
             yield from batch
 
