@@ -1,7 +1,7 @@
 """How much of the processors the drivers of a workcell need, told before the first tick and not by faults.
 
-An estimate: the processor time of a tick as it was measured for each kind of driver (docs/decisions/0351), times the
-rate. A slower machine needs more, effects and transmissions of simulated axes too.
+An estimate: the processor time of a tick as it was measured for each kind of driver (docs/decisions/0351 and 0570),
+times the rate. A slower machine needs more, effects and transmissions of simulated axes too.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Cost:
 
 COLD_BELOW_HZ = 200.0
 """Rate at and below which each tick begins with cold caches; above, the part of them that is cold falls as 1/rate."""
-COSTS = {"compiled": Cost(20, 195), "tick": Cost(60, 280), "stream": Cost(95, 280)}
+COSTS = {"compiled": Cost(25, 80), "tick": Cost(60, 280), "stream": Cost(95, 280)}
 """Of a device by the kind of its driver: a driver whose quiet ticks are compiled, one that ticks in Python, and one
 whose device sends by itself."""
 AXES_IN_PYTHON = Cost(150, 400)

@@ -236,26 +236,31 @@ class World:
             return None
         with _in_python("sioms.sdk.quiet_step") as module:
             module.clock_ns, module.wait_for = CLOCK, self._wait_for
-            module.expirations = lambda _: runtime._timer.expirations()
+            module.expirations = lambda fd: runtime._timer.expirations() if fd == 1 else 1
+            module.set_timer = lambda fd, when_ns: 0
             self.run_quietly = module.run
             return QuietRun(
-                steps, 0, 1, runtime._latch_words, runtime.period_ns, runtime._daemon_lease_ns, instants,
-                runtime.pages, runtime.stops, runtime.waits, runtime.clients, runtime.statistics,
+                steps, 0, 1, 2, runtime._latch_words, runtime.period_ns, runtime._lead_ns, runtime._daemon_lease_ns,
+                runtime._idling, instants, runtime.pages, runtime.stops, runtime.waits, runtime.clients,
+                runtime.statistics,
             )  # fmt: skip
 
     def _wait_for(self, poll: int, ready: Any) -> int:
-        """Say that the timer is due, until that has been heard; then that a signal has ended the wait."""
-        ready[0] = 1
-        return 1 if self.runtime._timer.expired else 0  # type: ignore[attr-defined]
+        """Say that a timer is due, until that has been heard; then that a signal has ended the wait."""
+        assert self._run is not None
+        ready[0] = 1 if self.runtime._timer.expired else 2  # type: ignore[attr-defined]
+        return 1 if ready[0] == 1 or self._run.record.announced else 0
 
     def _tick_quietly(self) -> bool:
         """Tick by steps; False when the tick is the loop's."""
-        if self._run is None or not self.runtime.clients.handles or self.runtime._idling.periods > 1:
+        runtime = self.runtime
+        if self._run is None or (runtime._line_due_ns is not None and not runtime._announced):
             return False
-        ready = self._run.wait(self.runtime._scheduled_ns, self.runtime.tick)
+        watched = bool(runtime.clients.handles) or runtime._is_used
+        ready = self._run.wait(runtime._scheduled_ns, runtime.tick, watched, runtime._announced, runtime._slack_ns)
         if ready is None:
             return False
-        self.runtime._resume(self._run.record)
+        runtime._resume(self._run.record)
         self.quiet += self._run.record.done
         return not ready
 

@@ -57,7 +57,7 @@ from sioms.sdk.exchange import LinkError
 from sioms.sdk.pages import Pages
 from sioms.sdk.tables import from_table, table_type
 
-from .axes_step import SimulatedAxes, advance_axes, tick_axes
+from .axes_step import SimulatedAxes, advance_axes, rest_axes, tick_axes
 
 # More than this many ticks late, the simulated world stands still instead of catching up.
 _CATCH_UP = 50
@@ -290,6 +290,11 @@ class SimAxes(TickDriver):
         if until_ns - time.monotonic_ns() > _SLACK_NS:
             self.bank.plan_ahead(_PLANS)
 
+    def plan_early(self) -> bool:
+        """Plan profiles ahead long before the next tick; return whether there were any."""
+        until_ns = self._last_ns + self._tick_ns
+        return until_ns - time.monotonic_ns() > 2 * _SLACK_NS and self.bank.plan_ahead(_PLANS) > 0
+
     def _advance(self, command: Array) -> None:
         if self._servos is not None:
             self._servos.advance(command[self._servo_rows])
@@ -340,12 +345,14 @@ class QuietAxes:
 
     tick = staticmethod(tick_axes)
     slack = staticmethod(advance_axes)
+    rest = staticmethod(rest_axes)
 
     def __init__(self, driver: SimAxes, pages: Pages, instants: NDArray[np.int64]) -> None:
         self._driver, self._axes, self._plant = driver, driver._axes, driver._plant
         plant, motors, steppers = self._plant, driver._servos, driver._steppers
         self.record = SimulatedAxes(
-            period_ns=driver._tick_ns, ahead=0, last_ns=0, found=0, loop=driver.bank.loop,
+            period_ns=driver._tick_ns, ahead=0, last_ns=0, found=0, may_rest=0, still=0, seen=driver._seen,
+            near=driver._near, loop=driver.bank.loop,
             motors=motors.record if motors else Motors.empty(),
             steppers=steppers.record if steppers else Steppers.empty(),
             motor_rows=driver._servo_rows, stepper_rows=driver._stepper_rows,
@@ -354,18 +361,23 @@ class QuietAxes:
             axes=pages.record(self._axes), plant=pages.record(plant),
         )  # fmt: skip
 
-    def is_ready(self) -> bool:
+    def is_ready(self, watched: bool) -> bool:
         """Tell whether nothing but motion is to be expected."""
-        driver = self._driver
-        if not driver._ahead or driver._found or not self._plant.is_plain or not driver.bank.is_quiet():
+        driver, record = self._driver, self.record
+        if driver._ahead > 1 or driver._found or not self._plant.is_plain:
             return False
-        self.record.ahead, self.record.last_ns, self.record.found = driver._ahead, driver._last_ns, 0
+        if not driver.bank.is_quiet() and not (driver.plan_early() and driver.bank.is_quiet()):
+            return False
+        record.ahead, record.last_ns, record.found = driver._ahead, driver._last_ns, 0
+        record.still = driver._is_still
+        record.may_rest = not watched and not driver._has_effects and driver.bank.is_idle(driver._all)
         return True
 
     def resume(self) -> None:
         """Go on from where the steps have come."""
         driver, record = self._driver, self.record
         driver._ahead, driver._last_ns, driver._found = record.ahead, record.last_ns, record.found
+        driver._is_still = bool(record.still)
         driver.bank.after_quiet()
 
 

@@ -19,14 +19,20 @@ UNDONE: Final = LATE | ENDS | NOT_FINITE | WIDE | ODD
 class SimulatedAxes(Record):
     """Servos over simulated motors and steppers, each a row of the loop.
 
-    ``ahead``: the world has gone on to the next tick; ``last_ns``: its time. ``found`` by the bank in a tick that is
-    half done. ``data`` and ``flags`` of the plant, as they are and as ``shown`` less the ``offset``.
+    ``ahead``: the world has gone on to the next tick; ``last_ns``: its time. ``may_rest``: axes are at rest when the
+    world is; ``still``: they are, and ticks that are left out change nothing. ``seen``: the command of the tick before,
+    and how ``near`` the next must be to be the same. ``found`` by the bank in a tick that is half done. ``data`` and
+    ``flags`` of the plant, as they are and as ``shown`` less the ``offset``.
     """
 
     period_ns: int
     ahead: int
     last_ns: int
     found: int
+    may_rest: int
+    still: int
+    seen: Floats
+    near: Floats
     loop: Loop
     motors: Motors
     steppers: Steppers
@@ -45,7 +51,8 @@ class SimulatedAxes(Record):
 @step
 def tick_axes(s: SimulatedAxes, now_ns: int, as_of_ns: int, number: int) -> int:
     """Measure, command, publish. Returns what the driver has to see to, 0 for nothing."""
-    if s.ahead != 1 or now_ns - s.last_ns != s.period_ns:
+    left_out = max(0, int((now_ns - s.last_ns) / s.period_ns) - 1) if s.still else 0
+    if now_ns - s.last_ns != (left_out + 1) * s.period_ns or advance_axes(s, 0, 0, 0):
         return NOT_READY
     loop = s.loop
     m = s.motors
@@ -62,6 +69,7 @@ def tick_axes(s: SimulatedAxes, now_ns: int, as_of_ns: int, number: int) -> int:
     if found & UNDONE:
         return found
     s.ahead = 0
+    s.still = 0
     s.last_ns = now_ns
     s.found = found
     if found:
@@ -102,3 +110,22 @@ def advance_axes(s: SimulatedAxes, now_ns: int, until_ns: int, unused: int) -> i
         turn(p)
     s.ahead = 1
     return 0
+
+
+@step
+def rest_axes(s: SimulatedAxes, a: int, b: int, c: int) -> int:
+    """Return whether world and command are at a fixed point, as ``SimAxes.is_at_rest`` does."""
+    if not s.may_rest:
+        return 0
+    s.still = 1
+    for i in range(s.loop.n):
+        if not abs(s.loop.actuator[i] - s.seen[i]) <= s.near[i]:
+            s.still = 0
+        s.seen[i] = s.loop.actuator[i]
+    for j in range(s.motors.n):
+        if s.motors.velocity[j] != 0.0:
+            s.still = 0
+    for j in range(s.steppers.n):
+        if s.steppers.velocity[j] != 0.0:
+            s.still = 0
+    return s.still

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import select
 import time
@@ -33,6 +34,12 @@ static inline int64_t sioms_expirations(int64_t timer)
     return read((int)timer, &count, 8) == 8 ? (int64_t)count : 0;
 }
 
+static inline int64_t sioms_set_timer(int64_t timer, int64_t when_ns)
+{
+    struct itimerspec when = {.it_value = {when_ns / 1000000000, when_ns % 1000000000}};
+    return timerfd_settime((int)timer, TFD_TIMER_ABSTIME, &when, 0);
+}
+
 static inline int64_t sioms_wake(int64_t pipe) { return write((int)pipe, "\\1", 1); }
 
 static inline int64_t sioms_fence(void)
@@ -42,6 +49,8 @@ static inline int64_t sioms_fence(void)
 }
 """
 
+_libc = ctypes.CDLL(None, use_errno=True)
+_ABSOLUTE = 1
 _polls: dict[int, select.epoll] = {}
 
 
@@ -68,6 +77,12 @@ def expirations(timer: int) -> int:
         return int.from_bytes(os.read(timer, 8), "little")
     except BlockingIOError:
         return 0
+
+
+def set_timer(timer: int, when_ns: int) -> int:
+    """Have a timer expire once at a time [ns, CLOCK_MONOTONIC]."""
+    when = (ctypes.c_long * 4)(0, 0, *divmod(when_ns, 1_000_000_000))
+    return int(_libc.timerfd_settime(timer, _ABSOLUTE, when, None))
 
 
 def wake(pipe: int) -> int:

@@ -21,6 +21,7 @@ HEAD = """/* Made by sioms.native.translate; do not edit. */
 #include <stdint.h>
 #include <string.h>
 #include <sys/epoll.h>
+#include <sys/timerfd.h>
 #include <time.h>
 #include <unistd.h>
 """

@@ -139,8 +139,14 @@ class QuietSteps(Protocol):
         ``TickDriver.slack`` is to be called.
         """
 
-    def is_ready(self) -> bool:
-        """Tell whether the next ticks may be steps, and hand the record over."""
+    @property
+    def rest(self) -> Callable[[Any, int, int, int], int]:
+        """Step after a tick of a device that nobody looks at: takes the record, and three times 0. Returns 1 when the
+        device is at rest, as ``TickDriver.is_at_rest`` does, else 0.
+        """
+
+    def is_ready(self, watched: bool) -> bool:
+        """Tell whether the next ticks may be steps, and hand the record over; ``watched``: ``rest`` is not asked."""
 
     def resume(self) -> None:
         """Take the record over: steps have been done."""

@@ -19,22 +19,25 @@ class Idling:
 
     Attributes:
         periods: how many periods lie between two ticks now.
+        restless_ns: when something happened last [ns].
+        rest_ns: how long nothing must have happened then [ns]; for ever where periods are long already.
     """
 
     def __init__(self, period_ns: int, lease_ns: int) -> None:
         self.periods = 1
         self._most = min(IDLE_NS, lease_ns // LEASES) // period_ns
-        self._restless_ns = 0
+        self.restless_ns = 0
+        self.rest_ns = REST_NS if self._most > 1 else 2**62
 
     def wake(self, now_ns: int) -> bool:
         """Something has happened; return whether it was idle."""
-        self._restless_ns = now_ns
+        self.restless_ns = now_ns
         was_idle, self.periods = self.periods > 1, 1
         return was_idle
 
     def rest(self, now_ns: int) -> bool:
         """Nothing has happened in a tick; return whether it has become idle by that."""
-        if self.periods > 1 or self._most < 2 or now_ns - self._restless_ns < REST_NS:
+        if self.periods > 1 or now_ns - self.restless_ns < self.rest_ns:
             return False
         self.periods = self._most
         return True

@@ -13,6 +13,7 @@ from sioms.native.language import library
 from sioms.native.system import MOST_EVENTS
 
 from .driver import Driver, QuietSteps, TickDriver
+from .idling import Idling
 from .quiet_step import Quiet, run
 from .statistics import TickStatistics
 
@@ -30,52 +31,64 @@ class QuietRun:
 
     Args:
         steps: the driver's.
-        poll, timer: descriptors of the loop's epoll and of its timer.
+        poll, timer, line_timer: descriptors of the loop's epoll and of its timers.
         latch: words of the latch page.
         period_ns: of the tick.
+        lead_ns: how long before a tick its slack is, 0: after it.
         daemon_lease_ns: how long the daemon may be silent.
+        idling: of the process.
         instants: of a tick, as its step notes them.
         pages, stops, waits, clients, statistics: parts of the process.
 
     Attributes:
         record: after ``wait``: ``done`` ticks, ``expired`` when the timer has been read and the tick is the loop's,
-            ``slackens`` when the slack of the last tick is.
+            ``slackens`` when the slack of the last tick is, ``announced`` when the slack of the next one is done, and
+            what is ``told``.
     """
 
     def __init__(
-        self, steps: QuietSteps, poll: int, timer: int, latch: NDArray[np.int64], period_ns: int, daemon_lease_ns: int,
-        instants: NDArray[np.int64], pages: Pages, stops: Stops, waits: Waits, clients: Attachments,
-        statistics: TickStatistics,
+        self, steps: QuietSteps, poll: int, timer: int, line_timer: int, latch: NDArray[np.int64], period_ns: int,
+        lead_ns: int, daemon_lease_ns: int, idling: Idling, instants: NDArray[np.int64], pages: Pages, stops: Stops,
+        waits: Waits, clients: Attachments, statistics: TickStatistics,
     ) -> None:  # fmt: skip
+        self._idling = idling
         self._steps, self._pages, self._stops, self._waits = steps, pages, stops, waits
         self._clients, self._statistics = clients, statistics
         self._ready = np.zeros(MOST_EVENTS, dtype=np.int64)
         self.record = Quiet(
-            poll=poll, timer=timer, ready=self._ready, latch=latch, stopped=0, resets=0, orders=0,
-            daemon_lease_ns=daemon_lease_ns, until_ns=0, period_ns=period_ns, device=steps.record, tick=steps.tick,
-            slack=steps.slack, instants=instants, scheduled_ns=0, began_ns=0, number=0, done=0, expired=0, slackens=0,
-            ring=statistics.ring.reshape(-1), ticks=0, longest_ns=0,
+            poll=poll, timer=timer, line_timer=line_timer, ready=self._ready, latch=latch, stopped=0, resets=0,
+            orders=0, daemon_lease_ns=daemon_lease_ns, until_ns=0, period_ns=period_ns, periods=1, lead_ns=lead_ns,
+            announced=0, worked_ns=0, watched=1, rest_ns=idling.rest_ns, restless_ns=0, told=0, device=steps.record,
+            tick=steps.tick, slack=steps.slack, rest=steps.rest, instants=instants, scheduled_ns=0, began_ns=0,
+            number=0, done=0, expired=0, slackens=0, ring=statistics.ring.reshape(-1), ticks=0, longest_ns=0,
         )  # fmt: skip
 
-    def wait(self, scheduled_ns: int, number: int) -> list[int] | None:
+    def wait(
+        self, scheduled_ns: int, number: int, watched: bool, announced: int = 0, worked_ns: int = 0
+    ) -> list[int] | None:
         """Wait for events, and tick meanwhile.
 
         Args:
             scheduled_ns, number: of the last tick.
+            watched: whether somebody looks at the device.
+            announced, worked_ns: whether the slack of the next tick is done, and how long that took [ns].
 
         Returns:
             descriptors that are ready; None, and nothing has been waited for, when the loop has to tick.
         """
-        record, statistics = self.record, self._statistics
+        record, statistics, idling = self.record, self._statistics, self._idling
         until_ns = self._waits.until_ns()
-        if not until_ns or not self._steps.is_ready() or not self._pages.lend():
+        if not until_ns or not self._steps.is_ready(watched) or not self._pages.lend():
             return None
         record.until_ns = min(until_ns, self._clients.until_ns())
         record.stopped, record.resets, record.orders = self._stops.seen
         record.scheduled_ns, record.number = scheduled_ns, number
+        record.watched, record.periods, record.restless_ns = watched, idling.periods, idling.restless_ns
+        record.announced, record.worked_ns = announced, worked_ns
         record.ticks, record.longest_ns = statistics.ticks, statistics.longest_ns
         count = run(record)
         statistics.ticks, statistics.longest_ns = record.ticks, record.longest_ns
+        idling.restless_ns = record.restless_ns
         self._pages.take_back()
         self._steps.resume()
         ready: list[int] = self._ready[:count].tolist()
@@ -83,8 +96,9 @@ class QuietRun:
 
 
 def quiet_run(
-    driver: Driver, poll: int, timer: int, latch: NDArray[np.int64], period_ns: int, daemon_lease_ns: int, pages: Pages,
-    stops: Stops, waits: Waits, clients: Attachments, statistics: TickStatistics,
+    driver: Driver, poll: int, timer: int, line_timer: int, latch: NDArray[np.int64], period_ns: int, lead_ns: int,
+    daemon_lease_ns: int, idling: Idling, pages: Pages, stops: Stops, waits: Waits, clients: Attachments,
+    statistics: TickStatistics,
 ) -> QuietRun | None:  # fmt: skip
     """Return what ticks by compiled steps, see QuietRun; None for a driver that has none, or without a library."""
     if library is None or not isinstance(driver, TickDriver) or any(block.spec.writable for block in driver.blocks):
@@ -92,5 +106,6 @@ def quiet_run(
     instants = np.zeros(2, dtype=np.int64)
     steps = driver.quiet_steps(pages, instants)
     return None if steps is None else QuietRun(
-        steps, poll, timer, latch, period_ns, daemon_lease_ns, instants, pages, stops, waits, clients, statistics,
+        steps, poll, timer, line_timer, latch, period_ns, lead_ns, daemon_lease_ns, idling, instants, pages, stops,
+        waits, clients, statistics,
     )  # fmt: skip

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Final
 
 from sioms.native.language import Call, Context, Integers, Record, step
-from sioms.native.system import clock_ns, expirations, fence, wait_for, wake
+from sioms.native.system import clock_ns, expirations, fence, set_timer, wait_for, wake
 
 STOPPED: Final = 0
 RESETS: Final = 1
@@ -30,6 +30,15 @@ RING: Final = 8192
 PHASES: Final = 7
 """Ticks whose times are kept, and how many of each; see statistics.py."""
 MOST_SUBSCRIBERS: Final = 32
+
+DONE: Final = 0
+LEFT: Final = 1
+HEARD: Final = 2
+"""What has become of a descriptor that was ready: all is done; it is the loop's; all is done, and the loop has to hear
+of it."""
+RESTED: Final = 1
+STIRS: Final = 2
+"""What the loop has to hear: the device has been at rest for long; it has been idle and is at rest no more."""
 
 
 class Page(Record):
@@ -53,14 +62,21 @@ class Page(Record):
 class Quiet(Record):
     """A driver process between two events.
 
-    ``poll``, ``timer`` and ``ready``: descriptors. ``latch`` page, and what of it has been seen. After ``until_ns`` a
-    lease or a wait may end. ``device`` has the steps ``tick`` and ``slack``. ``scheduled_ns``, ``began_ns`` and
-    ``number`` of the last tick; ``done`` ticks of this run; ``expired``: the timer has been read, and the tick is the
-    loop's; ``slackens``: the loop has to do the slack of the last tick. ``ring`` of the statistics.
+    ``poll``, ``timer``, ``line_timer`` and ``ready``: descriptors. ``latch`` page, and what of it has been seen. After
+    ``until_ns`` a lease or a wait may end. ``device`` has the steps ``tick``, ``slack`` and ``rest``.
+
+    A tick comes every ``period_ns`` times ``periods``. ``lead_ns`` before it, where that is not 0 and periods are 1, is
+    its slack: ``announced`` until the tick, after ``worked_ns`` of work. ``watched``: somebody looks at the device;
+    else it is idle when it has been at rest for ``rest_ns`` since ``restless_ns``, and ``told`` is RESTED or STIRS.
+
+    ``scheduled_ns``, ``began_ns`` and ``number`` of the last tick; ``done`` ticks of this run; ``expired``: the timer
+    has been read, and the tick is the loop's; ``slackens``: the loop has to do the slack of the last tick. ``ring`` of
+    the statistics.
     """
 
     poll: int
     timer: int
+    line_timer: int
     ready: Integers
     latch: Integers
     stopped: int
@@ -69,9 +85,18 @@ class Quiet(Record):
     daemon_lease_ns: int
     until_ns: int
     period_ns: int
+    periods: int
+    lead_ns: int
+    announced: int
+    worked_ns: int
+    watched: int
+    rest_ns: int
+    restless_ns: int
+    told: int
     device: Context
     tick: Call
     slack: Call
+    rest: Call
     instants: Integers
     scheduled_ns: int
     began_ns: int
@@ -128,24 +153,70 @@ def record(q: Quiet, ended_ns: int, slack_ns: int) -> int:
 
 @step
 def one_tick(q: Quiet) -> int:
-    """Do a tick. Returns 0 when the loop has to do it, or its slack."""
+    """Do a tick; return what has become of what announced it."""
     began_ns = clock_ns()
     if q.latch[STOPPED] != q.stopped or q.latch[RESETS] != q.resets or q.latch[ORDERS] != q.orders:
-        return 0
+        return LEFT
     if began_ns - q.latch[DAEMON_ALIVE] > q.daemon_lease_ns or began_ns >= q.until_ns:
-        return 0
-    scheduled_ns = q.scheduled_ns + q.period_ns
+        return LEFT
+    scheduled_ns = q.scheduled_ns + q.period_ns * q.periods
     if q.tick(q.device, scheduled_ns, began_ns, q.number + 1):
-        return 0
+        return LEFT
     q.expired = 0
+    q.announced = 0
     q.scheduled_ns = scheduled_ns
     q.began_ns = began_ns
     q.number += 1
     q.done += 1
     ended_ns = clock_ns()
-    q.slackens = q.slack(q.device, ended_ns, scheduled_ns + q.period_ns, 0)
-    record(q, ended_ns, clock_ns() - ended_ns)
-    return 0 if q.slackens else 1
+    if not q.lead_ns:
+        q.slackens = q.slack(q.device, ended_ns, scheduled_ns + q.period_ns, 0)
+        q.worked_ns = clock_ns() - ended_ns
+    record(q, ended_ns, q.worked_ns)
+    if not q.watched and not q.slackens:
+        look_at_rest(q, ended_ns)
+    return HEARD if q.slackens or q.told else DONE
+
+
+@step
+def look_at_rest(q: Quiet, now_ns: int) -> int:
+    """Look whether a device that nobody looks at has come to rest, or moves again."""
+    if not q.rest(q.device, 0, 0, 0):
+        q.restless_ns = now_ns
+        if q.periods > 1:
+            q.told = STIRS
+    elif q.periods == 1 and now_ns - q.restless_ns >= q.rest_ns:
+        q.told = RESTED
+    return 0
+
+
+@step
+def announce(q: Quiet) -> int:
+    """Do the slack of a tick before it, and have the other timer begin it; return what has become of this one."""
+    due_ns = q.scheduled_ns + q.period_ns
+    began_ns = clock_ns()
+    if q.announced or q.slack(q.device, began_ns, due_ns, 0):
+        return LEFT
+    q.expired = 0
+    q.announced = 1
+    q.worked_ns = clock_ns() - began_ns
+    set_timer(q.line_timer, due_ns)
+    return DONE
+
+
+@step
+def heed_timer(q: Quiet, fd: int) -> int:
+    """Do what a timer asks for; return what has become of a descriptor that is ready."""
+    if fd == q.timer:
+        q.expired = expirations(q.timer)
+        if q.expired == 0:
+            return DONE
+        if q.expired != 1:
+            return LEFT
+        return announce(q) if q.lead_ns and q.periods == 1 else one_tick(q)
+    if fd == q.line_timer and q.announced:
+        return one_tick(q) if expirations(q.line_timer) else DONE
+    return LEFT
 
 
 @step
@@ -154,10 +225,11 @@ def run(q: Quiet) -> int:
     q.done = 0
     q.expired = 0
     q.slackens = 0
+    q.told = 0
     while True:
         count = wait_for(q.poll, q.ready)
-        if count != 1 or q.ready[0] != q.timer:
+        if count != 1:
             return count
-        q.expired = expirations(q.timer)
-        if q.expired != 0 and (q.expired != 1 or not one_tick(q)):
-            return 1 if q.expired else 0
+        found = heed_timer(q, q.ready[0])
+        if found:
+            return 1 if found == LEFT else 0

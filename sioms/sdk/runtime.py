@@ -51,7 +51,7 @@ from .pages import Pages
 from .parts import Parts, Service
 from .persistence import keep_positions
 from .quiet import QuietRun, quiet_run
-from .quiet_step import Quiet
+from .quiet_step import RESTED, STIRS, Quiet
 from .rt import ChangeWatch, TimerFd, become_realtime, become_user, name_process
 from .statistics import Reports, TickStatistics
 from .stops import Reason, Stop, Stops
@@ -267,11 +267,12 @@ class Runtime:
 
     def _make_quiet(self) -> QuietRun | None:
         """Return what ticks by compiled steps; None where a tick has to look at more than they do."""
-        if self._lead_ns or self._stops_workcell or self.pages.watch or not self._sees_requests:
+        if self._stops_workcell or self.pages.watch or not self._sees_requests:
             return None
         return quiet_run(
-            self.driver, self._epoll.fileno(), self._timer.fd, self._latch_words, self.period_ns, self._daemon_lease_ns,
-            self.pages, self.stops, self.waits, self.clients, self.statistics,
+            self.driver, self._epoll.fileno(), self._timer.fd, self._line_timer.fd, self._latch_words, self.period_ns,
+            self._lead_ns, self._daemon_lease_ns, self._idling, self.pages, self.stops, self.waits, self.clients,
+            self.statistics,
         )  # fmt: skip
 
     def _watch_requests(self) -> None:
@@ -306,10 +307,11 @@ class Runtime:
     def _wait(self) -> list[int]:
         """Wait for events; return the descriptors that are ready."""
         pause_s = 0.0 if self._control.is_behind else self.turns.pause_s
-        looked_at = self.clients.handles or self._is_used  # else it is soon idle
         ready = None
-        if self._quiet and looked_at and pause_s is None and not self._ending_ns and not self._daemon_late:
-            ready = self._quiet.wait(self._scheduled_ns, self.tick)
+        is_early = self._line_due_ns is not None and not self._announced
+        if self._quiet and pause_s is None and not (is_early or self._ending_ns or self._daemon_late):
+            watched = bool(self.clients.handles) or self._is_used
+            ready = self._quiet.wait(self._scheduled_ns, self.tick, watched, self._announced, self._slack_ns)
         if self._quiet is None or ready is None:
             return [fd for fd, _ in self._epoll.poll(pause_s)]
         self._resume(self._quiet.record)
@@ -318,12 +320,18 @@ class Runtime:
     def _resume(self, quiet: Quiet) -> None:
         """Go on behind ticks that have been done by steps."""
         self._expired = quiet.expired
+        self._announced, self._slack_ns = quiet.announced, quiet.worked_ns
+        self._line_due_ns = quiet.scheduled_ns + self.period_ns if quiet.announced else None
         if not quiet.done:
             return
         self.tick, self.looked_ns = quiet.number, quiet.began_ns
         self._scheduled_ns = self._ticked_ns = quiet.scheduled_ns
         if quiet.slackens and isinstance(self.engine, TickEngine):
             self.engine.slack(time.monotonic_ns(), self._scheduled_ns + self.period_ns)
+        if quiet.told == STIRS:
+            self._wake()
+        elif quiet.told == RESTED:
+            self._be_idle(time.monotonic_ns())
         self._spare_until_ns = self._spare_until(self._scheduled_ns)
 
     def tick_early(self) -> None:
@@ -404,7 +412,11 @@ class Runtime:
         """Tick seldom when nobody looks and nothing has happened for a while."""
         if self._is_used or self._stops_workcell or not engine.is_at_rest():
             self._wake()
-        elif self._idling.rest(now_ns):
+        else:
+            self._be_idle(now_ns)
+
+    def _be_idle(self, now_ns: int) -> None:
+        if self._idling.rest(now_ns):
             idle_ns = self._idling.periods * self.period_ns
             self._timer.set(self._scheduled_ns + idle_ns, idle_ns)
 

@@ -139,3 +139,35 @@ def test_a_driver_that_ticks_seldom_sleeps_before_its_tick() -> None:
         runtime._on_line_timer()
         assert (len(worked), runtime.statistics.ticks) == (1, before + 1)
         world.close()
+
+
+def test_seldom_and_idle_ticks_are_steps() -> None:
+    """Slack before the tick, tick, rest: nothing of it needs the loop, until something happens."""
+    made: list[World] = []
+    with own_time(made):
+        table = {"axis": [axis | {"bandwidth_hz": 5.0} for axis in AXES["axis"]], "tick_hz": 100.0}
+        world = rested(SimAxes, table, made, used=True, ticks=20)
+        before = world.quiet
+        for _ in range(50):
+            world.tick()
+        assert world.quiet - before == 50
+        assert world.runtime.statistics.ticks >= 70
+        client = world.open(0, [0, 1], exclusive=True)
+        record = AXIS_WRITE.pack(
+            *({"control_mode": int(ControlMode.POSITION), "position": 0.1}.get(n, 0) for n in WRITE[NodeClass.AXIS])
+        )
+        client.write(record)
+        bank = world.runtime.blocks[0].bank  # type: ignore[attr-defined]
+        moving = world.quiet
+        for _ in range(300):
+            bank.plan_ahead()  # no time passes between ticks here
+            world.tick()
+        assert world.quiet - moving > 250 and bank._desired[0] == pytest.approx(0.1, abs=1e-9)
+        world.close()
+        world = rested(SimAxes, AXES, made, used=False)
+        assert periods(world) == 40
+        before = world.quiet
+        for _ in range(50):
+            world.tick()
+        assert world.quiet - before == 50 and periods(world) == 40
+        world.close()

@@ -56,9 +56,23 @@ class Cell:
                 self.pages.publish(block, now_ns, self.number, now_ns)
             self.driver.slack(now_ns, now_ns + 10 * PERIOD_NS)
 
-    def by_step(self, now_ns):
+    def rest(self, now_ns, watched=False):
+        """Tick after a while in which nobody looked, and tell whether all is at rest."""
+        self.number += 1
+        if self.steps and self.by_step(now_ns, watched):
+            self.steps.is_ready(watched)
+            rests = self.steps.rest(self.steps.record, 0, 0, 0)
+            self.steps.resume()
+            return bool(rests)
+        self.driver.tick(now_ns)
+        for block in self.driver.blocks:
+            self.pages.publish(block, now_ns, self.number, now_ns)
+        self.driver.slack(now_ns, now_ns + 10 * PERIOD_NS)
+        return self.driver.is_at_rest()
+
+    def by_step(self, now_ns, watched=True):
         steps = self.steps
-        if not steps.is_ready() or not self.pages.lend():
+        if not steps.is_ready(watched) or not self.pages.lend():
             return False
         done = steps.tick(steps.record, now_ns, now_ns, self.number) == 0
         self.quiet += done
@@ -107,6 +121,41 @@ def test_steps_show_what_the_driver_shows(monkeypatch):
             cell.driver.bank.take_events()
     assert quiet.quiet > 2000, "most ticks are steps"
     assert 5000 - quiet.quiet > 200, "and some are not"
+
+
+def test_idle_ticks_by_steps_show_what_those_of_the_driver_show(monkeypatch):
+    monkeypatch.setattr("sioms.drivers.sim.axes._SLACK_NS", -(10**18))
+    plain, quiet = Cell(False), Cell(True)
+    now_ns, idle = 1_000_000_000, 0
+    for cell in (plain, quiet):
+        cell.tick(now_ns)
+    for target in (0.05, -0.05, 0.1):
+        record = np.zeros(1, numpy_dtype(NodeClass.AXIS))
+        record["control_mode"], record["position"] = int(ControlMode.POSITION), target
+        for cell in (plain, quiet):
+            cell.driver.bank.append(record, range(3), now_ns)
+        quiet.quiet = 0
+        for _ in range(1500):
+            now_ns += PERIOD_NS * (40 if idle else 1)
+            rests = [cell.rest(now_ns) for cell in (plain, quiet)]
+            assert rests[0] == rests[1]
+            assert plain.shown() == quiet.shown()
+            idle += rests[0]
+            if idle > 50:
+                break
+        assert idle > 50 and quiet.quiet > 50, "it has come to rest, and was ticked by steps"
+        idle = 0
+
+
+def test_who_is_looked_at_or_has_effects_does_not_rest_by_steps():
+    cell, now_ns = Cell(True), 1_000_000_000
+    for _ in range(100):
+        now_ns += PERIOD_NS
+        cell.rest(now_ns)
+    assert cell.rest(now_ns + PERIOD_NS)
+    assert not cell.rest(now_ns + 2 * PERIOD_NS, watched=True)
+    cell.driver._has_effects = True
+    assert not cell.rest(now_ns + 3 * PERIOD_NS)
 
 
 def test_a_driver_in_plain_python_has_no_steps():
