@@ -282,8 +282,9 @@ async def connect(path: str | None = None, name: str = "") -> AsyncWorkcell:
     """Open a session with the daemon.
 
     Args:
-        path: the daemon's socket, or ``zmq://HOST:PORT`` of a gateway; None for $SIOMS_CELL, $SIOMS_SOCKET or the usual
-            places. Connecting to a gateway takes some milliseconds, in which the loop does nothing else.
+        path: the daemon's socket, or ``zmq://HOST:PORT`` or ``zenoh://HOST:PORT`` of a gateway; None for $SIOMS_CELL,
+            $SIOMS_SOCKET or the usual places. Connecting to a gateway takes some milliseconds, in which the loop does
+            nothing else.
         name: what this client calls itself.
     """
     path = path or cell_address()

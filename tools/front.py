@@ -50,6 +50,7 @@ COMMANDS: dict[str, Command] = {
     "metrics": Command("sioms.bridges.metrics", "serve values, states and alarms to Prometheus"),
     "epics": Command("sioms.bridges.epics", "show nodes to EPICS clients, and let them stop and move axes"),
     "key": Command("sioms.gateway.command", "make, allow, list and revoke the keys of remote clients"),
+    "cert": Command("sioms.gateway.cert_command", "make an authority, and certificates for gateways and clients"),
     "driver": Command("sioms.tools.driver", "list, check, trace and replay drivers"),
     "bench": Command("sioms.bench", "measure latencies and throughput on this machine"),
     "hand": Command("sioms.hand.command", "grasp, regrasp, roll and hold unknown objects by touch"),
@@ -93,8 +94,8 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 EXTRAS = {
-    "gpiod": "gpio", "matplotlib": "report", "numba": "fast", "p4p": "epics", "prometheus_client": "metrics",
-    "zstandard": "record",
+    "cryptography": "net", "gpiod": "gpio", "matplotlib": "report", "numba": "fast", "p4p": "epics",
+    "prometheus_client": "metrics", "zenoh": "net", "zstandard": "record",
 }  # fmt: skip
 """Packages that not everybody needs, and the extra of SIOMS that brings each."""
 

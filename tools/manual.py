@@ -161,7 +161,8 @@ DAEMON_OPTIONS = [
 ]
 STATUS = "0 on success; 1 after a failure, 2 after a wrong command line, each with one line on standard error."
 VARIABLES = (
-    "SIOMS_CELL is the workcell: the path of a socket, or zmq://HOST:PORT of a gateway on another machine. Without it, "
+    "SIOMS_CELL is the workcell: the path of a socket, or zmq://HOST:PORT or zenoh://HOST:PORT of a gateway on another "
+    "machine. Without it, "
     "SIOMS_SOCKET is the daemon's socket; else /run/sioms/siomsd.sock, else one in the user's runtime folder."
 )
 

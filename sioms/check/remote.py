@@ -43,13 +43,19 @@ class Gateway:
         self.folder = tempfile.mkdtemp(prefix="sioms-gateway-")
         self.keys, self.own = Folder(f"{self.folder}/cell"), Folder(f"{self.folder}/own")
         self.name, self._daemon_socket = name, daemon_socket
-        self.public = self.keys.new("gateway").public
-        self.keys.allow(name, self.own.new(name).public, ("crew",))
+        self._keys()
         self.port = free_ports()
         self.socket = self.trusted(self.port)
         self._before = os.environ.get(VARIABLE)
         os.environ[VARIABLE] = self.own.path
         self.start()
+
+    def _keys(self) -> None:
+        self.public = self.keys.new("gateway").public
+        self.keys.allow(self.name, self.own.new(self.name).public, ("crew",))
+
+    def _place(self) -> list[str]:
+        return ["--listen", f"127.0.0.1:{self.port}"]
 
     def trusted(self, port: int) -> str:
         """Return the address of a port of this machine, at which this gateway's key is trusted from now on."""
@@ -58,7 +64,7 @@ class Gateway:
 
     def start(self) -> None:
         """Start the process, which has not been started or has ended."""
-        place = ["--listen", f"127.0.0.1:{self.port}", "--socket", self._daemon_socket, "--keys", self.keys.path]
+        place = [*self._place(), "--socket", self._daemon_socket, "--keys", self.keys.path]
         self.process = Process(["sioms.tools.front", "serve", *place], "event=ready", errors=True)
 
     def __enter__(self) -> Self:
@@ -70,6 +76,48 @@ class Gateway:
         if self._before is not None:
             os.environ[VARIABLE] = self._before
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+class ZenohGateway(Gateway):
+    """The same over Zenoh, with an authority of its own.
+
+    Args:
+        daemon_socket, name: as of ``Gateway``; the name is that of the certificate of the clients.
+        authority: the folder of another gateway's, whose certificates both take; None: one of its own.
+
+    Attributes:
+        number: of the certificate of the clients.
+    """
+
+    def __init__(self, daemon_socket: str, name: str = "eva", authority: Folder | None = None) -> None:
+        from sioms.gateway import certificates
+
+        self._certificates = certificates
+        self._shared = authority
+        super().__init__(daemon_socket, name)
+
+    def _keys(self) -> None:
+        certificates = self._certificates
+        self.authority = self._shared or Folder(f"{self.folder}/authority")
+        if self._shared is None:
+            certificates.new_authority(self.authority, "fleet", 1)
+        self.certify(self.keys, "cell", ("127.0.0.1",))
+        self.number = self.certify(self.own, self.name)
+        self.keys.allow(self.name, self.number, ("crew",))
+
+    def certify(self, folder: Folder, name: str, hosts: tuple[str, ...] = (), days: int = 1) -> str:
+        """Have a certificate for a folder signed by this authority; return its number."""
+        asked = self._certificates.request(folder, name).encode()
+        signed, made = self._certificates.sign(self.authority, asked, hosts, days)
+        self._certificates.install(folder, signed.encode())
+        return made.number
+
+    def _place(self) -> list[str]:
+        return ["--zenoh", f"127.0.0.1:{self.port}"]
+
+    def trusted(self, port: int) -> str:
+        """Return the address of a port of this machine: the certificate vouches for whoever listens there."""
+        return f"zenoh://127.0.0.1:{port}"
 
 
 class Relay:
@@ -139,7 +187,11 @@ class Relay:
 
     def _accept(self, listener: socket.socket) -> None:
         near, _ = listener.accept()
-        far = socket.create_connection(("127.0.0.1", self._to + self._listeners.index(listener)))
+        try:
+            far = socket.create_connection(("127.0.0.1", self._to + self._listeners.index(listener)))
+        except OSError:  # nobody there any more
+            near.close()
+            return
         for sock in (near, far):
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._pairs |= {near: far, far: near}

@@ -151,7 +151,7 @@ def connect(path: str, timeout_s: float = CONNECT_S) -> socket:
 
 
 def connect_channel(address: str, timeout_s: float = CONNECT_S) -> Channel:
-    """Connect to the daemon at the path of its socket, or to a gateway at ``zmq://HOST:PORT``.
+    """Connect to the daemon at the path of its socket, or to a gateway, as ``zmq://HOST:PORT``.
 
     Raises:
         OSError: with a sentence: nobody there, or one does not get in.

@@ -1,11 +1,12 @@
 """A folder of keys: one's own pair, who may come in, and whose gateways one talks to.
 
     secret     NAME PUBLIC SECRET          one's own pair, mode 0600
-    allowed    NAME PUBLIC [GROUP,...]     whom a gateway of this user lets in
+    allowed    NAME PUBLIC [GROUP,...]     whom a gateway of this user lets in; also by the number of a certificate
     trusted    HOST:PORT PUBLIC            the keys of gateways
 
 One entry a line; lines that begin with ``#`` are comments. Keys are CURVE keys in Z85, 40 characters. The folder is of
-its user alone; a file is replaced as a whole, so that who reads it finds the old or the new one.
+its user alone; a file is replaced as a whole, so that who reads it finds the old or the new one. Certificates, for
+Zenoh, have files of their own (``certificates``).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ VARIABLE = "SIOMS_KEYS"
 MOST_BYTES = 1 << 20
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
+_CERTIFICATE = re.compile(r"cert-0[0-9]{3}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +60,16 @@ def checked_name(what: str, name: str) -> str:
     return name
 
 
-def checked_key(what: str, key: str) -> str:
+def checked_holder(what: str, key: str) -> str:
+    """Return a public key or the number of a certificate; raises OSError for what is none."""
+    return key if _CERTIFICATE.fullmatch(key) else checked_key(what, key, " or cert-NNNN of `sioms cert list`")
+
+
+def checked_key(what: str, key: str, other: str = "") -> str:
     """Return a public key; raises OSError for what is none."""
     if not _KEY.fullmatch(key):
-        raise OSError(errno.EINVAL, f"{what}: {key!r} is no public key; want the 40 characters of `sioms key list`")
+        want = f"want the 40 characters of `sioms key list`{other}"
+        raise OSError(errno.EINVAL, f"{what}: {key!r} is no public key; {want}")
     return key
 
 
@@ -95,6 +103,10 @@ class Folder:
         """Return the path of a file of the folder."""
         return os.path.join(self.path, name)
 
+    def check_secret(self, name: str) -> None:
+        """Raise OSError, EPERM, if others may read a file."""
+        self._check(self.file(name), 0o077)
+
     def _lines(self, name: str) -> list[list[str]]:
         path = self.file(name)
         try:
@@ -108,13 +120,17 @@ class Folder:
         return [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
 
     def _write(self, name: str, lines: list[str], mode: int) -> None:
+        self.write(name, "".join(f"{line}\n" for line in lines), mode)
+
+    def write(self, name: str, text: str, mode: int = 0o600) -> None:
+        """Replace a file of the folder as a whole; raises OSError."""
         os.makedirs(self.path, mode=0o700, exist_ok=True)
         self._check(self.path, 0o077)
         made = self.file(f".{name}-{os.getpid()}")
         fd = os.open(made, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
         try:
             with open(fd, "w", encoding="utf-8") as file:
-                file.writelines(f"{line}\n" for line in lines)
+                file.write(text)
                 file.flush()
                 os.fsync(fd)
             os.rename(made, self.file(name))
@@ -171,7 +187,7 @@ class Folder:
             if not 2 <= len(words) <= 3:
                 raise OSError(errno.EINVAL, f"{what}: a line of {len(words)} words; want NAME PUBLIC [GROUP,...]")
             groups = tuple(checked_name(what, group) for group in words[2].split(",")) if words[2:] else ()
-            found.append(Allowed(checked_name(what, words[0]), checked_key(what, words[1]), groups))
+            found.append(Allowed(checked_name(what, words[0]), checked_holder(what, words[1]), groups))
         return found
 
     def allow(self, name: str, public: str, groups: tuple[str, ...] = ()) -> None:
@@ -181,7 +197,7 @@ class Folder:
             OSError: EEXIST, the name is another key's, or the key has another name.
         """
         what = f"allow {name}"
-        entry = Allowed(checked_name(what, name), checked_key(what, public), groups)
+        entry = Allowed(checked_name(what, name), checked_holder(what, public), groups)
         for group in groups:
             checked_name(what, group)
         others = [one for one in self.allowed() if (one.name, one.public) != (name, public)]

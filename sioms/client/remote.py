@@ -1,9 +1,10 @@
-"""The transport to a gateway on another machine: ZeroMQ on one side, on the other the same sockets, pages and pipes as
-of a daemon on this machine.
+"""A session of a link to a gateway on another machine: its frames on one side, on the other the same sockets, pages and
+pipes as of a daemon on this machine.
 
 A thread moves frames between both and writes what it is told into pages; sessions, nodes and channels do not know that
 it is there. It says nothing of its own that would renew a lease: what does is what the program's own calls put
 into the sockets. A session is one connection: when that is lost the session ends, with a last word that says why.
+What carries the frames is a ``Link``: ``zeromq`` or ``zenoh_link``.
 
 Concurrency: one thread a session, which owns everything but the sockets' other ends. A forked child has no such thread.
 """
@@ -16,12 +17,10 @@ import select
 import socket
 import threading
 import time
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from mmap import mmap
-from typing import Any
-
-import zmq
-from zmq.utils.monitor import parse_monitor_message
+from typing import Any, Protocol
 
 from sioms.protocol import link
 from sioms.protocol.clock import Clock, Offset, Wall
@@ -31,17 +30,16 @@ from sioms.protocol.messages import MAX_PACKET, ClientVerb, refusal
 from sioms.protocol.page import REASON_SIZE, PageCopy, page_size
 from sioms.protocol.text import printable
 
-from .keys import Folder
+from .places import place_of
 
-SCHEME = "zmq://"
 STALE_S = 0.2
 """How much older than its driver's lease a reading may get on its way [s]; then it is none."""
 FIRST_PINGS = 8
 STOP_AGAIN_S = 0.3
 """A stop that has not been answered on its own way goes the other one, too, after so long [s]."""
-_WAYS_S = 2.0
+HELLO_AGAIN_S = 0.1
+"""How often a greeting is repeated [s]: a transport may not have made our end of the link known yet."""
 _BUFFER = 1 << 19
-_context: zmq.Context[zmq.Socket[bytes]] | None = None
 
 
 class LinkClock(Clock):
@@ -61,27 +59,41 @@ class LinkClock(Clock):
         return self.offset.error_ns(time.monotonic_ns())
 
 
-def place_of(address: str) -> tuple[str, int]:
-    """Return host and port of ``zmq://HOST:PORT``.
+class Link(Protocol):
+    """What carries frames to a gateway and back, in order, each once, until it is lost.
 
-    Raises:
-        OSError: EINVAL, it is none.
+    Attributes:
+        fds: descriptors that are readable when something has come, or happened.
     """
-    host, colon, port = address.removeprefix(SCHEME).rpartition(":")
-    host = host.removeprefix("[").removesuffix("]")
-    if not address.startswith(SCHEME) or not colon or not host or not port.isdecimal() or not 0 < int(port) < 65535:
-        raise OSError(
-            errno.EINVAL,
-            f"connect to {printable(address)}: want zmq://HOST:PORT, as zmq://lab2:5770, or the path of a socket",
-        )
-    return host, int(port)
+
+    fds: tuple[int, ...]
+
+    def send(self, frame: bytes) -> None:
+        """Send a frame; raises OSError."""
+
+    def stop(self, frame: bytes) -> None:
+        """Send a stop, which overtakes all other frames."""
+
+    def frames(self) -> Iterator[bytes]:
+        """Take what has come."""
+
+    def lost(self, ready: Collection[int], due: bool) -> str:
+        """Return why the link has ended, '' if it has not.
+
+        Args:
+            ready: descriptors that are readable.
+            due: whether to look, whatever those say.
+        """
+
+    def close(self) -> None:
+        """Let go of everything."""
 
 
 def connect(address: str, timeout_s: float) -> tuple[Any, LinkClock]:
     """Open a session of the link.
 
     Args:
-        address: ``zmq://HOST:PORT`` of the gateway.
+        address: ``zmq://HOST:PORT`` or ``zenoh://HOST:PORT`` of the gateway.
         timeout_s: how long that may take [s].
 
     Returns:
@@ -90,54 +102,29 @@ def connect(address: str, timeout_s: float) -> tuple[Any, LinkClock]:
     Raises:
         OSError: with a sentence: no such host, nobody there, a key that is not known, another release.
     """
-    host, port = place_of(address)
+    scheme, host, port = place_of(address)
     what = f"connect to {printable(address)}"
-    folder = Folder()
-    own = folder.own()
-    if own is None:
-        raise OSError(errno.EACCES, f"{what}: you have no key in {folder.path}; make one with: sioms key new")
-    server = folder.trusted().get(f"{host}:{port}")
-    if server is None:
-        raise OSError(
-            errno.EACCES,
-            f"{what}: the key of that gateway is not known here; look it up there with `sioms key list`, and run: "
-            f"sioms key trust {address} KEY",
-        )
-    numeric = _probe(what, host, port, timeout_s)
-    bridge = _Bridge(address, numeric, port, own.public, own.secret, server)
+    deadline = time.monotonic() + timeout_s
+    carrier: Link
+    if scheme == "zmq":
+        from .zeromq import ZmqLink
+
+        carrier = ZmqLink(what, address, host, port, timeout_s)
+    else:
+        try:
+            from .zenoh_link import ZenohLink
+        except ModuleNotFoundError as error:
+            text = f"{what}: {error.name} is not installed; run: pip install 'sioms[net]'"
+            raise OSError(errno.ENOPKG, text) from None
+        carrier = ZenohLink(what, address, host, port, timeout_s)
+    bridge = _Bridge(address, carrier)
     try:
-        bridge.begin(what, timeout_s)
+        bridge.begin(what, deadline)
     except BaseException:
         bridge.release()
         raise
     threading.Thread(target=bridge.run, name=f"sioms {address}", daemon=True).start()
     return bridge.theirs, bridge.clock
-
-
-def _probe(what: str, host: str, port: int, timeout_s: float) -> str:
-    """Return the address at which somebody listens; ZeroMQ itself would go on trying without a word."""
-    try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-    except socket.gaierror as error:
-        raise OSError(
-            errno.EHOSTUNREACH, f"{what}: host {printable(host)} is not known ({error.strerror}); is it spelt right?"
-        ) from None
-    last = OSError(errno.EHOSTUNREACH, "no address")
-    for family, kind, protocol, _, where in found:
-        with socket.socket(family, kind, protocol) as probe:
-            probe.settimeout(timeout_s)
-            try:
-                probe.connect(where)
-            except OSError as error:
-                last = error
-                continue
-            return f"[{where[0]}]" if family == socket.AF_INET6 else str(where[0])
-    number = errno.ETIMEDOUT if isinstance(last, TimeoutError) else last.errno or errno.EIO
-    hint = {
-        errno.ECONNREFUSED: "nobody listens there; start `sioms serve` on that machine, or correct the port",
-        errno.ETIMEDOUT: "no answer; is the machine on, and does its firewall let this port and the next one through?",
-    }.get(number, (last.strerror or str(last)).lower())
-    raise OSError(number, f"{what}: {hint}") from None
 
 
 class _Far:
@@ -191,8 +178,8 @@ class _Far:
 class _Bridge:
     """What the thread does."""
 
-    def __init__(self, address: str, host: str, port: int, public: str, secret: str, server: str) -> None:
-        self._address, self._public = address, public
+    def __init__(self, address: str, carrier: Link) -> None:
+        self._address, self._link = address, carrier
         self.clock = LinkClock()
         self.ours, self.theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.ours.setblocking(False)
@@ -204,73 +191,44 @@ class _Bridge:
         self._stop: tuple[float, bytes] | None = None
         self._last_word: tuple[int, str] | None = None
         self._epoll = select.epoll()
-        self._requests = self._socket(public, secret, server)
-        self._stops = self._socket(public, secret, server)
-        self._monitor = self._requests.get_monitor_socket(
-            zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_HANDSHAKE_FAILED_AUTH
-            | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
-        )  # fmt: skip
-        self._requests.connect(f"tcp://{host}:{port}")
-        self._stops.connect(f"tcp://{host}:{port + 1}")
-
-    def _socket(self, public: str, secret: str, server: str) -> zmq.Socket[bytes]:
-        global _context
-        if _context is None or _context.closed:
-            _context = zmq.Context(1)
-        sock = _context.socket(zmq.DEALER)
-        sock.curve_publickey, sock.curve_secretkey = public.encode(), secret.encode()
-        sock.curve_serverkey = server.encode()
-        for option, value in (
-            (zmq.LINGER, 200), (zmq.RECONNECT_IVL, -1), (zmq.MAXMSGSIZE, link.MAX_FROM_GATEWAY), (zmq.IPV6, 1),
-            (zmq.HANDSHAKE_IVL, 2000),
-        ):  # fmt: skip
-            sock.setsockopt(option, value)
-        return sock
+        for fd in (*carrier.fds, self.ours.fileno()):
+            self._epoll.register(fd, select.EPOLLIN)
 
     # --- beginning -------------------------------------------------------------------------------
 
-    def begin(self, what: str, timeout_s: float) -> None:
-        """Wait until the gateway has let us in, and compare clocks.
+    def begin(self, what: str, deadline: float) -> None:
+        """Have the gateway let us in, and compare clocks.
+
+        Args:
+            what: what is attempted, for messages.
+            deadline: until when [s, time.monotonic].
 
         Raises:
             OSError: why not.
         """
-        deadline = time.monotonic() + timeout_s
-        while True:
-            if not self._monitor.poll(max(0, int(1e3 * (deadline - time.monotonic())))):
-                raise OSError(errno.ETIMEDOUT, f"{what}: whoever listens there does not answer as a gateway does")
-            happened: Any = parse_monitor_message(self._monitor.recv_multipart())
-            if happened["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-                break
-            if happened["event"] == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
-                raise OSError(
-                    errno.EACCES,
-                    f"{what}: the gateway does not let your key in; on its machine run `sioms key allow NAME "
-                    f"{self._public}`",
-                )
-            raise OSError(
-                errno.EACCES,
-                f"{what}: whoever listens there has another key than the one that is trusted here, or is no gateway; "
-                "compare `sioms key list` of both machines",
-            )
         self._send(Up.HELLO, link.VERSION)
-        with suppress(zmq.ZMQError):
-            self._stops.send(link.pack(Up.HELLO), zmq.DONTWAIT)
-            self._stops.getsockopt(zmq.EVENTS)  # from now on its descriptor tells
         while not self._told_ns:
-            self._wait_frame(what, deadline)
+            if not self._wait_frame(what, deadline, HELLO_AGAIN_S):
+                self._link.send(link.pack(Up.HELLO, link.VERSION, 1))
         for _ in range(FIRST_PINGS):
             self._ping()
             exchanged_ns = self._pinged_ns
             while self._pinged_ns == exchanged_ns:
-                self._wait_frame(what, deadline)
+                self._wait_frame(what, deadline, 1.0)
 
-    def _wait_frame(self, what: str, deadline: float) -> None:
-        if not self._requests.poll(max(0, int(1e3 * (deadline - time.monotonic())))):
+    def _wait_frame(self, what: str, deadline: float, at_most_s: float) -> bool:
+        """Wait for frames, and take them; return whether some came."""
+        left_s = deadline - time.monotonic()
+        if left_s <= 0:
             raise OSError(errno.ETIMEDOUT, f"{what}: the gateway does not answer; is it hung?")
-        self._take(self._requests.recv())
+        ready = [fd for fd, _ in self._epoll.poll(min(left_s, at_most_s))]
+        came = self._take_all()
+        if self._last_word is None and (why := self._link.lost(ready, True)):
+            came = self._take_all() or came  # the gateway may have said why
+            self._last_word = self._last_word or (errno.EIO, why)
         if self._last_word is not None:
             raise OSError(self._last_word[0], f"{what}: {self._last_word[1]}")
+        return came
 
     def _ping(self) -> None:
         self._send(Up.PING, body=link.ping(time.monotonic_ns()))
@@ -281,17 +239,12 @@ class _Bridge:
         """Move frames until either side ends the session."""
         try:
             self._run()
-        except (OSError, zmq.ZMQError, MalformedFrame) as error:
+        except (OSError, MalformedFrame) as error:
             self._last_word = self._last_word or (errno.EIO, f"link to {self._address} lost: {error}")
         self._finish()
 
     def _run(self) -> None:
-        requests = int(self._requests.getsockopt(zmq.FD))
-        stops = int(self._stops.getsockopt(zmq.FD))
-        monitor = int(self._monitor.getsockopt(zmq.FD))
         session = self.ours.fileno()
-        for fd in (requests, stops, monitor, session):
-            self._epoll.register(fd, select.EPOLLIN)
         due_ns = 0
         while self._last_word is None:
             ready = [fd for fd, _ in self._epoll.poll(link.PING_S / 2)]
@@ -301,42 +254,41 @@ class _Bridge:
                         return
                 elif fd in self._by_fd:
                     self._from_node(fd)
-            if stops in ready:
-                self._take_from(self._stops)
             now_ns = time.monotonic_ns()
-            if monitor in ready or now_ns >= due_ns or self._stop is not None:
+            due = now_ns >= due_ns or self._stop is not None
+            if why := self._link.lost(ready, due):
+                self._take_all()  # the gateway may have said why
+                self._last_word = self._last_word or (errno.EIO, f"link to {self._address} lost: {why}")
+            if due:
                 self._look(now_ns)
                 due_ns = now_ns + int(link.PING_S * 1e9 / 4)
-            # Last: sending takes the edge off the descriptor of what has come.
-            self._take_from(self._requests)
+            # Last: sending takes the edge off a descriptor of what has come.
+            self._take_all()
 
     def _look(self, now_ns: int) -> None:
         """Do what is due by time."""
-        while int(self._monitor.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
-            happened: Any = parse_monitor_message(self._monitor.recv_multipart())
-            if happened["event"] == zmq.EVENT_DISCONNECTED:
-                self._take_from(self._requests)  # the gateway may have said why
-                text = f"link to {self._address} lost: the connection has ended"
-                self._last_word = self._last_word or (errno.EIO, text)
         if now_ns - self._pinged_ns > link.PING_S * 1e9:
             self._pinged_ns = now_ns
             self._ping()
         if now_ns - self._heard_ns > link.GONE_S * 1e9:
-            self._last_word = (
+            self._last_word = self._last_word or (
                 errno.ETIMEDOUT, f"link to {self._address} lost: nothing came for {link.GONE_S:g} s"
             )  # fmt: skip
         if self._stop is not None and time.monotonic() > self._stop[0]:
             packet, self._stop = self._stop[1], None
             self._send(Up.PACKET, body=packet)
 
-    def _take_from(self, sock: zmq.Socket[bytes]) -> None:
-        """Take what has come."""
-        while int(sock.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
-            self._take(sock.recv(zmq.DONTWAIT))
+    def _take_all(self) -> bool:
+        """Take what has come; return whether something has."""
+        came = False
+        for frame in self._link.frames():
+            self._take(frame)
+            came = True
+        return came
 
     def _send(self, kind: int, channel: int = 0, body: bytes = b"") -> None:
         self._number += 1
-        self._requests.send(link.pack(kind, channel, self._number, self._told_ns, body), zmq.DONTWAIT)
+        self._link.send(link.pack(kind, channel, self._number, self._told_ns, body))
 
     # --- from the program ------------------------------------------------------------------------
 
@@ -352,9 +304,7 @@ class _Bridge:
             return False
         if len(packet) > 1 and packet[1] == ClientVerb.EMERGENCY_STOP:
             self._stop = (time.monotonic() + STOP_AGAIN_S, packet)
-            with suppress(zmq.ZMQError):  # it goes the other way then
-                self._stops.send(link.pack(Up.PACKET, body=packet), zmq.DONTWAIT)
-                self._take_from(self._stops)
+            self._link.stop(link.pack(Up.PACKET, body=packet))
             return True
         self._send(Up.PACKET, 0, packet)
         return True
@@ -439,7 +389,7 @@ class _Bridge:
     def _finish(self) -> None:
         """Tell both sides, and let go of everything."""
         if self._last_word is None:
-            with suppress(zmq.ZMQError):
+            with suppress(OSError):
                 self._send(Up.BYE)
         else:
             word = refusal(0, *self._last_word)
@@ -459,7 +409,5 @@ class _Bridge:
             far.close()
         self._nodes.clear()
         self.ours.close()
-        self._requests.disable_monitor()
-        for sock in (self._monitor, self._requests, self._stops):
-            sock.close()
+        self._link.close()
         self._epoll.close()

@@ -30,8 +30,8 @@ class Workcell(Blocking, WorkcellVerbs[Marker]):
     """A session with the daemon. Use it in a ``with`` block, or close it; the end of the process does.
 
     Args:
-        path: the daemon's socket, or ``zmq://HOST:PORT`` of a gateway; None for $SIOMS_CELL, $SIOMS_SOCKET or the usual
-            places.
+        path: the daemon's socket, or ``zmq://HOST:PORT`` or ``zenoh://HOST:PORT`` of a gateway; None for $SIOMS_CELL,
+            $SIOMS_SOCKET or the usual places.
         name: what this client calls itself in messages and lists.
         enough: tells of a daemon that does not answer at once whether the session is not needed any more.
 

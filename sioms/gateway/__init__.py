@@ -1,6 +1,6 @@
 """The gateway, ``sioms serve``: the workcell for clients on other machines.
 
-``core`` is what every transport has in common: sessions, leases, numbers of frames, what is sent ahead; pure. ``serve``
-is ZeroMQ around it, ``stops`` the way of stops past it. Another transport is another loop around the same core.
-docs/decisions/0210-one-gateway-on-keys-and-leases.md
+``core`` has the sessions: leases, numbers of frames, what is sent ahead; pure. ``serve`` is the loop around it,
+``ways`` ends stops at the daemon. Transports are thin: ``zeromq`` with ``stops``, and ``zenoh``.
+docs/decisions/0210-one-gateway-on-keys-and-leases.md, docs/decisions/0520-zenoh-beside-zeromq.md
 """

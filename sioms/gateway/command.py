@@ -11,10 +11,10 @@ from typing import Any
 
 from sioms.arguments import place
 from sioms.client.keys import Folder
-from sioms.client.remote import SCHEME, place_of
+from sioms.client.places import place_of
 from sioms.protocol.socketpath import socket_path
 
-PLACE = "127.0.0.1:5770"
+PLACE, ZENOH_PLACE = "127.0.0.1:5770", "127.0.0.1:5780"
 
 
 def add_parser(subparsers: Any) -> None:
@@ -23,9 +23,13 @@ def add_parser(subparsers: Any) -> None:
         "serve",
         help="let clients on other machines use the workcell",
         description="A gateway: an ordinary client of the daemon that passes on what the holders of keys ask for, over "
-        "ZeroMQ with CURVE. It listens at PORT, and at the port after it for stops.",
+        "ZeroMQ with CURVE, over Zenoh with certificates, or over both.",
     )
-    serve.add_argument("--listen", metavar="HOST:PORT", default=PLACE, help=f"where; default {PLACE}, *:5770 for all")
+    serve.add_argument(
+        "--listen", metavar="HOST:PORT", help=f"where, over ZeroMQ, and at the port after it for stops; default "
+        f"{PLACE} unless --zenoh is given, *:5770 for all"
+    )  # fmt: skip
+    serve.add_argument("--zenoh", metavar="HOST:PORT", help="where, over Zenoh, *:5780 for all; needs `sioms cert`")
     serve.add_argument("--socket", metavar="PATH", default="", help="the daemon's socket")
     key = subparsers.add_parser("key", help="make, allow, list and revoke the keys of remote clients")
     verbs = key.add_subparsers(dest="verb", required=True, metavar="VERB")
@@ -33,7 +37,11 @@ def add_parser(subparsers: Any) -> None:
     new.add_argument("name", nargs="?", default="", help="default: the user's name")
     allow = verbs.add_parser("allow", help="let the holder of a key in through the gateway of this user")
     allow.add_argument("name", help="what messages and grants call it")
-    allow.add_argument("public", metavar="KEY", help="the public key, of `sioms key list` on the other machine")
+    allow.add_argument(
+        "public",
+        metavar="KEY",
+        help="the public key, of `sioms key list` on the other machine, or a certificate: cert-NNNN",
+    )
     allow.add_argument("--group", action="append", default=[], metavar="NAME", help="a group of grants; again for more")
     trust = verbs.add_parser("trust", help="take a public key for that of a gateway")
     trust.add_argument("address", help="zmq://HOST:PORT")
@@ -59,10 +67,14 @@ def run(args: argparse.Namespace) -> int:
         case "allow":
             folder.allow(args.name, args.public, tuple(args.group))
         case "trust":
-            host, port = place_of(args.address)
+            scheme, host, port = place_of(args.address)
+            if scheme != "zmq":
+                raise OSError(
+                    errno.EINVAL, f"trust {args.address}: over Zenoh the authority of `sioms cert` is trusted"
+                )
             folder.trust(f"{host}:{port}", args.public)
         case "revoke":
-            if not folder.distrust(args.name.removeprefix(SCHEME)):
+            if not folder.distrust(args.name.removeprefix("zmq://")):
                 folder.revoke(args.name)
         case "list":
             _list(folder)
@@ -79,15 +91,18 @@ def _list(folder: Folder) -> None:
 
 
 def _serve(args: argparse.Namespace, folder: Folder) -> None:
-    host, port = place(args.listen, PLACE)
+    zenoh = place(args.zenoh, ZENOH_PLACE) if args.zenoh else None
+    listen = args.listen or (None if zenoh else PLACE)
+    zmq = place(listen, PLACE) if listen else None
     if not folder.allowed():
         hint = f"nobody may come in by the keys in {folder.path}; run: sioms key allow NAME KEY"
-        if not _is_loopback(host):
-            raise OSError(errno.EACCES, f"listen on {args.listen}: {hint}")
+        for host, port in filter(None, (zmq, zenoh)):
+            if not _is_loopback(host):
+                raise OSError(errno.EACCES, f"listen on {host}:{port}: {hint}")
         print(f"sioms serve: {hint}", file=sys.stderr)
     from .serve import serve
 
-    serve(args.socket or socket_path(), host, port, folder)
+    serve(args.socket or socket_path(), folder, zmq=zmq, zenoh=zenoh)
 
 
 def _is_loopback(host: str) -> bool:

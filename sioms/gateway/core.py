@@ -241,6 +241,12 @@ class Gateway:
             if session is not None:
                 self.end(session, errno.EPROTO, f"internal error: {error!r}")
 
+    def gone(self, peer: bytes) -> None:
+        """The connection of a client has ended: what it held halts, and nothing more can be said to it."""
+        if session := self.sessions.get(peer):
+            self._outside.log("info", "session lost", peer=str(session))
+            self._forget(session)
+
     def _begin(self, peer: bytes, who: Principal, host: str, head: tuple[int, int, int], now_ns: int) -> None:
         kind, version, number = head
         if kind != Up.HELLO or number != 1:

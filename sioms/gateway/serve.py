@@ -1,6 +1,6 @@
-"""ZeroMQ around the sessions: one ROUTER under CURVE for requests and readings, and the loop that serves it.
+"""The loop around the sessions: transports bring frames of clients, the daemon and drivers bring packets.
 
-Concurrency: one thread; stops, and the question who may come in at all, have another (``stops``).
+Concurrency: one thread. Stops have others: ``stops``, ``zenoh``.
 """
 
 from __future__ import annotations
@@ -13,32 +13,21 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Protocol
 
-import zmq
-
-from sioms.client.keys import Folder, Pair
+from sioms.client.keys import Folder
 from sioms.client.wall import wall
 from sioms.notify import ServiceManager
-from sioms.protocol import link
 from sioms.protocol.clock import Wall
 from sioms.protocol.text import printable
 
 from .core import Gateway, Line, Node, Principal, Session
-from .inflow import MOST, Inflow
 from .sockets import DaemonLine, OpenNode
-from .stops import DOMAIN, Stops
 
 KEYS_S = 0.1
 """How often the list of keys, and what piles up, are looked at [s]."""
 WALL_S = 1.0
 """How often the wall clock is looked at [s]."""
-TURN = 200
-"""Frames of clients that are taken before others have their turn."""
-QUEUE = 1000
-"""Frames that wait for one client's connection, at most; a session with more has ended."""
-QUEUE_IN = 200
-"""Frames of a client that wait to be taken, at most; more wait at the client."""
-HANDSHAKE_MS = 2000
 
 
 def log(level: str, event: str, **words: object) -> None:
@@ -47,18 +36,36 @@ def log(level: str, event: str, **words: object) -> None:
     print(f"level={level} event={event.replace(' ', '-')} {text}".rstrip(), file=sys.stderr, flush=True)
 
 
-def secured(context: zmq.Context[zmq.Socket[bytes]], kind: int, pair: Pair) -> zmq.Socket[bytes]:
-    """Return a server's socket on which nobody is heard whose key is not allowed."""
-    sock = context.socket(kind)
-    sock.curve_server = True
-    sock.curve_secretkey = pair.secret.encode()
-    sock.zap_domain = DOMAIN
-    for option, value in (
-        (zmq.MAXMSGSIZE, link.MAX_TO_GATEWAY), (zmq.HANDSHAKE_IVL, HANDSHAKE_MS), (zmq.LINGER, 200),
-        (zmq.SNDHWM, QUEUE), (zmq.RCVHWM, QUEUE_IN), (zmq.ROUTER_MANDATORY, 1),
-    ):  # fmt: skip
-        sock.setsockopt(option, value)
-    return sock
+class Transport(Protocol):
+    """What brings frames of clients whose keys it has verified, and takes frames for them.
+
+    Attributes:
+        about: where it listens, for the log.
+        pending: whether frames wait of which no descriptor tells.
+    """
+
+    about: dict[str, str]
+
+    @property
+    def pending(self) -> bool: ...
+
+    def start(self) -> None:
+        """Begin."""
+
+    def owns(self, peer: bytes) -> bool:
+        """Tell whether a peer is one of this transport."""
+
+    def send(self, peer: bytes, frame: bytes) -> bool:
+        """Send a frame to a client; False when it has gone, or takes no more."""
+
+    def take(self) -> bool:
+        """Take frames of clients; return whether there are more."""
+
+    def look(self) -> None:
+        """Do what is due ten times a second."""
+
+    def close(self) -> None:
+        """Let go of everything."""
 
 
 class Keys:
@@ -99,52 +106,40 @@ class Keys:
 
 
 class Serve:
-    """A gateway over ZeroMQ.
+    """A gateway over any number of transports.
 
     Args:
         path: the daemon's socket.
-        host, port: where to listen; stops come in at the port after it.
         folder: of keys.
 
+    Attributes:
+        gateway: the sessions.
+        transports: what carries them.
+
     Raises:
-        OSError: the port is taken, or no such address is ours.
+        OSError: the list of keys is not good.
     """
 
-    def __init__(self, path: str, host: str, port: int, folder: Folder) -> None:
+    def __init__(self, path: str, folder: Folder) -> None:
         self._path = path
         self._epoll = select.epoll()
         self._readable: dict[int, Callable[[], None]] = {}
         self._writable: dict[int, Callable[[], None]] = {}
-        self._known: dict[bytes, tuple[str, str, int]] = {}
-        self._inflow = Inflow()
         self._ending = False
         self._wall, self._wall_ns = wall(), time.monotonic_ns()
         self._keys = Keys(folder)
         self.gateway = Gateway(self, time.monotonic_ns, self._wall_now)
-        pair = folder.own() or folder.new("gateway")
-        self.public = pair.public
-        self._context = zmq.Context(1)
-        self._router = secured(self._context, zmq.ROUTER, pair)
-        stops = secured(self._context, zmq.ROUTER, pair)
-        self._stops = Stops(self._context, stops, path, self._principal, self._inflow, log)
-        bind(self._router, host, port)
-        bind(stops, host, port + 1)
-        self._router_fd = int(self._router.getsockopt(zmq.FD))
-        self.add(self._router_fd, lambda: None)
+        self.transports: list[Transport] = []
 
-    def _principal(self, public: str) -> Principal | None:
+    def principal(self, public: str) -> Principal | None:
+        """Return who holds a key, None: nobody who may come in."""
         return self._keys.by_public.get(public)
 
     # --- core.Outside ----------------------------------------------------------------------------
 
     def send(self, peer: bytes, frame: bytes) -> bool:
         """Send a frame to a client; False when it has gone, or takes no more."""
-        try:
-            self._router.send_multipart((peer, frame), zmq.DONTWAIT)
-        except zmq.ZMQError:
-            self._known.pop(peer, None)
-            return False
-        return True
+        return any(each.owns(peer) and each.send(peer, frame) for each in self.transports)
 
     def connect(self, session: Session) -> Line:
         """Connect to the daemon."""
@@ -196,35 +191,10 @@ class Serve:
             self._wall, self._wall_ns = wall(), now_ns
         return self._wall
 
-    def _take(self) -> bool:
-        """Take frames of clients; return whether there are more."""
-        router, known = self._router, self._known
-        for _ in range(TURN):
-            if not int(router.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
-                return False
-            peer = router.recv()
-            if peer in known and peer in self.gateway.sessions:
-                frame = router.recv()
-            else:
-                first = router.recv(copy=False)
-                known[peer] = (str(first.get("User-Id")), str(first.get("Peer-Address")), int(first.get(zmq.SRCFD)))
-                frame = first.bytes
-            public, host, fd = known[peer]
-            size, more = len(frame), router.getsockopt(zmq.RCVMORE)
-            while router.getsockopt(zmq.RCVMORE):
-                size += len(router.recv())
-            self._inflow.took(fd, size)
-            # A peer that names itself could take over the name of one that has gone: those of ZeroMQ begin with zero.
-            if more or peer[:1] != b"\0":
-                continue
-            self.gateway.frame(peer, self._principal(public), host, frame)
-            if peer not in self.gateway.sessions:
-                known.pop(peer, None)
-        return True
-
     def run(self) -> None:
         """Serve until ``end``."""
-        self._stops.start()
+        for each in self.transports:
+            each.start()
         manager = ServiceManager()
         manager.tell("READY=1")
         keys_ns = fed_ns = 0
@@ -236,15 +206,17 @@ class Serve:
                     call()
                 if event & ~select.EPOLLOUT and (call := self._readable.get(fd)):
                     call()
-            busy = self._take()
+            busy = False
+            for each in self.transports:
+                busy = each.take() or busy
             now_ns = time.monotonic_ns()
             if now_ns >= self.gateway.due_ns:
                 self.gateway.tick()
-                busy = busy or bool(int(self._router.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
+                busy = busy or any(each.pending for each in self.transports)
             if now_ns >= keys_ns:
                 keys_ns = now_ns + int(KEYS_S * 1e9)
-                for fd in self._inflow.look():
-                    log("warning", "connection ended", why=f"more than {MOST} bytes of it wait", descriptor=fd)
+                for each in self.transports:
+                    each.look()
                 if self._keys.look():
                     self.gateway.allow(self._keys.by_public.values())
                     busy = True  # sending takes the edge off the descriptor of what has come
@@ -262,37 +234,33 @@ class Serve:
         """End all sessions, and let go of everything."""
         for session in list(self.gateway.sessions.values()):
             self.gateway.end(session, errno.EIO, "the gateway ends")
-        self._stops.close()
-        self.remove(self._router_fd)
-        self._router.close()
-        self._context.term()
+        for each in self.transports:
+            each.close()
         self._epoll.close()
 
 
-def bind(sock: zmq.Socket[bytes], host: str, port: int) -> None:
-    """Listen.
+def serve(path: str, folder: Folder, *, zmq: tuple[str, int] | None, zenoh: tuple[str, int] | None) -> None:
+    """Serve until SIGTERM or SIGINT.
+
+    Args:
+        path: the daemon's socket.
+        folder: of keys.
+        zmq, zenoh: host and port where each transport listens, None: not at all.
 
     Raises:
-        OSError: with a sentence.
+        OSError: with a sentence: a place that is taken or not ours, no certificate.
     """
-    place = f"[{host}]" if ":" in host else host
-    sock.setsockopt(zmq.IPV6, int(":" in host))
-    try:
-        sock.bind(f"tcp://{place}:{port}")
-    except zmq.ZMQError as error:
-        hint = {
-            errno.EADDRINUSE: "another program listens there; stop it, or choose another port (and the one after it)",
-            errno.ENODEV: "no address of this machine; want one of `ip address`, or * for all",
-            errno.EADDRNOTAVAIL: "no address of this machine; want one of `ip address`, or * for all",
-            errno.EACCES: "no right to that port; choose one above 1023",
-        }.get(error.errno or 0, str(error))
-        raise OSError(error.errno, f"listen on {place}:{port}: {hint}") from None
+    gateway = Serve(path, folder)
+    if zmq is not None:
+        from .zeromq import ZeroMq
 
+        gateway.transports.append(ZeroMq(gateway, path, *zmq, folder))
+    if zenoh is not None:
+        from .zenoh import Zenoh
 
-def serve(path: str, host: str, port: int, folder: Folder) -> None:
-    """Serve until SIGTERM or SIGINT."""
-    gateway = Serve(path, host, port, folder)
+        gateway.transports.append(Zenoh(gateway, path, *zenoh, folder))
     signal.signal(signal.SIGTERM, gateway.end)
     signal.signal(signal.SIGINT, gateway.end)
-    log("info", "ready", address=f"zmq://{host}:{port}", public=gateway.public, keys=folder.path)
+    for each in gateway.transports:
+        log("info", "ready", **each.about, keys=folder.path)
     gateway.run()

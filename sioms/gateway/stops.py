@@ -1,4 +1,5 @@
-"""The way of stops: a port, a thread and sessions at the daemon of their own, so that no other traffic is ahead.
+"""The way of stops over ZeroMQ: a port, a thread and sessions at the daemon of their own, so that no other traffic is
+ahead.
 
 The same thread answers whose keys may come in (ZAP, RFC 27), which ZeroMQ asks before anything of a peer is passed on.
 
@@ -7,67 +8,21 @@ Concurrency: one thread of its own; it shares with the gateway's the list of key
 
 from __future__ import annotations
 
-import errno
 import threading
-import time
 import traceback
 from collections.abc import Callable
-from contextlib import suppress
 
 import zmq
 from zmq.utils import z85
 
-from sioms.client.cell_verbs import request_stop
-from sioms.client.channel import Call, Channel, connect
-from sioms.protocol import link, verbs
-from sioms.protocol.flags import PROTOCOL_VERSION
-from sioms.protocol.link import Down, MalformedFrame, Up
-from sioms.protocol.messages import MalformedMessage, refusal, reply
-from sioms.protocol.stopfile import StopRequest
-from sioms.protocol.text import printable
+from sioms.protocol.link import MalformedFrame
+from sioms.protocol.messages import MalformedMessage
 
 from .core import Principal
 from .inflow import Inflow
+from .ways import Ways
 
 DOMAIN = b"sioms"
-MOST_WAYS = 64
-"""Sessions at the daemon that are kept for the next stop; the oldest gives way."""
-
-
-class Way:
-    """A session at the daemon on behalf of the holder of a key, for stops alone.
-
-    Raises:
-        OSError: the daemon does not take it.
-    """
-
-    def __init__(self, path: str, who: Principal, host: str) -> None:
-        self._channel = Channel(connect(path), "the daemon")
-        self._request: StopRequest | None = None
-        try:
-            self._channel.call(Call("represent", verbs.Represent(who.name, host, list(who.groups))))
-            answer = self._channel.call(Call("hello", verbs.Hello(PROTOCOL_VERSION, "stop")))
-            self._request = StopRequest(*answer.fds) if answer.fds else None
-        except BaseException:
-            self.close()
-            raise
-
-    def stop(self, stop: verbs.EmergencyStop) -> int:
-        """Stop, if need be without the daemon; return the instant from which readings show it [ns]."""
-        why = printable(str(stop.why))
-        taken = request_stop(None if stop.node else self._request, why)
-        try:
-            self._channel.call(Call("emergency stop", stop, enough=taken))
-        except OSError:
-            if taken is None or not taken():
-                raise
-        return time.monotonic_ns()
-
-    def close(self) -> None:
-        """End the session."""
-        self._channel.close()
-        if self._request is not None:
-            self._request.close()
 
 
 class Stops:
@@ -92,11 +47,10 @@ class Stops:
         log: Callable[..., None],
     ) -> None:
         self._sock = sock
-        self._path = path
         self._principal = principal
         self._inflow = inflow
         self._log = log
-        self._ways: dict[tuple[Principal, str], Way] = {}
+        self._ways = Ways(path)
         self._zap = context.socket(zmq.REP)
         self._zap.linger = 0
         self._zap.bind("inproc://zeromq.zap.01")  # before any socket listens: nobody is let in unasked
@@ -128,8 +82,7 @@ class Stops:
                 self._serve(self._judge)
             if self._quit in ready:
                 break
-        for way in self._ways.values():
-            way.close()
+        self._ways.close()
         for each in (self._zap, self._sock, self._quit):
             each.close()
 
@@ -159,34 +112,5 @@ class Stops:
         who, host = self._principal(str(frames[0].get("User-Id"))), str(frames[0].get("Peer-Address"))
         if who is None:
             return  # revoked since it came in
-        kind, _, _, _, packet = link.unpack(frames[0].bytes, link.MAX_TO_GATEWAY)
-        if kind == Up.HELLO:
-            with suppress(OSError):  # it will be tried again, and told, when it matters
-                self._way(who, host)
-            return
-        number, message = verbs.take(packet, verbs.FROM_CLIENT)
-        if kind != Up.PACKET or not isinstance(message, verbs.EmergencyStop):
-            return
-        answer = self._stop(who, host, number, message)
-        self._sock.send_multipart((peer.bytes, link.pack(Down.PACKET, body=answer)), zmq.DONTWAIT)
-
-    def _stop(self, who: Principal, host: str, number: int, message: verbs.EmergencyStop) -> bytes:
-        for attempt in (0, 1):
-            try:
-                return reply(number, None, self._way(who, host).stop(message))
-            except OSError as error:
-                way = self._ways.pop((who, host), None) if error.errno == errno.EIO else None
-                if way is not None:  # the daemon has been started again since
-                    way.close()
-                if way is not None and not attempt:
-                    continue
-                return refusal(number, error.errno or errno.EIO, error.strerror or str(error))
-        raise AssertionError("two attempts")
-
-    def _way(self, who: Principal, host: str) -> Way:
-        way = self._ways.get((who, host))
-        if way is None:
-            way = self._ways[who, host] = Way(self._path, who, host)
-            if len(self._ways) > MOST_WAYS:
-                self._ways.pop(next(iter(self._ways))).close()
-        return way
+        if answer := self._ways.answer(who, host, frames[0].bytes):
+            self._sock.send_multipart((peer.bytes, answer), zmq.DONTWAIT)

@@ -9,7 +9,7 @@ CELL = "SIOMS_CELL"
 
 def cell_address() -> str:
     """Return where a client finds its workcell: $SIOMS_CELL, the path of a socket or the address of a gateway
-    (``zmq://HOST:PORT``), else ``socket_path``.
+    (``zmq://HOST:PORT``, ``zenoh://HOST:PORT``), else ``socket_path``.
     """
     return os.environ.get(CELL) or socket_path()
 

@@ -10,7 +10,7 @@ import pytest
 from daemon_rig import raises
 
 from sioms.client.keys import Folder
-from sioms.client.remote import place_of
+from sioms.client.places import place_of
 from sioms.tools.front import main
 
 A, B = "a" * 40, "b" * 40
@@ -83,7 +83,8 @@ def test_an_address_that_is_none(address: str) -> None:
 
 
 def test_addresses() -> None:
-    assert place_of("zmq://lab2:5770") == ("lab2", 5770) and place_of("zmq://[::1]:5770") == ("::1", 5770)
+    assert place_of("zmq://lab2:5770") == ("zmq", "lab2", 5770) and place_of("zmq://[::1]:5770") == ("zmq", "::1", 5770)
+    assert place_of("zenoh://lab2:5780") == ("zenoh", "lab2", 5780)
 
 
 def test_the_commands(folder: Folder, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import zmq
 
-from sioms.gateway import stops
+from sioms.gateway import ways
 from sioms.gateway.core import Principal
 from sioms.gateway.inflow import Inflow
 from sioms.gateway.stops import Stops
@@ -47,22 +47,22 @@ def test_a_daemon_that_lets_nobody_in_is_told(ends: SimpleNamespace, monkeypatch
     def refused(*_: object) -> None:
         raise OSError(errno.EIO, "the daemon ended during the greeting")
 
-    monkeypatch.setattr(stops, "Way", refused)
+    monkeypatch.setattr(ways, "Way", refused)
     for known in (False, True):
         way = Gone()
         if known:
-            ends.stops._ways[KATE, "lab2"] = way
-        answer = decode_reply(ends.stops._stop(KATE, "lab2", 7, EmergencyStop("", "why")))
+            ends.stops._ways._ways[KATE, "lab2"] = way
+        answer = decode_reply(ends.stops._ways._stop(KATE, "lab2", 7, EmergencyStop("", "why")))
         assert answer[1:4] == [7, errno.EIO, "the daemon ended during the greeting"]
-        assert not ends.stops._ways and way.closed == known
+        assert not ends.stops._ways._ways and way.closed == known
 
 
 def test_a_daemon_that_has_been_started_again_is_asked_again(
     ends: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ends.stops._ways[KATE, "lab2"] = Gone()
-    monkeypatch.setattr(stops, "Way", lambda *_: SimpleNamespace(stop=lambda _: 5, close=lambda: None))
-    answer = decode_reply(ends.stops._stop(KATE, "lab2", 7, EmergencyStop("", "why")))
+    ends.stops._ways._ways[KATE, "lab2"] = Gone()
+    monkeypatch.setattr(ways, "Way", lambda *_: SimpleNamespace(stop=lambda _: 5, close=lambda: None))
+    answer = decode_reply(ends.stops._ways._stop(KATE, "lab2", 7, EmergencyStop("", "why")))
     assert answer[1:3] == [7, 0]
 
 

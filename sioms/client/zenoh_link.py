@@ -1,0 +1,147 @@
+"""The link over Zenoh: one connection under TLS with certificates of both ends; stops overtake by their priority.
+
+Concurrency: the thread of the session; frames come on threads of Zenoh, and are queued.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import socket
+import ssl
+from collections import deque
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+
+import zenoh
+from zenoh.handlers import Callback
+
+from sioms.protocol import link
+from sioms.protocol.link import Up
+
+from .certificates import AUTHORITY, CERTIFICATE, CERTIFICATE_KEY, own
+from .keys import Folder
+from .places import probe
+from .zenoh_keys import ALIVE, DOWN, GATEWAY, STOP, UP, config, endpoint
+
+BLOCKED_US = 1_000_000
+"""How long a frame may wait for a connection that takes none before that is given up [us]."""
+MOST_QUEUED = 64 << 20
+"""Bytes that a gateway may send ahead of this session; more ends it."""
+
+
+class ZenohLink:
+    """See ``remote.Link``.
+
+    Args:
+        what: what is attempted, for messages.
+        address, host, port: of the gateway.
+        timeout_s: how long connecting may take [s].
+
+    Raises:
+        OSError: no such host, nobody there, no certificate, or one that either end does not take.
+    """
+
+    def __init__(self, what: str, address: str, host: str, port: int, timeout_s: float) -> None:
+        folder = Folder()
+        mine = own(folder, what)
+        probe(what, host, port, timeout_s)
+        self._frames: deque[bytes] = deque()
+        self._bytes, self._lost = 0, ""
+        self._came = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self.fds: tuple[int, ...] = (self._came,)
+        connect = {"endpoints": [endpoint(host, port)], "timeout_ms": int(1e3 * timeout_s), "exit_on_failure": True}
+        try:
+            self._session = zenoh.open(config(folder, "connect", BLOCKED_US, mode="client", connect=connect))
+        except zenoh.ZError as error:
+            os.close(self._came)
+            raise _reason(what, host, port, folder, error) from None
+        name = f"{mine.number}/{secrets.token_hex(8)}"
+        session, live = self._session, self._session.liveliness()
+        self._declared = [
+            session.declare_subscriber(f"{DOWN}/{name}", Callback(self._take, indirect=False)),
+            live.declare_subscriber(GATEWAY, Callback(self._gateway, indirect=False), history=True),
+            live.declare_token(f"{ALIVE}/{name}"),
+        ]
+        self._up = self._publisher(f"{UP}/{name}", zenoh.Priority.INTERACTIVE_HIGH)
+        self._stop = self._publisher(f"{STOP}/{name}", zenoh.Priority.REAL_TIME)
+        self.stop(link.pack(Up.HELLO))
+
+    def _publisher(self, key: str, priority: zenoh.Priority) -> zenoh.Publisher:
+        block = zenoh.CongestionControl.BLOCK
+        return self._session.declare_publisher(key, congestion_control=block, priority=priority, express=True)
+
+    # --- threads of Zenoh ------------------------------------------------------------------------
+
+    def _wake(self) -> None:
+        with suppress(OSError):
+            os.eventfd_write(self._came, 1)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        frame = sample.payload.to_bytes()
+        self._bytes += len(frame)
+        self._frames.append(frame)
+        if self._bytes > MOST_QUEUED:
+            self._lost = f"more than {MOST_QUEUED} bytes wait to be taken"
+        self._wake()
+
+    def _gateway(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.DELETE:
+            self._lost = "the connection has ended"
+            self._wake()
+
+    # --- the thread of the session ---------------------------------------------------------------
+
+    def send(self, frame: bytes) -> None:
+        """Send a frame; raises OSError."""
+        try:
+            self._up.put(frame)
+        except zenoh.ZError as error:
+            raise OSError(errno.EIO, str(error)) from None
+
+    def stop(self, frame: bytes) -> None:
+        """Send a stop ahead of all other frames."""
+        with suppress(zenoh.ZError):  # it goes the other way then
+            self._stop.put(frame)
+
+    def frames(self) -> Iterator[bytes]:
+        """Take what has come."""
+        with suppress(BlockingIOError):
+            os.eventfd_read(self._came)
+        while self._frames:
+            frame = self._frames.popleft()
+            self._bytes -= len(frame)
+            yield frame
+
+    def lost(self, ready: Collection[int], due: bool) -> str:
+        """Return why the connection has ended, '' if it has not."""
+        return self._lost
+
+    def close(self) -> None:
+        """Let go of everything."""
+        self._session.close()  # type: ignore[no-untyped-call]
+        os.close(self._came)
+
+
+def _reason(what: str, host: str, port: int, folder: Folder, error: zenoh.ZError) -> OSError:
+    """Return why a connection was not made, which Zenoh does not tell: by a handshake with the same certificates."""
+    try:
+        context = ssl.create_default_context(cafile=folder.file(AUTHORITY))
+        context.load_cert_chain(folder.file(CERTIFICATE), folder.file(CERTIFICATE_KEY))
+        with (
+            socket.create_connection((host, port), 2.0) as plain,
+            context.wrap_socket(plain, server_hostname=host) as sock,
+        ):
+            sock.settimeout(0.5)
+            sock.recv(1)
+    except ssl.SSLCertVerificationError as wrong:
+        text = f"{what}: the certificate of whoever listens there is not taken: {wrong.verify_message}"
+        return OSError(errno.EACCES, f"{text}; it must be signed by the authority of {folder.path} for {host}")
+    except ssl.SSLError as wrong:
+        reason = (wrong.reason or str(wrong)).lower().replace("_", " ")
+        hint = "is it of the same authority as the gateway's, and does it still hold?"
+        return OSError(errno.EACCES, f"{what}: the gateway does not take your certificate ({reason}); {hint}")
+    except OSError:
+        pass
+    return OSError(errno.EIO, f"{what}: whoever listens there does not answer as a gateway over Zenoh does: {error}")

@@ -1,0 +1,90 @@
+"""``sioms cert``: an authority of one's own, and certificates of gateways and clients over Zenoh."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import getpass
+import os
+import sys
+from typing import Any
+
+from sioms.arguments import whole
+from sioms.client.keys import Folder
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add ``cert`` to the subcommands of ``sioms``."""
+    cert = subparsers.add_parser(
+        "cert",
+        help="make an authority, and certificates for gateways and clients over Zenoh",
+        description="One machine has the authority. Every gateway and every client requests a certificate of it, whose "
+        "key never leaves their machine; each gateway lists whose certificates it lets in, by `sioms key allow`.",
+    )
+    verbs = cert.add_subparsers(dest="verb", required=True, metavar="VERB")
+    authority = verbs.add_parser("authority", help="make the authority of a fleet on this machine")
+    authority.add_argument("name", nargs="?", default="fleet", help="default: fleet")
+    authority.add_argument("--days", type=whole(1), default=3650, help="how long it holds; default 3650")
+    request = verbs.add_parser("request", help="make a key of one's own, and print a request for its certificate")
+    request.add_argument("name", nargs="?", default="", help="default: the user's name; of a gateway that of the cell")
+    sign = verbs.add_parser("sign", help="sign a request, and print the certificate")
+    sign.add_argument("file", help="what `sioms cert request` has printed; - for standard input")
+    sign.add_argument(
+        "--host", action="append", default=[], help="a gateway's: name or address it is reached by; again for more"
+    )
+    sign.add_argument("--days", type=whole(1), default=365, help="how long it holds; default 365")
+    install = verbs.add_parser("install", help="take a signed certificate for one's own")
+    install.add_argument("file", help="what `sioms cert sign` has printed; - for standard input")
+    verbs.add_parser("list", help="list one's own certificate, and those that this machine's authority has signed")
+    for each in verbs.choices.values():
+        each.add_argument("--keys", metavar="FOLDER", default="", help="of keys; default $SIOMS_KEYS or the user's own")
+
+
+def _read(path: str) -> bytes:
+    from sioms.client.certificates import MOST_BYTES, read
+
+    if path != "-":
+        return read(path)
+    data = sys.stdin.buffer.read(MOST_BYTES + 1)
+    if len(data) > MOST_BYTES:
+        raise OSError(errno.EFBIG, f"read standard input: more than {MOST_BYTES} bytes; that is no certificate")
+    return data
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out ``cert``."""
+    from . import certificates
+
+    folder = Folder(args.keys)
+    match args.verb:
+        case "authority":
+            certificates.new_authority(folder, args.name, args.days)
+            print(f"authority {args.name} in {folder.path}", file=sys.stderr)
+        case "request":
+            print(certificates.request(folder, args.name or getpass.getuser()), end="")
+        case "sign":
+            text, made = certificates.sign(folder, _read(args.file), tuple(args.host), args.days)
+            print(text, end="")
+            if not made.hosts:
+                print(f"at the gateways: sioms key allow {made.name} {made.number}", file=sys.stderr)
+        case "install":
+            made = certificates.install(folder, _read(args.file))
+            print(f"certificate {made.number} of {made.name}, until {made.ends:%Y-%m-%d}", file=sys.stderr)
+        case "list":
+            _list(folder)
+    return 0
+
+
+def _list(folder: Folder) -> None:
+    from sioms.client.certificates import CERTIFICATE, look_at, read
+
+    from .certificates import issued
+
+    path = folder.file(CERTIFICATE)
+    if os.path.exists(path):
+        own = look_at(read(path), f"read {path}")
+        print(f"own     {own.number} {own.name} {own.ends:%Y-%m-%d} {','.join(own.hosts)}".rstrip())
+    else:
+        print("own     none; request one with: sioms cert request")
+    for words in issued(folder):
+        print(f"signed  {' '.join(words)}")

@@ -1,0 +1,220 @@
+"""A workcell on another machine over Zenoh: certificates, access control, and what a link can do."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+from daemon_rig import Client, Daemon, jog, raises, wait_for
+from zenoh.handlers import Callback
+
+import sioms
+from sioms.bench.watching import Watch, halting_ns
+from sioms.check.remote import Relay, ZenohGateway
+from sioms.client.keys import VARIABLE, Folder
+from sioms.client.zenoh_keys import ALIVE, DOWN, STOP, UP, config, endpoint
+from sioms.gateway import certificates
+from sioms.protocol import link
+from sioms.protocol.link import DEFAULT_LEASE_S, Up
+from sioms.protocol.verbs import EmergencyStop
+
+LATE_NS = int((DEFAULT_LEASE_S + 0.020) * 1e9) + 100_000_000
+"""Within which whatever fails halts what it held, on a machine that runs other tests."""
+
+
+@pytest.fixture(scope="module")
+def gate(shared_daemon: Daemon) -> Iterator[ZenohGateway]:
+    """A gateway to the module's daemon."""
+    with ZenohGateway(shared_daemon.socket) as gateway:
+        yield gateway
+
+
+@pytest.fixture
+def another(gate: ZenohGateway, tmp_path: Path) -> Folder:
+    """Keys of somebody else with a good certificate, whom the gateway lets in as ben."""
+    folder = Folder(str(tmp_path / "ben"))
+    number = gate.certify(folder, "ben")
+    gate.keys.allow(f"ben-{number}", number)
+    return folder
+
+
+def test_the_library_is_the_same(daemon: Daemon, gate: ZenohGateway, cell: sioms.Workcell) -> None:
+    with sioms.Workcell(gate.socket, "far") as remote, remote.open("mod0", "rw", lease=2.0) as arm:
+        arm.move(0.02 if arm.read().position[0] < 0.01 else 0.0)
+        arm.wait_until_idle(5.0)
+        with cell.open("mod0.readonly") as seen:
+            here, there = seen.read(), arm.read()
+        assert there.position == pytest.approx(here.position, abs=1e-4) and there.number >= here.number - 50
+        assert abs(there.stamp_ns - here.stamp_ns) < 1e9 and 0 < there.stamp_error_ns < 50_000_000
+        with raises(errno.EBUSY, "held by eva@127.0.0.1 through sioms serve (far)"):
+            cell.open("mod0", "rw")
+        numbers: list[int] = []
+        while len(numbers) < 200:
+            numbers += [s.number for s in arm.history(numbers[-1] if numbers else arm.read().number)]
+            arm.wait_new(numbers[-1] if numbers else 0, 2.0)
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), "nothing is lost"
+        remote.emergency_stop_workcell("enough")
+        assert "eva@127.0.0.1 through sioms serve" in str(cell.status())
+        remote.reset()
+
+
+@pytest.mark.parametrize("what", ["client killed", "gateway killed", "cut", "stalled"])
+def test_whatever_fails_halts_what_was_held_within_the_lease(
+    what: str, daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client]
+) -> None:
+    with ZenohGateway(daemon.socket) as gate, Relay(gate.port) as relay, cell.open("mod0.xaxis.readonly") as seen:
+        gate.socket = gate.trusted(relay.port)
+        victim = client(gate, jog("mod0.xaxis", 0.2) + "while True:\n    node.keepalive(); time.sleep(0.01)\n")
+        watch = Watch(seen)
+        time.sleep(0.3)
+        assert seen.read().commanded_velocity[0] == pytest.approx(0.2), "who is alive keeps its motion"
+        begin = time.monotonic_ns()
+        if what == "client killed":
+            victim.kill()
+        elif what == "gateway killed":
+            gate.process.kill()
+        elif what == "cut":
+            relay.cut()
+        else:
+            relay.stalled = True
+        assert halting_ns(watch, begin) - begin < LATE_NS
+        relay.stalled = False  # what was held back comes now, in a burst
+        time.sleep(0.3)
+        assert not seen.read().in_motion[0], "nothing resumes"
+        if what != "client killed":
+            victim.wait_line("Error")
+
+
+def _session(gate: ZenohGateway, folder: Folder) -> zenoh.Session:
+    connect = {"endpoints": [endpoint("127.0.0.1", gate.port)], "timeout_ms": 2000, "exit_on_failure": True}
+    return zenoh.open(config(folder, "connect", mode="client", connect=connect))
+
+
+def test_a_certificate_speaks_and_hears_only_for_itself(daemon: Daemon, gate: ZenohGateway, another: Folder) -> None:
+    """Puts, stops, subscriptions and the end of liveliness under another number come to nothing."""
+    heard: list[str] = []
+    with (
+        sioms.Workcell(gate.socket, "far") as far, far.open("mod1", "rw", lease=2.0) as axis,
+        _session(gate, another) as hostile,
+    ):  # fmt: skip
+        subscribers = [
+            hostile.declare_subscriber(
+                key,
+                Callback(lambda sample: heard.append(str(sample.key_expr)), indirect=False),
+                allowed_origin=zenoh.Locality.REMOTE,
+            )
+            for key in (f"{DOWN}/{gate.number}/*", f"{DOWN}/**", "**", f"{UP}/**")
+        ]
+        stop = EmergencyStop("", "not mine to say").packed(1)
+        name = f"{gate.number}/0123456789abcdef"
+        for _ in range(20):
+            hostile.put(f"{UP}/{name}", link.pack(Up.HELLO, link.VERSION, 1))
+            hostile.put(f"{STOP}/{name}", link.pack(Up.PACKET, body=stop))
+            hostile.liveliness().declare_token(f"{ALIVE}/{name}").undeclare()
+            axis.command(position=axis.read().position[0], replace=True)
+        time.sleep(0.2)
+        assert not far.status()["stopped_ns"] and not axis.closed
+        assert not heard, "nobody hears what is for another"
+        assert str(far.status()["sessions"]).count("eva@") == 2, "it, and its way of stops"
+        del subscribers
+
+
+def test_a_frame_that_is_played_again_is_taken_once(daemon: Daemon, gate: ZenohGateway, another: Folder) -> None:
+    number = certificates.look_at(Path(another.file("certificate.pem")).read_bytes(), "test").number
+    name = f"{number}/00000000000000aa"
+    answers: list[int] = []
+    with _session(gate, another) as session:
+        got = Callback(lambda sample: answers.append(sample.payload.to_bytes()[0]), indirect=False)
+        subscriber = session.declare_subscriber(f"{DOWN}/{name}", got)
+        time.sleep(0.2)
+        frames = [link.pack(Up.HELLO, link.VERSION, 1), link.pack(Up.PING, 0, 2, 0, link.ping(5))]
+        for _ in range(10):
+            for frame in frames:
+                session.put(f"{UP}/{name}", frame, congestion_control=zenoh.CongestionControl.BLOCK)
+        wait_for(lambda: link.Down.PONG in answers, "the answer to a ping")
+        time.sleep(0.3)
+        assert answers.count(link.Down.PONG) == 1
+        del subscriber
+
+
+def test_a_frame_that_is_too_large_never_arrives(daemon: Daemon, gate: ZenohGateway, another: Folder) -> None:
+    number = certificates.look_at(Path(another.file("certificate.pem")).read_bytes(), "test").number
+    with _session(gate, another) as session:
+        session.put(f"{UP}/{number}/00000000000000ab", bytes(4 << 20), congestion_control=zenoh.CongestionControl.BLOCK)
+        with sioms.Workcell(gate.socket, "far") as far:
+            assert far.nodes()
+
+
+def test_a_revoked_certificate_is_out_at_once(daemon: Daemon, gate: ZenohGateway, cell: sioms.Workcell) -> None:
+    with sioms.Workcell(gate.socket, "far") as far, far.open("mod1", "rw", lease=10.0):
+        gate.keys.revoke(gate.name)
+        try:
+            with cell.open("mod1", "rw", timeout=2.0):
+                pass
+            with raises(errno.EACCES, "revoked"):
+                far.nodes()
+            with raises(errno.EACCES, f"sioms key allow NAME {gate.number}"):
+                sioms.Workcell(gate.socket)
+        finally:
+            gate.keys.allow(gate.name, gate.number, ("crew",))
+    wait_for(lambda: _lets_in(gate), "the certificate that is allowed again")
+
+
+def _lets_in(gate: ZenohGateway) -> bool:
+    try:
+        sioms.Workcell(gate.socket).close()
+    except OSError:
+        return False
+    return True
+
+
+def test_who_has_no_good_certificate_is_told_why(
+    daemon: Daemon, gate: ZenohGateway, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Folder(str(tmp_path / "keys"))
+    monkeypatch.setenv(VARIABLE, folder.path)
+    with raises(errno.EACCES, "sioms cert request"):
+        sioms.Workcell(gate.socket)
+    gate.certify(folder, "late", days=0)
+    with raises(errno.EKEYEXPIRED, "has expired on"):
+        sioms.Workcell(gate.socket)
+    other = Folder(str(tmp_path / "other"))
+    certificates.new_authority(other, "other", 1)
+    signed, _ = certificates.sign(other, certificates.request(folder, "stranger").encode(), (), 1)
+    with raises(errno.EINVAL, "another authority has signed it"):
+        certificates.install(folder, signed.encode())
+    os.unlink(folder.file("authority.pem"))
+    certificates.install(folder, signed.encode())
+    with raises(errno.EACCES, "the certificate of whoever listens there is not taken"):
+        sioms.Workcell(gate.socket)
+    Path(folder.file("authority.pem")).write_bytes(Path(gate.authority.file("authority.pem")).read_bytes())
+    with raises(errno.EACCES, "does not take your certificate"):
+        sioms.Workcell(gate.socket)
+    monkeypatch.setenv(VARIABLE, gate.own.path)
+    with raises(errno.ECONNREFUSED, "start `sioms serve`"):
+        sioms.Workcell("zenoh://127.0.0.1:9")
+    with raises(errno.EACCES, "is not taken: Hostname mismatch"):
+        sioms.Workcell(f"zenoh://localhost:{gate.port}")
+
+
+def test_a_client_that_takes_nothing_is_let_go_and_others_do_not_wait(
+    daemon: Daemon, gate: ZenohGateway, client: Callable[..., Client]
+) -> None:
+    stuck = client(
+        gate,
+        "node = cell.open('mod0.readonly'); node.subscribe(1)\nprint('ready', flush=True)\nwhile True: time.sleep(1)\n",
+    )
+    stuck.wait_line("ready")
+    os.kill(stuck.pid, signal.SIGSTOP)
+    try:
+        with sioms.Workcell(gate.socket, "far") as far:
+            wait_for(lambda: "victim" not in str(far.status()["sessions"]), "the end of a session that takes nothing")
+            assert far.open("mod1", "rw").read()
+    finally:
+        os.kill(stuck.pid, signal.SIGCONT)
