@@ -33,6 +33,7 @@ from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, BlockSpec
 from sioms.sdk.driver import Awaited, Kit, Refusal
+from sioms.sdk.inputs import NotMeasuredError
 
 if TYPE_CHECKING:
     from sioms.tactile.finger import Finger
@@ -211,14 +212,11 @@ class TactileNodes:
         """Return the load node's reading if it is there, valid and young enough."""
         if not self._settings.load_node:
             return None
-        node = self._kit.inputs[self._settings.load_node]
-        reading = node.read(now_ns)
-        if reading is None or stamp_ns - node.stamp_ns > self._settings.load_age_s * 1e9:
+        oldest_ns = stamp_ns - round(self._settings.load_age_s * 1e9)
+        try:
+            return float(self._kit.inputs[self._settings.load_node].measured(now_ns, oldest_ns)[0])
+        except NotMeasuredError:
             return None
-        flags = reading.get("flags", (0,))
-        if int(flags[0]) & int(AnalogStatus.INVALID | AnalogStatus.SATURATED):
-            return None
-        return float(reading["value"][0])
 
     def _make(self, finger: Finger) -> ShapeSensor:
         from sioms.tactile.sensing import ShapeSensor

@@ -1,7 +1,7 @@
 """Damper control as a script: an axis gives way to the force on a sensor.
 
 The same as damper.sh, at the sensor's own rate and with a lease: should this program hang, the axis
-halts after 250 ms.
+halts after 250 ms. A force that is flagged invalid or saturated raises an error, which closes the axis: it halts.
 """
 
 import sys
@@ -22,7 +22,7 @@ def main(seconds: float) -> None:
         end_ns = snapshot.stamp_ns + int(seconds * 1e9)
         while snapshot.stamp_ns < end_ns:
             snapshot = sensor.wait_new(snapshot.number, timeout=1.0)
-            axis.command(velocity=-GAIN * snapshot.data[0], replace=True)
+            axis.command(velocity=-GAIN * snapshot.measured(), replace=True)
         print(f"at {axis.read().position[0] * 1e3:.2f} mm after {seconds:g} s")
 
 

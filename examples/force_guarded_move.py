@@ -18,7 +18,7 @@ def main() -> None:
         sensor.zero(samples=100)
         axis.command(velocity=0.02)
         snapshot = sensor.read()
-        while abs(snapshot.data[2]) < TOUCH:
+        while abs(snapshot.measured(2)) < TOUCH:  # an error, and the axis halts, if the force is not known
             axis.keepalive()
             snapshot = sensor.wait_new(snapshot.number, timeout=1.0)
         touched = axis.read().position[0]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from sioms.client.node_core import UNREADABLE
 from sioms.protocol import page
-from sioms.protocol.flags import PROTOCOL_VERSION, READONLY, Access, NodeClass, PageState
+from sioms.protocol.flags import PROTOCOL_VERSION, READONLY, Access, AnalogStatus, NodeClass, PageState
 from sioms.protocol.messages import MAX_PACKET
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.records import READ
@@ -46,7 +46,9 @@ def source() -> str:
     numbers = {
         "CHECKSUM": f"{checksum}u", "MOST_SOURCE": max(map(len, texts)), "MAX_PACKET": MAX_PACKET,
         "PAGE_VERSION": page.VERSION, "PAGE_HEADER": page.HEADER_SIZE, "SLOT_HEADER": page.SLOT_HEADER,
-        "NODE_INFO": len(NodeInfo.__slots__), "BINARY": int(NodeClass.BINARY), "DEFAULT_COUNT": devin.DEFAULT_COUNT,
+        "NODE_INFO": len(NodeInfo.__slots__), "BINARY": int(NodeClass.BINARY), "ANALOG": int(NodeClass.ANALOG),
+        "FLAGS": list(READ[NodeClass.ANALOG]).index("flags"), "INVALID": int(AnalogStatus.INVALID),
+        "DEFAULT_COUNT": devin.DEFAULT_COUNT,
         "HELLO_NUMBER": 1, "OPEN_NUMBER": 2,
         **{state.name: int(state) for state in (PageState.STARTING, PageState.GOOD, PageState.STALE)},
     }  # fmt: skip

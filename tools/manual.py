@@ -47,6 +47,7 @@ MANUALS: dict[str, Manual] = {
             "and does not count. With -N anywhere, each sample is a line that begins with the time since the "
             "first sample in seconds and the number of the sample on the schedule. On a busy machine a steady period "
             "requires real-time priority, if permitted: chrt -f 1 devin ...",
+            "A value that is flagged invalid is printed as nan.",
             "--record prints a table for programs: a header with names and units, then one line for each reading that "
             "the driver publishes, without duplicates, with the driver's timestamp. The record of an axis can be read "
             "by "
@@ -93,12 +94,10 @@ MANUALS: dict[str, Manual] = {
             "input but holds outputs and motion until it is interrupted or killed.",
             "With --lease=# the drivers halt the axes if no row arrives for that time, whether devout hangs or the "
             "program before it in the pipe.",
-            "A word that is not a finite number stops devout with an error that gives the line and the word, because "
-            "in a "
-            "stream without lines the meaning of the following numbers is uncertain. With --skip-bad-lines the line "
-            "is skipped instead. Input that ends within an iteration is an error. devout ends immediately if a command "
-            "is "
-            "refused, at an emergency stop, and if a device or the daemon is lost.",
+            "A word that is not a finite number stops devout with an error that gives the line and the word, as in a "
+            "stream without lines the meaning of the following numbers is uncertain. With --skip-bad-lines the line is "
+            "skipped instead, unless the word is nan. Input that ends within an iteration is an error. devout ends "
+            "immediately if a command is refused, at an emergency stop, and if a device or the daemon is lost.",
         ],
         [
             ("move an axis and wait", "devout mod0.xaxis 0.1"),

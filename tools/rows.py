@@ -2,7 +2,8 @@
 
 The formats are those of the examples in section F.4.1. Values are separated by one blank. With N each
 structure is a line, ``0 0 0.0000e+00 0.0000e+00 2.56e+02``, without a blank at its end. Without N every
-value is followed by a blank and there is no newline at all: ``-3.60e+00 ``.
+value is followed by a blank and there is no newline at all: ``-3.60e+00 ``. An analog value that is INVALID is ``nan``,
+so that nothing acts on it in a pipe.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ FIELDS: dict[NodeClass, tuple[tuple[str, str, int | None], ...]] = {
     NodeClass.AXIS: _AXIS, NodeClass.ANALOG: _ANALOG, NodeClass.BINARY: _BINARY,
 }  # fmt: skip
 _CHOICE = "pvfmN"
+_INVALID, _NAN = int(AnalogStatus.INVALID), float("nan")
 
 
 class Rows:
@@ -58,6 +60,7 @@ class Rows:
             self._format = "".join([text + " " for text in formats])
         # One format for all channels of a stream: one operation a sample.
         self._all = self._format * len(self._channels)
+        self._is_analog = info.node_class is NodeClass.ANALOG and "data" in self._names
         self._straight = self._channels == range(len(info.channels))
 
     def text(self, snapshot: Any) -> str:
@@ -65,6 +68,8 @@ class Rows:
         if self.verbose:
             return "".join([self._described(snapshot, i) for i in self._channels])
         columns = [getattr(snapshot, name) for name in self._names]
+        if self._is_analog:
+            columns = [[_NAN if f & _INVALID else v for v, f in zip(columns[0], snapshot.flags, strict=True)]]
         if not self._straight:
             columns = [[column[i] for i in self._channels] for column in columns]
         if self.lines:

@@ -14,7 +14,8 @@ class Tokens:
     """Numbers separated by blanks or newlines, in pieces as they come.
 
     Args:
-        skip_bad_lines: leave out each line that holds anything but numbers, instead of ending there.
+        skip_bad_lines: leave out each damaged line instead of ending there. ``nan`` is no damage: what was to be
+            measured is not known, so that the command before must not go on.
 
     Attributes:
         numbers: (number, line) in order, to be taken from the left by the caller.
@@ -55,7 +56,7 @@ class Tokens:
             except ValueError:
                 shown = word[:40].decode("ascii", "backslashreplace")
                 wrong = f"line {self._line}: {shown!r} is not a finite number"
-                if self._skip:
+                if self._skip and word.lower().lstrip(b"+-") != b"nan":
                     self.skipped.append(f"{wrong}; line skipped")
                     return
                 self.bad = wrong

@@ -19,6 +19,7 @@ and when a coordinate is; after a reset they hold where they are. A target out o
 singular, is refused; in motion the coordinates stop before they come there.
 
 A coordinate with a ``force_node`` takes force commands, if it has a ``damper``: it goes at damper * (wanted - felt).
+When that node has no valid, young reading, all coordinates are in fault at once.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ from sioms.protocol.records import WRITE
 from sioms.sdk.blocks import AxisBlock, BlockSpec, Description
 from sioms.sdk.driver import HeldNode, Kit, TickDriver
 from sioms.sdk.exchange import LinkError
+from sioms.sdk.inputs import NotMeasuredError
 from sioms.sdk.tables import from_table, table_type
 
 MODES = ControlMode(0x7FFF) & ~(
@@ -53,6 +55,7 @@ MODES = ControlMode(0x7FFF) & ~(
 _POSITION, _RELATIVE = int(ControlMode.POSITION), int(ControlMode.RELATIVE)
 _TARGET = list(WRITE[NodeClass.AXIS]).index("position")
 _LATCHED = int(AxisStatus.EMERGENCY_STOP | AxisStatus.FAULT)
+_LOST = int(AxisStatus.POSITION_LOST)
 _SATURATED = int(AxisStatus.SATURATED)
 
 _SETTLE_NS = 250_000_000
@@ -74,6 +77,7 @@ CoordinateTable: Any = table_type(
         "damper": (float, 0.0),
         "force_node": (str, ""),
         "force_scale": (float, 1.0),
+        "force_age_s": (float, 0.1),
         "description": (str, ""),
     },
 )  # fmt: skip
@@ -81,6 +85,7 @@ CoordinateTable: Any = table_type(
 
 ``gain``: how fast an error is brought back [1/s];
 ``force_node``: analog node of one channel with the force along the coordinate [N or N m], times ``force_scale``;
+``force_age_s``: a force that is older stops the coordinates with a fault [s];
 ``damper``: velocity per missing force [unit/(s N) or unit/(s N m)], 0: it takes no force commands.
 """
 
@@ -140,6 +145,8 @@ class Compound(TickDriver):
                     f"axis {axis.name}: damper {axis.damper:g} with force_node {axis.force_node!r}; want a positive "
                     "number and a node, or neither"
                 )
+            if not 0.0 < axis.force_age_s < math.inf:
+                raise ValueError(f"axis {axis.name}: force_age_s {axis.force_age_s:g}; want a positive number of s")
         for given in _settings(cls, settings):
             assert given.modes
         channels = tuple(_channel(cls.COORDINATES[axis.name], axis) for axis in settings.axis)
@@ -240,6 +247,8 @@ class Compound(TickDriver):
         if any(not held.is_there for held in self._held):
             self._lose(str(trouble[0]) if trouble else "an axis is not held any more")
         self.bank.tick(now_ns, np.array(self._at))
+        if status & _LOST:
+            self.bank.lose_place(self._all, "a held axis has lost its place", now_ns)
         loop = self.bank.arrays
         if trouble or (status & _LATCHED and not self._halted):
             self._bear(trouble, now_ns)
@@ -269,6 +278,8 @@ class Compound(TickDriver):
             reading = node.read(now_ns)
             if reading is None:
                 self._lose(f"{name}: its position is not known; want its device up")
+            if not np.isfinite(reading["value"]).all():
+                self._lose(f"{name}: its position is not a finite number")
             joints += reading["value"].tolist()
             load += reading["force"].tolist()
             status |= int(np.bitwise_or.reduce(reading["status"].astype(np.int64)))
@@ -369,11 +380,13 @@ class Compound(TickDriver):
         found = []
         for i, axis in enumerate(self.settings.axis):
             if loop["kind"][i] == FORCE:
-                reading = self.kit.inputs[axis.force_node].read(now_ns)
-                if reading is None:
-                    self.bank.fault(self._all, f"{axis.force_node}: no force is known; want its device up", now_ns)
+                oldest_ns = now_ns - round(axis.force_age_s * 1e9)
+                try:
+                    felt = float(self.kit.inputs[axis.force_node].measured(now_ns, oldest_ns)[0])
+                except NotMeasuredError as unknown:
+                    self.bank.fault(self._all, f"axis {axis.name}: no force is known: {unknown}", now_ns)
                     return [0.0] * self.bank.n
-                felt = float(reading["value"][0]) * axis.force_scale
+                felt *= axis.force_scale
                 rate = axis.damper * (float(loop["actuator"][i]) - felt)
                 most = float(loop["velocity_limit"][i])
                 found.append(min(max(rate, -most), most))

@@ -6,9 +6,10 @@ one time stamp.
 
 from __future__ import annotations
 
+from errno import EIO
 from struct import Struct, unpack_from
 
-from sioms.protocol.flags import NodeClass
+from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.page import SLOT_HEADER
 from sioms.protocol.records import READ
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from sioms.protocol.clock import Clock, Utc
     from sioms.protocol.records import Column
 
+_UNFIT = int(AnalogStatus.INVALID | AnalogStatus.SATURATED)
 _INSTANT = "changed_ns"
 """The column that is an instant by the clock of the cell."""
 
@@ -202,6 +204,27 @@ class AnalogSnapshot(Snapshot):
     """Analog channels in their declared units."""
 
     __slots__ = ()
+
+    def measured(self, channel: int | str = 0) -> float:
+        """Return the value of a channel, for a program that acts on it: a guard, a control law.
+
+        Args:
+            channel: its index or name.
+
+        Raises:
+            OSError: EIO, it is no measurement: flagged INVALID or SATURATED, or not finite.
+        """
+        reading = self[channel]
+        if reading.flags & _UNFIT or reading.data - reading.data != 0.0:
+            names = self._layout.names
+            name = channel if isinstance(channel, str) else names[channel] if names else f"channel {channel}"
+            words = [flag.name.lower() for flag in AnalogStatus if flag & reading.flags and flag.name]
+            raise OSError(
+                EIO,
+                f"read {name}: {reading.data:g}, {' and '.join(words) or 'flagged good'}; want a finite value that is "
+                "neither invalid nor saturated",
+            )
+        return float(reading.data)
 
 
 class BinarySnapshot(Snapshot):

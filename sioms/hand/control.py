@@ -79,7 +79,15 @@ class Controller:
             wanted: internal force f_d [N].
             force: internal force f_a as measured [N].
             sample_s: time since the last sample [s], > 0.
+
+        Raises:
+            ValueError: a coordinate or force is not finite; the hand is to be stopped.
         """
+        if not math.isfinite(sum(goal) + sum(along) + sum(now) + wanted + force):
+            raise ValueError(
+                f"move hand: a force of {force:g} N (wanted {wanted:g} N) at {', '.join(f'{q:g}' for q in now)}; "
+                "want finite numbers"
+            )
         gains = self.gains
         share = 1.0 if gains.filter_s == 0.0 else -math.expm1(-sample_s / gains.filter_s)
         self.felt += share * (force - self.felt)

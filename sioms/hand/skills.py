@@ -437,8 +437,11 @@ class Skills:
         manner = self.manner
         what = self._what
         for i, (finger, age_s) in enumerate(zip(self.now.fingers, self.now.ages_s, strict=True)):
-            if age_s > manner.stale_s or finger.touched is None:
-                why = f"its frame is {age_s:.2f} s old" if age_s > manner.stale_s else "it is blind"
+            unknown = not math.isfinite(finger.force)
+            if not age_s <= manner.stale_s or finger.touched is None or unknown:
+                why = "its force is not known" if unknown else "it is blind"
+                if not age_s <= manner.stale_s:
+                    why = f"its frame is {age_s:.2f} s old"
                 raise Failed(
                     Fault.STALE,
                     f"{what}: finger {i + 1} cannot be relied on: {why}; want a frame every {manner.stale_s:g} s",

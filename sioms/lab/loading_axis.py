@@ -6,9 +6,11 @@ pressed]. The axis' own limits, its guard and the emergency stop hold as ever; w
 
 from __future__ import annotations
 
+import errno
 import math
 import time
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -24,11 +26,14 @@ MOVE_S = 10.0  # longest move
 FEEL_M_S, LEARN_M_S, NEAR = 5e-3, 1e-3, 8
 FELT = 0.1  # of the largest force: the surface has been found
 LEARNT, OVER = 1.08, 1.3  # of the largest force: the way in is known up to there; pressing is stopped
+AGE_S = 0.5  # a force that is older is not known
 SETTLED, TARED = 60, 50  # samples of the force after a move; in a tare
 
 
 class LoadingAxis:
     """Loads a sensor with one axis and measures with one force channel. One thread.
+
+    While it relies on the force, a force that is not measured, or old, ends it with EIO, and the axis stops.
 
     Args:
         axis, force: open nodes; the axis for writing.
@@ -53,7 +58,7 @@ class LoadingAxis:
         """Take the force that is there for none."""
         number = self.force.read().number
         self.watch_for(TARED)
-        self.tare_n = float(np.mean([s.data[0] for s in self.force.history(number)]))
+        self.tare_n = float(np.mean([s.measured() for s in self.force.history(number)]))
 
     def learn(self) -> None:
         """Feel for the surface and learn how far the axis must go for a force; it must be clear, and tared.
@@ -106,16 +111,17 @@ class LoadingAxis:
         """
         limits = node.info.channels[0].limits  # those of a command stay in force until others come
         speed, acceleration = limits["velocity"], limits["acceleration"]
-        taken = node.command(position=position, max_velocity=speed, max_acceleration=acceleration, replace=True)
         deadline = time.monotonic() + MOVE_S
-        while True:
-            time.sleep(POLL_S)
-            self.check(guarded)
-            seen = node.read()
-            if seen.tick > taken and not seen.in_motion[0] and not seen.buffered[0]:
-                return
-            if time.monotonic() > deadline:
-                raise ExperimentStopped(f"move {node.name} to {position:.4g}: not there within {MOVE_S:g} s")
+        with self._stopped_by_errors(node):
+            taken = node.command(position=position, max_velocity=speed, max_acceleration=acceleration, replace=True)
+            while True:
+                time.sleep(POLL_S)
+                self.check(guarded)
+                seen = node.read()
+                if seen.tick > taken and not seen.in_motion[0] and not seen.buffered[0]:
+                    return
+                if time.monotonic() > deadline:
+                    raise ExperimentStopped(f"move {node.name} to {position:.4g}: not there within {MOVE_S:g} s")
 
     def watch_for(self, samples: int) -> None:
         """Wait for so many samples of the force, watching it."""
@@ -136,19 +142,35 @@ class LoadingAxis:
 
         Raises:
             ExperimentStopped: an axis is stopped, or the force is too large.
+            OSError: EIO, the force is not known.
         """
         self.keep_alive()
         for node in self._axes:
             check_running(node.name, node.read())
         most = OVER * self.most_n
         if guarded and not math.isnan(self.tare_n):
-            force = self.net(self.force.history(self.force.read().number - NEAR))
+            newest = self.force.read()
+            age_s = (time.monotonic_ns() - newest.stamp_ns) * 1e-9
+            if age_s > AGE_S:
+                text = f"press {self.axis.name}: the force of {self.force.name} is {age_s:.2f} s old; want {AGE_S:g} s"
+                raise OSError(errno.EIO, text)
+            force = self.net(self.force.history(newest.number - NEAR) or [newest])
             if force > most:
                 raise ExperimentStopped(f"press {self.axis.name}: {force:.3g} N, more than {most:.3g} N")
 
     def net(self, forces: Sequence[Any]) -> float:
-        """Return the mean force less the tare [N]."""
-        return float(sum(s.data[0] for s in forces)) / max(len(forces), 1) - self.tare_n
+        """Return the mean force less the tare [N]; raises OSError, EIO, where one is no measurement."""
+        return float(sum(s.measured() for s in forces)) / max(len(forces), 1) - self.tare_n
+
+    @contextmanager
+    def _stopped_by_errors(self, node: Any) -> Iterator[None]:
+        """Stop an axis before an error is told, whatever it is: nobody watches the force then."""
+        try:
+            yield
+        except BaseException:
+            with suppress(OSError):
+                node.stop()
+            raise
 
     def _feel(self, speed: float, until_n: float) -> tuple[Floats, Floats]:
         """Move in until a force is felt; return positions and forces on the way.
@@ -161,21 +183,22 @@ class LoadingAxis:
         last, force_last = self.axis.read().number, self.force.read().number
         seen: list[Any] = []
         forces: list[Any] = []
-        taken = self.axis.command(
-            position=end, max_velocity=speed, max_acceleration=limits["acceleration"], replace=True
-        )
-        while True:
-            time.sleep(POLL_S)
-            seen += self.axis.history(seen[-1].number if seen else last)
-            forces += self.force.history(forces[-1].number if forces else force_last)
-            self.check()
-            if len(forces) >= NEAR and self.net(forces[-NEAR:]) > until_n:
-                break
-            if seen and seen[-1].tick > taken and not seen[-1].in_motion[0]:
-                raise ExperimentStopped(
-                    f"feel for a surface with {self.axis.name}: no {until_n:.3g} N on {self.force.name} up to "
-                    f"{end:.4g} m; see to the force, the place and what is to be pressed"
-                )
+        with self._stopped_by_errors(self.axis):
+            taken = self.axis.command(
+                position=end, max_velocity=speed, max_acceleration=limits["acceleration"], replace=True
+            )
+            while True:
+                time.sleep(POLL_S)
+                seen += self.axis.history(seen[-1].number if seen else last)
+                forces += self.force.history(forces[-1].number if forces else force_last)
+                self.check()
+                if len(forces) >= NEAR and self.net(forces[-NEAR:]) > until_n:
+                    break
+                if seen and seen[-1].tick > taken and not seen[-1].in_motion[0]:
+                    raise ExperimentStopped(
+                        f"feel for a surface with {self.axis.name}: no {until_n:.3g} N on {self.force.name} up to "
+                        f"{end:.4g} m; see to the force, the place and what is to be pressed"
+                    )
         self.axis.stop()
         stamps = [s.stamp_ns for s in forces]
         at = np.interp(stamps, [s.stamp_ns for s in seen], [s.position[0] for s in seen])

@@ -257,6 +257,11 @@ static char *put_value(char *at, const struct target *t, const struct field *f, 
     double real;
     if (f->real) {
         memcpy(&real, place, 8);
+        if (t->class == ANALOG) {
+            memcpy(&whole, place + 8 * (FLAGS - f->row) * (int64_t)page->channels, 8);
+            if (whole & INVALID)
+                return at + sprintf(at, "nan");
+        }
         return at + (isnan(real) ? sprintf(at, "nan") : sprintf(at, "%.*e", f->digits, real));
     }
     memcpy(&whole, place, 8);

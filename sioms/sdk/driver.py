@@ -54,6 +54,13 @@ class InputNode(Protocol):
         ``value`` is the position of axes and the data of all others; the columns of its record are there, too.
         """
 
+    def measured(self, now_ns: int, since_ns: int = 0) -> NDArray[np.float64]:
+        """Return the values, shape (channels,), for who acts on them: not older than ``since_ns`` [ns].
+
+        Raises:
+            NotMeasuredError: they are not to be relied on, with a sentence (sioms.sdk.inputs).
+        """
+
     def fresh(self, now_ns: int) -> list[tuple[int, Mapping[str, NDArray[Any]]]]:
         """Return all snapshots since the last look, oldest first, as (stamp_ns, readings)."""
 

@@ -10,8 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.protocol.flags import AxisStatus
 from sioms.protocol.page import SLOT_HEADER, NotReadable, PageReader, slot_header
 from sioms.protocol.records import VALUE, read_rows
+
+from .blocks import unfit
+
+_LOST = int(AxisStatus.POSITION_LOST)
+
+
+class NotMeasuredError(ValueError):
+    """A node has no reading that may be relied on; the text names it and says why."""
 
 
 class Input:
@@ -61,6 +70,36 @@ class Input:
         self._number, self.stamp_ns, _ = slot_header(raw)
         return self._readings(reader, raw)
 
+    def measured(self, now_ns: int, since_ns: int = 0) -> NDArray[np.float64]:
+        """Return the values, shape (channels,), for who acts on them: forces, loads, positions.
+
+        Args:
+            now_ns: instant of the tick [ns].
+            since_ns: the oldest time stamp that will do [ns].
+
+        Raises:
+            NotMeasuredError: its device is not there, a reading is flagged INVALID or SATURATED, is not finite, is too
+                old, or is the position of an axis that has lost its place.
+        """
+        reading = self.read(now_ns)
+        if reading is None:
+            raise NotMeasuredError(f"{self.name}: it cannot be read; want its device up")
+        value = np.asarray(reading["value"], dtype=np.float64)
+        why = ""
+        if "flags" in reading and unfit(reading["flags"], value).any():
+            why = f"it reads {_first(value)}, flagged {int(np.bitwise_or.reduce(reading['flags'])):#x}"
+            why += "; want a value that is finite, neither INVALID nor SATURATED"
+        elif not np.isfinite(value).all():
+            why = f"it reads {_first(value)}; want a finite value"
+        elif "status" in reading and int(np.bitwise_or.reduce(reading["status"])) & _LOST:
+            why = "its place is not known; want it homed or calibrated"
+        elif self.stamp_ns < since_ns:
+            why = f"its last reading is {(now_ns - self.stamp_ns) / 1e9:.3f} s old"
+            why += f"; want at most {(now_ns - since_ns) / 1e9:.3f} s"
+        if why:
+            raise NotMeasuredError(f"{self.name}: {why}")
+        return value
+
     def fresh(self, now_ns: int) -> list[tuple[int, Mapping[str, NDArray[Any]]]]:
         """Return all snapshots since the last look, oldest first, as (stamp_ns, readings as of ``read``).
 
@@ -92,3 +131,9 @@ class Input:
             readings["data"] = readings["data"] >> self._bit & 1
         readings["value"] = readings[VALUE[reader.node_class]]
         return readings
+
+
+def _first(values: NDArray[np.float64]) -> str:
+    """Return a value for a message: the first that is not finite, if there is one."""
+    odd = values[~np.isfinite(values)]
+    return f"{(odd if odd.size else values)[0]:g}"

@@ -68,3 +68,13 @@ def test_gains_that_cannot_be_are_refused(name: str) -> None:
         Gains(**{name: 0.0})
     with pytest.raises(ValueError, match="filter_s"):
         Gains(filter_s=-1.0)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_no_rate_comes_out_of_what_is_not_known(bad: float) -> None:
+    law = Controller(Gains())
+    with pytest.raises(ValueError, match="want finite numbers"):
+        law.rates(REST, [0.0] * 6, REST, 0.5, bad, 2.5e-3)
+    with pytest.raises(ValueError, match="want finite numbers"):
+        law.rates(REST, [0.0] * 6, (*REST[:3], bad, *REST[4:]), 0.5, 0.1, 2.5e-3)
+    assert law.felt == 0.0

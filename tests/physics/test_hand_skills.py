@@ -78,6 +78,12 @@ def test_what_cannot_be_grasped_is_refused_before_anything_moves() -> None:
     assert refused(hand, skills)[0] is Fault.STALE
     skills.now = replace(hand.reading, fingers=(replace(hand.reading.fingers[0], touched=None), skills.now.fingers[1]))
     assert refused(hand, skills)[0] is Fault.STALE
+    for unknown in (math.nan, math.inf):
+        first = replace(hand.reading.fingers[0], touched=False, force=unknown)
+        skills.now = replace(hand.reading, fingers=(first, hand.reading.fingers[1]))
+        assert refused(hand, skills)[1].startswith("grasp object: finger 1 cannot be relied on: its force is not known")
+    skills.now = replace(hand.reading, ages_s=(0.0, math.nan))
+    assert refused(hand, skills)[0] is Fault.STALE
     large = PlaneHand(Body(disk(72.5 * MM)), (0.0, 0.0, 0.0), RIG)
     assert "leaves both free" in refused(large, Skills(large.hand, large.tick(_idle(large))))[1]
     far = PlaneHand(Body(disk(20 * MM)), (0.5, 0.0, 0.0), RIG, start=(0.5, 0.0, 0.0, 0.1, math.pi / 2, math.pi / 2))

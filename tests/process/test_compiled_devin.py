@@ -28,6 +28,13 @@ CELL = (
     + '\n[device.gripper0]\ndriver = "sim-io"\noutputs = 8\nsafe = 0xa5\n'
     + '\n[node.atod0]\nof = "lord1"\nchannels = ["fz", "fx"]\n'
 )
+BLIND = (
+    '[workcell]\nname = "blind"\n[device.gone0]\ndriver = "ascii-stream"\nline = { serial = "/dev/nothing" }\n'
+    'columns = ["load"]\nrate_hz = 50.0\nunit = "N"\n'
+    + FORCE.replace("force0", "blind0")
+    + '\n[[device.blind0.contact]]\nnode = "gone0.load"\ndirection = [0, 0, 1]\n'
+)
+"""A sensor whose readings are INVALID: what it feels is not there."""
 LINES = """
 mod0|-p mod0|-v mod0.readonly|-N mod0|-pvfm mod0 atod0|-l1h2p mod0|-l1h2N mod0 -N gripper0 -n1 atod0|-n2pN mod0.xaxis
 gripper0|gripper0.bit0 gripper0.bit2|-p gripper0|-v gripper0|-f lord1|-n1e mod0|-n0 mod0.xaxis
@@ -185,3 +192,12 @@ def test_a_page_has_no_gaps_which_c_would_fill_in() -> None:
         assert at % (1 if code.endswith("s") else size) == 0
         at += size
     assert at == 256
+
+
+def test_what_is_no_measurement_is_nan_either_way(start_daemon: Callable[..., Daemon]) -> None:
+    daemon = start_daemon(BLIND)
+    daemon.wait_up("blind0")
+    for words in (["-h1pN", "blind0"], ["-ph1", "blind0"], ["-t0.001", "-L1", "-h1", "blind0"]):
+        for compiled in (True, False):
+            done = subprocess.run([TOOL, *words], stdout=-1, env=environment(daemon, compiled), timeout=30, check=True)
+            assert re.findall(rb"nan", done.stdout) == [b"nan"] * 2 and b"e" not in done.stdout, done

@@ -225,7 +225,7 @@ class _Show:
             finger.zero(20)
             # However late this program may be to stop it, it presses no deeper than 1.5 mm, with 6 N.
             axis.move(0.0215, max_velocity=0.02, max_acceleration=4.0)
-            while abs(sensor.read().data[2]) < 0.5:
+            while abs(sensor.read().measured(2)) < 0.5:
                 sensor.wait_new(sensor.read().number, PATIENCE_S)
             self._note("touch: force above 0.5 N")
             axis.command(force=6.0, time=0.8, replace=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -12,8 +14,11 @@ import pytest
 from motion_rig import Markers, records
 
 from sioms.drivers.compound.slits import SlitsDriver
-from sioms.protocol.flags import AxisStatus, ControlMode
+from sioms.motion import CommandError
+from sioms.protocol.flags import AnalogStatus, AxisStatus, ControlMode
 from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.sdk.exchange import LinkError
+from sioms.sdk.inputs import Input
 
 TICK_NS = 2_000_000
 DTYPE = np.dtype([("value", float), ("force", float), ("status", np.uint32)])
@@ -28,6 +33,7 @@ class Blades:
 
     def __init__(self) -> None:
         self.at, self.rates, self.most, self.stamp_ns = [-0.1, 0.1], [0.0, 0.0], [1.0, 1.0], 0
+        self.status = 0
 
     def drive(self, velocities: Sequence[float]) -> None:
         self.rates = list(velocities)
@@ -41,7 +47,7 @@ class Blades:
 
     def read(self, now_ns: int) -> Any:
         self.stamp_ns = now_ns
-        return np.array([(value, 0.0, 0) for value in self.at], DTYPE)
+        return np.array([(value, 0.0, self.status) for value in self.at], DTYPE)
 
     def go_on(self) -> None:
         reached = [at + rate * TICK_NS * 1e-9 for at, rate in zip(self.at, self.rates, strict=True)]
@@ -51,10 +57,13 @@ class Blades:
 class Slits:
     """Slits over blades; ``run`` ticks them."""
 
-    def __init__(self, **keys: Any) -> None:
+    def __init__(self, inputs: dict[str, Any] | None = None, **keys: Any) -> None:
         self.blades, self.now_ns = Blades(), 1_000_000_000
         kit: Any = SimpleNamespace(
-            markers=Markers(), held={"blades": self.blades}, inputs={"blades": self.blades}, now_ns=lambda: self.now_ns
+            markers=Markers(),
+            held={"blades": self.blades},
+            now_ns=lambda: self.now_ns,
+            inputs={"blades": self.blades} | (inputs or {}),
         )
         axis = {"velocity_max": 0.2, "acceleration_max": 2.0} | keys
         table = {"axes": ["blades"], "axis": [axis | {"name": name} for name in ("centre", "gap")]}
@@ -98,3 +107,78 @@ def test_a_stop_of_coordinates_that_follow_keeps_their_course() -> None:
 def test_limits_that_cannot_be_are_refused_with_a_sentence() -> None:
     with pytest.raises(ValueError, match="velocity_max 0; want a positive number"):
         Slits(velocity_max=0.0)
+
+
+class Feeler(Input):
+    """A force sensor's node as its page gives it."""
+
+    def __init__(self) -> None:
+        super().__init__("wrist.fz")
+        self.force, self.flags, self.late_ns, self.is_up = 0.0, 0, 0, True
+
+    def read(self, now_ns: int) -> Any:
+        self.stamp_ns = now_ns - self.late_ns
+        return {"value": np.array([self.force]), "flags": np.array([self.flags])} if self.is_up else None
+
+
+def _pressing() -> tuple[Slits, Feeler]:
+    """Return slits that close with 4 N on what gives no way, half a second after they began to."""
+    feeler = Feeler()
+    slits = Slits({"wrist.fz": feeler}, damper=0.01, force_node="wrist.fz", force_max=20.0)
+    slits.bank.append(records(axis=1, mode=ControlMode.FORCE, force=4.0), [0, 1], slits.now_ns)
+    slits.run(0.5)
+    assert slits.blades.rates[1] == pytest.approx(0.5 * 0.01 * 4.0)
+    return slits, feeler
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"flags": int(AnalogStatus.INVALID)}, r"wrist\.fz: it reads 0, flagged 0x2; want .*INVALID"),
+        ({"flags": int(AnalogStatus.SATURATED)}, "flagged 0x1"),
+        ({"force": math.nan}, "it reads nan"),
+        ({"force": -math.inf}, "it reads -inf"),
+        ({"late_ns": 110_000_000}, r"its last reading is 0\.110 s old; want at most 0\.100 s"),
+        ({"is_up": False}, "cannot be read"),
+    ],
+)
+def test_a_force_that_is_not_known_stops_what_relies_on_it_at_once(change: dict[str, Any], why: str) -> None:
+    slits, feeler = _pressing()
+    for name, value in change.items():
+        setattr(feeler, name, value)
+    slits.run(2 * TICK_NS * 1e-9)
+    assert slits.blades.rates == [0.0, 0.0]
+    assert re.search(why, slits.bank.fault_text(1)), slits.bank.fault_text(1)
+    assert (slits.bank.rows["status"] & int(AxisStatus.FAULT)).all()
+    for name in change:
+        setattr(feeler, name, getattr(Feeler(), name))
+    slits.run(0.1)
+    assert slits.blades.rates == [0.0, 0.0]  # nothing goes on by itself
+
+
+def test_a_force_that_is_late_but_young_enough_is_followed() -> None:
+    slits, feeler = _pressing()
+    feeler.late_ns, feeler.flags = 90_000_000, int(AnalogStatus.OVERRUN | AnalogStatus.HIHI)
+    slits.run(0.1)
+    assert slits.blades.rates[1] == pytest.approx(0.5 * 0.01 * 4.0)
+
+
+def test_coordinates_of_an_axis_that_has_lost_its_place_are_lost() -> None:
+    slits = Slits()
+    slits.blades.status = int(AxisStatus.POSITION_LOST)
+    slits.run(0.01)
+    assert (slits.bank.rows["status"] & int(AxisStatus.POSITION_LOST)).all()
+    slits.bank.reset([0, 1])
+    slits.run(0.02)
+    with pytest.raises(CommandError, match="lost its place"):
+        slits.bank.append(records(mode=ControlMode.POSITION, position=0.1), [0], slits.now_ns)
+
+
+def test_a_held_position_that_is_not_a_number_is_a_lost_link() -> None:
+    slits = Slits()
+    slits.bank.append(records(mode=ControlMode.VELOCITY, velocity=0.1), [0], slits.now_ns)
+    slits.run(0.1)
+    slits.blades.at[1] = math.nan
+    with pytest.raises(LinkError, match="blades: its position is not a finite number"):
+        slits.run(0.01)
+    assert slits.blades.rates == [0.0, 0.0]

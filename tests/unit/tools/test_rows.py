@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import math
+
 import pytest
 from tool_rig import AXES, node_info, snapshot
 
-from sioms.protocol.flags import AxisStatus, NodeClass
+from sioms.protocol.flags import AnalogStatus, AxisStatus, NodeClass
 from sioms.tools.options import UsageError, fold
 from sioms.tools.rows import Rows
 
@@ -76,3 +79,29 @@ def test_verbose_overrides_and_names_everything():
 def test_a_structure_that_is_not_there():
     with pytest.raises(UsageError, match="structure 4; want 0 to 3"):
         printed("-n4 mod0")
+
+
+def test_what_is_no_measurement_is_no_number():
+    """A pipe acts on what it reads: an invalid value is none."""
+    analog = snapshot(NodeClass.ANALOG, 3, data=[1.5, 2.5, 3.5], flags=[AnalogStatus.INVALID, AnalogStatus.HIHI, 0])
+    names = ["fx", "fy", "fz"]
+    assert printed("-p lord1", analog, NodeClass.ANALOG, names) == "nan 2.50e+00 3.50e+00 "
+    assert printed("-n0pN lord1", analog, NodeClass.ANALOG, names) == "0 nan\n"
+    assert "data 1.500000e+00" in printed("-V lord1", analog, NodeClass.ANALOG, names)
+
+
+@pytest.mark.parametrize(
+    ("data", "flags", "words"),
+    [
+        (1.0, AnalogStatus.INVALID, "1, invalid"),
+        (2.0, AnalogStatus.SATURATED | AnalogStatus.OVERRUN, "2, saturated and overrun"),
+        (math.nan, 0, "nan, flagged good"),
+        (-math.inf, 0, "-inf, flagged good"),
+    ],
+)
+def test_who_acts_on_a_value_is_told_that_it_is_none(data: float, flags: int, words: str) -> None:
+    reading = snapshot(NodeClass.ANALOG, 2, data=[7.0, data], flags=[0, flags])
+    assert reading.measured() == 7.0
+    with pytest.raises(OSError, match=f"read channel 1: {words}; want a finite value") as caught:
+        reading.measured(1)
+    assert caught.value.errno == errno.EIO

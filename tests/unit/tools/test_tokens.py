@@ -34,7 +34,7 @@ def test_a_wrong_word_ends_the_stream_behind_the_numbers_before_it(word):
 
 
 def test_bad_lines_are_left_out_whole_when_asked():
-    tokens = fed(b"1 2\n3 foo 4\n5 6\nnan\n7 8", b"", skip=True)
+    tokens = fed(b"1 2\n3 foo 4\n5 6\ninf\n7 8", b"", skip=True)
     assert [value for value, _ in tokens.numbers] == [1, 2, 5, 6, 7, 8]
     assert [text.split(":")[0] for text in tokens.skipped] == ["line 2", "line 4"]
     assert not tokens.bad
@@ -42,3 +42,11 @@ def test_bad_lines_are_left_out_whole_when_asked():
 
 def test_a_word_without_end_is_refused_before_it_fills_the_memory():
     assert "without a separator" in fed(b"1" * (MAX_TOKEN + 1)).bad
+
+
+@pytest.mark.parametrize("word", [b"nan", b"NaN", b"-nan"])
+def test_a_value_that_is_not_known_is_never_skipped(word):
+    """devin prints nan for what is no measurement; a velocity that was written before it must not go on."""
+    tokens = fed(b"1\n", word + b"\n2\n", skip=True)
+    assert [value for value, _ in tokens.numbers] == [1.0]
+    assert tokens.bad == f"line 2: '{word.decode()}' is not a finite number" and not tokens.skipped
