@@ -49,6 +49,7 @@ COMMANDS: dict[str, Command] = {
     "serve": Command("sioms.gateway.command", "let clients on other machines use the workcell"),
     "metrics": Command("sioms.bridges.metrics", "serve values, states and alarms to Prometheus"),
     "epics": Command("sioms.bridges.epics", "show nodes to EPICS clients, and let them stop and move axes"),
+    "mount": Command("sioms.bridges.mount.command", "show device nodes as files, for cat, echo, dd and every program"),
     "key": Command("sioms.gateway.command", "make, allow, list and revoke the keys of remote clients"),
     "cert": Command("sioms.gateway.cert_command", "make an authority, and certificates for gateways and clients"),
     "driver": Command("sioms.tools.driver", "list, check, trace and replay drivers"),
@@ -94,8 +95,9 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 EXTRAS = {
-    "cryptography": "net", "gpiod": "gpio", "matplotlib": "report", "numba": "fast", "p4p": "epics",
-    "prometheus_client": "metrics", "zenoh": "net", "zstandard": "record",
+    "bluesky": "bluesky", "cryptography": "net", "gpiod": "gpio", "matplotlib": "report", "mfusepy": "mount",
+    "numba": "fast", "p4p": "epics", "prometheus_client": "metrics", "pyarrow": "parquet", "zenoh": "net",
+    "zstandard": "record",
 }  # fmt: skip
 """Packages that not everybody needs, and the extra of SIOMS that brings each."""
 
