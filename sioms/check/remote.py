@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import random
 import select
 import shutil
 import socket
@@ -129,6 +130,7 @@ class Relay:
     Attributes:
         port: where clients connect.
         delay_s: how long bytes stay on their way [s].
+        jitter_s: how much longer at most, at random [s]; they stay in order.
         stalled: whether nothing comes through; what has been sent comes when it does again.
         doubled: whether every piece comes twice.
 
@@ -136,7 +138,7 @@ class Relay:
     """
 
     def __init__(self, to_port: int) -> None:
-        self.delay_s, self.stalled, self.doubled = 0.0, False, False
+        self.delay_s, self.jitter_s, self.stalled, self.doubled = 0.0, 0.0, False, False
         self.port = free_ports()
         self._pairs: dict[socket.socket, socket.socket] = {}
         self._held: deque[tuple[float, socket.socket, bytes]] = deque()
@@ -203,7 +205,8 @@ class Relay:
             data = b""
         other = self._pairs[sock]
         if data:
-            self._held.append((time.monotonic() + self.delay_s, other, data * (2 if self.doubled else 1)))
+            way_s = self.delay_s + self.jitter_s * random.random()
+            self._held.append((time.monotonic() + way_s, other, data * (2 if self.doubled else 1)))
             return
         for each in (sock, other):
             self._pairs.pop(each, None)

@@ -221,8 +221,9 @@ class _Bridge:
         left_s = deadline - time.monotonic()
         if left_s <= 0:
             raise OSError(errno.ETIMEDOUT, f"{what}: the gateway does not answer; is it hung?")
-        ready = [fd for fd, _ in self._epoll.poll(min(left_s, at_most_s))]
-        came = self._take_all()
+        came = self._take_all()  # first: sending may have taken the edge off a descriptor of what has come
+        ready = [] if came else [fd for fd, _ in self._epoll.poll(min(left_s, at_most_s))]
+        came = self._take_all() or came
         if self._last_word is None and (why := self._link.lost(ready, True)):
             came = self._take_all() or came  # the gateway may have said why
             self._last_word = self._last_word or (errno.EIO, why)

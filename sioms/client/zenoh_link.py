@@ -5,11 +5,13 @@ Concurrency: the thread of the session; frames come on threads of Zenoh, and are
 
 from __future__ import annotations
 
+import atexit
 import errno
 import os
 import secrets
 import socket
 import ssl
+import threading
 from collections import deque
 from collections.abc import Collection, Iterator
 from contextlib import suppress
@@ -59,6 +61,8 @@ class ZenohLink:
             raise _reason(what, host, port, folder, error) from None
         name = f"{mine.number}/{secrets.token_hex(8)}"
         session, live = self._session, self._session.liveliness()
+        self._closing = threading.Lock()
+        atexit.register(self._end)  # or threads of Zenoh would call an interpreter that has ended
         self._declared = [
             session.declare_subscriber(f"{DOWN}/{name}", Callback(self._take, indirect=False)),
             live.declare_subscriber(GATEWAY, Callback(self._gateway, indirect=False), history=True),
@@ -120,8 +124,15 @@ class ZenohLink:
 
     def close(self) -> None:
         """Let go of everything."""
-        self._session.close()  # type: ignore[no-untyped-call]
+        self._end()
+        atexit.unregister(self._end)
         os.close(self._came)
+
+    def _end(self) -> None:
+        """End Zenoh's session; who comes second waits for the first."""
+        with self._closing:
+            if not self._session.is_closed():
+                self._session.close()  # type: ignore[no-untyped-call]
 
 
 def _reason(what: str, host: str, port: int, folder: Folder, error: zenoh.ZError) -> OSError:

@@ -56,7 +56,7 @@ def test_the_library_is_the_same_and_others_hear_whose_it_is(remote: sioms.Workc
         arm.wait_until_idle(5.0)
         with cell.open("mod0.readonly") as seen:
             here, there = seen.read(), arm.read()
-            assert there.position == pytest.approx(here.position, abs=1e-4) and there.number > start.number
+            assert there.position == pytest.approx(here.position, abs=1e-3) and there.number > start.number
         assert abs(there.stamp_ns - here.stamp_ns) < 1e9 and there.stamp_error_ns < 50_000_000
         assert abs(there.utc.ns - time.time_ns()) < 2e9 and here.stamp_error_ns == 0
         with raises(errno.EBUSY, "held by eva@127.0.0.1 through sioms serve (far)"):
