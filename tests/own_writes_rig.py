@@ -209,7 +209,7 @@ class World:
         CLOCK.intrude = self._intrude if self.between else None
         if not self._tick_quietly():
             runtime._on_timer()
-        if runtime._announced:
+        if runtime._announced and not self._tick_quietly():
             runtime._on_line_timer()
         CLOCK.intrude = None
         self.latch.daemon_alive(CLOCK.now_ns)

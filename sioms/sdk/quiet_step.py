@@ -214,7 +214,7 @@ def heed_timer(q: Quiet, fd: int) -> int:
         if q.expired != 1:
             return LEFT
         return announce(q) if q.lead_ns and q.periods == 1 else one_tick(q)
-    if fd == q.line_timer and q.announced:
+    if fd == q.line_timer and q.announced == 1:
         return one_tick(q) if expirations(q.line_timer) else DONE
     return LEFT
 

@@ -152,6 +152,10 @@ def test_seldom_and_idle_ticks_are_steps() -> None:
             world.tick()
         assert world.quiet - before == 50
         assert world.runtime.statistics.ticks >= 70
+        scheduled_ns = world.runtime._scheduled_ns
+        world.tick(skipped=2)
+        world.tick()
+        assert world.runtime._scheduled_ns - scheduled_ns == 4 * world.runtime.period_ns, "ticks that are missed count"
         client = world.open(0, [0, 1], exclusive=True)
         record = AXIS_WRITE.pack(
             *({"control_mode": int(ControlMode.POSITION), "position": 0.1}.get(n, 0) for n in WRITE[NodeClass.AXIS])
