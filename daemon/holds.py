@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .devices import DriverProcess
     from .names import NameTable
     from .node_verbs import NodeVerbs
+    from .server import Server
 
 
 class Holds:
@@ -52,6 +53,19 @@ class Holds:
                         device.send(Held(name, channels), [ours.fileno()])
                     except OSError:
                         nodes.detach(handle)  # the end of the socket here does the same, a little later
+
+    def silent(self, device: DriverProcess, name: str, why: str, server: Server) -> None:
+        """Stop a node whose driver takes no orders from who holds it, past its handles, and end that handle."""
+        session, node = self._sessions.get(device.name), server.names.nodes.get(name)
+        handles = [h for h in session.handles.values() if h.node.name == name] if session is not None else []
+        if node is None or not handles:
+            return  # it has been taken from it meanwhile
+        try:
+            server.stop_node(node, f"device {device.name}: {why}")
+        except OSError as error:
+            server.log("error", "held node not stopped", node=name, by=device.name, why=error.strerror)
+        for handle in handles:
+            server.clients.nodes.detach(handle)
 
     def device_gone(self, device: DriverProcess, nodes: NodeVerbs) -> None:
         """End what a process that is no more has held."""

@@ -226,11 +226,21 @@ class Server:
     def reset_node(self, node: Node, who: str) -> None:
         """Clear the stop and the faults of a node.
 
+        The reset is noted first: a stop that its driver takes after the reset, and notes by itself, is noted after it.
+
         Raises:
             OSError: EIO, its driver takes no messages.
         """
-        self._order(node, driver_verbs.NodeReset, who)
+        record = self.shared.record
+        record.look()
+        before = [entry for entry in record.state.entries() if entry.get("device") == node.device]
         self._note(self._node_entry(node, who, stop=False))
+        try:
+            self._order(node, driver_verbs.NodeReset, who)
+        except OSError:
+            for entry in before:
+                self._note(entry)
+            raise
         self.log("warning", "reset", node=node.name, by=who)
 
     def _order(self, node: Node, order: type[driver_verbs.NodeStop | driver_verbs.NodeReset], source: str) -> None:
@@ -377,6 +387,8 @@ class Server:
             case driver_verbs.AlarmChanged(block, channel, bit, what, severity, text):
                 node = part_name(device.info, block, channel, bit)
                 self.alarms.take(node, device.name, what, severity, text)
+            case driver_verbs.HeldSilent(name, why):
+                self._holds.silent(device, name, why, self)
             case driver_verbs.LogLine(level, text):
                 if text.startswith("fault of "):
                     device.trouble = text

@@ -73,7 +73,7 @@ from sioms.daemon.loop import Loop
 from sioms.daemon.rights import Peer
 from sioms.daemon.server import Server
 from sioms.daemon.stop_record import StopRecord
-from sioms.motion.bank import EMERGENCY_STOP
+from sioms.motion.queue import EMERGENCY_STOP
 from sioms.protocol.flags import PROTOCOL_VERSION, Request
 from sioms.protocol.messages import MAX_PACKET, ClientVerb, HandleVerb, decode, encode
 from sioms.protocol.records import BINARY_WRITE

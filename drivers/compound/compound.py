@@ -60,9 +60,6 @@ _SATURATED = int(AxisStatus.SATURATED)
 
 _SETTLE_NS = 250_000_000
 """How long the error of coordinates at rest is brought back before the held axes hold by themselves."""
-_BEAR_NS = 500_000_000
-"""How long after a reset held axes may still be stopped: theirs comes a little later, or is sent again."""
-_AGAIN_NS = 50_000_000
 _LATE = 4
 """Ticks by which held axes may follow late."""
 
@@ -171,8 +168,8 @@ class Compound(TickDriver):
         self._all = np.arange(self.bank.n)
         self._joints: list[float] = []
         self._at: list[float] = []
-        self._reset_ns = self._again_ns = 0
         self._moved_ns = 0
+        self._seen_ns = dict.fromkeys(settings.axes, 0)
         self._drives = False
         self._halted = False
 
@@ -251,11 +248,12 @@ class Compound(TickDriver):
             self.bank.lose_place(self._all, "a held axis has lost its place", now_ns)
         loop = self.bank.arrays
         if trouble or (status & _LATCHED and not self._halted):
-            self._bear(trouble, now_ns)
+            text = str(trouble[0].strerror) if trouble else "a held axis is stopped or in fault"
+            self.bank.fault(self._all, text, now_ns)
         if np.count_nonzero(loop["latched"] & _LATCHED):
             self._halt(now_ns)
         elif self._halted:
-            self._go_on(status, now_ns)
+            self._go_on()
         else:
             self._move(now_ns)
         self.bank.rows["force"][:] = forces(self._map, self._at, load)
@@ -266,6 +264,8 @@ class Compound(TickDriver):
 
     def _read(self, now_ns: int) -> tuple[int, list[float]]:
         """Take the positions of the held axes; return their status together, and their forces.
+
+        A stop or fault from before the end of a reset that has been sent does not count.
 
         Raises:
             LinkError: one is lost, or the coordinates mean nothing there.
@@ -282,7 +282,8 @@ class Compound(TickDriver):
                 self._lose(f"{name}: its position is not a finite number")
             joints += reading["value"].tolist()
             load += reading["force"].tolist()
-            status |= int(np.bitwise_or.reduce(reading["status"].astype(np.int64)))
+            shown = int(np.bitwise_or.reduce(reading["status"].astype(np.int64)))
+            status |= shown if node.as_of_ns >= self.kit.held[name].shows_reset_ns else shown & ~_LATCHED
             stamp_ns = min(stamp_ns, node.stamp_ns)
         try:
             found = list(self._map.forward(joints))
@@ -303,21 +304,13 @@ class Compound(TickDriver):
             held.stop()
         self._drives = False
 
-    def _bear(self, trouble: Sequence[OSError], now_ns: int) -> None:
-        """Put the coordinates in fault for what happened to a held axis; shortly after a reset, reset it again."""
-        if now_ns - self._reset_ns > _BEAR_NS:
-            text = str(trouble[0].strerror) if trouble else "a held axis is stopped or in fault"
-            self.bank.fault(self._all, text, now_ns)
-        elif now_ns - self._again_ns > _AGAIN_NS:
-            self._again_ns = now_ns
-            for held in self._held:
-                held.reset()
-
     def _halt(self, now_ns: int) -> None:
         """Let everything stand as long as a coordinate is latched: all are, then."""
         if not self._halted:
             self._stop()
         self._halted = True
+        for name in self.settings.axes:
+            self._seen_ns[name] = self.kit.inputs[name].as_of_ns
         latched = self.bank.arrays["latched"] & _LATCHED
         if not latched.all():
             axis = int(latched.argmax())
@@ -326,12 +319,15 @@ class Compound(TickDriver):
             self.bank.fault(np.flatnonzero(latched == 0), f"{name} was halted ({why}); reset all together", now_ns)
         self.bank.let_go(self._all)
 
-    def _go_on(self, status: int, now_ns: int) -> None:
-        """Begin again after a reset: the bank holds where it is, the held axes are reset, too."""
-        self._halted, self._reset_ns, self._again_ns, self._moved_ns = False, now_ns, now_ns, 0
-        if status & _LATCHED:
-            for held in self._held:
-                held.reset()
+    def _go_on(self) -> None:
+        """Begin again after a reset: the bank holds where it is, the held axes are reset, too.
+
+        They are reset after what they showed while the coordinates were halted: whatever has stopped them since is not
+        what has been reset.
+        """
+        self._halted, self._moved_ns = False, 0
+        for held in self._held:
+            held.reset(self._seen_ns[held.name])
 
     def _move(self, now_ns: int) -> None:
         bank, loop = self.bank, self.bank.arrays

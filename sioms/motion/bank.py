@@ -24,13 +24,12 @@ from sioms.protocol.records import READ, read_rows
 from .arrival import Arrivals
 from .commands import WIRE_DTYPE, Command
 from .plain import MOST
-from .queue import LOST, AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
+from .queue import EMERGENCY_STOP, LOST, AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
 from .settings import AxisSettings
 from .store import NEVER_NS
 from .types import CommandError, Event, EventKind, Keeper, MarkerPort
 
 Axes = NDArray[np.int64]
-EMERGENCY_STOP, FAULT = int(AxisStatus.EMERGENCY_STOP), int(AxisStatus.FAULT)
 
 
 class Written(NamedTuple):
@@ -240,6 +239,7 @@ class Bank(ABC):
     def emergency_stop(self, axes: AxesLike, now_ns: int) -> None:
         """Empty the buffers and stop the fastest way there is; latched: writes are refused (EPERM) until reset()."""
         chosen = np.asarray(axes, dtype=np.int64)
+        self._queue.latched_ns[chosen] = now_ns
         fresh = chosen[(self._queue.latched[chosen] & EMERGENCY_STOP) == 0]
         if not fresh.size:
             return
@@ -274,6 +274,18 @@ class Bank(ABC):
     def fault_text(self, axis: int) -> str:
         """Return why an axis is in fault, empty when it is not."""
         return self._queue.fault_text(axis)
+
+    def check_reset(self, axes: AxesLike, until_ns: int) -> None:
+        """Refuse a reset that is based on a reading, if there is more to be reset by now.
+
+        Args:
+            axes: which.
+            until_ns: the instant up to which that reading was complete [ns].
+
+        Raises:
+            CommandError: EAGAIN, one of them was stopped or put in fault at until_ns or later, and is so still.
+        """
+        self._queue.check_reset(np.asarray(axes, dtype=np.int64), until_ns)
 
     def reset(self, axes: AxesLike) -> None:
         """Clear emergency stop and fault, a drive's own too; axes that were let go, and steppers that lost steps, hold

@@ -20,10 +20,10 @@ from sioms.protocol.flags import AxisStatus
 from . import modes
 from .actions import ActionKind, DriveAction
 from .arrival import Approach
-from .bank import EMERGENCY_STOP, FAULT, Axes, Bank
+from .bank import Axes, Bank
 from .commands import Command, is_point_move
 from .profile import InfeasibleError
-from .queue import LOST, AxesLike
+from .queue import EMERGENCY_STOP, FAULT, LOST, AxesLike
 from .settings import AxisSettings
 from .store import NEVER_NS
 from .types import EventKind, MarkerPort

@@ -16,12 +16,12 @@ from sioms.protocol.flags import AxisStatus
 
 from . import axis_step
 from .axis_step import FORCE, HOLD, SETTLING, STOP
-from .bank import FAULT, Axes, Bank
+from .bank import Axes, Bank
 from .guard import LimitGuard
 from .homing import HomingRuns
 from .host_watch import HostWatch
 from .law import ControlLaw
-from .queue import LOST
+from .queue import FAULT, LOST
 from .sequencer import Sequencer
 from .settings import SWITCH_MINUS, SWITCH_PLUS, AxisSettings
 from .store import PlanStore

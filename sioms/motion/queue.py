@@ -28,6 +28,7 @@ AxesLike = Sequence[int] | NDArray[np.int64]
 LimitValue = float | None | Sequence[float | None]
 BARRED, HOMED = int(AxisStatus.EMERGENCY_STOP | AxisStatus.FAULT | AxisStatus.HOMING), int(AxisStatus.HOMED)
 LOST = int(AxisStatus.POSITION_LOST)
+EMERGENCY_STOP, FAULT = int(AxisStatus.EMERGENCY_STOP), int(AxisStatus.FAULT)
 LIMIT_NAMES = ("position_min", "position_max", "velocity_max", "acceleration_max", "jerk_max", "force_max")
 
 PIECE = 256
@@ -73,7 +74,8 @@ class CommandQueue:
     """The waiting commands of n axes. The *head* of an axis is the command that runs next.
 
     Arrays (n,): ``gated_synch`` and ``gated_marker`` say what the head waits for, ``latched`` holds
-    the persistent AxisStatus bits (HOMED, FAULT, EMERGENCY_STOP, FOLLOWING_ERROR, STALLED, HOMING, POSITION_LOST).
+    the persistent AxisStatus bits (HOMED, FAULT, EMERGENCY_STOP, FOLLOWING_ERROR, STALLED, HOMING, POSITION_LOST),
+    ``latched_ns`` when an axis came into fault or was last stopped, even if it was stopped already [ns].
     """
 
     def __init__(
@@ -88,6 +90,7 @@ class CommandQueue:
         self.gated_synch = np.zeros(self.n, dtype=bool)
         self.gated_marker = np.zeros(self.n, dtype=bool)
         self.latched = np.zeros(self.n, dtype=np.int64)
+        self.latched_ns = np.zeros(self.n, dtype=np.int64)
         self.home_required = np.array([s.homing is not None and s.homing.required for s in settings], dtype=bool)
         self._buffers = CommandBuffers(self.n, capacity)
         self.waiting = self._buffers.count
@@ -446,10 +449,11 @@ class CommandQueue:
 
     def latch_fault(self, axes: NDArray[np.int64], text: str, now_ns: int, errno_: int = errno.EIO) -> None:
         """Set the fault latch of these axes with its reason; the first reason stays."""
-        fresh = axes[(self.latched[axes] & int(AxisStatus.FAULT)) == 0]
+        fresh = axes[(self.latched[axes] & FAULT) == 0]
         if not fresh.size:
             return
-        self.latched[fresh] |= int(AxisStatus.FAULT)
+        self.latched[fresh] |= FAULT
+        self.latched_ns[fresh] = now_ns
         for axis in fresh.tolist():
             self._fault_text[axis] = text
         self.emit(EventKind.FAULT, fresh, now_ns, errno_, text)
@@ -479,6 +483,19 @@ class CommandQueue:
         self.latched[changed] ^= bit
         if homed:
             self.emit(EventKind.HOMED, changed, now_ns)
+
+    def check_reset(self, axes: NDArray[np.int64], until_ns: int) -> None:
+        """Raise when one of these axes was stopped or put in fault at ``until_ns`` or later, and is so still."""
+        later = (self.latched_ns[axes] >= until_ns) & (self.latched[axes] & (FAULT | EMERGENCY_STOP) != 0)
+        if later.any():
+            axis = int(axes[later.argmax()])
+            bits = int(self.latched[axis])
+            what = "stopped" if bits & EMERGENCY_STOP else f"put in fault ({self.fault_text(axis)})"
+            raise CommandError(
+                errno.EAGAIN,
+                f"axis {axis} ({self.settings[axis].name}) has been {what} since the reading that the reset is based "
+                "on; see why, and reset again",
+            )
 
     def unlatch(self, axes: NDArray[np.int64]) -> None:
         """Clear emergency stop and fault of these axes."""

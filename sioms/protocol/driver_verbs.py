@@ -32,6 +32,7 @@ class DriverVerb(IntEnum):
     LINK = 24
     LOG = 25
     ALARM = 26
+    HELD_SILENT = 27
 
 
 class ForkServerVerb(IntEnum):
@@ -175,6 +176,13 @@ class AlarmChanged(Message, on=FROM_DRIVER, verb=DriverVerb.ALARM, notice=True):
     what: Text
     severity: Integer
     text: Text
+
+
+class HeldSilent(Message, on=FROM_DRIVER, verb=DriverVerb.HELD_SILENT, notice=True):
+    """A node that this device holds takes no orders from it: it is to be stopped, and taken from it."""
+
+    name: Text
+    why: Text
 
 
 class LogLine(Message, on=FROM_DRIVER, verb=DriverVerb.LOG, notice=True):

@@ -68,6 +68,10 @@ class InputNode(Protocol):
     def stamp_ns(self) -> int:
         """Time stamp of what was returned last [ns]."""
 
+    @property
+    def as_of_ns(self) -> int:
+        """Instant before which everything shows in what was returned last [ns, CLOCK_MONOTONIC]."""
+
 
 class HeldNode(Protocol):
     """An axis node of another device that is this device's own (``Description.holds``)."""
@@ -90,8 +94,18 @@ class HeldNode(Protocol):
     def stop(self) -> None:
         """Stop the axes at their greatest deceleration."""
 
-    def reset(self) -> None:
-        """Reset the axes after a stop or a fault."""
+    def reset(self, until_ns: int) -> None:
+        """Reset the axes after what a reading has shown; a stop that came later stays, and the reset is refused.
+
+        Args:
+            until_ns: ``as_of_ns`` of that reading.
+        """
+
+    @property
+    def shows_reset_ns(self) -> int:
+        """Readings as of then or later tell what has become of the last reset [ns]; far ahead while it is not
+        answered.
+        """
 
     def trouble(self) -> OSError | None:
         """Return why it has not done as it was told since the last call: refused, stopped, in fault, gone; None: it

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.protocol.flags import AxisStatus
-from sioms.protocol.page import SLOT_HEADER, NotReadable, PageReader, slot_header
+from sioms.protocol.page import SLOT_HEADER, NotReadable, PageReader, as_of_ns, slot_header
 from sioms.protocol.records import VALUE, read_rows
 
 from .blocks import unfit
@@ -31,7 +31,7 @@ class Input:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.stamp_ns = 0
+        self.stamp_ns = self.as_of_ns = 0
         self._number = 0
         self._reader: PageReader | None = None
         self._map: mmap.mmap | None = None
@@ -68,6 +68,7 @@ class Input:
         except NotReadable:
             return None
         self._number, self.stamp_ns, _ = slot_header(raw)
+        self.as_of_ns = as_of_ns(raw)
         return self._readings(reader, raw)
 
     def measured(self, now_ns: int, since_ns: int = 0) -> NDArray[np.float64]:
@@ -119,6 +120,7 @@ class Input:
             raw = reader.numbered(number)
             if raw is not None:
                 self._number, self.stamp_ns, _ = slot_header(raw)
+                self.as_of_ns = as_of_ns(raw)
                 found.append((self.stamp_ns, self._readings(reader, raw)))
         return found
 

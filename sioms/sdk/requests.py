@@ -62,8 +62,9 @@ def ioctl(
             service.stops.stop_node(handle.block, handle.channels, handle.bit, source)
             return service.stops.note_node(handle, source, stop=True)
         case Request.RESET:
-            service.stops.reset_node(handle.block, handle.channels, handle.bit, what)
-            return service.stops.note_node(handle, handle.who, stop=False)
+            if argument is not None and (type(argument) is not int or argument < 0):
+                raise _refuse(errno.EINVAL, f"{what}: {shown(argument)} as instant; want a time in ns, or none for now")
+            return service.stops.reset_by(handle, what, argument, service.loop.heed)
         case Request.CANCEL_WAITS:
             ours = {int(c) for c in handle.channels}
             return service.waits.end_where(

@@ -122,7 +122,8 @@ class Runtime:
         self.markers = Markers(table, lambda number: self.tell(driver_verbs.MarkerSignalled(number)))
         description = driver.describe(device, settings)
         self.inputs: dict[str, Input] = {name: Input(name) for name in description.reads}
-        self.held: dict[str, Held] = {name: Held(name) for name in description.holds}
+        lease_ns = int(float(options.get("lease_s") or description.lease_s) * 1e9)
+        self.held: dict[str, Held] = {name: Held(name, lease_ns, self.now_ns, self.tell) for name in description.holds}
         self._description = description
         self._epoll = select.epoll()
         self._callbacks: dict[int, Callable[[], None]] = {}
@@ -141,7 +142,6 @@ class Runtime:
         self.driver = driver.variant(settings)(device, settings, self)
         self.blocks = list(self.driver.blocks)
         self._kept = keep_positions(str(options["state_folder"]), device, self.blocks, self.log)
-        lease_ns = int(float(options.get("lease_s") or description.lease_s) * 1e9)
         self._keep_ns, self._kept_ns = lease_ns // 4, 0
         self.pages = Pages(device, self.blocks, lease_ns, generation, self._link_changed)
         handles: dict[int, Handle] = {}

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sioms.motion import EventKind
+from sioms.motion import CommandError, EventKind
 from sioms.protocol.driver_verbs import AlarmChanged, Stopped
 from sioms.protocol.flags import PageState, Reaction, Severity
 from sioms.protocol.journal import JournalWriter, Note
@@ -309,14 +309,18 @@ class Stops:
                     self.latched_outputs[id(block), *part] = source
         self.safe_stop(_emergency_stop_by(source), [(block, channels, bit)])
 
-    def reset_node(self, block: AnyBlock, channels: Any, bit: int, what: str) -> None:
+    def reset_node(self, block: AnyBlock, channels: Any, bit: int, what: str, until_ns: int | None = None) -> None:
         """Clear the latched stop and faults of some channels, or the stop of one bit of them.
 
+        Args:
+            block, channels, bit: what is reset.
+            what: in words.
+            until_ns: see ``Bank.check_reset``; None: whatever there is now is reset.
+
         Raises:
-            OSError: EPERM, the whole workcell is stopped.
+            OSError: as ``check_reset``.
         """
-        if self.stopped:
-            raise OSError(errno.EPERM, f"{what}: the whole workcell is stopped ({self.source}); reset that")
+        self.check_reset(block, channels, what, until_ns)
         self._effects.note()
         self._events.note(Note.RESET, time.monotonic_ns(), block.spec.name, [int(c) for c in channels])
         if isinstance(block, AxisBlock):
@@ -325,6 +329,44 @@ class Stops:
         for channel in channels:
             for part in parts_of(int(channel), bit, block.spec.channels[channel].width):
                 self.latched_outputs.pop((id(block), *part), None)
+
+    def check_reset(self, block: AnyBlock, channels: Any, what: str, until_ns: int | None) -> None:
+        """Refuse a reset of some channels that cannot be.
+
+        Raises:
+            OSError: EPERM, the whole workcell is stopped; EAGAIN, they were stopped at until_ns or later.
+        """
+        if self.stopped:
+            raise OSError(errno.EPERM, f"{what}: the whole workcell is stopped ({self.source}); reset that")
+        if isinstance(block, AxisBlock) and until_ns is not None:
+            try:
+                block.bank.check_reset(channels, until_ns)
+            except CommandError as error:
+                raise OSError(error.errno, f"{what}: {error}") from None
+
+    def reset_by(self, handle: Handle, what: str, until_ns: int | None, heed: Callable[[], None]) -> None:
+        """Reset, on behalf of a client, the node that it holds or watches.
+
+        The reset is noted before it is done: a stop that the daemon sends at the same time is either heard before it is
+        done, or noted behind it. What is refused after all stays stopped over the end of this process, too.
+
+        Args:
+            handle: of the client.
+            what: in words.
+            until_ns: see ``Bank.check_reset``; None: whatever there is now is reset.
+            heed: obeys what the daemon has sent.
+
+        Raises:
+            OSError: as ``check_reset``.
+        """
+        self.check_reset(handle.block, handle.channels, what, until_ns)
+        self.note_node(handle, handle.who, stop=False)
+        heed()
+        try:
+            self.reset_node(handle.block, handle.channels, handle.bit, what, until_ns)
+        except OSError:
+            self.note_node(handle, f"a stop that came during a reset by {handle.who}", stop=True)
+            raise
 
     def note_node(self, handle: Handle, source: str, *, stop: bool) -> None:
         """Note that a client has stopped or reset the node that it holds or watches."""
@@ -449,7 +491,7 @@ class Stops:
     def _reset_axes(self, block: AxisBlock, channels: Any) -> None:
         for axis in channels:
             self._tell_fault(block, int(axis), Severity.NONE, "it has been reset")
-        block.bank.reset(np.array(channels, dtype=np.intp))
+        block.bank.reset(channels)
         self.engine.commands_written(block)
 
 

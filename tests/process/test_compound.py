@@ -28,6 +28,7 @@ CELL = (
 driver = "gantry"
 axes = ["mod0", "mod1.y2"]
 span_m = 1.0
+lease_s = 0.5
 late_max_s = 0.5
 history = 4096
 """

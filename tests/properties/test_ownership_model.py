@@ -5,11 +5,11 @@ where it should.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import pytest
-from ownership_cell import cells
+from ownership_cell import Cell, cells
 from ownership_explorer import (
     BEGINNINGS,
     Walk,
@@ -21,8 +21,12 @@ from ownership_explorer import (
     wander,
 )
 
+from sioms.daemon.devices import DriverProcess
+from sioms.motion.queue import EMERGENCY_STOP
+from sioms.protocol.latch import Latch
 from sioms.protocol.messages import ClientVerb
 from sioms.protocol.stopjournal import StopJournal, node_entry
+from sioms.sdk.blocks import AxisBlock
 
 DEPTH = int(os.environ.get("SIOMS_EXPLORE_DEPTH", "1"))
 """Steps from each beginning; a deeper exploration takes hours, see tests/ownership_explorer.py."""
@@ -96,6 +100,65 @@ def test_a_stop_that_is_asked_for_in_the_middle_of_a_reset_is_heard(by: str) -> 
         server.shared.record.note = note  # type: ignore[method-assign]
         cell.take(("tick", 0))
         assert server.shared.latch.stopped_ns, "by a driver that looks"
+
+
+@pytest.mark.parametrize("device", [0, 1])
+@pytest.mark.parametrize("by", ["daemon", "driver"])
+def test_a_stop_in_the_middle_of_the_reset_of_a_node_is_kept_or_undone_but_never_both(by: str, device: int) -> None:
+    """The daemon's reset meets a stop that the driver is asked for, or the other way round, at each of its steps.
+
+    A driver that is killed then starts as it was: what stops it does not depend on who has written first.
+    """
+    for place in range(6):
+        with cells() as make:
+            cell = make()
+            for action in [*begin("nobody owns anything"), ("open", 0, device), ("hear", device)]:
+                cell.take(action)
+            cell.take(("stop_node", 1, device))
+            cell.take(("hear", device))
+            server, runtime = cell.server, cell._process(device).runtime
+            assert server is not None
+            with pytest.MonkeyPatch.context() as patch:
+                left = [place]
+
+                def between(call: Callable[..., Any], left: list[int] = left, cell: Cell = cell) -> Callable[..., Any]:
+                    def called(*arguments: Any, **named: Any) -> Any:
+                        for moment in (0, 1):
+                            if moment:
+                                value = call(*arguments, **named)
+                            left[0] -= 1
+                            if left[0] == -1:
+                                if by == "daemon":
+                                    cell.stop_by_handle(0, device)
+                                else:
+                                    cell.stop_node(1, device)
+                        return value
+
+                    return called
+
+                if by == "daemon":
+                    patch.setattr(server.shared.record, "note", between(server.shared.record.note))
+                    patch.setattr(DriverProcess, "send", between(DriverProcess.send))
+                    patch.setattr(Latch, "ordered", between(Latch.ordered))
+                    assert cell.reset_node(2, device) == "done"
+                else:
+                    patch.setattr(runtime.stops, "_note", between(runtime.stops._note))
+                    patch.setattr(runtime.stops, "reset_node", between(runtime.stops.reset_node))
+                    assert cell.reset_by_handle(0, device) == "done"
+            cell.take(("hear", device))
+            stopped = _is_stopped(cell, device)
+            cell.take(("kill", device))
+            cell.take(("bury", device, "process"))
+            cell.take(("start", device))
+            assert _is_stopped(cell, device) or not stopped, place
+
+
+def _is_stopped(cell: Cell, device: int) -> bool:
+    runtime = cell._process(device).runtime
+    block = runtime.blocks[0]
+    if isinstance(block, AxisBlock):
+        return bool(block.bank._queue.latched[0] & EMERGENCY_STOP)
+    return bool(runtime.stops.latched_outputs)
 
 
 def test_a_handle_is_closed_once_and_each_close_is_answered() -> None:

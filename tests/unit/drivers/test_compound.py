@@ -33,7 +33,8 @@ class Blades:
 
     def __init__(self) -> None:
         self.at, self.rates, self.most, self.stamp_ns = [-0.1, 0.1], [0.0, 0.0], [1.0, 1.0], 0
-        self.status = 0
+        self.status = self.as_of_ns = self.shows_reset_ns = 0
+        self.resets: list[int] = []
 
     def drive(self, velocities: Sequence[float]) -> None:
         self.rates = list(velocities)
@@ -41,12 +42,14 @@ class Blades:
     def stop(self) -> None:
         self.rates = [0.0, 0.0]
 
-    def reset(self) -> None: ...
+    def reset(self, until_ns: int) -> None:
+        self.resets.append(until_ns)
+        self.shows_reset_ns = 2**62
 
     def trouble(self) -> None: ...
 
     def read(self, now_ns: int) -> Any:
-        self.stamp_ns = now_ns
+        self.stamp_ns = self.as_of_ns = now_ns
         return np.array([(value, 0.0, self.status) for value in self.at], DTYPE)
 
     def go_on(self) -> None:
@@ -182,3 +185,18 @@ def test_a_held_position_that_is_not_a_number_is_a_lost_link() -> None:
     with pytest.raises(LinkError, match="blades: its position is not a finite number"):
         slits.run(0.01)
     assert slits.blades.rates == [0.0, 0.0]
+
+
+def test_a_reset_is_of_what_the_held_axes_showed_while_all_was_halted_and_of_nothing_later() -> None:
+    slits = Slits()
+    slits.blades.status = int(AxisStatus.EMERGENCY_STOP)
+    slits.run(0.01)
+    assert slits.bank.fault_text(0)
+    shown_ns = slits.blades.as_of_ns
+    slits.bank.reset([0, 1])
+    slits.run(0.2)
+    assert slits.blades.resets == [shown_ns], "once, and nothing that came after that reading"
+    assert not slits.bank.fault_text(0), "what is shown before the answer does not count"
+    slits.blades.shows_reset_ns = slits.now_ns + 1
+    slits.run(0.01)
+    assert "stopped or in fault" in slits.bank.fault_text(0), "it is stopped still, or again"
