@@ -271,8 +271,10 @@ class Compound(TickDriver):
             LinkError: one is lost, or the coordinates mean nothing there.
         """
         joints: list[float] = []
+        rates: list[float] = []
+        stamps: list[int] = []
         load: list[float] = []
-        status, stamp_ns = 0, now_ns
+        status = 0
         for name in self.settings.axes:
             node = self.kit.inputs[name]
             reading = node.read(now_ns)
@@ -281,10 +283,17 @@ class Compound(TickDriver):
             if not np.isfinite(reading["value"]).all():
                 self._lose(f"{name}: its position is not a finite number")
             joints += reading["value"].tolist()
+            rates += reading["commanded_velocity"].tolist()
+            stamps += [node.stamp_ns] * (len(joints) - len(stamps))
             load += reading["force"].tolist()
             shown = int(np.bitwise_or.reduce(reading["status"].astype(np.int64)))
             status |= shown if node.as_of_ns >= self.kit.held[name].shows_reset_ns else shown & ~_LATCHED
-            stamp_ns = min(stamp_ns, node.stamp_ns)
+        stamp_ns = min(stamps)
+        # Where they were at one instant: a device that shows its axes later than another would look like a skew.
+        joints = [
+            at - rate * (stamp - stamp_ns) * 1e-9 if math.isfinite(rate) else at
+            for at, rate, stamp in zip(joints, rates, stamps, strict=True)
+        ]
         try:
             found = list(self._map.forward(joints))
         except ValueError as error:

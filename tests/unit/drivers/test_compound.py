@@ -21,7 +21,7 @@ from sioms.sdk.exchange import LinkError
 from sioms.sdk.inputs import Input
 
 TICK_NS = 2_000_000
-DTYPE = np.dtype([("value", float), ("force", float), ("status", np.uint32)])
+DTYPE = np.dtype([("value", float), ("force", float), ("commanded_velocity", float), ("status", np.uint32)])
 
 
 class Blades:
@@ -50,7 +50,7 @@ class Blades:
 
     def read(self, now_ns: int) -> Any:
         self.stamp_ns = self.as_of_ns = now_ns
-        return np.array([(value, 0.0, self.status) for value in self.at], DTYPE)
+        return np.array([(at, 0.0, rate, self.status) for at, rate in zip(self.at, self.rates, strict=True)], DTYPE)
 
     def go_on(self) -> None:
         reached = [at + rate * TICK_NS * 1e-9 for at, rate in zip(self.at, self.rates, strict=True)]
@@ -60,16 +60,15 @@ class Blades:
 class Slits:
     """Slits over blades; ``run`` ticks them."""
 
-    def __init__(self, inputs: dict[str, Any] | None = None, **keys: Any) -> None:
-        self.blades, self.now_ns = Blades(), 1_000_000_000
+    def __init__(self, inputs: dict[str, Any] | None = None, blades: Sequence[Blades] = (), **keys: Any) -> None:
+        self.held = list(blades) or [Blades()]
+        self.blades, self.now_ns = self.held[0], 1_000_000_000
+        nodes = {held.name: held for held in self.held}
         kit: Any = SimpleNamespace(
-            markers=Markers(),
-            held={"blades": self.blades},
-            now_ns=lambda: self.now_ns,
-            inputs={"blades": self.blades} | (inputs or {}),
+            markers=Markers(), held=nodes, now_ns=lambda: self.now_ns, inputs={**nodes, **(inputs or {})}
         )
         axis = {"velocity_max": 0.2, "acceleration_max": 2.0} | keys
-        table = {"axes": ["blades"], "axis": [axis | {"name": name} for name in ("centre", "gap")]}
+        table = {"axes": list(nodes), "axis": [axis | {"name": name} for name in ("centre", "gap")]}
         self.driver = SlitsDriver("slits", msgspec.convert(table, SlitsDriver.Settings), kit)
         self.bank = self.driver.bank
         self.driver.open()
@@ -78,7 +77,8 @@ class Slits:
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds * 1e9 / TICK_NS)):
             self.now_ns += TICK_NS
-            self.blades.go_on()
+            for held in self.held:
+                held.go_on()
             self.driver.tick(self.now_ns)
 
 
@@ -200,3 +200,32 @@ def test_a_reset_is_of_what_the_held_axes_showed_while_all_was_halted_and_of_not
     slits.blades.shows_reset_ns = slits.now_ns + 1
     slits.run(0.01)
     assert "stopped or in fault" in slits.bank.fault_text(0), "it is stopped still, or again"
+
+
+class Late(Blades):
+    """One of two devices with a blade each; it shows where its blade was some ticks ago."""
+
+    def __init__(self, name: str, ticks: int) -> None:
+        super().__init__()
+        self.name, self.channels, self._ticks, self._shown = name, Blades.channels[:1], ticks, list[float]()
+        self.at, self.rates, self.most = [0.1 if name == "plus" else -0.1], [0.0], [1.0]
+
+    def read(self, now_ns: int) -> Any:
+        self._shown.append(self.at[0])
+        reading = super().read(now_ns)
+        back = min(self._ticks, len(self._shown) - 1)
+        self.stamp_ns -= back * TICK_NS
+        reading["value"] = self._shown[-1 - back]
+        return reading
+
+
+def test_devices_that_show_their_axes_at_different_times_do_not_seem_to_part() -> None:
+    slits = Slits(blades=[Late("minus", 0), Late("plus", 5)])
+    slits.bank.append(records(mode=ControlMode.VELOCITY, velocity=0.2), [0], slits.now_ns)
+    slits.run(0.3)
+    gaps = []
+    for _ in range(100):
+        slits.run(0.002)
+        gaps.append(slits.bank.rows["position"][1])
+    assert max(gaps) - min(gaps) < 1e-4
+    assert gaps[-1] == pytest.approx(0.2, abs=1e-4)
