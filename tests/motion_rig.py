@@ -201,8 +201,8 @@ class Cell:
         self.markers = Markers()
         self.bank = DriveBank([axis(modes=DRIVE_MODES, k=None, **settings) for _ in range(n)], markers=self.markers)
         self.drives = [Drive() for _ in range(n)]
-        for drive in self.drives:
-            drive.position = start
+        for drive, position in zip(self.drives, np.broadcast_to(start, n).tolist(), strict=True):
+            drive.position = position
         self.holds = np.ones(n, dtype=bool)
         self.now_ns, self.axes, self.events, self.starts = 10**9, list(range(n)), [], []
         self.poll()

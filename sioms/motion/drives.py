@@ -121,6 +121,7 @@ class DriveBank(Bank):
 
     def _drop(self, axes: Axes) -> None:
         self._queue.clear(axes)
+        self._release_ns[axes] = 0
 
     def _emptied(self, axes: Axes) -> None:
         """Stop what was to be replaced by a command that has been flushed."""
@@ -538,7 +539,9 @@ class DriveBank(Bank):
             self._go(axis, command, approach, now_ns)
 
     def _halt(self, axes: Axes, now_ns: int, *, fastest: bool) -> None:
-        self._queue.clear(axes)
+        self._drop(axes)
+        self._end_ns[axes] = NEVER_NS
+        self._end_fraction[axes] = 0.0
         self._actions = [a for a in self._actions if a.axis not in axes or a.kind is ActionKind.RESET]
         self._queue.latched[axes] &= ~int(AxisStatus.HOMING)
         self._homing[axes] = False

@@ -195,8 +195,9 @@ class Sequencer:
         return rest
 
     def drop(self, axes: Axes) -> None:
-        """Forget all waiting commands of these axes, and the plans made for them."""
+        """Forget all waiting commands of these axes, the plans made for them, and when they were to start."""
         self._queue.clear(axes)
+        self.store.uncut(axes)
         self._ready[axes] = False
         if self._todo or self._held:
             for axis in axes.tolist():

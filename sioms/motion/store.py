@@ -196,6 +196,13 @@ class PlanStore:
         self.end_ns[axes] = np.minimum(self.end_ns[axes], end_ns)
         self.next_ns = min(self.next_ns, end_ns)
 
+    def uncut(self, axes: Axes) -> None:
+        """Let running plans go on to their own ends: what they were cut for is no more."""
+        cut = axes[self.cut_ns[axes] != UNCUT_NS]
+        if cut.size:
+            self.cut_ns[cut] = UNCUT_NS
+            self._load(cut)
+
     def state(self, axes: Axes, now_ns: int | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return position, velocity, acceleration (m, 3) of the present segments at now."""
         t = (now_ns - self.segment_ns[axes]) * 1e-9
