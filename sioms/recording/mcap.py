@@ -207,8 +207,13 @@ def chunk_of(content: bytes) -> Chunk:
     return Chunk(start, end, size, checksum, parts.text(), parts.block(_Q))
 
 
-def walk(data: Any, at: int, end: int) -> Iterator[tuple[int, int, int]]:
+def walk(data: Any, at: int, end: int, base: int = 0) -> Iterator[tuple[int, int, int]]:
     """Yield the records between two places: kind, where the content begins and ends.
+
+    Args:
+        data: bytes of a file, or what a chunk holds.
+        at, end: places in it.
+        base: where it lies in the file, for the error.
 
     Raises:
         Damaged: what comes is no whole record.
@@ -216,13 +221,21 @@ def walk(data: Any, at: int, end: int) -> Iterator[tuple[int, int, int]]:
     unpack = _RECORD.unpack_from
     while at < end:
         if at + HEAD > end:
-            raise Damaged(f"{end - at} bytes at {at} are no whole record")
+            raise Damaged(f"{end - at} bytes at {base + at} are no whole record")
         kind, size = unpack(data, at)
         stop = at + HEAD + size
         if not 1 <= kind <= DATA_END or size > LONGEST or stop > end:
-            raise Damaged(f"what is at {at} is no whole record")
+            raise Damaged(f"what is at {base + at} is no whole record")
         yield kind, at + HEAD, stop
         at = stop
+
+
+def size_of_first(data: bytes) -> int:
+    """Return the bytes of the record at the beginning, 0 where there is none that is believed."""
+    if len(data) < HEAD:
+        return 0
+    kind, size = _RECORD.unpack_from(data)
+    return HEAD + int(size) if 1 <= kind <= DATA_END and size <= LONGEST else 0
 
 
 def times(data: Any, offsets: NDArray[np.int64]) -> NDArray[np.uint64]:

@@ -1,12 +1,11 @@
 """Reads recordings: live or packed, whole or damaged. What is whole is read, what is lost is said.
 
 A file is read in pieces, of some megabytes each, and never as a whole; what is asked for in columns is kept, the rest
-is not.
+is not. It is read and not mapped: a mapped file that is cut off meanwhile would end whoever looks at it.
 """
 
 from __future__ import annotations
 
-import mmap
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -27,7 +26,9 @@ from . import mcap
 from .messages import CDR, EVENTS, Event
 
 PIECE = 8 << 20
-"""Bytes of a live file that are looked at together."""
+"""Bytes of a file that are looked at together; a record that is longer is looked at alone."""
+_PATTERN = mcap.HEAD + 2
+"""Bytes by which a message of a known node is found behind damage."""
 MOST_CHANNELS = 1 << 16
 """Of a node, as in a page of one on another machine."""
 
@@ -148,11 +149,15 @@ class Recording:
 
     def __init__(self, path: str | Path) -> None:
         self.path = str(path)
-        with open(path, "rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            if file.read(8) != mcap.MAGIC:
+        # A pipe would hold up who opens it.
+        self._fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        try:
+            self.size = os.fstat(self._fd).st_size
+            if self._read(0, len(mcap.MAGIC)) != mcap.MAGIC:
                 raise OSError(22, f"read {path}: it is no recording: it does not begin as MCAP files do")
-            self._data = mmap.mmap(file.fileno(), size, prot=mmap.PROT_READ)
+        except OSError:
+            os.close(self._fd)
+            raise
         self.nodes: dict[str, NodeRecord] = {}
         self.schemas: dict[int, mcap.Schema] = {}
         self.channels: dict[int, mcap.Channel] = {}
@@ -160,8 +165,7 @@ class Recording:
         self.damage: list[str] = []
         self._odd: list[str] = []
         """Sentences about what the file says of itself."""
-        self.is_packed = self._data[-8:] == mcap.MAGIC and size > 100
-        self.size = size
+        self.is_packed = self.size > 100 and self._read(self.size - 8, 8) == mcap.MAGIC
         self._lengths: dict[int, int] = {}
         self._events = -1
         self._known: dict[bytes, int] = {}
@@ -169,7 +173,9 @@ class Recording:
 
     def close(self) -> None:
         """Let go of the file."""
-        self._data.close()
+        if self._fd >= 0:
+            os.close(self._fd)
+        self._fd = -1
 
     def __enter__(self) -> Recording:
         return self
@@ -193,13 +199,31 @@ class Recording:
 
     def _head(self) -> None:
         """Take up what stands before the first message; channels may come later, too."""
-        try:
-            for kind, start, stop in mcap.walk(self._data, len(mcap.MAGIC), self.size):
-                if kind in (mcap.MESSAGE, mcap.CHUNK, mcap.DATA_END):
-                    return
-                self._take(kind, self._data[start:stop])
-        except mcap.Damaged:
-            return  # it is said by who reads the messages
+        at, seen = len(mcap.MAGIC), -1
+        while at > seen:
+            part, seen, begin = self._part(at), at, at
+            try:
+                for kind, start, stop in mcap.walk(part, 0, len(part)):
+                    if kind in (mcap.MESSAGE, mcap.CHUNK, mcap.DATA_END):
+                        return
+                    self._take(kind, part[start:stop])
+                    at = begin + stop
+            except mcap.Damaged:  # the part ends within a record; of a damaged one it is said by who reads the messages
+                continue
+
+    def _read(self, at: int, size: int) -> bytes:
+        """Return bytes of the file, fewer than asked for where it has been cut off since it was opened."""
+        pieces = []
+        while size > 0 and (piece := os.pread(self._fd, size, at)):
+            pieces.append(piece)
+            at, size = at + len(piece), size - len(piece)
+        return b"".join(pieces)
+
+    def _part(self, at: int) -> bytes:
+        """Return some megabytes of the file from a record on, or that record whole."""
+        part = self._read(at, min(PIECE, self.size - at))
+        size = mcap.size_of_first(part)
+        return self._read(at, size) if PIECE < size <= self.size - at else part
 
     def _take(self, kind: int, content: bytes) -> None:
         if kind == mcap.SCHEMA:
@@ -244,47 +268,44 @@ class Recording:
         """
         wanted = None if channels is None else frozenset(channels)
         self.damage = list(self._odd)
-        at = begin = len(mcap.MAGIC)
-        found: dict[int, list[int]] = {}
-        ended = False
-        data, size = self._data, self.size
-        while at < size and not ended:
+        at, ended = len(mcap.MAGIC), False
+        while at < self.size and not ended:
+            part, begin, found = self._part(at), at, dict[int, list[int]]()
+            problem: mcap.Damaged | None = None
             try:
-                for kind, start, stop in mcap.walk(data, at, size):
-                    at = stop
+                for kind, start, stop in mcap.walk(part, 0, len(part), begin):
                     if kind == mcap.MESSAGE:
-                        channel = int.from_bytes(data[start : start + 2], "little")
+                        channel = int.from_bytes(part[start : start + 2], "little")
                         if channel not in self.channels or stop - start < mcap.MESSAGE_HEAD:
-                            raise mcap.Damaged(f"a message at {start - mcap.HEAD} is of no channel")
+                            raise mcap.Damaged(f"a message at {begin + start - mcap.HEAD} is of no channel")
                         if wanted is None or channel in wanted:
-                            found.setdefault(channel, []).append(start - mcap.HEAD - begin)
-                        if at - begin > PIECE:
-                            if found:
-                                yield Piece(data[begin:at], found)
-                            begin, found = at, {}
+                            found.setdefault(channel, []).append(start - mcap.HEAD)
                     elif kind == mcap.CHUNK:
-                        if (piece := self._chunk(data[start:stop], start, wanted)) and piece.by_channel:
+                        if found:
+                            yield Piece(part, found)
+                            found = {}
+                        if (piece := self._chunk(part[start:stop], begin + start, wanted)) and piece.by_channel:
                             yield piece
-                        begin = at
                     elif kind == mcap.DATA_END:
                         ended = True
                         break
                     elif kind not in (mcap.MESSAGE_INDEX, mcap.HEADER):
-                        self._take(kind, data[start:stop])
-                else:
-                    break
-            except mcap.Damaged as problem:
-                if found:
-                    yield Piece(data[begin:at], found)
+                        self._take(kind, part[start:stop])
+                    at = begin + stop
+            except mcap.Damaged as damaged:
+                problem = damaged
+            if found:
+                yield Piece(part, found)
+            if at == begin and not ended:  # not only the end of what was read: this record is none
                 next_at = self._resume(at)
-                lost = (next_at or size) - at
+                lost = (next_at or self.size) - at
                 rest = "" if next_at else ", to the end of the file"
-                self.damage.append(f"{problem}: {lost} bytes from {at} on are lost{rest}")
+                self.damage.append(
+                    f"{problem or 'the file has been cut off'}: {lost} bytes from {at} on are lost{rest}"
+                )
                 if next_at is None:
                     return
-                begin, found, at = next_at, {}, next_at
-        if found:
-            yield Piece(data[begin:at], found)
+                at = next_at
         if not ended and not self.damage and self.is_packed:
             self.damage.append("the summary is damaged; the messages are whole")
 
@@ -309,13 +330,16 @@ class Recording:
 
     def _resume(self, at: int) -> int | None:
         """Return where the next message of a known node begins behind a place, None for nowhere."""
-        best: int | None = None
-        for size, channel in self._known.items():
-            pattern = bytes([mcap.MESSAGE]) + size + channel.to_bytes(2, "little")
-            place = self._data.find(pattern, at + 1, best if best is not None else self.size)
-            if place >= 0 and (best is None or place < best):
-                best = place
-        return best
+        patterns = [
+            bytes([mcap.MESSAGE]) + size + channel.to_bytes(2, "little") for size, channel in self._known.items()
+        ]
+        at += 1
+        while patterns and (part := self._read(at, PIECE + _PATTERN)):
+            places = [place for pattern in patterns if (place := part.find(pattern)) >= 0]
+            if places:
+                return at + min(places)
+            at += PIECE
+        return None
 
     # --- what is asked for -----------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from mcap.exceptions import EndOfFile
 from recording_rig import NODES, OFFSET_NS, START_NS, events, slots, write
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from sioms.recording import reader
 from sioms.recording.reader import Recording
 from sioms.recording.rewrite import rewrite
 
@@ -136,3 +138,52 @@ def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
     path.write_bytes(b"position,velocity\n1,2\n")
     with pytest.raises(OSError, match="no recording"):
         Recording(path)
+
+
+@pytest.mark.parametrize("is_packed", [False, True])
+@pytest.mark.parametrize("piece", [16, 100, 4096])
+def test_pieces_of_any_size_hold_every_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_packed: bool, piece: int
+) -> None:
+    monkeypatch.setattr(reader, "PIECE", piece)
+    path = write(tmp_path / "a.mcap", 40)
+    if is_packed:
+        rewrite([str(path)], str(path))
+    with Recording(path) as recording:
+        for node in NODES:
+            assert np.array_equal(np.concatenate(list(recording.slots(node.name))), slots(node, 1, 40))
+        assert recording.events() == events(5) and recording.damage == []
+    whole = path.read_bytes()
+    middle = len(whole) // 2
+    path.write_bytes(whole[:middle] + bytes(200) + whole[middle + 200 :])
+    with Recording(path) as recording:
+        read = sum(len(each) for node in NODES for each in recording.slots(node.name))
+        assert (0 < read < 120 or is_packed) and len(recording.damage) == 1
+
+
+@pytest.mark.parametrize("is_packed", [False, True])
+def test_a_file_that_is_cut_off_while_it_is_read_is_read_up_to_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_packed: bool
+) -> None:
+    """Somebody copies over it, or rotates it away: no signal, no exception, and what is lost is said."""
+    monkeypatch.setattr(reader, "PIECE", 8192)
+    path = write(tmp_path / "a.mcap", 400)
+    if is_packed:
+        rewrite([str(path)], str(path))
+    whole = path.read_bytes()
+    for left in (len(whole) // 2, 100, 0):
+        path.write_bytes(whole)
+        with Recording(path) as recording:
+            pieces = recording.slots("mod0")
+            read = [] if is_packed else [next(pieces)]
+            os.truncate(path, left)
+            read += list(pieces)
+            assert sum(map(len, read)) < 400 and recording.damage[-1].endswith("to the end of the file")
+            assert len(recording.table("mod0").numbers) <= 400 and len(recording.events()) <= 5
+
+
+def test_a_pipe_holds_up_nobody(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.mcap")
+    for name in ("pipe.mcap", ""):
+        with pytest.raises(OSError, match=r"no recording|[Ii]llegal seek|[Ii]s a directory"):
+            Recording(tmp_path / name)
